@@ -15,7 +15,7 @@ from performance.machine import machine
 import sparklod_cli as sparklod
 from sparklod_cli.lod import quality
 from sparklod_cli.lod.detail_levels import make
-from sparklod_cli.lod.detail_settings import DetailSettings
+from sparklod_cli.lod.detail_rule import DetailSettings
 from sparklod_cli.model.splats import Splats
 
 #: The growth of our tree.

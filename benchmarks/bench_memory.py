@@ -22,7 +22,8 @@ from sparklod_cli.model.sh import COEFFICIENTS
 CHILD = """
 import json, re, sys, threading, time
 from pathlib import Path
-from sparklod_cli.bake import BakeSettings, Resources, bake
+from sparklod_cli.bake.flow import bake
+from sparklod_cli.bake.settings import BakeSettings, Resources
 source, target, method, blocks = sys.argv[1:]
 target, most, done = Path(target), 0, threading.Event()
 scratch = target.with_name("scratch")

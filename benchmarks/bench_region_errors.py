@@ -19,9 +19,8 @@ import sparklod_cli
 from sparklod_cli.bake import region_errors
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.lod import quality
-from sparklod_cli.lod.detail_cuts import detail_cuts
-from sparklod_cli.lod.detail_levels import make
-from sparklod_cli.lod.detail_settings import DetailSettings
+from sparklod_cli.lod.detail_levels import detail_cuts, make
+from sparklod_cli.lod.detail_rule import DetailSettings
 from sparklod_cli.model.gaussian import covariance
 from sparklod_cli.model.scene import DetailScene
 from sparklod_cli.render import rasterizer

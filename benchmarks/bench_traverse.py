@@ -56,7 +56,6 @@ def _table(*names: Column) -> Table:
             ratio("path_s", "drawn", "ns a splat", per=1e-9),
             figure("alone_s", "on one thread, ms", 2, per=1e-3),
             figure("first_s", "a first frame, ms", 2, per=1e-3, spread=True),
-            figure("first_alone_s", "on one thread, ms", 2, per=1e-3),
             figure("measure_s", "its statistics, ms", 2, per=1e-3),
             figure("continuous_s", "a continuous cut, ms", 1, per=1e-3),
             figure("spark_s", "Spark ms", 1, per=1e-3, spread=True),
@@ -174,8 +173,7 @@ class Measured:
         jobs: dict[str, Callable[[], float]] = {
             "path_s": lambda: self._path(budget, processors()),
             "alone_s": lambda: self._path(budget, 1),
-            "first_s": lambda: self._first(budget, processors()),
-            "first_alone_s": lambda: self._first(budget, 1),
+            "first_s": lambda: self._first(budget),
             "measure_s": lambda: self._statistics(budget),
         }
         if self._continuous:
@@ -195,14 +193,14 @@ class Measured:
             pass
         return (time.perf_counter() - start) / len(self._views)
 
-    def _first(self, budget: int, threads: int) -> float:
+    def _first(self, budget: int) -> float:
         """Seconds of a cut that cannot start from the one before it; its buffers are allocated already.
 
         The mean of the first, the middle and the last view.
         """
         seconds = []
         for view in (self._views[0], self._views[len(self._views) // 2], self._views[-1]):
-            find = partial(self._traversal.cut, view, budget=budget, threads=threads)
+            find = partial(self._traversal.cut, view, budget=budget)
             find()
             self._traversal.forget()
             seconds.append(_seconds(find))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 from .cameras.path import CameraPath
 from .images.metrics import (
@@ -19,7 +18,6 @@ from .images.metrics import (
     ssim,
     worst_tile,
 )
-from .io import write_whole
 from .lod.budget import Budget
 from .lod.settings import LodSettings
 from .render.rasterizer import Image
@@ -31,7 +29,7 @@ from .support.errors import SparklodError
 from .support.parallel import on_threads, ordered_map
 from .support.progress import Progress, silent
 from .tables.columns import Row
-from .tables.comparison import COLUMNS, rows_by_budget
+from .tables.comparison import COLUMNS
 from .tables.statistics import numbers
 
 #: Threads that measure pictures; each has a few that wait, which take memory.
@@ -96,7 +94,7 @@ class Comparison:
         self._cuts = [Renderer(finder.with_budget(count), render, []) for count in self.counts]
 
     def run(self, path: CameraPath, *, threads: int = 1, progress: Progress = silent) -> Iterator[Row]:
-        """Rows of `tables.comparison.COLUMNS`: for each camera one for each budget.
+        """Yield rows of `tables.comparison.COLUMNS`: for each camera one for each budget.
 
         Cells of `popping` are empty where a camera does not follow the one before it (`CameraPath.follows`).
 
@@ -135,7 +133,7 @@ class Comparison:
 
 
 def measured(pictures: Pictures) -> Row:
-    """The row of a comparison: what was known of the pictures, and how far they are apart."""
+    """Return the row of a comparison: what was known of the pictures, and how far they are apart."""
     row, before = pictures.row, pictures.before
     tiles = []
     for name, gray in BACKGROUNDS.items():
@@ -153,23 +151,3 @@ def measured(pictures: Pictures) -> Row:
     worst = min(tiles, key=lambda tile: tile.psnr)
     row |= {"worst_tile_psnr": worst.psnr, "worst_tile_x": worst.x, "worst_tile_y": worst.y}
     return {column.name: column.rounded(row.get(column.name)) for column in COLUMNS}
-
-
-def write_charts(target: Path, rows: Sequence[Row], budgets: Sequence[Budget], title: str, *, overwrite: bool) -> None:
-    """Writes the charts of a comparison as a .png.
-
-    Args:
-        target: the file.
-        rows: of `Comparison.run`.
-        budgets: of the comparison.
-        title: the name of the scene.
-        overwrite: replace a file that exists.
-
-    Raises:
-        SparklodError: matplotlib is not installed, or the file cannot be written.
-    """
-    from .figures.comparison_chart import plot
-
-    texts = (budget.text for budget in budgets)
-    series = list(zip(texts, rows_by_budget(rows, len(budgets)), strict=True))
-    write_whole(target, [plot(series, title)], overwrite=overwrite)

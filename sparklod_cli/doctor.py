@@ -142,7 +142,7 @@ def _extras() -> Iterator[Check]:
 def _print_kernels() -> None:
     """Loads all that a bake takes, starts the threads of kernels, and prints what there is of kernels, as JSON."""
     from . import warmup
-    from .bake import bake  # noqa: F401
+    from .bake.flow import bake  # noqa: F401
     from .support import jit
 
     jit.load_numba()

@@ -49,7 +49,7 @@ class Extracted:
 
 
 def leaves_of(scene: Scene) -> Scene:
-    """The splats that the tree of a scene was built of, as a scene without a tree.
+    """Return the splats that the tree of a scene was built of, as a scene without a tree.
 
     Raises:
         FormatError: it has no tree.
@@ -72,16 +72,13 @@ def extract_leaves(
     threads: int = 1,
     progress: Progress = silent,
 ) -> Extracted:
-    """Reads the tree of a Level-of-Detail file and writes its leaves, in their order, as a file of plain splats.
+    """Read the tree of a Level-of-Detail file and writes its leaves, in their order, as a file of plain splats.
 
     Args:
         source: a Level-of-Detail file; - is standard input.
         target: of any name; - is standard output.
         options: how to write; what is None is taken from the input, which keeps its values as they are.
         suffix: of the format, one of `WRITABLE`.
-        overwrite: replace a file that exists.
-        threads: to work on.
-        progress: told of the stages.
 
     Raises:
         FormatError, OutputError: see `io.read_scene` and `io.scene_sink`; the file has no tree.

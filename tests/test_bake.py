@@ -17,7 +17,8 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from fixtures import by_hand, by_hand_ksplat, by_hand_splat
-from sparklod_cli.bake import BakeSettings, bake
+from sparklod_cli.bake.flow import bake
+from sparklod_cli.bake.settings import BakeSettings
 from sparklod_cli.codecs import ply, spz_options
 from sparklod_cli.codecs.gpu.table import ENCODINGS
 from sparklod_cli.codecs.options import RadOptions, WriteOptions

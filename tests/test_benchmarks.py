@@ -16,6 +16,8 @@ import pytest
 import sparklod_cli as sparklod
 from tests.conftest import ROOT
 
+pytestmark = pytest.mark.slow
+
 BENCHMARKS = [*sorted(path.stem for path in (ROOT / "benchmarks").glob("bench_*.py")), "digests", "run_all"]
 
 

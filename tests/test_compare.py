@@ -33,6 +33,8 @@ from sparklod_cli.tables.columns import Row
 from sparklod_cli.tables.comparison import COLUMNS, rows_by_budget, summarize
 from tests.conftest import FIXTURES
 
+pytestmark = pytest.mark.slow
+
 TREE = FIXTURES / "traverse" / "town.spz"
 LOD = LodSettings(1, Cones(), pixel_scale_limit=0.0)
 RENDER = RenderSettings()

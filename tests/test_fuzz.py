@@ -18,6 +18,8 @@ from fuzz.child import Child
 from tests import planted
 from tests.conftest import ROOT
 
+pytestmark = pytest.mark.slow
+
 if sys.platform != "linux":
     pytest.skip("the process that runs cases is watched by what Linux offers", allow_module_level=True)
 

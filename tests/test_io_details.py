@@ -12,8 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sparklod_cli.io import companions, detail_files, detail_sink, files_of, read_levels, read_scene
-from sparklod_cli.io.names import leads_away
+from sparklod_cli.io import companions, read_levels, read_scene
+from sparklod_cli.io.details import detail_files, detail_sink
+from sparklod_cli.io.identity import files_of
+from sparklod_cli.io.paths import leads_away
 from sparklod_cli.support import atomic
 from sparklod_cli.support.addresses import Address
 from sparklod_cli.support.errors import OutputError
@@ -205,6 +207,7 @@ def held_at(address: Address) -> dict[str, bytes]:
     return {name: (folder / name).read(0, (folder / name).size()) for name in folder.files()}
 
 
+@pytest.mark.slow
 def test_an_output_at_an_address_replaces_a_former_one(address: Address) -> None:
     old = output("0_0", "0_1", "env")
     assert detail_sink(address, overwrite=False)(pieces(old)) == sum(map(len, old.values()))
@@ -217,6 +220,7 @@ def test_an_output_at_an_address_replaces_a_former_one(address: Address) -> None
     assert held_at(address) == new | {"0_1/notes": b"precious"}
 
 
+@pytest.mark.slow
 def test_what_is_in_the_way_at_an_address_is_told_before_anything_is_removed(address: Address) -> None:
     detail_sink(address, overwrite=False)(pieces(output("0_0")))
     (address.parent / "2_0/meta.json").write([b"precious"])
@@ -226,6 +230,7 @@ def test_what_is_in_the_way_at_an_address_is_told_before_anything_is_removed(add
     assert held_at(address) == before
 
 
+@pytest.mark.slow
 def test_what_was_sent_is_removed_where_the_rest_cannot_be_made(address: Address) -> None:
     def broken() -> Iterator[tuple[str, Iterable[bytes]]]:
         yield from list(pieces(output("0_0", "0_1")))[:-1]
@@ -236,6 +241,7 @@ def test_what_was_sent_is_removed_where_the_rest_cannot_be_made(address: Address
     assert held_at(address) == {}
 
 
+@pytest.mark.slow
 def test_an_output_at_an_address_is_read_from_there(address: Address) -> None:
     files = {name: (GOLDEN / name).read_bytes() for name in GOLDEN_NAMES if name != "lod-meta.json"}
     detail_sink(address, overwrite=False)(pieces(files | {"lod-meta.json": (GOLDEN / "lod-meta.json").read_bytes()}))

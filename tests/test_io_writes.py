@@ -12,7 +12,8 @@ from typing import Any
 
 import pytest
 
-from sparklod_cli.io import check_writable, detail_sink, sink_together, write_stdout, write_whole
+from sparklod_cli.io import check_writable, sink_together, write_stdout, write_whole
+from sparklod_cli.io.details import detail_sink
 from sparklod_cli.support import atomic
 from sparklod_cli.support.errors import FormatError, OutputError
 from tests.conftest import FIXTURES, IS_ROOT

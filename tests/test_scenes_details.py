@@ -17,9 +17,9 @@ from sparklod_cli.model.instances import Cones, Instance
 from sparklod_cli.model.scene import DetailScene, Scene
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.render.color_by import numbers_of, scale_of_splats
-from sparklod_cli.scenes.detail_scene import LoadedDetail
 from sparklod_cli.scenes.finder import CutFinder
 from sparklod_cli.scenes.loaded import Scenes
+from sparklod_cli.scenes.loaded_scene import LoadedDetail
 from sparklod_cli.scenes.reading import read_scenes
 from tests.conftest import FIXTURES
 from tests.lod.details import row_of_regions

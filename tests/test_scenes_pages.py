@@ -21,11 +21,10 @@ from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.nodes import CHUNK_NODES
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS
-from sparklod_cli.scenes import paged_scene
+from sparklod_cli.scenes import pages
 from sparklod_cli.scenes.finder import CutFinder, view_of
 from sparklod_cli.scenes.loaded import Scenes
-from sparklod_cli.scenes.paged_forest import PagedForest
-from sparklod_cli.scenes.paged_scene import PagedScene
+from sparklod_cli.scenes.pages import PagedForest, PagedScene
 from sparklod_cli.scenes.reading import read_scenes
 from sparklod_cli.simulation.streaming import Network, StreamingSettings
 from sparklod_cli.support.errors import FormatError, TreeError
@@ -33,6 +32,8 @@ from tests.conftest import FIXTURES
 from tests.lod.forests import transform
 from tests.scenes import random_splats
 from tests.simulation.paths import SPARK, around, camera, rows_of, without
+
+pytestmark = pytest.mark.slow
 
 HAND = FIXTURES / "golden" / "hand-tree-v3.spz"
 NEAR = camera((0.05, -0.05, -0.3), (0.3, 0.1, 0))
@@ -169,7 +170,7 @@ def test_cameras_see_what_they_see_of_scenes_read_whole(
         spoiled = Scene(dataclasses.replace(scene.splats, center=center), scene.tree)
         file = tmp_path / "b.rad"
         file.write_bytes(b"".join(rad.encode(spoiled, WriteOptions(compression_level=1), threads=2)))
-    for module in (framing, paged_scene):
+    for module in (framing, pages):
         monkeypatch.setattr(module, "SAMPLE", 50_000)
     whole, paged = (scenes.balls() for scenes in both(instances(file)))
     assert len(paged.radius) < len(whole.radius) / 4

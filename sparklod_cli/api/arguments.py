@@ -1,10 +1,11 @@
-"""Arguments of the API, checked before they reach a loop or a kernel; errors say the value, and what to give."""
+"""Arguments of the API, checked before they reach a loop or a kernel: errors say the value, and what to give."""
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +15,11 @@ from ..cameras.camera import Camera
 from ..cameras.path import CameraPath
 from ..model.scene import Scene
 from ..support.errors import OutputError
+from ..support.progress import Progress, silent
 
 
 def scene_like(value: Any) -> Scene:
-    """A scene or a tree.
+    """Return a scene or a tree.
 
     Raises:
         TypeError: it is anything else.
@@ -28,7 +30,7 @@ def scene_like(value: Any) -> Scene:
 
 
 def camera_like(value: Any) -> Camera:
-    """One camera, all of whose numbers are finite.
+    """Return one camera, all of whose numbers are finite.
 
     Raises:
         TypeError: it is anything else.
@@ -44,7 +46,7 @@ def camera_like(value: Any) -> Camera:
 
 
 def path_like(cameras: CameraPath | Iterable[Camera]) -> CameraPath:
-    """Cameras one after the other.
+    """Return cameras one after the other.
 
     Raises:
         TypeError: one is no camera.
@@ -76,7 +78,7 @@ def file_path(path: Path | str) -> Path:
 
 
 def within(name: str, value: Any, least: float, most: float) -> None:
-    """Raises ValueError unless a number is from `least` to `most`, and TypeError unless it is a number."""
+    """Raise ValueError unless a number is from `least` to `most`, and TypeError unless it is a number."""
     if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
         raise TypeError(f"{name} is {value!r}; give a number from {least} to {most}")
     if not least <= value <= most:
@@ -84,14 +86,14 @@ def within(name: str, value: Any, least: float, most: float) -> None:
 
 
 def whole_within(name: str, value: Any, least: int, most: int) -> None:
-    """`within` for whole numbers."""
+    """Check a whole number as `within`."""
     if isinstance(value, (float, np.floating)):
         raise TypeError(f"{name} is {value!r}; give a whole number from {least} to {most}")
     within(name, value, least, most)
 
 
 def viewed_like(value: Any) -> None:
-    """Raises TypeError for what cannot be looked at, though Python could iterate over it or fail within it."""
+    """Raise TypeError for what cannot be looked at, though Python could iterate over it or fail within it."""
     if isinstance(value, (str, bytes)) or not hasattr(value, "__iter__"):
         raise TypeError(f"it takes scenes, trees or instances, not {_kind(value)}; {_SCENES}")
 
@@ -102,3 +104,41 @@ _SCENES = "read reads a file, Scene.from_arrays takes arrays"
 
 def _kind(value: Any) -> str:
     return repr(value) if isinstance(value, str) else f"a {type(value).__name__}" if value is not None else "None"
+
+
+#: A callback `(stage, done, total, unit)`, a class of bars that is called as `tqdm.tqdm` is, or None.
+Told = Progress | type[Any] | None
+
+
+class _Bars:
+    """One bar for each stage, of a class that makes bars."""
+
+    def __init__(self, kind: type[Any]) -> None:
+        self._kind, self._stage = kind, ""
+        self._bar: Any = None
+
+    def __call__(self, stage: str, done: int, total: int, unit: str) -> None:
+        if self._bar is None or stage != self._stage:
+            self.close()
+            self._stage, self._bar = stage, self._kind(total=total, desc=stage, unit=f" {unit}s", leave=False)
+        self._bar.update(done - self._bar.n)
+
+    def close(self) -> None:
+        """End the bar of the last stage."""
+        if self._bar is not None:
+            self._bar.close()
+
+
+@contextlib.contextmanager
+def telling(progress: Told) -> Iterator[Progress]:
+    """Yield the callback for work inside; bars are closed at its end."""
+    if progress is None:
+        yield silent
+    elif isinstance(progress, type):
+        bars = _Bars(progress)
+        try:
+            yield bars
+        finally:
+            bars.close()
+    else:
+        yield progress

@@ -32,7 +32,7 @@ def read_cameras(
     every: int = 1,
     up: Point | None = None,
 ) -> CameraPath:
-    """The cameras of a file, or of a folder that COLMAP wrote; docs/cameras.md has the formats.
+    """Return the cameras of a file, or of a folder that COLMAP wrote; docs/cameras.md has the formats.
 
     Args:
         path: of the file or folder.
@@ -90,7 +90,7 @@ def orbit(
     fov_y: float = 60.0,
     size: tuple[int, int] = (1280, 720),
 ) -> CameraPath:
-    """Cameras once around scenes, as `--orbit` makes them.
+    """Return cameras once around scenes, as `--orbit` makes them.
 
     Args:
         viewed: a scene or tree, or instances.

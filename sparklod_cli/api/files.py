@@ -1,4 +1,4 @@
-"""Splat files and scenes: read, build a tree, take its leaves, inspect."""
+"""Splat files: read, inspect, pack for a viewer; RAD in parts."""
 
 from __future__ import annotations
 
@@ -8,37 +8,28 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..io import examine_scene, read_scene
-from ..lod.builders import BUILDERS, METHODS
+import numpy as np
+
+from ..io import examine_scene, rad_file, read_scene
 from ..model.scene import Scene, Tree
-from ..model.splats import COLUMNS
-from ..support.defaults import (
-    DEFAULT_BASE,
-    DEFAULT_GROWTH,
-    MAX_BASE,
-    MAX_GROWTH,
-    MAX_SH_DEGREE,
-    MIN_BASE,
-    MIN_GROWTH,
-)
+from ..model.splats import COLUMNS, FloatArray
 from ..support.errors import FormatError, InvalidSplatsError, TreeError, memory_errors_translated
-from ..support.parallel import on_threads, thread_count
-from .arguments import scene_like, whole_within, within
-from .progress import Told, telling
+from ..support.parallel import thread_count
+from .arguments import Told, scene_like, telling
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from ..fitting.settings import FitSettings
+    from ..codecs.rad.codec import RadChunk
+    from ..codecs.rad.records import RadHeader
     from ..inspection.report import Report
-    from ..model.selection import Selection
 
 
 def read(
     path: Path | str, *, columns: Collection[str] | None = None, threads: int | None = None, progress: Told = None
 ) -> Scene:
-    """Reads a splat file; its content tells the format. The scene is a `Tree` if the file has a Level-of-Detail tree.
+    """Read a splat file; its content tells the format. The scene is a `Tree` if the file has a Level-of-Detail tree.
 
     Args:
         path: of a file, or of a folder that holds an unpacked SOG or a Streamed SOG, of which level 0 is read.
@@ -68,7 +59,7 @@ def read(
 
 @contextlib.contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Puts the file before what is wrong with it: Python, unlike a command, says nothing before it."""
+    """Put the file before what is wrong with it: Python, unlike a command, says nothing before it."""
     try:
         yield
     except (FormatError, InvalidSplatsError, TreeError) as error:
@@ -76,80 +67,14 @@ def naming(path: Path) -> Iterator[None]:
 
 
 def as_tree(scene: Scene) -> Scene:
-    """A scene as a `Tree` where it has one."""
+    """Return a scene as a `Tree` where it has one."""
     if scene.tree is None or isinstance(scene, Tree):
         return scene
     return Tree(**{each.name: getattr(scene, each.name) for each in fields(Scene)})
 
 
-def build_lod(
-    scene: Scene,
-    *,
-    method: str = METHODS[0],
-    base: float = DEFAULT_BASE,
-    growth: float = DEFAULT_GROWTH,
-    max_sh: int = MAX_SH_DEGREE,
-    selection: Selection | None = None,
-    refine: bool | int | FitSettings = False,
-    threads: int | None = None,
-    progress: Told = None,
-) -> Tree:
-    """Builds the Level-of-Detail tree of a scene; the same scene and options give the same tree.
-
-    Args:
-        scene: without a tree.
-        method: "quick" or "quality".
-        base: of quick, growth of the voxel grid from level to level, 1.1 to 2.0.
-        growth: of quality, the most nodes for each leaf, 1.05 to 2.0.
-        max_sh: SH degrees above this are left out.
-        selection: which splats to keep; all that can be drawn, unless given.
-        refine: fit merged splats to pictures of full detail: True, or in how many steps, or how. The function `refine`
-            does the same and tells what it brought.
-        threads: to work on; None for all processors.
-        progress: called with how much is done.
-
-    Raises:
-        FormatError: the scene has a tree already.
-        InvalidSplatsError: some splats are invalid and `selection` does not drop them, or none is left.
-        ValueError: there is no such method, or an option is out of its range.
-    """
-    from ..bake import BakeSettings
-    from ..lod.band_order import banded
-    from ..lod.check import select
-    from ..model.selection import Selection
-    from .refining import asked_for, refined_tree
-
-    if scene_like(scene).tree is not None:
-        raise FormatError("the scene has a Level-of-Detail tree already; extract_leaves gives its splats")
-    if method not in BUILDERS:
-        raise ValueError(f"there is no method {method!r}; give one of {', '.join(BUILDERS)}")
-    within("base", base, MIN_BASE, MAX_BASE)
-    within("growth", growth, MIN_GROWTH, MAX_GROWTH)
-    whole_within("max_sh", max_sh, 0, MAX_SH_DEGREE)
-    fitting = asked_for(refine)
-    build, setting = BakeSettings(method=method, base=base, growth=growth).builder()
-    with on_threads(threads), telling(progress) as told, memory_errors_translated():
-        kept, _ = select(selection or Selection(), scene.splats.with_max_sh(max_sh), thread_count(threads))
-        # A builder frees its input as it goes where nobody else holds it.
-        built = build(kept, setting, progress=told)
-        nodes, links = banded([built]) if BUILDERS[method].in_bands else built
-        made = Tree(nodes, links, scene.antialiased, up=scene.up)
-        return made if fitting is None else refined_tree(made, fitting, thread_count(threads), told, None)[0]
-
-
-def extract_leaves(tree: Scene) -> Scene:
-    """The splats that a tree was built of, in the order of its leaves.
-
-    Raises:
-        FormatError: the scene has no tree.
-    """
-    from ..extract_leaves import leaves_of
-
-    return leaves_of(scene_like(tree))
-
-
 def pack(scene: Scene, encoding: str, *, threads: int | None = None) -> dict[str, NDArray[np.uint32]]:
-    """A scene in the layout of a viewer's memory, as `build-lod --encoding` writes it; docs/formats.md has the words.
+    """Return a scene in the layout of a viewer's memory, as `build-lod --encoding` writes it (docs/formats.md).
 
     Args:
         scene: a scene or a tree.
@@ -175,7 +100,7 @@ def pack(scene: Scene, encoding: str, *, threads: int | None = None) -> dict[str
 
 
 def unpack(arrays: Mapping[str, NDArray[np.uint32]], *, threads: int | None = None) -> Scene:
-    """The scene that arrays of `pack`, or of a viewer, hold; a `Tree` where the words of a LodTree are among them.
+    """Return the scene in arrays of `pack`, or of a viewer; a `Tree` where the words of a LodTree are among them.
 
     Args:
         arrays: those of "packed" or of "ext", and of "lodtree" where there is a tree.
@@ -212,7 +137,7 @@ def inspect(
     threads: int | None = None,
     progress: Told = None,
 ) -> Report:
-    """What is in a file and, if asked for, what is wrong with it; `Report.as_dict` is what `inspect --json` prints.
+    """Report what is in a file, and what is wrong with it; `Report.as_dict` is what `inspect --json` prints.
 
     Args:
         path: of a splat file, or of a folder that holds an unpacked SOG.
@@ -228,3 +153,38 @@ def inspect(
     with telling(progress) as told, memory_errors_translated():
         found, _ = report.inspect(Path(path), wanted, threads=thread_count(threads), progress=told)
     return found
+
+
+def read_rad_header(path: Path | str) -> RadHeader:
+    """Read the header of a RAD file and nothing else; the chunks need not be there.
+
+    Args:
+        path: of a .rad file, whole or with chunks in files of their own.
+
+    Raises:
+        FormatError: it cannot be read, is no such header, or promises what cannot be.
+    """
+    path = Path(path)
+    with naming(path):
+        return rad_file.read_rad_header(path)
+
+
+def read_rad_chunk(path: Path | str, number: int, *, palette: FloatArray | None = None) -> RadChunk:
+    """Read the header of a RAD file and the bytes of one chunk, as a viewer does that streams it.
+
+    Args:
+        path: of a .rad file, whole or with chunks in files of their own.
+        number: of the chunk, from 0; `read_rad_header(path).chunks` has them all.
+        palette: (codes, K, 3) SH coefficients, the `palette` of chunk 0, where the file has one. Without it, the other
+            chunks of such a file have `labels` and no SH.
+
+    Raises:
+        FormatError: the header or the chunk cannot be read, or is broken.
+        TypeError: the number is not a whole one.
+        ValueError: there is no such chunk, or the palette is of another SH degree than the file.
+    """
+    path = Path(path)
+    if isinstance(number, bool) or not isinstance(number, (int, np.integer)):
+        raise TypeError(f"number is {number!r}; give a whole number, which counts chunks from 0")
+    with naming(path), memory_errors_translated():
+        return rad_file.read_rad_chunk(path, number, palette=palette)

@@ -50,7 +50,7 @@ class DrawSettings:
     chunks: TableOutput | None = None
 
     def check(self) -> None:
-        """Raises a `SparklodError` where a file cannot be written or drawn, before anything is read."""
+        """Raise a `SparklodError` where a file cannot be written or drawn, before anything is read."""
         if self.chunks is not None:
             self.chunks.check()
         for target in (self.plot, self.html):
@@ -84,7 +84,7 @@ class Inspected:
 def inspect_file(
     path: Path, settings: CheckSettings, drawn: DrawSettings, *, threads: int = 1, progress: Progress = silent
 ) -> Inspected:
-    """Reports on a file, checks it and draws it.
+    """Report on a file, check it and draw it.
 
     Args:
         path: of a file that is read, or of a .npz of arrays; - is standard input.
@@ -115,7 +115,7 @@ def inspect_file(
 
 
 def _picture(report: Report, scene: Scene | None, drawn: DrawSettings) -> tuple[Picture | None, str | None]:
-    """The picture that is wanted, or why there is none."""
+    """Return the picture that is wanted, or why there is none."""
     if (drawn.plot is None and drawn.html is None) or report.format is None:
         return None, None
     if scene is None:
@@ -129,7 +129,7 @@ def _picture(report: Report, scene: Scene | None, drawn: DrawSettings) -> tuple[
 
 
 def _thumbnail(report: Report, scene: Scene, threads: int) -> Picture | None:
-    """The scene as a viewer draws it; None where it is broken, or too large to be drawn at once."""
+    """Return the scene as a viewer draws it; None where it is broken, or too large to be drawn at once."""
     from ..figures.tree_plot import Picture
     from ..inspection.arrays import NO_CHILDREN
     from .cameras import orbit
@@ -166,7 +166,7 @@ def _histograms(scene: Scene | None, names: Sequence[str]) -> dict[str, str]:
 
 
 def write_page(path: Path, sections: Sequence[Section], *, overwrite: bool) -> int:
-    """Writes the page of some files, and returns its bytes."""
+    """Write the page of some files, and return its bytes."""
     from ..inspection.html import page
 
     return write_whole(path, [page(sections).encode()], overwrite=overwrite)

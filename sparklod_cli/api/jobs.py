@@ -12,18 +12,28 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from ..cameras.frame import Point, direction_of
+from ..cameras.framing import reach
+from ..io import check_writable, write_whole
 from ..model.instances import instances_of
+from ..model.splats import COLUMNS
 from ..scenes.finder import CutFinder, CutSource
+from ..scenes.pages import TRAVERSED
+from ..scenes.reading import read_scenes
 from ..support.parallel import on_threads
-from ..support.progress import silent
-from .viewed_files import ViewedFiles
+from ..support.progress import Progress, silent
 
 if TYPE_CHECKING:
+    from ..cameras.frame import Settings
     from ..cameras.path import CameraPath
+    from ..cameras.sources import CameraSource
     from ..images.output import Output
     from ..images.sequence import Pictures, PictureSettings
     from ..lod.budget import Budget
     from ..lod.settings import LodSettings
+    from ..model.instances import Instance
     from ..render.settings import RenderSettings
     from ..scenes.loaded import Scenes
     from ..simulation.outputs import FrameOutputs, WrittenFrames
@@ -33,6 +43,62 @@ if TYPE_CHECKING:
     from ..tables.columns import Row
     from ..tables.comparison import BudgetSummary
     from ..tables.output import Filter, TableOutput
+
+
+@dataclass(frozen=True)
+class ViewedFiles:
+    """Splat files, and the cameras that look at them.
+
+    Attributes:
+        instances: at least one.
+        cameras: the source of the cameras.
+        settings: override those of a camera file.
+        precision: one of `PRECISIONS`, of the nodes that cuts are found with.
+        threads: to work on.
+        progress: called with how much is done.
+    """
+
+    instances: Sequence[Instance]
+    cameras: CameraSource
+    settings: Settings
+    precision: str
+    threads: int
+    progress: Progress = silent
+
+    def read(
+        self, *, trees_only: bool = False, through: str | None = None, plain: bool = True, paged: bool = False
+    ) -> Scenes:
+        """Return the scenes, with all columns if `plain`; as cuts need them if `paged`."""
+        return read_scenes(
+            self.instances,
+            columns=COLUMNS if plain else TRAVERSED,
+            trees_only=trees_only,
+            through=through,
+            precision=self.precision,
+            paged=paged,
+            threads=self.threads,
+            progress=self.progress,
+        )
+
+    def path(self, scenes: Callable[[], Scenes]) -> CameraPath:
+        """Return the cameras; scenes are read only where cameras are chosen for them, or need their up axis."""
+        settings = dataclasses.replace(self.settings, up_of_scene=lambda: self._up_of(scenes()))
+        return self.cameras.cameras(settings, lambda: scenes().balls())
+
+    def _up_of(self, scenes: Scenes) -> Point:
+        """Return up axis of the scenes, in the world of the cameras."""
+        up = direction_of(scenes.up)
+        if scenes.up is None or self.settings.world is None:
+            return up
+        x, y, z = (np.asarray(up) @ self.settings.world[:3, :3]).tolist()  # the inverse rotation, of any length
+        return x, y, z
+
+    def with_planes(self, render: RenderSettings, path: CameraPath, scenes: Callable[[], Scenes]) -> RenderSettings:
+        """Return settings whose near and far planes enclose the scenes, where the cameras are chosen for them."""
+        if not self.cameras.fits_scene:
+            return render
+        near, far = reach(render.raster.near, render.raster.far, path.cameras, scenes().balls())
+        return dataclasses.replace(render, raster=dataclasses.replace(render.raster, near=near, far=far))
 
 
 #: Colours of pictures whose scale is that of what cameras see, rather than of all that they may see.
@@ -74,7 +140,7 @@ def draw_files(
     overwrite: bool = False,
     ready: Callable[[CameraPath, Scenes], None] = lambda path, scenes: None,
 ) -> Drawn:
-    """Draws files and writes the pictures.
+    """Draw files and write the pictures.
 
     Args:
         files: splat files, and the cameras that look at them.
@@ -180,7 +246,7 @@ def compare_files(
     ready: Callable[[CameraPath, Scenes], None] = lambda path, scenes: None,
     passed: Filter | None = None,
 ) -> Compared:
-    """Measures how far cuts of files are from full detail, and writes the table and the charts.
+    """Measure how far cuts of files are from full detail, and write the table and the charts.
 
     Args:
         files: splat files, and the cameras that look at them.
@@ -199,14 +265,13 @@ def compare_files(
         UnfitError: there are both trees and Streamed SOG, or too many instances.
         SparklodError: a file cannot be read or written, has no levels, or a picture cannot be drawn.
     """
-    from ..compare import Comparison, write_charts
+    from ..compare import Comparison
     from ..tables.assertions import check
     from ..tables.comparison import EMPTY, rows_by_budget, summarize
 
     table.check()
     if plot is not None:
         from ..figures.charts import load_matplotlib
-        from ..io import check_writable
 
         check_writable(plot, overwrite=overwrite)
         load_matplotlib()
@@ -222,9 +287,12 @@ def compare_files(
             raise UnfitError(str(error)) from None
         rows = list(comparison.run(path, threads=files.threads, progress=files.progress))
     table.write(rows, passed=passed)
-    if plot is not None:
-        write_charts(plot, rows, budgets, scenes.title, overwrite=overwrite)
     groups = rows_by_budget(rows, len(budgets))
+    if plot is not None:
+        from ..figures.comparison_chart import plot as chart
+
+        series = list(zip((budget.text for budget in budgets), groups, strict=True))
+        write_whole(plot, [chart(series, scenes.title)], overwrite=overwrite)
     outcomes = [each for at, what in asserts for each in check([what], rows if at is None else groups[at], empty=EMPTY)]
     summary = summarize(rows, [budget.text for budget in budgets])
     return Compared(len(rows), path, comparison.leaves, summary, outcomes)
@@ -243,7 +311,7 @@ def traverse_files(
     passed: Filter | None = None,
     bar: bool = True,
 ) -> Traversed:
-    """Simulates what a viewer draws of files along a path, and writes what is made of the frames.
+    """Simulate what a viewer draws of files along a path, and write what is made of the frames.
 
     Args:
         files: splat files, and the cameras that look at them.

@@ -22,7 +22,7 @@ class Frames(Table):
     """The rows of a traversal: one for each frame and, if asked for, one for each of its instances."""
 
     def summary(self) -> Summary:
-        """Statistics of the frames, totals, and the frames that are worth a look."""
+        """Return statistics of the frames, totals, and the frames that are worth a look."""
         from ..simulation.summary import summarize
 
         return summarize(self.rows)
@@ -39,7 +39,7 @@ class ComparisonTable(Table):
     budgets: Sequence[str]
 
     def summary(self) -> list[BudgetSummary]:
-        """Means and extremes over the frames, for each budget."""
+        """Return means and extremes over the frames, for each budget."""
         from ..tables.comparison import summarize
 
         return summarize(self.rows, self.budgets)
@@ -62,7 +62,7 @@ class Picture:
         return self.png
 
     def save(self, path: Path | str, *, overwrite: bool = False) -> None:
-        """Writes the PNG, whole or not at all.
+        """Write the PNG, whole or not at all.
 
         Raises:
             OutputError: the file exists, or cannot be written.
@@ -78,7 +78,7 @@ class Picture:
 
 
 def show(image: NDArray[np.float32], *, background: tuple[float, float, float] | None = (0.0, 0.0, 0.0)) -> Picture:
-    """A picture of floats as one that Jupyter shows.
+    """Return a picture of floats as one that Jupyter shows.
 
     Args:
         image: (H, W, 4) float32 with alpha multiplied in, as `render` draws it.

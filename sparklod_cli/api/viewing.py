@@ -61,7 +61,7 @@ class Prepared:
 def prepare(
     paths: Sequence[Path], settings: ViewSettings, *, served: bool, threads: int, progress: Progress = silent
 ) -> Prepared:
-    """The site of some splat files.
+    """Return the site of some splat files.
 
     Args:
         paths: of the files, at least one.

@@ -30,8 +30,7 @@ from ..support.defaults import BLEND
 from ..support.errors import FormatError, memory_errors_translated
 from ..support.parallel import on_threads, thread_count
 from ..tables.comparison import COLUMNS as OF_COMPARISON
-from .arguments import camera_like, path_like, viewed_like
-from .progress import Told, telling
+from .arguments import Told, camera_like, path_like, telling, viewed_like
 from .results import ComparisonTable, Frames
 
 if TYPE_CHECKING:
@@ -57,7 +56,7 @@ def cut(
     precision: str = PRECISIONS[0],
     threads: int | None = None,
 ) -> Cut:
-    """The nodes that a viewer draws for a camera, or the splats of the detail levels that it chooses.
+    """Return the nodes that a viewer draws for a camera, or the splats of the detail levels that it chooses.
 
     Args:
         viewed: a tree, a scene at several detail levels, or instances. Of other scenes all splats are drawn.
@@ -69,7 +68,7 @@ def cut(
         precision: of the centres and sizes of a tree: "float32", or their half floats, "float16"; or what Spark has of
             it, for the same cut to the last node: "ext" with `extSplats`, else "packed", or "packed-pages" where Spark
             streams a RAD file. Of a tree that was not read from a file, Spark's are taken to be its own numbers.
-        threads: to prepare the trees on, and to find a large cut; None for all processors.
+        threads: to prepare the trees on; None for all processors.
 
     Raises:
         ValueError: the budget is out of its range, or less than one splat for each instance; `continuous` is not
@@ -78,7 +77,7 @@ def cut(
     camera_like(camera)
     with on_threads(threads) as count, memory_errors_translated():
         scenes = scenes_of(viewed, count, precision)
-        return CutFinder(scenes, _lod(scenes, budget, settings, continuous), threads=count).cut(camera)
+        return CutFinder(scenes, _lod(scenes, budget, settings, continuous)).cut(camera)
 
 
 def render(
@@ -89,7 +88,7 @@ def render(
     backend: str | None = None,
     threads: int | None = None,
 ) -> Image:
-    """The picture of a camera: of a cut, or of scenes and trees in full detail.
+    """Return the picture of a camera: of a cut, or of scenes and trees in full detail.
 
     Splats of scenes without trees that cannot be drawn are left out.
 
@@ -131,7 +130,7 @@ def traverse(
     threads: int | None = None,
     progress: Told = None,
 ) -> Frames:
-    """What a viewer draws and fetches along a camera path: a row for each frame.
+    """Return what a viewer draws and fetches along a camera path: a row for each frame.
 
     Args:
         viewed: a tree, a scene at several detail levels, or instances of trees or of such scenes.
@@ -170,7 +169,7 @@ def compare(
     threads: int | None = None,
     progress: Told = None,
 ) -> ComparisonTable:
-    """How far cuts of some budgets are from full detail: PSNR, SSIM and PSNR at edges, on black and on white.
+    """Return how far cuts of some budgets are from full detail: PSNR, SSIM and PSNR at edges, on black and on white.
 
     Cameras that follow each other, with later times, have popping as well.
 
@@ -206,7 +205,7 @@ def compare(
 
 
 def psnr(a: Image, b: Image, *, background: float = 0.0) -> float:
-    """Peak signal-to-noise ratio of two pictures, in dB; 100 where they are the same.
+    """Return peak signal-to-noise ratio of two pictures, in dB; 100 where they are the same.
 
     Args:
         a, b: floats: (H, W, 3) 0..1, or (H, W, 4) with alpha multiplied in, as `render` draws them.
@@ -219,7 +218,7 @@ def psnr(a: Image, b: Image, *, background: float = 0.0) -> float:
 
 
 def ssim(a: Image, b: Image, *, background: float = 0.0) -> float:
-    """Structural similarity of two pictures (Wang et al. 2004), 1 where they are the same; see `psnr`.
+    """Return structural similarity of two pictures (Wang et al. 2004), 1 where they are the same; see `psnr`.
 
     Raises:
         ValueError: they have different shapes, or are no pictures.
@@ -240,7 +239,7 @@ def _opaque(a: Image, b: Image, background: float) -> list[Image]:
 
 
 def scenes_of(viewed: Viewed, threads: int | None, precision: str = PRECISIONS[0]) -> Scenes:
-    """The scenes, prepared for views; a single scene keeps them for the next call."""
+    """Return the scenes, prepared for views; a single scene keeps them for the next call."""
     if precision not in PRECISIONS:
         raise ValueError(f"there is no precision {precision!r}; give one of {', '.join(PRECISIONS)}")
     count = thread_count(threads)
@@ -259,7 +258,7 @@ def scenes_of(viewed: Viewed, threads: int | None, precision: str = PRECISIONS[0
 
 
 def _named(instances: Sequence[Instance]) -> list[Instance]:
-    """The instances, those without a name with one of their own."""
+    """Return the instances, those without a name with one of their own."""
     from pathlib import Path
 
     unnamed = [each.file or Path(UNNAMED) for each in instances if not each.name]

@@ -9,7 +9,8 @@ from types import NoneType
 from typing import TYPE_CHECKING
 
 from ..codecs.streamed_sog.names import MANIFEST
-from ..io import detail_sink, scene_sink, write_whole
+from ..io import scene_sink, write_whole
+from ..io.details import detail_sink
 from ..model.scene import Scene
 from ..support.defaults import (
     DEFAULT_COMPRESSION,
@@ -21,14 +22,13 @@ from ..support.defaults import (
 )
 from ..support.errors import FormatError, InvalidSplatsError, memory_errors_translated
 from ..support.parallel import thread_count
-from .arguments import file_path, scene_like, whole_within
+from .arguments import Told, file_path, scene_like, telling, whole_within
 from .files import naming, pack
-from .progress import Told, telling
 
 if TYPE_CHECKING:
     from ..bake.detail_output import DetailOutput
     from ..codecs.options import RadOptions, SogOptions
-    from ..lod.detail_settings import DetailSettings
+    from ..lod.detail_rule import DetailSettings
     from ..support.progress import Progress
 
 #: Binary digits after the point of the smallest number of float32.
@@ -67,7 +67,7 @@ def write(
     threads: int | None = None,
     progress: Told = None,
 ) -> Written:
-    """Writes a scene, or a tree, whole or not at all. Nodes keep their order, see `arrange_chunks`.
+    """Write a scene, or a tree, whole or not at all. Nodes keep their order, see `arrange_chunks`.
 
     Args:
         path: of the file, whose suffix tells the format: .spz or .rad; for a scene without a tree, .ply, .sog or
@@ -102,7 +102,7 @@ def write(
     from ..codecs.options import RadOptions, SogOptions, WriteOptions
     from ..codecs.sound import check_scene
     from ..codecs.splat_encoding import SplatEncoding
-    from ..lod.detail_settings import DetailSettings
+    from ..lod.detail_rule import DetailSettings
 
     path, count = file_path(path), thread_count(threads)
     form = None if encoding is not None else WRITABLE.get(ending_of(path.name))
@@ -119,20 +119,20 @@ def write(
         raise ValueError(f"{path}: sog is of SOG; leave it out, or write a .sog")
     if (detail is not None or environment is not None) and not streamed:
         raise ValueError(f"{path}: detail and environment are of Streamed SOG; leave them out, or write a {MANIFEST}")
-    if not isinstance(detail, (DetailSettings, NoneType)):
-        raise TypeError(f"detail is {detail!r}; give DetailSettings")
-    if not isinstance(rad, (RadOptions, NoneType)):
-        raise TypeError(f"rad is {rad!r}; give RadOptions")
-    if not isinstance(sog, (SogOptions, NoneType)):
-        raise TypeError(f"sog is {sog!r}; give SogOptions")
-    if rad is not None and not isinstance(rad.ranges, (SplatEncoding, NoneType)):
-        raise TypeError(f"ranges is {rad.ranges!r}; give a SplatEncoding")
+    ranges = rad.ranges if isinstance(rad, RadOptions) else None
+    for name, value, kind in (
+        ("detail", detail, DetailSettings),
+        ("rad", rad, RadOptions),
+        ("sog", sog, SogOptions),
+        ("ranges", ranges, SplatEncoding),
+    ):
+        if not isinstance(value, (kind, NoneType)):
+            raise TypeError(f"{name} is {value!r}; give {'a ' if name == 'ranges' else ''}{kind.__name__}")
     if rad is not None and rad.center_bits is not None:
         whole_within("center_bits", rad.center_bits, -MAX_CENTER_BITS, MAX_CENTER_BITS)
-    if rad is not None and rad.sh_codes is not None:
-        whole_within("sh_codes", rad.sh_codes, MIN_SH_CODES, MAX_SH_CODES)
-    if sog is not None and sog.sh_codes is not None:
-        whole_within("sh_codes", sog.sh_codes, MIN_SH_CODES, MAX_SH_CODES)
+    for options in (rad, sog):
+        if options is not None and options.sh_codes is not None:
+            whole_within("sh_codes", options.sh_codes, MIN_SH_CODES, MAX_SH_CODES)
     if not len(scene_like(scene).splats):
         raise InvalidSplatsError(f"{path}: the scene has no splats to write")
     with telling(progress) as told, memory_errors_translated():
@@ -141,8 +141,11 @@ def write(
         with naming(path):
             check_scene(scene, count)
         if streamed:
-            options = WriteOptions(sog=sog or SogOptions())
-            output = DetailOutput(detail or DetailSettings(), options, detail_sink(path, overwrite=overwrite))
+            output = DetailOutput(
+                detail or DetailSettings(),
+                WriteOptions(sog=sog or SogOptions()),
+                detail_sink(path, overwrite=overwrite),
+            )
             return _write_levels(path, scene, environment, output, count, told)
         if form is None or (scene.tree is not None and not form.trees):
             known = ", ".join(ending for ending, each in WRITABLE.items() if each.trees or scene.tree is None)
@@ -150,15 +153,15 @@ def write(
             raise FormatError(f"{path}: {what} is written as {known}, which the name does not end in")
         rad = rad or RadOptions()
         rad = dataclasses.replace(rad, chunked=rad.chunked or chunked)
-        options = WriteOptions(spz_version, fractional_bits, compression_level, rad, sog or SogOptions())
+        chosen = WriteOptions(spz_version, fractional_bits, compression_level, rad, sog or SogOptions())
         save = scene_sink(path, form, chunked=rad.chunked, overwrite=overwrite)
-        return Written(path, form.name, save(scene, options, threads=count, progress=told))
+        return Written(path, form.name, save(scene, chosen, threads=count, progress=told))
 
 
 def _write_levels(
     path: Path, scene: Scene, environment: Scene | None, output: DetailOutput, threads: int, progress: Progress
 ) -> Written:
-    from ..bake.clock import Clock
+    from ..bake.records import Clock
 
     if scene.tree is None:
         raise FormatError(f"{path}: detail levels are cuts of a tree; build_lod makes one, best by method='quality'")
@@ -167,7 +170,7 @@ def _write_levels(
     if environment is not None and not len(environment.splats):
         raise InvalidSplatsError(f"{path}: the environment has no splats to write")
     always = None if environment is None else environment.splats
-    return Written(path, "Streamed SOG", output.write(scene, always, Clock(), threads, progress).bytes)
+    return Written(path, "Streamed SOG", output.write_levels(scene, always, Clock(), threads, progress).bytes)
 
 
 def _write_arrays(path: Path, scene: Scene, encoding: str, *, overwrite: bool, threads: int) -> Written:

@@ -7,18 +7,15 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 from ..codecs.options import WriteOptions
-from ..codecs.statistics import Statistics
 from ..codecs.streamed_sog.names import ENVIRONMENT, folders_of
-from ..io import SinkTogether
-from ..io.together import Files
-from ..lod.detail_settings import DetailSettings
+from ..io.writing import Files, SinkTogether
+from ..lod.detail_rule import DetailSettings
 from ..model.scene import DetailScene, Scene
 from ..model.splats import Splats
 from ..support.parallel import on_threads
 from ..support.progress import Progress
-from .clock import Clock
-from .whole_output import WholeOutput
-from .written import WrittenDetail, WrittenLevel, WrittenTree
+from .output import Encode, WholeOutput
+from .records import BuiltTree, Clock, WrittenDetail, WrittenLevel, WrittenTree
 
 
 def detail_levels(
@@ -30,15 +27,13 @@ def detail_levels(
     threads: int,
     progress: Progress,
 ) -> DetailScene:
-    """Regions of a tree at several detail levels, with their errors.
+    """Return regions of a tree at several detail levels, with their errors.
 
     Args:
         scene: a tree.
         environment: splats beside it; None without.
         settings: of levels and regions.
-        clock: told of the stages.
         threads: to work on; the result does not depend on it.
-        progress: told of the stages.
     """
     from ..lod.detail_levels import make
     from .region_errors import measured
@@ -67,18 +62,14 @@ class DetailOutput(WholeOutput):
     options: WriteOptions
     sink: SinkTogether
 
-    made = "detail levels are made"
+    def write(self, tree: BuiltTree, encode: Encode, clock: Clock, threads: int, progress: Progress) -> WrittenTree:
+        """Make the levels of a tree and write them."""
+        return self.write_levels(tree.scene, tree.environment, clock, threads, progress)
 
-    def write(
-        self,
-        scene: Scene,
-        environment: Splats | None,
-        clock: Clock,
-        threads: int,
-        progress: Progress,
-        counted: Statistics | None = None,
+    def write_levels(
+        self, scene: Scene, environment: Splats | None, clock: Clock, threads: int, progress: Progress
     ) -> WrittenTree:
-        """Makes its levels and writes them."""
+        """Make the levels of a tree and write them, with the splats of an environment."""
         from ..codecs.streamed_sog.codec import encode_files
 
         made = detail_levels(scene, environment, self.settings, clock, threads=threads, progress=progress)
@@ -90,14 +81,14 @@ class DetailOutput(WholeOutput):
 
 
 def _noted(files: Files, names: list[str]) -> Iterator[tuple[str, Iterable[bytes]]]:
-    """The same files; their names are added to a list."""
+    """Yield the same files; their names are added to a list."""
     for name, pieces in files:
         names.append(name)
         yield name, pieces
 
 
 def _told(made: DetailScene, names: list[str]) -> WrittenDetail:
-    """What is said of a scene that was written to files of these names."""
+    """Return what is said of a scene that was written to files of these names."""
     assert made.errors is not None
     splats, errors = made.counts.sum(axis=0).tolist(), made.errors.max(axis=0).tolist()
     return WrittenDetail(

@@ -1,35 +1,33 @@
-"""Writing a tree in the format that is set, and what is to be said of the output."""
+"""Outputs of a bake: a file that is written in windows, or what is made of all nodes at once, in memory."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 from ..codecs import clamps
-from ..codecs.clamps import Range
-from ..codecs.encoder import CLAMPED, Encoder, Get, Kept, Stored, results, windows_of
+from ..codecs.encoder import CLAMPED, Encoder, Get, Stored, windows_of
 from ..codecs.formats import WRITABLE, Format
 from ..codecs.options import DEFAULTS, WriteOptions
 from ..codecs.rad.layout import OPTIONS
 from ..codecs.rad.names import SUFFIX as RAD
 from ..codecs.statistics import Statistics
-from ..io import SceneSink, Sink, scene_sink, sink
+from ..io.reading import opened, read_stored
+from ..io.writing import SceneSink, Sink, scene_sink, sink
 from ..model.nodes import CHUNK_NODES
 from ..model.scene import Scene
 from ..model.splats import Splats, same_rows
-from ..model.streams import NodeStream
 from ..support.addresses import Place
+from ..support.errors import FormatError
 from ..support.progress import Progress
-from .clock import Clock
-from .repacked import Repacked
-from .settings import BakeSettings
-from .whole_output import WholeOutput
-from .written import WrittenTree
+from .records import BuiltTree, Clock, WrittenTree
+from .settings import SPZ, BakeSettings
+from .sources import Merged, Source
 
-#: Bytes of encoded nodes that wait in memory for their header; beyond, they wait on disk.
-SPOOLED = 1 << 26
+#: Encodes the windows of a tree, and returns what reads their results.
+Encode = Callable[[BuiltTree, Encoder], Get]
 
 
 class Output(Protocol):
@@ -43,92 +41,88 @@ class Output(Protocol):
     def needed(self) -> frozenset[str]:
         """The statistics of all nodes by which it is written, see `codecs.statistics`."""
 
-    def check(self, splats: Splats, threads: int) -> Statistics | None:
-        """Raises `FormatError` where a tree of these splats cannot be written; statistics of them that `write` takes.
+    def check(self, leaves: Statistics) -> None:
+        """Raise `FormatError` where a tree of leaves with these statistics cannot be written."""
 
-        Args:
-            splats: the leaves of the tree.
-            threads: to count on.
-        """
-
-    def check_statistics(self, found: Statistics) -> None:
-        """As `check`, of statistics of these splats; and where it cannot be written without all nodes in memory."""
-
-    def converting(self) -> Output:
-        """The same for the tree of a file, in another format or in several files, whose nodes keep their opacities."""
-
-    def keeping(self, stored: Stored, before: Splats) -> Output:
-        """The same for the tree of a file of the same format: what was not chosen of how to write is that of the file.
-
-        Nodes that have the same values as there, as all leaves, are written bit for bit as they stand there.
-
-        Args:
-            stored: the codes of the file.
-            before: its nodes.
-        """
-
-    def repacking(self, source: Place) -> Output:
-        """The same for the tree of a file of the same format in its other container, where no option tells how.
-
-        Args:
-            source: the file, whose chunks are written as they stand.
-        """
-
-    def write(
-        self,
-        scene: Scene,
-        environment: Splats | None,
-        clock: Clock,
-        threads: int,
-        progress: Progress,
-        counted: Statistics | None = None,
-    ) -> WrittenTree:
-        """Writes a tree.
-
-        Args:
-            scene: the tree.
-            environment: splats beside it that are always drawn, which only a Streamed SOG can hold; None without.
-            clock: told of the stages.
-            threads, progress: as for `bake`.
-            counted: statistics of its leaves, of `check`; None to count these, too.
-        """
-
-    def encoder(self, nodes: NodeStream, found: Statistics, threads: int, progress: Progress) -> Encoder:
-        """The encoder of a tree, which `write_windows` takes.
-
-        Args:
-            nodes: of the tree, in their final order.
-            found: statistics of all of them.
-            threads, progress: for what has to be found out of the nodes first.
-
-        Raises:
-            FormatError: the tree cannot be written, or not without all nodes in memory.
-        """
-
-    def write_windows(self, encoder: Encoder, get: Get, threads: int, progress: Progress) -> WrittenTree:
-        """Writes a tree whose windows are encoded; `get` reads their results."""
+    def write(self, tree: BuiltTree, encode: Encode, clock: Clock, threads: int, progress: Progress) -> WrittenTree:
+        """Write a tree whose nodes are in order; in memory, unless this is a `FileOutput`."""
 
 
 def output_of(target: Place, settings: BakeSettings, *, overwrite: bool) -> Output:
-    """The output that settings ask for; fails now if it cannot be written later.
+    """Return the output that settings ask for; fail now if it cannot be written later.
 
     Raises:
-        OutputError: see `io.scene_sink` and `io.detail_sink`.
+        OutputError: see `io.writing.scene_sink` and `io.details.detail_sink`.
     """
     if settings.detail is not None:
-        from ..io import detail_sink  # what most bakes do without
+        from ..io.details import detail_sink  # what most bakes do without
         from .detail_output import DetailOutput
 
         return DetailOutput(settings.detail, settings.options, detail_sink(target, overwrite=overwrite))
     if settings.encoding is not None:
-        return _Arrays(settings.encoding, settings.raw, sink(target, overwrite=overwrite))
+        return ArrayOutput(settings.encoding, settings.raw, sink(target, overwrite=overwrite))
     form, chunked = WRITABLE[settings.suffix], settings.options.rad.chunked
     write = scene_sink(target, form, chunked=chunked, overwrite=overwrite)
-    return _File(form, settings.options, write, in_chunks=settings.suffix == RAD)
+    return FileOutput(form, settings.options, write, in_chunks=settings.suffix == RAD)
+
+
+def output_of_kept(output: Output, source: Source, scene: Scene, settings: BakeSettings) -> tuple[Output, bool]:
+    """Return the output of an input that has a tree, which is kept, and whether its nodes are in order already.
+
+    Nodes keep their opacities. In the same format, what was not chosen of how to write is that of the file, and nodes
+    that have the values of the file are written bit for bit as they stand there; chunks of a RAD that goes into its
+    other container are copied, unless an option tells how.
+
+    Args:
+        output: of an input without a tree.
+        source: the input.
+        scene: its content.
+
+    Raises:
+        FormatError: nobody asked for another format than that of the scene, or for merged splats to be fitted; or for
+            something that only splats without a tree can be given.
+    """
+    held, plain = scene.format.split()[0], settings.detail is None and settings.encoding is None
+    is_same = plain and WRITABLE[settings.suffix].name == held
+    is_same_container = bool(scene.header.get("chunked")) == settings.options.rad.chunked
+    converts = settings.converts and settings.encoding is None and not (is_same and is_same_container)
+    if settings.refine is None and not converts:
+        other = next(each for each in (WRITABLE[RAD], WRITABLE[SPZ]) if each.name != held)
+        raise FormatError(
+            "it is a Level-of-Detail file already; --unlod writes its splats back out, and --format"
+            f" {other.suffixes[0][1:]} its tree as {other.name}; --refine fits its merged splats"
+        )
+    if settings.unused:
+        kept = "is written as it is" if settings.refine is None else "--refine keeps"
+        raise FormatError(
+            f"it has a tree, which {kept}; leave out {', '.join(settings.unused)}, or give the splats that"
+            " the tree was built from"
+        )
+    if not isinstance(output, FileOutput):
+        return output, False
+    options = output.options
+    if is_same and settings.refine is not None:
+        assert not isinstance(source, Merged)  # of which no part is a tree
+        stored = read_stored(source)
+        return dataclasses.replace(output, options=stored.like(options), stored=stored, before=scene.splats), True
+    if is_same and dataclasses.replace(options, rad=dataclasses.replace(options.rad, chunked=False)) == DEFAULTS:
+        assert not isinstance(source, Merged)
+        return RepackedOutput(source, output.sink), False
+    return dataclasses.replace(output, options=dataclasses.replace(options, covering=False)), False
+
+
+class WholeOutput:
+    """Base of outputs that are made of a tree in memory, and hold any."""
+
+    in_chunks = False
+    needed: frozenset[str] = frozenset()
+
+    def check(self, leaves: Statistics) -> None:
+        """Accept any tree."""
 
 
 @dataclass(frozen=True)
-class _Arrays(WholeOutput):
+class ArrayOutput(WholeOutput):
     """Arrays in the layout of a viewer's memory.
 
     Attributes:
@@ -141,21 +135,11 @@ class _Arrays(WholeOutput):
     raw: bool
     sink: Sink
 
-    made = "the arrays of --encoding are packed"
-
-    def write(
-        self,
-        scene: Scene,
-        environment: Splats | None,
-        clock: Clock,
-        threads: int,
-        progress: Progress,
-        counted: Statistics | None = None,
-    ) -> WrittenTree:
-        """Writes them."""
+    def write(self, tree: BuiltTree, encode: Encode, clock: Clock, threads: int, progress: Progress) -> WrittenTree:
+        """Pack the nodes and write the arrays."""
         from ..codecs.gpu import dump
 
-        arrays = dump.pack(scene, self.encoding, threads)
+        arrays = dump.pack(tree.scene, self.encoding, threads)
         size = self.sink(dump.encode_raw(arrays) if self.raw else dump.encode_npz(arrays))
         shapes = {name: words.shape for name, words in arrays.items()}
         clock.end("write")
@@ -163,8 +147,35 @@ class _Arrays(WholeOutput):
 
 
 @dataclass(frozen=True)
-class _File:
-    """A splat file.
+class RepackedOutput(WholeOutput):
+    """RAD file with the chunks of another one.
+
+    Attributes:
+        source: the other file.
+        sink: writes it.
+    """
+
+    source: Place
+    sink: SceneSink
+
+    def write(self, tree: BuiltTree, encode: Encode, clock: Clock, threads: int, progress: Progress) -> WrittenTree:
+        """Copy the chunks."""
+        with opened(self.source) as (file, form, more):
+            chunks = form.codec().PackedChunks.of(file, **more)
+            size = self.sink.repack(chunks)
+        clock.end("write")
+        return WrittenTree(
+            output_format="rad" if chunks.header.chunked else "rad-chunked",
+            bytes=size,
+            chunks=len(chunks.header.chunks),
+            encodings=chunks.encodings,
+            sh_codes=chunks.header.sh_code_count,
+        )
+
+
+@dataclass(frozen=True)
+class FileOutput:
+    """SPZ or RAD file, written in windows.
 
     Attributes:
         form: its format.
@@ -184,85 +195,34 @@ class _File:
 
     @property
     def needed(self) -> frozenset[str]:
-        """Those of the codec."""
+        """Statistics by which the codec settles options."""
         needed: frozenset[str] = self.form.codec().needed(self.options)
         return needed
 
-    def converting(self) -> Output:
-        """The same without changes to opacities."""
-        return dataclasses.replace(self, options=dataclasses.replace(self.options, covering=False))
+    def check(self, leaves: Statistics) -> None:
+        """Fail where the format cannot hold a tree of these leaves."""
+        self.form.codec().settled(leaves, self.options)
 
-    def keeping(self, stored: Stored, before: Splats) -> Output:
-        """The same with these codes."""
-        return dataclasses.replace(self, options=stored.like(self.options), stored=stored, before=before)
-
-    def repacking(self, source: Place) -> Output:
-        """The chunks of a RAD file, where options do not ask for others."""
-        plain = dataclasses.replace(self.options, rad=dataclasses.replace(self.options.rad, chunked=False))
-        return Repacked(source, self.sink) if plain == DEFAULTS else self.converting()
-
-    def check(self, splats: Splats, threads: int) -> Statistics | None:
-        """The codec knows."""
-        found = Statistics.of_leaves(splats, self.needed, threads=threads)
-        self.check_statistics(found)
-        return found
-
-    def check_statistics(self, found: Statistics) -> None:
-        """The codec knows."""
-        self.form.codec().settled(found, self.options)
-
-    def write(
-        self,
-        scene: Scene,
-        environment: Splats | None,
-        clock: Clock,
-        threads: int,
-        progress: Progress,
-        counted: Statistics | None = None,
-    ) -> WrittenTree:
-        """Writes it."""
-        if counted is None:
-            found = Statistics.of_scene(scene, self.needed, threads=threads)
-        else:
-            found = Statistics.of_tree(scene, counted, self.needed, threads=threads)
-        options: WriteOptions = self.form.codec().settled(found, self.options)
+    def encoder(self, tree: BuiltTree, threads: int, progress: Progress) -> Encoder:
+        """Return the encoder of a tree, which counts what it clamps."""
+        codec: Any = self.form.codec()
+        options: WriteOptions = codec.settled(tree.statistics, self.options)
+        ranges = tuple(codec.held(options, tree.sh_degree))
+        encoder: Encoder = codec.encoder(tree.nodes, options, ranges, threads=threads, progress=progress)
         if self.stored is None or self.before is None:
-            size = self.sink(scene, options, threads=threads, progress=progress)
-        else:
-            made = self.form.codec().encoder(scene, options, threads=threads, progress=progress)
-            encoder = self.stored.keeping(made, same_rows(scene.splats, self.before))
-            with Kept(None, SPOOLED) as kept:
-                for result in results(encoder, scene, threads, progress, "encoding"):
-                    kept.put(result)
-                size = self.sink.assemble(encoder, kept.get, threads=threads, progress=progress)
-        beyond = clamps.find(scene.splats, threads, self._held(options, scene.splats.sh_degree), scene.tree)
-        clock.end("write")
-        return self._written(options, size, len(scene), scene.splats.sh_degree, beyond)
+            return encoder
+        return self.stored.keeping(encoder, same_rows(tree.scene.splats, self.before))
 
-    def encoder(self, nodes: NodeStream, found: Statistics, threads: int, progress: Progress) -> Encoder:
-        """That of the codec."""
-        codec = self.form.codec()
-        options = codec.settled(found, self.options)
-        ranges = tuple(self._held(options, nodes.sh_degree))
-        encoder: Encoder = codec.encoder(nodes, options, ranges, threads=threads, progress=progress)
-        return encoder
-
-    def write_windows(self, encoder: Encoder, get: Get, threads: int, progress: Progress) -> WrittenTree:
-        """Writes it."""
+    def write(self, tree: BuiltTree, encode: Encode, clock: Clock, threads: int, progress: Progress) -> WrittenTree:
+        """Encode the windows and write the file."""
+        encoder = self.encoder(tree, threads, progress)
+        get, options, count = encode(tree, encoder), encoder.options, encoder.count
         size = self.sink.assemble(encoder, get, threads=threads, progress=progress)
-        tallies = [get(number, CLAMPED) for number in range(len(windows_of(encoder.count)))]
-        beyond = clamps.clamps_of(clamps.merged(tallies), encoder.ranges)
-        return self._written(encoder.options, size, encoder.count, encoder.sh_degree, beyond)
-
-    def _held(self, options: WriteOptions, sh_degree: int) -> Sequence[Range]:
-        """The values that are not clamped."""
-        held: Sequence[Range] = self.form.codec().held(options, sh_degree)
-        return held
-
-    def _written(
-        self, options: WriteOptions, size: int, count: int, sh_degree: int, beyond: clamps.Clamps
-    ) -> WrittenTree:
-        """What was written, of so many bytes and nodes, with settled options."""
+        numbers = range(len(windows_of(count)) if encoder.ranges else 0)
+        beyond = clamps.Clamps()
+        if numbers:
+            beyond = clamps.clamps_of(clamps.merged([get(number, CLAMPED) for number in numbers]), encoder.ranges)
+        clock.end("write")
         if not self.in_chunks:
             return WrittenTree(
                 output_format="spz",
@@ -276,8 +236,8 @@ class _File:
             output_format="rad-chunked" if options.rad.chunked else "rad",
             bytes=size,
             chunks=-(-count // CHUNK_NODES),
-            encodings={name: getattr(options.rad, name) for name in OPTIONS if sh_degree or name != "sh"},
-            sh_codes=min(options.rad.sh_codes, count) if options.rad.sh_codes and sh_degree else None,
+            encodings={name: getattr(options.rad, name) for name in OPTIONS if encoder.sh_degree or name != "sh"},
+            sh_codes=min(options.rad.sh_codes, count) if options.rad.sh_codes and encoder.sh_degree else None,
             clamped=beyond.splats,
             clamps=beyond.ends,
         )

@@ -32,7 +32,7 @@ class Refined(FitReport):
 
 
 def fit_settings(settings: BakeSettings) -> FitSettings | None:
-    """How merged splats are fitted, with the cameras of the file that the settings name; None for not at all.
+    """Return how merged splats are fitted, with the cameras of the file that the settings name; None for not at all.
 
     Raises:
         CameraPathError: that file cannot be read, or has no cameras; names it.
@@ -47,15 +47,13 @@ def fit_settings(settings: BakeSettings) -> FitSettings | None:
 def refined(
     scene: Scene, settings: FitSettings, *, threads: int, progress: Progress, say: Callable[[str], None]
 ) -> tuple[Scene, Refined]:
-    """A tree whose merged splats are fitted, and what that brought.
+    """Return a tree whose merged splats are fitted, and what that brought.
 
     A first Ctrl-C ends the fitting early: what the finished stages gained is kept.
 
     Args:
         scene: a tree.
-        settings: how.
         threads: to work on; the result does not depend on it.
-        progress: told of the steps.
         say: told what came of each stage.
 
     Raises:
@@ -90,7 +88,7 @@ def refined(
 
 
 def _within(nodes: Splats, scene: Scene) -> Splats:
-    """Nodes whose merged splats stay in the box of all centres before.
+    """Return nodes whose merged splats stay in the box of all centres before.
 
     A format that holds these with some number of bits then still does; with another one, leaves would move.
     """

@@ -56,7 +56,7 @@ BATCH = 1 << 21
 
 
 def measured(scene: DetailScene, *, threads: int | None = None, progress: Progress = silent) -> Errors:
-    """(R, L) float64 error of each region at each detail level.
+    """Return (R, L) float64 error of each region at each detail level.
 
     0 at the first level that a region has, not decreasing, and the same for any number of threads. A level that a
     region lacks has the error of the level before.
@@ -64,7 +64,6 @@ def measured(scene: DetailScene, *, threads: int | None = None, progress: Progre
     Args:
         scene: its errors are not read.
         threads: None for all processors.
-        progress: told of the regions.
     """
     order = np.argsort(scene.counts == 0, axis=1, kind="stable")  # levels that have splats come first
     runs = np.take_along_axis(np.stack([scene.starts, scene.counts], 2), order[:, :, None], 1)
@@ -81,7 +80,7 @@ def measured(scene: DetailScene, *, threads: int | None = None, progress: Progre
 def _differences(
     scene: DetailScene, runs: NDArray[np.int64], threads: int | None, progress: Progress
 ) -> NDArray[np.float64]:
-    """(R, L) sums of `compare_levels` over all views, level by level as in `runs`."""
+    """Return (R, L) sums of `compare_levels` over all views, level by level as in `runs`."""
     splats = scene.splats
     columns = ShadedColumns(splats.center, splats.scale, splats.quat_xyzw, lod_opacity(splats.opacity), splats.rgb)
     turns = _turns()
@@ -100,7 +99,7 @@ def _differences(
 
 
 def _turns() -> NDArray[np.float64]:
-    """(6, 3, 3) rotations from the world to cameras that look along z, with y down: along each axis, then back."""
+    """Return (6, 3, 3) rotations from the world to cameras that look along z, y down: along each axis, then back."""
     axes = rotation_of(TURN).T
     return np.array(
         [turn for a, b, c in ((0, 1, 2), (1, 2, 0), (2, 0, 1)) for turn in (axes[[b, c, a]], axes[[c, b, a]] * BACK)]
@@ -108,7 +107,7 @@ def _turns() -> NDArray[np.float64]:
 
 
 def _poses(bounds: NDArray[np.float64], turns: NDArray[np.float64]) -> NDArray[np.float32]:
-    """(R, 6, 3, 4) world to camera, in radii of each region, whose middle is DISTANCE in front of the camera."""
+    """Return (R, 6, 3, 4) world to camera, in radii of each region, whose middle is DISTANCE in front of the camera."""
     radius = np.linalg.norm(bounds[:, 1] - bounds[:, 0], axis=1) / 2
     least = LEAST_RADIUS * np.maximum(np.abs(bounds).max(axis=(1, 2)), 1)
     matrices = turns / np.maximum(np.where(radius > 0, radius, 1), least)[:, None, None, None]
@@ -118,7 +117,7 @@ def _poses(bounds: NDArray[np.float64], turns: NDArray[np.float64]) -> NDArray[n
 
 
 def _basis(turns: NDArray[np.float64], coefficients: int) -> NDArray[np.float32]:
-    """(6, K) values of the spherical harmonics of degree 1 and above in the direction of each view."""
+    """Return (6, K) values of the spherical harmonics of degree 1 and above in the direction of each view."""
     basis = np.zeros((len(turns), coefficients, 3), np.float32)
     ones = np.repeat(np.eye(coefficients, dtype=np.float32)[:, :, None], 3, axis=2)
     if coefficients:
@@ -129,7 +128,7 @@ def _basis(turns: NDArray[np.float64], coefficients: int) -> NDArray[np.float32]
 
 
 def _widths(scene: DetailScene, runs: NDArray[np.int64]) -> NDArray[np.int64]:
-    """(R,) widths of the pictures of each region, pixels: so that small splats of its first level can be seen."""
+    """Return (R,) widths of the pictures of each region, pixels, so that small splats of its first level show."""
     diameter = np.linalg.norm(scene.bounds[:, 1] - scene.bounds[:, 0], axis=1)
     wanted = np.empty(scene.regions)
     for region, (start, count) in enumerate(runs[:, 0]):

@@ -1,19 +1,17 @@
-"""`BakeSettings`, how to bake."""
+"""Settings of a bake, and the resources that it may use."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from ..codecs.options import WriteOptions
 from ..fitting.settings import FitSettings
-from ..lod.builders import BUILDERS, METHODS
-from ..lod.detail_settings import DetailSettings
-from ..model.lod_tree import LodTree
+from ..lod.builders import METHODS
+from ..lod.detail_rule import DetailSettings
 from ..model.selection import Selection
-from ..model.splats import Splats
 from ..model.transforms import Transform, rotated
+from ..support.addresses import Place
 from ..support.defaults import DEFAULT_BASE, DEFAULT_GROWTH, MAX_SH_DEGREE
 
 #: Suffix of the format that is written unless another one is chosen.
@@ -22,7 +20,7 @@ SPZ = ".spz"
 
 @dataclass(frozen=True)
 class BakeSettings:
-    """How to bake.
+    """Settings of a bake.
 
     Attributes:
         method: of `lod.builders.BUILDERS`.
@@ -31,8 +29,8 @@ class BakeSettings:
         max_sh: the highest SH degree that is kept.
         selection: which splats are kept; its coordinates are those of the input.
         transform: turns, scales and moves the splats that are kept.
-        up: axis of the input that points up, one of `transforms.AXES`, which `transform` may have turned to another;
-            None for the one that the input notes.
+        up: axis of the input that points up, one of `up_axis.AXES`, which `transform` may have turned to another; None
+            for the one that the input notes.
         rgba: a file of colours and opacities that replace the splats' own, see `io.read_rgba`.
         suffix: of the format, one of `WRITABLE` that holds trees.
         options: how to write it.
@@ -41,7 +39,7 @@ class BakeSettings:
         detail: of regions and detail levels, to write a Streamed SOG instead.
         environment: of a Streamed SOG, a file whose splats are always drawn; turned and moved as the scene.
         environment_beyond: of a Streamed SOG, splats of the input farther out than this become its environment, see
-            `lod.environment.beyond`; in the input's units. None for none.
+            `lod.regions.beyond`; in the input's units. None for none.
         refine: how merged splats are fitted to pictures of full detail, its cameras left out; None for not at all.
         camera_path: a file of training cameras, in the coordinates of the output; None for cameras that are placed
             around and inside the scene.
@@ -73,10 +71,20 @@ class BakeSettings:
         """Return the axis of the output that points up, for the axis that the input notes."""
         return rotated(self.up or noted, self.transform.rotation)
 
-    def builder(self) -> tuple[Callable[..., tuple[Splats, LodTree]], float]:
-        """What makes `(nodes, tree)` of splats and its setting; takes `progress`, too.
 
-        Not a `functools.partial`, which would hold the splats until it returns, when the builder wants to free them.
-        """
-        row = BUILDERS[self.method]
-        return row.load().build, getattr(self, row.setting)
+@dataclass(frozen=True)
+class Resources:
+    """Resources that a bake may use.
+
+    Attributes:
+        memory: bytes; None for `estimate.MEMORY_SHARE` of what is available.
+        scratch_dir: folder for the scratch folder of a bake out of core; None for that of the output.
+        resume: go on with what an interrupted bake left there.
+        block_splats: splats of a block, out of core; None for as many as the memory allows, at most
+            `estimate.MOST_BLOCK_SPLATS`.
+    """
+
+    memory: int | None = None
+    scratch_dir: Place | None = None
+    resume: bool = False
+    block_splats: int | None = None

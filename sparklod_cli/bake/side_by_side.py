@@ -10,12 +10,12 @@ from typing import Any
 from ..support.addresses import Place, absolute
 from ..support.errors import SparklodError
 from ..support.progress import Progress, silent
-from .baking import Baked, bake
+from .fingerprint import FILES
+from .flow import bake
 from .out_of_core.cluster_engine import ClusterEngine
-from .recipe import FILES
-from .resources import Resources
-from .scaling import fits_in_memory
-from .settings import BakeSettings
+from .out_of_core.planning import fits_in_memory
+from .records import Baked
+from .settings import BakeSettings, Resources
 from .sources import Source, absolute_source, places_of
 
 
@@ -30,17 +30,14 @@ def bake_side_by_side(
     overwrite: bool = False,
     progress: Progress = silent,
 ) -> Iterator[Any]:
-    """Bakes scenes; yields what came of each, a `Baked` or a `SparklodError`, in their order as soon as it is known.
+    """Bake scenes; yields what came of each, a `Baked` or a `SparklodError`, in their order as soon as it is known.
 
     Args:
         pairs: inputs and outputs, which all workers see.
-        settings: how.
         engine: of the cluster.
         resources: of a worker; a scene that its memory holds is one task.
         bake_large: bakes one that none can, and returns what came of it.
         make: bakes one; a function of a module.
-        overwrite: replace files that exist.
-        progress: told how many scenes are done.
     """
     small = [fits_in_memory(source, settings, resources.memory) for source, _ in pairs]
     named = {name: getattr(settings, name) for name in FILES}
@@ -58,7 +55,7 @@ def bake_side_by_side(
 
 
 def _found(outcome: Any, target: Place) -> Any:
-    """What came of a scene; a `SparklodError` where its output is on a machine that this one does not see."""
+    """Return what came of a scene; a `SparklodError` where its output is on a machine that this one does not see."""
     if isinstance(outcome, Baked) and isinstance(target, Path) and not target.exists():
         return SparklodError(
             f"a worker wrote {target} into a folder that is not seen here: give --output-dir a folder that all machines"
@@ -77,5 +74,5 @@ def _bake_small(
     *,
     threads: int,
 ) -> Baked | None:
-    """What a worker does."""
+    """Return what a worker does."""
     return make(source, target, settings, overwrite=overwrite, threads=threads, resources=resources)

@@ -1,8 +1,8 @@
 """Bakes that need not be done again, as their output is there: `--skip-existing`.
 
-A file beside the output, NAME.sparklod.json, has the recipe of the output, with a digest of all that each input held,
-and a digest of each file of the output. Dates only save reading files that nobody has touched since; with `verify`, all
-are read.
+A file beside the output, NAME.sparklod.json, has the fingerprint of the output, with a digest of all that each input
+held, and a digest of each file of the output. Dates only save reading files that nobody has touched since; with
+`verify`, all are read.
 """
 
 from __future__ import annotations
@@ -12,15 +12,16 @@ import json
 from pathlib import Path
 from typing import Any
 
-from ..io import Identity, content_of, files_of, identity_of, sink, stamp_of
+from ..io.identity import Identity, content_of, files_of, identity_of, stamp_of
+from ..io.writing import sink
 from ..support.addresses import Address, Place, size_of
 from ..support.errors import OutputError, UnreadableError
 from ..support.untrusted import parse_json
-from .baking import Baked, bake
-from .recipe import Recipe, files_named_in, settings_of
-from .resources import Resources
-from .scaling import has_published
-from .settings import BakeSettings
+from .fingerprint import Fingerprint, files_named_in, settings_of
+from .flow import bake
+from .out_of_core.planning import has_published
+from .records import Baked
+from .settings import BakeSettings, Resources
 from .sources import Source, placement_of, places_of
 
 #: Suffix of the file beside an output, and the most bytes of it that are read.
@@ -30,10 +31,9 @@ SUFFIX, MAX_BYTES = ".sparklod.json", 1 << 24
 def bake_unless_there(
     source: Source, target: Place, settings: BakeSettings, *, verify: bool = False, overwrite: bool = False, **how: Any
 ) -> Baked | None:
-    """Bakes as `bake` does, and notes of what; None where the output of the same recipe is there.
+    """Bake as `bake` does, and notes of what; None where the output of the same fingerprint is there.
 
     Args:
-        source, target, settings, overwrite: as for `bake`; the output is no standard output.
         verify: read all of the inputs and of the output, also where size and date are those of the last bake.
         how: further arguments of `bake`.
 
@@ -45,13 +45,13 @@ def bake_unless_there(
     former = _former(beside)
     files = [*(file for place in places_of(source) for file in files_of(place)), *files_named_in(settings)]
     seen = [identity_of(file) for file in files]
-    recipe = _recipe(source, settings, files, seen, {} if verify else former)
+    fingerprint = _fingerprint(source, settings, files, seen, {} if verify else former)
     if (
         target.exists()
         and not target.is_dir()
         and not has_published(source, target, settings, how.get("resources") or Resources())
     ):
-        differences = _differences(recipe, target, former, verify=verify)
+        differences = _differences(fingerprint, target, former, verify=verify)
         if not differences:
             return None
         if not overwrite:
@@ -62,7 +62,7 @@ def bake_unless_there(
         return baked  # another run would get farther
     inputs = [dataclasses.asdict(each) for each in seen]
     note = {
-        "recipe": recipe.to_record(),
+        "recipe": dataclasses.asdict(fingerprint),
         "inputs": inputs,
         "output": {_within(target, file): _record_of(file) for file in files_of(target)},
     }
@@ -71,14 +71,14 @@ def bake_unless_there(
 
 
 def _former(beside: Place) -> dict[str, Any]:
-    """What the file beside an output says; empty where there is none that can be understood."""
+    """Return what the file beside an output says; empty where there is none that can be understood."""
     try:
         if size_of(beside) > MAX_BYTES:
             return {}
         with beside.open("rb") as file:
             found = parse_json(file.read())
         return {
-            "recipe": Recipe.from_record(found["recipe"]),
+            "recipe": Fingerprint.from_record(found["recipe"]),
             "inputs": [Identity(**each) for each in found["inputs"]],
             "output": dict(found["output"]),
         }
@@ -86,22 +86,22 @@ def _former(beside: Place) -> dict[str, Any]:
         return {}
 
 
-def _recipe(
+def _fingerprint(
     source: Source, settings: BakeSettings, files: list[Place], seen: list[Identity], former: dict[str, Any]
-) -> Recipe:
-    """The recipe of an output; inputs that are as they were last time are not read again."""
+) -> Fingerprint:
+    """Return the fingerprint of an output; inputs that are as they were last time are not read again."""
     known = {}
     if former and len(former["recipe"].inputs) == len(former["inputs"]):
         known = dict(zip(former["inputs"], former["recipe"].inputs, strict=True))
     inputs = tuple(known.get(each) or content_of(file) for file, each in zip(files, seen, strict=True))
-    return Recipe(inputs, tuple(each.name for each in seen), settings_of(settings) | placement_of(source))
+    return Fingerprint(inputs, tuple(each.name for each in seen), settings_of(settings) | placement_of(source))
 
 
-def _differences(recipe: Recipe, target: Place, former: dict[str, Any], *, verify: bool) -> list[str]:
-    """Why an output that is there is not that of a recipe; empty where it is."""
+def _differences(fingerprint: Fingerprint, target: Place, former: dict[str, Any], *, verify: bool) -> list[str]:
+    """Return why an output that is there is not that of a recipe; empty where it is."""
     if not former:
         return ["nothing tells of what it was made"]
-    found = recipe.differences(former["recipe"])
+    found = fingerprint.differences(former["recipe"])
     if found:
         return found
     files, records = {_within(target, file): file for file in files_of(target)}, former["output"]
@@ -111,7 +111,7 @@ def _differences(recipe: Recipe, target: Place, former: dict[str, Any], *, verif
 
 
 def _record_of(file: Place) -> dict[str, str]:
-    """Size and date of a file of an output, and a digest of all of it; at an address, its version."""
+    """Return size and date of a file of an output, and a digest of all of it; at an address, its version."""
     stamp = stamp_of(file)
     return {"stamp": stamp, "content": stamp if isinstance(file, Address) else content_of(file)}
 
@@ -129,7 +129,7 @@ def _is_same(file: Place | None, record: Any, *, verify: bool) -> bool:
 
 
 def _within(target: Place, file: Place) -> str:
-    """The name of a file of an output, with the folder that it has beside it."""
+    """Return the name of a file of an output, with the folder that it has beside it."""
     if isinstance(target, Path) and isinstance(file, Path) and file.is_relative_to(target.parent):
         return file.relative_to(target.parent).as_posix()
     return file.name

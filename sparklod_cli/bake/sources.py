@@ -31,12 +31,12 @@ class Merged:
 
     @classmethod
     def of(cls, places: Sequence[Place]) -> Merged:
-        """Files where their own coordinates put them."""
+        """Return files where their own coordinates put them."""
         return cls(tuple(PlacedFile(place) for place in places))
 
     @classmethod
     def of_instances(cls, instances: Sequence[Instance]) -> Merged:
-        """The files of instances, where these stand."""
+        """Return the files of instances, where these stand."""
         return cls(tuple(PlacedFile(each.file, each.transform) for each in instances if each.file is not None))
 
     def __str__(self) -> str:
@@ -48,31 +48,31 @@ Source = Place | Merged
 
 
 def places_of(source: Source) -> list[Place]:
-    """The files of a source, in order."""
+    """Return the files of a source, in order."""
     return [each.file for each in source.files] if isinstance(source, Merged) else [source]
 
 
 def absolute_source(source: Source) -> Source:
-    """The same source for processes whose working folders are others."""
+    """Return the same source for processes whose working folders are others."""
     if not isinstance(source, Merged):
         return absolute(source)
     return Merged(tuple(dataclasses.replace(each, file=absolute(each.file)) for each in source.files))
 
 
 def placement_of(source: Source) -> dict[str, Any]:
-    """Where the files of a source stand, as a recipe has it; nothing for a single file."""
+    """Return where the files of a source stand, as a recipe has it; nothing for a single file."""
     if not isinstance(source, Merged):
         return {}
     return {"merged": [_numbers(each.transform) for each in source.files]}
 
 
 def _numbers(transform: Transform) -> list[float]:
-    """The rotation row by row, the scale, the translation."""
+    """Return the rotation row by row, the scale, the translation."""
     return [float(each) for each in (*transform.rotation.flat, transform.scale, *transform.translation)]
 
 
 def read_source(source: Source, *, threads: int = 1, progress: Progress = silent) -> Scene:
-    """All of a source in memory; several files take no more of it than their splats and a block.
+    """Return all of a source in memory; several files take no more of it than their splats and a block.
 
     Raises:
         HasTreeError: one of several files is a tree; names it.
@@ -88,12 +88,11 @@ def read_source(source: Source, *, threads: int = 1, progress: Progress = silent
 def opened_source(
     source: Source, *, scratch: Path | None = None, threads: int = 1, progress: Progress = silent
 ) -> Iterator[SceneStream]:
-    """A source as a stream.
+    """Yield a source as a stream.
 
     Args:
         source: without a tree.
         scratch: folder in which what is unpacked stays, so that other processes find it; None for one that is removed.
-        threads, progress: see `io.open_stream`.
 
     Raises:
         HasTreeError, FormatError: as `read_source`.

@@ -17,7 +17,7 @@ from .paths import InputPath
 from .usage import exclude
 
 if TYPE_CHECKING:
-    from ..api.bake_jobs import Source
+    from ..bake.sources import Source
     from ..model.instances import Instance
 
 
@@ -56,7 +56,7 @@ class Inputs:
         self, instances: Sequence[Instance], outputs: Outputs, say: Callable[[str], None]
     ) -> list[tuple[Source, Place]]:
         """What is baked, and the output of each; says what of an instance is left out."""
-        from ..api.bake_jobs import Merged
+        from ..bake.sources import Merged
 
         if not self.is_merged:
             return [(place, outputs.target(place)) for place in self.inputs]
@@ -106,7 +106,7 @@ def check_inputs(ctx: click.Context, given: Inputs, outputs: Outputs) -> None:
 
 def record_of(source: Source) -> dict[str, Any]:
     """What a line of JSON calls the input: "input", or "inputs" where several are one scene."""
-    from ..api.bake_jobs import Merged
+    from ..bake.sources import Merged
 
     if isinstance(source, Merged):
         return {"inputs": [str(each.file) for each in source.files]}

@@ -18,7 +18,10 @@ from .options.resources import resources_of
 from .reports import report_baked, report_extracted
 
 if TYPE_CHECKING:
-    from ..api.bake_jobs import Baked, ClusterEngine, Extracted, Source
+    from ..bake.out_of_core.cluster_engine import ClusterEngine
+    from ..bake.records import Baked
+    from ..bake.sources import Source
+    from ..extract_leaves import Extracted
     from .console import Console
 
     #: What is known of an output; None where it was there already.
@@ -32,13 +35,15 @@ def job_of(
     ctx: click.Context, outputs: Outputs, general: General, console: Console, engine: ClusterEngine | None
 ) -> tuple[Make, Callable[..., None]]:
     """What makes outputs of inputs, and what reports one; the point where numpy is loaded."""
-    from ..api import bake_jobs
-
     console.announce_compiling()
     shared: dict[str, Any] = {"overwrite": outputs.overwrite, "progress": console.progress}
     if outputs.unlod:
+        from ..extract_leaves import extract_leaves
+
         how: dict[str, Any] = {"suffix": outputs.suffix, "options": write_options(ctx), "threads": general.threads}
-        return _one_by_one(functools.partial(bake_jobs.extract_leaves, **how, **shared)), report_extracted
+        return _one_by_one(functools.partial(extract_leaves, **how, **shared)), report_extracted
+    from ..bake.flow import bake
+
     settings = bake_settings(
         ctx,
         suffix=outputs.suffix,
@@ -46,9 +51,11 @@ def job_of(
         streamed_sog=outputs.is_streamed_sog,
         converts=outputs.format_is_asked_for,
     )
-    make: Callable[..., Baked | None] = bake_jobs.bake
+    make: Callable[..., Baked | None] = bake
     if outputs.skip_existing is not None:
-        make = functools.partial(bake_jobs.bake_unless_there, verify=outputs.skip_existing == VERIFY)
+        from ..bake.skipping import bake_unless_there
+
+        make = functools.partial(bake_unless_there, verify=outputs.skip_existing == VERIFY)
     resources = resources_of(ctx)
     if engine is not None:
         resources = dataclasses.replace(resources, memory=engine.memory)
@@ -58,8 +65,10 @@ def job_of(
     alone = _one_by_one(here)
     if engine is None:
         return alone, report_baked
+    from ..bake.side_by_side import bake_side_by_side
+
     beside: Make = functools.partial(
-        bake_jobs.bake_side_by_side,
+        bake_side_by_side,
         make=make,
         settings=settings,
         engine=engine,

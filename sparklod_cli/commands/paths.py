@@ -168,7 +168,8 @@ def keep_apart(ctx: click.Context, stands_for: Mapping[str, Iterable[Place]] | N
 
 def with_chunks(headers: Iterable[Place]) -> list[Place]:
     """Outputs of several files each, and the files beside them that are replaced or removed with them."""
-    from ..io import chunk_files, detail_files
+    from ..io import chunk_files
+    from ..io.details import detail_files
 
     chunks: list[Place] = []
     for header in headers:

@@ -22,7 +22,7 @@ from .paths import claim_stdout, keep_apart, name_outputs
 from .usage import exclude, given, options_of
 
 if TYPE_CHECKING:
-    from ..api.viewed_files import ViewedFiles
+    from ..api.jobs import ViewedFiles
     from ..cameras.path import CameraPath
     from ..images.output import Output
     from ..images.sequence import PictureSettings
@@ -179,7 +179,7 @@ def _draw(ctx: click.Context, asked: RenderOptions) -> None:
 
 def viewed_files(asked: RenderOptions, instances: list[Instance], console: Console) -> ViewedFiles:
     """The files and the cameras that look at them."""
-    from ..api.viewed_files import ViewedFiles
+    from ..api.jobs import ViewedFiles
 
     return ViewedFiles(
         instances,

@@ -10,8 +10,10 @@ from ..support.units import format_size
 from .console import Console, count_of, size_of
 
 if TYPE_CHECKING:
-    from ..api.bake_jobs import Baked, Extracted, Refined, WrittenDetail
+    from ..bake.records import Baked, WrittenDetail
+    from ..bake.refining import Refined
     from ..codecs.clamps import Clamp
+    from ..extract_leaves import Extracted
 
 #: What clamping does to a scene and what to do about it, by column of `Splats` and whether the upper end clamps.
 CLAMPED_BY_SPZ = {

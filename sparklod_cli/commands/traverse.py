@@ -86,8 +86,7 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
     asserts = place.assertions()
     start = time.perf_counter()
     with general.console() as console:
-        from ..api.jobs import UnfitError, traverse_files
-        from ..api.viewed_files import ViewedFiles
+        from ..api.jobs import UnfitError, ViewedFiles, traverse_files
 
         def ready(path: CameraPath, scenes: Scenes) -> None:
             for note in path.notes:

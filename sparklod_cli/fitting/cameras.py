@@ -1,4 +1,4 @@
-"""Where training and held-out cameras stand: around a scene and inside it, or along a path that is given."""
+"""Training and held-out cameras: around a scene and inside it, or of a camera path."""
 
 from __future__ import annotations
 
@@ -49,13 +49,7 @@ R3 = np.array([1 / _PLASTIC, 1 / _PLASTIC**2, 1 / _PLASTIC**3])
 
 @dataclass(frozen=True)
 class Place:
-    """What cameras are placed by.
-
-    Attributes:
-        center: (N, 3) some splats of the scene, world units.
-        middle: (3,) median of their centres.
-        radius: of the ball around it that holds most of them.
-    """
+    """Extent of a scene: (N, 3) centres of splats, world units, and the middle and radius of a ball around most."""
 
     center: NDArray[np.floating]
     middle: Vector
@@ -63,12 +57,12 @@ class Place:
 
     @classmethod
     def of(cls, center: NDArray[np.floating]) -> Place:
-        """That of a scene with these centres, (N, 3)."""
+        """Return the extent of a scene with (N, 3) centres."""
         return cls(center, *framing(center))
 
 
 def placed(place: Place, seed: np.random.SeedSequence) -> Iterator[Camera]:
-    """Cameras around a scene and inside it, without end; the directions of those around it spread evenly."""
+    """Yield cameras around a scene and inside it, without end; directions of those around it spread evenly."""
     random = np.random.Generator(np.random.PCG64(seed))
     start = random.random(3)
     number = 0
@@ -81,7 +75,7 @@ def placed(place: Place, seed: np.random.SeedSequence) -> Iterator[Camera]:
 
 
 def _around(place: Place, spread: Vector, random: np.random.Generator) -> Camera:
-    """A camera outside, by three numbers 0..1 for its direction and distance."""
+    """Return a camera outside, by three numbers 0..1 for its direction and distance."""
     near, far = np.log(DISTANCES)
     distance = float(np.exp(near + (far - near) * spread[2])) * place.radius
     sine = 2 * spread[1] - 1
@@ -94,7 +88,7 @@ def _around(place: Place, spread: Vector, random: np.random.Generator) -> Camera
 
 
 def _inside(place: Place, random: np.random.Generator) -> Camera:
-    """A camera between two splats that looks at a third one, all of them in the ball."""
+    """Return a camera between two splats that looks at a third one, all of them in the ball."""
     target = _some(place, random)
     eye = (_some(place, random) + _some(place, random)) / 2
     if np.linalg.norm(target - eye) < 1e-3 * place.radius:
@@ -103,7 +97,7 @@ def _inside(place: Place, random: np.random.Generator) -> Camera:
 
 
 def _some(place: Place, random: np.random.Generator) -> Vector:
-    """(3,) the centre of a splat, pulled into the ball."""
+    """Return the (3,) centre of a random splat, pulled into the ball."""
     away: Vector = place.center[random.integers(len(place.center))] - place.middle
     return place.middle + away * min(1.0, place.radius / max(float(np.linalg.norm(away)), 1e-30))
 
@@ -117,10 +111,7 @@ def _looking(eye: Vector, target: Vector, random: np.random.Generator) -> Camera
 
 
 def split_path(path: CameraPath) -> tuple[tuple[Camera, ...], tuple[Camera, ...]]:
-    """The training cameras of a path and the held-out ones, with pictures of at most `LONGEST` pixels a side.
-
-    A path of one camera is both.
-    """
+    """Return the training and the held-out cameras of a path, at most `LONGEST` pixels a side; one camera is both."""
     cameras = tuple(map(smaller, path.cameras))
     every = max(OF_PATH, -(-len(cameras) // HELD_OUT))
     held_out = cameras[every // 2 :: every] or cameras[-1:]
@@ -130,7 +121,7 @@ def split_path(path: CameraPath) -> tuple[tuple[Camera, ...], tuple[Camera, ...]
 
 
 def smaller(camera: Camera) -> Camera:
-    """The same camera with a picture of at most `LONGEST` pixels a side."""
+    """Return the same camera with a picture of at most `LONGEST` pixels a side."""
     share = LONGEST / max(camera.width, camera.height)
     if share >= 1:
         return camera

@@ -1,4 +1,4 @@
-"""`fit`: fits the merged splats of a finished tree to pictures of full detail."""
+"""Fitting of the merged splats of a finished tree to pictures of full detail."""
 
 from __future__ import annotations
 
@@ -14,12 +14,9 @@ from ..render.settings import RasterSettings
 from ..support.parallel import on_threads
 from ..support.progress import Progress, silent
 from .cameras import HELD_OUT, Place, placed, split_path
-from .held_out import Scores, gain, scores_of
-from .laws import keep_gains, keep_sizes
 from .nodes import FittedNodes
-from .optimiser import Optimiser
-from .pictures import Picture, pictures
-from .schedule import ROUNDS, STAGES, default_steps, rates_at
+from .optimiser import ROUNDS, STAGES, Optimiser, default_steps, rates_at
+from .pictures import Picture, Scores, gain, keep_gains, keep_sizes, pictures, scores_of
 from .settings import FitReport, FitSettings, FitStage
 
 #: Near plane at most and far plane at least, in radii of the scene, for scenes of tiny or huge units.
@@ -40,7 +37,7 @@ def fit(
     say: Callable[[str], None] = lambda text: None,
     interrupted: Callable[[], bool] = lambda: False,
 ) -> tuple[Splats, FitReport]:
-    """Fits the merged splats of a finished tree to pictures of full detail.
+    """Fit the merged splats of a finished tree to pictures of full detail.
 
     Args:
         nodes: N nodes in final order.
@@ -62,12 +59,12 @@ def fit(
             if not fitting.run_stage(number, progress, interrupted):
                 is_complete = False
                 break
-            say(fitting.told())
+            say(fitting.describe_stage())
         return fitting.finish(is_complete)
 
 
 class _Fitting:
-    """What is fitted, and how far it has come."""
+    """State of a fit."""
 
     def __init__(self, nodes: Splats, tree: LodTree, settings: FitSettings, threads: int) -> None:
         place = Place.of(nodes.center[tree.is_leaf])
@@ -76,7 +73,10 @@ class _Fitting:
         self.nodes = FittedNodes(nodes, tree, RasterSettings(near=near, far=far), threads)
         seeds = np.random.SeedSequence(settings.seed).spawn(3)
         self._random = np.random.Generator(np.random.PCG64(seeds[2]))
-        training, held_out = self._cameras(settings, place, seeds)
+        training, held_out = placed(place, seeds[0]), placed(place, seeds[1])
+        if settings.path is not None:
+            of_training, of_held_out = split_path(settings.path)
+            training, held_out = self._shuffled(of_training), iter(of_held_out)
         self._training, self._rounds = pictures(training, self.nodes), itertools.cycle(ROUNDS)
         self._held_out = list(itertools.islice(pictures(held_out, self.nodes), HELD_OUT))
         self._steps = default_steps(len(self.nodes.leaves)) if settings.steps is None else settings.steps
@@ -86,28 +86,19 @@ class _Fitting:
         self._kept = self.nodes.copy()
         self._stages: list[FitStage] = []
 
-    def _cameras(
-        self, settings: FitSettings, place: Place, seeds: list[np.random.SeedSequence]
-    ) -> tuple[Iterator[Camera], Iterator[Camera]]:
-        """Training cameras without end, and held-out cameras."""
-        if settings.path is None:
-            return placed(place, seeds[0]), placed(place, seeds[1])
-        training, held_out = split_path(settings.path)
-        return self._shuffled(training), iter(held_out)
-
     def _shuffled(self, cameras: tuple[Camera, ...]) -> Iterator[Camera]:
-        """Cameras without end, each as often as the others; on a path neighbours see nearly the same."""
+        """Yield cameras without end, each as often as the others; on a path neighbours see nearly the same."""
         while True:
             for at in self._random.permutation(len(cameras)):
                 yield cameras[at]
 
     @property
     def can_gain(self) -> bool:
-        """Whether there is anything to do, and to see."""
+        """True if there is anything to do, and to see."""
         return self._steps > 0 and bool(self._held_out) and self.nodes.merged.size > 0
 
     def run_stage(self, number: int, progress: Progress, interrupted: Callable[[], bool]) -> bool:
-        """Takes the steps of a stage, and keeps the nodes if that brought anything; False if it was interrupted."""
+        """Take the steps of a stage, and keep the nodes if they gained; return False if it was interrupted."""
         first, last = self._done, self._steps * (number + 1) // STAGES
         while self._done < last:
             picture = next(self._training, None)
@@ -126,7 +117,7 @@ class _Fitting:
     def _fit_to(
         self, picture: Picture, shares: Sequence[float], progress: Progress, interrupted: Callable[[], bool]
     ) -> bool:
-        """A step for each of some cuts, by their shares of the leaves; False if it was interrupted."""
+        """Take a step for cuts of some shares of the leaves; return False if it was interrupted."""
         shown = []
         for share in shares:
             if interrupted():
@@ -138,25 +129,22 @@ class _Fitting:
         self.nodes.renew(np.unique(np.concatenate(shown)))
         return True
 
-    def told(self) -> str:
-        """What the last stage brought, for display."""
-        stage = self._stages[-1]
-        changes = (
-            f"{share:.0%} {self._before[share]:.2f} -> {after:.2f} dB" for share, after in stage.psnr_after.items()
-        )
+    def describe_stage(self) -> str:
+        """Return what the last stage gained, for display."""
+        stage, before = self._stages[-1], self._before
+        changes = (f"{share:.0%} {before[share]:.2f} -> {after:.2f} dB" for share, after in stage.psnr_after.items())
         return f"{stage.name}: {', '.join(changes)}"
 
     def finish(self, is_complete: bool) -> tuple[Splats, FitReport]:
-        """The best nodes, those that lost with their first values, and the report."""
+        """Return the best nodes, those that lost with their first values, and the report."""
         self.nodes.restore(self.nodes.merged, self._kept)
         after = self._lawful() if self.can_gain else self._before
-        changed = self.nodes.changed()
-        kept = float(changed[self.nodes.merged].mean()) if self.nodes.merged.size else 0.0
+        kept = float(self.nodes.changed()[self.nodes.merged].mean()) if self.nodes.merged.size else 0.0
         report = FitReport(self._done, tuple(self._stages), self._before, after, kept, is_complete)
         return self.nodes.result(), report
 
     def _lawful(self) -> Scores:
-        """Has the nodes keep what they must, and returns their scores."""
+        """Take back what breaks a law, and return the scores of the nodes."""
         for _ in range(TRIES):
             keep_sizes(self.nodes)
             after = keep_gains(self.nodes, self._held_out, self._before)

@@ -1,4 +1,4 @@
-"""`FittedNodes`: the nodes of a tree while they change, and what cameras see of them."""
+"""The nodes of a tree while they are fitted, and what cameras see of them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ..render.settings import RasterSettings
 from ..render.shading import ShadedSplats
 from ..scenes.loaded_scene import nodes_of
 from .kernels.adam import Columns
-from .kernels.view import gather, mark_seen
+from .kernels.view import mark_seen
 
 Index = NDArray[np.int64]
 
@@ -44,28 +44,27 @@ class FittedNodes:
         self.original, self.tree, self.raster = nodes, tree, raster
         d = lod_opacity(nodes.opacity)
         self.old = Columns(nodes.center, nodes.scale, nodes.quat_xyzw, d, nodes.rgb, nodes.sh)
-        self.columns = Columns(*(column.copy() for column in self.old))
+        self.columns = _copied(self.old)
         self.leaves: Index = np.flatnonzero(tree.is_leaf)
         self.merged: Index = np.flatnonzero(~tree.is_leaf)
         self._forest = Forest([nodes_of(nodes, tree, PLAIN, precision="float16", threads=threads)])
         self._traversal = Traversal(self._forest, [TreeInstance(foveation=Cones())])
 
     def cut(self, camera: Camera, share: float) -> Index:
-        """The nodes of a cut of this share of the leaves, ascending, without a pixel-scale limit or foveation."""
+        """Return the nodes, ascending, of a cut of a share of the leaves, without pixel-scale limit or foveation."""
         budget = max(1, int(share * len(self.leaves)))
         view = View(camera.camera_to_world, camera.fov_x, camera.fov_y)
         return self._traversal.cut(view, budget=budget).indices()[0].astype(np.int64)
 
     def seen(self, index: Index, camera: Camera) -> tuple[Index, ShadedSplats]:
-        """Those of some nodes that a camera may see, and as it sees them."""
+        """Return those of some nodes that a camera may see, and how it sees them."""
         now = self.columns
         whole = ShadedSplats(now.center, now.scale, now.quat_xyzw, now.lod_opacity, now.rgb)
         _, matrix, lens, limits = rasterizer.arguments(whole, camera, self.raster)
         marks = np.empty(len(index), np.bool_)
         mark_seen(now.center, now.lod_opacity, index, matrix, lens, limits, marks)
         seen = index[marks]
-        found = Columns(*(np.empty((len(seen), *column.shape[1:]), np.float32) for column in now))
-        gather(now, seen, found)
+        found = Columns(*(column[seen] for column in now))
         if terms := found.sh.shape[1]:
             add_sh(found.center, found.sh, camera.position.astype(np.float32), COEFFICIENTS.index(terms), found.rgb)
         np.maximum(found.rgb, 0, out=found.rgb)
@@ -73,27 +72,27 @@ class FittedNodes:
 
     @np.errstate(over="ignore")  # what float16 cannot hold is infinite, as in Spark
     def renew(self, index: Index) -> None:
-        """Has cuts found with some nodes as they are now."""
+        """Update the nodes that cuts are found with."""
         rows = self._forest.nodes
         center = self.columns.center[index].astype(np.float16)
         rows["x"][index], rows["y"][index], rows["z"][index] = center.T
         rows["size"][index] = self.sizes(index).astype(np.float16)
 
     def sizes(self, index: Index, columns: Columns | None = None) -> FloatArray:
-        """Feature sizes of some nodes as they are now, or by other columns; `gaussian.spark_size`."""
+        """Return feature sizes of some nodes as they are now, or by other columns; see `gaussian.spark_size`."""
         columns = columns or self.columns
         x, y, z = columns.scale[index].T
         size: FloatArray = size_factor(columns.lod_opacity[index]) * 2 * ((x + y + z) / np.float32(3))
         return size
 
     def restore(self, index: Index, columns: Columns | None = None) -> None:
-        """Gives some nodes the values of other columns, or those that they had at first."""
+        """Set some nodes to the values of other columns, or to their first ones."""
         for now, other in zip(self.columns, columns or self.old, strict=True):
             now[index] = other[index]
         self.renew(index)
 
     def halve(self, index: Index) -> None:
-        """Takes back half of what was changed of some nodes."""
+        """Halve the changes of some nodes."""
         for now, old in zip(self.columns, self.old, strict=True):
             now[index] = (now[index] + old[index]) / 2
         turned = index[(self.columns.quat_xyzw[index] != self.old.quat_xyzw[index]).any(axis=1)]
@@ -101,18 +100,22 @@ class FittedNodes:
         self.renew(index)
 
     def copy(self) -> Columns:
-        """The columns as they are now."""
-        return Columns(*(column.copy() for column in self.columns))
+        """Return the columns as they are now."""
+        return _copied(self.columns)
 
     def changed(self) -> NDArray[np.bool_]:
-        """(N,) the nodes that are not as they were at first."""
+        """Return a (N,) mask of the nodes that are not as they were at first."""
         pairs = zip(self.columns, self.old, strict=True)
         return np.logical_or.reduce([(a != b).reshape(len(a), -1).any(axis=1) for a, b in pairs])
 
     def result(self) -> Splats:
-        """All nodes as they are now; what has not changed is the same bit for bit."""
+        """Return all nodes as they are now; what has not changed is the same bit for bit."""
         now = self.columns
         opacity = np.where(
             now.lod_opacity == self.old.lod_opacity, self.original.opacity, linear_opacity(now.lod_opacity)
         )
         return Splats(now.center, now.scale, now.quat_xyzw, opacity, now.rgb, now.sh)
+
+
+def _copied(columns: Columns) -> Columns:
+    return Columns(*(column.copy() for column in columns))

@@ -1,12 +1,16 @@
-"""`Optimiser`: moves merged splats against the gradients of pictures."""
+"""`Optimiser`: moves merged splats against the gradients of pictures; and the schedule of its steps."""
 
 from __future__ import annotations
+
+import math
+from dataclasses import dataclass
 
 import numpy as np
 
 from ..model.splats import FloatArray
 from ..render import gradients
 from .kernels import adam
+from .kernels.adam import Rates
 from .nodes import FittedNodes, Index
 from .pictures import Picture
 
@@ -19,13 +23,18 @@ USUAL_ERROR = 0.03
 #: cut refines matters more than how large they are; measured (docs/decisions/2026-11-22-refine.md).
 MOST_REACH, FREE_SHARE = 1.5, 0.03
 
+#: Stages, after each of which held-out cameras decide.
+STAGES = 6
+
+#: Rates of the first steps, and those of the last ones over these. Measured (docs/decisions/2026-11-22-refine.md).
+RATES, LAST = Rates(0.015, 0.03, 0.008, 0.015, 0.015, 0.003), 0.02
+
+#: Steps unless given: the most, the least, and their number times that of the leaves: 2,400 for 500,000. Chosen.
+MOST_BY_DEFAULT, LEAST_BY_DEFAULT, WORK = 6000, 1000, 1_200_000_000
+
 
 class Optimiser:
-    """Adam for the merged splats of a tree, each with its own count of steps.
-
-    Args:
-        nodes: that are moved.
-    """
+    """Adam for the merged splats of a tree, each with its own count of steps."""
 
     def __init__(self, nodes: FittedNodes) -> None:
         self.nodes = nodes
@@ -41,7 +50,7 @@ class Optimiser:
         )
 
     def step(self, picture: Picture, index: Index, rates: adam.Rates) -> Index:
-        """One step for a picture of a cut; returns the nodes that it showed."""
+        """Take one step for a picture of a cut; return the nodes that it showed."""
         nodes, camera = self.nodes, picture.camera
         seen, shaded = nodes.seen(index, camera)
         drawing = gradients.draw(shaded, camera, nodes.raster)
@@ -58,8 +67,38 @@ class Optimiser:
 
 
 def reach_of(nodes: FittedNodes) -> FloatArray:
-    """(S,) float32 of each merged node: most that its feature size may become of the first one, or that of it."""
+    """Return the (S,) float32 factor that bounds the change of the feature size of each merged node, either way."""
     order = np.argsort(-nodes.sizes(nodes.merged), kind="stable")
     share = np.empty(len(order))
     share[order] = np.arange(1, len(order) + 1) / len(nodes.leaves)
     return (MOST_REACH ** np.minimum(1, np.sqrt(FREE_SHARE / share))).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class Round:
+    """Cuts that are drawn for one camera: their number, and the range of their shares of the leaves."""
+
+    cuts: int
+    least: float
+    most: float
+
+    def shares(self, random: np.random.Generator) -> list[float]:
+        """Return shares of the leaves, one of each part of the range, in any order."""
+        ratio = self.most / self.least
+        parts = random.permutation(self.cuts)
+        return [float(self.least * ratio ** ((part + random.random()) / self.cuts)) for part in parts]
+
+
+#: Rounds, one after the other, each with a camera of its own: what is fitted to few cameras looks right from those.
+ROUNDS = (Round(2, 0.01, 0.1), Round(2, 0.1, 0.5))
+
+
+def default_steps(leaves: int) -> int:
+    """Return the default number of steps for a tree of so many leaves."""
+    return max(LEAST_BY_DEFAULT, min(MOST_BY_DEFAULT, WORK // leaves))
+
+
+def rates_at(progress: float) -> Rates:
+    """Return the rates after a share of the steps, 0..1: half a wave of a cosine."""
+    factor = LAST + (1 - LAST) * 0.5 * (1 + math.cos(math.pi * progress))
+    return Rates(*(rate * factor for rate in RATES))

@@ -1,18 +1,23 @@
-"""Pictures of full detail, and how far those of cuts are from them."""
+"""Pictures of full detail, how far cuts are from them, and what fitted nodes must keep."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from ..cameras.camera import Camera
-from ..images.metrics import on_background
+from ..images.metrics import on_background, psnr_of
+from ..lod.kernels.tree_links import add_weighted, fill_weights, find_parents
+from ..model.gaussian import linear_opacity
+from ..model.splats import FloatArray
 from ..render.rasterizer import Image, draw
-from .kernels.difference import by_image, squared_differences
-from .nodes import FittedNodes
+from .kernels.adam import Columns
+from .kernels.view import by_image, squared_differences
+from .nodes import FittedNodes, Index
+from .settings import SHARES
 
 #: Least mean alpha of a picture, and least standard deviation of its colours over grey: else there is nothing to see.
 COVERED, VARIED = 0.02, 0.01
@@ -22,6 +27,16 @@ LEAST_ERROR = 1e-5
 
 #: Cameras in a row that see too little, after which no more are tried.
 MOST_MISSES = 64
+
+#: Share of the leaves -> mean PSNR, dB.
+Scores = dict[float, float]
+
+#: Least feature size of a node, over the mean of its children's, weighted by opacity times surface. `inspect --check`
+#: warns below a third, also after rounding to the steps of a format.
+LEAST_RATIO = 0.38
+
+#: Times that half of what was changed is taken back, before all is.
+HALVES = 12
 
 
 @dataclass(frozen=True)
@@ -37,28 +52,22 @@ class Picture:
     full: Image
 
     def errors(self, image: Image) -> tuple[float, float]:
-        """Mean squared errors of a picture on black and on white."""
+        """Return the mean squared errors of a picture on black and on white."""
         sums = np.empty((len(image), 2))
         squared_differences(image, self.full, sums)
         black, white = sums.sum(axis=0) / (image.shape[0] * image.shape[1] * 3)
         return float(black), float(white)
 
     def gradient(self, image: Image) -> tuple[Image, float]:
-        """How to change a picture of a cut.
-
-        Returns:
-            the derivative of the mean of the logarithms of `errors`, which is what PSNR is a mean of; and the root of
-            the mean squared error.
-        """
-        result = np.empty_like(image)
-        pixels = image.shape[0] * image.shape[1] * 3
+        """Return the derivative of the mean logarithm of `errors`, as in PSNR, and the root mean squared error."""
+        result, pixels = np.empty_like(image), image.shape[0] * image.shape[1] * 3
         errors = [error + LEAST_ERROR for error in self.errors(image)]
         by_image(image, self.full, *(np.float32(1 / (pixels * error)) for error in errors), result)
         return result, math.sqrt(sum(errors) / 2)
 
 
 def pictures(cameras: Iterator[Camera], nodes: FittedNodes) -> Iterator[Picture]:
-    """Pictures of full detail of those cameras that see enough to compare cuts by; ends if hardly any does."""
+    """Yield the pictures of full detail of cameras that see enough to compare cuts by; end if hardly any does."""
     misses = 0
     for camera in cameras:
         full = draw(nodes.seen(nodes.leaves, camera)[1], camera, nodes.raster)
@@ -68,3 +77,67 @@ def pictures(cameras: Iterator[Camera], nodes: FittedNodes) -> Iterator[Picture]
         misses += 1
         if misses > MOST_MISSES:
             return
+
+
+def scores_of(nodes: FittedNodes, held_out: Sequence[Picture]) -> Scores:
+    """Return the means over held-out pictures and a black and a white background; empty without pictures."""
+    scores: Scores = {}
+    for share in SHARES if held_out else ():
+        psnr: list[float] = []
+        for picture in held_out:
+            _, shaded = nodes.seen(nodes.cut(picture.camera, share), picture.camera)
+            psnr += map(psnr_of, picture.errors(draw(shaded, picture.camera, nodes.raster)))
+        scores[share] = float(np.mean(psnr))
+    return scores
+
+
+def gain(before: Scores, after: Scores) -> float:
+    """Return the mean gain in dB."""
+    return float(np.mean([after[share] - before[share] for share in before]))
+
+
+def keep_sizes(nodes: FittedNodes) -> bool:
+    """Restore nodes that became too small for their children, unless they were so at first; return True if any were.
+
+    A parent is refined before its children if it is larger; a small one is drawn in their place for too long
+    (docs/decisions/2026-11-21-sizes-of-parents.md).
+    """
+    parent, _ = find_parents(nodes.tree.child_count, nodes.tree.child_start)
+    at_first = _ratios(nodes.old, nodes, parent)
+    restored = np.zeros(len(parent), np.bool_)
+    while True:
+        small = _ratios(nodes.columns, nodes, parent) < np.minimum(LEAST_RATIO, at_first)
+        if not small.any():
+            break
+        # Where the node itself has its first values already, its children have grown.
+        grown = np.flatnonzero((parent >= 0) & (small & restored)[parent] & ~nodes.tree.is_leaf)
+        back = np.union1d(np.flatnonzero(small & ~restored), grown)
+        back = back[~restored[back]]
+        if not back.size:
+            break
+        restored[back] = True
+        nodes.restore(back)
+    return bool(restored.any())
+
+
+def _ratios(columns: Columns, nodes: FittedNodes, parent: Index) -> FloatArray:
+    """Return the (N,) feature size of each node over the mean of its children's; infinite for leaves."""
+    every = np.arange(len(parent))
+    size, weight = nodes.sizes(every, columns), np.empty(len(parent))
+    fill_weights(parent, size, columns.scale, linear_opacity(columns.lod_opacity), weight)
+    sums, weights = np.zeros(len(parent)), np.zeros(len(parent))
+    add_weighted(parent, size, weight, sums, weights)
+    return np.divide(size * weights, sums, out=np.full(len(parent), np.inf), where=sums > 0)
+
+
+def keep_gains(nodes: FittedNodes, held_out: Sequence[Picture], before: Scores) -> Scores:
+    """Halve changes of the nodes that cuts of a share draw, while one scores less than before; return the scores."""
+    for _ in range(HALVES):
+        now = scores_of(nodes, held_out)
+        worst = min(SHARES, key=lambda share: now[share] - before[share])
+        if not now[worst] < before[worst]:
+            return now
+        drawn = [nodes.cut(picture.camera, worst) for picture in held_out]
+        nodes.halve(np.intersect1d(np.unique(np.concatenate(drawn)), nodes.merged))
+    nodes.restore(nodes.merged)
+    return before

@@ -1,4 +1,4 @@
-"""What can be chosen about fitting a tree, and what is reported of it. Imports nothing heavy."""
+"""Settings of fitting a tree, and its report. Imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SHARES = (0.02, 0.05, 0.1, 0.25, 0.5)
 
 @dataclass(frozen=True)
 class FitSettings:
-    """How the merged splats of a tree are fitted.
+    """Settings of fitting the merged splats of a tree.
 
     Attributes:
         steps: pictures of cuts that are drawn and compared; None for a number that suits the size of the tree.
@@ -33,7 +33,7 @@ class FitSettings:
 
 @dataclass(frozen=True)
 class FitStage:
-    """What one stage brought.
+    """Result of a stage.
 
     Attributes:
         name: for display.
@@ -49,7 +49,7 @@ class FitStage:
 
 @dataclass(frozen=True)
 class FitReport:
-    """What fitting a tree brought.
+    """Result of fitting a tree.
 
     Attributes:
         steps: that were done.

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..codecs.spz_coded import CodedSpz
-from ..io import RadFile
+from ..io.rad_file import RadFile
 from ..model.lod_tree import LodTree
 from ..model.nodes import CHUNK_NODES
 from ..model.scene import Scene

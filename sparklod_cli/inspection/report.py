@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from ..codecs.spz_layout import KNOWN_FLAGS
-from ..io import RadFile, examine_scene, read_arrays, read_coded, size_of_input
+from ..io import examine_scene, read_arrays, read_coded, size_of_input
+from ..io.rad_file import RadFile
 from ..model.scene import Scene
 from ..model.sh import COEFFICIENTS
 from ..model.splats import COLUMNS

@@ -14,18 +14,17 @@ from ..support.addresses import Place
 from ..support.errors import FormatError, UnreadableError
 from ..support.stdin import DASH
 from ..support.untrusted import quoted_value
-from .names import leads_away, reason_of
+from .paths import leads_away, reason_of
 
 #: The splat file that a folder stands for: the first of these that is there.
 IN_FOLDERS = (MANIFEST, META)
 
 
 def companions(path: Path, sets: Collection[Collection[str]]) -> list[Path]:
-    """The files that are read together with one, as far as can be told; nothing is raised.
+    """Return the files that are read together with one, as far as can be told; nothing is raised.
 
     Args:
         path: of a file, or of a folder.
-        sets: as for `read_together`.
     """
     try:
         folder = path if path.is_dir() else path.parent
@@ -44,7 +43,7 @@ def companions(path: Path, sets: Collection[Collection[str]]) -> list[Path]:
 
 
 def _named_in(path: Path) -> list[Path]:
-    """The files that a splat file refers to: images of an unpacked SOG, chunks of a RAD, all those of Streamed SOG."""
+    """Return the files that a splat file names: images of an unpacked SOG, chunks of a RAD, all of a Streamed SOG."""
     with path.open("rb") as file:
         head = file.read(HEAD)
         form = sniff(head, "")
@@ -63,7 +62,7 @@ def _named_in(path: Path) -> list[Path]:
 
 
 def _images_of(path: Path) -> list[Path]:
-    """The images that the meta.json of an unpacked SOG names."""
+    """Return the images that the meta.json of an unpacked SOG names."""
     from ..codecs.sog.files import MAX_META, names_beside
 
     if not path.is_file() or path.stat().st_size > MAX_META:
@@ -78,7 +77,7 @@ def _beside(path: Path, names: Iterable[str], *, folders: bool = False) -> list[
 
 
 def in_folder(folder: Place) -> Place:
-    """The splat file that a folder stands for: the manifest of Streamed SOG, or else the meta.json of a SOG.
+    """Return the splat file that a folder stands for: the manifest of Streamed SOG, or else the meta.json of a SOG.
 
     Raises:
         UnreadableError: the folder holds neither.
@@ -90,13 +89,13 @@ def in_folder(folder: Place) -> Place:
 
 
 def path_beside(first: Path, name: str) -> Path:
-    """Where a file would be that another one names; `FormatError` where the name could lead out of their folder."""
+    """Return the path of a file that another names; raise `FormatError` where the name could leave their folder."""
     _check_name(name)
     return first.parent / name
 
 
 def open_beside(first: Place, name: str, *, folders: bool = False) -> BinaryIO:
-    """Opens a file that another one names, which may be in folders there if `folders`.
+    """Open a file that another one names, which may be in folders there if `folders`.
 
     Raises:
         FormatError: it cannot be opened, or the name could lead out of the folder of the first.

@@ -1,4 +1,4 @@
-"""Writes the files of a Streamed SOG, a manifest and folders of chunks, so that all of them appear or none does."""
+"""Files of a Streamed SOG, a manifest and folders of chunks: their sizes, and writing all of them or none."""
 
 from __future__ import annotations
 
@@ -6,25 +6,28 @@ import contextlib
 import functools
 import os
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 from ..codecs.sog.files import MAX_META, names_beside
 from ..codecs.sog.names import META
-from ..codecs.streamed_sog.manifest import MAX_MANIFEST, parse
+from ..codecs.streamed_sog.manifest import MAX_MANIFEST, Manifest, parse
 from ..codecs.streamed_sog.names import chunk_name, folders_of, is_folder, is_named, is_ours
 from ..support import atomic, atomic_set
 from ..support.addresses import Address, Place
 from ..support.errors import FormatError, OutputError
-from .names import reason_of
-from .together import Files, SinkTogether, check_header
-from .uploads import check_address, send_together
+from ..support.stdin import DASH
+from .beside import companions, in_folder
+from .paths import reason_of
+from .reading import opened
+from .writing import Files, SinkTogether, check_header, send_together
 
 #: The folder that every output has.
 FIRST = chunk_name(0, 0)
 
 
 def detail_sink(path: Place, *, overwrite: bool) -> SinkTogether:
-    """The function that writes a manifest and the files of its chunks. Fails now if they cannot be written later.
+    """Return the function that writes a manifest and its chunk files. Fail now if they cannot be written later.
 
     It is given names, with their folders, and contents, the manifest last, and returns the size of all. With
     `overwrite`, the chunks of the output that was there before are replaced or removed: those files that its manifest
@@ -39,10 +42,7 @@ def detail_sink(path: Place, *, overwrite: bool) -> SinkTogether:
         OutputError: it is no place for several files, a folder is in the way, or see `check_writable`.
     """
     target = _target(path)
-    if isinstance(target, Address):
-        check_address(target, overwrite=overwrite)
-    else:
-        check_header(path, overwrite=overwrite)
+    check_header(path, overwrite=overwrite)
     former = _former(target)
     for folder in [FIRST] if isinstance(target, Path) else [FIRST, *folders_of(_standing(target))]:
         _check_folder(target, folder, former)  # at an address all of them now: nothing can be undone there later
@@ -50,7 +50,7 @@ def detail_sink(path: Place, *, overwrite: bool) -> SinkTogether:
 
 
 def detail_files(path: Path) -> list[Path]:
-    """The files beside a manifest that are called as those of an output there, whether it names them or not.
+    """Return the files beside a manifest that are called as those of an output there, whether it names them or not.
 
     Args:
         path: of the manifest, which need not exist.
@@ -97,7 +97,7 @@ def _target(path: Place) -> Place:
 
 
 def _check_folder(target: Place, folder: str, former: Iterable[str]) -> None:
-    """Raises `OutputError` where a folder is not empty, and not one of the former output."""
+    """Raise `OutputError` where a folder is not empty, and not one of the former output."""
     if folder in folders_of(list(former)):
         return
     place = target.parent / folder
@@ -115,7 +115,7 @@ def _check_folder(target: Place, folder: str, former: Iterable[str]) -> None:
 
 
 def _former(target: Place) -> list[str]:
-    """The files of the output that is there, as far as its manifest and its chunks name them and they are called so."""
+    """Return the files of a former output that its manifest and its chunks name, and that have names of ours."""
     found = list[str]()
     with contextlib.suppress(OSError, FormatError):
         metas = parse(_content(target, MAX_MANIFEST)).names()
@@ -136,7 +136,7 @@ def _content(path: Place, most: int) -> bytes:
 
 
 def _standing(target: Place) -> list[str]:
-    """The files in folders beside a manifest that are called as those of an output."""
+    """Return the files in folders beside a manifest that are called as those of an output."""
     if isinstance(target, Address):
         return sorted(name for name in target.parent.files() if is_ours(name))
     found = list[str]()
@@ -145,3 +145,47 @@ def _standing(target: Place) -> list[str]:
             if is_folder(folder.name) and folder.is_dir() and not folder.is_symlink():
                 found += [f"{folder.name}/{file.name}" for file in folder.iterdir()]
     return sorted(name for name in found if is_ours(name))
+
+
+@dataclass(frozen=True)
+class LevelFiles:
+    """A manifest and its files.
+
+    Attributes:
+        manifest: as parsed.
+        bytes: of the manifest.
+        sizes: bytes of the chunk files that it names, and then of the environment: each meta.json with its images.
+    """
+
+    manifest: Manifest
+    bytes: int
+    sizes: tuple[int, ...]
+
+
+def has_levels(path: Path) -> bool:
+    """Return whether a file, or what a folder stands for, has a scene at several detail levels.
+
+    Raises:
+        FormatError: it cannot be read, or is of no known format.
+    """
+    if path == DASH:
+        return False
+    with opened(path) as (_, form, _):
+        return form.detailed
+
+
+def read_level_files(path: Path) -> LevelFiles:
+    """Return the files of a lod-meta.json, or of the folder that holds it.
+
+    Raises:
+        FormatError: it cannot be read, or is no such manifest.
+    """
+    first = path if path.is_file() else path / in_folder(path).name
+    with opened(first) as (file, _, _):
+        data = file.read(MAX_MANIFEST + 1)
+    manifest = parse(data)
+    sizes: dict[Path, int] = {}
+    for each in companions(first, ()):
+        sizes[each.parent] = sizes.get(each.parent, 0) + each.stat().st_size
+    folders = [(first.parent / name).parent for name in manifest.names()]
+    return LevelFiles(manifest, len(data), tuple(sizes.get(folder, 0) for folder in folders))

@@ -13,7 +13,7 @@ from ..support.addresses import Address, Place
 from ..support.errors import UnreadableError
 from ..support.stdin import DASH, name_of, spooled
 from .beside import companions
-from .names import reason_unreadable
+from .paths import reason_unreadable
 
 #: Places of a file that are looked at, and bytes at each: 4 MB of a large one, which takes milliseconds. Chosen.
 PLACES, PLACE_BYTES = 64, 1 << 16
@@ -42,7 +42,7 @@ class Identity:
 
 
 def files_of(path: Place, sets: Collection[Collection[str]] = ()) -> list[Place]:
-    """The file of a path and those that it names, or the files of a folder that is an unpacked or a Streamed SOG.
+    """Return the file of a path and those that it names, or the files of an unpacked or a Streamed SOG.
 
     Args:
         path: of a file or a folder.
@@ -55,7 +55,7 @@ def files_of(path: Place, sets: Collection[Collection[str]] = ()) -> list[Place]
 
 
 def identity_of(path: Place) -> Identity:
-    """What a file is like, without reading much of it; - is standard input.
+    """Return what a file is like, without reading much of it; - is standard input.
 
     Raises:
         UnreadableError: it cannot be read.
@@ -76,7 +76,7 @@ def identity_of(path: Place) -> Identity:
 
 
 def stamp_of(path: Place) -> str:
-    """Size and date of a file, or its version at an address: what changes when it is written, without reading it.
+    """Return size and date of a file, or its version at an address, which change when it is written.
 
     Raises:
         UnreadableError: there is no such file.
@@ -89,7 +89,7 @@ def stamp_of(path: Place) -> str:
 
 
 def content_of(path: Place) -> str:
-    """A digest of all of a file; - is standard input. Some 0.5 GB a second.
+    """Return a digest of all of a file; - is standard input. Some 0.5 GB a second.
 
     Raises:
         UnreadableError: it cannot be read.
@@ -103,7 +103,7 @@ def content_of(path: Place) -> str:
 
 @contextlib.contextmanager
 def _opened(path: Place) -> Iterator[BinaryIO]:
-    """A file, or standard input, at its beginning."""
+    """Yield a file, or standard input, at its beginning."""
     with _readable():
         if path == DASH:
             yield spooled()
@@ -114,7 +114,7 @@ def _opened(path: Place) -> Iterator[BinaryIO]:
 
 @contextlib.contextmanager
 def _readable() -> Iterator[None]:
-    """An `OSError` of the body becomes an `UnreadableError`."""
+    """Yield an `OSError` of the body becomes an `UnreadableError`."""
     try:
         yield
     except OSError as error:

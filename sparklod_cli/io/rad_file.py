@@ -1,20 +1,28 @@
-"""`RadFile`, a RAD file that is read chunk by chunk, since it may be larger than memory."""
+"""RAD files in parts: the header alone, one chunk, or chunk by chunk where a file may be larger than memory."""
 
 from __future__ import annotations
 
 import contextlib
+import functools
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from ..codecs.promises import check
+from ..codecs.rad import promises
 from ..codecs.rad.by_chunk import ByChunk, bytes_decoded
-from ..codecs.rad.codec import name_of
+from ..codecs.rad.codec import RadChunk, name_of, read_chunk
+from ..codecs.rad.header import read_header
+from ..codecs.rad.places import file_of
 from ..codecs.rad.records import RadHeader
 from ..model.lod_tree import LodTree
 from ..model.scene import FileCoding
-from ..model.splats import Splats
+from ..model.splats import FloatArray, Splats
+from ..support.errors import UnreadableError
 from ..support.machine import available_memory
+from .beside import open_beside
+from .paths import reason_of
 from .reading import opened
 
 #: Name of the format in `codecs.formats`.
@@ -43,7 +51,7 @@ class RadFile:
 
     @classmethod
     def open(cls, path: Path) -> RadFile | None:
-        """Reads the header of a file, and its palette; None where the file is of another format.
+        """Read the header of a file, and its palette; None where the file is of another format.
 
         Raises:
             FormatError: it cannot be read, or breaks a promise without which its chunks cannot be.
@@ -73,12 +81,11 @@ class RadFile:
     def chunks(
         self, columns: Collection[str], *, thorough: bool, threads: int
     ) -> Iterator[tuple[int, Splats, LodTree | None]]:
-        """All chunks in order: the index of the first splat of each, its splats, and its nodes where there is a tree.
+        """Yield all chunks in order: the index of the first splat of each, its splats, and its nodes if it has a tree.
 
         Args:
             columns: of `Splats`; the others are 0.
             thorough: unpack the others, too, which finds what is corrupt.
-            threads: to decode with.
 
         Raises:
             FormatError: a chunk is damaged.
@@ -88,7 +95,7 @@ class RadFile:
             yield from self._chunks.read_all(*found, columns, thorough=thorough, threads=threads)
 
     def chunk(self, number: int, columns: Collection[str]) -> tuple[Splats, LodTree | None, FileCoding]:
-        """One chunk and its coding; only these columns are unpacked. Several threads may ask.
+        """Return one chunk and its coding; only these columns are unpacked. Several threads may ask.
 
         Raises:
             FormatError: it is damaged.
@@ -100,6 +107,54 @@ class RadFile:
 
 @contextlib.contextmanager
 def _opened(path: Path) -> Iterator[tuple[BinaryIO, Any] | None]:
-    """A RAD file and what opens the files beside it; None for a file of another format."""
+    """Yield a RAD file and what opens the files beside it; None for a file of another format."""
     with opened(path) as (file, form, more):
         yield (file, more["beside"]) if form.name == FORMAT else None
+
+
+def read_rad_header(path: Path) -> RadHeader:
+    """Read the header of a RAD file; its chunks need not be there.
+
+    Raises:
+        FormatError: it cannot be read, is no such header, or promises what cannot be.
+    """
+    with _opened_plain(path) as file:
+        return _header(file)
+
+
+def read_rad_chunk(path: Path, number: int, *, palette: FloatArray | None = None) -> RadChunk:
+    """Read the header of a RAD file, and one chunk of it.
+
+    Args:
+        path: of the file, or of the header whose chunks are files beside it.
+        number: of the chunk, from 0.
+        palette: that of the first chunk, see `codecs.rad.codec.read_chunk`.
+
+    Raises:
+        FormatError: the header or the chunk cannot be read, or is broken.
+        ValueError: there is no such chunk.
+    """
+    with _opened_plain(path) as file:
+        header = _header(file)
+        if not 0 <= number < len(header.chunks):
+            raise ValueError(f"number is {number}; its chunks are 0 to {len(header.chunks) - 1}")
+        entry = header.chunks[number]
+        with file_of(entry, file, functools.partial(open_beside, path)) as source:
+            return read_chunk(source, entry, header, palette)
+
+
+@contextlib.contextmanager
+def _opened_plain(path: Path) -> Iterator[BinaryIO]:
+    try:
+        if path.exists() and not path.is_file():
+            raise UnreadableError("cannot be read: it is a directory, a pipe or a device")
+        with path.open("rb") as file:
+            yield file
+    except OSError as error:
+        raise UnreadableError(f"cannot be read: {reason_of(error)}") from None
+
+
+def _header(file: BinaryIO) -> RadHeader:
+    header = read_header(file)
+    check(promises.violations(header))
+    return header

@@ -1,4 +1,4 @@
-"""Reads splat files of any format, which their content tells."""
+"""Splat files of any format, which their content tells, and small files that are read whole."""
 
 from __future__ import annotations
 
@@ -9,33 +9,33 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
+from ..codecs import rgba
 from ..codecs.encoder import Stored
 from ..codecs.formats import FORMATS, HEAD, Format, sniff
 from ..codecs.gpu.table import NPZ, RAW_SUFFIXES
 from ..model.scene import DetailScene, Scene
-from ..model.splats import COLUMNS
+from ..model.splats import COLUMNS, FloatArray
 from ..support.addresses import Place, size_of
-from ..support.errors import UnknownFormatError, UnreadableError
+from ..support.errors import FormatError, UnknownFormatError, UnreadableError
 from ..support.progress import Progress, silent
 from ..support.stdin import DASH, spooled
 from .beside import in_folder, open_beside
-from .names import reason_unreadable
+from .paths import reason_unreadable
 
 if TYPE_CHECKING:
     from ..codecs.gpu import dump
     from ..codecs.spz_coded import CodedSpz, Watch
+
 
 #: How a .npz begins, which is a zip.
 ZIP = b"PK\x03\x04"
 
 
 def read_scene(path: Place, *, threads: int = 1, progress: Progress = silent) -> Scene:
-    """Reads a splat file of any known format, told by its content, or else by its suffix.
+    """Read a splat file of any known format, told by its content, or else by its suffix.
 
     Args:
         path: of a file, or of a folder that holds an unpacked SOG or a Streamed SOG; - is standard input.
-        threads: to decode with.
-        progress: is told how much is done.
 
     Raises:
         FormatError: it is not a file, empty, of no known format, or broken.
@@ -46,7 +46,7 @@ def read_scene(path: Place, *, threads: int = 1, progress: Progress = silent) ->
 
 
 def read_stored(path: Place) -> Stored:
-    """The codes of a Level-of-Detail file as they stand in it, so that its leaves can be written again bit for bit.
+    """Return the codes of a Level-of-Detail file, so that its leaves can be written again bit for bit.
 
     Args:
         path: of a file whose format can be written with a tree; - is standard input.
@@ -60,12 +60,10 @@ def read_stored(path: Place) -> Stored:
 
 
 def read_levels(path: Place, *, threads: int = 1, progress: Progress = silent) -> DetailScene:
-    """Reads a scene at all its detail levels.
+    """Read a scene at all its detail levels.
 
     Args:
         path: of the lod-meta.json of a Streamed SOG, or of the folder that holds it.
-        threads: to decode with.
-        progress: is told how much is done.
 
     Raises:
         UnknownFormatError: its format has no detail levels.
@@ -82,13 +80,10 @@ def read_levels(path: Place, *, threads: int = 1, progress: Progress = silent) -
 def examine_scene(
     path: Place, *, columns: Collection[str] = COLUMNS, threads: int = 1, progress: Progress = silent
 ) -> Scene:
-    """Reads a splat file for a report on it: its tree may be broken, and columns that are not asked for may be 0.
+    """Read a splat file for a report on it: its tree may be broken, and columns that are not asked for may be 0.
 
     Args:
-        path: as for `read_scene`.
         columns: of `Splats`.
-        threads: to decode with.
-        progress: is told how much is done.
 
     Raises:
         FormatError: as `read_scene`, but for the tree.
@@ -110,10 +105,9 @@ def read_coded(
     threads: int = 1,
     progress: Progress = silent,
 ) -> CodedSpz | None:
-    """The codes of an SPZ file, for a report on it; None where a file is of another format.
+    """Return the codes of an SPZ file, for a report on it; None where a file is of another format.
 
     Args:
-        path, columns, threads, progress: as for `examine_scene`.
         watch: sees the codes of some columns, which need not be kept.
 
     Raises:
@@ -130,7 +124,7 @@ def read_coded(
 
 @contextlib.contextmanager
 def opened(path: Place) -> Iterator[tuple[BinaryIO, Format, dict[str, Any]]]:
-    """A splat file of any known format, the format, and what else its codec takes.
+    """Yield a splat file of any known format, the format, and what else its codec takes.
 
     Raises:
         FormatError: it is not a file, empty, or of no known format; an `OSError` of the body becomes one.
@@ -163,7 +157,7 @@ def opened(path: Place) -> Iterator[tuple[BinaryIO, Format, dict[str, Any]]]:
 
 @contextlib.contextmanager
 def readable() -> Iterator[None]:
-    """An `OSError` of the body, which reads a file, becomes an `UnreadableError`."""
+    """Yield an `OSError` of the body, which reads a file, becomes an `UnreadableError`."""
     try:
         yield
     except OSError as error:
@@ -171,7 +165,7 @@ def readable() -> Iterator[None]:
 
 
 def read_arrays(path: Path) -> dump.Arrays | None:
-    """The arrays of a .npz file; None where a file is something else, or cannot be opened.
+    """Return the arrays of a .npz file; None where a file is something else, or cannot be opened.
 
     Raises:
         FormatError: an array is damaged, or of no plain numbers.
@@ -190,12 +184,12 @@ def read_arrays(path: Path) -> dump.Arrays | None:
 
 
 def _file_of(path: Place) -> contextlib.AbstractContextManager[BinaryIO]:
-    """A file that is closed at the end, or standard input, which is not."""
+    """Return a file that is closed at the end, or standard input, which is not."""
     return contextlib.nullcontext(spooled()) if path == DASH else path.open("rb")
 
 
 def size_of_input(path: Place) -> int | None:
-    """Bytes of a file, or of standard input; None where that cannot be told."""
+    """Return bytes of a file, or of standard input; None where that cannot be told."""
     try:
         if path == DASH:
             return spooled().seek(0, os.SEEK_END)
@@ -204,3 +198,70 @@ def size_of_input(path: Place) -> int | None:
         return None
     except OSError:
         return None
+
+
+#: Bytes of a text that is read whole: instances, expectations, matrices. Parsed it may take thirty times as much.
+MAX_TEXT = 1 << 24
+
+
+def read_text(path: Path) -> str:
+    """Return a text file of at most `MAX_TEXT` bytes; `UnreadableError`, naming it, where that cannot be."""
+    try:
+        return str(_read_up_to(path, MAX_TEXT), "utf-8-sig")
+    except (OSError, ValueError) as error:
+        reason = reason_unreadable(error) if isinstance(error, OSError) else "it is not text"
+        raise UnreadableError(f"{path} cannot be read: {reason}") from None
+
+
+def read_together(path: Path, sets: Collection[Collection[str]], limit: int) -> dict[str, bytes]:
+    """Return files that belong together, by name, the one that `path` names first.
+
+    Args:
+        path: of a file, or of a folder that holds one of the sets.
+        sets: names of files that belong together; where `path` is one of a set, the others beside it are read, too.
+        limit: bytes that a file may have.
+
+    Raises:
+        UnreadableError: there is no such file or set, or one is too large; the text names it.
+    """
+    try:
+        if path.is_dir():
+            folder = path
+            names = next((names for names in sets if all((folder / name).is_file() for name in names)), None)
+            if names is None:
+                known = ", or ".join(" and ".join(names) for names in sets)
+                raise UnreadableError(f"{path} cannot be read: is a directory, without {known}")
+        else:
+            folder = path.parent
+            others = next((names for names in sets if path.name in names), ())
+            names = [path.name, *(name for name in others if name != path.name and (folder / name).is_file())]
+        return {name: _read_up_to(folder / name, limit) for name in names}
+    except OSError as error:
+        raise UnreadableError(f"{path} cannot be read: {reason_unreadable(error)}") from None
+
+
+def read_rgba(path: Path, count: int, rows: slice | None = None) -> FloatArray:
+    """Return colours and opacities for the `count` splats of a scene, or for a range of them, see `rgba.decode`.
+
+    Raises:
+        FormatError: it cannot be read or is not such a file; names it.
+    """
+    try:
+        if path.exists() and not path.is_file():
+            raise FormatError("cannot be read: it is a directory, a pipe or a device")
+        with path.open("rb") as file:
+            return rgba.decode(file, count, rows)
+    except OSError as error:
+        raise FormatError(f"{path} cannot be read: {reason_unreadable(error)}") from None
+    except FormatError as error:
+        raise type(error)(f"{path} {error}") from None
+
+
+def _read_up_to(path: Path, limit: int) -> bytes:
+    if path.is_dir():
+        raise UnreadableError(f"{path} cannot be read: is a directory")
+    if path.exists() and not path.is_file():
+        raise UnreadableError(f"{path} cannot be read: it is a pipe or a device; save it to a file first")
+    if path.stat().st_size > limit:
+        raise UnreadableError(f"{path} is larger than {limit >> 20:,} MiB, which nothing of its kind is")
+    return path.read_bytes()

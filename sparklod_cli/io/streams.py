@@ -1,11 +1,13 @@
-"""Reads splat files of any format block by block, so that they need not fit into memory."""
+"""Splat files of any format as streams of blocks, so that they need not fit into memory."""
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import dataclasses
 import functools
 import hashlib
+import os
 import tempfile
 import threading
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
@@ -21,8 +23,7 @@ from ..support.addresses import Address, Place
 from ..support.errors import FormatError, OutputError, SparklodError
 from ..support.progress import Progress, silent
 from ..support.stdin import DASH, name_of
-from .idle import Opened, borrowed, close_idle
-from .names import reason_of
+from .paths import reason_of
 from .reading import opened, readable
 
 #: Makes the bytes of a scratch file.
@@ -38,19 +39,16 @@ def open_stream(
     threads: int = 1,
     progress: Progress = silent,
 ) -> Iterator[SceneStream]:
-    """The splats of a file of any known format without a tree, block by block.
+    """Yield the splats of a file of any known format without a tree, block by block.
 
     Only its header is read now. Each read of the stream has the file for itself, so that several threads may read.
     Columns that lie one after the other (SPZ, SOG), and text, are unpacked once, when splats are first read; see
     docs/formats.md for the room that takes.
 
     Args:
-        path: as for `io.read_scene`.
         scratch: folder for what is unpacked; None for one of the system's temporary files.
         keep: leave what is unpacked in `scratch`, where the same file is found unpacked the next time, by other
             processes, too; whoever owns the folder removes it. The stream can be pickled then, if `progress` can.
-        threads: to decode with.
-        progress: told of what is unpacked.
 
     Raises:
         HasTreeError: the file is a tree.
@@ -93,13 +91,12 @@ def open_streams(
     threads: int = 1,
     progress: Progress = silent,
 ) -> Iterator[SceneStream]:
-    """The splats of several files, each where it stands, as those of one scene; see `streams.merged`.
+    """Yield the splats of several files, each where it stands, as those of one scene; see `streams.merged`.
 
     Nothing is kept open between reads, and the header of a file that is named twice is read once.
 
     Args:
         files: at least one.
-        scratch, keep, threads, progress: as for `open_stream`. Unless `keep` is set, a file is unpacked for each read.
 
     Raises:
         HasTreeError, FormatError, ValueError: as `open_stream`; names the file.
@@ -110,7 +107,7 @@ def open_streams(
 
 
 def _again(file: Place, scratch: Path | None, keep: bool, threads: int, progress: Progress) -> SceneStream:
-    """The stream of a file that need not stay open."""
+    """Return the stream of a file that need not stay open."""
     try:
         with open_stream(file, scratch=scratch, keep=keep, threads=threads, progress=progress) as stream:
             once = functools.partial(_read_once, file, scratch, threads, progress)
@@ -137,10 +134,10 @@ class _Store(Protocol):
     def name(self) -> Hashable: ...
 
     def file(self, path: Place, pieces: Pieces) -> contextlib.AbstractContextManager[BinaryIO]:
-        """What has been unpacked of a file; `pieces` are written first if they have not been."""
+        """Return what has been unpacked of a file; `pieces` are written first if they have not been."""
 
     def close(self) -> None:
-        """Removes it, unless it is to stay."""
+        """Remove it, unless it is to stay."""
 
 
 @dataclass
@@ -199,7 +196,7 @@ class _Folder:
 
 
 def _digest(path: Place) -> str:
-    """A name for this version of a file."""
+    """Return a name for this version of a file."""
     if isinstance(path, Address):
         parts: tuple[Any, ...] = (path.url, path.version())
     else:
@@ -210,7 +207,7 @@ def _digest(path: Place) -> str:
 
 @contextlib.contextmanager
 def _room(folder: Path | None) -> Iterator[None]:
-    """An `OSError` of the body becomes an `OutputError`."""
+    """Yield an `OSError` of the body becomes an `OutputError`."""
     try:
         yield
     except OSError as error:
@@ -239,7 +236,7 @@ class _Source:
 
     @contextlib.contextmanager
     def borrowed(self) -> Iterator[SceneStream]:
-        """The stream of the file, which nobody else reads as long as the body runs."""
+        """Yield the stream of the file, which nobody else reads as long as the body runs."""
         with readable():
             key = _Key(self.store.name, self.path, _digest(self.path), self.threads, self.progress)
             with borrowed(key, self._opened) as stream:
@@ -280,3 +277,66 @@ class _Read:
             if (stream.count, stream.sh_degree) != (self.count, self.sh_degree):
                 raise FormatError("it was changed while it was read; start again")
             yield from stream.read(start, stop)
+
+
+#: An open file, and the stream of it.
+Opened = tuple[contextlib.ExitStack, SceneStream]
+
+#: Files that wait at most: a palette takes up to 12 MB, and each is an open file. Chosen.
+MOST = 4
+
+_LOCK = threading.Lock()
+
+#: By what tells them apart, the one that waits longest first; one that is in use is not among them.
+_IDLE: list[tuple[Hashable, Opened]] = []
+
+
+@contextlib.contextmanager
+def borrowed(key: Hashable, opened: Callable[[], Opened]) -> Iterator[SceneStream]:
+    """Yield a stream that nobody else reads meanwhile: one that waits, or else a new one. It waits afterwards.
+
+    Args:
+        key: tells a file, its version and how it is read from others.
+        opened: makes a new one.
+    """
+    found = _taken(key) or opened()
+    sound = False
+    try:
+        yield found[1]
+        sound = True
+    except GeneratorExit:  # whoever reads wants no more
+        sound = True
+        raise
+    finally:
+        if sound:
+            _put(key, found)
+        else:
+            found[0].close()
+
+
+def close_idle(matches: Callable[[Hashable], bool] = lambda key: True) -> None:
+    """Close the files that wait, or those whose keys match."""
+    with _LOCK:
+        closing = [item for item in _IDLE if matches(item[0])]
+        _IDLE[:] = [item for item in _IDLE if not matches(item[0])]
+    for _, (stack, _) in closing:
+        stack.close()
+
+
+def _taken(key: Hashable) -> Opened | None:
+    with _LOCK:
+        place = next((place for place, (other, _) in enumerate(_IDLE) if other == key), None)
+        return None if place is None else _IDLE.pop(place)[1]
+
+
+def _put(key: Hashable, opened: Opened) -> None:
+    with _LOCK:
+        _IDLE.append((key, opened))
+        closing = _IDLE.pop(0)[1] if len(_IDLE) > MOST else None
+    if closing is not None:
+        closing[0].close()
+
+
+atexit.register(close_idle)
+if hasattr(os, "register_at_fork"):  # a child shares the position in a file with its parent
+    os.register_at_fork(after_in_child=_IDLE.clear)

@@ -1,27 +1,50 @@
-"""Writes files whole or not at all, and standard output."""
+"""Outputs, written whole or not at all: a file, a header with the files that it names, or objects at addresses."""
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import os
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
 
-from ..support import atomic
+from ..codecs.encoder import Encoder, Get
+from ..codecs.formats import Format
+from ..codecs.options import WriteOptions
+from ..model.scene import Scene
+from ..support import atomic, atomic_set
 from ..support.addresses import Address, Place
 from ..support.errors import OutputError, StdoutError
+from ..support.progress import Progress, silent
 from ..support.stdin import DASH
 from ..support.stdout import ReaderGoneError, guarded
-from .names import reason_of
-from .uploads import check_address, upload
+from .paths import number_of, reason_of
+
+if TYPE_CHECKING:
+    from ..codecs.rad.repacking import PackedChunks
+
+
+#: Path or address of a header.
+_Header = TypeVar("_Header", Path, Address)
+
+#: Schemes of addresses that are only read.
+READ_ONLY = ("http", "https")
 
 #: Writes the pieces of an output and returns how many bytes it wrote.
 Sink = Callable[[Iterable[bytes]], int]
 
+#: Names and contents of files, one after the other.
+Files = Iterable[tuple[str, Iterable[bytes]]]
+
+#: Writes such files and returns how many bytes it wrote.
+SinkTogether = Callable[[Files], int]
+
 
 def check_writable(path: Place, *, overwrite: bool) -> None:
-    """Raises `OutputError` where an output cannot be written, before work goes into it.
+    """Raise `OutputError` where an output cannot be written, as far as that can be told before work goes into it.
 
     Folders on the way to it that do not exist are no error: `write_whole` makes them.
 
@@ -29,34 +52,36 @@ def check_writable(path: Place, *, overwrite: bool) -> None:
         path: of the output.
         overwrite: an existing file may be replaced.
     """
-    if isinstance(path, Address):
-        check_address(path, overwrite=overwrite)
-        return
     try:
-        if path.is_dir():
+        if isinstance(path, Address):
+            scheme = path.url.split("://", 1)[0].lower()
+            if scheme in READ_ONLY:
+                raise OutputError(f"cannot write {path}: {scheme}:// is for reading; write a file and upload that")
+        elif path.is_dir():
             raise OutputError(f"{path} is a directory")
         if path.is_file() and not overwrite:
-            raise OutputError(f"{path} exists, add --overwrite to replace it")
-        path.exists()  # raises where its name is too long
-        nearest = next(folder for folder in path.absolute().parents if folder.exists())
-        if not nearest.is_dir():
-            raise OutputError(f"cannot write {path}: {nearest} is a file, not a folder")
+            raise _taken(path)
+        if isinstance(path, Path):
+            path.exists()  # raises where its name is too long
+            nearest = next(folder for folder in path.absolute().parents if folder.exists())
+            if not nearest.is_dir():
+                raise OutputError(f"cannot write {path}: {nearest} is a file, not a folder")
     except OSError as error:
         raise OutputError(f"cannot write {path}: {reason_of(error)}") from None
 
 
 def write_whole(path: Place, pieces: Iterable[bytes], *, overwrite: bool) -> int:
-    """Writes a file so that it appears complete or not at all, and returns its size; makes its folder if need be.
+    """Write a file so that it appears complete or not at all, and return its size; make its folder if need be.
 
-    It gets its name when it is filled and synced, see `whole`; an interruption leaves nothing behind.
+    It gets its name when it is filled and synced, see `atomic`; an interruption leaves nothing behind.
 
     Raises:
-        OutputError: it exists and `overwrite` is not set, or the file system refused something.
+        OutputError: it exists and `overwrite` is not set, or the file system, or the service, refused something.
     """
-    if isinstance(path, Address):
-        return upload(path, pieces, overwrite=overwrite)
     check_writable(path, overwrite=overwrite)
     try:
+        if isinstance(path, Address):
+            return path.write(pieces)
         if path.exists() and not path.is_file():  # a pipe or a device is written to, never replaced
             with path.open("wb") as file:
                 return sum(map(file.write, pieces))
@@ -64,13 +89,13 @@ def write_whole(path: Place, pieces: Iterable[bytes], *, overwrite: bool) -> int
         with atomic.created(target.parent):
             return atomic.write(target, pieces, overwrite=overwrite)
     except FileExistsError:
-        raise OutputError(f"{path} exists, add --overwrite to replace it") from None
+        raise _taken(path) from None
     except OSError as error:
         raise OutputError(f"cannot write {path}: {reason_of(error)}") from None
 
 
 def sink(path: Place, *, overwrite: bool) -> Sink:
-    """The function that writes an output; - is standard output. Fails now if the output cannot be written later.
+    """Return the function that writes an output; - is standard output. Fail now if it cannot be written later.
 
     Raises:
         OutputError: see `check_writable`.
@@ -82,7 +107,7 @@ def sink(path: Place, *, overwrite: bool) -> Sink:
 
 
 def write_stdout(pieces: Iterable[bytes]) -> int:
-    """Writes to standard output and returns the number of bytes; raises `StdoutError` if they cannot be written."""
+    """Write to standard output and return the number of bytes; raise `StdoutError` if they cannot be written."""
     size = 0
     with guarded():
         try:
@@ -92,3 +117,215 @@ def write_stdout(pieces: Iterable[bytes]) -> int:
         except ReaderGoneError as error:
             raise StdoutError(str(error)) from None
     return size
+
+
+def chunk_files(path: Path) -> list[Path]:
+    """Return the existing files beside a header whose names match its pattern, in the order of their numbers.
+
+    Args:
+        path: of a header, which need not exist: the meta.json of a SOG, or a RAD.
+    """
+    target = Path(os.path.realpath(path))
+    try:
+        return _numbered(target, (each.name for each in target.parent.iterdir()))
+    except OSError:
+        return []
+
+
+def _chunks_at(address: Address) -> list[Address]:
+    """Return those at an address."""
+    try:
+        return _numbered(address, (name for name in address.parent.files() if "/" not in name))
+    except OSError as error:
+        raise OutputError(f"cannot list {address.parent}: {reason_of(error)}") from None
+
+
+def _numbered(header: _Header, names: Iterable[str]) -> list[_Header]:
+    numbers = {number_of(name, header.name): header.parent / name for name in names}
+    return [numbers[number] for number in sorted(number for number in numbers if number is not None)]
+
+
+def write_together(path: Place, files: Files, *, overwrite: bool) -> int:
+    """Write a header and the files that it names, all or none of them, and return their size; make their folder.
+
+    With `overwrite`, files of a larger output that was there before are removed. See `atomic_set.write` and
+    `send_together` for what an interruption leaves.
+
+    Args:
+        path: of the header; where it is a symbolic link, all files go to where that leads.
+        files: names in the folder of the header, and their content; the last is the header, whose name is that of
+            `path`.
+
+    Raises:
+        OutputError: a file exists and `overwrite` is not set, or the file system, or the service, refused something.
+    """
+    check_together(path, overwrite=overwrite)
+    target = path if isinstance(path, Address) else Path(os.path.realpath(path))
+    placed = ((target.name if number_of(name, target.name) is None else name, pieces) for name, pieces in files)
+    if isinstance(target, Address):
+        return send_together(target, placed, former=_chunks_at(target), overwrite=overwrite)
+    header = target
+    try:
+        with atomic.created(header.parent):
+            return atomic_set.write(
+                header.parent,
+                placed,
+                overwrite=overwrite,
+                outdated=lambda names: (each.name for each in chunk_files(header) if each.name not in names),
+            )
+    except FileExistsError as error:
+        raise _taken(Path(error.filename or header)) from None
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {reason_of(error)}") from None
+
+
+def sink_together(path: Place, *, overwrite: bool) -> SinkTogether:
+    """Return the function that writes a header and the files that it names. Fail now if that will not be possible.
+
+    Raises:
+        OutputError: it is no place for several files, or see `check_writable`.
+    """
+    check_together(path, overwrite=overwrite)
+    return functools.partial(write_together, path, overwrite=overwrite)
+
+
+def check_header(path: Place, *, overwrite: bool) -> None:
+    """Raise `OutputError` where a file that names others cannot be written, before work goes into it."""
+    if path == DASH:
+        raise OutputError("standard output cannot take several files; name a file")
+    check_writable(path, overwrite=overwrite)
+    if isinstance(path, Path) and _is_no_file(path):
+        raise OutputError(f"{path} is a pipe or a device, which cannot take several files; name a file")
+
+
+def check_together(path: Place, *, overwrite: bool) -> None:
+    """Raise `OutputError` where a header, or a file that it names, cannot be written."""
+    check_header(path, overwrite=overwrite)
+    if isinstance(path, Address):
+        for address in [] if overwrite else _chunks_at(path):
+            raise _taken(address)
+        return
+    for each in chunk_files(path):
+        if not overwrite or _is_no_file(each):
+            raise _taken(each)
+
+
+def _taken(path: Place) -> OutputError:
+    if isinstance(path, Path) and _is_no_file(path):
+        return OutputError(f"{path} is not a file; move it away, or name another output")
+    return OutputError(f"{path} exists, add --overwrite to replace it")
+
+
+def _is_no_file(path: Path) -> bool:
+    return path.exists() and not path.is_file()
+
+
+def send_together(address: Address, files: Files, *, former: Sequence[Address], overwrite: bool) -> int:
+    """Write files at addresses, and then the one that names them; return their size.
+
+    If something fails, what was sent is removed, so that no header names files that are not there. Where files are
+    replaced, the old header is removed first for the same reason: services replace one object at a time.
+
+    Args:
+        address: of the file that names the others.
+        files: names, with the folders that they are in there, and contents; the last is that of `address`.
+        former: files of a former output, which are removed where no new one has their name.
+
+    Raises:
+        OutputError: the header exists and `overwrite` is not set, or a file cannot be sent.
+    """
+    check_writable(address, overwrite=overwrite)
+    sent, size = list[Address](), 0
+    try:
+        address.unlink(missing_ok=True)
+        for name, pieces in files:
+            place = address if name == address.name else address.parent / name
+            sent.append(place)
+            size += place.write(pieces)
+        for outdated in former:
+            if outdated not in sent:
+                outdated.unlink(missing_ok=True)
+    except BaseException as error:
+        for place in reversed(sent):
+            with contextlib.suppress(OSError):
+                place.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            raise OutputError(f"cannot write {address}: {reason_of(error)}") from None
+        raise
+    return size
+
+
+@dataclass(frozen=True)
+class SceneSink:
+    """Writes a scene.
+
+    Attributes:
+        form: that is written.
+        whole: writes one file; None for several.
+        together: writes a header and the files that it names; None for one file.
+        stem: of the names of chunks.
+    """
+
+    form: Format
+    whole: Sink | None
+    together: SinkTogether | None
+    stem: str
+
+    def __call__(self, scene: Scene, options: WriteOptions, *, threads: int = 1, progress: Progress = silent) -> int:
+        """Write a scene and return how many bytes it wrote.
+
+        Raises:
+            OutputError: see `scene_sink`; and what the codec raises.
+        """
+        codec = self.form.codec()
+        if self.whole is not None:
+            return self.whole(codec.encode(scene, options, threads=threads, progress=progress))
+        assert self.together is not None
+        if self.form.unbundled is not None:
+            files = codec.encode_files(scene, options, threads=threads, progress=progress)
+            return self.together((name, (content,)) for name, content in files)
+        return self.together(codec.encode_chunked(scene, options, self.stem, threads=threads, progress=progress))
+
+    def repack(self, chunks: PackedChunks) -> int:
+        """Write the chunks of a RAD file as they stand, and return how many bytes were written.
+
+        Raises:
+            OutputError: see `scene_sink`.
+        """
+        if self.whole is not None:
+            return self.whole(chunks.in_one_file())
+        assert self.together is not None
+        return self.together(chunks.in_files(self.stem))
+
+    def assemble(self, encoder: Encoder, get: Get, *, threads: int = 1, progress: Progress = silent) -> int:
+        """Write a tree whose windows are encoded, and return how many bytes it wrote.
+
+        Args:
+            encoder: of the tree, in the format of this sink.
+            get: reads the results of the windows.
+
+        Raises:
+            OutputError: see `scene_sink`.
+        """
+        if self.whole is not None:
+            return self.whole(encoder.pieces(get, threads=threads, progress=progress))
+        assert self.together is not None
+        return self.together(self.form.codec().assemble_chunked(encoder, get, self.stem, progress=progress))
+
+
+def scene_sink(path: Place, form: Format, *, chunked: bool = False, overwrite: bool) -> SceneSink:
+    """Return what writes a scene in a format. Fails now if the output cannot be written later.
+
+    Args:
+        path: of the file, or of the header where `chunked`; - is standard output, for one file. One that is called as
+            the `unbundled` of the format has the other files beside it.
+        form: that is written.
+        chunked: with each chunk in a file of its own, beside the header; of RAD.
+
+    Raises:
+        OutputError: see `sink` and `sink_together`. Writing raises that, too, and what the codec raises.
+    """
+    stem = path.stem if isinstance(path, Address) else Path(os.path.realpath(path)).stem
+    if chunked or path.name.lower() == form.unbundled:
+        return SceneSink(form, None, sink_together(path, overwrite=overwrite), stem)
+    return SceneSink(form, sink(path, overwrite=overwrite), None, stem)

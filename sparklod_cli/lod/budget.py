@@ -35,22 +35,22 @@ class Budget:
 
     @classmethod
     def of_count(cls, count: int) -> Budget:
-        """A budget of this many splats."""
+        """Return a budget of this many splats."""
         return cls(f"{count}", None, count)
 
     def scaled(self, scale: float) -> Budget:
-        """The budget times a factor."""
+        """Return the budget times a factor."""
         return replace(self, scale=self.scale * scale)
 
     def of(self, leaves: int) -> int:
-        """The number of splats, at least 1, for instances with this many leaves in total."""
+        """Return the number of splats, at least 1, for instances with this many leaves in total."""
         splats = self.count if self.share is None else self.share * leaves
         assert splats is not None
         return max(1, int(splats if self.scale == 1 else float(splats) * self.scale))
 
 
 def parse_budget(text: str) -> Budget:
-    """The budget of a text such as "5%" or "500k".
+    """Return the budget of a text such as "5%" or "500k".
 
     Raises:
         ValueError: the text is neither a share nor a count, or is out of range (0, or a count beyond `LARGEST`).
@@ -69,7 +69,7 @@ def parse_budget(text: str) -> Budget:
 
 
 def parse_budgets(text: str) -> tuple[Budget, ...]:
-    """The budgets of a text such as "2%,5%,500k".
+    """Return the budgets of a text such as "2%,5%,500k".
 
     Raises:
         ValueError: the text has no budget, or one that is invalid.

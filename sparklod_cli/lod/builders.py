@@ -4,10 +4,23 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, NamedTuple
 
-if TYPE_CHECKING:
-    from .stages.records import StagedBuilder
+from ..model.sh import COEFFICIENTS
+
+
+class SplatBytes(NamedTuple):
+    """Bytes that a splat takes at the peak of a bake: without spherical harmonics, and for each of their coefficients.
+
+    Peaks of processes (VmHWM), as `benchmarks/bench_memory.py` measures them, with some room to spare.
+    """
+
+    fixed: int
+    coefficient: int
+
+    def of(self, splats: int, sh_degree: int) -> int:
+        """Return the bytes of so many splats."""
+        return splats * (self.fixed + self.coefficient * COEFFICIENTS[sh_degree])
 
 
 @dataclass(frozen=True)
@@ -15,33 +28,50 @@ class Builder:
     """A tree builder.
 
     Attributes:
-        module: module of this package that has `build(splats, SETTING, *, progress) -> (nodes, tree)`.
-        stages: module of this package that is a `stages.records.StagedBuilder` of such trees.
+        module: module of this package that has `build(splats, SETTING, *, progress) -> (nodes, tree)`, and is a
+            `stage_records.StagedBuilder` of such trees.
         setting: name of its only parameter, a number.
         summary: a phrase for help texts.
         in_bands: its trees are put in the order of `band_order` for files that are read whole. That saves 3 to 4 % of
             a file of quality, and 1 to 2 % of one of quick, which is not worth the time.
+        in_memory: bytes of a splat of the input, in memory.
+        in_block: bytes of a splat of a block, out of core.
+        in_scratch: bytes of a splat of the input in the scratch folder, out of core. Those of blocks are removed when
+            their nodes are made.
     """
 
     module: str
-    stages: str
     setting: str
     summary: str
     in_bands: bool
+    in_memory: SplatBytes
+    in_block: SplatBytes
+    in_scratch: SplatBytes
 
     def load(self) -> Any:
-        """The module, imported when it is needed."""
+        """Import and return the module."""
         return import_module(f".{self.module}", __package__)
-
-    def load_stages(self) -> StagedBuilder:
-        """The module that builds in stages, imported when it is needed."""
-        found: Any = import_module(f".{self.stages}", __package__)
-        return cast("StagedBuilder", found)
 
 
 #: Builders by the name of the method; the first is the default.
 BUILDERS = {
-    "quick": Builder("quick", "stages.quick", "base", "pairs in cells of a voxel grid, in seconds", in_bands=False),
-    "quality": Builder("quality", "stages.quality", "growth", "the pairs that cost least, in all", in_bands=True),
+    "quick": Builder(
+        "quick",
+        "base",
+        "pairs in cells of a voxel grid, in seconds",
+        in_bands=False,
+        in_memory=SplatBytes(220, 27),
+        in_block=SplatBytes(300, 50),
+        in_scratch=SplatBytes(190, 32),
+    ),
+    "quality": Builder(
+        "quality",
+        "growth",
+        "the pairs that cost least, in all",
+        in_bands=True,
+        in_memory=SplatBytes(250, 30),
+        in_block=SplatBytes(350, 50),
+        in_scratch=SplatBytes(200, 34),
+    ),
 }
 METHODS = tuple(BUILDERS)

@@ -1,14 +1,13 @@
-"""Selects and checks the input of a builder, and checks its setting."""
+"""Checks of the input of a builder, and of its setting."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..codecs.sound import check_valid, is_valid_and_visible
-from ..model.selection import Selection
+from ..codecs.sound import check_valid
 from ..model.splats import Splats
 from ..support.errors import InvalidSplatsError
 from ..support.jit import threads_for
@@ -31,21 +30,13 @@ class Bounds:
 
 
 def check_setting(name: str, value: float, least: float, most: float) -> None:
-    """Raises a `ValueError` where the setting of a builder is out of its range."""
+    """Raise a `ValueError` where the setting of a builder is out of its range."""
     if not least <= value <= most:
         raise ValueError(f"{name} {value} is not within {least} to {most}")
 
 
-def select(selection: Selection, splats: Splats, threads: int) -> tuple[Splats, dict[str, int]]:
-    """`Selection.apply`, which takes longer where nothing is to be dropped."""
-    drops_nothing = len(splats) and replace(selection, drop_invalid=False) == Selection()
-    if drops_nothing and all(is_valid_and_visible(splats, threads)):
-        return splats, {}
-    return selection.apply(splats, threads=threads)
-
-
 def check(splats: Splats) -> Bounds:
-    """Checks that a tree can be built of splats, and returns their bounds.
+    """Check that a tree can be built of splats, and returns their bounds.
 
     Raises:
         InvalidSplatsError: there is no splat, or one is invalid or cannot be seen.
@@ -60,6 +51,6 @@ def check(splats: Splats) -> Bounds:
 
 
 def check_visible(smallest: float, faintest: float = 1.0) -> None:
-    """Raises `InvalidSplatsError` where the least size, or the least opacity, of splats is 0."""
+    """Raise `InvalidSplatsError` where the least size, or the least opacity, of splats is 0."""
     if not (smallest > 0 and faintest > 0):
         raise InvalidSplatsError("a splat is without opacity or scale: see Selection.apply")

@@ -3,13 +3,14 @@
 A viewer fetches a tree chunk by chunk. It needs the chunks that hold the children of the nodes that it refines, so the
 unit of an order is the *family*, the children of one node. The first chunk holds the largest families: a coarse picture
 of the whole. The rest is split in two, again and again, until each part is a chunk: along x, y or z between subtrees,
-or by size, where the coarse part comes first. Of these, the split is taken after which viewers at quasi-random
+or by size, where the coarse part comes first. Of these, the split is reordered after which viewers at quasi-random
 viewpoints, with budgets of all sizes, are expected to fetch the fewest bytes; docs/streaming.md says how it compares.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,16 +21,14 @@ from ..model.lod_tree import LodTree
 from ..model.nodes import CHUNK_NODES
 from ..model.splats import FloatArray, Splats
 from ..support.jit import threads_for
+from ..support.parallel import blocks_of
 from ..support.progress import Progress, silent
-from .chunk_parts import Index, parts_of
-from .families import families_of, placed, taken
-from .foveation import set_foveation
-from .kernels.chunk_demand import DEMAND_BYTES, LANES, fill_demand
-from .kernels.chunk_inside import sort_within_chunks
-from .kernels.chunk_sets import Families, split_sets
-from .kernels.family_links import find_limits
+from .families import families_of, node_order, reordered
+from .kernels.chunk_sets import DEMAND_BYTES, LANES, Families, fill_demand, sort_within_chunks, split_sets
 from .kernels.pixel_scale import NODE, VIEW
 from .kernels.sort import sort_by_key
+from .kernels.tree_links import find_limits
+from .traversal import set_foveation
 
 #: Viewpoints: half outside of the scene looking at it, a quarter anywhere inside, a quarter near a node. Chosen: 16
 #: are as good for large trees, not for those of four chunks (docs/decisions/2026-11-22-chunk-order.md).
@@ -58,9 +57,14 @@ FAMILY_BYTES = 124
 
 Matrix = NDArray[np.float64]
 
+Index = NDArray[np.int32]
+
+#: Families that are looked at together on the way up the tree. Chosen.
+_ROWS = 1 << 16
+
 
 def arrange(splats: Splats, tree: LodTree, *, progress: Progress = silent) -> tuple[Splats, LodTree]:
-    """The same tree with its nodes in the order for streaming.
+    """Return the same tree with its nodes in the order for streaming.
 
     The root is node 0, siblings are consecutive and come after their parent. No siblings lie in two chunks, unless
     families are so large that chunks cannot be filled with whole ones. The result does not depend on the number of
@@ -72,19 +76,19 @@ def arrange(splats: Splats, tree: LodTree, *, progress: Progress = silent) -> tu
         progress: called with the number of nodes that have a chunk.
     """
     order, child_start = chunk_order(splats, tree, progress=progress)
-    return taken([(splats, tree)], order, child_start)
+    return reordered([(splats, tree)], order, child_start)
 
 
 def chunk_order(
     splats: Splats, tree: LodTree, *, progress: Progress = silent
 ) -> tuple[NDArray[np.uint32], NDArray[np.uint32]]:
-    """The order of `arrange`: (M,) uint32 the node at each place, and (M,) uint32 the `child_start` of each place."""
+    """Return the order of `arrange`: (M,) uint32 the node, and (M,) uint32 the `child_start`, of each place."""
     nodes, parent = families_of(tree)
     if not len(nodes):
-        return placed(tree, nodes)
+        return node_order(tree, nodes)
     size = spark_size(splats)[nodes]
     families = family_order(parent, tree.child_count[nodes], splats.center[nodes], size, progress=progress)
-    return placed(tree, nodes[families])
+    return node_order(tree, nodes[families])
 
 
 def family_order(
@@ -96,7 +100,7 @@ def family_order(
     most: int | None = None,
     progress: Progress = silent,
 ) -> Index:
-    """The order of families of which `arrange` speaks.
+    """Return the order of families of which `arrange` speaks.
 
     Args:
         parent: (F,) for each node that has children, in any order in which parents come first, the place here of its
@@ -105,7 +109,7 @@ def family_order(
         center: (F, 3) its centre, world units.
         size: (F,) its feature size, world units.
         most: how many families are put in order at a time, see `family_bytes`; None for all. Parts, see
-            `chunk_parts.parts_of`, are each put in order as if they were a tree, one after the other.
+            `parts_of`, are each put in order as if they were a tree, one after the other.
         progress: called with the number of nodes that have a chunk.
 
     Returns:
@@ -140,7 +144,7 @@ def _part(parent: Index, members: Index) -> Index:
 
 
 def _largest_first(limit: FloatArray, threads: int) -> NDArray[np.uint32]:
-    """(F,) the families, parents first: by descending limit, the least size from the root to the parent."""
+    """Return the (F,) families, parents first: by descending limit, the least size from the root to the parent."""
     keys = np.uint64(0x7FFFFFFF) - limit.view(np.uint32).astype(np.uint64)
     return sort_by_key(keys, np.arange(len(limit), dtype=np.uint32), 31, threads)[1]
 
@@ -153,7 +157,7 @@ def _families(
     order: NDArray[np.uint32],
     threads: int,
 ) -> Families:
-    """The families in an order."""
+    """Return the families in an order."""
     records = np.empty(len(order), NODE)
     records["x"], records["y"], records["z"] = center[order].T
     records["size"], records["child_count"] = size[order], count[order]
@@ -186,7 +190,7 @@ def _ranks_in(order: NDArray[np.uint32], center: FloatArray, threads: int) -> ND
 
 
 def _sequence(families: Families, filled: int, total: int, progress: Progress) -> Index:
-    """(F,) the families in the order in which they are written.
+    """Return the (F,) families in the order in which they are written.
 
     Args:
         families: of a part, F at least 1.
@@ -224,7 +228,7 @@ def _sequence(families: Families, filled: int, total: int, progress: Progress) -
 
 
 def viewpoints(centers: FloatArray) -> NDArray[np.void]:
-    """(VIEWPOINTS,) `pixel_scale.VIEW` with Spark's foveation, spread evenly by Halton sequences.
+    """Return (VIEWPOINTS,) `pixel_scale.VIEW` with Spark's foveation, spread evenly by Halton sequences.
 
     Args:
         centers: (F, 3) of the nodes that viewers may look at, F at least 1.
@@ -253,7 +257,7 @@ def viewpoints(centers: FloatArray) -> NDArray[np.void]:
 
 
 def _halton(base: int) -> Matrix:
-    """(VIEWPOINTS,) of the Halton sequence, from its second element on: evenly spread in 0..1, without its ends."""
+    """Return VIEWPOINTS elements of the Halton sequence from the second on, evenly spread in 0..1."""
     left, share, out = np.arange(1, VIEWPOINTS + 1), 1.0, np.zeros(VIEWPOINTS)
     while left.any():
         share /= base
@@ -263,13 +267,84 @@ def _halton(base: int) -> Matrix:
 
 
 def _on_sphere(u: Matrix, v: Matrix) -> Matrix:
-    """(N, 3) directions, evenly spread if (u, v) are so in the unit square."""
+    """Return the (N, 3) directions, evenly spread if (u, v) are so in the unit square."""
     z = 2 * u - 1
     across = np.sqrt(1 - z * z)
     return np.stack([across * np.cos(2 * np.pi * v), across * np.sin(2 * np.pi * v), z], axis=1)
 
 
 def _log_uniform(bounds: tuple[float, float], u: Matrix) -> Matrix:
-    """(N, 1) numbers between bounds, with logarithms spread as u is in 0..1."""
+    """Return the (N, 1) numbers between bounds, with logarithms spread as u is in 0..1."""
     low, high = bounds
     return low * (high / low) ** u[:, None]
+
+
+def parts_of(
+    parent: Index, center: FloatArray, limit: FloatArray, most: int, members: Index | None = None
+) -> Iterator[Index]:
+    """Yield all families in parts of at most `most`, of which none comes before the one that has its parent.
+
+    The largest families are the first part. What is left are subtrees below them: those that are near each other are
+    parts together, and one that is too large is divided like the tree. All of it takes some 40 bytes a family.
+
+    Args:
+        parent: (F,) int32 the family that has each one's parent, which comes before it; -1 for that of the root.
+        center: (F, 3) of the parents.
+        limit: (F,) the least size from the root to the parent.
+        most: at least 1.
+        members: (N,) families of a subtree, ascending; all unless given.
+
+    Yields:
+        (n,) int32 families, ascending.
+    """
+    if members is None:
+        members = np.arange(len(parent), dtype=np.int32)
+    if len(members) <= most:
+        yield members
+        return
+    largest = _largest(limit[members], most)
+    yield members[largest]
+    rest = members[~largest]
+    roots, of_root, weight = np.unique(_roots(parent, rest), return_inverse=True, return_counts=True)
+    group = np.empty(len(roots), np.int32)
+    for number, some in enumerate(_neighbours(center[rest[roots]], weight, np.arange(len(roots)), most)):
+        group[some] = number
+    of_family = group[of_root]
+    order = np.argsort(of_family, kind="stable")
+    for found in np.split(rest[order], np.cumsum(np.bincount(of_family))[:-1]):
+        yield from parts_of(parent, center, limit, most, found)
+
+
+def _largest(limit: FloatArray, most: int) -> NDArray[np.bool_]:
+    """Return a (N,) mask of the `most` largest; of equal ones the first, which are not below the others."""
+    least = np.partition(limit, len(limit) - most)[len(limit) - most]
+    found: NDArray[np.bool_] = limit > least
+    equal = np.flatnonzero(limit == least)
+    found[equal[: most - int(np.count_nonzero(found))]] = True
+    return found
+
+
+def _roots(parent: Index, members: Index) -> Index:
+    """Return the (N,) place, among ascending members, of the highest ancestor of each that is a member."""
+    above = parent[members]
+    at = np.minimum(np.searchsorted(members, above), len(members) - 1).astype(np.int32)
+    root = np.where(members[at] == above, at, np.arange(len(members), dtype=np.int32))
+    for part in blocks_of(len(root), _ROWS):
+        while not np.array_equal(higher := root[root[part]], root[part]):
+            root[part] = higher
+    return root
+
+
+def _neighbours(
+    center: FloatArray, weight: NDArray[np.int64], some: NDArray[np.int64], most: int
+) -> Iterator[NDArray[np.int64]]:
+    """Yield subtrees in groups of at most `most` families, unless one has more; halved where they are spread most."""
+    if len(some) == 1 or weight[some].sum() <= most:
+        yield some
+        return
+    axis = int(np.ptp(center[some], axis=0).argmax())
+    ordered = some[np.argsort(center[some, axis], kind="stable")]
+    until = np.cumsum(weight[ordered])
+    middle = min(max(1, int(np.searchsorted(until, until[-1] / 2))), len(some) - 1)
+    yield from _neighbours(center, weight, ordered[:middle], most)
+    yield from _neighbours(center, weight, ordered[middle:], most)

@@ -31,12 +31,16 @@ from numpy.typing import NDArray
 from ..model.gaussian import linear_opacity, lod_opacity
 from ..model.splats import FloatArray
 from ..support.defaults import BLEND
-from .kernels import continuous as kernels
 from .kernels.cut_arrays import BUCKET_BITS, BUCKETS
+from .kernels.pixel_scale import pixel_scales
+from .kernels.tree_links import find_depths, find_limits, find_parents
 from .traversal import Traversal, View, views_of
 
 #: Bisections of the threshold's interval, whose ends differ by a factor of the width; 40 leave a share of 1e-12 of it.
 HALVINGS = 40
+
+#: In place of an infinite limit, so that logarithms are finite.
+LARGEST = np.finfo(np.float32).max
 
 Shares = NDArray[np.float64]
 
@@ -74,7 +78,7 @@ class ContinuousCuts:
         self._inner = [_Inner(self._forest.nodes[bases[i] : bases[i + 1]]) for i in range(len(self._forest))]
 
     def cut(self, view: View, *, budget: int, smallest: float = 0.0, width: float = BLEND) -> BlendedCut:
-        """The continuous cut.
+        """Return the continuous cut.
 
         Args:
             view: the camera.
@@ -98,7 +102,7 @@ class ContinuousCuts:
 
 
 def shares(limit: NDArray[np.float32], threshold: float, width: float) -> Shares:
-    """(M,) the shares by which nodes are refined, 0..1: t(n) above.
+    """Return the (M,) shares by which nodes are refined, 0..1: t(n) above.
 
     Args:
         limit: (M,) float32 of nodes with children; at least 0.
@@ -119,7 +123,7 @@ def _smoothstep(x: Shares) -> Shares:
 
 
 def find_threshold(limit: NDArray[np.float32], more: NDArray[np.int64], room: int, width: float) -> float:
-    """The threshold at which `shares` of nodes add `room` to the sum of weights; 0 if all nodes can be refined.
+    """Return the threshold at which `shares` of nodes add `room` to the sum of weights; 0 if all nodes can be refined.
 
     Args:
         limit: (M,) float32 of nodes with children; finite, at least 0.
@@ -146,7 +150,7 @@ def find_threshold(limit: NDArray[np.float32], more: NDArray[np.int64], room: in
 
 
 def _first_over(limit: NDArray[np.float32], more: NDArray[np.int64], room: int) -> float:
-    """The limit of the first node that adds too much, if nodes are refined by descending limits; 0 if none does."""
+    """Return the limit of the first node that adds too much, refined by descending limits; 0 if none does."""
     # Only nodes that have the upper half of its bits are sorted; the bits of floats >= 0 are in their order.
     upper = limit.view(np.int32) >> BUCKET_BITS
     totals = np.cumsum(np.bincount(upper, weights=more, minlength=BUCKETS)[::-1])
@@ -167,27 +171,40 @@ class _Inner:
     """
 
     def __init__(self, nodes: NDArray[np.void]) -> None:
-        children = nodes["child_count"]
-        self._nodes = nodes
-        self._node, self._above = (np.empty(np.count_nonzero(children), np.int64) for _ in range(2))
-        kernels.order_inner(nodes, self._node, self._above)
+        children, start = nodes["child_count"].astype(np.uint16), nodes["child_start"].copy()
+        depth, _ = find_depths(children, start, nodes["size"].copy())
+        self._parent, _ = find_parents(children, start)
+        inner = np.flatnonzero(children)
+        self._nodes, self._node = nodes, inner[np.argsort(depth[inner], kind="stable")]
+        place = np.empty(len(nodes), np.int32)
+        place[self._node] = np.arange(len(inner), dtype=np.int32)
+        above = self._parent[self._node]
+        self._above = np.where(above < 0, np.int32(-1), place[above])
         self.more = children[self._node].astype(np.int64) - 1
 
     def limits(self, views: NDArray[np.void], number: int) -> NDArray[np.float32]:
-        """(M,) the least pixel scale on the path from the root to each node, in the view of an instance."""
-        limit = np.empty(len(self._node), np.float32)
-        kernels.find_limits(self._nodes, self._node, self._above, views, number, limit)
+        """Return the (M,) least pixel scales on the paths from the root to each node, in the view of an instance."""
+        scale = np.empty(len(self._node), np.float32)
+        pixel_scales(self._nodes, self._node, views, number, scale)
+        limit: NDArray[np.float32] = np.minimum(find_limits(self._above, scale)[1], LARGEST)
         return limit
 
     def blended(self, share: Shares) -> tuple[NDArray[np.uint32], Shares]:
-        """The nodes with a weight above 0, ascending, and their weights, of (M,) shares by which nodes are refined."""
-        node, weight = np.empty(len(self._nodes), np.uint32), np.empty(len(self._nodes))
-        found = kernels.blend(self._nodes, self._node, share, node, weight)
-        return node[:found].copy(), weight[:found].copy()
+        """Return the nodes with a weight above 0, ascending, and their weights.
+
+        Args:
+            share: (M,) by which nodes are refined.
+        """
+        refined = np.zeros(len(self._nodes))
+        refined[self._node] = share
+        weight = refined[self._parent] - refined
+        weight[0] = 1 - refined[0]
+        drawn = np.flatnonzero(weight > 0)
+        return drawn.astype(np.uint32), weight[drawn]
 
 
 def faded(opacity: FloatArray, weight: Shares) -> FloatArray:
-    """(N,) linear opacities of splats drawn with a weight: those of D times the weight.
+    """Return the (N,) linear opacities of splats drawn with a weight: those of D times the weight.
 
     A parent and children of half the weight each let more through than either alone: a quarter, if both are opaque.
     Ways to compensate for that were tried, and pop no less; see docs/decisions. Linear opacity times the weight pops as

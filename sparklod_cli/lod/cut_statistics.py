@@ -17,15 +17,15 @@ from .traversal import Forest, TreeCut, TreeInstance, View
 
 @dataclass(frozen=True)
 class CutStatistics:
-    """Statistics of a cut, or of one instance's nodes in it.
+    """Statistics of a cut, or of one instance's nodes in it; names are those of `simulation.columns`.
 
     Attributes:
         selected, leaves: numbers of nodes, and of those without children.
         frontier: number of nodes left in the queue when it stops.
         in_frustum, outside, behind: numbers of nodes by their centres: inside the frustum, outside, behind the camera.
         level_min, level_mean, level_max: depth, edges from the root; None if no node is selected.
-        px_p50, px_p95: percentiles of the feature sizes inside the frustum, pixels; None if there are none.
-        overdraw: mean number of nodes inside the frustum that cover a pixel.
+        projected_px_p50, projected_px_p95: percentiles of the feature sizes inside the frustum, pixels; None without.
+        overdraw_estimate: mean number of nodes inside the frustum that cover a pixel.
     """
 
     selected: int
@@ -37,9 +37,9 @@ class CutStatistics:
     level_min: int | None
     level_mean: float | None
     level_max: int | None
-    px_p50: float | None
-    px_p95: float | None
-    overdraw: float
+    projected_px_p50: float | None
+    projected_px_p95: float | None
+    overdraw_estimate: float
 
 
 def measure(
@@ -51,7 +51,7 @@ def measure(
     size: tuple[int, int],
     by_instance: bool = False,
 ) -> tuple[CutStatistics, list[CutStatistics]]:
-    """Statistics of a cut as a whole and, optionally, of each instance in it.
+    """Return the statistics of a cut as a whole and, optionally, of each instance in it.
 
     Args:
         forest: the trees.
@@ -98,14 +98,14 @@ def _measured(row: NDArray[np.int64], sizes: NDArray[np.float32], pixels: int) -
         level_min=count[kernels.DEPTH_MIN] if selected else None,
         level_mean=count[kernels.DEPTH_SUM] / selected if selected else None,
         level_max=count[kernels.DEPTH_MAX] if selected else None,
-        px_p50=median,
-        px_p95=high,
-        overdraw=count[kernels.AREA] / kernels.AREA_PARTS / pixels,
+        projected_px_p50=median,
+        projected_px_p95=high,
+        overdraw_estimate=count[kernels.AREA] / kernels.AREA_PARTS / pixels,
     )
 
 
 def _percentiles(values: NDArray[np.float32], shares: Sequence[float]) -> list[float | None]:
-    """Percentiles of numbers >= 0, by ascending shares, interpolated linearly between two; None if there are none."""
+    """Return percentiles of numbers >= 0, by ascending shares, interpolated linearly; None without numbers."""
     if not len(values):
         return [None] * len(shares)
     places = [share * (len(values) - 1) for share in shares]
@@ -137,7 +137,7 @@ class Changes:
         self._counts = [0] * len(bits)
 
     def next(self, cut: TreeCut) -> list[tuple[int, int | None, int]]:
-        """For each instance: nodes in this cut, nodes in both this and the last cut, and nodes in the last cut.
+        """Return for each instance: nodes in this cut, nodes in both this and the last cut, and nodes in the last cut.
 
         The second is None for the first cut.
         """

@@ -11,12 +11,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .detail_distance import Distances
 from .detail_rule import DetailRule
+
+if TYPE_CHECKING:
+    from .traversal import View
 
 Levels = NDArray[np.int64]
 
@@ -30,6 +33,15 @@ DUE = BINS // 2
 
 #: The least squared distance.
 NEAREST_SQUARED = 1e-12
+
+Matrix = NDArray[np.float64]
+Distances = NDArray[np.float64]
+
+#: Distances are those of a camera whose narrower field of view is 45 degrees; others see as large from farther away.
+REFERENCE_TANGENT = math.tan(math.radians(22.5))
+
+#: Squared world units below which nothing is behind the camera.
+NO_BEHIND = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +63,7 @@ class Chains:
 
     @classmethod
     def of(cls, counts: Levels, rule: DetailRule) -> Chains:
-        """The chains of regions with (R, L) splats at each level."""
+        """Return the chains of regions with (R, L) splats at each level."""
         most = counts.shape[1] - 1
         finest = min(rule.finest, most)
         allowed = counts[:, finest : min(rule.coarsest, most) + 1] > 0
@@ -100,7 +112,7 @@ class DetailChoice:
 
 
 def choose(instances: Sequence[Distant], budget: int, rule: DetailRule) -> DetailChoice:
-    """The levels that a viewer shows of some instances, all within one budget.
+    """Return the levels that a viewer shows of some instances, all within one budget.
 
     Args:
         instances: at least one.
@@ -125,7 +137,7 @@ def choose(instances: Sequence[Distant], budget: int, rule: DetailRule) -> Detai
 
 
 def _positions(instance: Distant, rule: DetailRule) -> Distances:
-    """(R, S - 1) positions of the steps of each region, in bins, descending."""
+    """Return the (R, S - 1) positions of the steps of each region, in bins, descending."""
     chains, step = instance.chains, math.log(rule.multiplier) * PER_LOG
     zero = (-math.log(instance.base_distance) - LOWEST) * PER_LOG - (chains.finest - 1) * step
     distance = np.log(np.maximum(instance.squared_distance, NEAREST_SQUARED)) * (PER_LOG * 0.5) + zero
@@ -134,14 +146,14 @@ def _positions(instance: Distant, rule: DetailRule) -> Distances:
 
 
 def _keys(positions: Distances) -> Levels:
-    """Positions as whole numbers of parts, in their order."""
+    """Return positions as whole numbers of parts, in their order."""
     bins = np.clip(positions, 0, BINS - 1).astype(np.int64)
     parts = np.clip((positions - bins) * PARTS, 0, PARTS - 1).astype(np.int64)
     return bins * PARTS + parts
 
 
 def _threshold(instances: Sequence[Distant], keys: Sequence[Levels], room: int, bins: int) -> int:
-    """The least key of a step that is taken: the highest at which the budget suffices, but for the rest of a part.
+    """Return the least key of a step that is taken: the highest at which the budget suffices, to a part.
 
     Args:
         instances: of the regions.
@@ -160,7 +172,7 @@ def _threshold(instances: Sequence[Distant], keys: Sequence[Levels], room: int, 
 
 
 def _first_over(number: Levels, saved: Levels, room: int, count: int) -> tuple[int, int]:
-    """The first of some bins whose splats, with those of all before it, exceed the room; and the room before it."""
+    """Return the first bin whose splats, with those of all before it, exceed the room; and the room before it."""
     added = np.cumsum(np.bincount(number, saved, minlength=count)[:count])
     over = np.flatnonzero(added > room)
     first = int(over[0]) if len(over) else count
@@ -174,3 +186,58 @@ def _chosen(instances: Sequence[Distant], places: Sequence[Levels], reason: str)
         levels.append(instance.chains.level[rows, place])
         splats += int(instance.chains.count[rows, place].sum())
     return DetailChoice(tuple(levels), splats, reason)
+
+
+class RegionBounds:
+    """Bounds of regions as PlayCanvas holds them: in float32, each with what it has more than the median.
+
+    Args:
+        bounds: (R, 2, 3) lowest and highest corner of each, in the space of the scene.
+
+    Attributes:
+        low, high: (R, 3) float64.
+        excess: (R, 3) float64, half of each side, less half of the median side along the axis; not less than 0.
+    """
+
+    def __init__(self, bounds: Matrix) -> None:
+        center, half = bounds.sum(axis=1) * 0.5, (bounds[:, 1] - bounds[:, 0]) * 0.5
+        self.low = (center - half).astype(np.float32).astype(np.float64)
+        self.high = (center + half).astype(np.float32).astype(np.float64)
+        half32 = ((self.high - self.low) * 0.5).astype(np.float32)
+        median = np.sort(half32, axis=0)[len(half32) // 2].astype(np.float64)
+        self.excess = np.maximum(half32 - median, 0).astype(np.float32).astype(np.float64)
+
+    def squared_distances(self, view: View, object_to_world: Matrix, rule: DetailRule) -> Distances:
+        """Return (R,) squared distances by which levels are chosen, world units at a field of view of 45 degrees.
+
+        The distance is that from the camera to the nearest point of the bound, shrunk by `rule.shrink` of its excess;
+        what lies behind the camera counts as farther. As `GSplatOctreeInstance.evaluateNodeDistances` of PlayCanvas.
+
+        Args:
+            view: the camera.
+            object_to_world: (4, 4) where the scene stands: a rotation, a uniform scale and a translation.
+            rule: for its `shrink` and `behind_penalty`.
+        """
+        # PlayCanvas holds matrices in float32.
+        placed, camera = (
+            matrix.astype(np.float32).astype(np.float64) for matrix in (object_to_world, view.camera_to_world)
+        )
+        world_to_object = np.linalg.inv(placed).astype(np.float32).astype(np.float64)
+        eye = world_to_object[:3, :3] @ camera[:3, 3] + world_to_object[:3, 3]
+        forward = world_to_object[:3, :3] @ -_unit(camera[:3, 2])
+        forward = _unit(forward)
+        low, high = self.low + self.excess * rule.shrink, self.high - self.excess * rule.shrink
+        offset = np.where(eye < low, low, np.where(eye > high, high, eye)) - eye
+        squared: Distances = (offset**2).sum(axis=1)
+        factor = np.ones(len(squared))
+        ahead = offset @ forward
+        behind = (squared > NO_BEHIND) & (ahead < 0)
+        factor[behind] += -ahead[behind] / np.sqrt(squared[behind]) * (rule.behind_penalty - 1)
+        tangent = min(math.tan(view.fov_x / 2), math.tan(view.fov_y / 2))
+        scale = tangent / REFERENCE_TANGENT * float(np.linalg.norm(placed[:3, 0]))
+        return squared * factor * factor * (scale * scale)
+
+
+def _unit(vector: Matrix) -> Matrix:
+    unit: Matrix = vector / np.linalg.norm(vector)
+    return unit

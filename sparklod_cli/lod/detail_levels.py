@@ -1,21 +1,63 @@
-"""Detail levels of a tree: cuts of it, region by region, in plain splats."""
+"""Detail levels of a tree: cuts of it that do not depend on a camera, region by region, in plain splats.
+
+Splats of an opacity above 1 become ones of opacity 1, for formats that hold no more. A splat of linear opacity A > 1
+has the alpha p(z) = 1 - (1 - exp(-z^2 / 2)) ** A, flat on top. A plain Gaussian of opacity 1 and k times the scale has
+g(z) = exp(-z^2 / (2 k^2)). Both are isotropic on the screen, in standard deviations of the splat, so k depends on A
+alone. It is the one that covers as much: the integral of p over the plane is 2 pi H(A), with the harmonic number H (see
+`model/falloff.py`), that of g is 2 pi k^2, so k = sqrt(H(A)).
+"""
 
 from __future__ import annotations
 
-import numpy as np
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
+from ..model.falloff import harmonic
+from ..model.gaussian import covariance, spark_size
 from ..model.lod_tree import LodTree
 from ..model.scene import DetailScene
 from ..model.splats import Splats
 from ..support.progress import Progress, silent
-from .detail_cuts import detail_cuts, shares_of
-from .detail_settings import DetailSettings
-from .plain_opacity import with_plain_opacity
-from .regions import Places, divide, extents, united
+from .detail_rule import DetailSettings
+from .kernels.tree_links import find_parents
+from .regions import divide, extents, united
+
+#: Without given shares, each level has this share of the splats of the level before. A viewer goes one level coarser
+#: with each factor of its own in distance, by default 3 in PlayCanvas's engine: a surface then covers a ninth of the
+#: pixels, so that levels of a quarter still have twice as many splats a pixel as the one before. All coarser levels
+#: together are a third of full detail. Chosen.
+STEP = 0.25
+
+#: Without given shares, levels are added until one has no more splats than this: what a viewer loads first, and draws
+#: at least. Chosen.
+COARSE_ENOUGH = 1 << 16
+Nodes = NDArray[np.int64]
+
+#: Rows and columns, among xx xy xz yy yz zz, of the covariance on the planes xy, xz and yz, and the axes of these.
+PLANES = ((0, 3, 1, 0, 1), (0, 5, 2, 0, 2), (3, 5, 4, 1, 2))
+
+#: How far apart in the list of a node's children two may be for their overlap to count: all children of a tree of the
+#: quality builder with up to 1.4 nodes a leaf. Nodes of other trees may have thousands. Chosen.
+SIBLINGS = 15
+
+#: Weight of opacity beside each of red, green and blue, as pictures may have any background. Chosen.
+ALPHA_WEIGHT = 1.0
+
+#: Standard deviation of the logarithms of the leaves' sizes from which on their number counts in full. Those of trained
+#: scenes differ by 0.6 and more. Chosen.
+SIZES_DIFFER = 0.3
+
+#: Splats or pairs that are worked on at a time, so that their columns stay in the cache. Chosen.
+BLOCK = 1 << 14
+Column = NDArray[np.float64]
 
 
 def make(nodes: Splats, tree: LodTree, settings: DetailSettings, *, progress: Progress = silent) -> DetailScene:
-    """The detail levels of a scene, from its tree.
+    """Return the detail levels of a scene, from its tree.
 
     Level 0 has the leaves, bit for bit if their opacity is at most 1. Each further level is a cut of the tree that the
     finer levels refine. A region is a set of nodes of the coarsest level, and all that is below them: at every level it
@@ -24,15 +66,11 @@ def make(nodes: Splats, tree: LodTree, settings: DetailSettings, *, progress: Pr
     Args:
         nodes: M splats, those of a tree in final order.
         tree: of them.
-        settings: shares of the levels and sizes of regions. A region that is a single node of the coarsest level is not
-            divided, whatever its size.
+        settings: shares of the levels and sizes of regions.
         progress: called with the number of levels done in the stage dividing.
 
     Returns:
         the scene, without errors; within a run, splats are in the order of the tree.
-
-    Raises:
-        ValueError: the shares do not descend, or are not between 0 and 1.
     """
     leaves = int(np.count_nonzero(tree.is_leaf))
     shares = shares_of(settings.levels, leaves)
@@ -45,14 +83,189 @@ def make(nodes: Splats, tree: LodTree, settings: DetailSettings, *, progress: Pr
     under = len(cuts.coarsest)
     center = nodes.center[order]
     box = united(np.stack([center, center], axis=1), owner, under)
-    places = Places(nodes.center[cuts.coarsest], box, np.bincount(owner, minlength=under))
-    regions = divide(places, settings)
-    region = regions.number[owner]
-    count = int(regions.number.max()) + 1
+    under_each = np.bincount(owner, minlength=under)
+    number, children = divide(nodes.center[cuts.coarsest], box, under_each, settings)
+    region, count = number[owner], int(number.max()) + 1
     level = np.repeat(np.arange(levels), [len(some) for some in cuts.nodes])
     key = level * count + region
     splats = with_plain_opacity(nodes.take(order[np.argsort(key, kind="stable")]))
     counts = np.bincount(key, minlength=levels * count).reshape(levels, count).T
     bounds = united(extents(splats), np.sort(key) % count, count)
     progress("dividing", levels, levels, "level")
-    return DetailScene(splats, np.ascontiguousarray(counts), bounds, regions.children)
+    return DetailScene(splats, np.ascontiguousarray(counts), bounds, children)
+
+
+@dataclass(frozen=True, eq=False)
+class DetailCuts:
+    """The nodes of each detail level.
+
+    Attributes:
+        nodes: (n,) int64 ascending, those of each level; level 0 has the leaves.
+        parent: (M,) int32 parent of each node, -1 of the root.
+    """
+
+    nodes: list[Nodes]
+    parent: NDArray[np.int32]
+
+    @property
+    def coarsest(self) -> Nodes:
+        """The nodes of the last level."""
+        return self.nodes[-1]
+
+    def owners(self) -> NDArray[np.int64]:
+        """Return the (M,) place in `coarsest` of each node or its ancestor that is there; -1 above the coarsest."""
+        above = np.maximum(self.parent, 0).astype(np.int64)
+        above[self.coarsest] = self.coarsest
+        while True:  # each round doubles the number of edges that are gone up
+            higher = above[above]
+            if np.array_equal(higher, above):
+                break
+            above = higher
+        place = np.full(len(self.parent), -1, np.int64)
+        place[self.coarsest] = np.arange(len(self.coarsest))
+        owner: NDArray[np.int64] = place[above]
+        return owner
+
+
+def shares_of(levels: Sequence[float] | None, leaves: int) -> list[float]:
+    """Return the shares of the levels after full detail: those given, or such that suit a scene of so many splats."""
+    if levels is not None:
+        return list(levels)
+    shares = [STEP]
+    while shares[-1] * leaves > COARSE_ENOUGH:
+        shares.append(shares[-1] * STEP)
+    return shares
+
+
+def detail_cuts(nodes: Splats, tree: LodTree, shares: Sequence[float]) -> DetailCuts:
+    """Return cuts of a tree with shares of its leaves, rounded, never more and less by at most the children of a node.
+
+    Nodes are refined in the order of their losses (see `losses`), which do not grow from a node to its
+    children; one order for all cuts, so that each refines the coarser ones.
+
+    Args:
+        nodes: M splats, final order.
+        tree: of them.
+        shares: of each level after full detail, descending, between 0 and 1.
+    """
+    parent, _ = find_parents(tree.child_count, tree.child_start)
+    loss = losses(nodes, tree, parent)
+    inner = np.flatnonzero(~tree.is_leaf)
+    order = inner[np.argsort(-loss[inner], kind="stable")]  # parents come first among equals, too
+    turn = np.full(len(tree), len(order), np.int64)  # the number of nodes refined before it, leaves after all
+    turn[order] = np.arange(len(order))
+    turn_of_parent = np.where(parent >= 0, turn[np.maximum(parent, 0)], -1)
+    splats = 1 + np.cumsum(tree.child_count[order].astype(np.int64) - 1)
+    leaves = len(tree) - len(inner)
+    found = [np.flatnonzero(tree.is_leaf)]
+    for share in shares:
+        refined = int(np.searchsorted(splats, round(share * leaves), side="right"))
+        found.append(np.flatnonzero((turn_of_parent < refined) & (turn >= refined)))
+    return DetailCuts(found, parent)
+
+
+@np.errstate(over="ignore", invalid="ignore")  # where splats are as large as numbers are
+def losses(nodes: Splats, tree: LodTree, parent: NDArray[np.int32]) -> Column:
+    """Return the (M,) float64 loss of each node drawn instead of what is below it; no less than that of any below.
+
+    The loss of a node is the root of its picture error, times its feature size, times its leaves (to a power of at most
+    1). The picture error is the squared difference between the picture of the node and that of its children, over red,
+    green, blue and opacity, on the planes of the three axes; like the size squared, an area. The number of leaves is
+    what says how much detail was here: where a scene has small splats close together, training put them there because
+    pictures showed the need. Where all leaves have one size, as in a point cloud, it says nothing but how densely was
+    sampled: the power is 0.
+
+    Args:
+        nodes: M splats of a tree in final order.
+        tree: of them.
+        parent: (M,) of each node, -1 of the root.
+    """
+    size = spark_size(nodes).astype(np.float64)
+    loss = np.sqrt(picture_errors(with_plain_opacity(nodes), parent)) * size
+    logs = np.log(np.maximum(size[tree.is_leaf], np.finfo(np.float64).tiny))
+    power = min(1.0, float(logs.std()) / SIZES_DIFFER)
+    leaves = tree.is_leaf.astype(np.float64)
+    for family, starts, members in _families(tree):
+        leaves[family] = np.add.reduceat(leaves[members], starts)
+        own = np.nan_to_num(loss[family], nan=0.0) * leaves[family] ** power
+        loss[family] = np.maximum(own, np.maximum.reduceat(loss[members], starts))
+    return loss
+
+
+def picture_errors(splats: Splats, parent: NDArray[np.int32]) -> Column:
+    """Return the (M,) squared difference between the picture of each splat and the sum of its children's, 0 for leaves.
+
+    With Gaussians G of opacity times colour, it is the integral of (G - sum of G_c)^2 over each of three planes; the
+    mean of them, divided by pi. Children more than SIBLINGS apart are taken for ones that do not overlap.
+
+    Args:
+        splats: M splats, opacities of at most 1.
+        parent: (M,) of each, whose children are consecutive; -1 of the root.
+    """
+    count = len(splats)
+    shape = np.empty((count, 6))
+    for begin in range(0, count, BLOCK):
+        some = slice(begin, begin + BLOCK)
+        shape[some] = covariance(splats.scale[some], splats.quat_xyzw[some])
+    node = np.arange(1, count)
+    above = parent[1:].astype(np.int64)
+    alone = _shared(splats, shape, np.arange(count), np.arange(count))
+    error = np.bincount(above, alone[1:] - 2 * _shared(splats, shape, node, above), count)
+    for step in range(1, SIBLINGS + 1):
+        first = node[:-step][above[:-step] == above[step:]]
+        if not first.size:
+            break
+        error += np.bincount(parent[first], 2 * _shared(splats, shape, first, first + step), count)
+    inner = np.zeros(count, np.bool_)
+    inner[above] = True
+    return np.where(inner, np.maximum(error + alone, 0), 0.0)
+
+
+@np.errstate(divide="ignore", over="ignore", invalid="ignore")  # where splats have no extent, or are too far apart
+def _shared(splats: Splats, shape: Column, first: NDArray[np.int64], second: NDArray[np.int64]) -> Column:
+    """Return (n,) integrals of products of two splats' pictures, in all channels; mean of the planes over pi."""
+    found = np.empty(len(first))
+    for begin in range(0, len(first), BLOCK):
+        a, b = first[begin : begin + BLOCK], second[begin : begin + BLOCK]
+        color = np.einsum("ni,ni->n", splats.rgb[a], splats.rgb[b], dtype=np.float64) + ALPHA_WEIGHT
+        high = splats.opacity[a].astype(np.float64) * splats.opacity[b] * color
+        offset = splats.center[b].astype(np.float64) - splats.center[a]
+        p, q = shape[a].T, shape[b].T
+        total = np.zeros(len(a))
+        for row, column, mixed, across, along in PLANES:
+            xx, yy, xy = p[row] + q[row], p[column] + q[column], p[mixed] + q[mixed]
+            own = np.maximum(p[row] * p[column] - p[mixed] ** 2, 0) * np.maximum(q[row] * q[column] - q[mixed] ** 2, 0)
+            det = xx * yy - xy * xy
+            x, y = offset[:, across], offset[:, along]
+            power = (yy * x * x - 2 * xy * x * y + xx * y * y) / det
+            total += np.where(det > 0, np.sqrt(own / det) * np.exp(-power / 2), 0.0)
+        found[begin : begin + BLOCK] = high * total * (2 / 3)
+    return found
+
+
+def _families(tree: LodTree) -> list[tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]]:
+    """Return inner nodes by depth, the deepest first, where the children of each begin in a list, and the list."""
+    depth = tree.depths()
+    inner = np.flatnonzero(~tree.is_leaf)
+    inner = inner[np.argsort(depth[inner], kind="stable")]
+    found = []
+    for family in np.split(inner, np.flatnonzero(np.diff(depth[inner])) + 1)[::-1]:
+        count = tree.child_count[family].astype(np.int64)
+        starts = np.cumsum(count) - count
+        first = tree.child_start[family].astype(np.int64)
+        if len(family):
+            found.append((family, starts, np.repeat(first - starts, count) + np.arange(count.sum())))
+    return found
+
+
+def with_plain_opacity(splats: Splats) -> Splats:
+    """Return splats with opacities of at most 1, those above enlarged so that they cover as much on the screen."""
+    above = np.flatnonzero(splats.opacity > 1)
+    if not above.size:
+        return splats
+    scale, opacity = splats.scale.copy(), splats.opacity.copy()
+    factor = np.sqrt(harmonic(opacity[above].astype(np.float64))[0])
+    with np.errstate(over="ignore"):
+        scale[above] = np.minimum(scale[above] * factor[:, None], np.finfo(np.float32).max)
+    opacity[above] = 1
+    return dataclasses.replace(splats, scale=scale, opacity=opacity)

@@ -8,25 +8,47 @@
 3. The binary tree's least useful nodes are dropped (`kernels/prune.py`).
 
 docs/decisions/2026-11-21-fidelity.md has the reasons, and the alternatives that were tried.
+
+In stages, the nodes of a region merge level by level, too. Before each level those nodes are set aside that are so
+close to the region's border that their best partner may be beyond it; they are handed on, and merge at that level in
+the stage of a larger region. So trees have no seams along borders. Each stage prunes the nodes that it made, and leaves
+part of what the growth allows to the stages above it.
 """
 
 from __future__ import annotations
 
-import numpy as np
+import math
+from dataclasses import dataclass, fields, replace
 
+import numpy as np
+from numpy.typing import NDArray
+
+from ..model.gaussian import spark_size
 from ..model.lod_tree import LodTree
 from ..model.splats import FloatArray, Splats
 from ..support.defaults import DEFAULT_GROWTH, MAX_GROWTH, MIN_GROWTH
 from ..support.jit import threads_for
 from ..support.progress import Progress, silent
-from .check import check, check_setting
-from .pairs.binary import BinaryTree, Levels, levels_of, lowest_level, merge_levels
-from .pairs.curve import Curve
-from .pairs.final_tree import Wanted, in_final_order
+from .check import Bounds, check, check_setting
+from .final_tree import FinalTree, PruningGoal, in_final_order
+from .kernels import pair_cost
+from .kernels.sort import Nodes
+from .pair_tree import BinaryTree, Curve, Levels, levels_of, lowest_level, merge_levels
+from .stage_records import NO_FAMILY, STAGE_BITS, Families, Pending, Region, Survey
+
+#: For each node that a stage hands on, it leaves this many times what the growth allows for a leaf to those above it:
+#: more than once, as the pruning of a stage adds to what it hands on. Measured: once loses up to 0.3 dB.
+RESERVE = 1.25
+
+#: ln(size in units) of rank 0: larger than any size.
+HIGHEST = 128 * math.log(2)
+
+#: The rank of the children of a leaf, which has none: after all others.
+LAST = np.iinfo(np.int32).max
 
 
 def build(splats: Splats, growth: float = DEFAULT_GROWTH, *, progress: Progress = silent) -> tuple[Splats, LodTree]:
-    """Builds a Level-of-Detail tree whose cuts are close to full detail.
+    """Build a Level-of-Detail tree whose cuts are close to full detail.
 
     The result does not depend on the number of threads. Each input splat is one leaf, bit for bit.
     The root is node 0, siblings are consecutive and come after their parent. Any prefix of the nodes is a coarser
@@ -54,14 +76,173 @@ def build(splats: Splats, growth: float = DEFAULT_GROWTH, *, progress: Progress 
         index = curve.order(splats.center, threads)
         binary = BinaryTree.of_leaves(*curve.leaf_rows(splats, index))
         merge_levels(binary, _levels(binary.size[:n]), curve, None, progress)
-        wanted = Wanted(max(int(growth * n) - n, 1), n)
+        goal = PruningGoal(max(int(growth * n) - n, 1), n)
         columns = dict(vars(splats))
         del splats
-        final = in_final_order(binary, index, columns, wanted, curve, progress)
+        final = in_final_order(binary, index, columns, goal, curve, progress)
         return final.splats, final.tree
 
 
 def _levels(size: FloatArray) -> Levels:
-    """(n,) levels that leaves of a size, in units, join at."""
+    """Return the (n,) levels that leaves of a size, in units, join at."""
     levels = levels_of(size)
     return np.maximum(levels, lowest_level(levels), out=levels)
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """What all stages of a build share.
+
+    Attributes:
+        growth: maximum ratio of nodes to leaves of the whole tree.
+        curve: of the whole scene.
+        lowest: first level that nodes merge at.
+    """
+
+    growth: float
+    curve: Curve
+    lowest: int
+
+
+@dataclass(frozen=True, eq=False)
+class _Nodes:
+    """What the builder knows of pending nodes besides how they are drawn: the other columns of `Pending`.
+
+    Attributes:
+        rows: (n, WIDTH) float32 node rows.
+        size: (n,) float32 feature sizes, units.
+        level: (n,) int32 at which they merge next.
+        family: (n,) int64 numbers of their families.
+        rank: (n,) int32 batches of their families, LAST for leaves.
+        leaves, merged: (n,) int64 numbers of leaves and of merged nodes in their trees; only the sums have a meaning.
+    """
+
+    rows: FloatArray
+    size: FloatArray
+    level: Levels
+    family: NDArray[np.int64]
+    rank: NDArray[np.int32]
+    leaves: NDArray[np.int64]
+    merged: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, pending: Pending, index: NDArray[np.unsignedinteger], plan: Plan) -> _Nodes:
+        """Of some of the pending nodes; if they are fresh from `leaves`, the columns are those of leaves."""
+        columns = pending.columns
+        if "rows" in columns:
+            return cls(**{field.name: columns[field.name][index] for field in fields(cls)})
+        rows, size = plan.curve.leaf_rows(pending.splats, index)
+        count = len(index)
+        family, rank = np.full(count, NO_FAMILY, np.int64), np.full(count, LAST, np.int32)
+        level = np.maximum(levels_of(size), plan.lowest)
+        return cls(rows, size, level, family, rank, np.ones(count, np.int64), np.zeros(count, np.int64))
+
+    def pending(self, splats: Splats) -> Pending:
+        """With how they are drawn."""
+        return Pending.of(splats, **vars(self))
+
+
+def plan(survey: Survey, setting: float) -> Plan:
+    """See `StagedBuilder`; the setting is the growth, 1.05 to 2."""
+    check_setting("growth", setting, MIN_GROWTH, MAX_GROWTH)
+    bounds = Bounds(np.array(survey.low), np.array(survey.high), survey.smallest, survey.largest)
+    curve = Curve.of(survey.sample, bounds)
+    _, size = curve.leaf_rows(survey.sample, np.arange(len(survey.sample), dtype=np.uint32))
+    return Plan(setting, curve, lowest_level(levels_of(size)))
+
+
+def leaves(splats: Splats, index: NDArray[np.int64], plan: Plan) -> Pending:
+    """See `StagedBuilder`."""
+    return Pending.of(splats)
+
+
+def advance(
+    pending: Pending, region: Region | None, stage: int, plan: Plan, *, progress: Progress
+) -> tuple[Families, Pending]:
+    """See `StagedBuilder`."""
+    splats, count = pending.splats, len(pending)
+    if count <= 1:
+        everything = np.arange(count, dtype=np.uint32)
+        return _no_families(splats), _Nodes.of(pending, everything, plan).pending(splats)
+    curve = plan.curve.around(splats.center)
+    with threads_for(count) as threads:
+        index = curve.order(splats.center, threads)
+        nodes = _Nodes.of(pending, index, plan)
+        binary = BinaryTree.of_leaves(nodes.rows, nodes.size)
+        nodes = replace(nodes, rows=np.empty((0, pair_cost.WIDTH), np.float32))  # the tree writes over them
+        left = merge_levels(binary, nodes.level, curve, region, progress)
+        goal = _pruning_goal(nodes, len(left[0]), region, plan)
+        final = in_final_order(binary, index, dict(vars(splats)), goal, plan.curve, progress)
+    numbers = np.full(len(final.order), NO_FAMILY, np.int64)
+    is_leaf = final.order < count
+    numbers[is_leaf] = nodes.family[final.order[is_leaf]]
+    numbers[final.parents] = (stage << STAGE_BITS) | np.arange(len(final.parents))
+    families = _families(final, numbers)
+    if region is None:
+        return families, Pending.of(final.splats.take(slice(1)), family=numbers[:1])
+    sums = int(nodes.leaves.sum()), int(nodes.merged.sum()) + len(final.parents)
+    return families, _rest(final, pending, index, left, numbers, sums, plan)
+
+
+def _pruning_goal(nodes: _Nodes, handed: int, region: Region | None, plan: Plan) -> PruningGoal:
+    """Return the goal of a stage that hands on so many nodes."""
+    splats = int(nodes.leaves.sum())
+    most = int(plan.growth * splats) - splats - int(nodes.merged.sum())
+    if region is None:
+        one_stage = bool((nodes.family == NO_FAMILY).all())  # then the tree is that of `quality.build`
+        return PruningGoal(max(most, 1), splats, highest=None if one_stage else HIGHEST, latest=nodes.rank)
+    reserve = max(1, math.ceil(min(RESERVE * (plan.growth - 1), 1) * handed))
+    return PruningGoal(max(most - reserve, 0), splats, False, HIGHEST, nodes.rank)
+
+
+def _families(final: FinalTree, numbers: NDArray[np.int64]) -> Families:
+    """Return the families of the nodes that a stage kept; `numbers` are those of all nodes' families."""
+    children = slice(final.first_child, None)
+    nodes, parents = final.splats.take(children), final.splats.take(final.parents)
+    count, size = final.tree.child_count[final.parents], spark_size(parents)
+    return Families(final.ranks, final.keys[:, None], count, nodes, numbers[children], parents.center, size)
+
+
+def _no_families(splats: Splats) -> Families:
+    """Of a stage without a merge."""
+    none = splats.take(slice(0, 0))
+    empty = np.empty(0, np.int32), np.empty((0, 1), np.uint64), np.empty(0, np.uint16)
+    return Families(*empty, none, np.empty(0, np.int64), none.center, none.opacity)
+
+
+def _rest(
+    final: FinalTree,
+    pending: Pending,
+    index: Nodes,
+    left: tuple[Nodes, Levels],
+    numbers: NDArray[np.int64],
+    sums: tuple[int, int],
+    plan: Plan,
+) -> Pending:
+    """Return the nodes that a stage hands on: those without a parent, which come right after the first.
+
+    Args:
+        final: tree of the stage.
+        pending: what it began with.
+        index: (n,) places there of the tree's leaves.
+        left: nodes without a parent before the tree was pruned, and the levels at which they merge next.
+        numbers: (M,) of the families of the nodes of `final`.
+        sums: numbers of leaves and of merged nodes under all that is handed on.
+        plan: of the build.
+    """
+    here = slice(1, final.first_child)
+    splats, node, family = final.splats.take(here), final.order[here], numbers[here]
+    merged = node >= len(index)
+    nodes = _Nodes.of(pending, index[np.where(merged, 0, node)], plan)
+    own = family[merged] & ((1 << STAGE_BITS) - 1)
+    nodes.rows[merged], nodes.rank[merged] = final.rows[own], final.ranks[own]
+    nodes.size[merged] = spark_size(splats)[merged] / plan.curve.unit
+    # Whose parent was pruned merges again at the level of its size.
+    nodes.level[:] = np.maximum(levels_of(nodes.size), plan.lowest)
+    by_node = np.argsort(left[0])
+    at = np.minimum(np.searchsorted(left[0], node, sorter=by_node), len(by_node) - 1)
+    known = left[0][by_node[at]] == node
+    nodes.level[known] = left[1][by_node[at]][known]
+    nodes.leaves[:], nodes.merged[:] = 0, 0
+    nodes.leaves[:1], nodes.merged[:1] = sums
+    return replace(nodes, family=family).pending(splats)

@@ -39,7 +39,7 @@ class LodSettings:
 
 
 def pixel_limit(fov_y: float, height: int, scale: float = 1.0) -> float:
-    """The pixel scale of a pixel, Spark's `pixelScaleLimit`: 2 * tan(fov_y / 2) / height * scale.
+    """Return the pixel scale of a pixel, Spark's `pixelScaleLimit`: 2 * tan(fov_y / 2) / height * scale.
 
     Args:
         fov_y: radians.

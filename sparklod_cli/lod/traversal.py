@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -11,11 +12,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..model.instances import Cones, Foveation
+from ..model.instances import Cones, Foveation, Frustum
 from ..model.nodes import CHUNK_BITS, CHUNK_NODES, Nodes
-from .cut_search import CutSearch
-from .foveation import set_foveation
 from .kernels import cut_arrays, pixel_scale
+from .kernels.cut import find_cut
+
+#: Initial size of the buffers, in visited nodes per node of a cut: enough if every refined node has two or more
+#: children; for other trees the buffers grow.
+VISITS = 2
+
+#: The first threshold for a cut, as a share of the last cut's: slightly lower, because visiting some nodes
+#: unnecessarily costs less than another round. Chosen; cuts do not depend on it.
+GUESS = 0.97
 
 Matrix = NDArray[np.float64]
 
@@ -70,8 +78,8 @@ class Forest:
 
     def __init__(self, trees: Sequence[Nodes]) -> None:
         self._make_room([len(tree.size) for tree in trees], np.empty)
-        for number, tree in enumerate(trees):
-            self._put(tree, int(self.node_base[number]))
+        for tree, start in zip(trees, self.node_base.tolist(), strict=False):
+            fill_nodes(self.nodes[start : start + len(tree.size)], tree)
 
     def _make_room(self, counts: Sequence[int], make: Callable[..., NDArray[Any]]) -> None:
         """For trees of so many nodes."""
@@ -79,14 +87,6 @@ class Forest:
         chunks = [-(-count // CHUNK_NODES) for count in counts]
         self.chunk_base = np.concatenate([[0], np.cumsum(chunks)]).astype(np.int64)
         self.nodes = make(int(self.node_base[-1]), pixel_scale.NODE)
-
-    def _put(self, tree: Nodes, start: int) -> None:
-        """Writes some nodes from an index on."""
-        part = self.nodes[start : start + len(tree.size)]
-        part["x"], part["y"], part["z"] = tree.center.T
-        part["size"] = tree.size
-        part["child_start"] = tree.tree.first_child()
-        part["child_count"] = tree.tree.child_count
 
     def __len__(self) -> int:
         return len(self.node_base) - 1
@@ -97,20 +97,27 @@ class Forest:
         return int(self.chunk_base[-1])
 
     def present(self) -> NDArray[np.bool_]:
-        """(chunks,) bool, those whose nodes are in memory; not changed later."""
+        """Return the (chunks,) bool, those whose nodes are in memory; not changed later."""
         return np.ones(self.chunks, np.bool_)
 
     def read(self, chunks: NDArray[np.bool_]) -> None:
-        """Reads those of these chunks, (chunks,) bool, that are not in memory."""
+        """Read those of these chunks, (chunks,) bool, that are not in memory."""
 
     def read_some(self, wanted: NDArray[np.float32], present: NDArray[np.bool_]) -> bool:
-        """Reads chunks that a cut wants; False if it lacked none.
+        """Read chunks that a cut wants; False if it lacked none.
 
         Args:
             wanted: (chunks,) float32, of a `TreeCut`.
             present: (chunks,) bool that it was found with.
         """
         return False
+
+
+def fill_nodes(rows: NDArray[np.void], nodes: Nodes) -> None:
+    """Fill rows of `pixel_scale.NODE`."""
+    rows["x"], rows["y"], rows["z"] = nodes.center.T
+    rows["size"] = nodes.size
+    rows["child_start"], rows["child_count"] = nodes.tree.first_child(), nodes.tree.child_count
 
 
 @dataclass(frozen=True)
@@ -126,7 +133,6 @@ class TreeCut:
         reason: why the cut is not finer, a value of `REASONS`.
         missing: number of nodes that would be refined if their children were resident, and of roots that are not.
         least: the least limit of a refined node; infinite if none was refined.
-        stop: (pixel scale, instance, index) of the node that would have exceeded the budget, or None.
         wanted: (chunks,) float32, for each chunk of all trees the largest limit of the nodes that are, or should be,
             refined and have children in it; 0 if there is none.
         seconds: that it took to find, once its chunks were in memory.
@@ -139,7 +145,6 @@ class TreeCut:
     reason: str
     missing: int
     least: float
-    stop: tuple[float, int, int] | None
     wanted: NDArray[np.float32]
     seconds: float = 0.0
 
@@ -147,11 +152,11 @@ class TreeCut:
         return len(self.node)
 
     def indices(self) -> list[NDArray[np.uint32]]:
-        """The nodes of the cut in each instance, ascending."""
+        """Return the nodes of the cut in each instance, ascending."""
         return [np.sort(self.node[self.instance == number]) for number in range(len(self.views))]
 
     def chunks(self) -> list[int]:
-        """The chunks of all trees that finding the cut reads, or would read if they were resident, by priority.
+        """Return the chunks of all trees that finding the cut reads, or would read if they were resident, by priority.
 
         Those of equal priority are in the order of their numbers; Spark has them in the order that its queue finds.
         """
@@ -170,72 +175,89 @@ class Traversal:
 
     def __init__(self, forest: Forest, instances: Sequence[TreeInstance]) -> None:
         self.forest, self.instances = forest, list(instances)
-        self._local = threading.local()
+        self._memory = _Memory()
         sizes = np.diff(forest.node_base)
         self._most = sum(int(sizes[instance.tree]) for instance in self.instances)
 
     def cut(
-        self,
-        view: View,
-        *,
-        budget: int,
-        smallest: float = 0.0,
-        resident: NDArray[np.bool_] | None = None,
-        threads: int = 1,
+        self, view: View, *, budget: int, smallest: float = 0.0, resident: NDArray[np.bool_] | None = None
     ) -> TreeCut:
-        """The cut that a viewer draws.
+        """Return the cut that a viewer draws.
 
         Args:
             view: the camera.
             budget: maximum number of splats, all instances together; at least one per instance.
             smallest: nodes of this pixel scale or less are not refined; see `settings.pixel_limit`.
             resident: (chunks,) bool, of all trees; all chunks are resident unless given.
-            threads: that find a large cut, if all chunks are resident; the cut is the same for any number. For several
-                cuts, it is faster to find one on each thread.
         """
         if resident is not None:
             self.forest.read(resident)
-            return self._cut(view, budget, smallest, resident, threads)
+            return self._cut(view, budget, smallest, resident)
         while True:
             # As long as chunks are not in memory that would be read next, the cut is one of a viewer that lacks them.
             present = self.forest.present()
-            found = self._cut(view, budget, smallest, present, threads)
-            if not self.forest.read_some(found.wanted, present):
-                return found
+            cut = self._cut(view, budget, smallest, present)
+            if not self.forest.read_some(cut.wanted, present):
+                return cut
 
-    def _cut(self, view: View, budget: int, smallest: float, present: NDArray[np.bool_], threads: int) -> TreeCut:
-        """The cut with these chunks, which are in memory."""
+    def _cut(self, view: View, budget: int, smallest: float, present: NDArray[np.bool_]) -> TreeCut:
+        """Return the cut with these chunks, which are in memory."""
         start = time.perf_counter()
         views = views_of(self.forest, self.instances, view)
         trees = cut_arrays.Trees(self.forest.nodes, views, present, CHUNK_BITS)
-        found = self._search().find(trees, smallest, budget, threads)
+        stop = cut_arrays.Stop(np.float32(smallest).view(np.int32), budget)
+        room = min(budget, self._most) + 1  # the kernel writes one more before it knows whether that is drawn
+        nodes = cut_arrays.CutNodes(np.empty(room, np.uint32), np.empty(room, np.int32), np.empty(room, np.uint16))
+        wanted, memory = np.empty(len(present), np.float32), self._memory
+        size = VISITS * budget + CHUNK_NODES
+        while True:
+            size = min(size, 2 * self._most)  # a node is visited by its threshold, and once more by the queue
+            if memory.slots is None or len(memory.slots.node) <= size:
+                memory.slots = _slots(size)
+            slots, guess = memory.slots, np.float32(memory.guess)
+            selected, reason, missing, least, _ = find_cut(trees, stop, guess, slots, wanted, nodes)
+            if reason != cut_arrays.FULL:
+                break
+            size = 2 * len(slots.node)
+        # The next cut is likely to be similar.
+        memory.guess = GUESS * float(least) if reason == cut_arrays.BUDGET else smallest
         return TreeCut(
             views=views,
-            node=found.nodes.node,
-            instance=found.nodes.instance,
-            limit=found.nodes.limit.view(np.float32),
-            reason=REASONS[found.reason],
-            missing=found.missing,
-            least=found.least,
-            stop=found.stop,
-            wanted=found.wanted,
+            node=nodes.node[:selected],
+            instance=nodes.instance[:selected],
+            limit=nodes.limit[:selected].view(np.float32),
+            reason=REASONS[reason],
+            missing=missing,
+            least=float(least),
+            wanted=wanted,
             seconds=time.perf_counter() - start,
         )
 
     def forget(self) -> None:
-        """Discards the threshold of this thread's last cut. The next cut is the same either way."""
-        self._search().guess = 0.0
+        """Discard the threshold of this thread's last cut. The next cut is the same either way."""
+        self._memory.guess = 0.0
 
-    def _search(self) -> CutSearch:
-        """This thread's."""
-        search: CutSearch | None = getattr(self._local, "search", None)
-        if search is None:
-            search = self._local.search = CutSearch(self._most)
-        return search
+
+class _Memory(threading.local):
+    """Buffers of a thread, and the threshold that its next cut begins with; 0 for none."""
+
+    slots: cut_arrays.Slots | None = None
+    guess = 0.0
+
+
+def _slots(size: int) -> cut_arrays.Slots:
+    """Return buffers for so many visited nodes."""
+    return cut_arrays.Slots(
+        node=np.empty(size + 1, np.uint32),
+        instance=np.empty(size + 1, np.uint16),
+        sums=np.empty(cut_arrays.BUCKETS, np.int32),
+        tally=np.empty(cut_arrays.TALLIES, np.int64),
+        **{name: np.empty(size + 1, np.int32) for name in ("limit", "first", "queue", "pending", "heap")},
+    )
 
 
 def views_of(forest: Forest, instances: Sequence[TreeInstance], view: View) -> NDArray[np.void]:
-    """(instances,) `pixel_scale.VIEW`: the camera in the space of each instance, in Spark's precision."""
+    """Return (instances,) `pixel_scale.VIEW`: the camera in the space of each instance, in Spark's precision."""
     views = np.zeros(len(instances), pixel_scale.VIEW)
     for row, instance in zip(views, instances, strict=True):
         view_to_object = (np.linalg.inv(instance.object_to_world) @ view.camera_to_world).astype(np.float32)
@@ -255,7 +277,31 @@ def views_of(forest: Forest, instances: Sequence[TreeInstance], view: View) -> N
 
 
 def _unit(vector: NDArray[np.float32]) -> NDArray[np.float32]:
-    """A unit vector as glam, Spark's library, computes it: divided by its length, in float32."""
+    """Return a unit vector as glam, Spark's library, computes it: divided by its length, in float32."""
     x, y, z = vector
     unit: NDArray[np.float32] = vector / np.sqrt((x * x + y * y) + z * z)
     return unit
+
+
+def set_foveation(row: np.void, foveation: Foveation, fov_x: float, fov_y: float) -> None:
+    """Fill the foveation fields of a `kernels.pixel_scale.VIEW`; fields of view in radians."""
+    row["behind"] = foveation.behind
+    if isinstance(foveation, Frustum):
+        row["kind"] = pixel_scale.FRUSTUM
+        row["side"] = foveation.outside
+        row["inner"], row["outer"] = math.tan(fov_x / 2), math.tan(fov_y / 2)
+    else:
+        row["kind"] = pixel_scale.CONE
+        row["side"] = foveation.foveate
+        row["inner"] = _half_angle_cosine(foveation.fov0)
+        row["outer"] = min(row["inner"], _half_angle_cosine(foveation.fov))
+    if row["behind"] == row["side"] == 1:
+        row["kind"] = pixel_scale.NO_FOVEATION
+
+
+def _half_angle_cosine(degrees: float) -> np.float32:
+    """Return the cosine of half an angle, of 0 to 180 degrees at most; rounded to float32 where Spark rounds."""
+    if degrees <= 0:
+        return np.float32(1)
+    radians = np.float32(0.5) * np.float32(min(degrees, 180)) * np.float32(math.pi / 180)
+    return np.float32(math.cos(float(radians)))

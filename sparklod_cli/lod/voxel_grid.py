@@ -2,6 +2,8 @@
 
 Nodes of a level are about base ** level large. A cell is wider, so that it holds several of them to choose from, and is
 divided into parts, along which its nodes are sorted. From level to level the grid is shifted, and its seams with it.
+
+`Margins` are where nodes can be that a stage of the builder does not know: outside of its region, and near its faces.
 """
 
 from __future__ import annotations
@@ -14,9 +16,8 @@ from numpy.typing import NDArray
 
 from ..model.splats import FloatArray
 from .check import Bounds
-from .kernels.group import level_keys
 from .kernels.node_rows import Space
-from .kernels.sort import PART_BITS, Keys, Parts
+from .kernels.sort import PART_BITS, Keys, Nodes, Parts, level_keys, split_box
 
 #: Largest coordinate in steps of a level: parts are half a step wide, their coordinates int64, and so must be their
 #: differences. No level is finer than this allows.
@@ -43,6 +44,10 @@ FARTHEST = 1e15
 #: float32, the base is at least 1.1), fit a uint64.
 CURVE_BITS = 17
 
+FLOAT_MAX = np.float32(np.finfo(np.float32).max)
+INFINITY = np.float32(np.inf)
+Corner = tuple[float, float, float]
+
 
 @dataclass(frozen=True)
 class VoxelGrid:
@@ -67,7 +72,7 @@ class VoxelGrid:
 
     @classmethod
     def of(cls, bounds: Bounds, base: float) -> VoxelGrid:
-        """The grid of a scene with these bounds."""
+        """Return the grid of a scene with these bounds."""
         farthest = float(np.abs([bounds.low, bounds.high]).max())
         finest = math.floor(math.log(max(bounds.smallest, farthest / MAX_STEPS), base))
         coarsest = max(finest + 1, math.ceil(math.log(bounds.largest, base)) + 1)
@@ -87,16 +92,16 @@ class VoxelGrid:
         return self.base ** np.arange(self.finest, self.coarsest + 1, dtype=np.float64)
 
     def step(self, level: int) -> np.float64:
-        """The step of any level, in units."""
+        """Return the step of any level, in units."""
         return np.float64(np.float64(self.base) ** (self.finest + level) / self.unit)
 
     def largest_trace(self, level: int) -> np.float32:
-        """The largest trace of the covariance of a node that is merged at a level, units squared; may be infinite."""
+        """Return the largest trace of the covariance of a node merged at a level, units squared; may be infinite."""
         size = LIMIT * float(self.step(level))
         return np.float32(0.75 * size * size if size < FARTHEST**1.2 else math.inf)
 
     def shift(self, level: int) -> NDArray[np.int64]:
-        """(3,) parts, fewer than a cell has, by which the grid of a level is shifted."""
+        """Return the (3,) parts, fewer than a cell has, by which the grid of a level is shifted."""
         return np.floor(np.array(SHIFT) * level % 1 * PARTS).astype(np.int64)
 
     def part_edge(self, level: int) -> np.float64:
@@ -104,19 +109,19 @@ class VoxelGrid:
         return self.step(level) * np.float64(CELL / PARTS)
 
     def box(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """The corners of the box of all centres, in units, as rows hold them."""
+        """Return the corners of the box of all centres, in units, as rows hold them."""
         low, high = (np.array(corner) / self.unit for corner in (self.low, self.high))
         return low.astype(np.float32).astype(np.float64), high.astype(np.float32).astype(np.float64)
 
     def parts(self, level: int) -> Parts:
-        """The parts of a level. A mean is in the box of its terms, so the scene's box bounds those of all levels."""
+        """Return the parts of a level; the scene's box bounds all, as a mean is in the box of its terms."""
         edge, shift = self.part_edge(level), self.shift(level)
         low, high = (np.floor(corner / edge).astype(np.int64) for corner in self.box())
         lowest = (low - shift) // PARTS * PARTS + shift
         return Parts(edge, lowest, int((high - lowest).max()).bit_length())
 
     def leaf_keys(self, center: FloatArray, scale: FloatArray) -> tuple[Keys, NDArray[np.int32], int]:
-        """Keys that order splats by level and along a curve, (n,) their levels, and the number of bits of a key."""
+        """Return keys that order splats by level and along a curve, their (n,) levels, and the bits of a key."""
         steps = self.steps
         low, high = np.array(self.low), np.array(self.high)
         edge = max(float((high - low).max()) / (2**CURVE_BITS - 2), float(steps[0]))  # one cell to spare at either end
@@ -128,3 +133,62 @@ class VoxelGrid:
     def last_level(self) -> int:
         """The level of the largest splat, the last one that a splat joins at."""
         return max(0, int(np.searchsorted(self.steps, self.largest)))
+
+
+class Margins:
+    """The centres that unknown nodes can have: on some axis, at most `below` or at least `above`; in units."""
+
+    def __init__(self, grid: VoxelGrid, low: Corner, high: Corner) -> None:
+        """Before the first level: whatever is not within low <= centre < high, world units, which may be infinite."""
+        self._grid = grid
+        self._low, self._high = (corner.tolist() for corner in grid.box())
+        # As centres of rows are rounded, if at all.
+        self._below = [_rounded(value / grid.unit) for value in low]
+        self._above = [_rounded(value / grid.unit) for value in high]
+
+    def widen(self, level: int) -> None:
+        """Take the whole cells of a level that unknown nodes can be in; called for one level after another."""
+        edge, shift = float(self._grid.part_edge(level)), self._grid.shift(level).tolist()
+        for axis in range(3):
+            below, above = self._below[axis], self._above[axis]
+            # No centre lies outside of the box of the scene, known or unknown.
+            has_below, has_above = below >= self._low[axis], above <= self._high[axis]
+            last = _first_part(float(below), edge, shift[axis]) + PARTS - 1 if has_below else 0
+            first = _first_part(float(above), edge, shift[axis]) if has_above else 0
+            self._below[axis] = _last_of_part(last, edge) if has_below else -INFINITY
+            self._above[axis] = _first_of_part(first, edge) if has_above else INFINITY
+
+    @property
+    def are_closed(self) -> bool:
+        """Whether no centre in the box of the scene is off the margins."""
+        sides = zip(self._below, self._above, self._low, self._high, strict=True)
+        return any(float(below) >= min(float(above), high) or float(above) <= low for below, above, low, high in sides)
+
+    def split(self, nodes: Nodes, geometry: FloatArray) -> tuple[Nodes, Nodes]:
+        """Separate nodes off the margins, whose cells no unknown node can be in, from the others."""
+        return split_box(nodes, geometry, np.array(self._below), np.array(self._above))
+
+
+def _rounded(value: float) -> np.float32:
+    """Return the nearest float32, which may be infinite."""
+    return np.float32(value if math.isinf(value) else min(max(value, -float(FLOAT_MAX)), float(FLOAT_MAX)))
+
+
+def _first_part(value: float, edge: float, shift: int) -> int:
+    """Return the first part of the cell that a coordinate is in."""
+    return (math.floor(value / edge) - shift) // PARTS * PARTS + shift
+
+
+def _last_of_part(part: int, edge: float) -> np.float32:
+    """Return the largest float32 in a part of an axis or in one below it."""
+    near = np.float32(min(max((part + 1) * edge, -float(FLOAT_MAX)), float(FLOAT_MAX)))
+    while near > -FLOAT_MAX and math.floor(float(near) / edge) > part:
+        near = np.nextafter(near, -INFINITY)
+    while near < FLOAT_MAX and math.floor(float(after := np.nextafter(near, INFINITY)) / edge) <= part:
+        near = after
+    return near
+
+
+def _first_of_part(part: int, edge: float) -> np.float32:
+    """Return the least float32 in a part of an axis or in one above it."""
+    return np.nextafter(_last_of_part(part - 1, edge), INFINITY)

@@ -19,13 +19,14 @@ from ..model.splats import COLUMNS, FloatArray, Splats
 from ..support.jit import threads_for
 from ..support.parallel import blocks_of
 from .kernels.cell_pairs import merge_in_cells, split_families
-from .kernels.final_order import fill_leaves, merge_colors
-from .kernels.node_rows import Space, fill_merged_splats
+from .kernels.geometry import SplatColumns
+from .kernels.node_rows import Space, fill_leaf_rows, fill_leaves, fill_merged_splats, merge_colors
 from .kernels.pair_cost import WEIGHT, WIDTH
-from .kernels.sort import Keys, Nodes
+from .kernels.sort import Keys, Nodes, sort_by_key
+from .voxel_grid import VoxelGrid
 
 #: In place of the number of a node that was given, for a node that was made.
-MADE = np.uint32(0xFFFFFFFF)
+MERGED = np.uint32(0xFFFFFFFF)
 
 #: Rows that are moved at a time: their copies stay in a processor's cache.
 MOVED = 1 << 14
@@ -62,21 +63,21 @@ class Rows:
 
     @classmethod
     def concat(cls, parts: list[Rows]) -> Rows:
-        """All parts in order."""
+        """Return all parts in order."""
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__dataclass_fields__))
 
     def take(self, nodes: Nodes | slice) -> Rows:
-        """Some of the nodes."""
+        """Return some of the nodes."""
         return Rows(self.node[nodes], self.number[nodes], self.count[nodes])
 
     def shrink(self, size: int) -> None:
-        """Gives memory back but for the first rows. Nobody may have a view of them."""
+        """Give memory back but for the first rows. Nobody may have a view of them."""
         for name in self.__dataclass_fields__:
             column = getattr(self, name)
             column.resize((size, *column.shape[1:]), refcheck=False)
 
     def put(self, into: Rows, start: int) -> None:
-        """Writes these rows over others, from `start` on."""
+        """Write these rows over others, from `start` on."""
         part = slice(start, start + len(self))
         into.node[part], into.number[part], into.count[part] = self.node, self.number, self.count
 
@@ -99,14 +100,14 @@ class Joining:
         return len(self.index)
 
     def put(self, into: Rows, start: int) -> None:
-        """Writes their rows over others, from `start` on."""
+        """Write their rows over others, from `start` on."""
         part = slice(start, start + len(self))
         self.fill(self.index, into.node[part])
         into.number[part] = np.arange(self.number, self.number + len(self), dtype=np.uint32)
         into.count[part] = 0
 
     def rows(self) -> Rows:
-        """Their rows."""
+        """Return their rows."""
         rows = Rows.empty(len(self))
         self.put(rows, 0)
         return rows
@@ -141,7 +142,7 @@ class VoxelTree:
     def __init__(
         self, given: int, leaves: int, space: Space, keys: Callable[[int, FloatArray], Keys] | None = None
     ) -> None:
-        """A tree without nodes.
+        """Make a tree without nodes.
 
         Args:
             given: number of nodes that will be given.
@@ -165,11 +166,11 @@ class VoxelTree:
         return self._rows.node
 
     def take(self, nodes: Nodes) -> Rows:
-        """Copies of some of them."""
+        """Return copies of some of them."""
         return self._rows.take(nodes)
 
     def join(self, active: Nodes, rows: Rows | Joining) -> Nodes:
-        """Adds nodes; returns where the active ones and they are. Others may be forgotten."""
+        """Add nodes; returns where the active ones and they are. Others may be forgotten."""
         active = self.tidy(active, len(rows))
         rows.put(self._rows, self._used)
         self._awaited -= len(rows)
@@ -178,7 +179,7 @@ class VoxelTree:
         return np.concatenate([active, added])
 
     def tidy(self, active: Nodes, more: int = 0) -> Nodes:
-        """Makes room for so many more nodes, and for what all of them are merged into; returns where the active are."""
+        """Make room for so many more nodes, and for what all of them are merged into; returns where the active are."""
         need, size = len(active) + 2 * more, len(self._rows)
         if self._used + need <= size and self._used <= 2 * len(active) + more:
             return active
@@ -189,7 +190,7 @@ class VoxelTree:
         return active
 
     def _forget(self, active: Nodes) -> Nodes:
-        """Moves the active nodes together, in place; returns where they are."""
+        """Move the active nodes together, in place; returns where they are."""
         kept = np.zeros(self._used, np.bool_)
         kept[active] = True
         order = np.flatnonzero(kept).astype(np.uint32)
@@ -202,7 +203,7 @@ class VoxelTree:
         return place[active]
 
     def merge_cells(self, level: int, nodes: Nodes, is_first: NDArray[np.bool_], largest: np.float32) -> Nodes:
-        """Merges the nodes of each cell, as `kernels.cell_pairs.merge_in_cells`; returns the nodes without a parent."""
+        """Merge the nodes of each cell, as `kernels.cell_pairs.merge_in_cells`; returns the nodes without a parent."""
         owner, row = merge_in_cells(nodes, is_first, self._rows.node, largest, self._used)
         members, first, made, survivors = split_families(nodes, owner, row)
         del owner, row
@@ -216,7 +217,7 @@ class VoxelTree:
         return survivors
 
     def write(self, nodes: Nodes) -> None:
-        """Puts nodes before all that have been written."""
+        """Put nodes before all that have been written."""
         end = len(self._weight) - self.total
         part = slice(end - len(nodes), end)
         rows, count = self._rows, len(nodes)
@@ -229,7 +230,7 @@ class VoxelTree:
         self.total += count
 
     def finish(self, tops: Rows, index: Nodes, given: Splats) -> Final:
-        """The nodes as they are drawn: those without a parent, then the children of the batches, last batch first.
+        """Return the nodes as they are drawn: those without a parent, then children of the batches, the last first.
 
         Colours are merged here, where those of siblings are adjacent. The tree is of no use afterwards.
 
@@ -246,7 +247,7 @@ class VoxelTree:
         inner = np.flatnonzero(count).astype(np.uint32)
         start = np.zeros(total, np.uint32)
         start[inner] = np.uint32(total) - number[inner]
-        number[inner] = MADE
+        number[inner] = MERGED
         owner = np.zeros(total + 1, np.uint32)  # of a family, by its first child
         owner[start[inner]] = inner + np.uint32(1)
         parents = owner[owner > 0] - np.uint32(1)
@@ -276,7 +277,7 @@ class Final:
     Attributes:
         nodes: M nodes, as they are drawn.
         tree: the children that they were given here.
-        number: (M,) uint32 of the nodes that were given, `MADE` for the others.
+        number: (M,) uint32 of the nodes that were given, `MERGED` for the others.
         parents: (F,) uint32 the nodes with children, in the order of these.
     """
 
@@ -284,3 +285,46 @@ class Final:
     tree: LodTree
     number: NDArray[np.uint32]
     parents: NDArray[np.uint32]
+
+
+def sorted_leaves(
+    center: FloatArray, scale: FloatArray, grid: VoxelGrid, threads: int, order: Nodes | None = None
+) -> tuple[Nodes, Offsets]:
+    """Return the splats by level and then along a curve, and where each level ends.
+
+    Args:
+        center, scale: (n, 3) of the splats.
+        grid: of the scene.
+        threads: to work on.
+        order: (n,) the splats in the order of the scene; by default they are in it.
+    """
+    keys, levels, bits = grid.leaf_keys(center, scale)
+    ends = np.cumsum(np.bincount(levels))
+    del levels
+    if order is None:
+        order = np.arange(len(center), dtype=np.uint32)
+    else:
+        keys = keys[order]
+    return sort_by_key(keys, order, bits, threads)[1], ends
+
+
+def joining(index: Nodes, ends: Offsets, fill: FillRows) -> dict[int, Joining]:
+    """Return the splats of each level that has some.
+
+    Args:
+        index: (n,) the splat of each node; nodes are numbered in this order.
+        ends: where each level ends.
+        fill: fills the node rows of splats.
+    """
+    found, begin = {}, 0
+    for level, end in enumerate(ends.tolist()):
+        if end > begin:
+            found[level] = Joining(index[begin:end], begin, fill)
+        begin = end
+    return found
+
+
+def fill_rows(index: Nodes, splats: Splats, space: Space, rows: FloatArray) -> None:
+    """Fill the node rows of some splats."""
+    columns = SplatColumns(splats.center, splats.scale, splats.quat_xyzw, splats.opacity)
+    fill_leaf_rows(index, columns, splats.rgb, space, rows, np.empty(len(index), np.float32))

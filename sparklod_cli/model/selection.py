@@ -45,7 +45,7 @@ class Tally:
         return self.count - sum(self.dropped.values())
 
     def then(self, after: Tally) -> Tally:
-        """Return the tally of these splats and of those that come after them."""
+        """That of these splats and those that come after them."""
         first = self.first_invalid
         if first is None and after.first_invalid is not None:
             first = self.count + after.first_invalid
@@ -71,24 +71,29 @@ class Selection:
     within: tuple[Vector, float] | None = None
 
     def apply(self, splats: Splats, *, threads: int = 1) -> tuple[Splats, dict[str, int]]:
-        """Return the splats that are kept, in their order, and the number dropped for each of `REASONS` that occurred.
+        """The splats that are kept, in their order, and the number dropped for each of `REASONS` that occurred.
 
         Raises:
             InvalidSplatsError: there are no splats, some are invalid without `drop_invalid`, or none is left.
         """
-        keep, tally = np.ones(len(splats), np.bool_), Tally()
-        parts = blocks_of(len(splats), EXAMINED)
-        found = ordered_map(lambda part: self.examine(splats.take(part)), parts, threads)
-        for part, (kept, some) in zip(parts, found, strict=True):
-            keep[part], tally = kept, tally.then(some)
+        keep, tally = self.examine(splats, threads=threads)
         self.check(tally)
         return (splats if keep.all() else splats.take(keep)), tally.dropped
 
-    def examine(self, splats: Splats) -> tuple[NDArray[np.bool_], Tally]:
-        """Return (N,) which splats of a scene, or of a part of it, are kept, and what becomes of the others.
+    def examine(self, splats: Splats, *, threads: int = 1) -> tuple[NDArray[np.bool_], Tally]:
+        """Return which splats of a scene, or of a part of it, are kept, (N,), and what becomes of the others.
 
         Invalid ones are not kept in any case.
         """
+        keep, tally = np.ones(len(splats), np.bool_), Tally()
+        parts = blocks_of(len(splats), EXAMINED)
+        examined = ordered_map(lambda part: self._examine(splats.take(part)), parts, threads)
+        for part, (kept, more) in zip(parts, examined, strict=True):
+            keep[part], tally = kept, tally.then(more)
+        return keep, tally
+
+    def _examine(self, splats: Splats) -> tuple[NDArray[np.bool_], Tally]:
+        """`examine` for a few splats."""
         invalid = splats.invalid()
         keeps = {kind: ~mask for kind, mask in invalid.items()} | {
             "zero_opacity": splats.opacity > 0,
@@ -106,7 +111,7 @@ class Selection:
         return keep, Tally(len(splats), {reason: count for reason, count in dropped.items() if count}, first)
 
     def check(self, tally: Tally) -> None:
-        """Check that a tree can be made of what is kept of a whole scene.
+        """Checks that a tree can be made of what is kept of a whole scene.
 
         Raises:
             InvalidSplatsError: see `apply`.
@@ -134,5 +139,5 @@ class Selection:
 
 
 def describe(dropped: dict[str, int]) -> str:
-    """Return a text such as "12 not finite, 3 cropped"."""
+    """ "12 not finite, 3 cropped", for display."""
     return ", ".join(f"{count:,} {REASONS[reason]}" for reason, count in dropped.items())

@@ -18,10 +18,10 @@ class CutSource(Protocol):
     """What pictures are of: a `CutFinder`, or a `FixedCut`."""
 
     def cut(self, camera: Camera) -> Cut:
-        """What a camera sees."""
+        """Return what a camera sees."""
 
     def candidates(self) -> Cut:
-        """All that some camera may see."""
+        """Return all that some camera may see."""
 
 
 @dataclass(frozen=True)
@@ -31,11 +31,11 @@ class FixedCut:
     whole: Cut
 
     def cut(self, camera: Camera) -> Cut:
-        """The cut, whatever the camera."""
+        """Return the cut, whatever the camera."""
         return self.whole
 
     def candidates(self) -> Cut:
-        """The cut."""
+        """Return the cut."""
         return self.whole
 
 
@@ -45,14 +45,13 @@ class CutFinder:
     Args:
         scenes: with trees or detail levels, or without.
         settings: of the viewer; None draws full detail.
-        threads: that find each cut of a tree, if it is large. Where several threads ask, one is faster.
 
     Raises:
         ValueError: the budget is too small for the roots, or there are too many instances.
     """
 
-    def __init__(self, scenes: Scenes, settings: LodSettings | None, *, threads: int = 1) -> None:
-        self.scenes, self.settings, self._threads = scenes, settings, threads
+    def __init__(self, scenes: Scenes, settings: LodSettings | None) -> None:
+        self.scenes, self.settings = scenes, settings
         self._traversal: Traversal | DetailTraversal | None = None
         self._continuous: ContinuousCuts | None = None
         if settings is not None and scenes.with_cuts:
@@ -61,7 +60,7 @@ class CutFinder:
                 self._continuous = ContinuousCuts(self._traversal)
 
     def with_budget(self, budget: int) -> CutFinder:
-        """One with another budget and traversal, for a traversal begins where its last cut ended."""
+        """Return one with another budget and traversal, for a traversal begins where its last cut ended."""
         twin = copy.copy(self)
         if self.settings is not None and self._traversal is not None:
             twin.settings = replace(self.settings, budget=budget)
@@ -69,12 +68,12 @@ class CutFinder:
         return twin
 
     def cut(self, camera: Camera) -> Cut:
-        """What a camera sees: the cut of the trees or detail levels, and all splats of scenes that have none."""
+        """Return what a camera sees: the cut of the trees or detail levels, and all splats of scenes that have none."""
         if self._traversal is None or self.settings is None:
             return self.scenes.full()
         view, limit = view_of(camera), self.settings.limit(camera.fov_y, camera.height)
         if self._continuous is None or self.settings.continuous is None:
-            found = self._traversal.cut(view, budget=self.settings.budget, smallest=limit, threads=self._threads)
+            found = self._traversal.cut(view, budget=self.settings.budget, smallest=limit)
             return self.scenes.cut_of(found)
         blended = self._continuous.cut(
             view, budget=self.settings.budget, smallest=limit, width=self.settings.continuous
@@ -84,7 +83,7 @@ class CutFinder:
         return Cut(self.scenes.parts_of(nodes), blended.threshold)
 
     def candidates(self) -> Cut:
-        """All that some camera may see: whole trees and all levels where cuts are drawn, else full detail."""
+        """Return all that some camera may see: whole trees and all levels where cuts are drawn, else full detail."""
         if self._traversal is None:
             return self.scenes.full()
         return Cut(
@@ -96,5 +95,5 @@ class CutFinder:
 
 
 def view_of(camera: Camera) -> View:
-    """A camera as the traversal sees it."""
+    """Return a camera as the traversal sees it."""
     return View(camera.camera_to_world, camera.fov_x, camera.fov_y)

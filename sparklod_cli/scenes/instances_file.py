@@ -35,7 +35,7 @@ class InstancesFileError(SparklodError):
 
 
 def read_instances(path: Path | str) -> list[Instance]:
-    """Reads the instances of a file; paths in it are relative to its folder.
+    """Read the instances of a file; paths in it are relative to its folder.
 
     Raises:
         InstancesFileError: it says something that is not an instance; names the file and the instance.
@@ -63,7 +63,7 @@ def read_instances(path: Path | str) -> list[Instance]:
 
 
 def _instance(data: Any, folder: Path) -> Instance:
-    """One instance, its name empty where it has none; `ValueError` where it is none."""
+    """Return one instance, its name empty where it has none; `ValueError` where it is none."""
     if not isinstance(data, dict):
         raise ValueError(f"is {quoted_value(data)}, not an object")
     for key in data:
@@ -83,7 +83,7 @@ def _instance(data: Any, folder: Path) -> Instance:
 
 
 def _matrix(data: Mapping[str, Any]) -> Matrix:
-    """(4, 4) of a matrix, or of scale, rotation and translation."""
+    """Return the (4, 4) matrix of a matrix, or of scale, rotation and translation."""
     if "matrix" not in data:
         x, y, z, w = _numbers(data, "rotation", [0, 0, 0, 1])
         scale = _numbers(data, "scale", [1.0])[0]
@@ -127,7 +127,7 @@ def _foveation(data: Any) -> Foveation | None:
 
 
 def _numbers(data: Mapping[str, Any], key: str, default: list[float]) -> list[float]:
-    """The finite numbers of a key, as many as it has."""
+    """Return the finite numbers of a key, as many as it has."""
     value = data.get(key, default)
     flat = value if isinstance(value, list) else [value]
     if key == "matrix" and len(flat) == 4 and all(isinstance(row, list) for row in flat):

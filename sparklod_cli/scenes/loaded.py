@@ -24,10 +24,8 @@ from ..model.scene import Scene
 from ..model.splats import Splats
 from ..model.transforms import common, rotated
 from ..support.units import count_of
-from .detail_scene import LoadedDetail
-from .loaded_scene import Index, LoadedScene, depth_of, nodes_of
-from .paged_forest import PagedForest
-from .paged_scene import PagedScene, sampled_balls
+from .loaded_scene import Index, LoadedDetail, LoadedScene, nodes_of
+from .pages import PagedForest, PagedScene, sampled_balls
 
 Weights = NDArray[np.float64]
 
@@ -62,8 +60,7 @@ class Part:
     @property
     def depth(self) -> NDArray[np.int32]:
         """(M,) edges from the root to each, or its detail level; 0 of scenes without."""
-        depth = self.scene.depth
-        return np.zeros(len(self.index), np.int32) if depth is None else depth[self.index]
+        return self.scene.depth[self.index]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -144,7 +141,7 @@ class Scenes:
 
     @functools.cached_property
     def details(self) -> list[LoadedDetail]:
-        """The scenes at several detail levels, in the order of `detail_forest`."""
+        """The scenes at several detail levels, in the order of `forest`."""
         return [loaded for loaded in self.loaded if isinstance(loaded, LoadedDetail)]
 
     @property
@@ -167,7 +164,7 @@ class Scenes:
         return sum(loaded.leaf_count for loaded in self.of_instance if loaded.has_cuts)
 
     def splats_of(self, budget: Budget) -> int:
-        """The splats of a budget, of which some are shares of the leaves."""
+        """Return the splats of a budget, of which some are shares of the leaves."""
         if budget.by_default and self.details:
             budget = replace(budget, count=detail_rule.BUDGET)
         return budget.of(self.leaves if budget.share is not None else 0)
@@ -176,24 +173,16 @@ class Scenes:
     def forest(self) -> Forest:
         """The trees, or the scenes at several detail levels, as traversals read them."""
         if self.details:
-            return self.detail_forest
+            return DetailForest(
+                *zip(*((each.detail, each.scene.splats, each.files) for each in self.details), strict=True)
+            )
         if not any(isinstance(loaded, PagedScene) for loaded in self.trees):
             return Forest([self._nodes(loaded.scene) for loaded in self.trees])
         return PagedForest(
             [
-                loaded.pages if isinstance(loaded, PagedScene) else (self._nodes(loaded.scene), depth_of(loaded))
+                loaded.pages if isinstance(loaded, PagedScene) else (self._nodes(loaded.scene), loaded.depth)
                 for loaded in self.trees
             ]
-        )
-
-    @functools.cached_property
-    def detail_forest(self) -> DetailForest:
-        """The scenes at several detail levels as traversals read them."""
-        details = self.details
-        return DetailForest(
-            [loaded.detail for loaded in details],
-            [loaded.scene.splats for loaded in details],
-            [loaded.files for loaded in details],
         )
 
     @functools.cached_property
@@ -201,14 +190,14 @@ class Scenes:
         """(nodes,) edges from the root to each node of `forest`, as far as it was read, or the detail level of each."""
         if isinstance(self.forest, PagedForest):
             return self.forest.depth
-        return np.concatenate([depth_of(loaded) for loaded in self.with_cuts])
+        return np.concatenate([loaded.depth for loaded in self.with_cuts])
 
     def _nodes(self, scene: Scene) -> Nodes:
         assert scene.tree is not None
         return nodes_of(scene.splats, scene.tree, scene.coding, precision=self.precision, threads=self.threads)
 
     def tree_instances(self, foveation: Foveation) -> list[TreeInstance]:
-        """The instances of which cuts are drawn; those without a foveation of their own have this one."""
+        """Return the instances of which cuts are drawn; those without a foveation of their own have this one."""
         numbers = {id(loaded): number for number, loaded in enumerate(self.with_cuts)}
         return [
             TreeInstance(numbers[id(loaded)], at.object_to_world, at.lod_scale, at.foveation or foveation)
@@ -217,7 +206,7 @@ class Scenes:
         ]
 
     def traversal(self, settings: LodSettings, *, remembers: bool = False) -> Traversal | DetailTraversal:
-        """Finds the cuts of the instances of trees, or of scenes at several detail levels.
+        """Find the cuts of the instances of trees, or of scenes at several detail levels.
 
         Args:
             settings: of the viewer.
@@ -233,14 +222,8 @@ class Scenes:
             raise ValueError(f"a budget of {budget} is less than one for each of {len(instances)} instances")
         if len(instances) > MAX_INSTANCES:
             raise ValueError(f"{len(instances):,} instances are more than {MAX_INSTANCES:,}")
-        if not self.details:
+        if not isinstance(self.forest, DetailForest):
             return Traversal(self.forest, instances)
-        self._check_detail(settings)
-        fixed = sum(loaded.leaf_count for loaded in self.of_instance if not loaded.has_cuts)
-        return DetailTraversal(self.detail_forest, instances, settings.detail, fixed=fixed, remembers=remembers)
-
-    def _check_detail(self, settings: LodSettings) -> None:
-        """Raises a ValueError for what viewers of Streamed SOG do not do."""
         if settings.continuous is not None:
             raise ValueError(f"{self.details[0].name} is Streamed SOG; continuous cuts are of trees alone")
         for at, loaded in zip(self.instances, self.of_instance, strict=True):
@@ -248,18 +231,20 @@ class Scenes:
                 raise ValueError(
                     f"{at.name} is Streamed SOG, and has a foveation, which is for trees alone; leave it out"
                 )
+        fixed = sum(loaded.leaf_count for loaded in self.of_instance if not loaded.has_cuts)
+        return DetailTraversal(self.forest, instances, settings.detail, fixed=fixed, remembers=remembers)
 
     def full(self) -> Cut:
         """Full detail: all leaves, and all splats of scenes without trees."""
         return Cut(tuple(map(self._whole, range(len(self.instances)))))
 
     def cut_of(self, found: TreeCut) -> Cut:
-        """What a traversal of these scenes found, with its splats."""
+        """Return what a traversal of these scenes found, with its splats."""
         least = found.least if np.isfinite(found.least) else None
         return Cut(self.parts_of([(nodes, None) for nodes in found.indices()]), least, found.reason)
 
     def parts_of(self, of_trees: Sequence[tuple[NDArray[np.uint32], Weights | None]]) -> tuple[Part, ...]:
-        """What is drawn of each instance: of those with cuts, in order, these nodes by these weights; of others all."""
+        """Return what is drawn of each instance: of those with cuts, in order, these nodes; of others all."""
         found = iter(of_trees)
         parts = []
         for number, (at, loaded) in enumerate(zip(self.instances, self.of_instance, strict=True)):
@@ -275,7 +260,7 @@ class Scenes:
         return Part(loaded, loaded.leaves, None, self.instances[number].object_to_world)
 
     def balls(self) -> Balls:
-        """What the splats cover in the world: full detail of every instance."""
+        """Return what the splats cover in the world: full detail of every instance."""
         if any(isinstance(loaded, PagedScene) for loaded in self.loaded):
             return sampled_balls(self.instances, self.of_instance)
         return Balls.concat(

@@ -1,19 +1,21 @@
-"""`LoadedScene`, a scene that is looked at, read once however often it stands."""
+"""Scenes that are looked at, each read once however often it stands: plain ones, trees, and several detail levels."""
 
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..codecs.gpu import loaded_nodes, lod_tree
+from ..io.details import LevelFiles
+from ..lod.detail_traversal import DetailFiles
 from ..model.lod_tree import LodTree
 from ..model.nodes import CHUNK_NODES, Nodes
-from ..model.scene import FileCoding, Scene
-from ..model.splats import Splats
+from ..model.scene import DetailScene, FileCoding, Scene
+from ..model.splats import COLUMNS, Splats
 
 Index = NDArray[np.signedinteger]
 
@@ -55,9 +57,9 @@ class LoadedScene:
         return self.is_tree
 
     @functools.cached_property
-    def depth(self) -> NDArray[np.int32] | None:
-        """(N,) edges from the root to each node; None without a tree."""
-        return None if self.scene.tree is None else self.scene.tree.depths()
+    def depth(self) -> NDArray[np.int32]:
+        """(N,) edges from the root to each node; 0 without a tree."""
+        return np.zeros(self.count, np.int32) if self.scene.tree is None else self.scene.tree.depths()
 
     @functools.cached_property
     def every(self) -> Index:
@@ -90,7 +92,7 @@ class LoadedScene:
         return -(-self.count // CHUNK_NODES)
 
     def rows(self, index: Index) -> Splats:
-        """Some splats, in the space of the scene, by their indices, ascending."""
+        """Return some splats, in the space of the scene, by their indices, ascending."""
         return self.splats if index is self.every else self.splats.take(index)
 
     @property
@@ -100,16 +102,15 @@ class LoadedScene:
         return sizes is not None and len(sizes) == self.chunks and splats == CHUNK_NODES
 
     def chunk_of(self, index: Index) -> NDArray[np.int64]:
-        """(M,) numbers of the chunks that some splats are in, where the chunks of all scenes are counted."""
+        """Return the (M,) numbers of the chunks that some splats are in, where the chunks of all scenes are counted."""
         return self.first_chunk + index // CHUNK_NODES
 
     def chunk_bytes(self) -> NDArray[np.int64]:
-        """(chunks,) bytes of each in the file; without chunks of its own (SPZ) as if the file were cut evenly."""
+        """Return the (chunks,) bytes of each; without chunks of its own (SPZ) as if the file were cut evenly."""
         if self.has_chunks:
             return np.array(self.scene.chunk_bytes, np.int64)
-        nodes = self.count
-        ends = np.minimum(np.arange(1, self.chunks + 1) * CHUNK_NODES, nodes)
-        return np.diff(ends * self.bytes // nodes, prepend=0)
+        ends = np.minimum(np.arange(1, self.chunks + 1) * CHUNK_NODES, self.count)
+        return np.diff(ends * self.bytes // self.count, prepend=0)
 
     @property
     def header_bytes(self) -> int:
@@ -117,16 +118,91 @@ class LoadedScene:
         return self.scene.header.get("header_bytes", 0) if self.has_chunks else 0
 
 
-def depth_of(loaded: LoadedScene) -> NDArray[np.int32]:
-    """(N,) edges from the root to each node of a tree."""
-    assert loaded.depth is not None
-    return loaded.depth
-
-
 def nodes_of(splats: Splats, tree: LodTree, coding: FileCoding, *, precision: str, threads: int) -> Nodes:
-    """Nodes as a traversal reads them, in one of `gpu.table.PRECISIONS`."""
+    """Return nodes as a traversal reads them, in one of `gpu.table.PRECISIONS`."""
     if precision == "float32":
         return Nodes.of(splats, tree)
     if precision == "float16":
         return lod_tree.unpack(lod_tree.pack(splats, tree, threads=threads))
     return loaded_nodes.nodes(splats, tree, precision, coding, threads=threads)
+
+
+@dataclass(frozen=True, eq=False)
+class LoadedDetail(LoadedScene):
+    """A scene at several detail levels; `scene` and `splats` have those of all levels, then the environment.
+
+    Attributes:
+        detail: its regions.
+        files: where its splats are.
+    """
+
+    detail: DetailScene = field(kw_only=True)
+    files: DetailFiles = field(kw_only=True)
+
+    @property
+    def has_cuts(self) -> bool:
+        return True
+
+    @functools.cached_property
+    def depth(self) -> NDArray[np.int32]:
+        """(N,) the detail level of each splat; 0 of the environment."""
+        levels = np.repeat(np.arange(self.detail.levels, dtype=np.int32), self.detail.counts.sum(axis=0))
+        return np.concatenate([levels, np.zeros(self.count - len(levels), np.int32)])
+
+    @functools.cached_property
+    def leaves(self) -> Index:
+        """(M,) indices of full detail: level 0, and the environment."""
+        return np.flatnonzero(self.depth == 0)
+
+    @property
+    def chunks(self) -> int:
+        """How many chunk files it has."""
+        return len(self.files.sizes)
+
+    def chunk_of(self, index: Index) -> NDArray[np.int64]:
+        """Return the (M,) numbers of the chunk files that some splats are in."""
+        return self.first_chunk + self._file[index]
+
+    @functools.cached_property
+    def _file(self) -> NDArray[np.int64]:
+        file = np.repeat(self.files.of_run.T.ravel(), self.detail.counts.T.ravel())
+        return np.concatenate([file, np.full(self.count - len(file), self.files.environment or 0)])
+
+    def chunk_bytes(self) -> NDArray[np.int64]:
+        """Return the (chunks,) bytes of each chunk file."""
+        return self.files.sizes
+
+
+def whole_scene(detail: DetailScene) -> Scene:
+    """Return all levels and the environment as one plain scene."""
+    splats = detail.splats
+    if detail.environment is not None:
+        degree = min(splats.sh_degree, detail.environment.sh_degree)
+        splats = Splats.concat([part.with_max_sh(degree) for part in (splats, detail.environment)])
+    return Scene(splats, None, detail.antialiased, detail.format, detail.notes, detail.header, up=detail.up)
+
+
+def files_of(found: LevelFiles) -> DetailFiles:
+    """Return the chunk files of a manifest; regions are in its order."""
+    manifest = found.manifest
+    of_run = np.full((sum(1 for _ in manifest.regions()), manifest.levels), -1, np.int64)
+    for row, (_, node) in zip(of_run, manifest.regions(), strict=True):
+        for level, run in (node.runs or {}).items():
+            if run.count:
+                row[level] = run.file
+    environment = None if manifest.environment is None else len(manifest.filenames)
+    return DetailFiles(of_run, np.array(found.sizes, np.int64), environment, found.bytes)
+
+
+def files_in_memory(detail: DetailScene) -> DetailFiles:
+    """Return files for a scene in memory: one for each level, of the bytes of its columns, and the environment."""
+    of_run = np.where(detail.counts > 0, np.arange(detail.levels), -1)
+    sizes = [bytes_of(detail.splats) * int(count) // max(1, len(detail.splats)) for count in detail.counts.sum(axis=0)]
+    if detail.environment is None:
+        return DetailFiles(of_run, np.array(sizes, np.int64))
+    return DetailFiles(of_run, np.array([*sizes, bytes_of(detail.environment)], np.int64), detail.levels)
+
+
+def bytes_of(splats: Splats) -> int:
+    """Return the bytes of the columns."""
+    return sum(getattr(splats, name).nbytes for name in COLUMNS)

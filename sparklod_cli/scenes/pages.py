@@ -1,24 +1,31 @@
-"""`Pages`: a tree whose file is read chunk by chunk, as far as cuts of it need."""
+"""Trees whose files are read chunk by chunk, as far as cuts need: their pages, their forest and their scenes."""
 
 from __future__ import annotations
 
+import functools
 import itertools
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..io import RadFile
+from ..cameras.framing import SAMPLE
+from ..io.rad_file import RadFile
 from ..lod.kernels.pixel_scale import NODE
+from ..lod.traversal import Forest, fill_nodes
+from ..model.balls import USED, Balls, balls_of
+from ..model.instances import Instance
 from ..model.lod_tree import LodTree
 from ..model.nodes import CHUNK_BITS, CHUNK_NODES, Nodes
-from ..model.scene import FileCoding
+from ..model.scene import FileCoding, Scene
 from ..model.splats import COLUMNS, Splats
 from ..support.errors import SparklodError, TreeError
 from ..support.machine import available_memory
 from ..support.parallel import ordered_map
+from .loaded_scene import Index, LoadedScene, bytes_of
 
 #: Makes nodes of the splats, the tree and the coding of a chunk.
 NodesOf = Callable[[Splats, LodTree, FileCoding], Nodes]
@@ -29,6 +36,10 @@ TRAVERSED = ("center", "scale", "opacity")
 #: Decoded chunks that are kept for the splats of the next cut: they take at most this share of the free memory, but
 #: there are at least so many. Chosen.
 KEPT_SHARE, LEAST_KEPT = 0.25, 8
+
+#: Share of the chunks that a cut lacks that is read before the cut is found again, the most important ones first. With
+#: fewer, it is found more often; with more, chunks are read that it turns out not to need. Chosen.
+READ_SHARE = 0.5
 
 
 class Pages:
@@ -56,18 +67,18 @@ class Pages:
         self._lock = threading.Lock()
         self._cache: OrderedDict[int, Splats] = OrderedDict()
         self._kept = LEAST_KEPT
-        free, bytes_of_chunk = available_memory(), Splats.empty(1, file.header.max_sh)
+        free = available_memory()
         if free is not None:
-            size = CHUNK_NODES * sum(getattr(bytes_of_chunk, name).nbytes for name in COLUMNS)
+            size = CHUNK_NODES * bytes_of(Splats.empty(1, file.header.max_sh))
             self._kept = max(LEAST_KEPT, int(KEPT_SHARE * free / size))
 
     def place(self, nodes: NDArray[np.void], depth: NDArray[np.int32]) -> None:
-        """Takes arrays of zeros, (N,) `NODE` and (N,) int32, for the nodes that will be read, and reads the root's."""
+        """Take arrays of zeros, (N,) `NODE` and (N,) int32, for the nodes that will be read, and reads the root's."""
         self.nodes, self.depth = nodes, depth
         self.read([0])
 
     def read(self, numbers: Sequence[int]) -> None:
-        """Reads the nodes of chunks that are not present.
+        """Read the nodes of chunks that are not present.
 
         Raises:
             FormatError, TreeError: a chunk is damaged, or its children are not those of a tree; names the file.
@@ -82,16 +93,13 @@ class Pages:
         assert tree is not None
         start = number << CHUNK_BITS
         self._check(tree, start)
-        found, part = self._nodes_of(splats, tree, coding), self.nodes[start : start + len(tree)]
-        part["x"], part["y"], part["z"] = found.center.T
-        part["size"] = found.size
-        part["child_start"], part["child_count"] = tree.first_child(), tree.child_count
+        fill_nodes(self.nodes[start : start + len(tree)], self._nodes_of(splats, tree, coding))
         self.present[number] = True
         known = start + np.flatnonzero(self.depth[start : start + len(tree)])
         self._descend(known if number else np.concatenate([np.zeros(1, np.int64), known]))
 
     def _check(self, tree: LodTree, start: int) -> None:
-        """Raises a `TreeError` for children that no tree has; `LodTree.validate` has the same texts."""
+        """Raise a `TreeError` for children that no tree has; `LodTree.validate` has the same texts."""
         first, node = tree.child_start.astype(np.int64), start + np.arange(len(tree))
         for mask, what in (
             (~tree.is_leaf & (first <= node), "comes after one of its children"),
@@ -101,7 +109,7 @@ class Pages:
                 raise TreeError(f"{self._name}: its tree is broken: node {node[np.argmax(mask)]} {what}")
 
     def _descend(self, frontier: NDArray[np.int64]) -> None:
-        """Gives their depths to the nodes below some whose depth is known, as far as chunks are present."""
+        """Give their depths to the nodes below some whose depth is known, as far as chunks are present."""
         while len(frontier):
             count = self.nodes["child_count"][frontier].astype(np.int64)
             inner, count = frontier[count > 0], count[count > 0]
@@ -115,7 +123,7 @@ class Pages:
             frontier = children[self.present[children >> CHUNK_BITS]]
 
     def splats(self, index: NDArray[np.integer]) -> Splats:
-        """Some splats, whose chunks are decoded, and kept for the next ones as far as there is room.
+        """Return some splats, whose chunks are decoded, and kept for the next ones as far as there is room.
 
         Args:
             index: (M,) ascending.
@@ -150,7 +158,7 @@ class Pages:
         return rows
 
     def blocks(self, columns: Collection[str]) -> Iterator[tuple[Splats, LodTree]]:
-        """All chunks in order, with these columns; none of them is kept.
+        """Yield all chunks in order, with these columns; none of them is kept.
 
         Raises:
             FormatError: a chunk is damaged; names the file.
@@ -167,7 +175,7 @@ class Pages:
         return sum(int(np.count_nonzero(tree.is_leaf)) for _, tree in self.blocks(()))
 
     def leaves(self) -> NDArray[np.int64]:
-        """(M,) indices of all leaves."""
+        """Return the (M,) indices of all leaves."""
         found = [np.flatnonzero(tree.is_leaf) for _, tree in self.blocks(())]
         return np.concatenate([number * CHUNK_NODES + leaves for number, leaves in enumerate(found)])
 
@@ -176,3 +184,169 @@ class Pages:
             return self.file.chunk(number, columns)
         except SparklodError as error:
             raise type(error)(f"{self._name}: {error}") from None
+
+
+class PagedForest(Forest):
+    """Trees in the memory layout of the traversal; those with pages are read as cuts need them.
+
+    Args:
+        trees: whole, each with the depths of its nodes, or pages.
+
+    Attributes:
+        depth: (nodes,) int32 edges from the root to each, of the nodes that were read and of their children.
+    """
+
+    def __init__(self, trees: Sequence[tuple[Nodes, NDArray[np.int32]] | Pages]) -> None:
+        # Zeros take no memory before something is written to them.
+        self._make_room([tree.count if isinstance(tree, Pages) else len(tree[1]) for tree in trees], np.zeros)
+        self.depth = np.zeros(len(self.nodes), np.int32)
+        self._pages = {number: tree for number, tree in enumerate(trees) if isinstance(tree, Pages)}
+        for number, tree in enumerate(trees):
+            start, stop = self.node_base[number : number + 2]
+            if isinstance(tree, Pages):
+                tree.place(self.nodes[start:stop], self.depth[start:stop])
+            else:
+                fill_nodes(self.nodes[start:stop], tree[0])
+                self.depth[start:stop] = tree[1]
+
+    def present(self) -> NDArray[np.bool_]:
+        """Return the (chunks,) bool, those whose nodes are in memory; not changed later."""
+        present = np.ones(self.chunks, np.bool_)
+        for number, pages in self._pages.items():
+            present[self.chunk_base[number] : self.chunk_base[number + 1]] = pages.present
+        return present
+
+    def read(self, chunks: NDArray[np.bool_]) -> None:
+        """Read those of these chunks, (chunks,) bool, that are not in memory.
+
+        Raises:
+            FormatError, TreeError: see `Pages.read`.
+        """
+        for number, pages in self._pages.items():
+            own = chunks[self.chunk_base[number] : self.chunk_base[number + 1]]
+            pages.read(np.flatnonzero(own & ~pages.present).tolist())
+
+    def read_some(self, wanted: NDArray[np.float32], present: NDArray[np.bool_]) -> bool:
+        """Read the more important half of the chunks that a cut lacked; False if it lacked none.
+
+        The most important one is needed for certain, as a cut takes nodes by their importance; others may turn out not
+        to be, once the nodes in that one take their share of the budget.
+        """
+        missing = np.flatnonzero((wanted > 0) & ~present)
+        missing = missing[np.argsort(-wanted[missing], kind="stable")]
+        now = np.zeros(self.chunks, np.bool_)
+        now[missing[: int(np.ceil(READ_SHARE * len(missing)))]] = True
+        self.read(now)
+        return len(missing) > 0
+
+
+@dataclass(frozen=True, eq=False)
+class PagedScene(LoadedScene):
+    """A tree that may be larger than memory; `scene` and `splats` have no rows.
+
+    Attributes:
+        pages: its nodes and splats.
+    """
+
+    pages: Pages = field(kw_only=True)
+
+    @property
+    def depth(self) -> NDArray[np.int32]:
+        """(N,) edges from the root to each node that was read, and to their children."""
+        return self.pages.depth
+
+    @property
+    def count(self) -> int:
+        """N."""
+        return self.pages.count
+
+    @functools.cached_property
+    def leaves(self) -> Index:
+        """(M,) indices of full detail, for which the children of all nodes are read."""
+        return self.pages.leaves()
+
+    @functools.cached_property
+    def leaf_count(self) -> int:
+        """M."""
+        return self.pages.leaf_count()
+
+    def rows(self, index: Index) -> Splats:
+        """Return some splats, in the space of the scene, by their indices, ascending."""
+        return self.pages.splats(index)
+
+
+def empty_scene(file: RadFile) -> Scene:
+    """Return what is known of the scene of a file before its chunks are read."""
+    tree = LodTree(np.zeros(0, np.uint16), np.zeros(0, np.uint32))
+    header = file.header
+    splats = Splats.empty(0, header.max_sh)
+    return Scene(
+        splats,
+        tree,
+        header.noted.antialiased,
+        file.format,
+        header.noted.problems,
+        dict(file.about),
+        file.chunk_bytes,
+        up=header.noted.up,
+    )
+
+
+def sampled_balls(instances: Sequence[Instance], scenes: Sequence[LoadedScene]) -> Balls:
+    """Return what the splats of instances cover, as many as cameras look at: those that they take of all.
+
+    Args:
+        instances: at least one.
+        scenes: that each is of.
+    """
+    counts = [loaded.leaf_count for loaded in scenes]
+    while True:
+        every = max(sum(counts) // SAMPLE, 1)
+        starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+        samples = [_Sample(int(start), every) for start in starts[:-1]]
+        for loaded in dict.fromkeys(scenes):
+            of_loaded = [at for at, each in enumerate(scenes) if each is loaded]
+            for splats, leaves in _leaves_of(loaded):
+                for at in of_loaded:
+                    samples[at].add(balls_of(splats, leaves, instances[at].object_to_world))
+        found = [sample.count for sample in samples]
+        if found == counts:
+            break
+        counts = found  # some are not finite, and do not count
+    whole = Balls.concat(part for sample in samples for part in sample.parts)
+    low = np.min([sample.low for sample in samples], axis=0)
+    high = np.max([sample.high for sample in samples], axis=0)
+    return Balls(whole.center, whole.radius, np.stack([low, high]), max(sample.largest for sample in samples))
+
+
+class _Sample:
+    """Evenly spaced balls of an instance, and the ends of all of them.
+
+    Args:
+        start: number of its first ball among those of all instances.
+        every: one is taken of so many.
+    """
+
+    def __init__(self, start: int, every: int) -> None:
+        self._start, self._every = start, every
+        self.count, self.largest = 0, 0.0
+        self.low, self.high = np.full(3, np.inf), np.full(3, -np.inf)
+        self.parts: list[Balls] = [Balls(np.empty((0, 3)), np.empty(0))]
+
+    def add(self, balls: Balls) -> None:
+        """Add some in order."""
+        first = -(self._start + self.count) % self._every
+        self.parts.append(Balls(balls.center[first :: self._every].copy(), balls.radius[first :: self._every].copy()))
+        self.count += len(balls.radius)
+        self.largest = max(self.largest, float(balls.radius.max(initial=0)))
+        self.low = np.minimum(self.low, balls.center.min(axis=0, initial=np.inf))
+        self.high = np.maximum(self.high, balls.center.max(axis=0, initial=-np.inf))
+
+
+def _leaves_of(loaded: LoadedScene) -> Iterator[tuple[Splats, Index]]:
+    """Yield splats of a scene, and which of them are its leaves."""
+    if not isinstance(loaded, PagedScene):
+        yield loaded.splats, loaded.leaves
+        return
+    for splats, tree in loaded.pages.blocks(USED):
+        yield splats, np.flatnonzero(tree.is_leaf)

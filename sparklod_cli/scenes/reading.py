@@ -9,20 +9,20 @@ from pathlib import Path
 
 from ..codecs.gpu.table import PRECISIONS
 from ..codecs.rounding import after
-from ..io import RadFile, examine_scene, has_levels, read_level_files, read_levels, size_of_input
+from ..io import examine_scene, read_levels, size_of_input
+from ..io.details import has_levels, read_level_files
+from ..io.rad_file import RadFile
 from ..model.instances import Instance
 from ..model.nodes import CHUNK_NODES
 from ..model.scene import DetailScene, Scene
 from ..model.selection import Selection, describe
-from ..model.splats import COLUMNS, Splats
+from ..model.splats import COLUMNS
 from ..support.errors import FormatError, InvalidSplatsError, SparklodError, TreeError, memory_errors_translated
 from ..support.progress import Progress, silent
 from ..support.stdin import DASH
-from .detail_scene import LoadedDetail, files_in_memory, files_of, whole_scene
 from .loaded import Scenes
-from .loaded_scene import UNNAMED, LoadedScene, nodes_of
-from .paged_scene import PagedScene, empty_scene
-from .pages import Pages
+from .loaded_scene import UNNAMED, LoadedDetail, LoadedScene, bytes_of, files_in_memory, files_of, nodes_of, whole_scene
+from .pages import PagedScene, Pages, empty_scene
 
 
 def read_scenes(
@@ -36,7 +36,7 @@ def read_scenes(
     threads: int = 1,
     progress: Progress = silent,
 ) -> Scenes:
-    """Reads the scenes of instances, each once.
+    """Read the scenes of instances, each once.
 
     Splats that cannot be drawn are left out of scenes without trees; `Scenes.notes` has their number.
 
@@ -63,35 +63,28 @@ def read_scenes(
     for source in (instance.source for instance in instances):
         if _key(source) in loaded:
             continue
+        file = source if isinstance(source, Path) else None
         pages = _pages(source, precision, threads) if paged and through is None else None
         if pages is not None:
-            assert isinstance(source, Path)
-            size, empty = size_of_input(source) or 0, empty_scene(pages.file)
-            entry: LoadedScene = PagedScene(source, size, empty, empty.splats, chunks, pages=pages)
-            loaded[_key(source)] = entry
-            chunks += entry.chunks
-            continue
-        detail = _detail(source, threads, progress)
-        if detail is not None:
-            entry = _loaded_detail(source, detail, through, chunks, threads)
+            assert file is not None
+            empty = empty_scene(pages.file)
+            entry: LoadedScene = PagedScene(file, size_of_input(file) or 0, empty, empty.splats, chunks, pages=pages)
+        elif (detail := _detail(source, threads, progress)) is not None:
+            entry = _loaded_detail(file, detail, through, chunks, threads)
             notes += (f"{entry.name}: {note}" for note in detail.notes)
-            loaded[_key(source)] = entry
-            chunks += entry.chunks
-            continue
-        assert not isinstance(source, DetailScene)
-        scene = _read(source, columns if trees_only else COLUMNS, threads, progress)
-        file = source if isinstance(source, Path) else None
-        name = file if file is not None else UNNAMED
-        if scene.tree is None and trees_only:
-            raise FormatError(
-                f"{name}: it is not a Level-of-Detail tree, nor Streamed SOG; bake it first with sparklod build-lod"
-            )
-        notes += (f"{name}: {note}" for note in scene.notes)
-        if scene.tree is None:
-            scene = _drawable(str(name), scene, notes)
-        size = (size_of_input(file) or 0) if file is not None else _size_of(scene.splats)
-        drawn = after(through, file or Path(UNNAMED), scene, threads)
-        loaded[_key(source)] = entry = LoadedScene(file, size, scene, drawn, chunks)
+        else:
+            name = file or UNNAMED
+            scene = _read(source, columns if trees_only else COLUMNS, threads, progress)
+            if scene.tree is None and trees_only:
+                raise FormatError(
+                    f"{name}: it is not a Level-of-Detail tree, nor Streamed SOG; bake it first with sparklod build-lod"
+                )
+            notes += (f"{name}: {note}" for note in scene.notes)
+            if scene.tree is None:
+                scene = _drawable(str(name), scene, notes)
+            size = bytes_of(scene.splats) if file is None else size_of_input(file) or 0
+            entry = LoadedScene(file, size, scene, after(through, Path(name), scene, threads), chunks)
+        loaded[_key(source)] = entry
         chunks += entry.chunks
     of_instance = [loaded[_key(instance.source)] for instance in instances]
     return Scenes(instances, list(loaded.values()), of_instance, notes, precision, threads)
@@ -102,7 +95,7 @@ def _key(source: Path | Scene | DetailScene) -> Path | int:
 
 
 def _detail(source: Path | Scene | DetailScene, threads: int, progress: Progress) -> DetailScene | None:
-    """A scene at several detail levels; None for others."""
+    """Return a scene at several detail levels; None for others."""
     if isinstance(source, Scene):
         return None
     try:
@@ -117,9 +110,8 @@ def _detail(source: Path | Scene | DetailScene, threads: int, progress: Progress
 
 
 def _loaded_detail(
-    source: Path | Scene | DetailScene, detail: DetailScene, through: str | None, chunks: int, threads: int
+    file: Path | None, detail: DetailScene, through: str | None, chunks: int, threads: int
 ) -> LoadedDetail:
-    file = source if isinstance(source, Path) else None
     scene = whole_scene(detail)
     if not len(scene.splats):
         raise InvalidSplatsError(f"{file or UNNAMED}: it has no splats")
@@ -129,7 +121,7 @@ def _loaded_detail(
 
 
 def _pages(source: Path | Scene | DetailScene, precision: str, threads: int) -> Pages | None:
-    """The pages of a file that is too large to be read whole; None for others, and where reading them will fail."""
+    """Return the pages of a file too large to be read whole; None for others, and where reading will fail."""
     if isinstance(source, (Scene, DetailScene)) or source == DASH:
         return None
     try:
@@ -141,12 +133,9 @@ def _pages(source: Path | Scene | DetailScene, precision: str, threads: int) -> 
     return Pages(file, str(source), functools.partial(nodes_of, precision=precision, threads=1), threads)
 
 
-def _size_of(splats: Splats) -> int:
-    return sum(getattr(splats, name).nbytes for name in COLUMNS)
-
-
-def _read(source: Path | Scene, columns: Collection[str], threads: int, progress: Progress) -> Scene:
-    """The scene of a source; its tree, if it has one, is sound."""
+def _read(source: Path | Scene | DetailScene, columns: Collection[str], threads: int, progress: Progress) -> Scene:
+    """Return the scene of a source; its tree, if it has one, is sound."""
+    assert not isinstance(source, DetailScene)
     name = UNNAMED if isinstance(source, Scene) else source
     try:
         if isinstance(source, Scene):
@@ -164,7 +153,7 @@ def _read(source: Path | Scene, columns: Collection[str], threads: int, progress
 
 
 def _drawable(name: str, scene: Scene, notes: list[str]) -> Scene:
-    """A scene without the splats that cannot be drawn."""
+    """Return a scene without the splats that cannot be drawn."""
     try:
         splats, dropped = Selection(drop_invalid=True).apply(scene.splats)
     except InvalidSplatsError as error:

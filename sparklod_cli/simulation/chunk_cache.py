@@ -1,4 +1,4 @@
-"""Chunks of trees: numbering, priority, and a cache with least-recently-used eviction."""
+"""Chunks of trees: their numbers, and a cache with least-recently-used eviction."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ HEADER_REQUESTS = (64 << 10, 256 << 10, 1 << 20)
 
 
 def header_answers(header_bytes: int, file_bytes: int) -> tuple[int, ...]:
-    """Sizes of the answers that Spark's pager waits for before it can ask for a chunk of a file.
+    """Return the sizes of the answers that Spark's pager waits for before it can ask for a chunk of a file.
 
     It does not know how long the header is, so it asks for the beginning of the file, and for more of it as long as the
     header is not whole. What it gets of the first chunk along with it is thrown away.
@@ -82,34 +82,16 @@ class Chunks:
         return len(self.sizes)
 
     def tree_of(self, chunk: int) -> int:
-        """The tree of a chunk."""
+        """Return the tree of a chunk."""
         return bisect_right(self.firsts, chunk) - 1
 
     def shows(self, resident: NDArray[np.bool_]) -> bool:
-        """Whether anything is drawn with (chunks,) bool resident chunks."""
+        """Return True if anything is drawn with (chunks,) bool resident chunks."""
         return bool((resident[self.roots] if self.roots else resident).any())
 
     def bytes_of(self, chunks: Iterable[int]) -> int:
-        """The total size of some chunks."""
+        """Return the total size of some chunks."""
         return sum(self.sizes[chunk] for chunk in chunks)
-
-
-def by_priority(chunks: NDArray[np.integer], pixel_scales: NDArray[np.floating]) -> list[int]:
-    """Each chunk once, by descending pixel scale and then by ascending number.
-
-    A node is never larger than its parent where pixel scales are limits of a cut (`lod.kernels.cut`), so that coarse
-    chunks come first.
-
-    Args:
-        chunks: (N,) chunks that are read, with repetitions.
-        pixel_scales: (N,) pixel scales of the nodes whose children are in them. NaN is the largest.
-    """
-    if not len(chunks):
-        return []
-    greatest = np.full(int(chunks.max()) + 1, -1.0)
-    np.maximum.at(greatest, chunks, np.where(np.isnan(pixel_scales), np.inf, pixel_scales))
-    touched = np.flatnonzero(greatest >= 0)
-    return touched[np.argsort(-greatest[touched], kind="stable")].tolist()
 
 
 class ChunkCache:
@@ -151,17 +133,17 @@ class ChunkCache:
         return chunk in self._resident
 
     def resident(self) -> NDArray[np.bool_]:
-        """(chunks,) bool, the resident chunks, for `lod.traversal.Traversal.cut`."""
+        """Return the resident chunks, (chunks,) bool, for `lod.traversal.Traversal.cut`."""
         present = np.zeros(len(self._chunks), np.bool_)
         present[list(self._resident)] = True
         return present
 
     def missing(self) -> list[int]:
-        """The admitted chunks that are not resident, the most important first."""
+        """Return the admitted chunks that are not resident, the most important first."""
         return [chunk for chunk in self.admitted if chunk not in self._resident]
 
     def want(self, wanted: Iterable[int]) -> None:
-        """Replaces the list of wanted chunks.
+        """Replace the list of wanted chunks.
 
         Args:
             wanted: chunks, the most important first. The roots of all trees come before them, in this order,
@@ -181,7 +163,7 @@ class ChunkCache:
         self._arrange()
 
     def arrive(self, chunk: int) -> int | None:
-        """Adds a chunk that has been fetched.
+        """Add a chunk that has been fetched.
 
         Returns:
             the chunk that was evicted: the least recently used of the unwanted chunks, or else the least important. It
@@ -198,13 +180,13 @@ class ChunkCache:
         return evicted
 
     def copy(self) -> ChunkCache:
-        """An independent copy of the cache."""
+        """Return an independent copy of the cache."""
         twin = copy.copy(self)  # the lists are replaced, never changed
         twin._resident = self._resident.copy()
         return twin
 
     def _arrange(self) -> None:
-        """Puts the resident chunks in order of eviction."""
+        """Put the resident chunks in order of eviction."""
         for chunk in reversed(self.wanted):
             if chunk in self._resident:
                 self._resident.move_to_end(chunk)

@@ -11,12 +11,8 @@ from ..tables.columns import FRAME, Column
 COLUMNS = (
     *FRAME,
     Column("instance", str, "", "", "name of the instance, or `total` for all together"),
-    Column("position_x", float, ".6f", "world units", "position of the camera"),
-    Column("position_y", float, ".6f", "world units", "position of the camera"),
-    Column("position_z", float, ".6f", "world units", "position of the camera"),
-    Column("forward_x", float, ".6f", "", "unit vector along the optical axis"),
-    Column("forward_y", float, ".6f", "", "unit vector along the optical axis"),
-    Column("forward_z", float, ".6f", "", "unit vector along the optical axis"),
+    *(Column(f"position_{axis}", float, ".6f", "world units", "position of the camera") for axis in "xyz"),
+    *(Column(f"forward_{axis}", float, ".6f", "", "unit vector along the optical axis") for axis in "xyz"),
     Column("fov_y_deg", float, ".4f", "degrees", "vertical field of view"),
     Column("width", int, "", "px", "width of the image"),
     Column("height", int, "", "px", "height of the image"),
@@ -130,15 +126,14 @@ EMPTY = {
     "time_s": "the path has no times",
     "complete_in_s": "it needs --bandwidth",
     "traverse_ms": "--no-timing leaves it out",
-    "added": "it compares a frame with the one before, and there is only one frame",
-    "removed": "it compares a frame with the one before, and there is only one frame",
-    "churn": "it compares a frame with the one before, and there is only one frame",
-    "pixel_scale_limit": "only trees have it, not Streamed SOG",
+    **dict.fromkeys(
+        ("added", "removed", "churn"), "it compares a frame with the one before, and there is only one frame"
+    ),
+    **dict.fromkeys(("pixel_scale_limit", "frontier"), "only trees have it, not Streamed SOG"),
     "pixel_scale_min": "no node was refined, or it is Streamed SOG",
-    "frontier": "only trees have it, not Streamed SOG",
-    "projected_px_p50": "no splat is inside the frustum on any frame",
-    "projected_px_p95": "no splat is inside the frustum on any frame",
-} | dict.fromkeys((column.name for column in LOADING), "it needs --bandwidth, and a --chunk-cache that suffices")
+    **dict.fromkeys(("projected_px_p50", "projected_px_p95"), "no splat is inside the frustum on any frame"),
+    **dict.fromkeys((column.name for column in LOADING), "it needs --bandwidth, and a --chunk-cache that suffices"),
+}
 
 
 class UnknownColumnError(SparklodError):
@@ -146,7 +141,7 @@ class UnknownColumnError(SparklodError):
 
 
 def select(names: Sequence[str] = (), *, timing: bool = True) -> tuple[Column, ...]:
-    """The columns of these names, in this order; without names all columns, in the order of `COLUMNS`.
+    """Return the columns of these names, in this order; without names all columns, in the order of `COLUMNS`.
 
     Args:
         names: of columns; a repeated one is taken once.

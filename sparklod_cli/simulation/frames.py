@@ -20,7 +20,7 @@ from ..support.parallel import ordered_map
 from ..support.progress import Progress, silent
 from ..tables.columns import Row
 from .columns import COLUMNS, OF_TREES
-from .loading import chunks_of
+from .loading import Viewer
 from .streaming import Stream, StreamingSettings
 
 
@@ -47,24 +47,19 @@ class Frame:
 
 @dataclass(frozen=True)
 class _MeasuredCut:
-    """A cut, and its statistics as a whole and by instance."""
+    """A cut with its statistics, as a whole and by instance."""
 
     cut: TreeCut
     whole: CutStatistics
     parts: list[CutStatistics]
 
 
-class Simulation:
-    """A viewer that moves along a camera path through trees.
+class Simulation(Viewer):
+    """A viewer that moves along a camera path through scenes that all have cuts.
 
     Args:
-        scenes: scenes that all have cuts: trees, or several detail levels.
-        settings: settings of the cuts; continuous cuts are not simulated.
-        streaming: network and cache; everything is resident unless given.
+        scenes, settings, streaming: as of `Viewer`.
         by_instance: make a row per instance, too.
-
-    Raises:
-        ValueError: the budget, or the cache, is too small for the roots; or there are too many instances.
     """
 
     def __init__(
@@ -75,27 +70,20 @@ class Simulation:
         *,
         by_instance: bool = False,
     ) -> None:
-        self.scenes, self.settings, self._by_instance = scenes, settings, by_instance
-        self._streaming = streaming or StreamingSettings()
-        self._traversal = scenes.traversal(settings, remembers=not self._streaming.network.instant)
-        self._depth = scenes.depth
-        self._chunks = chunks_of(scenes)
+        super().__init__(scenes, settings, streaming, remembers=True)
+        self._by_instance, self._depth = by_instance, scenes.depth
         self._names = [instance.name for instance in scenes.instances]
-        self._stream()  # raises what would fail at the first frame
-
-    def _stream(self, start: float = 0.0) -> Stream:
-        """A stream that starts at a time in seconds."""
-        return Stream(self._chunks, self._streaming.network, capacity=self._streaming.chunk_cache, start=start)
 
     def run(self, path: CameraPath, *, threads: int = 1, progress: Progress = silent) -> Iterator[Frame]:
-        """The frames of a path, in order.
+        """Yield the frames of a path, in order.
 
         Cuts are found on several threads, some frames ahead; anything that depends on the previous frame is done in
         order. If chunks are missing, the cut is found again with the resident ones.
         """
         stream = self._stream(path.cameras[0].time)
         changes = Changes(self.scenes.forest, self._traversal.instances)
-        self._warm_up(path.cameras[0])
+        # Loads or compiles the kernels, so that the time of the first frame does not include it.
+        self._traversal.cut(view_of(path.cameras[0]), budget=len(self._traversal.instances))
         found = ordered_map(self._find, path.cameras, threads)
         for at, (number, camera, ideal) in enumerate(zip(path.numbers, path.cameras, found, strict=True)):
             stream.advance(max(camera.time, stream.now))
@@ -109,29 +97,15 @@ class Simulation:
             yield Frame(number, camera, drawn.cut, resident, [_rounded(row) for row in rows], in_front)
             progress("traverse", at + 1, len(path.cameras), "frame")
 
-    def _warm_up(self, camera: Camera) -> None:
-        """Loads or compiles the kernels, so that the time of the first frame does not include it."""
-        view = view_of(camera)
-        self._traversal.cut(view, budget=len(self._traversal.instances))
-
     def _find(self, camera: Camera, resident: NDArray[np.bool_] | None = None) -> _MeasuredCut:
-        view = view_of(camera)
-        limit = self.settings.limit(camera.fov_y, camera.height)
-        cut = self._traversal.cut(view, budget=self.settings.budget, smallest=limit, resident=resident)
-        whole, parts = measure(
-            self.scenes.forest,
-            self._depth,
-            cut,
-            view,
-            size=(camera.width, camera.height),
-            by_instance=self._by_instance,
-        )
-        return _MeasuredCut(cut, whole, parts)
+        cut, size = self._cut(camera, resident), (camera.width, camera.height)
+        forest, view = self.scenes.forest, view_of(camera)
+        return _MeasuredCut(cut, *measure(forest, self._depth, cut, view, size=size, by_instance=self._by_instance))
 
     def _fetched(
         self, camera: Camera, ideal: _MeasuredCut, stream: Stream
     ) -> tuple[_MeasuredCut, NDArray[np.bool_], Row]:
-        """The cut with the resident chunks, these chunks, and the cells of the row that describe chunks."""
+        """Return the cut with the resident chunks, these chunks, and the cells of the row that describe chunks."""
         wanted = ideal.cut.chunks()
         instant = self._streaming.network.instant
         if instant:
@@ -155,7 +129,7 @@ class Simulation:
     def _rows(
         self, number: int, camera: Camera, drawn: _MeasuredCut, changes: Sequence[tuple[int, int | None, int]]
     ) -> list[Row]:
-        """The row of all instances together, without the chunk cells, then one per instance, if requested."""
+        """Return the row of all instances, without the chunk cells, then one per instance, if requested."""
         cut, settings = drawn.cut, self.settings
         where: Row = {"frame": number, "time_s": camera.time, "name": camera.name}
         for name, vector in (("position", camera.position), ("forward", camera.forward)):
@@ -188,33 +162,16 @@ class Simulation:
 
 
 def _shape(measured: CutStatistics, budget: int) -> Row:
-    return {
-        "selected": measured.selected,
-        "leaves": measured.leaves,
-        "interior": measured.selected - measured.leaves,
-        "budget_used": measured.selected / budget,
-        "frontier": measured.frontier,
-        "level_min": measured.level_min,
-        "level_mean": measured.level_mean,
-        "level_max": measured.level_max,
-        "in_frustum": measured.in_frustum,
-        "outside": measured.outside,
-        "behind": measured.behind,
-        "projected_px_p50": measured.px_p50,
-        "projected_px_p95": measured.px_p95,
-        "overdraw_estimate": measured.overdraw,
-    }
+    shares: Row = {"interior": measured.selected - measured.leaves, "budget_used": measured.selected / budget}
+    return shares | vars(measured)
 
 
 def _change(selected: int, kept: int | None, before: int) -> Row:
     if kept is None:
         return {"added": selected, "removed": 0, "churn": None}
     added, removed = selected - kept, before - kept
-    return {
-        "added": added,
-        "removed": removed,
-        "churn": (added + removed) / (selected + before) if selected + before else 0.0,
-    }
+    churn = (added + removed) / (selected + before) if selected + before else 0.0
+    return {"added": added, "removed": removed, "churn": churn}
 
 
 def _rounded(row: Row) -> Row:

@@ -1,4 +1,4 @@
-"""Loading: what a visitor sees who opens a page with trees or Streamed SOG and waits, arrival by arrival."""
+"""What a visitor sees who opens a page with trees or Streamed SOG and waits, arrival by arrival."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ MOST = 0.9
 
 @dataclass(frozen=True)
 class Arrival:
-    """What is there when a chunk has arrived.
+    """State when a chunk has arrived.
 
     Attributes:
         seconds: since the page was opened.
@@ -40,29 +40,48 @@ class Arrival:
     resident: NDArray[np.bool_]
 
 
-class Loader:
-    """Opens a page with scenes, for one camera after another.
+class Viewer:
+    """A viewer that fetches the chunks of scenes, for one camera after another.
 
     Args:
         scenes: with trees or detail levels; others are there from the beginning.
         settings: of the cuts; continuous cuts are not simulated.
-        streaming: network and cache.
+        streaming: network and cache; everything is resident unless given.
+        remembers: cuts are found one after the other, along a path; see `Scenes.traversal`.
 
     Raises:
         ValueError: the budget, or the cache, is too small for the roots; or there are too many instances.
     """
 
-    def __init__(self, scenes: Scenes, settings: LodSettings, streaming: StreamingSettings) -> None:
-        self.scenes, self.settings, self._streaming = scenes, settings, streaming
-        self._traversal = scenes.traversal(settings)
+    def __init__(
+        self,
+        scenes: Scenes,
+        settings: LodSettings,
+        streaming: StreamingSettings | None = None,
+        *,
+        remembers: bool = False,
+    ) -> None:
+        self.scenes, self.settings = scenes, settings
+        self._streaming = streaming or StreamingSettings()
+        self._traversal = scenes.traversal(settings, remembers=remembers and not self._streaming.network.instant)
         self._chunks = chunks_of(scenes)
         self._stream()  # raises what would fail later
 
-    def _stream(self) -> Stream:
-        return Stream(self._chunks, self._streaming.network, capacity=self._streaming.chunk_cache)
+    def _stream(self, start: float = 0.0) -> Stream:
+        """Return a stream that starts at a time in seconds."""
+        return Stream(self._chunks, self._streaming.network, capacity=self._streaming.chunk_cache, start=start)
+
+    def _cut(self, camera: Camera, resident: NDArray[np.bool_] | None = None) -> TreeCut:
+        """Return the cut with the resident chunks, all unless given."""
+        limit = self.settings.limit(camera.fov_y, camera.height)
+        return self._traversal.cut(view_of(camera), budget=self.settings.budget, smallest=limit, resident=resident)
+
+
+class Loader(Viewer):
+    """A visitor who opens a page with scenes and waits in front of a camera; see `Viewer`."""
 
     def arrivals(self, camera: Camera) -> Iterator[Arrival]:
-        """The state at the beginning and after each arrival of a chunk, as long as any are wanted.
+        """Yield the state at the beginning and after each arrival of a chunk, as long as any are wanted.
 
         The camera rests. As soon as a chunk has arrived, the viewer looks for the chunks that the cut needs, as far as
         it can tell from those that it has; Spark does so with the next picture that it draws.
@@ -80,10 +99,7 @@ class Loader:
                     return
 
     def load(self, camera: Camera) -> Row:
-        """What a visitor waits for who opens the page in front of a camera and stays: `LOADING`, rounded.
-
-        None for what never comes, since the cache is too small.
-        """
+        """Return the waits, `LOADING`, of a visitor who stays at a camera; None for what never fits into the cache."""
         figures: Row = dict.fromkeys(column.name for column in LOADING)
         for arrival in self.arrivals(camera):
             if figures["first_picture_s"] is None and self._chunks.shows(arrival.resident):
@@ -96,7 +112,7 @@ class Loader:
         return {column.name: column.rounded(figures[column.name]) for column in LOADING}
 
     def cut_after(self, camera: Camera, seconds: float) -> Cut:
-        """What is drawn for a camera so many seconds after the page was opened in front of it."""
+        """Return what is drawn for a camera so many seconds after the page was opened in front of it."""
         resident = np.zeros(len(self._chunks), np.bool_)
         for arrival in self.arrivals(camera):
             if arrival.seconds > seconds:
@@ -104,12 +120,8 @@ class Loader:
             resident = arrival.resident
         return self.scenes.cut_of(self._cut(camera, resident))
 
-    def _cut(self, camera: Camera, resident: NDArray[np.bool_] | None = None) -> TreeCut:
-        limit = self.settings.limit(camera.fov_y, camera.height)
-        return self._traversal.cut(view_of(camera), budget=self.settings.budget, smallest=limit, resident=resident)
-
     def _splats_of(self, cut: TreeCut) -> NDArray[np.int64]:
-        """(chunks,) how many splats of a cut are in each chunk of all trees."""
+        """Return the (chunks,) numbers of splats of a cut in each chunk of all trees."""
         counts = np.zeros(len(self._chunks), np.int64)
         scenes = [loaded for loaded in self.scenes.of_instance if loaded.has_cuts]
         for loaded, view, nodes in zip(scenes, cut.views, cut.indices(), strict=True):
@@ -118,12 +130,11 @@ class Loader:
         return counts
 
 
-class LoadingCuts:
-    """What visitors see who opened the page so many seconds ago, each in front of a camera of their own.
+class LoadingCuts(Loader):
+    """What visitors see who opened the page some time ago, each in front of a camera of their own; a `CutSource`.
 
     Args:
-        scenes: some or all of them with cuts; others are there from the beginning.
-        settings, streaming: as of `Loader`.
+        scenes, settings, streaming: as of `Loader`.
         seconds: since then.
 
     Raises:
@@ -131,20 +142,20 @@ class LoadingCuts:
     """
 
     def __init__(self, scenes: Scenes, settings: LodSettings, streaming: StreamingSettings, seconds: float) -> None:
-        self._loader = Loader(scenes, settings, streaming)
+        super().__init__(scenes, settings, streaming)
         self._seconds = seconds
 
     def cut(self, camera: Camera) -> Cut:
-        """What the visitor in front of a camera sees."""
-        return self._loader.cut_after(camera, self._seconds)
+        """Return what the visitor in front of a camera sees."""
+        return self.cut_after(camera, self._seconds)
 
     def candidates(self) -> Cut:
-        """All that some camera may see, sooner or later."""
-        return CutFinder(self._loader.scenes, self._loader.settings).candidates()
+        """Return the nodes visible to any camera."""
+        return CutFinder(self.scenes, self.settings).candidates()
 
 
 def chunks_of(scenes: Scenes) -> Chunks:
-    """The chunks of scenes with cuts, and what a viewer needs before it can ask for them."""
+    """Return the chunks of scenes with cuts, and what a viewer needs before it can ask for them."""
     if scenes.details:
         manifests = [[loaded.files.manifest] if loaded.files.manifest else [] for loaded in scenes.details]
         sizes = [loaded.chunk_bytes() for loaded in scenes.details]

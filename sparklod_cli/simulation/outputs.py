@@ -43,7 +43,7 @@ class FrameOutputs:
     overwrite: bool = False
 
     def check(self) -> None:
-        """Raises a `SparklodError` if an output cannot be written; called before any work is done."""
+        """Raise a `SparklodError` if an output cannot be written; called before any work is done."""
         self.table.check()
         if self.plot is not None:
             check_writable(self.plot, overwrite=self.overwrite)
@@ -54,7 +54,7 @@ class FrameOutputs:
             check_writable(self.indices / "0.npy", overwrite=True)
 
     def index_files(self, numbers: Sequence[int], instances: int) -> Iterator[Path]:
-        """The index files that will be written for frames of these numbers."""
+        """Yield the index files that will be written for frames of these numbers."""
         if self.indices is not None:
             for number in numbers:
                 yield from index_files(self.indices, number, instances)
@@ -85,13 +85,13 @@ class _ChartData:
     frames: dict[str, Frame] = field(default_factory=dict)
 
     def add(self, frame: Frame) -> None:
-        """Stores a frame if it exceeds all earlier frames in one of the criteria."""
+        """Store a frame if it exceeds all earlier frames in one of the criteria."""
         for what in self.lookout.add(frame.rows[0]):
             self.frames[what] = frame
         self.frames.setdefault("first", frame)
 
     def best(self) -> Frame:
-        """The first extreme frame that draws anything; frames before the first chunk has arrived draw nothing."""
+        """Return the first extreme frame that draws anything, as none does before the first chunk has arrived."""
         extremes = [self.frames[what] for what in (*(moment.what for moment in self.lookout.moments()), "first")]
         return next((each for each in extremes if len(each.cut)), extremes[0])
 
@@ -105,7 +105,7 @@ def write_frames(
     progress: Progress = silent,
     passed: Filter | None = None,
 ) -> WrittenFrames:
-    """Simulates a camera path and writes the outputs: table and index files frame by frame, then the charts.
+    """Simulate a camera path and writes the outputs: table and index files frame by frame, then the charts.
 
     Args:
         simulation: the simulation.
@@ -135,7 +135,7 @@ def write_frames(
 
 
 def index_files(folder: Path, frame: int, instances: int) -> list[Path]:
-    """The index files of a frame, one per instance."""
+    """Return the index files of a frame, one per instance."""
     if instances == 1:
         return [folder / f"{frame:06d}.npy"]
     return [folder / f"{frame:06d}.{instance}.npy" for instance in range(instances)]
@@ -154,7 +154,7 @@ def _write_indices(frame: Frame, outputs: FrameOutputs) -> None:
 
 
 def _plot(simulation: Simulation, path: CameraPath, target: Path, data: _ChartData, *, overwrite: bool) -> str | None:
-    """Writes the charts, with the path over the cut of an extreme frame; returns a note if that picture is missing."""
+    """Write the charts, with the path over the cut of an extreme frame; returns a note if that picture is missing."""
     from ..figures import traversal_chart
 
     frame = data.best()

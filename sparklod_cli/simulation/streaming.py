@@ -113,7 +113,7 @@ class Stream:
         self._arrived: list[int] = []
 
     def advance(self, to_time: float) -> None:
-        """Processes all events up to and including a time in seconds.
+        """Process all events up to and including a time in seconds.
 
         Raises:
             ValueError: the time is in the past, or not finite.
@@ -125,7 +125,7 @@ class Stream:
         self.now = to_time
 
     def want(self, wanted: Iterable[int]) -> None:
-        """Replaces the list of wanted chunks, the most important first, see `ChunkCache.want`.
+        """Replace the list of wanted chunks, the most important first, see `ChunkCache.want`.
 
         Raises:
             ValueError: there is no such chunk.
@@ -136,17 +136,17 @@ class Stream:
         self.advance(self.now)  # with an instant network everything arrives now
 
     def take_arrivals(self) -> list[int]:
-        """The chunks that have arrived since the last call, in order; including those that have been evicted."""
+        """Return the chunks that have arrived since the last call, in order; including those that have been evicted."""
         arrived, self._arrived = self._arrived, []
         return arrived
 
     def take_bytes(self) -> int:
-        """Bytes of what has arrived since the last call, headers and chunks."""
+        """Return bytes of what has arrived since the last call, headers and chunks."""
         taken, self._taken = self.received - self._taken, self.received
         return taken
 
     def step(self) -> bool:
-        """Goes on to the next event, the start or end of a transfer; False if there is none."""
+        """Go on to the next event, the start or end of a transfer; False if there is none."""
         going = self._step(math.inf)
         self.now = self._since if going else self.now
         return going
@@ -178,7 +178,7 @@ class Stream:
         return twin
 
     def _request(self, time: float) -> None:
-        """Starts requests on the free fetchers."""
+        """Start requests on the free fetchers."""
         admitted = self.cache.admitted
         while len(self._under_way) < self._fetchers and self._next < len(admitted):
             chunk = admitted[self._next]
@@ -192,7 +192,7 @@ class Stream:
                     self._requested.append((time + self._network.latency, chunk))
 
     def _step(self, until: float) -> bool:
-        """Processes the next event, the start or end of a transfer; False if there is none until a time."""
+        """Process the next event, the start or end of a transfer; False if there is none until a time."""
         if not self._requested and not self._transfers:
             return False
         begin = self._requested[0][0] if self._requested else math.inf
@@ -208,7 +208,7 @@ class Stream:
         return True
 
     def _begin(self, time: float) -> None:
-        """The first byte of the oldest request arrives."""
+        """Process the first byte of the oldest request."""
         if self._transfers:
             served = self._served + (time - self._since) * self._network.bandwidth / len(self._transfers)
             self._served = min(served, self._transfers[0][0])  # rounding must not exceed the next end
@@ -219,7 +219,7 @@ class Stream:
         heappush(self._transfers, (self._served + size, self._begun, chunk))
 
     def _end(self, time: float) -> None:
-        """The last byte of the transfer that ends next arrives, and its fetcher starts another request."""
+        """Process the last byte of the transfer that ends next; its fetcher starts another request."""
         self._served, _, chunk = heappop(self._transfers)
         if not self._transfers:
             self._served = 0.0  # keeps the numbers small, for precision
@@ -234,7 +234,7 @@ class Stream:
         self._request(time)
 
     def _end_header(self, tree: int, time: float) -> None:
-        """An answer with the beginning of a file has arrived: the next one is requested, or the chunks that wait."""
+        """Process an answer with the beginning of a file: request the next one, or the chunks that wait."""
         answer, *rest = self._headers[tree]
         self.received += answer
         if rest:

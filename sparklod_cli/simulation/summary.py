@@ -136,12 +136,12 @@ def _share(row: Row) -> Number | None:
 
 
 def _rounded(value: Number) -> Number:
-    """Rounded to nine significant digits, which hides rounding errors of floats."""
+    """Round to nine significant digits, which hides rounding errors of floats."""
     return value if isinstance(value, int) else float(f"{value:.9g}")
 
 
 def coarseness(row: Row) -> Number | None:
-    """The smallest pixel scale of a refined node, as a multiple of the limit; None if either is missing."""
+    """Return the smallest pixel scale of a refined node, as a multiple of the limit; None if either is missing."""
     scale, limit = row["pixel_scale_min"], row["pixel_scale_limit"]
     return scale / limit if isinstance(scale, (int, float)) and isinstance(limit, (int, float)) and limit else None
 
@@ -172,7 +172,7 @@ class Lookout:
         self._frames = 0
 
     def add(self, row: Row) -> list[str]:
-        """Adds the row of the next frame; returns the criteria in which it exceeds all earlier frames."""
+        """Add the row of the next frame; returns the criteria in which it exceeds all earlier frames."""
         found = []
         for what, (measure, above, _) in MOMENTS.items():
             value = None if what == "bytes" and not self._frames else measure(row)
@@ -183,7 +183,7 @@ class Lookout:
         return found
 
     def moments(self) -> list[Moment]:
-        """The extreme frames so far, in the order of `MOMENTS`."""
+        """Return the extreme frames so far, in the order of `MOMENTS`."""
         return [
             _moment(what, row, _rounded(value), unit)
             for what, (_, _, unit) in MOMENTS.items()
@@ -193,7 +193,7 @@ class Lookout:
 
 
 def look_at(frames: Sequence[Row]) -> list[Moment]:
-    """The frames with the largest values of the criteria `MOMENTS`."""
+    """Return the frames with the largest values of the criteria `MOMENTS`."""
     lookout = Lookout()
     for row in frames:
         lookout.add(row)

@@ -108,10 +108,6 @@ class Kernel:
 
         return [tuple(numba.typeof(example(each)) for each in types) for types in self.declared]
 
-    def is_cached(self, signature: tuple[Any, ...]) -> bool:
-        """Return True if the cache has machine code for some types of arguments."""
-        return CACHE_FOLDER is not None and bool(self.dispatcher._cache.is_cached(signature))
-
 
 def kernel(
     *types: Any, parallel: bool = False, nogil: bool = False, inline: bool = False, contract: bool = False

@@ -18,7 +18,7 @@ from ..cameras.frame import Settings
 from ..cameras.path import CameraPath
 from ..cameras.sources import read_path
 from ..io import write_whole
-from ..io.names import leads_away
+from ..io.paths import leads_away
 from ..support.errors import CameraPathError
 from ..support.untrusted import parse_json, quoted_value
 

@@ -18,9 +18,8 @@ from ..codecs.rad.records import RadHeader
 from ..codecs.sog.names import META
 from ..codecs.streamed_sog.names import MANIFEST
 from ..io.beside import companions, in_folder, path_beside
-from ..io.level_files import read_level_files
-from ..io.names import reason_unreadable
-from ..io.plain import open_plain
+from ..io.details import read_level_files
+from ..io.paths import open_plain, reason_unreadable
 from ..model.nodes import CHUNK_NODES
 from ..support.errors import FormatError, NotSplatsError, UnknownFormatError, UnreadableError
 from ..support.printable import printable

@@ -19,7 +19,7 @@ from typing import Any, BinaryIO
 from urllib.parse import unquote_to_bytes
 
 from .. import __version__
-from ..io.plain import open_plain
+from ..io.paths import open_plain
 from ..support.errors import SparklodError
 from .drops import MAX_BYTES, parse_drop
 from .files import media_type

@@ -19,8 +19,7 @@ from ..codecs.rad.codec import count_leaves, read_chunk
 from ..codecs.rad.places import file_of
 from ..codecs.rad.records import RadHeader
 from ..io import examine_scene, read_levels
-from ..io.names import reason_of
-from ..io.plain import open_plain
+from ..io.paths import open_plain, reason_of
 from ..model.balls import USED, Balls, balls_of
 from ..model.splats import Splats
 from ..support.errors import InvalidSplatsError, SparklodError, UnreadableError

@@ -18,7 +18,7 @@ from sparklod_cli.codecs.options import RadOptions, SogOptions
 from sparklod_cli.codecs.rad.layout import OPTIONS, choices
 from sparklod_cli.codecs.streamed_sog.names import MANIFEST
 from sparklod_cli.lod.builders import METHODS
-from sparklod_cli.lod.detail_settings import DetailSettings
+from sparklod_cli.lod.detail_rule import DetailSettings
 from sparklod_cli.model.gaussian import normalized_quat
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.sh import COEFFICIENTS

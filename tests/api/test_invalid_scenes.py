@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 import sparklod_cli as sparklod
-from sparklod_cli.bake import BakeSettings, bake
+from sparklod_cli.bake.flow import bake
+from sparklod_cli.bake.settings import BakeSettings
 from sparklod_cli.codecs.formats import WRITABLE
 from sparklod_cli.codecs.gpu.table import ENCODINGS
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
@@ -18,7 +19,7 @@ from sparklod_cli.codecs.splat_encoding import SplatEncoding
 from sparklod_cli.codecs.streamed_sog.names import MANIFEST
 from sparklod_cli.extract_leaves import extract_leaves
 from sparklod_cli.io import write_whole
-from sparklod_cli.lod.detail_settings import DetailSettings
+from sparklod_cli.lod.detail_rule import DetailSettings
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene, Tree
 from sparklod_cli.support.errors import InvalidSplatsError, TreeError

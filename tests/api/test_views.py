@@ -15,6 +15,8 @@ import sparklod_cli as sparklod
 from tests.api.runs import SIZE, VIEW, camera, command, without_time
 from tests.conftest import FIXTURES
 
+pytestmark = pytest.mark.slow
+
 
 def test_a_cut_is_within_its_budget(held: sparklod.Tree) -> None:
     for budget in (1, 37, 500, 10**9):

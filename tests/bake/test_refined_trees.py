@@ -10,7 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sparklod_cli.bake import Baked, BakeSettings, bake
+from sparklod_cli.bake.flow import bake
+from sparklod_cli.bake.records import Baked
+from sparklod_cli.bake.settings import BakeSettings
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.cli import run
 from sparklod_cli.codecs.formats import WRITABLE
@@ -19,7 +21,7 @@ from sparklod_cli.codecs.options import RadOptions, WriteOptions
 from sparklod_cli.fitting import cameras, fit
 from sparklod_cli.fitting.settings import SHARES, FitSettings
 from sparklod_cli.io import read_levels, read_scene, scene_sink
-from sparklod_cli.lod.detail_settings import DetailSettings
+from sparklod_cli.lod.detail_rule import DetailSettings
 from sparklod_cli.lod.traversal import Forest, Traversal, TreeInstance
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import same_rows

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sparklod_cli.bake import BakeSettings, bake, bake_unless_there
-from sparklod_cli.bake.resources import Resources
-from sparklod_cli.bake.skipping import SUFFIX
+from sparklod_cli.bake.flow import bake
+from sparklod_cli.bake.settings import BakeSettings, Resources
+from sparklod_cli.bake.skipping import SUFFIX, bake_unless_there
 from sparklod_cli.codecs.formats import WRITABLE
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
 from sparklod_cli.codecs.splat_encoding import SplatEncoding

@@ -8,11 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from sparklod_cli.bake import BakeSettings, bake_unless_there, skipping
-from sparklod_cli.bake.skipping import SUFFIX
+from sparklod_cli.bake import skipping
+from sparklod_cli.bake.settings import BakeSettings
+from sparklod_cli.bake.skipping import SUFFIX, bake_unless_there
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
 from sparklod_cli.io import identity
-from sparklod_cli.lod.detail_settings import DetailSettings
+from sparklod_cli.lod.detail_rule import DetailSettings
 from sparklod_cli.support.errors import OutputError
 from tests.conftest import FIXTURES
 

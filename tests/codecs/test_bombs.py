@@ -19,7 +19,10 @@ from fixtures import by_hand, by_hand_sog
 from tests.conftest import FIXTURES
 from tests.scenes import splat_columns
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="memory is limited and counted as Linux does")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(sys.platform != "linux", reason="memory is limited and counted as Linux does"),
+]
 
 PLY = by_hand.ply(splat_columns(20))
 GIGABYTES = 8

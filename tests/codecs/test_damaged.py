@@ -45,7 +45,7 @@ ZIPPED = tuple(name for name in FILES if name.endswith(".sog"))
 #: without being doubted.
 MEMORY, SECONDS = 2e8, 2.0
 
-pytestmark = pytest.mark.filterwarnings("error")  # they would go to standard error
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("error")]  # they would go to standard error
 
 
 @functools.cache

@@ -112,6 +112,7 @@ def test_whether_a_scene_is_antialiased_is_kept(codec: ModuleType, antialiased: 
 
 
 @pytest.mark.parametrize(("form", "way"), CASES)
+@pytest.mark.slow
 def test_threads_do_not_change_what_is_read(form: str, way: str, tmp_path: Path) -> None:
     case = WRITERS[form][way]
     splats = random_splats(17_000, sh_degree=1)  # more than one chunk of rows

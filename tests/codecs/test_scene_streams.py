@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from sparklod_cli.codecs.sog.files import Files
-from sparklod_cli.io import PlacedFile, idle, open_stream, open_streams, read_scene
+from sparklod_cli.io import PlacedFile, open_stream, open_streams, read_scene
+from sparklod_cli.io import streams as idle_streams
 from sparklod_cli.model import streams
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
@@ -34,6 +35,7 @@ def assert_rows(blocks: list[Splats], expected: Splats) -> None:
 
 @pytest.mark.parametrize("threads", [1, 2])
 @pytest.mark.parametrize(("form", "way"), CASES)
+@pytest.mark.slow
 def test_the_blocks_of_any_range_are_the_rows_of_the_scene(
     form: str, way: str, threads: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -150,11 +152,11 @@ def test_short_reads_decode_the_palette_once(tmp_path: Path, monkeypatch: pytest
 
 
 def test_files_that_wait_are_few_and_closed_at_the_end(tmp_path: Path) -> None:
-    idle.close_idle()
+    idle_streams.close_idle()
     with contextlib.ExitStack() as stack:
-        for number in range(idle.MOST + 3):
+        for number in range(idle_streams.MOST + 3):
             path = tmp_path / f"{number}.ply"
             path.write_bytes((FIXTURES / "one.ply").read_bytes())
             next(stack.enter_context(open_stream(path)).read(0, 1))
-        assert len(idle._IDLE) == idle.MOST
-    assert not idle._IDLE
+        assert len(idle_streams._IDLE) == idle_streams.MOST
+    assert not idle_streams._IDLE

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -79,6 +80,7 @@ def limited(folder: Path, room: int, small: object, large: object, command: str)
     done = subprocess.run(
         [sys.executable, "-c", LIMITED, str(room), str(small), str(large), *words],
         cwd=ROOT,
+        env={**os.environ, "MALLOC_ARENA_MAX": "1"},  # threads' arenas reserve room that a limited run could use
         capture_output=True,
         text=True,
         timeout=300,

@@ -11,6 +11,8 @@ from sparklod_cli.cli import run
 from tests.commands.test_keep_apart import LOD, LOOK, OUTPUTS, PLAIN
 from tests.conftest import FIXTURES
 
+pytestmark = pytest.mark.slow
+
 SMALL = ("--size", "8x8")
 
 #: Options with which each command can write the file Y, by the parameter that names it, and the name of that file.

@@ -18,6 +18,8 @@ import pytest
 from sparklod_cli.cli import run
 from tests.conftest import FIXTURES, ROOT
 
+pytestmark = pytest.mark.slow
+
 CI = (ROOT / "docs" / "ci.md").read_text(encoding="utf-8")
 PAGE = (ROOT / "docs" / "inspect.md").read_text(encoding="utf-8")
 HOOKS = (ROOT / ".pre-commit-hooks.yaml").read_text(encoding="utf-8")

@@ -9,6 +9,8 @@ import pytest
 
 from tests.conftest import ROOT
 
+pytestmark = pytest.mark.slow
+
 NOTEBOOK = ROOT / "docs" / "notebook.ipynb"
 
 #: Seconds that a cell may take, compilation on a slow machine included.

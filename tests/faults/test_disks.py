@@ -10,7 +10,7 @@ import pytest
 
 from tests.faults.runs import CHUNKED, DEMO, SMALL, TREE, WRITERS, mounted, said_one_error, shell, sparklod
 
-pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows has other file systems")
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(sys.platform == "win32", reason="Windows has other file systems")]
 
 FULL = Path("/dev/full")
 needs_full = pytest.mark.skipif(not FULL.exists(), reason="there is no /dev/full here")

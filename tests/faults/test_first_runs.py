@@ -6,9 +6,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from sparklod_cli.support.kernel_cache import SUFFIX
 from tests.conftest import ROOT
 from tests.faults.runs import ENVIRONMENT
+
+pytestmark = pytest.mark.slow
 
 #: Calls a few kernels that call each other; prints the cache folder, the number of compilations, and the results.
 SCRIPT = """

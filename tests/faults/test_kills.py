@@ -13,7 +13,7 @@ import pytest
 
 from tests.faults.runs import CHUNKED, ENVIRONMENT, TREE, WRITERS, check_whole, command, sparklod
 
-pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="there is no kill -9 on Windows")
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(sys.platform == "win32", reason="there is no kill -9 on Windows")]
 
 #: Commands with one output, and with many.
 CASES = {

@@ -12,7 +12,7 @@ import pytest
 
 from tests.faults.runs import ENVIRONMENT, TREE, WRITERS, check_whole, said_one_error, shell
 
-pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no ulimit")
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(sys.platform == "win32", reason="Windows has no ulimit")]
 
 
 @pytest.mark.parametrize("name", WRITERS)

@@ -14,16 +14,18 @@ from pathlib import Path
 
 import pytest
 
-from sparklod_cli.bake import BakeSettings, Resources, bake, bake_unless_there
-from sparklod_cli.bake.out_of_core import manifest
+from sparklod_cli.bake.flow import bake
+from sparklod_cli.bake.out_of_core import scratch_folder
 from sparklod_cli.bake.out_of_core.job import PUBLISHED
-from sparklod_cli.bake.out_of_core.manifest import SUFFIX
-from sparklod_cli.bake.out_of_core.store import FolderStore
+from sparklod_cli.bake.out_of_core.scratch_folder import SUFFIX
+from sparklod_cli.bake.out_of_core.store import Store
+from sparklod_cli.bake.settings import BakeSettings, Resources
+from sparklod_cli.bake.skipping import bake_unless_there
 from sparklod_cli.support.errors import InvalidSplatsError, OutputError, ScratchError
 from tests.faults.runs import DEMO, ENVIRONMENT, mounted
 from tests.signals import heed_signals
 
-pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="there is no kill -9 on Windows")
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(sys.platform == "win32", reason="there is no kill -9 on Windows")]
 
 #: Small enough for the demo to be several blocks.
 BLOCK_SPLATS = 5000
@@ -32,12 +34,13 @@ BLOCK_SPLATS = 5000
 SCRIPT = """
 import os, signal, sys, time
 from pathlib import Path
-from sparklod_cli.bake import BakeSettings, Resources, bake
-from sparklod_cli.bake.out_of_core.store import FolderStore
+from sparklod_cli.bake.flow import bake
+from sparklod_cli.bake.settings import BakeSettings, Resources
+from sparklod_cli.bake.out_of_core.store import Store
 from sparklod_cli.support import interrupts
 
 source, target, scratch, method, suffix, moment, how = sys.argv[1:]
-left, write = int(moment), FolderStore._write
+left, write = int(moment), Store._write
 
 def end():
     if how == "kill":
@@ -56,7 +59,7 @@ def failing(self, name, pieces):
     left -= 1
     return write(self, name, halfway(pieces) if left == 0 else pieces)
 
-FolderStore._write = failing
+Store._write = failing
 interrupts.handle()
 try:
     bake(Path(source), Path(target), BakeSettings(method=method, suffix=suffix), say=print,
@@ -147,14 +150,14 @@ def test_an_interrupted_bake_says_what_is_left_and_is_refused_or_begun_anew(
 
 def stop_at_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
     """Interrupts bakes when their output is in place, and nothing of their scratch is removed."""
-    clear = manifest._clear
+    clear = scratch_folder._clear
 
-    def interrupted(store: FolderStore) -> None:
+    def interrupted(store: Store) -> None:
         if store.has(PUBLISHED):
             raise KeyboardInterrupt
         clear(store)
 
-    monkeypatch.setattr(manifest, "_clear", interrupted)
+    monkeypatch.setattr(scratch_folder, "_clear", interrupted)
 
 
 @pytest.mark.parametrize("bakes", [bake, bake_unless_there], ids=lambda bakes: bakes.__name__)

@@ -11,7 +11,10 @@ import pytest
 from tests.faults.runs import DEMO, TREE, WRITERS, check_whole, shell, sparklod
 from tests.faults.test_disks import PRINTERS
 
-pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="these are pipes and shells of Unix")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(sys.platform == "win32", reason="these are pipes and shells of Unix"),
+]
 
 
 def nobody_reads() -> int:

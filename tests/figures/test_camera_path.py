@@ -12,6 +12,8 @@ from tests.figures.flights import SIZE, circle, count_of, looking, path_scene, p
 from tests.scenes import random_splats
 from tests.tables.rows import flight
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.usefixtures("drawing")
 class TestPictureOfPath:

@@ -13,6 +13,8 @@ from sparklod_cli.tables.columns import Row
 from tests.figures.flights import count_of, marked, pixels, plotted
 from tests.tables.rows import flight, row
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize("most", [0, 1, 2, 3, 7, 999, 12_345, 2_500_000])
 def test_ticks_of_counts_are_integers(most: int, charting: None) -> None:

@@ -12,6 +12,8 @@ from sparklod_cli.figures.viewpoint import viewpoint
 from sparklod_cli.model.gaussian import covariance
 from tests.scenes import random_splats
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize(("rounds", "points", "triangles"), [(0, 12, 20), (1, 42, 80), (2, 162, 320)])
 def test_a_sphere_is_closed_and_faces_outwards(rounds: int, points: int, triangles: int) -> None:

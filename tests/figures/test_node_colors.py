@@ -10,6 +10,8 @@ from sparklod_cli.model.gaussian import spark_size
 from sparklod_cli.render.color_scales import MAGMA, PLASMA, VIRIDIS, ramp
 from tests.scenes import random_splats
 
+pytestmark = pytest.mark.slow
+
 
 def brightness(colors: np.ndarray) -> np.ndarray:
     linear = (colors / 255) ** 2.2

@@ -12,6 +12,8 @@ from sparklod_cli.support.optional import install_hint
 from tests.figures.flights import path_scene, plotted
 from tests.tables.rows import flight
 
+pytestmark = pytest.mark.slow
+
 
 def test_a_chart_of_no_frames_is_an_error() -> None:
     with pytest.raises(SparklodError, match="nothing to draw"):

@@ -24,6 +24,8 @@ from sparklod_cli.support.errors import SparklodError
 from sparklod_cli.support.optional import install_hint
 from tests.scenes import random_splats
 
+pytestmark = pytest.mark.slow
+
 SIZE = (320, 200)
 
 

@@ -12,12 +12,11 @@ import pytest
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.cameras.path import CameraPath
 from sparklod_cli.codecs import ply
-from sparklod_cli.fitting import cameras, schedule
+from sparklod_cli.fitting import cameras, optimiser
 from sparklod_cli.fitting import fit as fit_module
 from sparklod_cli.fitting.fit import fit
-from sparklod_cli.fitting.held_out import scores_of
 from sparklod_cli.fitting.nodes import FittedNodes
-from sparklod_cli.fitting.pictures import pictures
+from sparklod_cli.fitting.pictures import pictures, scores_of
 from sparklod_cli.fitting.settings import SHARES, FitReport, FitSettings
 from sparklod_cli.inspection.tree import examine
 from sparklod_cli.lod import quality, quick
@@ -26,6 +25,8 @@ from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.render.settings import RasterSettings
 from tests.conftest import FIXTURES
 from tests.scenes import random_splats
+
+pytestmark = pytest.mark.slow
 
 #: Steps of quick tests.
 STEPS = 160
@@ -118,7 +119,7 @@ def test_an_interruption_keeps_what_the_finished_stages_gained() -> None:
     )
     assert not report.is_complete
     assert report.steps == len(steps) == STEPS // 2 + 1
-    assert len(report.stages) == len(stages) == schedule.STAGES // 2
+    assert len(report.stages) == len(stages) == optimiser.STAGES // 2
     assert report.kept > 0
     assert not same(result, demo()[0])
 

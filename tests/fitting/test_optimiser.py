@@ -11,9 +11,8 @@ from sparklod_cli.fitting import cameras
 from sparklod_cli.fitting.cameras import Place, placed
 from sparklod_cli.fitting.kernels.adam import MOST_D, Rates
 from sparklod_cli.fitting.nodes import FittedNodes
-from sparklod_cli.fitting.optimiser import MOST_REACH, Optimiser, reach_of
+from sparklod_cli.fitting.optimiser import LAST, MOST_REACH, RATES, ROUNDS, Optimiser, default_steps, rates_at, reach_of
 from sparklod_cli.fitting.pictures import Picture, pictures
-from sparklod_cli.fitting.schedule import LAST, RATES, ROUNDS, default_steps, rates_at
 from sparklod_cli.lod import quality
 from sparklod_cli.render.rasterizer import draw
 from sparklod_cli.render.settings import RasterSettings

@@ -17,6 +17,8 @@ from sparklod_cli.images import animated_webp, animation, gif
 from sparklod_cli.support.errors import SparklodError
 from sparklod_cli.support.optional import install_hint
 
+pytestmark = pytest.mark.slow
+
 COLORS = [(250, 10, 10), (10, 250, 10), (10, 10, 250), (240, 240, 10)]
 
 

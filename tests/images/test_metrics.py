@@ -21,6 +21,8 @@ from sparklod_cli.images.metrics import (
     worst_tile,
 )
 
+pytestmark = pytest.mark.slow
+
 
 def pictures(height: int = 45, width: int = 37, noise: float = 0.1, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Something smooth, and the same with noise."""

@@ -64,6 +64,7 @@ def test_arrays_of_nodes_have_the_facts_of_the_tree(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
+@pytest.mark.slow
 def test_the_command_prints_reports_pages_and_json(
     encoding: str, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -13,7 +13,7 @@ from hypothesis.extra import numpy as arrays
 
 from sparklod_cli.inspection import percentiles
 from sparklod_cli.inspection.report import Report, ReportSettings, inspect
-from sparklod_cli.io import RadFile
+from sparklod_cli.io.rad_file import RadFile
 from tests.conftest import FIXTURES, real_scene
 from tests.inspection.rad_files import Rad, tree
 from tests.inspection.test_rad_faults import FAULTS, column

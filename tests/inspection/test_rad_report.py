@@ -205,6 +205,7 @@ def test_coordinates_at_the_end_of_float16_are_found(tmp_path: Path) -> None:
     ("name", "original"),
     [("rad/biker-spark.rad", "biker.ply"), ("rad/playbot-125k-spark/p-lod.rad", "playbot-125k.ply")],
 )
+@pytest.mark.slow
 def test_leaves_of_files_that_spark_wrote_are_the_splats_of_their_scenes(
     name: str, original: str, capsys: Said
 ) -> None:

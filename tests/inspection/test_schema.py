@@ -106,6 +106,7 @@ def test_reports_of_trees_follow_the_schema(tmp_path: Path, sh_degree: int, want
 
 @pytest.mark.parametrize("wanted", WAYS.values(), ids=WAYS.keys())
 @pytest.mark.parametrize("path", SMALL, ids=name_of)
+@pytest.mark.slow
 def test_reports_of_broken_files_follow_the_schema(tmp_path: Path, path: Path, wanted: ReportSettings) -> None:
     for name, data in broken(path):
         file = tmp_path / f"broken{path.suffix}"
@@ -115,6 +116,7 @@ def test_reports_of_broken_files_follow_the_schema(tmp_path: Path, path: Path, w
 
 @pytest.mark.parametrize("most", [1, 3, MAX_CHILDREN])
 @pytest.mark.parametrize("count", [1, 2, 5, 300])
+@pytest.mark.slow
 def test_reports_of_broken_trees_follow_the_schema(tmp_path: Path, count: int, most: int) -> None:
     """Links that lead anywhere, and splats that are nowhere to be seen."""
     for seed in range(20):

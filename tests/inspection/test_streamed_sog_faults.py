@@ -20,9 +20,10 @@ from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.codecs.streamed_sog import codec
 from sparklod_cli.codecs.streamed_sog.promises import ERRORS, WARNINGS
 from sparklod_cli.inspection.report import Report, ReportSettings, inspect
-from sparklod_cli.io import detail_sink, read_levels
+from sparklod_cli.io import read_levels
+from sparklod_cli.io.details import detail_sink
 from sparklod_cli.lod import detail_levels, quick
-from sparklod_cli.lod.detail_settings import DetailSettings
+from sparklod_cli.lod.detail_rule import DetailSettings
 from sparklod_cli.support.errors import FormatError
 from tests.inspection.streamed_sog_files import COUNTS, Folder, Node, folder, regions, splats
 from tests.inspection.test_schema import faults as schema_faults

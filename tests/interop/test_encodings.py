@@ -34,6 +34,8 @@ from tests.interop.ties import Floats, check, ext_codes, ext_steps, packed_codes
 from tests.interop.words import check_file, check_tree, spark_encoding
 from tests.scenes import random_splats
 
+pytestmark = pytest.mark.slow
+
 WIDE = SplatEncoding(rgb_min=-0.5, rgb_max=2, ln_scale_min=-8, ln_scale_max=1, sh1_max=0.5, sh2_max=2, sh3_max=0.25)
 PROGRAM = Path(__file__).with_name("spark_encode.mjs")
 

@@ -17,6 +17,8 @@ from tests.interop import laws
 from tests.interop.spark import Spark
 from tests.scenes import random_splats
 
+pytestmark = pytest.mark.slow
+
 
 def baked(splats: Splats, method: str = "quick") -> Scene:
     return Scene(*BUILDERS[method].load().build(splats))

@@ -22,6 +22,8 @@ from tests.interop.foreign import Foreign
 from tests.interop.laws import EXT_DEGREES, HALF, TINY, Floats, degrees_between, held_by_ext_sh, within
 from tests.interop.spark import Spark
 
+pytestmark = pytest.mark.slow
+
 #: Makes a file from a PLY file: takes the programs, the PLY file and a folder, and returns the path.
 Writer = Callable[[Foreign, Path, Path], Path]
 

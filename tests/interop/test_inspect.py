@@ -27,6 +27,8 @@ from tests.conftest import FIXTURES, real_scene
 from tests.interop.laws import degrees_between
 from tests.interop.spark import Spark
 
+pytestmark = pytest.mark.slow
+
 #: Values of Spark's option `lod` for its two builders, the tiny one and Bhattacharyya's, by sparklod's methods.
 BUILDERS: dict[str, Any] = {"quick": True, "quality": "quality"}
 CHUNK = 65_536

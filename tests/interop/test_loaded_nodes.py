@@ -37,6 +37,8 @@ from tests.interop.ties import Words
 from tests.references.dynamic_cuts import dynamic_limit
 from tests.scenes import random_splats
 
+pytestmark = pytest.mark.slow
+
 #: What Spark's worker is asked for, by precision.
 LAYOUTS = {"ext": "Ext", "packed": "Packed"}
 #: Precisions of the chunks of a RAD file that are loaded alone, as pages are.

@@ -20,6 +20,8 @@ from tests.interop.pictures import cameras_around
 from tests.interop.spark import Spark
 from tests.scenes import random_splats
 
+pytestmark = pytest.mark.slow
+
 
 def both(folder: Path, suffix: str, scene: Scene) -> list[Path]:
     """A file without the axis and one with it, which differ."""

@@ -27,6 +27,8 @@ from tests.interop.test_traversal import FOV_Y, FOVEATIONS, LOD_SCALES, SPARKS_C
 from tests.lod.forests import links, transform
 from tests.simulation.paths import around
 
+pytestmark = pytest.mark.slow
+
 
 def scattered(rng: np.random.Generator, count: int, chunks: int, most_children: int) -> Tree:
     """A tree of about `count` nodes, the children of each anywhere in some chunks, now and then across a border.

@@ -20,6 +20,8 @@ from tests.interop.page import Page
 from tests.interop.pictures import Difference, cameras_around, compare
 from tests.scenes import random_splats
 
+pytestmark = pytest.mark.slow
+
 SIZE = 320, 180
 
 #: Least PSNR in dB: of all pixels and of covered ones in 8 bits, to which Spark rounds after every splat; and of

@@ -40,6 +40,8 @@ from tests.interop.words import check_ext, check_packed
 from tests.node_streams import node_stream
 from tests.scenes import random_splats
 
+pytestmark = pytest.mark.slow
+
 #: Spark's encoding of a chunk that it reads alone: the header that has the file's ranges is not there.
 ALONE = SplatEncoding(lod_opacity=True)
 #: Of codes that ties may decide, see `ties`.

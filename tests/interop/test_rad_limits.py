@@ -12,6 +12,8 @@ from tests.conftest import FIXTURES
 from tests.interop.spark import Spark
 from tests.scenes import random_splats
 
+pytestmark = pytest.mark.slow
+
 
 def test_spark_loads_a_header_of_chunk_files_paged_alone(spark: Spark) -> None:
     with pytest.raises(AssertionError, match="Incomplete RAD chunk"):

@@ -8,6 +8,7 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from sparklod_cli.cameras.camera import Camera
@@ -29,6 +30,8 @@ from tests.conftest import FIXTURES, real_scene
 from tests.interop.page import Page, Picture, Request
 from tests.interop.pictures import cameras_around
 from tests.scenes import random_splats
+
+pytestmark = pytest.mark.slow
 
 SIZE = 240, 136
 

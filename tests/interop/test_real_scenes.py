@@ -14,6 +14,8 @@ from tests.conftest import real_scene
 from tests.interop import laws
 from tests.interop.spark import Spark
 
+pytestmark = pytest.mark.slow
+
 
 @cache
 def baked(name: str, method: str = "quick") -> Scene:

@@ -19,6 +19,8 @@ from tests.interop.pictures import cameras_around, compare
 from tests.interop.test_pictures import LEAST_SH, check, written
 from tests.scenes import random_splats
 
+pytestmark = pytest.mark.slow
+
 SIZE = 320, 180
 
 

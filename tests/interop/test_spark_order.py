@@ -10,6 +10,8 @@ from sparklod_cli.model.nodes import CHUNK_NODES
 from tests.conftest import real_scene
 from tests.references.chunk_orders import size_order, spark_order
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize("name", ["rad/biker-spark.rad", "rad/playbot-125k-spark/p-lod.rad"])
 def test_the_twin_fills_spark_s_chunks_with_the_same_nodes(name: str) -> None:

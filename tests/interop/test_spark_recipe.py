@@ -19,6 +19,8 @@ from tests.interop.engines.browser import Browser
 from tests.interop.pictures import psnr
 from tests.interop.test_view import packages as packages
 
+pytestmark = pytest.mark.slow
+
 SIZE = 320, 180
 
 #: The camera of the page, in the axes of the file: y and z point the other way.

@@ -24,6 +24,8 @@ from tests.interop.spark import NODE, Spark
 from tests.lod.forests import rotation, transform
 from tests.references import budgeted_cuts
 
+pytestmark = pytest.mark.slow
+
 SPARKS_CONES = Cones(90, 120, 0.4, 0.2)
 FOVEATIONS = (
     Cones(),

@@ -34,6 +34,8 @@ from tests.interop.node import Node
 from tests.interop.pictures import psnr
 from tests.signals import heed_signals
 
+pytestmark = pytest.mark.slow
+
 PROGRAM = Path(__file__).with_name("view_page.mjs")
 
 SIZE = 320, 180

@@ -1,4 +1,4 @@
-"""What builders take: the fast test of their input agrees with the definition of a valid and visible splat."""
+"""The fast test of what builders take agrees with the definition of a valid and visible splat."""
 
 from __future__ import annotations
 
@@ -7,8 +7,6 @@ import pytest
 
 from sparklod_cli.codecs import sound
 from sparklod_cli.codecs.sound import check_valid, is_valid_and_visible
-from sparklod_cli.lod.check import select
-from sparklod_cli.model.selection import Selection
 from sparklod_cli.model.splats import COLUMNS
 from sparklod_cli.support.errors import InvalidSplatsError
 from tests.lod.trees import hard_cases
@@ -27,7 +25,6 @@ FAULTS = {
 def test_splats_that_can_be_drawn_are_known_as_such(name: str) -> None:
     splats = hard_cases()[name]
     assert is_valid_and_visible(splats, 1) == (True, True)
-    assert select(Selection(), splats, 1) == (splats, {})
 
 
 @pytest.mark.parametrize("fault", FAULTS)
@@ -50,29 +47,8 @@ def test_what_cannot_be_seen_is_valid(column: str) -> None:
     check_valid(splats, 1)
 
 
-def test_a_splat_without_extent_is_dropped_and_counted() -> None:
-    splats = random_splats(9)
-    splats.scale[4] = 0
-    kept, dropped = select(Selection(), splats, 1)
-    assert len(kept) == 8
-    assert dropped == {"zero_scale": 1}
-
-
-def test_a_selection_with_a_limit_is_applied() -> None:
-    splats = random_splats(50)
-    faintest = float(np.median(splats.opacity))
-    kept, dropped = select(Selection(min_opacity=faintest), splats, 1)
-    assert sum(dropped.values()) == 50 - len(kept) > 0
-
-
-def test_no_splats_are_an_error() -> None:
-    with pytest.raises(InvalidSplatsError, match="no splats"):
-        select(Selection(), random_splats(0), 1)
-
-
 def test_a_rotation_near_the_tolerance_is_left_to_the_definition() -> None:
     splats = random_splats(9)
     splats.quat_xyzw[3] *= np.float32(np.sqrt(1 + 0.8e-3))
     assert not is_valid_and_visible(splats, 1)[0]
     check_valid(splats, 1)
-    assert len(select(Selection(), splats, 1)[0]) == 9

@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sparklod_cli.lod.detail_choice import Chains, DetailChoice, Distant, choose
-from sparklod_cli.lod.detail_distance import RegionBounds
+from sparklod_cli.lod.detail_choice import Chains, DetailChoice, Distant, RegionBounds, choose
 from sparklod_cli.lod.detail_rule import DetailRule
 from sparklod_cli.lod.traversal import View
 from tests.lod.details import random_regions, random_view

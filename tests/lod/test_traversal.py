@@ -12,9 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sparklod_cli.lod.cut_search import VISITS
 from sparklod_cli.lod.settings import pixel_limit
-from sparklod_cli.lod.traversal import Forest, TreeInstance, View, views_of
+from sparklod_cli.lod.traversal import VISITS, Forest, TreeInstance, View, views_of
 from sparklod_cli.model.instances import Cones, Frustum
 from sparklod_cli.model.nodes import CHUNK_NODES, Nodes
 from tests.lod.forests import Case, ancestors_drawn, cases, check, drawn, links, random_tree, rotation, transform, views
@@ -26,6 +25,7 @@ LIMITS = (0.0, 0.02, 0.3)
 
 @given(cases())
 @settings(max_examples=400)
+@pytest.mark.slow
 def test_the_cut_is_that_of_one_queue(case: Case) -> None:
     check(case, case.find())
 
@@ -115,6 +115,7 @@ def large_case(seed: int, *, nodes: int = 150_000, instances: int = 3) -> Case:
 
 
 @pytest.mark.parametrize("seed", range(4))
+@pytest.mark.slow
 def test_the_cut_of_large_trees_is_that_of_one_queue(seed: int) -> None:
     case = large_case(seed)
     found = case.traversal()

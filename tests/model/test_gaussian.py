@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sparklod_cli.lod.kernels import merge, profile
+from sparklod_cli.lod.kernels import geometry, profile
 from sparklod_cli.model import gaussian
 from sparklod_cli.render.kernels import ellipse, project
 from tests.scenes import random_splats
@@ -27,7 +27,7 @@ def test_a_rotation_matrix_turns_vectors_as_its_quaternion_does() -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "kernel"), [(np.float32, ellipse.rotation_matrix), (np.float64, merge.rotation_matrix)]
+    ("kind", "kernel"), [(np.float32, ellipse.rotation_matrix), (np.float64, geometry.rotation_matrix)]
 )
 def test_kernels_have_the_rotation_matrix_of_numpy_bit_for_bit(kind: type, kernel) -> None:  # type: ignore[no-untyped-def]
     quats = QUATS.astype(kind)

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sparklod_cli.simulation.chunk_cache import ChunkCache, Chunks, by_priority, header_answers
+from sparklod_cli.simulation.chunk_cache import ChunkCache, Chunks, header_answers
 from tests.references.streaming import NaiveCache, roots_first
 
 
@@ -22,6 +20,7 @@ def here(cache: ChunkCache) -> set[int]:
 
 @settings(max_examples=400)  # what goes wrong here takes several steps that suit each other
 @given(st.data())
+@pytest.mark.slow
 def test_the_least_recently_used_chunk_is_evicted(data: st.DataObject) -> None:
     trees = data.draw(st.lists(st.integers(1, 5), min_size=1, max_size=3))
     chunks = Chunks([np.ones(count, np.int64) for count in trees])
@@ -111,16 +110,6 @@ def test_chunks_are_numbered_across_trees() -> None:
 def test_impossible_chunk_sizes_are_refused(sizes: list[list[int]]) -> None:
     with pytest.raises(ValueError, match="chunks of tree 1"):
         Chunks(sizes)
-
-
-@given(st.lists(st.tuples(st.integers(0, 8), st.sampled_from([0.0, 0.25, 0.5, 3.0, math.inf, math.nan]))))
-def test_priority_is_the_greatest_pixel_scale_of_a_chunk(looks: list[tuple[int, float]]) -> None:
-    greatest: dict[int, float] = {}
-    for chunk, scale in looks:
-        greatest[chunk] = max(greatest.get(chunk, 0.0), math.inf if math.isnan(scale) else scale)
-    expected = sorted(greatest, key=lambda chunk: (-greatest[chunk], chunk))
-    touched = np.array([chunk for chunk, _ in looks], np.int64)
-    assert by_priority(touched, np.array([scale for _, scale in looks], np.float32)) == expected
 
 
 def test_a_viewer_asks_for_more_until_the_header_is_whole() -> None:

@@ -15,9 +15,9 @@ from sparklod_cli.cameras.path import CameraPath
 from sparklod_cli.lod.detail_rule import DetailRule
 from sparklod_cli.lod.settings import LodSettings
 from sparklod_cli.model.instances import Instance
-from sparklod_cli.scenes.detail_scene import LoadedDetail
 from sparklod_cli.scenes.finder import CutFinder
 from sparklod_cli.scenes.loaded import Scenes
+from sparklod_cli.scenes.loaded_scene import LoadedDetail
 from sparklod_cli.scenes.reading import read_scenes
 from sparklod_cli.simulation.columns import OF_TREES
 from sparklod_cli.simulation.frames import Simulation

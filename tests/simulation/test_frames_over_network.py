@@ -14,6 +14,8 @@ from sparklod_cli.scenes.reading import read_scenes
 from sparklod_cli.simulation.streaming import Network, StreamingSettings
 from tests.simulation.paths import HAND, OF_THE_PAST, SPARK, TOWN, around, path_of, resting, rows_of, without
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize("capacity", [2, 3, 4])
 def test_a_cache_never_holds_more_than_fits(three: Scenes, capacity: int) -> None:

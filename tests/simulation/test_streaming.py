@@ -44,6 +44,7 @@ def rest(stream: Stream, wanted: list[int]) -> list[tuple[float, int]]:
 
 @settings(max_examples=400)  # what goes wrong here takes several steps that suit each other
 @given(st.data(), tree_sizes, headers, networks)
+@pytest.mark.slow
 def test_a_stream_does_what_its_twin_does(
     data: st.DataObject, sizes: list[list[int]], headers: list[list[int]], network: Network
 ) -> None:

@@ -19,6 +19,8 @@ from sparklod_cli.support.errors import SparklodError
 from sparklod_cli.support.optional import install_hint
 from sparklod_cli.support.printable import printable
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def folder() -> Address:

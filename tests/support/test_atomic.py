@@ -60,6 +60,7 @@ def names(folder: Path) -> list[str]:
 
 
 @pytest.mark.parametrize("overwrite", [False, True])
+@pytest.mark.slow
 def test_a_writer_that_is_killed_leaves_whole_files_only(overwrite: bool, unnamed: bool, tmp_path: Path) -> None:
     seen = 0
     chance = random.Random(1)

@@ -67,19 +67,19 @@ def test_a_kernel_depends_on_all_that_its_module_imports(kernels: Path) -> None:
 def test_a_change_of_a_kernel_or_constant_changes_the_names_of_those_that_depend_on_it(tmp_path: Path) -> None:
     copy = tmp_path / "sparklod_cli"
     shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
-    names = ("merge", "sort", "node_rows", "prune")
+    names = ("geometry", "sort", "node_rows", "prune")
     code = "from sparklod_cli.support.kernel_cache import *; " + "".join(
         f"print(digest_of(sources_of(PACKAGE / 'lod/kernels/{name}.py'))); " for name in names
     )
     digests = []
-    for changed in ("model/lod_tree.py", "lod/kernels/merge.py", "support/jit.py", "README.md"):
+    for changed in ("model/lod_tree.py", "lod/kernels/geometry.py", "support/jit.py", "README.md"):
         command = [sys.executable, "-c", code]
         found = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True).stdout.split()
         digests.append(dict(zip(names, found, strict=True)))
         with (copy / changed).open("a") as file:
             file.write("# changed\n")
     changes = [{name for name in names if now[name] != before[name]} for before, now in itertools.pairwise(digests)]
-    assert changes == [{"prune"}, {"merge", "node_rows"}, set(names)]
+    assert changes == [{"prune"}, {"geometry", "node_rows"}, set(names)]
 
 
 @fields(f4[:, :], out(i8[:]), b1)
@@ -163,6 +163,7 @@ def test_kernels_run_without_compilation() -> None:
     assert float(done.stdout) == pytest.approx(12.566, abs=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("content", [b"a: [b\n", b"- a\n", b"\xff\xfe"])
 def test_malformed_settings_of_numba_are_an_error_that_names_them(content: bytes, tmp_path: Path) -> None:
     pytest.importorskip("yaml")  # without which numba reads no settings

@@ -12,6 +12,8 @@ import pytest
 from sparklod_cli.support.kernel_cache import SUFFIX
 from tests.conftest import ROOT
 
+pytestmark = pytest.mark.slow
+
 #: Kernels, and what scripts call them with.
 KERNELS = """
 import os, signal, sys, threading, time, warnings

@@ -19,6 +19,8 @@ from sparklod_cli.support.kernel_cache import SUFFIX, is_whole, start_of
 from sparklod_cli.warmup import units
 from tests.conftest import ROOT
 
+pytestmark = pytest.mark.slow
+
 DAMAGE: dict[str, Callable[[bytes], bytes]] = {
     "empty": lambda content: b"",
     "cut": lambda content: content[: len(content) // 2],

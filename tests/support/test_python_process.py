@@ -14,6 +14,8 @@ from sparklod_cli import doctor
 from sparklod_cli.support.python_process import module_command, program_command
 from tests.conftest import ROOT
 
+pytestmark = pytest.mark.slow
+
 #: Modules of each kind that a process may import: of the package, of the standard library, and of others.
 PLANTED = ("sparklod_cli", "json", "runpy", "numpy", "numba", "moderngl", "open3d", "vtkmodules", "imageio_ffmpeg")
 

@@ -14,6 +14,8 @@ from sparklod_cli.cli import run
 from sparklod_cli.io import write_stdout
 from tests.conftest import FIXTURES, ROOT
 
+pytestmark = pytest.mark.slow
+
 TREE, PLAIN = FIXTURES / "golden" / "tree-v3.spz", FIXTURES / "one.ply"
 PRINTING = [
     ("--help",),

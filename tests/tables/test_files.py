@@ -22,6 +22,8 @@ from sparklod_cli.tables.columns import Cell, Column, Row
 from sparklod_cli.tables.files import FORMS, TYPES, encode
 from tests.tables.rows import flight, row
 
+pytestmark = pytest.mark.slow
+
 NAMES = st.none() | st.text(min_size=1, max_size=20)
 INTS = st.none() | st.integers(-(2**53), 2**53)
 FLOATS = st.none() | st.floats(-1e9, 1e9)

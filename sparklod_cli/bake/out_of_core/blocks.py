@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ...lod.stages.records import Region
+from ...lod.stage_records import Region
 from ...model.splats import FloatArray
 
 #: The most regions that a join takes: three splits in two.
@@ -64,7 +64,7 @@ class Blocks:
         return tuple(range(start, stop) for start, stop in zip([0, *ends], ends, strict=False))
 
     def sort(self, center: FloatArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Sorts splats by their blocks, stably.
+        """Sort splats by their blocks, stably.
 
         Args:
             center: (N, 3).
@@ -110,7 +110,7 @@ class _Cut:
         self.blocks = 0
 
     def part(self, index: NDArray[np.int64], wanted: int, region: Region) -> _Part:
-        """Cuts a region, which has these centres of the sample, into at most so many blocks."""
+        """Cut a region, which has these centres of the sample, into at most so many blocks."""
         split = self._split(index, wanted) if wanted > 1 else None
         if split is None:
             self.blocks += 1
@@ -125,7 +125,7 @@ class _Cut:
         return _Part(number, region, (low, high))
 
     def _split(self, index: NDArray[np.int64], wanted: int) -> tuple[int, float] | None:
-        """The axis, and where to cut it; None where all centres are the same."""
+        """Return the axis, and where to cut it; None where all centres are the same."""
         center = self.sample[index]
         if not len(center):
             return None
@@ -139,7 +139,7 @@ class _Cut:
         return None
 
     def stage(self, part: _Part, region: Region | None) -> Stage:
-        """Makes the stages of a part, the last one of this region."""
+        """Make the stages of a part, the last one of this region."""
         below = [self.stage(each, each.region) for each in _joined(part)] if part.halves else []
         stage = Stage(
             number=len(self.stages),
@@ -153,7 +153,7 @@ class _Cut:
 
 
 def _joined(part: _Part) -> list[_Part]:
-    """The parts, at most `CHILDREN`, that one stage joins."""
+    """Return the parts, at most `CHILDREN`, that one stage joins."""
     found = [part]
     for _ in range(int(math.log2(CHILDREN))):
         found = [each for some in found for each in some.halves or (some,)]
@@ -161,13 +161,13 @@ def _joined(part: _Part) -> list[_Part]:
 
 
 def _moved(corner: tuple[float, float, float], axis: int, value: float) -> tuple[float, float, float]:
-    """A corner with another coordinate."""
+    """Return a corner with another coordinate."""
     x, y, z = (value if each == axis else corner[each] for each in range(3))
     return x, y, z
 
 
 def cut_into_blocks(sample: FloatArray, count: int, block_splats: int) -> Blocks:
-    """Cuts a scene into blocks of at most about `block_splats`, by a sample of its centres.
+    """Cut a scene into blocks of at most about `block_splats`, by a sample of its centres.
 
     Args:
         sample: (n, 3) centres, evenly drawn; without any, the scene is one block.

@@ -83,7 +83,7 @@ def cluster(
     scratch: Path | None = None,
     say: Callable[[str], None] = lambda text: None,
 ) -> Iterator[ClusterEngine]:
-    """An engine on a cluster, which is left alone at the end, or ended if it was started here.
+    """Yield an engine on a cluster, which is left alone at the end, or ended if it was started here.
 
     Args:
         settings: which cluster.
@@ -121,7 +121,7 @@ def cluster(
 
 @contextlib.contextmanager
 def _connected(address: str) -> Iterator[Any]:
-    """A client of a cluster that runs."""
+    """Yield a client of a cluster that runs."""
     from distributed import Client
 
     whole = address if "://" in address else f"tcp://{address}"
@@ -163,7 +163,7 @@ def _credentials(address: str) -> Any:
 
 @contextlib.contextmanager
 def _started(workers: int, threads: int, memory: int | None, scratch: Path | None) -> Iterator[Any]:
-    """A client of a cluster of processes on this machine, which answer nobody else: other users reach their ports."""
+    """Yield a client of processes on this machine, which answer nobody else: other users reach their ports."""
     import dask
     from distributed import Client, LocalCluster, Security
 
@@ -182,7 +182,7 @@ def _started(workers: int, threads: int, memory: int | None, scratch: Path | Non
                 memory_limit=_memory_limit(workers, memory),
                 local_directory=folder,
                 env={"NUMBA_NUM_THREADS": str(threads)},
-                preload=["sparklod_cli.bake.out_of_core.cluster_worker"],
+                preload=["sparklod_cli.bake.out_of_core.cluster_engine"],
                 scheduler_kwargs={"allowed_failures": LOSSES},
                 silence_logs=SILENT,
             )
@@ -195,7 +195,7 @@ def _started(workers: int, threads: int, memory: int | None, scratch: Path | Non
 
 
 def _end(own: Any) -> None:
-    """Ends workers, what they do included: all that is wanted of them is in the store."""
+    """End workers, what they do included: all that is wanted of them is in the store."""
     for nanny in list(own.workers.values()):
         process = getattr(getattr(nanny, "process", None), "process", None)
         nanny.auto_restart = False
@@ -207,21 +207,21 @@ def _end(own: Any) -> None:
 
 
 def _least_memory(client: Any, memory: int | None) -> int | None:
-    """Bytes that a task may take on each worker of a cluster that runs, and by --memory; None without a limit."""
+    """Return bytes that a task may take on each worker of a running cluster, and by --memory; None for no limit."""
     workers = client.scheduler_info()["workers"].values()
     limits = [each["memory_limit"] // each["nthreads"] for each in workers if each["memory_limit"]]
     return min([int(TASK_SHARE * limit) for limit in limits] + ([] if memory is None else [memory]), default=None)
 
 
 def _memory_limit(workers: int, memory: int | None) -> int:
-    """Bytes beyond which a worker of our own is ended: its share of --memory, or of what is free if that is more."""
+    """Return bytes beyond which a worker of our own is ended: its share of --memory, or of free memory if more."""
     free = machine.available_memory() or 0
     return max(LEAST_MEMORY, max(memory or 0, int(MEMORY_SHARE * free)) // workers)
 
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Keeps Dask's own messages off the screen: what they tell of workers and schedulers, the engine says."""
+    """Keep Dask's own messages off the screen: what they tell of workers and schedulers, the engine says."""
     names = [name for name in logging.Logger.manager.loggerDict if name.partition(".")[0] in TALKERS]
     before = {name: logging.getLogger(name).level for name in names}
     for name in names:

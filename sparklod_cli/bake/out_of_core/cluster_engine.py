@@ -1,24 +1,29 @@
-"""An engine that hands tasks to the workers of a Dask cluster."""
+"""An engine that hands tasks to the workers of a Dask cluster, and what these run."""
 
 from __future__ import annotations
 
 import contextlib
+import os
 import pickle
 import shutil
+import signal
+import socket
 import uuid
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ... import __version__
+from ...support import machine
 from ...support.addresses import Place
-from ...support.errors import SparklodError
-from ...support.progress import Progress
+from ...support.errors import SparklodError, memory_errors_translated
+from ...support.progress import Progress, silent
 from .cluster_pool import Connection, Pool
-from .cluster_worker import PROBE, Probed, probe, run_call, run_task
-from .contracts import Store, Task
+from .store import Store
+from .tasks import Task
 
 _INSTALL = f"install sparklod {__version__} with its extra cluster there, and start it again"
 
@@ -35,7 +40,7 @@ class ClusterEngine:
     """
 
     def __init__(self, connection: Connection, *, threads: int, memory: int | None = None) -> None:
-        """Takes the connection to a cluster, and what `threads` and `memory` say."""
+        """Take the connection to a cluster, and what `threads` and `memory` say."""
         self._connection, self.threads, self.memory = connection, threads, memory
         self._checked: tuple[str, frozenset[str]] | None = None
 
@@ -84,13 +89,12 @@ class ClusterEngine:
     def each(
         self, stage: str, call: Callable[..., Any], arguments: Sequence[tuple[Any, ...]], progress: Progress, unit: str
     ) -> Iterator[Iterator[Any]]:
-        """Calls a function with each tuple of arguments, side by side, until the context ends.
+        """Call a function with each tuple of arguments, side by side, until the context ends.
 
         Args:
             stage: word for what is done.
             call: a function of a module that takes `threads` besides, and returns something small.
             arguments: small, and can be pickled.
-            progress: told how many calls ended.
             unit: what a call is called.
 
         Yields:
@@ -113,7 +117,7 @@ class ClusterEngine:
             yield outcomes.pop(str(place))
 
     def check(self, store: Store | None, files: Sequence[Place] = ()) -> None:
-        """Raises a `SparklodError` where a worker cannot do its share: another sparklod, or a folder it does not see.
+        """Raise a `SparklodError` where a worker cannot do its share: another sparklod, or a folder it does not see.
 
         Args:
             store: of the bake, if it has one.
@@ -133,7 +137,7 @@ class ClusterEngine:
             _check_answer(worker, answer, store)
 
     def remove(self, folder: Path) -> None:
-        """Removes a folder on the machines of all workers, and on this one."""
+        """Remove a folder on the machines of all workers, and on this one."""
         shutil.rmtree(folder, ignore_errors=True)
         if self._connection.alive:
             with contextlib.suppress(SparklodError), self._connection.guarded():
@@ -141,7 +145,7 @@ class ClusterEngine:
 
 
 def _check_answer(worker: str, answer: Any, store: Store | None) -> None:
-    """Raises a `SparklodError` for what a worker said of itself."""
+    """Raise a `SparklodError` for what a worker said of itself."""
     if not isinstance(answer, Probed):  # an error: it has no sparklod, or one that knows no such question
         raise SparklodError(f"worker {worker} does not run sparklod {__version__} ({answer}): {_INSTALL}")
     place = f"worker {worker} on {answer.host}"
@@ -159,3 +163,80 @@ def _check_answer(worker: str, answer: Any, store: Store | None) -> None:
             f"{place} does not see {', '.join(answer.missing)}: put inputs into a folder that all machines share, or at"
             " a URL"
         )
+
+
+#: What a probe has.
+PROBE = "probe"
+
+
+@dataclass(frozen=True)
+class Probed:
+    """What a worker says of itself.
+
+    Attributes:
+        version: of sparklod.
+        host: name of its machine.
+        reads: it reads the result that the client wrote.
+        writes: empty, or why it cannot write one.
+        missing: of the files that were asked for, those that it does not see.
+    """
+
+    version: str
+    host: str
+    reads: bool
+    writes: str
+    missing: tuple[str, ...]
+
+
+def probe(store: Store | None, name: str, files: Sequence[Path]) -> Probed:
+    """Try whether this worker can do its share: read what others wrote, and write what they read.
+
+    Args:
+        store: of the bake, if it has one.
+        name: of a result that the client wrote.
+        files: that tasks read.
+    """
+    reads, writes = True, ""
+    if store is not None:
+        mine = f"{name}-{uuid.uuid4().hex}"
+        try:
+            store.put(mine, {PROBE: np.arange(2)})
+            store.remove(mine)
+        except Exception as error:
+            writes = f"{type(error).__name__}: {error}"
+        try:
+            reads = store.has(name) and len(store.get(name)[PROBE]) > 0
+        except Exception:
+            reads = False
+    missing = tuple(str(path) for path in files if not path.exists())
+    return Probed(__version__, socket.gethostname(), reads, writes, missing)
+
+
+def run_task(packed: bytes, task: Task, threads: int) -> tuple[int, int]:
+    """Run a task, unless its result is there: a worker may have been lost after it had put that.
+
+    Args:
+        packed: the job, pickled; a copy for each task, so that each counts its own bytes.
+        task: to be run.
+
+    Returns:
+        bytes that it wrote to the store, and read there.
+    """
+    job = pickle.loads(packed)
+    if not job.store.has(task.name):
+        with memory_errors_translated():
+            task.run(job, *task.arguments, threads=threads, progress=silent)
+        machine.release_memory()
+    return job.store.traffic.written, job.store.traffic.read
+
+
+def run_call(call: Callable[..., Any], arguments: tuple[Any, ...], threads: int) -> Any:
+    """Call a function that returns something small."""
+    return call(*arguments, threads=threads)
+
+
+def dask_setup(worker: Any) -> None:
+    """Prepare a worker process that sparklod started: it has no dashboard, and the client ends it, no Ctrl-C."""
+    worker.http_server.stop()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.environ.setdefault("NUMBA_NUM_THREADS", "1")

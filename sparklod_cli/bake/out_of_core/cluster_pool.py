@@ -44,7 +44,7 @@ class Connection:
     """A client of a cluster, and what is known of its workers. Used as a context manager."""
 
     def __init__(self, client: Any, say: Callable[[str], None]) -> None:
-        """Takes a `distributed.Client`, and what is told of workers that are lost."""
+        """Take a `distributed.Client`, and what is told of workers that are lost."""
         self.client, self.say = client, say
         self._losses: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
         self._starved = set[str]()
@@ -66,28 +66,28 @@ class Connection:
         return bool(self.client.status == "running")
 
     def workers(self) -> dict[str, Any]:
-        """What the scheduler knows of each worker, by its address."""
+        """Return what the scheduler knows of each worker, by its address."""
         with self.guarded():
             known: dict[str, Any] = dict(self.client.scheduler_info()["workers"])
         return known
 
     @contextlib.contextmanager
     def guarded(self) -> Iterator[None]:
-        """Turns an error of the connection into one for people."""
+        """Turn an error of the connection into one for people."""
         try:
             yield
         except (OSError, CancelledError, RuntimeError, AttributeError):
             raise self.gone() from None
 
     def gone(self) -> SparklodError:
-        """The error where the scheduler does not answer any more."""
+        """Return the error where the scheduler does not answer any more."""
         return SparklodError(
             "the scheduler of the cluster does not answer any more; what is done is kept: start the cluster again, and"
             " add --resume"
         )
 
     def look(self) -> None:
-        """Tells of workers that were lost, and where there are none; raises a `SparklodError` without a scheduler."""
+        """Tell of workers that were lost, and where there are none; raise a `SparklodError` without a scheduler."""
         self.tell_losses()
         if not self.alive:
             raise self.gone()
@@ -100,7 +100,7 @@ class Connection:
             self._alone_since = float("inf")
 
     def tell_losses(self) -> None:
-        """Says which workers were lost, and what is done again because of it."""
+        """Say which workers were lost, and what is done again because of it."""
         with contextlib.suppress(queue.Empty):
             while True:
                 lost = self._losses.get_nowait()
@@ -111,7 +111,7 @@ class Connection:
                 self.say(f"worker {lost['worker']} {why}{again}")
 
     def failure(self, name: str, future: Any) -> Exception:
-        """The error of a call that did not end well."""
+        """Return the error of a call that did not end well."""
         if future.status == "cancelled":
             return self.gone()
         with self.guarded():
@@ -129,7 +129,7 @@ class Connection:
         return error
 
     def _keep(self, event: tuple[float, Any]) -> None:
-        """Keeps what the scheduler tells; called on the client's own thread."""
+        """Keep what the scheduler tells; called on the client's own thread."""
         message = event[1]
         if not isinstance(message, dict):
             return
@@ -140,7 +140,7 @@ class Connection:
 
 
 def _name_of(key: Any) -> str:
-    """What a person calls a call, by its key."""
+    """Return what a person calls a call, by its key."""
     return str(key[-1] if isinstance(key, tuple) else key)
 
 
@@ -169,7 +169,7 @@ class Pool:
         return bool(self._calls)
 
     def submit(self, name: str, place: int, *call: Any) -> None:
-        """Hands a call to the cluster.
+        """Hand a call to the cluster.
 
         Args:
             name: its own in this pool.
@@ -184,7 +184,7 @@ class Pool:
         future.add_done_callback(lambda _: self._ended.put(name))
 
     def next(self) -> tuple[str, Any, Exception | None]:
-        """Waits for a call that ends: its name, its result, and the error that it failed with, if it did."""
+        """Wait for a call that ends: its name, its result, and the error that it failed with, if it did."""
         while True:
             self._go_on()
             try:
@@ -208,13 +208,13 @@ class Pool:
                 return name, None, error
 
     def _ask_again(self, name: str) -> None:
-        """Looks at a call once more, after a while."""
+        """Look at a call once more, after a while."""
         self._connection.look()
         loop = self._connection.client.loop
         loop.add_callback(loop.call_later, TICK, self._ended.put, name)
 
     def _is_worth_another(self, name: str, error: Exception) -> bool:
-        """Whether a call is tried again, after a pause."""
+        """Return whether a call is tried again, after a pause."""
         tried = self._tries.get(name, 0)
         if not isinstance(error, OSError) or error.errno in LASTING or tried >= len(PAUSES):
             return False
@@ -223,7 +223,7 @@ class Pool:
         return True
 
     def _go_on(self) -> None:
-        """Submits calls that have paused long enough."""
+        """Submit calls that have paused long enough."""
         due = [name for when, name in self._paused if when <= time.monotonic()]
         self._paused = [each for each in self._paused if each[1] not in due]
         for name in due:

@@ -1,14 +1,13 @@
 """How much memory and room on a disk a bake takes, before it begins.
 
-Coefficients are peaks of processes (VmHWM), as `benchmarks/bench_memory.py` measures them, with some room to spare.
+Coefficients are measured as those of `lod.builders.SplatBytes`.
 """
 
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
 
-from ...model.sh import COEFFICIENTS
+from ...lod.builders import BUILDERS, SplatBytes
 from ...support import machine
 
 #: Part of the memory available that a bake may take unless told otherwise: other programs need some, and figures for it
@@ -22,31 +21,8 @@ PROCESS = 200_000_000
 MOST_BLOCK_SPLATS, LEAST_BLOCK_SPLATS = 1 << 21, 1 << 16
 
 
-@dataclass(frozen=True)
-class _Bytes:
-    """What a splat takes at the peak.
-
-    Attributes:
-        fixed: without spherical harmonics.
-        each: for each of their coefficients.
-    """
-
-    fixed: int
-    each: int
-
-    def of(self, splats: int, sh_degree: int) -> int:
-        """So many splats."""
-        return splats * (self.fixed + self.each * COEFFICIENTS[sh_degree])
-
-
-#: In memory, a splat of the input; by method.
-IN_MEMORY = {"quick": _Bytes(220, 27), "quality": _Bytes(250, 30)}
-
-#: Out of core, a splat of a block; by method.
-OF_BLOCK = {"quick": _Bytes(300, 50), "quality": _Bytes(350, 50)}
-
 #: Out of core, a node of those that are read, gathered or encoded at once, and how many these are.
-OF_WINDOW, WINDOW = _Bytes(230, 50), 1 << 19
+OF_WINDOW, WINDOW = SplatBytes(230, 50), 1 << 19
 
 #: Out of core, a splat of the whole scene while its nodes are put in order, before and after that for streaming.
 OF_ORDER = 20
@@ -54,65 +30,60 @@ OF_ORDER = 20
 #: Families a splat of the input, and bytes of each while parts of them are put in the order for streaming.
 FAMILIES, OF_FAMILY = 0.4, 40
 
-#: In the scratch folder, a splat of the input; by method. Those of blocks are removed when their nodes are made.
-IN_SCRATCH = {"quick": _Bytes(190, 32), "quality": _Bytes(200, 34)}
-
 
 def default_memory() -> int | None:
-    """Bytes that a bake may take unless told otherwise; None where the system does not say what is available."""
+    """Return bytes that a bake may take unless told otherwise; None where the system does not say what is available."""
     available = machine.available_memory()
     return None if available is None else int(MEMORY_SHARE * available)
 
 
 def in_memory_bytes(method: str, splats: int, sh_degree: int) -> int:
-    """Bytes that a bake in memory takes at its peak.
+    """Return bytes that a bake in memory takes at its peak.
 
     Args:
         method: of `lod.builders.BUILDERS`.
         splats, sh_degree: of the input.
     """
-    return PROCESS + IN_MEMORY[method].of(splats, sh_degree)
+    return PROCESS + BUILDERS[method].in_memory.of(splats, sh_degree)
 
 
 def out_of_core_bytes(
     method: str, splats: int, sh_degree: int, block_splats: int, *, in_chunks: bool = False, threads: int = 1
 ) -> int:
-    """Bytes that a bake out of core takes at its peak.
+    """Return bytes that a bake out of core takes at its peak.
 
     Args:
         method: of `lod.builders.BUILDERS`.
         splats, sh_degree: of the input; `sh_degree` as far as it is kept.
         block_splats: of a block.
         in_chunks: families are put in an order for streaming at the end.
-        threads: to work on.
     """
     from ...lod.chunk_order import MOST_FAMILIES, family_bytes  # takes long to load, and this is asked out of core only
 
     window = OF_WINDOW.of(min(2 * splats, WINDOW), sh_degree)
-    block = OF_BLOCK[method].of(min(splats, block_splats), sh_degree)
+    block = BUILDERS[method].in_block.of(min(splats, block_splats), sh_degree)
     families = int(FAMILIES * splats) if in_chunks else 0
     arranging = family_bytes(threads) * min(families, MOST_FAMILIES) + OF_FAMILY * families
     return PROCESS + max(window, block, OF_ORDER * splats, arranging)
 
 
 def scratch_bytes(method: str, splats: int, sh_degree: int) -> int:
-    """Bytes that the scratch folder takes at its peak, without what is unpacked of the input.
+    """Return bytes that the scratch folder takes at its peak, without what is unpacked of the input.
 
     Args:
         method: of `lod.builders.BUILDERS`.
         splats, sh_degree: of the input; `sh_degree` as far as it is kept.
     """
-    return IN_SCRATCH[method].of(splats, sh_degree)
+    return BUILDERS[method].in_scratch.of(splats, sh_degree)
 
 
 def block_splats_within(
     memory: int | None, method: str, splats: int, sh_degree: int, *, in_chunks: bool = False, threads: int = 1
 ) -> int | None:
-    """The splats of a block, a power of two, so that nearly the same memory gives the same blocks.
+    """Return the splats of a block, a power of two, so that nearly the same memory gives the same blocks.
 
     Args:
         memory: bytes that a bake may take; None for any number.
-        method, splats, sh_degree, in_chunks, threads: as for `out_of_core_bytes`.
 
     Returns:
         None where the memory is too little for blocks of `LEAST_BLOCK_SPLATS`.

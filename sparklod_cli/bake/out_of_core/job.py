@@ -8,11 +8,11 @@ from typing import Any
 
 from ...codecs.encoder import Encoder
 from ...lod.builders import BUILDERS
-from ...lod.stages.records import StagedBuilder
+from ...lod.stage_records import StagedBuilder
 from ...model.streams import SceneStream
 from ..settings import BakeSettings
 from .blocks import Blocks
-from .contracts import Store
+from .store import Store
 
 #: Those of a scene that is not cut yet.
 NO_BLOCKS = Blocks((), ())
@@ -28,7 +28,7 @@ class Job:
         settings: how to bake.
         needed: statistics by which the output is settled.
         in_chunks: the output has the order for streaming.
-        parts: where each part of the input begins, and at last the count.
+        parts: where each part of the input begins, and at last the count; none before that is known.
         blocks: that the scene is cut into; none before that is known.
         round: how often it was cut before.
         kept: how many splats of the parts before each part are kept; empty before that is known.
@@ -42,7 +42,7 @@ class Job:
     settings: BakeSettings
     needed: frozenset[str]
     in_chunks: bool
-    parts: tuple[int, ...]
+    parts: tuple[int, ...] = ()
     blocks: Blocks = NO_BLOCKS
     round: int = 0
     kept: tuple[int, ...] = ()
@@ -56,47 +56,23 @@ class Job:
         return min(self.stream.sh_degree, self.settings.max_sh)
 
     def builder(self) -> StagedBuilder:
-        """The builder of the tree."""
-        return BUILDERS[self.settings.method].load_stages()
+        """Return the builder of the tree."""
+        return BUILDERS[self.settings.method].load()
 
     def part(self, number: int) -> str:
-        """The name of what is known of a part of the input, whose splats are in blocks then."""
+        """Return the name of what is known of a part of the input, whose splats are in blocks then."""
         return f"scatter-{self.round}/{number}"
 
     def splats(self, part: int, group: int) -> str:
-        """The name of the splats of a part that are in a group of blocks."""
+        """Return the name of the splats of a part that are in a group of blocks."""
         return f"{self.part(part)}/{group}"
 
 
-def stage_of(number: int | str) -> str:
-    """The name of what is known of a stage, all of whose results are there then."""
-    return f"stage/{number}"
-
-
-def families_of(number: int) -> str:
-    """The name of the families of a stage."""
-    return f"families/{number}"
-
-
-def pending_of(number: int) -> str:
-    """The name of the nodes that a stage hands on."""
-    return f"pending/{number}"
-
-
-def window_of(number: int) -> str:
-    """The name of what a window of nodes is gathered by."""
-    return f"order/{number}"
-
-
-def encoded_of(number: int) -> str:
-    """The name of a window of nodes as it is written."""
-    return f"encoded/{number}"
-
-
-def clean_of(group: int) -> str:
-    """The name of the mark that the splats of a group of blocks were removed."""
-    return f"clean/{group}"
-
+#: Names of results by number: what is known of a stage, all of whose results are there then; its families; the nodes
+#: that it hands on; what a window of nodes is gathered by; that window as it is written; and the mark that the splats
+#: of a group of blocks were removed.
+stage_of, families_of, pending_of = "stage/{}".format, "families/{}".format, "pending/{}".format
+window_of, encoded_of, clean_of = "order/{}".format, "encoded/{}".format, "clean/{}".format
 
 #: Names of the root, of what is known of all nodes when they are in order, and of the mark that the output is published
 #: from then on.
@@ -104,7 +80,7 @@ ROOT, ORDER, PUBLISHED = "root", "order", "published"
 
 
 def forget(store: Store, damaged: Collection[str]) -> None:
-    """Removes results that are damaged, and whatever has to be made again for them; stages that are whole are kept."""
+    """Remove results that are damaged, and whatever has to be made again for them; stages that are whole are kept."""
     names = set(damaged)
     if any(name.startswith("order") for name in damaged):
         names |= {ORDER}
@@ -119,5 +95,5 @@ def forget(store: Store, damaged: Collection[str]) -> None:
 
 
 def _numbers(store: Store, prefix: str) -> list[int]:
-    """The numbers of the results whose names begin like this."""
+    """Return the numbers of the results whose names begin like this."""
     return [int(name.removeprefix(prefix)) for name in store.names() if name.startswith(prefix)]

@@ -1,33 +1,89 @@
-"""The nodes of a tree in their final order, gathered from the results of the stages."""
+"""Nodes of a tree in their final order, gathered from the results of the stages, and rows that these hold splats as."""
 
 from __future__ import annotations
 
 import functools
+import math
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...codecs.encoder import rows_of, windows_of
+from ...codecs import encoder as codec_encoder
+from ...codecs.encoder import windows_of
 from ...codecs.sound import check_valid
 from ...model.lod_tree import LodTree
-from ...model.splats import Splats
+from ...model.sh import COEFFICIENTS, degree_of
+from ...model.splats import COLUMNS, Splats
 from ...model.streams import NodeStream
-from ...support.parallel import ordered_map
+from ...support.parallel import for_blocks, ordered_map
 from ...support.progress import Progress
-from .contracts import Store
 from .job import ROOT, Job, encoded_of, families_of, window_of
 from .order import WINDOW_NODES
-from .rows import Rows, splats_of, width_of
+from .store import Store
+
+#: (N, `width_of`) float32: centre, scale, rotation, opacity, rgb and SH of a splat, in the order of `COLUMNS`.
+Rows = NDArray[np.float32]
+
+
+def width_of(sh_degree: int) -> int:
+    """Return numbers of a row."""
+    return 14 + 3 * COEFFICIENTS[sh_degree]
+
+
+def rows_of(splats: Splats, threads: int = 1) -> Rows:
+    """Return the rows of splats."""
+    rows = np.empty((len(splats), width_of(splats.sh_degree)), np.float32)
+    fill_rows(splats, rows, threads)
+    return rows
+
+
+def fill_rows(splats: Splats, rows: Rows, threads: int = 1) -> None:
+    """Fill rows with splats."""
+    places = _places(splats)
+
+    def fill(block: slice) -> None:
+        for part, column in places:
+            rows[block, part] = column[block]
+
+    for_blocks(fill, len(rows), threads, _nothing)
+
+
+def splats_of(rows: Rows, threads: int = 1) -> Splats:
+    """Return the splats of rows."""
+    splats = Splats.empty(len(rows), degree_of((rows.shape[1] - width_of(0)) // 3))
+    places = _places(splats)
+
+    def fill(block: slice) -> None:
+        for part, column in places:
+            column[block] = rows[block, part]
+
+    for_blocks(fill, len(rows), threads, _nothing)
+    return splats
+
+
+def _nothing(done: int) -> None:
+    """Report no progress."""
+
+
+def _places(splats: Splats) -> list[tuple[slice, Rows]]:
+    """Return each column as a matrix, a view of it, and where it is in a row."""
+    places, at = [], 0
+    for name in COLUMNS:
+        column = getattr(splats, name)
+        numbers = math.prod(column.shape[1:])
+        places.append((slice(at, at + numbers), column.reshape(len(splats), numbers)))
+        at += numbers
+    return places
+
 
 #: Rows that are not wanted and read with those around them, rather than in another go. Chosen: some 10 KB.
 GAP = 128
 
 
 def node_stream(job: Job, count: int, leaves: int) -> NodeStream:
-    """The nodes of a tree that is in order.
+    """Return the nodes of a tree that is in order.
 
     Args:
-        job: the job.
         count: of the nodes.
         leaves: of these.
     """
@@ -37,7 +93,7 @@ def node_stream(job: Job, count: int, leaves: int) -> NodeStream:
 
 
 def encode(job: Job, window: int, *, threads: int, progress: Progress) -> None:
-    """A task. Result: what the encoder of the output makes of the chunks of a window, by their numbers."""
+    """Encode a window; a task. Result: what the encoder of the output makes of its chunks, by their numbers."""
     assert job.encoder is not None
     encoder = job.encoder
     start = window * WINDOW_NODES
@@ -46,7 +102,7 @@ def encode(job: Job, window: int, *, threads: int, progress: Progress) -> None:
     check_valid(splats, threads)
 
     def encoded(part: slice) -> dict[str, NDArray[np.generic]]:
-        return encoder.encode(*rows_of(splats, tree, part), start + part.start)
+        return encoder.encode(*codec_encoder.rows_of(splats, tree, part), start + part.start)
 
     arrays: dict[str, NDArray[np.generic]] = {}
     for number, found in enumerate(ordered_map(encoded, windows_of(stop - start), threads)):
@@ -55,7 +111,7 @@ def encode(job: Job, window: int, *, threads: int, progress: Progress) -> None:
 
 
 def encoded_chunk(store: Store, number: int, name: str) -> NDArray[np.generic]:
-    """What `encode` made of a chunk: the array of this name."""
+    """Return what `encode` made of a chunk: the array of this name."""
     window, place = divmod(number, len(windows_of(WINDOW_NODES)))
     key = f"{place}.{name}"
     return store.get(encoded_of(window), [key])[key]
@@ -74,7 +130,7 @@ def _read(store: Store, width: int, start: int, stop: int, threads: int = 1) -> 
 
 
 def _read_window(store: Store, width: int, window: int) -> tuple[Rows, LodTree]:
-    """The nodes of a window, see `order.put_order`."""
+    """Return the nodes of a window, see `order.put_order`."""
     plan = store.get(window_of(window))
     count = plan["count"].astype(np.int64)
     total = int(count.sum()) + (window == 0)
@@ -95,7 +151,7 @@ def _read_window(store: Store, width: int, window: int) -> tuple[Rows, LodTree]:
 def _fill(
     store: Store, name: str, row: NDArray[np.int64], count: NDArray[np.int64], target: NDArray[np.int64], rows: Rows
 ) -> None:
-    """Fills rows with the children of some families of a stage: of each `count` of them, from `row` on, at `target`."""
+    """Fill rows with the children of some families of a stage: of each `count` of them, from `row` on, at `target`."""
     cuts = np.flatnonzero(row[1:] > row[:-1] + count[:-1] + GAP) + 1
     for first, last in zip([0, *cuts.tolist()], [*cuts.tolist(), len(row)], strict=True):
         begin, end, some = row[first], row[last - 1] + count[last - 1], count[first:last]

@@ -3,25 +3,35 @@
 from __future__ import annotations
 
 import bisect
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...lod.band_order import band_order
 from ...lod.builders import BUILDERS
 from ...lod.chunk_order import MOST_FAMILIES, family_order
-from ...lod.kernels.family_links import find_limits
-from ...lod.stages.records import NO_FAMILY, STAGE_BITS
+from ...lod.families import band_order
+from ...lod.kernels.tree_links import find_limits
+from ...lod.stage_records import NO_FAMILY, STAGE_BITS
 from ...model.nodes import CHUNK_NODES
 from ...model.splats import FloatArray
 from ...support.parallel import blocks_of, on_threads
 from ...support.progress import Progress
 from .job import ORDER, Job, families_of, window_of
-from .merging import Run, merged, runs_of
+from .store import Store
 
 #: Nodes of a window that is gathered in one go, whole chunks: 30 MB without SH, 120 MB with SH of degree 3. Chosen.
 WINDOW_NODES = 8 * CHUNK_NODES
+
+#: Families whose keys are in memory at once: some 100 MB. Chosen.
+MERGED = 1 << 22
+
+#: Keys of so many families that are looked at to cut them in ranges of about as many. Chosen.
+PROBES = 256
+
+#: A range of families of a stage: the stage, the first one and the end.
+Run = tuple[int, int, int]
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,14 +60,14 @@ class _Links:
         return 1 + int(self.count.sum(dtype=np.int64))
 
     def starts(self, sequence: NDArray[np.uint32]) -> NDArray[np.uint32]:
-        """(F,) where the children of each family are, if families are in this order."""
+        """Return (F,) where the children of each family are, if families are in this order."""
         start = np.empty(len(sequence), np.uint32)
         ordered = self.count[sequence].astype(np.uint32)
         start[sequence] = np.cumsum(ordered, dtype=np.uint32) - ordered + np.uint32(1)
         return start
 
     def families_at(self, start: NDArray[np.uint32]) -> NDArray[np.int32]:
-        """(nodes,) the family of the children of each node, if families begin there; -1 for a leaf."""
+        """Return (nodes,) the family of the children of each node, if families begin there; -1 for a leaf."""
         at = np.full(self.nodes, -1, np.int32)
         place = start[self.parent]
         place += self.offset
@@ -67,7 +77,7 @@ class _Links:
 
 
 def put_order(job: Job, *, threads: int, progress: Progress) -> None:
-    """A task. Results: what each window is read by, see `nodes`; at last the number of nodes and of levels."""
+    """Order the nodes; a task. Results: what each window is read by; at last the number of nodes and of levels."""
     links = _links(job)
     levels = 1
     sequence = _by_key(job, links, progress)
@@ -89,9 +99,9 @@ def put_order(job: Job, *, threads: int, progress: Progress) -> None:
 
 
 def _by_key(job: Job, links: _Links, progress: Progress) -> NDArray[np.uint32]:
-    """(F,) the families by batch, and then by key."""
+    """Return (F,) the families by batch, and then by key."""
     sequence, done = np.empty(len(links.count), np.uint32), 0
-    for some in merged(job.store, links.runs, links.begin):
+    for some in _merged(job.store, links.runs, links.begin):
         sequence[done : done + len(some)] = some
         done += len(some)
         progress("ordering", done, 2 * len(sequence), "family")
@@ -99,13 +109,13 @@ def _by_key(job: Job, links: _Links, progress: Progress) -> NDArray[np.uint32]:
 
 
 def _by_place(links: _Links, sequence: NDArray[np.uint32]) -> NDArray[np.int32]:
-    """(F,) the families in the order of the nodes whose children they are, in a tree whose families are in this one."""
+    """Return (F,) the families in the order of their parents, in a tree whose families are in this sequence."""
     at = links.families_at(links.starts(sequence))
     return at[at >= 0]
 
 
 def _links(job: Job) -> _Links:
-    """Reads the families of all stages."""
+    """Read the families of all stages."""
     begin = np.cumsum([0, *job.families])
     total = int(begin[-1])
     count, row, offset = np.empty(total, np.uint16), np.empty(total, np.uint32), np.zeros(total, np.uint16)
@@ -115,7 +125,7 @@ def _links(job: Job) -> _Links:
         here = slice(begin[stage], begin[stage + 1])
         count[here] = found["count"]
         row[here] = np.cumsum(found["count"], dtype=np.int64) - found["count"]
-        runs.append(runs_of(stage, found["batch"]))
+        runs.append(_runs_of(stage, found["batch"]))
         inner = np.flatnonzero(found["family"] != NO_FAMILY)
         family = found["family"][inner]
         child = begin[family >> STAGE_BITS] + (family & ((1 << STAGE_BITS) - 1))
@@ -128,13 +138,10 @@ def _links(job: Job) -> _Links:
 def _arranged(
     job: Job, links: _Links, by_place: NDArray[np.int32], progress: Progress
 ) -> tuple[int, NDArray[np.uint32] | None]:
-    """The levels of the tree, and the order of its families in the output, if that is not the builder's.
+    """Return the levels of the tree, and the order of its families in the output, if that is not the builder's.
 
     Args:
-        job: the job.
-        links: of the families.
         by_place: (F,) the families in the order of the nodes whose children they are.
-        progress: of the task.
     """
     place = np.empty(len(by_place), np.int32)
     place[by_place] = np.arange(len(by_place), dtype=np.int32)
@@ -155,7 +162,7 @@ def _arranged(
 
 
 def _of_all(job: Job, key: str) -> FloatArray:
-    """A column of the families of all stages."""
+    """Return a column of the families of all stages."""
     parts = [job.store.get(families_of(stage), [key])[key] for stage in range(len(job.families))]
     return np.concatenate(parts)
 
@@ -169,7 +176,7 @@ def _put_window(
     start: NDArray[np.uint32],
     at: NDArray[np.int32],
 ) -> None:
-    """Puts what a window is read by.
+    """Put what a window is read by.
 
     Families whose children are in it, as far as they are, stage by stage: `stages`, where those of each stage begin,
     `row`, `count` and `target`, the first one's place in the window. Its nodes with children: `owner`, places in the
@@ -199,3 +206,46 @@ def _put_window(
             "child_count": links.count[mine[owner]],
         },
     )
+
+
+def _runs_of(stage: int, batch: NDArray[np.int32]) -> dict[int, Run]:
+    """Return the families of each batch of a stage."""
+    ends = [*(np.flatnonzero(np.diff(batch)) + 1).tolist(), len(batch)]
+    return {int(batch[a]): (stage, a, b) for a, b in zip([0, *ends], ends, strict=False) if a < b}
+
+
+def _merged(store: Store, batches: list[dict[int, Run]], begin: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
+    """Yield the numbers of all families in the order of the tree, some at a time."""
+    for batch in sorted({batch for runs in batches for batch in runs}):
+        runs = [runs[batch] for runs in batches if batch in runs]
+        words = max(store.shape(families_of(stage), "key")[1] for stage, _, _ in runs)
+        for some in _ranges(store, runs, words):
+            key = np.concatenate([_keys(store, run, words) for run in some])
+            number = np.concatenate([np.arange(start, stop) + begin[stage] for stage, start, stop in some])
+            yield number[np.lexsort(key.T[::-1])]
+
+
+def _ranges(store: Store, runs: list[Run], words: int) -> Iterator[list[Run]]:
+    """Yield runs cut at the same keys, so that each range is small enough to be sorted at once."""
+    pieces = -(-sum(stop - start for _, start, stop in runs) // MERGED)
+    if pieces == 1:
+        yield runs
+        return
+    ends = np.concatenate([_keys(store, (stage, k, k + 1), words) for stage, a, b in runs for k in (a, b - 1)])
+    # The first word in which they differ decides: families that are the same there stay together.
+    word = int(np.argmax((ends != ends[0]).any(axis=0)))
+    columns = [_keys(store, run, words)[:, word].copy() for run in runs]
+    probes = np.sort(np.concatenate([column[:: max(1, MERGED // PROBES)] for column in columns]))
+    pivots = np.unique(probes[[len(probes) * piece // pieces for piece in range(1, pieces)]])
+    cuts = [[0, *np.searchsorted(column, pivots).tolist(), len(column)] for column in columns]
+    for piece in range(len(pivots) + 1):
+        parts = [(run[0], run[1] + cut[piece], run[1] + cut[piece + 1]) for run, cut in zip(runs, cuts, strict=True)]
+        if some := [part for part in parts if part[1] < part[2]]:
+            yield some
+
+
+def _keys(store: Store, run: Run, words: int) -> NDArray[np.uint64]:
+    """Return the keys of a run, of so many words."""
+    stage, start, stop = run
+    key = store.rows(families_of(stage), "key", start, stop)
+    return np.pad(key, ((0, 0), (words - key.shape[1], 0)))

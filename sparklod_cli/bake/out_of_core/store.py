@@ -1,13 +1,17 @@
-"""Stores of results: in a folder, which several machines may mount, or at an address."""
+"""Stores of results: in a folder, which several machines may mount, or at an address, in files of one layout."""
 
 from __future__ import annotations
 
 import contextlib
 import errno
+import json
+import math
 import os
+import struct
 import threading
-from abc import ABC, abstractmethod
-from collections.abc import Collection, Iterable, Iterator
+import zlib
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from io import BufferedReader, FileIO
 from pathlib import Path
 from typing import Any, NoReturn
@@ -18,8 +22,145 @@ from numpy.typing import NDArray
 from ...support import atomic
 from ...support.addresses import Address, Place
 from ...support.errors import ScratchError
-from .contracts import Arrays, Traffic
-from .results import HEAD, DamagedError, Entry, Table, check, decode_table, encode, table_bytes
+
+#: Arrays of a result by name, empty or of any shape.
+Arrays = Mapping[str, NDArray[Any]]
+
+#: How a file begins; the digit is the version of its layout.
+MAGIC = b"slresul1"
+
+#: The magic, the bytes of the table, their CRC-32, and the bytes of the file.
+HEAD = struct.Struct("<8sIIQ")
+
+#: Arrays begin at multiples of this, so that they are aligned wherever a file is mapped or read.
+ALIGNMENT = 64
+
+#: Bytes of a table that are believed; those of results have some hundreds.
+MAX_TABLE = 1 << 24
+
+
+class DamagedError(ValueError):
+    """A file is no result, or not all of it; the message says what is wrong."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """An array of a result.
+
+    Attributes:
+        dtype: of its numbers, as numpy writes it.
+        shape: of it.
+        offset: bytes of the file before it.
+        checksum: CRC-32 of its bytes.
+    """
+
+    dtype: np.dtype[Any]
+    shape: tuple[int, ...]
+    offset: int
+    checksum: int
+
+    @property
+    def bytes(self) -> int:
+        """Of all its numbers."""
+        return math.prod(self.shape) * self.dtype.itemsize
+
+    @property
+    def row_bytes(self) -> int:
+        """Of one row."""
+        return math.prod(self.shape[1:]) * self.dtype.itemsize
+
+
+@dataclass(frozen=True)
+class Table:
+    """The arrays of a result, by name.
+
+    Attributes:
+        entries: them.
+        bytes: of the whole file.
+    """
+
+    entries: Mapping[str, Entry]
+    bytes: int
+
+
+def encode(arrays: Arrays) -> Iterator[bytes | memoryview]:
+    """Yield the bytes of a result in pieces; nothing of an array that is C-contiguous is copied.
+
+    Raises:
+        TypeError: an array has no plain numbers.
+    """
+    whole = {name: _plain(name, array) for name, array in arrays.items()}
+    rows = [[name, array.dtype.str, list(array.shape), zlib.crc32(_bytes(array))] for name, array in whole.items()]
+    table = json.dumps(rows, separators=(",", ":")).encode()
+    end = start = _aligned(HEAD.size + len(table))
+    for array in whole.values():
+        end = _aligned(end) + array.nbytes
+    yield HEAD.pack(MAGIC, len(table), zlib.crc32(table), end) + table + bytes(start - HEAD.size - len(table))
+    at = start
+    for array in whole.values():
+        yield bytes(_aligned(at) - at)
+        yield _bytes(array)
+        at = _aligned(at) + array.nbytes
+
+
+def table_bytes(head: bytes) -> int:
+    """Return how many bytes follow the head, and are the table.
+
+    Raises:
+        DamagedError: it is no head of a result.
+    """
+    if len(head) < HEAD.size or not head.startswith(MAGIC):
+        raise DamagedError("it does not begin as a result")
+    size: int = HEAD.unpack(head)[1]
+    if size > MAX_TABLE:
+        raise DamagedError(f"its table has {size:,} bytes")
+    return size
+
+
+def decode_table(head: bytes, text: bytes, file_bytes: int) -> Table:
+    """Return the table of a file.
+
+    Args:
+        head, text: what it begins with.
+        file_bytes: that it has.
+
+    Raises:
+        DamagedError: the table is damaged, or the file has another length than when it was written.
+    """
+    _, size, checksum, end = HEAD.unpack(head)
+    if len(text) != size or zlib.crc32(text) != checksum:
+        raise DamagedError("its table is damaged")
+    if end != file_bytes:
+        raise DamagedError(f"it has {file_bytes:,} bytes of {end:,}")
+    entries, at = {}, HEAD.size + size
+    for name, dtype, shape, each in json.loads(text):
+        entries[name] = Entry(np.dtype(dtype), tuple(shape), _aligned(at), each)
+        at = _aligned(at) + entries[name].bytes
+    return Table(entries, end)
+
+
+def check(entry: Entry, pieces: Iterable[NDArray[Any]]) -> None:
+    """Raise `DamagedError` where the bytes of an array, in pieces, are not those that were written."""
+    found = 0
+    for piece in pieces:
+        found = zlib.crc32(_bytes(piece), found)
+    if found != entry.checksum:
+        raise DamagedError("its checksum does not match")
+
+
+def _plain(name: str, array: NDArray[Any]) -> NDArray[Any]:
+    if array.dtype.kind not in "biufc":
+        raise TypeError(f"{name} is an array of {array.dtype}; results have arrays of plain numbers")
+    return np.ascontiguousarray(array).reshape(array.shape)
+
+
+def _bytes(array: NDArray[Any]) -> memoryview:
+    return array.reshape(-1).view(np.uint8).data
+
+
+def _aligned(offset: int) -> int:
+    return -(-offset // ALIGNMENT) * ALIGNMENT
+
 
 #: Suffix of the files of results, so that a result may have the name of a folder of others.
 SUFFIX = ".result"
@@ -37,14 +178,36 @@ FULL = {errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC)}
 _File = FileIO | BufferedReader
 
 
-class FileStore(ABC):
-    """A file for each result.
+class Traffic:
+    """Bytes of results that a store has written and read in this process; a copy in another one begins at 0."""
 
-    A checksum of each array, in its file, tells what was damaged. `get` compares it, `rows` does not; `is_sound` reads
-    all of a result for that, as a bake does that resumes.
+    def __init__(self) -> None:
+        self.written = self.read = 0
+        self._lock = threading.Lock()
+
+    def add(self, *, written: int = 0, read: int = 0) -> None:
+        """Count bytes; may be called by several threads at once."""
+        with self._lock:
+            self.written += written
+            self.read += read
+
+    def __reduce__(self) -> tuple[type[Traffic], tuple[()]]:
+        return Traffic, ()
+
+
+class Store:
+    """Results of tasks by name, each a file that appears whole or not at all, with arrays by key.
+
+    Small, so that it can be pickled. Methods may be called by several threads at once, and raise `ScratchError` where
+    results cannot be read or written. A checksum of each array, in its file, tells what was damaged. `get` compares it,
+    `rows` does not; `is_sound` reads all of a result for that, as a bake does that resumes.
+
+    Files are not synced, which would take half of the time of writing: what a process has written is there when the
+    process is killed, and checksums tell what a power failure damaged. At an address, an object appears when all of it
+    was sent.
 
     Attributes:
-        folder: of the files; made when the first result is put.
+        folder: of the files, on this machine, mounted by several, or at an address; made when the first result is put.
         traffic: what was written and read by this process.
     """
 
@@ -54,31 +217,49 @@ class FileStore(ABC):
         self._tables: dict[str, Table] = {}
         self._lock = threading.Lock()
 
-    def __reduce__(self) -> tuple[type[FileStore], tuple[Place]]:
+    def __reduce__(self) -> tuple[type[Store], tuple[Place]]:
         return type(self), (self.folder,)
 
     def __str__(self) -> str:
         return str(self.folder)
 
-    @abstractmethod
     def names(self) -> list[str]:
-        """The names of all results, in order."""
+        """Return the names of all results, in order."""
+        folder = self.folder
+        if isinstance(folder, Path):
+            files = folder.rglob(f"*{SUFFIX}")
+            return sorted(path.relative_to(folder).as_posix().removesuffix(SUFFIX) for path in files)
+        try:
+            return [name.removesuffix(SUFFIX) for name in folder.files() if name.endswith(SUFFIX)]
+        except OSError as error:
+            self._refused("read", error)
 
-    @abstractmethod
+    def _place(self, name: str) -> Place:
+        """Return the file of a result."""
+        return self.folder / f"{name}{SUFFIX}"
+
     def _open(self, name: str) -> _File:
-        """Opens the file of a result."""
+        """Open the file of a result."""
+        place = self._place(name)
+        if isinstance(place, Path):
+            return place.open("rb", buffering=0)
+        table = self._tables.get(name)
+        return place.open(buffering=READ_AHEAD, size=None if table is None else table.bytes)
 
-    @abstractmethod
     def _write(self, name: str, pieces: Iterable[bytes | memoryview]) -> int:
-        """Writes the file of a result, which appears when it is whole; returns its size."""
-
-    @abstractmethod
-    def _unlink(self, name: str) -> None:
-        """Removes the file of a result, if it is there."""
+        """Write the file of a result, which appears when it is whole; return its size."""
+        place = self._place(name)
+        if isinstance(place, Address):
+            return place.write(pieces)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        return atomic.write(place, pieces, overwrite=True, sync=False)
 
     def has(self, name: str) -> bool:
-        """Whether there is a result of the length that it was written with."""
+        """Return whether there is a result, in a folder of the length that it was written with."""
+        place = self._place(name)
         try:
+            if isinstance(place, Address):
+                return place.is_file()
             with self._open(name) as file:
                 self._table(name, file)
         except (FileNotFoundError, NotADirectoryError, DamagedError):
@@ -88,7 +269,7 @@ class FileStore(ABC):
         return True
 
     def put(self, name: str, arrays: Arrays) -> None:
-        """Writes a result; replaces one of this name."""
+        """Write a result; replaces one of this name."""
         self._forget(name)
         try:
             self.traffic.add(written=self._write(name, encode(arrays)))
@@ -96,7 +277,7 @@ class FileStore(ABC):
             self._refused("write", error)
 
     def get(self, name: str, keys: Collection[str] | None = None) -> dict[str, NDArray[Any]]:
-        """Reads a result, or some of its arrays, and compares their checksums."""
+        """Read a result, or some of its arrays, and compare their checksums."""
         found = {}
         with self._reading(name) as (file, table):
             for key in table.entries if keys is None else keys:
@@ -107,7 +288,7 @@ class FileStore(ABC):
         return found
 
     def rows(self, name: str, key: str, start: int, stop: int) -> NDArray[Any]:
-        """Reads rows of an array and nothing else."""
+        """Read rows of an array and nothing else."""
         with self._reading(name) as (file, table):
             entry = table.entries[key]
             start, stop, _ = slice(start, stop).indices(entry.shape[0])
@@ -117,20 +298,20 @@ class FileStore(ABC):
         return rows
 
     def shape(self, name: str, key: str) -> tuple[int, ...]:
-        """The shape of an array."""
+        """Return the shape of an array."""
         with self._reading(name) as (_, table):
             return table.entries[key].shape
 
     def remove(self, name: str) -> None:
-        """Removes a result, if it is there."""
+        """Remove a result, if it is there."""
         self._forget(name)
         try:
-            self._unlink(name)
+            self._place(name).unlink(missing_ok=True)
         except OSError as error:
             self._refused("write", error)
 
     def is_sound(self, name: str) -> bool:
-        """Whether a result is there, and has the bytes that were put; reads all of it."""
+        """Return whether a result is there, and has the bytes that were put; reads all of it."""
         self._forget(name)
         if not self.has(name):
             return False
@@ -150,7 +331,7 @@ class FileStore(ABC):
             self._tables.pop(name, None)
 
     def _table(self, name: str, file: _File) -> Table:
-        """The table of a file that is open, which is read once."""
+        """Return the table of a file that is open, which is read once."""
         size = file.seek(0, os.SEEK_END)
         with self._lock:
             table = self._tables.get(name)
@@ -164,7 +345,7 @@ class FileStore(ABC):
 
     @contextlib.contextmanager
     def _reading(self, name: str) -> Iterator[tuple[_File, Table]]:
-        """The file of a result, and its table."""
+        """Yield the file of a result, and its table."""
         try:
             with self._open(name) as file:
                 yield file, self._table(name, file)
@@ -193,76 +374,8 @@ class FileStore(ABC):
         ) from None
 
 
-class FolderStore(FileStore):
-    """A folder of this machine, or one that several machines mount.
-
-    Files are not synced, which would take half of the time of writing: what a process has written is there when the
-    process is killed, and checksums tell what a power failure damaged.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        super().__init__(folder)
-        self._folder = folder
-
-    def names(self) -> list[str]:
-        files = self._folder.rglob(f"*{SUFFIX}")
-        return sorted(path.relative_to(self._folder).as_posix().removesuffix(SUFFIX) for path in files)
-
-    def _open(self, name: str) -> FileIO:
-        return self._path(name).open("rb", buffering=0)
-
-    def _write(self, name: str, pieces: Iterable[bytes | memoryview]) -> int:
-        path = self._path(name)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        return atomic.write(path, pieces, overwrite=True, sync=False)
-
-    def _unlink(self, name: str) -> None:
-        self._path(name).unlink(missing_ok=True)
-
-    def _path(self, name: str) -> Path:
-        return self._folder / f"{name}{SUFFIX}"
-
-
-class AddressStore(FileStore):
-    """An object for each result, which appears when all of it was sent."""
-
-    def __init__(self, folder: Address) -> None:
-        super().__init__(folder)
-        self._folder = folder
-
-    def has(self, name: str) -> bool:
-        try:
-            return self._path(name).is_file()
-        except OSError as error:
-            self._refused("read", error)
-
-    def names(self) -> list[str]:
-        try:
-            return [name.removesuffix(SUFFIX) for name in self._folder.files() if name.endswith(SUFFIX)]
-        except OSError as error:
-            self._refused("read", error)
-
-    def _open(self, name: str) -> BufferedReader:
-        table = self._tables.get(name)
-        return self._path(name).open(buffering=READ_AHEAD, size=None if table is None else table.bytes)
-
-    def _write(self, name: str, pieces: Iterable[bytes | memoryview]) -> int:
-        return self._path(name).write(pieces)
-
-    def _unlink(self, name: str) -> None:
-        self._path(name).unlink(missing_ok=True)
-
-    def _path(self, name: str) -> Address:
-        return self._folder / f"{name}{SUFFIX}"
-
-
-def store_of(folder: Place) -> FileStore:
-    """The store in a folder, wherever it is."""
-    return AddressStore(folder) if isinstance(folder, Address) else FolderStore(folder)
-
-
 def _filled(file: _File, offset: int, array: NDArray[Any]) -> NDArray[Any]:
-    """An array with the bytes of a file."""
+    """Return an array with the bytes of a file."""
     view = array.reshape(-1).view(np.uint8).data
     file.seek(offset)
     while view:
@@ -274,7 +387,7 @@ def _filled(file: _File, offset: int, array: NDArray[Any]) -> NDArray[Any]:
 
 
 def _pieces(file: _File, entry: Entry) -> Iterator[NDArray[Any]]:
-    """The bytes of an array, some at a time."""
+    """Yield the bytes of an array, some at a time."""
     for start in range(0, entry.bytes, CHECK_BYTES):
         piece = np.empty(min(CHECK_BYTES, entry.bytes - start), np.uint8)
         yield _filled(file, entry.offset + start, piece)

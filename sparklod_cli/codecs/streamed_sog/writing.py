@@ -28,7 +28,7 @@ TOGETHER = 2
 
 
 class Divided(Protocol):
-    """How a scene was divided into regions, for the manifest; `lod.detail_settings.DetailSettings` is one."""
+    """How a scene was divided into regions, for the manifest; `lod.detail_rule.DetailSettings` is one."""
 
     @property
     def chunk_splats(self) -> int:

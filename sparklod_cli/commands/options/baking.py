@@ -22,7 +22,7 @@ from .refining import fit_settings_of, refining_options
 from .types import AutoOr, Ball, Codes, Numbers, Real
 
 if TYPE_CHECKING:
-    from ...api.bake_jobs import BakeSettings
+    from ...bake.settings import BakeSettings
     from ...codecs.options import WriteOptions
 
 TREE, SELECTION, PLACE, FORMAT = "Tree", "Selection", "Rotation, scale and position", "File format"
@@ -259,7 +259,7 @@ def bake_settings(ctx: click.Context, *, suffix: str, raw: bool, streamed_sog: b
         streamed_sog: write that.
         converts: somebody chose the format of the output, so that the tree of an input is kept.
     """
-    from ...api.bake_jobs import BakeSettings
+    from ...bake.settings import BakeSettings
     from ...model.selection import Selection
     from ...model.transforms import Transform
 

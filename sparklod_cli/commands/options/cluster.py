@@ -13,7 +13,7 @@ from ..usage import exclude, given, is_given
 from .common import Command, General
 
 if TYPE_CHECKING:
-    from ...api.bake_jobs import ClusterEngine
+    from ...bake.out_of_core.cluster_engine import ClusterEngine
     from ..console import Console
 
 CLUSTER = "Cluster"
@@ -57,7 +57,7 @@ def cluster_of(ctx: click.Context, general: General, console: Console) -> Iterat
     if not given(ctx, OF_CLUSTERS):
         yield None
         return
-    from ...api.bake_jobs import ClusterSettings, cluster
+    from ...bake.out_of_core.cluster import ClusterSettings, cluster
 
     asked = ctx.params
     threads = general.threads if asked["scheduler"] is None or is_given(ctx, "threads") else None

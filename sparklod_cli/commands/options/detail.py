@@ -14,7 +14,7 @@ from .common import Command
 from .types import Quantity, Real
 
 if TYPE_CHECKING:
-    from ...lod.detail_settings import DetailSettings
+    from ...lod.detail_rule import DetailSettings
 
 HEADING = "Streamed SOG"
 
@@ -26,7 +26,7 @@ OF_DETAIL = (
 
 
 def _levels(text: str) -> tuple[float, ...] | None:
-    from ...lod.detail_settings import parse_levels
+    from ...lod.detail_rule import parse_levels
 
     return parse_levels(text)
 
@@ -90,7 +90,7 @@ def detail_options(command: Command) -> Command:
 
 def detail_of(ctx: click.Context) -> DetailSettings:
     """How levels and regions are made."""
-    from ...lod.detail_settings import DetailSettings
+    from ...lod.detail_rule import DetailSettings
 
     asked = ctx.params
     return DetailSettings(asked["levels"], asked["chunk_splats"], asked["region_extent"], asked["region_min_splats"])

@@ -14,7 +14,7 @@ from .common import Command
 from .types import Quantity
 
 if TYPE_CHECKING:
-    from ...api.bake_jobs import Resources
+    from ...bake.settings import Resources
 
 HEADING = "Large scenes"
 
@@ -60,7 +60,7 @@ def resources_options(command: Command) -> Command:
 
 def resources_of(ctx: click.Context) -> Resources:
     """What the bakes may use; loads numpy."""
-    from ...api.bake_jobs import Resources
+    from ...bake.settings import Resources
 
     asked = ctx.params
     return Resources(memory=asked["memory"], scratch_dir=asked["scratch_dir"], resume=asked["resume"])

@@ -113,14 +113,14 @@ class Rates(NamedTuple):
 
 @kernel(inline=True)
 def size_of(scale, lod_opacity, node):
-    """Three halves of a node's feature size; see `gaussian.spark_size`."""
+    """Return three halves of a node's feature size; see `gaussian.spark_size`."""
     mean = scale[node, 0] + scale[node, 1] + scale[node, 2]
     return mean * (f32(1) + SIZE_PER_D * max(lod_opacity[node] - f32(1), f32(0)))
 
 
 @kernel(inline=True)
 def moved(first, second, slot, column, of_property, gradient, rate, correction):
-    """Step along three components of a property, whose second moment they share."""
+    """Return the step along three components of a property, whose second moment they share."""
     a, b, c = gradient
     v = second[slot, of_property]
     v += (f32(1) - BETA2) * ((a * a + b * b + c * c) / f32(3) - v)
@@ -134,7 +134,7 @@ def moved(first, second, slot, column, of_property, gradient, rate, correction):
 
 @kernel(out(Columns), Columns, i8[:], i4[:], Gradients, Rates, Moments, f4, parallel=True)
 def step(nodes, old, index, slots, gradients, rates, moments, precision):
-    """Moves the merged splats that were drawn against their gradients.
+    """Move the merged splats that were drawn against their gradients.
 
     Args:
         nodes: `Columns`, changed.

@@ -1,4 +1,4 @@
-"""What one camera may see of some nodes, as columns of shaded splats."""
+"""Which nodes a camera may see, and how far a picture is from another."""
 
 from __future__ import annotations
 
@@ -6,15 +6,16 @@ import numpy as np
 
 from ...render.kernels.ellipse import Lens, Limits
 from ...support.jit import kernel, prange
-from ...support.jit_types import b1, f4, i8, out
-from .adam import Columns
+from ...support.jit_types import b1, f4, f8, i8, out
 
 f32 = np.float32
+
+ZERO, ONE = f32(0), f32(1)
 
 
 @kernel(f4[:, :], f4[:], i8[:], f4[:, :], Lens, Limits, out(b1[:]), parallel=True)
 def mark_seen(center, lod_opacity, index, world_to_camera, lens, limits, seen):
-    """Marks the nodes that `project` may draw: between near and far, with a centre in or near the picture.
+    """Mark the nodes that `project` may draw: between near and far, with a centre in or near the picture.
 
     Args:
         center: (N, 3) float32 world units.
@@ -44,26 +45,55 @@ def mark_seen(center, lod_opacity, index, world_to_camera, lens, limits, seen):
         seen[i] = visible
 
 
-@kernel(Columns, i8[:], out(Columns), parallel=True)
-def gather(columns, index, found):
-    """Copies some nodes.
+@kernel(inline=True)
+def clipped(value):
+    """Return a colour value as a picture shows it."""
+    return min(max(value, ZERO), ONE)
+
+
+@kernel(f4[:, :, :], f4[:, :, :], out(f8[:, :]), parallel=True)
+def squared_differences(image, full, sums):
+    """Fill the sums of squared differences over the pixels of each row.
 
     Args:
-        columns: `adam.Columns` of N nodes.
-        index: (M,) int64 nodes.
-        found: `adam.Columns` of M, filled.
+        image, full: (H, W, 4) float32, colours multiplied by alpha, and alpha.
+        sums: (H, 2) float64, filled: on black and on white.
     """
-    center, scale, quat, lod_opacity, rgb, sh = columns
-    to_center, to_scale, to_quat, to_opacity, to_rgb, to_sh = found
-    for i in prange(len(index)):
-        at = index[i]
-        for c in range(3):
-            to_center[i, c] = center[at, c]
-            to_scale[i, c] = scale[at, c]
-            to_rgb[i, c] = rgb[at, c]
-        for c in range(4):
-            to_quat[i, c] = quat[at, c]
-        to_opacity[i] = lod_opacity[at]
-        for k in range(sh.shape[1]):
+    height, width = image.shape[:2]
+    for y in prange(height):
+        black, white = 0.0, 0.0
+        for x in range(width):
+            behind, full_behind = ONE - image[y, x, 3], ONE - full[y, x, 3]
             for c in range(3):
-                to_sh[i, k, c] = sh[at, k, c]
+                a, b = image[y, x, c], full[y, x, c]
+                on_black = clipped(a) - clipped(b)
+                on_white = clipped(a + behind) - clipped(b + full_behind)
+                black += on_black * on_black
+                white += on_white * on_white
+        sums[y, 0] = black
+        sums[y, 1] = white
+
+
+@kernel(f4[:, :, :], f4[:, :, :], f4, f4, out(f4[:, :, :]), parallel=True)
+def by_image(image, full, on_black, on_white, result):
+    """Fill the derivative of half the squared differences on either background, times `on_black` and `on_white`.
+
+    A value that is clipped counts only if it is to come back.
+
+    Args:
+        image, full: of `squared_differences`.
+        on_black, on_white: float32.
+        result: (H, W, 4) float32, filled: derivative by each value of `image`.
+    """
+    height, width = image.shape[:2]
+    for y in prange(height):
+        for x in range(width):
+            behind, full_behind = ONE - image[y, x, 3], ONE - full[y, x, 3]
+            by_alpha = ZERO
+            for c in range(3):
+                a, b = image[y, x, c], full[y, x, c]
+                black = on_black * (clipped(a) - clipped(b))
+                white = on_white * (clipped(a + behind) - clipped(b + full_behind))
+                result[y, x, c] = black + white
+                by_alpha -= white
+            result[y, x, 3] = by_alpha

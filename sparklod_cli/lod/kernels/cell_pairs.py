@@ -65,7 +65,7 @@ LOG2_E = f32(math.log2(math.e))
 
 @kernel(inline=True)
 def on_plane(axx, ayy, axy, bxx, byy, bxy, x, y, density_a, density_b):
-    """Coverage on a plane, divided by 2 pi, of two Gaussians' overlap, and of both; float32.
+    """Return coverage on a plane, divided by 2 pi, of two Gaussians' overlap, and of both; float32.
 
     Args:
         axx, ayy, axy, bxx, byy, bxy: their covariances on the plane.
@@ -84,7 +84,7 @@ def on_plane(axx, ayy, axy, bxx, byy, bxy, x, y, density_a, density_b):
 
 @kernel()
 def unite(a, b):
-    """Replaces nodes by the unions of each with another one.
+    """Replace nodes by the unions of each with another one.
 
     The overlap of two nodes covers a share h of what both cover, at most 0.5, which is measured on the planes of the
     three axes. It is in the middle, and about half as wide as the two: its moments are those of the union less. What
@@ -149,7 +149,7 @@ def unite(a, b):
 
 @kernel()
 def finish_row(lanes, i, row):
-    """Fills the node row of node i, with the density of its coverage over the area of its ellipsoid."""
+    """Fill the node row of node i, with the density of its coverage over the area of its ellipsoid."""
     for column in range(WIDTH):
         row[column] = lanes[column, i]
     large, middle, small = semi_axes(
@@ -165,7 +165,7 @@ def finish_row(lanes, i, row):
 
 @kernel()
 def find_partners_in_cells(lanes, count, cell, place, largest, cost, best, at):
-    """Fills the cheapest partner of each node of a span, by its place in the cell, or -1.
+    """Fill the cheapest partner of each node of a span, by its place in the cell, or -1.
 
     Among equal costs, that partner wins whose place differs from the node's in the lowest bits, so that among many
     equal nodes half choose each other.
@@ -201,7 +201,7 @@ def find_partners_in_cells(lanes, count, cell, place, largest, cost, best, at):
 
 @kernel()
 def merge_span(nodes, is_first, rows, largest, begin, end, made, owner, row):
-    """Merges the nodes of whole cells, those from `begin` to `end`; see `merge_in_cells`."""
+    """Merge the nodes of whole cells, those from `begin` to `end`; see `merge_in_cells`."""
     size = end - begin
     lanes = np.empty((WIDTH, size + PADDING), np.float32)
     a, b = np.ones(WIDTH * GROUP, np.float32), np.ones(WIDTH * GROUP, np.float32)
@@ -283,7 +283,7 @@ def merge_span(nodes, is_first, rows, largest, begin, end, made, owner, row):
 
 @kernel(u4[:], b1[:], out(f4[:, :]), f4, i8, parallel=True)
 def merge_in_cells(nodes, is_first, rows, largest, made):
-    """Merges nodes with others of their cell, and fills the rows of the nodes that become parents.
+    """Merge nodes with others of their cell, and fills the rows of the nodes that become parents.
 
     Args:
         nodes: (n,) uint32 rows, by cell and then along a curve.
@@ -311,7 +311,7 @@ def merge_in_cells(nodes, is_first, rows, largest, made):
 
 @kernel(u4[:], i8[:], u4[:])
 def split_families(nodes, owner, row):
-    """Separates the members of families from the nodes that are left as they are.
+    """Separate the members of families from the nodes that are left as they are.
 
     Args:
         nodes: (n,) uint32 rows.

@@ -1,17 +1,21 @@
-"""Splits sets of families in two, again and again, until each set is a chunk.
+"""The kernels of the order of chunks: the demand for families, their division into chunks, their order in a chunk.
 
-A set is a slice of `sequence`, an array of families, in descending order of size, parents before their children. Its
-*roots* are the families whose parents' families are not in it; each family of a set has one root above it.
+Sets of families are split in two, again and again, until each set is a chunk. A set is a slice of `sequence`, an array
+of families, in descending order of size, parents before their children. Its *roots* are the families whose parents'
+families are not in it; each family of a set has one root above it.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ...support.jit import kernel, prange
-from ...support.jit_types import fields, i4, i8, out, u1
+from ...support.jit_types import f8, fields, i4, i8, out, u1
+from .pixel_scale import NODES, VIEWS, ZERO, pixel_scale
+from .sort import AXIS_BITS, interleave
 
 #: Ways to split a set: along x, y, z (whole subtrees of roots, by the parent's centre), or by size.
 AXES = 4
@@ -27,6 +31,21 @@ FEW_CHUNKS = 8
 #: When fewer nodes than this are left to fill a part, a family that would leave one is passed over, since no family of
 #: a builder has one node. Chosen.
 NEARLY_FULL = 64
+
+
+#: Viewpoints that one pass over the families serves. Measured: 8 take half as long as one by one.
+LANES = 8
+
+#: Buckets of pixel scales: the upper bits of a float32, 1.6 to 3.1 % wide, which cover all of its numbers above 0.
+BUCKET_SHIFT = 18
+BUCKETS = 1 << (31 - BUCKET_SHIFT)
+
+#: Bytes that each thread takes for a family: its buckets.
+DEMAND_BYTES = 2 * LANES
+
+#: Bits of a key below its depth, and the depth from which on families keep the order that they have.
+CODE_BITS = 57
+DEEP = 63
 
 
 @fields(i4[:], i4[:], i4[:, :], u1[:, :])
@@ -48,7 +67,7 @@ class Families(NamedTuple):
 
 @kernel()
 def find_roots(families, members, number, set_of, root, weight):
-    """Finds the roots of a set, and the nodes below each.
+    """Find the roots of a set, and the nodes below each.
 
     Args:
         families: `Families`.
@@ -79,7 +98,7 @@ def find_roots(families, members, number, set_of, root, weight):
 
 @kernel()
 def sum_of(values):
-    """The sum of uint8 values."""
+    """Return the sum of uint8 values."""
     total = 0
     for value in values:
         total += np.int64(value)
@@ -88,7 +107,7 @@ def sum_of(values):
 
 @kernel()
 def fill_bins(families, members, root, weight, nodes, greatest):
-    """Fills the bins of a set, along each axis.
+    """Fill the bins of a set, along each axis.
 
     Args:
         families, members, root, weight: as for `find_roots`, which filled the last two.
@@ -120,7 +139,7 @@ def fill_bins(families, members, root, weight, nodes, greatest):
 
 @kernel()
 def choose_split(nodes, greatest, size, chunks):
-    """The split of a set after which viewers are expected to fetch the fewest bytes.
+    """Return the split of a set after which viewers are expected to fetch the fewest bytes.
 
     A part is expected to be fetched as a whole by those who need any of it, as in the surface area heuristic of ray
     tracing: the cost of a split is the sum over both parts of nodes x viewers, and viewers are counted by the greatest
@@ -167,7 +186,7 @@ def choose_split(nodes, greatest, size, chunks):
 
 @kernel()
 def mark_first_part(families, members, root, weight, axis, room):
-    """Marks what goes into the first part of a split, by a weight of -1.
+    """Mark what goes into the first part of a split, by a weight of -1.
 
     Families are taken in order as long as there is room; those that do not fit are passed over, so that the room is
     used up but for very few nodes.
@@ -213,7 +232,7 @@ def mark_first_part(families, members, root, weight, axis, room):
 
 @kernel()
 def move_first_part(members, root, weight, spare):
-    """Moves the marked families to the beginning; both parts keep their order.
+    """Move the marked families to the beginning; both parts keep their order.
 
     Args:
         members, root, weight: as for `mark_first_part`.
@@ -238,7 +257,7 @@ def move_first_part(members, root, weight, spare):
 
 @kernel(Families, i8[:, :], out(i4[:]), out(i4[:]), out(i4[:]), out(i8[:]), out(i4[:]), out(i8[:]), parallel=True)
 def split_sets(families, sets, sequence, set_of, root, weight, spare, lengths):
-    """Splits each set in two; the first part of each fills whole chunks, but for very few nodes.
+    """Split each set in two; the first part of each fills whole chunks, but for very few nodes.
 
     Args:
         families: `Families`.
@@ -265,3 +284,86 @@ def split_sets(families, sets, sequence, set_of, root, weight, spare, lengths):
         if roots == 1 or not mark_first_part(families, members, root, weight, axis, room):
             mark_first_part(families, members, root, weight, SIZE, room)
         lengths[i] = move_first_part(members, root, weight, spare[begin:end])
+
+
+@kernel(NODES, i4[:], VIEWS, f8, f8, out(u1[:, :]), parallel=True)
+def fill_demand(families, parent, views, least, most, demand):
+    """Fill the chance that a viewer at each viewpoint refines a family's parent, if its budget is unknown.
+
+    A viewer refines the largest nodes first. It needs a family if its budget has room for all families whose pixel
+    scale, limited by those of their ancestors, is at least as large. The logarithm of budgets is uniform between
+    `least` and `most` nodes.
+
+    Args:
+        families: (F,) `pixel_scale.NODE`, the parents of families, parents before their children.
+        parent: (F,) int32, the family to which each parent belongs; -1 for the root.
+        views: (V,) `pixel_scale.VIEW`; V is a multiple of `LANES`.
+        least, most: budgets in nodes, float64; `least` is less than `most`.
+        demand: (F, V) uint8, filled: 255 for certain. No family has more than its parent.
+    """
+    span = math.log(most / least)
+    for block in prange(len(views) // LANES):
+        bucket = np.empty((len(families), LANES), np.int16)
+        nodes = np.zeros((LANES, BUCKETS), np.int64)
+        code = np.zeros((LANES, BUCKETS), np.uint8)
+        first = block * LANES
+        for family in range(len(families)):
+            above = parent[family]
+            for lane in range(LANES):
+                scale = pixel_scale(families[family], views[first + lane])
+                if not scale >= ZERO:  # also not a number
+                    scale = ZERO
+                at = np.float32(scale).view(np.int32) >> BUCKET_SHIFT
+                if above >= 0:  # buckets ascend as scales do, so that the least one has the least bucket
+                    at = min(at, np.int32(bucket[above, lane]))
+                bucket[family, lane] = at
+                nodes[lane, at] += families[family].child_count
+        for lane in range(LANES):
+            needed = 0
+            for at in range(BUCKETS - 1, -1, -1):
+                needed += nodes[lane, at]
+                chance = 1.0 - math.log(max(needed, 1) / least) / span
+                code[lane, at] = np.uint8(255.0 * min(1.0, max(0.0, chance)))
+        for family in range(len(families)):
+            for lane in range(LANES):
+                demand[family, first + lane] = code[lane, bucket[family, lane]]
+
+
+@kernel(i8[:], i4[:], i4[:, :], i8, out(i4[:]), out(i4[:]), out(i4[:]), parallel=True)
+def sort_within_chunks(bounds, parent, rank, axis_bits, sequence, chunk_of, depth):
+    """Sort the families of each chunk by the depth within it, then along a Morton curve.
+
+    Neighbours in space have similar centres and colours, which makes them smaller to compress; parents stay before
+    their children.
+
+    Args:
+        bounds: (C + 1,) int64, where each chunk begins in `sequence`, and the end.
+        parent: (F,) int32, the family that has its parent; -1 for the root's.
+        rank: (F, 3) int32, place of the parent's centre among all, along each axis.
+        axis_bits: bits of the greatest rank.
+        sequence: (F,) int32 families, parents first; reordered.
+        chunk_of: (F,) int32 of no chunk's number; filled. Another thread may not have reached the parent's chunk yet.
+        depth: (F,) int32, working memory.
+    """
+    up, down = np.uint64(max(AXIS_BITS - axis_bits, 0)), np.uint64(max(axis_bits - AXIS_BITS, 0))
+    for chunk in prange(len(bounds) - 1):
+        begin, end = bounds[chunk], bounds[chunk + 1]
+        members = sequence[begin:end].copy()
+        keys = np.empty(len(members), np.uint64)
+        for i in range(len(members)):
+            chunk_of[members[i]] = chunk
+        for i in range(len(members)):
+            family = members[i]
+            above = parent[family]
+            depth[family] = depth[above] + 1 if above >= 0 and chunk_of[above] == chunk else 0
+            if depth[family] >= DEEP:
+                keys[i] = (np.uint64(DEEP) << np.uint64(CODE_BITS)) | np.uint64(i)
+                continue
+            x, y, z = np.uint64(rank[family, 0]), np.uint64(rank[family, 1]), np.uint64(rank[family, 2])
+            code = interleave((x << up) >> down, (y << up) >> down, (z << up) >> down)
+            keys[i] = (np.uint64(depth[family]) << np.uint64(CODE_BITS)) | (
+                code >> np.uint64(3 * AXIS_BITS - CODE_BITS)
+            )
+        order = np.argsort(keys)
+        for i in range(len(members)):
+            sequence[begin + i] = members[order[i]]

@@ -23,6 +23,12 @@ LEAF = np.int32(-(1 << 31))
 BUDGET, PIXEL, MISSING, EXHAUSTED, FULL = 0, 1, 2, 3, 4
 
 
+#: Entries of `Slots.tally`: slots in use; refined nodes; pending ones; roots; nodes of the cut once all of bucket LOW
+#: and above are refined; LOW itself; refined nodes whose children are missing; whether the slots did not suffice.
+COUNT, RUNS, WAITING, BASE, DRAWN, LOW, GAPS, OVERFLOW = range(8)
+TALLIES = 8
+
+
 @fields(NODES, VIEWS, b1[:], i8)
 class Trees(NamedTuple):
     """Instances of trees as one camera sees them.
@@ -70,23 +76,20 @@ class CutNodes(NamedTuple):
     instance: Any
 
 
-@fields(u4[:, :], i4[:, :], u2[:, :], i4[:, :], i4[:, :], i4[:, :], i4[:, :], i4[:, :], i8[:, :])
+@fields(u4[:], i4[:], u2[:], i4[:], i4[:], i4[:], i4[:], i4[:], i8[:])
 class Slots(NamedTuple):
     """Working memory for nodes that have been visited: of roots, then of the children of each refined node, run by run.
 
-    Each part of a cut, which one thread works on at a time, has a row; `row_of` is the slots of one.
-
     Attributes:
-        node: (parts, slots) uint32 index in its tree.
-        limit: (parts, slots) int32, see `limit_bits`.
-        instance: (parts, slots) uint16.
-        first: (parts, slots) int32, the first slot of each run.
-        queue: (parts, slots) int32 slots that have been refined, one for each run, then those that will be.
-        pending: (parts, slots) int32 slots below the threshold.
-        heap: (parts, slots) int32.
-        sums: (parts, BUCKETS) int32, for each bucket of limits the number of nodes that refining its nodes adds to the
-            cut.
-        tally: (parts, TALLIES) int64, see COUNT.
+        node: (slots,) uint32 index in its tree.
+        limit: (slots,) int32, see `limit_bits`.
+        instance: (slots,) uint16.
+        first: (slots,) int32, the first slot of each run.
+        queue: (slots,) int32 slots that have been refined, one for each run, then those that will be.
+        pending: (slots,) int32 slots below the threshold.
+        heap: (slots,) int32.
+        sums: (BUCKETS,) int32, for each bucket of limits the number of nodes that refining its nodes adds to the cut.
+        tally: (TALLIES,) int64, see COUNT.
     """
 
     node: Any
@@ -100,57 +103,28 @@ class Slots(NamedTuple):
     tally: Any
 
 
-#: Columns of `Slots.tally`. While nodes are refined: slots in use; refined nodes; pending ones; nodes of the cut before
-#: anything is refined; nodes of the cut once all of bucket LOW and above are refined; LOW itself; refined nodes whose
-#: children are not resident; whether the slots did not suffice.
-COUNT, RUNS, WAITING, BASE, DRAWN, LOW, GAPS, OVERFLOW = range(8)
-#: When the cut is collected: its nodes so far; nodes of the last bucket, in `Slots.heap`; nodes whose children are
-#: missing; whether a node with children is too small to be refined; bits of the least limit of a refined node.
-SELECTED, QUEUED, ABSENT, SMALL, LEAST = range(8, 13)
-#: Where several threads find a cut: what the part does next, see `cut_parts`; bits of the threshold; most nodes of the
-#: cut in the part; index of its first node in the cut.
-NEXT, THRESHOLD, ROOM, BEGIN = range(13, 17)
-TALLIES = 17
-
-
-@kernel(inline=True)
-def row_of(slots, part):
-    """The slots of one part, in arrays without the first dimension."""
-    return Slots(
-        slots.node[part],
-        slots.limit[part],
-        slots.instance[part],
-        slots.first[part],
-        slots.queue[part],
-        slots.pending[part],
-        slots.heap[part],
-        slots.sums[part],
-        slots.tally[part],
-    )
-
-
 @kernel(inline=True)
 def to_bits(value):
-    """The bits of a float32 >= 0 as int32; NaN may have either sign."""
+    """Return the bits of a float32 >= 0 as int32; NaN may have either sign."""
     return np.float32(value).view(np.int32) & ~LEAF
 
 
 @kernel(inline=True)
 def from_bits(bits):
-    """The float32 of these bits, without the mark of a leaf."""
+    """Return the float32 of these bits, without the mark of a leaf."""
     return np.int32(bits & ~LEAF).view(np.float32)
 
 
 @kernel(inline=True)
 def limit_bits(node, view, above):
-    """The bits of a node's limit, the least pixel scale from the root to it; `above` are those of its parent."""
+    """Return the bits of a node's limit, the least pixel scale from the root to it; `above` are those of its parent."""
     limit = min(to_bits(pixel_scale(node, view)), above)
     return limit if node.child_count else limit | LEAF
 
 
 @kernel(inline=True)
 def is_resident(trees, view, start, children):
-    """Whether children are resident; they are in one chunk or two."""
+    """Return whether children are resident; they are in one chunk or two."""
     last = start + children - 1
     return (
         trees.resident[view.chunk_base + (start >> trees.chunk_bits)]
@@ -160,7 +134,7 @@ def is_resident(trees, view, start, children):
 
 @kernel(inline=True)
 def request_chunks(wanted, trees, view, start, children, limit):
-    """Raises the priority of the chunks of a node's children to the node's limit."""
+    """Raise the priority of the chunks of a node's children to the node's limit."""
     for chunk in (start >> trees.chunk_bits, (start + children - 1) >> trees.chunk_bits):
         at = view.chunk_base + chunk
         wanted[at] = max(wanted[at], limit)
@@ -168,5 +142,5 @@ def request_chunks(wanted, trees, view, start, children, limit):
 
 @kernel(inline=True)
 def put(cut, at, node, limit, instance):
-    """Writes a node of the cut."""
+    """Write a node of the cut."""
     cut.node[at], cut.limit[at], cut.instance[at] = node, limit, instance

@@ -47,7 +47,7 @@ class Screen(NamedTuple):
 
 @kernel(NODES, i4[:], VIEWS, CutNodes, Screen, out(i8[:, :]), out(f4[:]), out(u2[:]), nogil=True)
 def measure_cut(nodes, depths, views, cut, screen, counts, sizes, owners):
-    """Counts the nodes of a cut by where their centres are, and measures those inside the frustum.
+    """Count the nodes of a cut by where their centres are, and measures those inside the frustum.
 
     Args:
         nodes: `NODE` of all trees.
@@ -112,7 +112,7 @@ def measure_cut(nodes, depths, views, cut, screen, counts, sizes, owners):
 
 @kernel(nogil=True)
 def measure_block(x, y, z, size, count, view, screen):
-    """Measures the splats of a block.
+    """Measure the splats of a block.
 
     Args:
         x, y, z: (BLOCK_NODES,) float32 centres.
@@ -153,7 +153,7 @@ def measure_block(x, y, z, size, count, view, screen):
 
 @kernel(f4[:], i8[:], out(f4[:]), nogil=True)
 def select(values, places, found):
-    """The values that would be at some places if all were in ascending order.
+    """Fill the values that would be at some places if all were in ascending order.
 
     Args:
         values: (n,) float32, at least 0.
@@ -186,7 +186,7 @@ def select(values, places, found):
 
 @kernel(out(u4[:]), out(u4[:]), i8[:], u4[:], u2[:], u4[:], u2[:], out(i8[:, :]), nogil=True)
 def replace_drawn(drawn, before, base, node, instance, old_node, old_instance, counts):
-    """Counts the nodes of a cut, and those that the cut before it had, too.
+    """Count the nodes of a cut, and those that the cut before it had, too.
 
     Args:
         drawn: uint32 words of zeros, a bit for each node of each instance; filled with the nodes of the cut.

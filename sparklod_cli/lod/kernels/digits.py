@@ -19,7 +19,7 @@ DIGIT_BITS = 16
     nogil=True,
 )
 def count_digits(values, bits, shift, prefixes, counts, seen, mixed):
-    """Counts a digit of the keys of those finite numbers whose digits before it are given.
+    """Count a digit of the keys of those finite numbers whose digits before it are given.
 
     The keys of numbers are whole numbers in the same order, that of -0 the same as of 0.
 
@@ -69,7 +69,7 @@ def count_digits(values, bits, shift, prefixes, counts, seen, mixed):
 
 @kernel(f4[:, :, :], i8, i8, out(f8[:]), nogil=True)
 def sh_lengths(sh, first, last, out):
-    """Root mean squares of the coefficients of splats from `first` up to `last`.
+    """Fill the root mean squares of the coefficients of splats from `first` up to `last`.
 
     Args:
         sh: (n, K, 3) float32.

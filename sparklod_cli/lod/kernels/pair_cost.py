@@ -64,7 +64,7 @@ def log_det(xx, yy, zz, xy, xz, yz):
 
 @kernel()
 def pair_costs(lanes, first, step, count, largest, cost):
-    """Cost of merging node first + i with that `step` places on: Runnalls' bound on the Kullback-Leibler divergence.
+    """Fill the costs of merging node first + i with that `step` places on: Runnalls' bound on the divergence.
 
     With coverages w as weights, and covariances P, it is ((w_i + w_j) ln|P_ij| - w_i ln|P_i| - w_j ln|P_j|) / 2
     (Runnalls 2007), plus COLOR_COST times Ward's variance of the colours. Branch-free, and columns are contiguous, so
@@ -104,7 +104,7 @@ def pair_costs(lanes, first, step, count, largest, cost):
 
 @kernel(f4[:, :], u4[:], i8, f4, parallel=True)
 def find_partners(rows, nodes, window, largest):
-    """The cheapest partner of each node among its neighbours in a list.
+    """Return the cheapest partner of each node among its neighbours in a list.
 
     Args:
         rows: node rows, see above.
@@ -164,7 +164,7 @@ def keep_cheaper(cost, count, best, at, here, there):
 
 @kernel(u4[:], i4[:], f4[:], f4, i8)
 def match_pairs(nodes, partner, cost, limit, made):
-    """Pairs of nodes that are each other's cheapest partner, and the list in which merged nodes replace them.
+    """Return pairs of nodes that are each other's cheapest partner, and the list in which merged nodes replace them.
 
     Args:
         nodes: (n,) uint32.

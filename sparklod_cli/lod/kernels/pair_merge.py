@@ -1,13 +1,15 @@
 """Merges pairs of nodes into nodes that cover the union of both.
 
 Coverage is opacity integrated over the plane of projection. The coverage of a union is the sum of the two coverages
-less that of the overlap (`pair_overlap.py`), and the same holds for first and second moments. The overlap's moments are
-those of the product of the two Gaussians in space.
+less that of the overlap, and the same holds for first and second moments. The overlap's moments are those of the
+product of the two Gaussians in space. The overlap, and how much the picture of a merged node differs from that of its
+two, are integrals of products of Gaussians on the planes of the three axes.
 """
 
 from __future__ import annotations
 
 import math
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,7 +17,6 @@ from ...support.jit import kernel, prange
 from ...support.jit_types import f4, i8, out, u4
 from .geometry import ellipsoid_area
 from .pair_cost import CENTER, COLOR, COVARIANCE, COVERED, DENSITY, LOG_DET, WEIGHT, WIDTH, log_det
-from .pair_overlap import center_of, covariance_of, overlap_share, overlaps, picture_error
 from .profile import is_needle, profile_of, size_factor
 
 #: Least semi-axis of a merged node, in the builder's unit, so that it has an area. Chosen.
@@ -33,14 +34,21 @@ RIDGE, LEAST_RIDGE = 1e-6, 1e-30
 #: product in space is not where they overlap (docs/decisions/2026-11-21-sizes-of-parents.md).
 LEAST_UNION = 0.5
 
-
 #: Pairs that a thread merges one after the other; results do not depend on it. Chosen.
 BLOCK = 256
 
 
+#: Weight of opacity relative to each colour channel in the error of a picture, which may have any background. Chosen.
+ALPHA_WEIGHT = 1.0
+
+#: Two Gaussians do not overlap on a plane from this exponent on: e^-30 is 1e-13, and coverage is stored as a float32,
+#: whose precision is 6e-8. Chosen.
+MAX_EXPONENT = 30
+
+
 @kernel()
 def semi_axes(xx, yy, zz, xy, xz, yz):
-    """Square roots of a covariance's eigenvalues, the largest first (Smith 1961), in float64."""
+    """Return square roots of a covariance's eigenvalues, the largest first (Smith 1961), in float64."""
     mean = (xx + yy + zz) / 3
     a, b, c = xx - mean, yy - mean, zz - mean
     spread = math.sqrt((a * a + b * b + c * c + 2 * (xy * xy + xz * xz + yz * yz)) / 6)
@@ -61,7 +69,7 @@ def semi_axes(xx, yy, zz, xy, xz, yz):
 
 @kernel()
 def merge_pair(a, b, planes, merged):
-    """Fills the centre, covariance and coverage of the union of two nodes.
+    """Fill the centre, covariance and coverage of the union of two nodes.
 
     The product of two Gaussians with covariances P and Q at 0 and d is a Gaussian with covariance P - P (P + Q)^-1 P at
     P (P + Q)^-1 d. That of needles side by side, or of flat splats nearly in one plane, may be far away from both,
@@ -125,13 +133,13 @@ def merge_pair(a, b, planes, merged):
 
 @kernel(inline=True)
 def dot(row, x, y, z):
-    """The scalar product of a tuple and x, y, z."""
+    """Return the scalar product of a tuple and x, y, z."""
     return row[0] * x + row[1] * y + row[2] * z
 
 
 @kernel(inline=True)
 def row_times(x, y, z, symmetric, divisor):
-    """The row x, y, z times a symmetric matrix, xx yy zz xy xz yz, divided by a number."""
+    """Return the row x, y, z times a symmetric matrix, xx yy zz xy xz yz, divided by a number."""
     xx, yy, zz, xy, xz, yz = symmetric
     return (
         (x * xx + y * xy + z * xz) / divisor,
@@ -142,7 +150,9 @@ def row_times(x, y, z, symmetric, divisor):
 
 @kernel(inline=True)
 def without(moment, of_product, hidden, first, second):
-    """A second moment of two nodes less that of their overlap; the mean moves by -hidden / (1 - hidden) of the middle.
+    """Return a second moment of two nodes less that of their overlap.
+
+    The mean moves by -hidden / (1 - hidden) of the middle.
 
     Args:
         moment: of the two nodes, about their mean.
@@ -156,7 +166,7 @@ def without(moment, of_product, hidden, first, second):
 
 @kernel(u4[:, :], i8, i8, out(f4[:, :]), out(u4[:]), out(u4[:]), out(u4[:, :]), out(f4[:]), out(f4[:]), parallel=True)
 def merge_pairs(pairs, made, leaves, rows, row, spare, children, size, error):
-    """Merges each pair of nodes into one, which takes over the row that is to spare in the tree of the first.
+    """Merge each pair of nodes into one, which takes over the row that is to spare in the tree of the first.
 
     Args:
         pairs: (P, 2) uint32 nodes.
@@ -200,3 +210,105 @@ def merge_pairs(pairs, made, leaves, rows, row, spare, children, size, error):
             spare[node] = second if second < leaves else spare[second - leaves]
             for column in range(WIDTH):
                 rows[row[node], column] = merged[column]
+
+
+class OnPlane(NamedTuple):
+    """Integrals over a plane, divided by 2 pi, of Gaussians of height 1 that are projected onto it, in float64.
+
+    Attributes:
+        both: of the product of the two.
+        first, second: of either.
+    """
+
+    both: Any
+    first: Any
+    second: Any
+
+
+@kernel(inline=True)
+def overlap_on_plane(axx, ayy, axy, bxx, byy, bxy, x, y):
+    """Return `OnPlane` of two Gaussians with covariances a and b, of which the second is at x, y from the first."""
+    a_det, b_det = max(axx * ayy - axy * axy, 0.0), max(bxx * byy - bxy * bxy, 0.0)
+    xx, yy, xy = axx + bxx, ayy + byy, axy + bxy
+    det = xx * yy - xy * xy
+    both = 0.0
+    if det > 0:
+        power = 0.5 * (yy * x * x - 2 * xy * x * y + xx * y * y) / det
+        if power < MAX_EXPONENT:
+            both = math.sqrt(a_det * b_det / det) * math.exp(-power)
+    return OnPlane(both, math.sqrt(a_det), math.sqrt(b_det))
+
+
+@kernel(inline=True)
+def center_of(row):
+    """Return the centre of a node row, in float64."""
+    return np.float64(row[CENTER]), np.float64(row[CENTER + 1]), np.float64(row[CENTER + 2])
+
+
+@kernel(inline=True)
+def covariance_of(row):
+    """Return the covariance of a node row, xx yy zz xy xz yz, in float64."""
+    xx, yy, zz = np.float64(row[COVARIANCE]), np.float64(row[COVARIANCE + 1]), np.float64(row[COVARIANCE + 2])
+    xy, xz, yz = np.float64(row[COVARIANCE + 3]), np.float64(row[COVARIANCE + 4]), np.float64(row[COVARIANCE + 5])
+    return xx, yy, zz, xy, xz, yz
+
+
+@kernel()
+def overlaps(a, b):
+    """Return `OnPlane` of two node rows on the planes xy, xz and yz."""
+    x, y, z = center_of(a)
+    u, v, w = center_of(b)
+    axx, ayy, azz, axy, axz, ayz = covariance_of(a)
+    bxx, byy, bzz, bxy, bxz, byz = covariance_of(b)
+    return (
+        overlap_on_plane(axx, ayy, axy, bxx, byy, bxy, u - x, v - y),
+        overlap_on_plane(axx, azz, axz, bxx, bzz, bxz, u - x, w - z),
+        overlap_on_plane(ayy, azz, ayz, byy, bzz, byz, v - y, w - z),
+    )
+
+
+@kernel()
+def overlap_share(planes, density_a, density_b):
+    """Return the coverage of two nodes' overlap, as a share of the sum of their coverages; over the three planes.
+
+    Args:
+        planes: `overlaps` of the two.
+        density_a, density_b: DENSITY of the two.
+    """
+    shared = alone = 0.0
+    density_a, density_b = np.float64(density_a), np.float64(density_b)
+    for both, area_a, area_b in planes:
+        area_a, area_b = density_a * area_a, density_b * area_b
+        shared += min(density_a * density_b * both, min(area_a, area_b))
+        alone += area_a + area_b
+    return shared / alone if alone > 0 else 0.0
+
+
+@kernel()
+def picture_error(a, b, merged, planes):
+    """Return squared difference between the picture of a merged node and that of its two nodes.
+
+    It is summed over red, green, blue and opacity, and over the three planes.
+
+    Args:
+        a, b, merged: node rows.
+        planes: `overlaps` of a and b.
+    """
+    high_a, high_b, high = min(a[DENSITY], 1.0), min(b[DENSITY], 1.0), min(merged[DENSITY], 1.0)
+    aa = bb = mm = ab = am = bm = 0.0
+    with_a, with_b = overlaps(a, merged), overlaps(b, merged)
+    for plane in range(3):
+        both, area_a, area_b = planes[plane]
+        ab += both
+        am += with_a[plane].both
+        bm += with_b[plane].both
+        aa, bb, mm = aa + area_a / 2, bb + area_b / 2, mm + with_a[plane].second / 2
+    total = 0.0
+    for channel in range(4):
+        if channel < 3:
+            p, q, r = high_a * a[COLOR + channel], high_b * b[COLOR + channel], high * merged[COLOR + channel]
+        else:
+            root = math.sqrt(ALPHA_WEIGHT)
+            p, q, r = high_a * root, high_b * root, high * root
+        total += p * p * aa + q * q * bb + r * r * mm + 2 * (p * q * ab - p * r * am - q * r * bm)
+    return max(total, 0.0)

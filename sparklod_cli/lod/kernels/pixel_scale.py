@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...support.jit import kernel
-from ...support.jit_types import Type
+from ...support.jit_types import Type, f4, i8, out
 
 #: A node as the traversal reads it; child indices are relative to its own tree. Siblings are adjacent, so that
 #: a node's children share a few cache lines.
@@ -51,7 +51,7 @@ ZERO, ONE, INFINITE = np.float32(0), np.float32(1), np.float32(np.inf)
 
 @kernel(inline=True)
 def foveation_at(view, dx, dy, dz, inverse):
-    """The foveation weight of a node's pixel scale.
+    """Return the foveation weight of a node's pixel scale.
 
     Cones: 1 inside the inner one, falling linearly in the cosine to `side` at the outer one, and on to `behind` at 90
     degrees. Frustum: 1 inside, `side` outside, `behind` behind the camera.
@@ -96,7 +96,7 @@ def pixel_scale(node, view):
     return scale
 
 
-@kernel(nogil=True)
+@kernel(NODES, i8[:], VIEWS, i8, out(f4[:]), nogil=True)
 def pixel_scales(nodes, index, views, number, scales):
     """Absolute pixel scales of some nodes, with NaN as infinity, as cuts order them.
 

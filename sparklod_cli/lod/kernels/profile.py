@@ -1,9 +1,9 @@
 """Opacity profiles of merged splats: their coverage and variance on the screen, and the inverse.
 
-A splat of linear opacity A > 1, see `model/falloff.py`, has the coverage 2 pi sigma^2 * H(A), the integral over the
-plane, where H(A) is the harmonic number 1 + 1/2 + ... + 1/A. Its variance along an axis is sigma^2 * (H(A) + H2(A) /
-H(A)) / 2, with H2(A) = 1 + 1/4 + ... + 1/A^2. Both follow from integration by parts; for A up to 1 they are
-2 pi sigma^2 * A and sigma^2.
+Spark draws a splat of linear opacity A > 1 with the alpha 1 - (1 - exp(-t)) ** A, t = z^2 / 2, which is that of A equal
+splats on top of each other. Its coverage, the integral over the plane, is 2 pi sigma^2 * H(A), where H(A) is the
+harmonic number 1 + 1/2 + ... + 1/A. Its variance along an axis is sigma^2 * (H(A) + H2(A) / H(A)) / 2, with H2(A) = 1 +
+1/4 + ... + 1/A^2. Both follow from integration by parts; for A up to 1 they are 2 pi sigma^2 * A and sigma^2.
 
 The A of a splat of given coverage and variance therefore depends on the *density* alone, coverage / (2 pi * variance).
 The density is A itself up to 1, and H / spread above, which tends to 2, the density of a disc with a sharp edge.
@@ -34,9 +34,11 @@ NEEDLE, NEEDLE_D = 0.25, 1.5
 #: Entries of the table of profiles by density, between which it is interpolated linearly. Chosen.
 ENTRIES = 256
 
+lod_opacity_above_1 = kernel(inline=True)(gaussian.lod_opacity_above_1)
+
 
 def _profiles(lod_opacity: NDArray[np.float32]) -> tuple[NDArray[np.float64], ...]:
-    """Linear opacity, spread (variance / sigma^2) and density of profiles of D at least 1."""
+    """Return linear opacity, spread (variance / sigma^2) and density of profiles of D at least 1."""
     a = linear_opacity(lod_opacity).astype(np.float64)
     first, second = harmonic(a)
     spread = (first + second / first) / 2
@@ -44,7 +46,7 @@ def _profiles(lod_opacity: NDArray[np.float32]) -> tuple[NDArray[np.float64], ..
 
 
 def _table() -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """Linear opacity and spread at ENTRIES densities from 1 to that of MAX_D, which is third."""
+    """Return linear opacity and spread at ENTRIES densities from 1 to that of MAX_D, which is third."""
     a, spread, density = _profiles(np.linspace(1, MAX_D, 4096, dtype=np.float32))
     even = np.linspace(1, density[-1], ENTRIES)
     return np.interp(even, density, a), np.interp(even, density, spread), float(density[-1])
@@ -53,18 +55,16 @@ def _table() -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
 OPACITIES, SPREADS, MAX_DENSITY = _table()
 NEEDLE_OPACITY, NEEDLE_SPREAD, NEEDLE_DENSITY = (float(x[0]) for x in _profiles(np.array([NEEDLE_D], np.float32)))
 
-lod_opacity_above_1 = kernel(inline=True)(gaussian.lod_opacity_above_1)
-
 
 @kernel(inline=True)
 def is_needle(a, b, c):
-    """Whether the second of three variances along the axes, in any order, is below NEEDLE squared of the largest."""
+    """Return whether the second of three variances along the axes is below NEEDLE squared of the largest."""
     return max(min(a, b), min(max(a, b), c)) < NEEDLE * NEEDLE * max(a, b, c)
 
 
 @kernel(inline=True)
 def profile_of(density, needle):
-    """Linear opacity and spread of a splat, or a needle, of a density; its variance is spread * sigma^2.
+    """Return linear opacity and spread of a splat, or a needle, of a density; its variance is spread * sigma^2.
 
     Above the density of the largest D the spread is smaller than the profile's, which makes sigma larger, so that the
     coverage is kept.

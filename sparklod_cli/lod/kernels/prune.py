@@ -60,13 +60,13 @@ LAST_KEY = (1 << KEY_BITS) - 1
 
 @kernel()
 def size_step(size):
-    """The size step of a node."""
+    """Return the size step of a node."""
     return min(max(int(STEPS * (math.log2(size) + OCTAVES / 2)), 0), STEPS * OCTAVES - 1)
 
 
 @kernel(u4[:, :], i8, i8, i8, out(f4[:]), out(f4[:]), out(f4[:]), i8, parallel=True)
 def fill_usefulness_terms(children, leaves, drawn_leaves, top, log_size, lost, weight, blocks):
-    """Fills the terms of `usefulness`.
+    """Fill the terms of `usefulness`.
 
     Args:
         children: (T - leaves, 2) uint32 of merged nodes; parents come after their children, and the root is last.
@@ -127,7 +127,7 @@ def fill_usefulness_terms(children, leaves, drawn_leaves, top, log_size, lost, w
 
 @kernel()
 def usefulness_key(useful):
-    """The KEY_BITS highest bits of a float32 as an integer >= 0, in the order of the numbers."""
+    """Return the KEY_BITS highest bits of a float32 as an integer >= 0, in the order of the numbers."""
     bits = np.int64(np.float32(useful).view(np.int32))
     ordered = bits if bits >= 0 else np.int64(-0x80000000) - bits
     return (ordered + 0x80000000) >> (32 - KEY_BITS)
@@ -135,7 +135,7 @@ def usefulness_key(useful):
 
 @kernel(i8, i8, out(u4[:]), f4[:], out(f4[:]), f4[:], out(i4[:]), i8, parallel=True)
 def drop_nodes(leaves, most, parent, log_size, lost, weight, saved, blocks):
-    """Drops the least useful merged nodes until `most` are left, or none can be dropped.
+    """Drop the least useful merged nodes until `most` are left, or none can be dropped.
 
     Args:
         leaves: number of leaves; they come first, and have no place in arrays of merged nodes.
@@ -211,13 +211,13 @@ def drop_nodes(leaves, most, parent, log_size, lost, weight, saved, blocks):
 
 @kernel(inline=True)
 def can_be_dropped(node, leaves, parent, saved, children):
-    """Whether merged node `leaves + node` is kept as yet, and its parent has room for its children."""
+    """Return whether merged node `leaves + node` is kept as yet, and its parent has room for its children."""
     return saved[node] > 0 and saved[parent[node + leaves] - leaves] + saved[node] < children
 
 
 @kernel(inline=True)
 def usefulness(node, leaves, parent, log_size, lost, weight, saved):
-    """Usefulness of merged node `leaves + node`: (span of ln(size)) * (children - 1 - error cost) * rarity weight."""
+    """Return the usefulness of merged node `leaves + node`: span of ln(size) * (children - 1 - cost) * weight."""
     span = log_size[parent[node + leaves]] - log_size[node + leaves]
     if span > ABOVE_ALL / 2:
         span = UNKNOWN_SPAN
@@ -226,7 +226,7 @@ def usefulness(node, leaves, parent, log_size, lost, weight, saved):
 
 @kernel(i8, f4, u4[:], f4[:], i4[:], i4[:])
 def size_ranks(leaves, highest, parent, log_size, saved, latest):
-    """The rank of merged nodes in the final order: size steps below the highest, and more than the parent's rank.
+    """Return the ranks of merged nodes in the final order: size steps below the highest, above the parent's.
 
     Args:
         leaves, parent, log_size, saved: as for `drop_nodes`.
@@ -260,7 +260,7 @@ def size_ranks(leaves, highest, parent, log_size, saved, latest):
 
 @kernel(u4[:], i8, u4[:], i4[:], out(u4[:]), out(u4[:]), out(u2[:]))
 def lay_out_children(inner, leaves, parent, saved, order, child_start, child_count):
-    """Assigns final indices: the root is 0, siblings are consecutive, and come in the order of their parents.
+    """Assign final indices: the root is 0, siblings are consecutive, and come in the order of their parents.
 
     Args:
         inner: (I,) uint32, the merged nodes that are kept, parents before their children.

@@ -1,4 +1,4 @@
-"""Refines all nodes above a threshold: what finding a cut does round by round."""
+"""The rounds of the search for a cut, which refine all nodes above a threshold; and its priority queue, a heap."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ BEYOND = 0.98
 
 @kernel(nogil=True)
 def visit_roots(trees, stop, slots):
-    """Puts the resident roots into the slots of a part; returns the bits of the largest limit."""
+    """Put the resident roots into the slots; returns the bits of the largest limit."""
     nodes, views, resident, _ = trees
     node, limit, instance, _, _, pending, _, sums, tally = slots
     sums[:] = 0
@@ -70,20 +70,19 @@ def visit_roots(trees, stop, slots):
 
 
 @kernel(nogil=True)
-def refine(trees, stop, slots, threshold, room):
-    """Refines the nodes of a part with a limit above a threshold, in the order in which they are in memory.
+def refine(trees, stop, slots, threshold):
+    """Refine the nodes with a limit above a threshold, in the order in which they are in memory.
 
-    Where they come to more than `room` nodes of the cut, the threshold is raised, to the bucket in which that happens.
+    Where they come to more than the budget, the threshold is raised, to the bucket in which that happens.
 
     Args:
         trees: `Trees`.
         stop: `Stop`.
-        slots: `Slots` of the part; `tally` has the state, which is brought up to date.
+        slots: `Slots`; `tally` has the state, which is brought up to date.
         threshold: float32.
-        room: number of nodes of the cut in this part, at most.
     """
     nodes, views, _, _ = trees
-    smallest = stop.smallest
+    smallest, budget = stop
     node, limit, instance, first, queue, pending, _, sums, tally = slots
     count, runs, waiting, gaps = tally[COUNT], tally[RUNS], tally[WAITING], tally[GAPS]
     low = np.int64(to_bits(threshold) >> BUCKET_BITS)
@@ -131,7 +130,7 @@ def refine(trees, stop, slots, threshold, room):
             return
         drawn += children - 1
         sums[bucket] += children - 1
-        while drawn - sums[low] > room:
+        while drawn - sums[low] > budget:
             drawn -= sums[low]
             low += 1
         for child in range(start, start + children):
@@ -154,27 +153,61 @@ def refine(trees, stop, slots, threshold, room):
 
 @kernel(nogil=True)
 def lowered(slots, threshold, budget):
-    """The next threshold, at which the cut is likely to have a little more than `budget` nodes.
+    """Return the next threshold, at which the cut is likely to have a little more than `budget` nodes.
 
     Args:
-        slots: `Slots` of all parts.
-        threshold: float32, down to which all parts are refined, by fewer than `budget` nodes.
+        slots: `Slots`.
+        threshold: float32, down to which nodes are refined; they are fewer than `budget`.
         budget: number of nodes.
     """
     # The number of nodes grows as a power of 1 / threshold, which is estimated by the last octave.
-    drawn, before, largest = np.int64(0), np.int64(0), np.int32(0)
+    drawn = slots.tally[DRAWN]
+    before, largest = drawn, np.int32(0)
     low = np.int64(to_bits(threshold) >> BUCKET_BITS)
-    for part in range(len(slots.tally)):
-        drawn += slots.tally[part, DRAWN]
-        before += slots.tally[part, DRAWN]
-        for bucket in range(low, min(low + OCTAVE, BUCKETS)):
-            before -= slots.sums[part, bucket]
+    for bucket in range(low, min(low + OCTAVE, BUCKETS)):
+        before -= slots.sums[bucket]
     if drawn == before or threshold == INFINITE:
         # Nothing was added in the last octave; perhaps nothing is in several more.
-        for part in range(len(slots.tally)):
-            for entry in range(slots.tally[part, WAITING]):
-                largest = max(largest, slots.limit[part, slots.pending[part, entry]])
+        for entry in range(slots.tally[WAITING]):
+            largest = max(largest, slots.limit[slots.pending[entry]])
         return min(from_bits(largest), threshold * np.float32(LEAST_STEP))
     power = min(MOST_POWER, max(LEAST_POWER, np.log2(drawn / max(before, 1))))
     step = BEYOND * (drawn / budget) ** (1 / power)
     return threshold * np.float32(min(MOST_STEP, max(LEAST_STEP, step)))
+
+
+@kernel(inline=True)
+def comes_before(node, limit, instance, a, b):
+    """Return whether slot `a` is refined before `b`: by pixel scale, instance, index, the greatest first."""
+    if limit[a] != limit[b]:
+        return limit[a] > limit[b]
+    if instance[a] != instance[b]:
+        return instance[a] > instance[b]
+    return node[a] > node[b]
+
+
+@kernel(nogil=True)
+def sift_up(node, limit, instance, heap, at):
+    """Move the heap's entry at `at` up to where the heap is in order."""
+    while at > 0:
+        above = (at - 1) >> 1
+        if not comes_before(node, limit, instance, heap[at], heap[above]):
+            return
+        heap[at], heap[above] = heap[above], heap[at]
+        at = above
+
+
+@kernel(nogil=True)
+def sift_down(node, limit, instance, heap, length):
+    """Move the heap's first entry down to where the heap is in order."""
+    at = 0
+    while True:
+        child = 2 * at + 1
+        if child >= length:
+            return
+        if child + 1 < length and comes_before(node, limit, instance, heap[child + 1], heap[child]):
+            child += 1
+        if not comes_before(node, limit, instance, heap[child], heap[at]):
+            return
+        heap[at], heap[child] = heap[child], heap[at]
+        at = child

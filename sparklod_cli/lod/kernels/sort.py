@@ -1,4 +1,4 @@
-"""Morton codes of cells, and a parallel, stable radix sort by them."""
+"""Morton codes of cells, a parallel, stable radix sort by them, and nodes in a box."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Parts:
 
 @kernel()
 def spread_bits(x):
-    """The low 21 bits of a uint64, each followed by two zero bits."""
+    """Return the low 21 bits of a uint64, each followed by two zero bits."""
     x &= np.uint64(0x1FFFFF)
     x = (x | (x << np.uint64(32))) & np.uint64(0x1F00000000FFFF)
     x = (x | (x << np.uint64(16))) & np.uint64(0x1F0000FF0000FF)
@@ -60,13 +60,13 @@ def spread_bits(x):
 
 @kernel()
 def interleave(i, j, k):
-    """The Morton code of three uint64 coordinates of 21 bits; the lowest bit is of `i`."""
+    """Return the Morton code of three uint64 coordinates of 21 bits; the lowest bit is of `i`."""
     return spread_bits(i) | (spread_bits(j) << np.uint64(1)) | (spread_bits(k) << np.uint64(2))
 
 
 @kernel()
 def morton_code(x, y, z, step, low, shift):
-    """The Morton code of bits shift .. shift + 20 of floor(centre / step) - low on each axis."""
+    """Return the Morton code of bits shift .. shift + 20 of floor(centre / step) - low on each axis."""
     i = np.uint64(np.int64(math.floor(x / step)) - low[0]) >> shift
     j = np.uint64(np.int64(math.floor(y / step)) - low[1]) >> shift
     k = np.uint64(np.int64(math.floor(z / step)) - low[2]) >> shift
@@ -75,7 +75,7 @@ def morton_code(x, y, z, step, low, shift):
 
 @kernel(f4[:, :], u4[:], f8, i8[:], i8, parallel=True)
 def cell_words(geometry, nodes, step, low, word):
-    """One 63-bit word of the Morton code of each node's cell.
+    """Return one 63-bit word of the Morton code of each node's cell.
 
     Args:
         geometry: node rows of `pair_cost.py`; or any whose first columns are the centre.
@@ -97,7 +97,7 @@ def cell_words(geometry, nodes, step, low, word):
 
 @kernel(u8[:], u4[:], out(u8[:]), out(u4[:]), i8, i8, i8, parallel=True)
 def sort_pass(keys, values, keys_out, values_out, shift, bits, blocks):
-    """One stable pass of a radix sort, by `bits` bits at `shift`; the result is the same for any number of `blocks`."""
+    """Do a stable pass of a radix sort, by `bits` bits at `shift`; the result does not depend on `blocks`."""
     n = len(keys)
     buckets = 1 << bits
     mask = np.uint64(buckets - 1)
@@ -122,7 +122,7 @@ def sort_pass(keys, values, keys_out, values_out, shift, bits, blocks):
 
 
 def sort_by_key(keys: Keys, values: Nodes, key_bits: int, blocks: int) -> tuple[Keys, Nodes]:
-    """Sorts values by their keys, stably; overwrites its inputs.
+    """Sort values by their keys, stably; overwrites its inputs.
 
     Args:
         keys: (n,) uint64 below 2 ** key_bits.
@@ -146,7 +146,7 @@ def sort_by_key(keys: Keys, values: Nodes, key_bits: int, blocks: int) -> tuple[
 def sort_by_cell(
     geometry: FloatArray, nodes: Nodes, grid: Parts, blocks: int, *, within: bool = True
 ) -> tuple[Nodes, NDArray[np.bool_]]:
-    """Sorts nodes in the Morton order of their cells and, within a cell, of its parts.
+    """Sort nodes in the Morton order of their cells and, within a cell, of its parts.
 
     Args:
         geometry, nodes: as for `cell_words`.
@@ -173,3 +173,63 @@ def sort_by_cell(
             keys = keys >> in_cell
         is_first[1:] |= keys[1:] != keys[:-1]
     return nodes, is_first
+
+
+@kernel(f4[:, :], f4[:, :], f8[:], f8, i8[:], i8, parallel=True)
+def level_keys(center, scale, steps, grid, low, cell_bits):
+    """Return sort keys that order splats by level and, within a level, along a Morton curve.
+
+    Args:
+        center, scale: (n, 3) float32.
+        steps: (L,) float64, the cell edge of each level, a rising geometric series. The last is at least the largest
+            size; splats smaller than the first belong to it.
+        grid: edge of the cells of the curve, float64.
+        low: (3,) int64, the lowest cell of the curve.
+        cell_bits: number of bits for the curve; the level's bits are above them.
+
+    Returns:
+        keys: (n,) uint64.
+        levels: (n,) int32, indices into `steps`.
+    """
+    n = len(scale)
+    keys = np.empty(n, np.uint64)
+    levels = np.empty(n, np.int32)
+    start = math.log(steps[0])
+    per_level = (len(steps) - 1) / (math.log(steps[-1]) - start)
+    for i in prange(n):
+        size = 2 * np.float64(max(scale[i, 0], scale[i, 1], scale[i, 2]))
+        level = min(max(np.int64(math.ceil((math.log(size) - start) * per_level)), 0), len(steps) - 1)
+        # The logarithm is rounded; the table of steps defines the level.
+        while level > 0 and size <= steps[level - 1]:
+            level -= 1
+        while size > steps[level]:
+            level += 1
+        levels[i] = level
+        x, y, z = np.float64(center[i, 0]), np.float64(center[i, 1]), np.float64(center[i, 2])
+        keys[i] = morton_code(x, y, z, grid, low, np.uint64(0)) | (np.uint64(levels[i]) << np.uint64(cell_bits))
+    return keys, levels
+
+
+@kernel(u4[:], f4[:, :], f4[:], f4[:])
+def split_box(nodes, geometry, below, above):
+    """Separate nodes whose centres lie between two corners from the others.
+
+    Args:
+        nodes: (n,) uint32 rows of geometry.
+        geometry: node rows of `pair_cost.py`.
+        below, above: (3,) float32; centres between them on all axes are inside.
+
+    Returns:
+        inside, outside: uint32, the nodes in their order.
+    """
+    inside, outside = np.empty(len(nodes), np.uint32), np.empty(len(nodes), np.uint32)
+    n = m = 0
+    for i in range(len(nodes)):
+        x, y, z = geometry[nodes[i], CENTER], geometry[nodes[i], CENTER + 1], geometry[nodes[i], CENTER + 2]
+        if below[0] < x < above[0] and below[1] < y < above[1] and below[2] < z < above[2]:
+            inside[n] = nodes[i]
+            n += 1
+        else:
+            outside[m] = nodes[i]
+            m += 1
+    return inside[:n], outside[:m].copy()

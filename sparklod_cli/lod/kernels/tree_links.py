@@ -21,7 +21,7 @@ LEAST_AREA = 1e-300
 
 @kernel(u2[:], u4[:], f4[:], nogil=True)
 def find_depths(child_count, child_start, size):
-    """Depths of the nodes that are reachable from the root.
+    """Return depths of the nodes that are reachable from the root.
 
     Takes linear time for any links: at most MAX_LINKS per node are followed.
 
@@ -77,7 +77,7 @@ def find_depths(child_count, child_start, size):
 
 @kernel(u2[:], u4[:], nogil=True)
 def find_parents(child_count, child_start):
-    """Parents of all nodes.
+    """Return parents of all nodes.
 
     Args:
         child_count: (N,) of any unsigned type.
@@ -108,32 +108,16 @@ def find_parents(child_count, child_start):
     return parent, references[:count]
 
 
-@kernel(i4[:], f4[:], f4[:, :], f4[:], out(f8[:]), out(f8[:]))
-def add_child_sizes(parent, size, scale, opacity, sums, weights):
-    """Adds some nodes to the sums of their parents' children, weighted with opacity times surface area.
-
-    Nodes count that have a parent, a positive opacity and a positive, finite size. The mean size of a node's children
-    is `sums` over `weights`; as sums grow in the order of nodes, blocks of nodes give what all nodes at once give.
+@kernel(i4[:], f4[:], f4[:, :], f4[:], out(f8[:]), nogil=True)
+def fill_weights(parent, size, scale, opacity, weight):
+    """Fill the weights of nodes in the mean size of their parents' children: opacity times surface area.
 
     Args:
         parent: (n,) int32, of `find_parents`.
         size: (n,) of each node, any unit.
         scale: (n, 3) float32.
         opacity: (n,) float32, linear.
-        sums, weights: (N,) float64 of all nodes.
-    """
-    weight = np.empty(len(parent), np.float64)
-    fill_weights(parent, size, scale, opacity, weight)
-    add_weighted(parent, size, weight, sums, weights)
-
-
-@kernel(i4[:], f4[:], f4[:, :], f4[:], out(f8[:]), nogil=True)
-def fill_weights(parent, size, scale, opacity, weight):
-    """The weights of `add_child_sizes`: opacity times surface area, -1 of nodes that do not count.
-
-    Args:
-        parent, size, scale, opacity: of n nodes, as there.
-        weight: (n,) float64, filled.
+        weight: (n,) float64, filled; -1 of nodes without a parent, a positive opacity or a positive, finite size.
     """
     for node in range(len(parent)):
         weight[node] = -1
@@ -144,7 +128,14 @@ def fill_weights(parent, size, scale, opacity, weight):
 
 @kernel(i4[:], f4[:], f8[:], out(f8[:]), out(f8[:]), nogil=True)
 def add_weighted(parent, size, weight, sums, weights):
-    """The sums of `add_child_sizes`, of n nodes with the weights of `fill_weights`."""
+    """Add some nodes to the sums of their parents' children, so that the mean size of these is `sums` over `weights`.
+
+    As sums grow in the order of nodes, blocks of nodes give what all nodes at once give.
+
+    Args:
+        parent, size, weight: of n nodes, as for `fill_weights`.
+        sums, weights: (N,) float64 of all nodes.
+    """
     for node in range(len(parent)):
         if not weight[node] < 0:
             weights[parent[node]] += weight[node]
@@ -153,7 +144,7 @@ def add_weighted(parent, size, weight, sums, weights):
 
 @kernel(i4[:], i4[:], nogil=True)
 def find_cycles(parent, depth):
-    """Nodes on a cycle or below one: parents lead from them neither to the root nor to a node without a parent.
+    """Return nodes on a cycle or below one: parents lead from them neither to the root nor to a node without a parent.
 
     Args:
         parent: (N,) int32, of `find_parents`.
@@ -181,7 +172,7 @@ def find_cycles(parent, depth):
 
 @kernel(i4[:], u2[:], f4[:], nogil=True)
 def sum_by_depth(depth, child_count, size):
-    """Numbers of nodes and sums of their sizes by depth; nodes of depth -1 are left out of both.
+    """Return numbers of nodes and sums of their sizes by depth; nodes of depth -1 are left out of both.
 
     Args:
         depth: (N,) int32.
@@ -209,7 +200,7 @@ def sum_by_depth(depth, child_count, size):
 
 @kernel(u2[:], u4[:], f4[:], i8, out(i8[:]), nogil=True)
 def count_limits(child_count, child_start, limit, chunk_bits, counts):
-    """Counts inner nodes by their limits.
+    """Count inner nodes by their limits.
 
     Args:
         child_count, child_start: (N,) of any unsigned type.
@@ -233,7 +224,7 @@ def count_limits(child_count, child_start, limit, chunk_bits, counts):
 
 @kernel(u2[:], u4[:], f4[:], f8, out(b1[:]), nogil=True)
 def mark_small(child_count, child_start, size, ratio, marks):
-    """Marks nodes whose size is less than `ratio` times that of one of their children, of finite size.
+    """Mark nodes whose size is less than `ratio` times that of one of their children, of finite size.
 
     Args:
         child_count, child_start: (N,) of any unsigned type.
@@ -259,3 +250,24 @@ def mark_small(child_count, child_start, size, ratio, marks):
             marks[node] = True
         marked += marks[node]
     return marked
+
+
+@kernel(i4[:], f4[:], nogil=True)
+def find_limits(parent, size):
+    """Return depths and limits of the nodes that have children.
+
+    Args:
+        parent: (F,) int32 place here of the parent of each of these nodes, which comes before it; -1 for the root.
+        size: (F,) float32 of each node, any unit.
+
+    Returns:
+        depth: (F,) int32 edges from the root.
+        limit: (F,) float32 the least size from the root to the node, its own included.
+    """
+    depth, limit = np.zeros(len(parent), np.int32), np.empty(len(parent), np.float32)
+    for family in range(len(parent)):
+        limit[family] = size[family]
+        if parent[family] >= 0:
+            depth[family] = depth[parent[family]] + 1
+            limit[family] = min(limit[family], limit[parent[family]])
+    return depth, limit

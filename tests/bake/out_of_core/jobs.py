@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sparklod_cli.bake.out_of_core.contracts import Store, Task
+from sparklod_cli.bake.out_of_core.store import Store
+from sparklod_cli.bake.out_of_core.tasks import Task
 from sparklod_cli.support.progress import Progress
 
 COUNT = 6

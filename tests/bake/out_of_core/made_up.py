@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from sparklod_cli.bake.out_of_core.contracts import Store, Task
+from sparklod_cli.bake.out_of_core.store import Store
+from sparklod_cli.bake.out_of_core.tasks import Task
 from sparklod_cli.support.errors import ScratchError
 
 

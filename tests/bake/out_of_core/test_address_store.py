@@ -11,24 +11,26 @@ import pytest
 
 pytest.importorskip("fsspec")
 
-from sparklod_cli.bake.out_of_core.engine import LocalEngine
-from sparklod_cli.bake.out_of_core.store import AddressStore, FolderStore, store_of
+from sparklod_cli.bake.out_of_core.store import Store
+from sparklod_cli.bake.out_of_core.tasks import LocalEngine
 from sparklod_cli.support.addresses import Address
 from sparklod_cli.support.errors import ScratchError
 from sparklod_cli.support.progress import silent
 
 from .made_up import Job, tree_of
 
+pytestmark = pytest.mark.slow
+
 ARRAYS = {"rows": np.arange(300_000, dtype=np.float32).reshape(-1, 3), "none": np.empty((0, 4), np.int64)}
 
 
 @pytest.fixture
-def store() -> AddressStore:
-    return AddressStore(Address(f"memory://{uuid.uuid4().hex}/scratch"))
+def store() -> Store:
+    return Store(Address(f"memory://{uuid.uuid4().hex}/scratch"))
 
 
-def test_it_has_the_bytes_of_a_folder(store: AddressStore, tmp_path: Path) -> None:
-    folder = FolderStore(tmp_path)
+def test_it_has_the_bytes_of_a_folder(store: Store, tmp_path: Path) -> None:
+    folder = Store(tmp_path)
     for each in (store, folder):
         each.put("stage/1", ARRAYS)
         assert each.names() == ["stage/1"]
@@ -38,7 +40,7 @@ def test_it_has_the_bytes_of_a_folder(store: AddressStore, tmp_path: Path) -> No
     assert store.traffic.written == folder.traffic.written > 1_200_000
 
 
-def test_what_is_put_is_got(store: AddressStore) -> None:
+def test_what_is_put_is_got(store: Store) -> None:
     assert not store.has("stage/1") and store.names() == []
     store.put("stage/1", ARRAYS)
     for each in (store, pickle.loads(pickle.dumps(store))):
@@ -54,29 +56,29 @@ def test_what_is_put_is_got(store: AddressStore) -> None:
     assert not store.has("stage/1") and not store.is_sound("stage/1")
 
 
-def test_damage_is_found(store: AddressStore) -> None:
+def test_damage_is_found(store: Store) -> None:
     store.put("stage/1", ARRAYS)
     object_of = store.folder / "stage/1.result"
     with object_of.open() as file:
         data = bytearray(file.read())
     data[5_000] ^= 1
     object_of.write([data])
-    again = store_of(store.folder)
+    again = Store(store.folder)
     assert again.has("stage/1") and not again.is_sound("stage/1")
     with pytest.raises(ScratchError, match="damaged: its checksum does not match; run it again with --resume"):
         again.get("stage/1")
 
 
-def test_what_is_missing_is_said(store: AddressStore) -> None:
+def test_what_is_missing_is_said(store: Store) -> None:
     with pytest.raises(ScratchError, match=r"stage/1 is missing in .* memory://.*; begin anew with --overwrite"):
         store.get("stage/1")
 
 
-def test_tasks_run_on_it(store: AddressStore) -> None:
+def test_tasks_run_on_it(store: Store) -> None:
     tasks = tree_of(16)
     LocalEngine().run("building", tasks, Job(store), silent)
     assert int(store.get(tasks[-1].name)["total"][0]) == len(tasks)
 
 
 def test_a_path_gives_a_folder(tmp_path: Path) -> None:
-    assert isinstance(store_of(tmp_path), FolderStore)
+    assert isinstance(Store(tmp_path), Store)

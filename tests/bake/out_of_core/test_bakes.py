@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sparklod_cli.bake import Baked, BakeSettings, bake
-from sparklod_cli.bake.resources import Resources
+from sparklod_cli.bake.flow import bake
+from sparklod_cli.bake.records import Baked
+from sparklod_cli.bake.settings import BakeSettings, Resources
 from sparklod_cli.codecs import ply
 from sparklod_cli.io import read_scene
 from sparklod_cli.model.scene import Scene
@@ -21,6 +22,8 @@ from sparklod_cli.support.errors import InvalidSplatsError
 from tests.bake.out_of_core.plain import Loop
 from tests.conftest import FIXTURES, real_scene
 from tests.scenes import random_splats
+
+pytestmark = pytest.mark.slow
 
 #: What differs by nature: how long it took, and what was in the scratch folder.
 OWN = {"seconds", "blocks", "scratch_bytes_written", "scratch_bytes_read"}

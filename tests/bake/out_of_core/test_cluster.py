@@ -14,16 +14,18 @@ import pytest
 pytest.importorskip("cryptography")
 pytest.importorskip("distributed")
 
-from sparklod_cli.bake.out_of_core import cluster_engine, cluster_pool, cluster_worker
+from sparklod_cli.bake.out_of_core import cluster_engine, cluster_pool
 from sparklod_cli.bake.out_of_core.cluster import ClusterSettings, cluster
 from sparklod_cli.bake.out_of_core.cluster_engine import ClusterEngine
-from sparklod_cli.bake.out_of_core.contracts import Task
-from sparklod_cli.bake.out_of_core.store import FolderStore
+from sparklod_cli.bake.out_of_core.store import Store
+from sparklod_cli.bake.out_of_core.tasks import Task
 from sparklod_cli.support.errors import OutOfMemoryError, ScratchError, SparklodError
 from sparklod_cli.support.progress import silent
 
 from . import made_up
 from .made_up import Job, tree_of
+
+pytestmark = pytest.mark.slow
 
 SAID: list[str] = []
 
@@ -40,7 +42,7 @@ def engine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ClusterEngine]:
 @pytest.fixture
 def job(tmp_path: Path) -> Job:
     SAID.clear()
-    return Job(FolderStore(tmp_path / "store"))
+    return Job(Store(tmp_path / "store"))
 
 
 @pytest.fixture(autouse=True)
@@ -111,7 +113,7 @@ def test_calls_side_by_side_give_results_and_failures_in_order(engine: ClusterEn
 
 def test_a_result_that_is_lost_with_its_worker_is_waited_for(engine: ClusterEngine) -> None:
     with cluster_pool.Pool(engine._connection, "baking") as pool:
-        pool.submit("twice", 0, cluster_worker.run_call, made_up.twice, (21,), 1)
+        pool.submit("twice", 0, cluster_engine.run_call, made_up.twice, (21,), 1)
         future = pool._futures["twice"]
         future.result(timeout=60)
         loop, lost = engine._connection.client.loop, threading.Event()
@@ -146,22 +148,22 @@ def test_workers_that_do_not_fit_are_refused(
     assert not list(tmp_path.rglob("*.result"))
 
 
-class _Elsewhere(FolderStore):
+class _Elsewhere(Store):
     """A folder of this machine alone: a copy of the store in another process is another one."""
 
     def __reduce__(self) -> Any:
-        return FolderStore, (self.folder / "there",)
+        return Store, (self.folder / "there",)
 
 
 def test_a_worker_without_sparklod_is_told_what_to_do(engine: ClusterEngine, job: Job) -> None:
     client = engine._connection.client
     client.wait_for_workers(2, timeout=60)  # one that another test killed may only now be replaced
-    client.run(_hide, cluster_worker.__name__)
+    client.run(_hide, cluster_engine.__name__)
     try:
         with pytest.raises(SparklodError, match=r"does not run sparklod .*: install sparklod .* extra cluster there"):
             engine.check(job.store)
     finally:
-        client.run(_show, cluster_worker.__name__)
+        client.run(_show, cluster_engine.__name__)
 
 
 def _hide(module: str) -> None:
@@ -184,7 +186,7 @@ def _show(module: str) -> None:
 def test_a_block_that_does_not_fit_into_memory_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sparklod_cli.bake.out_of_core.cluster.LOSSES", 0)
     monkeypatch.setattr("sparklod_cli.bake.out_of_core.cluster._memory_limit", lambda workers, memory: 400_000_000)
-    job = Job(FolderStore(tmp_path / "store"))
+    job = Job(Store(tmp_path / "store"))
     with cluster(ClusterSettings(workers=1)) as started:
         with pytest.raises(
             OutOfMemoryError, match=r"^stage/7 does not fit into the memory of a worker; give a smaller"

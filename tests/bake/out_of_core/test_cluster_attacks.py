@@ -21,10 +21,12 @@ import psutil
 from sparklod_cli.bake.out_of_core import cluster as module
 from sparklod_cli.bake.out_of_core.cluster import ClusterSettings, cluster
 from sparklod_cli.bake.out_of_core.cluster_engine import ClusterEngine
-from sparklod_cli.bake.out_of_core.store import FolderStore
+from sparklod_cli.bake.out_of_core.store import Store
 from sparklod_cli.support.progress import silent
 
 from .made_up import Job, tree_of
+
+pytestmark = pytest.mark.slow
 
 #: Seconds that somebody who has the credentials waits on a busy machine, and for how long others try.
 PATIENCE, TRIES = 60, 2
@@ -73,7 +75,7 @@ def test_no_port_answers_without_credentials(attacked: tuple[ClusterEngine, dict
         assert asyncio.run(answered(distributed.Security.temporary(), tls, TRIES)) == []
         tcp = [address.replace("tls", "tcp") for address in tls]
         assert asyncio.run(answered(distributed.Security(), tcp, TRIES)) == []
-    job, tasks = Job(FolderStore(tmp_path)), tree_of(4)
+    job, tasks = Job(Store(tmp_path)), tree_of(4)
     engine.run("building", tasks, job, silent)
     assert job.store.has(tasks[-1].name)
 

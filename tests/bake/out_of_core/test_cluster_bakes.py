@@ -19,17 +19,20 @@ pytest.importorskip("distributed")
 
 import distributed
 
-from sparklod_cli.bake import Baked, BakeSettings, bake
+from sparklod_cli.bake.flow import bake
 from sparklod_cli.bake.out_of_core import cluster as module
 from sparklod_cli.bake.out_of_core.cluster import ClusterSettings, cluster
 from sparklod_cli.bake.out_of_core.cluster_engine import ClusterEngine
-from sparklod_cli.bake.out_of_core.contracts import Engine
-from sparklod_cli.bake.resources import Resources
+from sparklod_cli.bake.out_of_core.tasks import Engine
+from sparklod_cli.bake.records import Baked
+from sparklod_cli.bake.settings import BakeSettings, Resources
 from sparklod_cli.codecs.rad.names import SUFFIX as RAD
 from sparklod_cli.support.addresses import Address, Place
 from sparklod_cli.support.errors import SparklodError
 from sparklod_cli.support.progress import Progress, silent
 from tests.conftest import FIXTURES
+
+pytestmark = pytest.mark.slow
 
 DEMO = FIXTURES / "demo.ply"
 

@@ -17,11 +17,13 @@ import distributed
 
 from sparklod_cli.bake.out_of_core import cluster as module
 from sparklod_cli.bake.out_of_core.cluster import ClusterSettings, cluster
-from sparklod_cli.bake.out_of_core.store import FolderStore
+from sparklod_cli.bake.out_of_core.store import Store
 from sparklod_cli.support.errors import SparklodError
 from sparklod_cli.support.progress import silent
 
 from .made_up import Job, tree_of
+
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture
@@ -43,7 +45,7 @@ def _scheduler(**how: Any) -> Any:
 
 
 def test_a_scheduler_that_runs_is_used_and_left_alone(scheduler: Any, tmp_path: Path) -> None:
-    job, address = Job(FolderStore(tmp_path)), scheduler.scheduler_address.removeprefix("tcp://")
+    job, address = Job(Store(tmp_path)), scheduler.scheduler_address.removeprefix("tcp://")
     said: list[str] = []
     for count in (4, 8):
         tasks = tree_of(count)
@@ -56,7 +58,7 @@ def test_a_scheduler_that_runs_is_used_and_left_alone(scheduler: Any, tmp_path: 
 
 def test_a_scheduler_with_certificates_is_used_with_those_of_dask_s_settings(tmp_path: Path) -> None:
     pytest.importorskip("cryptography")
-    own, job, said = distributed.Security.temporary(), Job(FolderStore(tmp_path)), list[str]()
+    own, job, said = distributed.Security.temporary(), Job(Store(tmp_path)), list[str]()
     of_dask = "distributed.comm.tls"
     names = {
         f"{of_dask}.ca-file": own.tls_ca_file,
@@ -78,7 +80,7 @@ def test_a_scheduler_with_certificates_is_used_with_those_of_dask_s_settings(tmp
 
 
 def test_a_scheduler_that_goes_away_keeps_what_is_done(scheduler: Any, tmp_path: Path) -> None:
-    job, tasks = Job(FolderStore(tmp_path)), tree_of(64, seconds=0.05)
+    job, tasks = Job(Store(tmp_path)), tree_of(64, seconds=0.05)
     with cluster(ClusterSettings(scheduler=scheduler.scheduler_address)) as engine:
 
         def close() -> None:

@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays_of
 
-from sparklod_cli.bake.out_of_core.store import FolderStore
+from sparklod_cli.bake.out_of_core.store import Store
 from sparklod_cli.support.errors import ScratchError
 from tests.conftest import IS_ROOT
 from tests.faults.runs import mounted
@@ -31,11 +31,11 @@ ARRAYS = {
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> FolderStore:
-    return FolderStore(tmp_path / "scratch")
+def store(tmp_path: Path) -> Store:
+    return Store(tmp_path / "scratch")
 
 
-def file_of(store: FolderStore) -> Path:
+def file_of(store: Store) -> Path:
     """The one file of a store."""
     (path,) = (path for path in store.folder.rglob("*") if path.is_file())
     return path
@@ -51,7 +51,7 @@ def same(got: dict[str, np.ndarray], put: dict[str, np.ndarray]) -> bool:
 @given(st.dictionaries(st.text("abc_", min_size=1), arrays_of.arrays(DTYPES, SHAPES), max_size=4))
 @settings(max_examples=60)
 def test_what_is_put_is_got(tmp_path_factory: pytest.TempPathFactory, arrays: dict[str, np.ndarray]) -> None:
-    store = FolderStore(tmp_path_factory.mktemp("scratch"))
+    store = Store(tmp_path_factory.mktemp("scratch"))
     store.put("stage/1", arrays)
     assert same(store.get("stage/1"), arrays)
     assert store.is_sound("stage/1")
@@ -61,19 +61,19 @@ def test_what_is_put_is_got(tmp_path_factory: pytest.TempPathFactory, arrays: di
             assert store.rows("stage/1", name, 1, 3).tobytes() == array[1:3].tobytes()
 
 
-def test_arrays_that_are_not_contiguous_are_put_as_they_look(store: FolderStore) -> None:
+def test_arrays_that_are_not_contiguous_are_put_as_they_look(store: Store) -> None:
     turned = np.arange(12).reshape(3, 4).T[::2]
     store.put("x", {"turned": turned})
     assert (store.get("x")["turned"] == turned).all()
 
 
-def test_some_arrays_are_got(store: FolderStore) -> None:
+def test_some_arrays_are_got(store: Store) -> None:
     store.put("x", ARRAYS)
     assert list(store.get("x", ["count"])) == ["count"]
     assert list(store.get("x", [])) == []
 
 
-def test_results_are_named_and_removed(store: FolderStore) -> None:
+def test_results_are_named_and_removed(store: Store) -> None:
     assert store.names() == []
     for name in ("stage/1", "stage/1/families", "survey/0"):
         assert not store.has(name)
@@ -86,7 +86,7 @@ def test_results_are_named_and_removed(store: FolderStore) -> None:
     assert not store.has("stage/1")
 
 
-def test_a_result_is_replaced(store: FolderStore) -> None:
+def test_a_result_is_replaced(store: Store) -> None:
     store.put("x", ARRAYS)
     store.put("x", {"other": np.arange(3)})
     assert same(store.get("x"), {"other": np.arange(3)})
@@ -94,7 +94,7 @@ def test_a_result_is_replaced(store: FolderStore) -> None:
     assert same(store.get("x"), {"other": np.arange(3)[::-1]})
 
 
-def test_a_copy_for_another_process_is_small_and_finds_the_results(store: FolderStore) -> None:
+def test_a_copy_for_another_process_is_small_and_finds_the_results(store: Store) -> None:
     store.put("x", ARRAYS)
     packed = pickle.dumps(store)
     assert len(packed) < 500
@@ -103,7 +103,7 @@ def test_a_copy_for_another_process_is_small_and_finds_the_results(store: Folder
     assert copy.traffic.written == 0
 
 
-def test_bytes_are_counted(store: FolderStore) -> None:
+def test_bytes_are_counted(store: Store) -> None:
     store.put("x", ARRAYS)
     assert store.traffic.written == file_of(store).stat().st_size
     assert store.traffic.read == 0
@@ -113,7 +113,7 @@ def test_bytes_are_counted(store: FolderStore) -> None:
     assert store.traffic.read == 100 * 14 + 10 * 12
 
 
-def test_nothing_is_left_where_writing_fails(store: FolderStore) -> None:
+def test_nothing_is_left_where_writing_fails(store: Store) -> None:
     class Broken:
         """Stands for an array; fails as the second of a result."""
 
@@ -126,19 +126,19 @@ def test_nothing_is_left_where_writing_fails(store: FolderStore) -> None:
 
 
 @pytest.mark.parametrize("at", [0, 9, 14, 20, 60, 200, -1])
-def test_a_flipped_byte_is_found(store: FolderStore, at: int) -> None:
+def test_a_flipped_byte_is_found(store: Store, at: int) -> None:
     store.put("x", ARRAYS)
     data = bytearray(file_of(store).read_bytes())
     data[at] ^= 0x10
     file_of(store).write_bytes(data)
     assert not store.is_sound("x")
-    fresh = FolderStore(store.folder)
+    fresh = Store(store.folder)
     with pytest.raises(ScratchError, match=r"x in the scratch folder .* is damaged: .*--resume"):
         fresh.get("x")
 
 
 @pytest.mark.parametrize("left", [0, 10, 30, 200, -1])
-def test_a_cut_file_is_no_result(store: FolderStore, left: int) -> None:
+def test_a_cut_file_is_no_result(store: Store, left: int) -> None:
     store.put("x", ARRAYS)
     path = file_of(store)
     os.truncate(path, left if left >= 0 else path.stat().st_size - 1)
@@ -148,14 +148,14 @@ def test_a_cut_file_is_no_result(store: FolderStore, left: int) -> None:
         store.rows("x", "center", 0, 1)
 
 
-def test_a_missing_result_is_an_error_that_names_the_folder(store: FolderStore) -> None:
+def test_a_missing_result_is_an_error_that_names_the_folder(store: Store) -> None:
     with pytest.raises(ScratchError, match=r"x is missing in the scratch folder .*scratch: .*--overwrite"):
         store.get("x")
 
 
 def test_a_full_disk_is_an_error_that_says_what_to_do(tmp_path: Path) -> None:
     with mounted(tmp_path / "disk", "size=64k") as disk:
-        store = FolderStore(disk / "scratch")
+        store = Store(disk / "scratch")
         store.put("small", ARRAYS)
         with pytest.raises(ScratchError, match=r"no room left in the scratch folder .*: no space left.*--resume"):
             store.put("x", {"center": np.zeros(100_000)})
@@ -164,7 +164,7 @@ def test_a_full_disk_is_an_error_that_says_what_to_do(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such limit")
-def test_a_limit_of_file_size_is_an_error(store: FolderStore) -> None:
+def test_a_limit_of_file_size_is_an_error(store: Store) -> None:
     before, handler = resource.getrlimit(resource.RLIMIT_FSIZE), signal.getsignal(signal.SIGXFSZ)
     signal.signal(signal.SIGXFSZ, signal.SIG_IGN)  # as Python does where it starts as a program
     resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, before[1]))
@@ -178,13 +178,13 @@ def test_a_limit_of_file_size_is_an_error(store: FolderStore) -> None:
 
 
 @pytest.mark.skipif(IS_ROOT or sys.platform == "win32", reason="root may write everywhere")
-def test_a_folder_without_permission_is_an_error(store: FolderStore) -> None:
+def test_a_folder_without_permission_is_an_error(store: Store) -> None:
     store.folder.mkdir(0o500)
     with pytest.raises(ScratchError, match=r"cannot write in the scratch folder .*: permission denied.*--scratch-dir"):
         store.put("x", ARRAYS)
 
 
-def test_a_file_in_place_of_the_folder_is_an_error(store: FolderStore) -> None:
+def test_a_file_in_place_of_the_folder_is_an_error(store: Store) -> None:
     store.folder.write_text("a file")
     assert not store.has("x")
     with pytest.raises(ScratchError, match=r"cannot write in the scratch folder .*--scratch-dir"):

@@ -17,6 +17,8 @@ from sparklod_cli.cameras.path import read
 from tests.cameras.known import FOLDER, KNOWN, LANDMARK, files_at, pixel
 from tests.interop import npm
 
+pytestmark = pytest.mark.slow
+
 #: The version that has --camera-track; playcanvas is its peer.
 SPLAT_TRANSFORM = {"@playcanvas/splat-transform": "3.7.0", "playcanvas": "2.23.3"}
 

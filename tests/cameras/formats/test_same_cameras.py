@@ -28,6 +28,8 @@ from tests.cameras.known import (
     text_file,
 )
 
+pytestmark = pytest.mark.slow
+
 #: What has to be said about a format that leaves things open.
 NO_LENS = Settings(size=SIZE, fov_y=FOV_Y)
 TURNED = Settings(size=SIZE, world=OUT_OF_PLAYCANVAS)

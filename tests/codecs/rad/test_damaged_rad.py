@@ -27,7 +27,7 @@ FILES = {path.name: path.read_bytes() for path in (FIXTURES / "golden" / "sh3-ra
 CHUNKED = "golden/sh3-rad/sh3.rad"
 PARTS = by_hand_rad.split(content(WHOLE))
 
-pytestmark = pytest.mark.filterwarnings("error")  # they would go to standard error
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("error")]  # they would go to standard error
 
 
 def test_parts_are_put_together_again() -> None:

@@ -14,6 +14,8 @@ from sparklod_cli.support.addresses import Address
 from tests.commands.build_lod.runs import SMALL, build
 from tests.conftest import FIXTURES
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def folder() -> Address:

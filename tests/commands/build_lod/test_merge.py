@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sparklod_cli.api.bake_jobs import BakeSettings, Merged, Resources, bake
+from sparklod_cli.bake.flow import bake
+from sparklod_cli.bake.settings import BakeSettings, Resources
+from sparklod_cli.bake.sources import Merged
 from sparklod_cli.cli import run
 from sparklod_cli.codecs import ply
 from sparklod_cli.io import read_scene

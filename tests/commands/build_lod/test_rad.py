@@ -85,6 +85,7 @@ def test_a_shorter_output_removes_the_chunks_of_a_longer_one(large: Path, tmp_pa
     assert len(read_scene(tmp_path / "x.rad")) == 1
 
 
+@pytest.mark.slow
 def test_a_tree_is_the_same_in_the_other_format(
     large: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

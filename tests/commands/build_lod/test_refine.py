@@ -18,6 +18,8 @@ from tests.fittings import STEPS, StandIn
 from tests.fittings import stand_in as stand_in
 from tests.signals import heed_signals
 
+pytestmark = pytest.mark.slow
+
 CAMERAS = "x,y,z,target_x,target_y,target_z\n0,0,-3,0,0,0\n0,1,-3,0,0,0\n"
 
 

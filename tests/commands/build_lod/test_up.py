@@ -17,6 +17,8 @@ from sparklod_cli.io import read_levels, read_scene
 from sparklod_cli.model.transforms import AXES
 from tests.commands.build_lod.runs import SMALL, build
 
+pytestmark = pytest.mark.slow
+
 DEMO = Path(SMALL.parent, "demo.ply")
 
 #: Names of outputs, and the options that write them: all formats of trees.

@@ -13,6 +13,8 @@ pytest.importorskip("distributed")
 
 from tests.commands.build_lod.runs import ONE, SMALL, build, sparklod
 
+pytestmark = pytest.mark.slow
+
 
 def test_scenes_side_by_side_are_those_of_one_after_the_other(tmp_path: Path) -> None:
     small = [shutil.copy(SMALL, tmp_path / f"small-{number}.ply") for number in range(3)]

@@ -64,6 +64,7 @@ def huge(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("source", [(), ("--orbit", "2"), ("--dolly", "--every", "20")])
+@pytest.mark.slow
 def test_a_scene_of_any_size_is_compared_as_it_is_drawn(source: tuple[str, ...], huge: Path, capsys: Said) -> None:
     """Wherever cameras are chosen for the scene, near and far are, too."""
     size = ("--size", "160x90")

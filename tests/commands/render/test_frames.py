@@ -15,6 +15,8 @@ from sparklod_cli.render.renderer import Renderer
 from sparklod_cli.support.optional import install_hint
 from tests.commands.render.runs import CAMERAS, DEMO, SIZE, TOWN, TREE, Said, pixels, render
 
+pytestmark = pytest.mark.slow
+
 
 def test_frames_of_a_path_are_its_views(tmp_path: Path, capsys: Said) -> None:
     how = (TOWN, "--budget", "2k", *SIZE, "-q")

@@ -27,6 +27,8 @@ from tests.lod.details import row_of_regions
 from tests.scenes import random_splats
 from tests.streamed import write_streamed
 
+pytestmark = pytest.mark.slow
+
 CAMERAS = FIXTURES / "cameras"
 AT = ("--look-at", "0.5,-0.2,-2:0,0.1,0")
 

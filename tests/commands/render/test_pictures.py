@@ -16,6 +16,8 @@ from sparklod_cli.render.backends import BACKENDS
 from tests.commands.render.runs import AT, DEMO, PLAIN, SIZE, TOWN, TREE, Said, floats, pixels, render
 from tests.conftest import FIXTURES
 
+pytestmark = pytest.mark.slow
+
 
 def test_a_tree_is_drawn_to_a_png(built: Path, tmp_path: Path, capsys: Said) -> None:
     output = tmp_path / "preview.png"

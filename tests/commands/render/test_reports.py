@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from sparklod_cli.api import viewed_files
+from sparklod_cli.api import jobs
 from tests.commands.render.runs import PLAIN, SIZE, TOWN, TREE, Said, pixels, render
 from tests.conftest import ROOT
 
@@ -31,13 +31,13 @@ def test_json_says_what_was_drawn(tmp_path: Path, capsys: Said) -> None:
 
 
 def test_the_time_that_is_said_is_the_whole_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Said) -> None:
-    whole = viewed_files.read_scenes
+    whole = jobs.read_scenes
 
     def slow(*arguments: Any, **named: Any) -> Any:
         time.sleep(0.5)
         return whole(*arguments, **named)
 
-    monkeypatch.setattr(viewed_files, "read_scenes", slow)
+    monkeypatch.setattr(jobs, "read_scenes", slow)
     assert render(PLAIN, *SIZE, "--json", "-o", tmp_path / "x.png") == 0
     out, err = capsys.readouterr()
     assert json.loads(out)["seconds"] >= 0.5

@@ -9,6 +9,8 @@ import pytest
 
 from tests.commands.traverse.runs import CAMERAS, TOWN, TREE, Said, table, traverse
 
+pytestmark = pytest.mark.slow
+
 AWAY = "axes (--camera-axes, --world-transform, --up)"
 
 

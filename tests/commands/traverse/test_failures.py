@@ -82,6 +82,7 @@ def test_wrong_usage_of_traverse_is_exit_code_2(arguments: list[object], message
     assert out == ""
 
 
+@pytest.mark.slow
 def test_traverse_never_writes_over_its_inputs(tmp_path: Path, capsys: Said) -> None:
     tree, cameras = tmp_path / "tree.spz", tmp_path / "path.json"
     shutil.copy(TREE, tree)
@@ -163,6 +164,7 @@ def is_writing(process: int, folder: Path) -> bool:
     return any(folder.iterdir())
 
 
+@pytest.mark.slow
 def test_sigterm_leaves_nothing_behind(tmp_path: Path) -> None:
     """As Ctrl-C, which whoever runs tests in the background may have turned off."""
     settings = ("--distance", "5", "--center", "0,0,0", "--budget", "50k", "--threads", "2", "-q")

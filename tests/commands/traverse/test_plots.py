@@ -10,6 +10,8 @@ import pytest
 
 from tests.commands.traverse.runs import ORBIT, TOWN, Said, traverse
 
+pytestmark = pytest.mark.slow
+
 
 def test_a_plot_is_a_picture(tmp_path: Path, capsys: Said) -> None:
     pytest.importorskip("matplotlib")

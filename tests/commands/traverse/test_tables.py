@@ -13,6 +13,8 @@ from sparklod_cli.simulation.columns import COLUMNS
 from tests.commands.traverse.runs import NAMES, ORBIT, TOWN, TREE, Said, table, traverse
 from tests.conftest import ROOT
 
+pytestmark = pytest.mark.slow
+
 
 def test_a_table_comes_on_standard_output_and_nothing_else_is_said(capsys: Said) -> None:
     assert traverse(TOWN) == 0

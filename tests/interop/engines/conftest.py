@@ -18,9 +18,10 @@ from fixtures import demo_scene
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.codecs.streamed_sog import codec
-from sparklod_cli.io import detail_sink, read_scene
+from sparklod_cli.io import read_scene
+from sparklod_cli.io.details import detail_sink
 from sparklod_cli.lod import detail_levels, quality
-from sparklod_cli.lod.detail_settings import DetailSettings
+from sparklod_cli.lod.detail_rule import DetailSettings
 from sparklod_cli.model.scene import DetailScene
 from sparklod_cli.model.splats import Splats
 from tests.conftest import FIXTURES

@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sparklod_cli.lod.detail_choice import Chains, Distant, choose
-from sparklod_cli.lod.detail_distance import RegionBounds
+from sparklod_cli.lod.detail_choice import Chains, Distant, RegionBounds, choose
 from sparklod_cli.lod.detail_rule import DetailRule
 from sparklod_cli.lod.traversal import View
 from tests.interop.node import Node
 from tests.lod.details import Regions, random_regions, random_view
+
+pytestmark = pytest.mark.slow
 
 #: By name: the rule, and the share of runs that are empty.
 RULES = {

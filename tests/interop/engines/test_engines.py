@@ -20,6 +20,8 @@ from tests.interop.engines.browser import Browser, Request, Shown
 from tests.interop.engines.conftest import Shot, counts_of
 from tests.interop.engines.likeness import likeness, our_picture
 
+pytestmark = pytest.mark.slow
+
 #: Least PSNR in dB, of red, green and blue of all pixels. PlayCanvas is set to draw as we do, but for its falloff and a
 #: sort of few bits; SuperSplat's viewer and Babylon.js are as their pages set them.
 PLAYCANVAS, OTHERS = 38, 33

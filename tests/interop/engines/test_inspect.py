@@ -6,10 +6,14 @@ import os
 import subprocess
 from pathlib import Path
 
+import pytest
+
 import sparklod_cli as sparklod
 from sparklod_cli.inspection.report import ReportSettings, inspect
 from sparklod_cli.model.scene import Scene
 from tests.conftest import FIXTURES
+
+pytestmark = pytest.mark.slow
 
 
 def test_files_of_splat_transform_have_no_errors(engines_dir: Path, tmp_path: Path) -> None:

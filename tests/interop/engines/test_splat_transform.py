@@ -15,6 +15,8 @@ from tests.interop.engines.conftest import Shot, counts_of
 from tests.interop.engines.splat_transform import SplatTransform
 from tests.interop.laws import within
 
+pytestmark = pytest.mark.slow
+
 
 def check_same(ours: Splats, theirs: Splats) -> None:
     """Asserts that both have the same splats in any order, up to the rounding of float32."""

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sparklod_cli.lod.kernels import pair_merge, pair_overlap, profile
+from sparklod_cli.lod.kernels import pair_merge, profile
 from sparklod_cli.lod.kernels.pair_cost import CENTER, COLOR, COVARIANCE, COVERED, DENSITY, LOG_DET, WEIGHT, WIDTH
-from sparklod_cli.lod.pairs.binary import BinaryTree
+from sparklod_cli.lod.pair_tree import BinaryTree
 from sparklod_cli.model.gaussian import lod_opacity
 from tests.references import gaussians
 from tests.references import quality as twin
@@ -40,17 +40,17 @@ def test_semi_axes_of_what_is_round_or_flat(variances: tuple[float, float, float
 
 
 def overlap_share(a: np.ndarray, b: np.ndarray) -> float:
-    return float(pair_overlap.overlap_share(pair_overlap.overlaps(a, b), a[DENSITY], b[DENSITY]))
+    return float(pair_merge.overlap_share(pair_merge.overlaps(a, b), a[DENSITY], b[DENSITY]))
 
 
 def picture_error(a: np.ndarray, b: np.ndarray, merged: np.ndarray) -> float:
-    return float(pair_overlap.picture_error(a, b, merged, pair_overlap.overlaps(a, b)))
+    return float(pair_merge.picture_error(a, b, merged, pair_merge.overlaps(a, b)))
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_products_on_planes_are_integrals(seed: int) -> None:
     a, b = twin.random_rows(2, seed, spread=0.7)
-    for axes, found in zip(PLANES, pair_overlap.overlaps(a, b), strict=True):
+    for axes, found in zip(PLANES, pair_merge.overlaps(a, b), strict=True):
         expected = np.array(twin.integrals(a, b, axes)) / (2 * math.pi)
         np.testing.assert_allclose(found, expected, rtol=1e-5)
 
@@ -68,6 +68,7 @@ def test_the_overlap_is_that_of_integrals(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(2))
+@pytest.mark.slow
 def test_the_error_of_a_picture_is_an_integral(seed: int) -> None:
     a, b, merged = twin.random_rows(3, seed + 20, spread=0.7)
     total = 0.0
@@ -92,7 +93,7 @@ def test_a_merged_node_that_looks_as_its_two_is_without_error() -> None:
 
 def united(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     merged = np.zeros_like(a)
-    pair_merge.merge_pair(a, b, pair_overlap.overlaps(a, b), merged)
+    pair_merge.merge_pair(a, b, pair_merge.overlaps(a, b), merged)
     return merged
 
 

@@ -15,10 +15,12 @@ from hypothesis import strategies as st
 from sparklod_cli.lod.kernels.tree_links import (
     LIMIT_BITS,
     MAX_LINKS,
-    add_child_sizes,
+    add_weighted,
     count_limits,
+    fill_weights,
     find_cycles,
     find_depths,
+    find_limits,
     find_parents,
     mark_small,
     sum_by_depth,
@@ -119,7 +121,9 @@ def test_children_count_by_what_they_cover(links: Links, seed: int) -> None:
     parent, size = find_parents(count, start)[0], spark_size(splats)
     sums, weights = np.zeros(len(links)), np.zeros(len(links))
     for part in (slice(0, len(links) // 2), slice(len(links) // 2, None)):
-        add_child_sizes(parent[part], size[part], splats.scale[part], splats.opacity[part], sums, weights)
+        weight = np.empty(len(size[part]))
+        fill_weights(parent[part], size[part], splats.scale[part], splats.opacity[part], weight)
+        add_weighted(parent[part], size[part], weight, sums, weights)
     found = np.divide(sums, weights, out=np.zeros(len(links)), where=weights > 0)
     for node in range(len(links)):
         below = np.flatnonzero((parent == node) & (splats.opacity > 0) & (size > 0))
@@ -171,6 +175,7 @@ def test_a_tree_that_is_a_chain_is_followed_to_its_end() -> None:
     assert (nodes_of == 1).all()
 
 
+@pytest.mark.slow
 def test_the_kernels_give_the_same_without_compilation() -> None:
     """A kernel that is debugged wraps no integers that the compiled one does not."""
     twins = (
@@ -219,3 +224,17 @@ def test_nodes_much_smaller_than_a_child_are_marked(links: Links, ratio: float, 
     assert marks[expected].all()
     if followed(links) <= MAX_LINKS * len(links):
         assert np.array_equal(marks, expected)
+
+
+@given(st.integers(1, 40), st.integers(0, 2**32 - 1))
+def test_depth_and_limit_are_those_of_the_way_to_the_root(count: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    parent = np.array([-1, *(rng.integers(k) for k in range(1, count))], np.int32)
+    size = rng.uniform(size=count).astype(np.float32)
+    depth, limit = find_limits(parent, size)
+    for family in range(count):
+        way = [family]
+        while parent[way[-1]] >= 0:
+            way.append(int(parent[way[-1]]))
+        assert depth[family] == len(way) - 1
+        assert limit[family] == size[way].min()

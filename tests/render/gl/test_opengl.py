@@ -19,6 +19,8 @@ from sparklod_cli.support.errors import SparklodError
 from sparklod_cli.support.optional import install_hint
 from tests.render.gl.test_osmesa import CAMERAS, SPLATS, needs_opengl, opengl
 
+pytestmark = pytest.mark.slow
+
 __all__ = ["opengl"]  # a fixture
 
 

@@ -24,6 +24,8 @@ from sparklod_cli.render.shading import ShadedSplats, shade
 from tests.conftest import FIXTURES
 from tests.scenes import random_splats
 
+pytestmark = pytest.mark.slow
+
 #: dB in which it agrees with the reference; the first is that of the reference's own early end in each tile.
 FLOAT, HALF = 80, 45
 

@@ -18,6 +18,8 @@ from sparklod_cli.render.settings import RasterSettings
 from sparklod_cli.render.shading import ShadedSplats
 from tests.render.open3d.test_process import forget
 
+pytestmark = pytest.mark.slow
+
 BY_DEPTH = RasterSettings(sort="z")
 
 

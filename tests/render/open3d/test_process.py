@@ -20,6 +20,8 @@ from sparklod_cli.render.settings import RasterSettings
 from sparklod_cli.render.shading import ShadedSplats
 from tests.conftest import ROOT
 
+pytestmark = pytest.mark.slow
+
 
 def forget() -> None:
     if backend._child is not None:

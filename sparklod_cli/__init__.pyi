@@ -1,0 +1,70 @@
+"""Public names, for type checkers, and for `__init__.py`, which imports each when it is first used."""
+
+from typing import TYPE_CHECKING
+
+__version__: str
+
+if TYPE_CHECKING:  # mypy then resolves the modules first, which import this one
+    from .api.cameras import orbit as orbit
+    from .api.cameras import read_cameras as read_cameras
+    from .api.files import inspect as inspect
+    from .api.files import pack as pack
+    from .api.files import read as read
+    from .api.files import read_rad_chunk as read_rad_chunk
+    from .api.files import read_rad_header as read_rad_header
+    from .api.files import unpack as unpack
+    from .api.results import ComparisonTable as ComparisonTable
+    from .api.results import Frames as Frames
+    from .api.results import Picture as Picture
+    from .api.results import show as show
+    from .api.trees import arrange_chunks as arrange_chunks
+    from .api.trees import build_lod as build_lod
+    from .api.trees import extract_leaves as extract_leaves
+    from .api.trees import refine as refine
+    from .api.views import compare as compare
+    from .api.views import cut as cut
+    from .api.views import psnr as psnr
+    from .api.views import render as render
+    from .api.views import ssim as ssim
+    from .api.views import traverse as traverse
+    from .api.writing import Written as Written
+    from .api.writing import write as write
+    from .bake.refining import Refined as Refined
+    from .cameras.camera import Camera as Camera
+    from .cameras.path import CameraPath as CameraPath
+    from .codecs.options import RadOptions as RadOptions
+    from .codecs.options import SogOptions as SogOptions
+    from .codecs.rad.codec import RadChunk as RadChunk
+    from .codecs.rad.records import RadChunkEntry as RadChunkEntry
+    from .codecs.rad.records import RadChunkHeader as RadChunkHeader
+    from .codecs.rad.records import RadHeader as RadHeader
+    from .codecs.splat_encoding import SplatEncoding as SplatEncoding
+    from .fitting.settings import FitSettings as FitSettings
+    from .inspection.report import Report as Report
+    from .lod.detail_rule import DetailRule as DetailRule
+    from .lod.detail_rule import DetailSettings as DetailSettings
+    from .lod.settings import LodSettings as LodSettings
+    from .model.instances import Cones as Cones
+    from .model.instances import Frustum as Frustum
+    from .model.instances import Instance as Instance
+    from .model.lod_tree import LodTree as LodTree
+    from .model.scene import Scene as Scene
+    from .model.scene import Tree as Tree
+    from .model.selection import Selection as Selection
+    from .model.splats import Splats as Splats
+    from .model.transforms import Transform as Transform
+    from .render.backends import BackendError as BackendError
+    from .render.settings import RasterSettings as RasterSettings
+    from .render.settings import RenderSettings as RenderSettings
+    from .scenes.instances_file import InstancesFileError as InstancesFileError
+    from .scenes.instances_file import read_instances as read_instances
+    from .scenes.loaded import Cut as Cut
+    from .simulation.streaming import Network as Network
+    from .simulation.streaming import StreamingSettings as StreamingSettings
+    from .support.errors import CameraPathError as CameraPathError
+    from .support.errors import FormatError as FormatError
+    from .support.errors import InvalidSplatsError as InvalidSplatsError
+    from .support.errors import OutOfMemoryError as OutOfMemoryError
+    from .support.errors import OutputError as OutputError
+    from .support.errors import SparklodError as SparklodError
+    from .support.errors import TreeError as TreeError

@@ -1,0 +1,184 @@
+"""Trees of scenes in memory: build, fit, arrange, take the leaves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
+from ..bake.in_memory import build_tree
+from ..bake.refining import Refined, refined
+from ..bake.selecting import select
+from ..bake.settings import BakeSettings
+from ..cameras.camera import Camera
+from ..cameras.path import CameraPath
+from ..fitting.settings import MOST_SEED, MOST_STEPS, FitSettings
+from ..lod.builders import BUILDERS, METHODS
+from ..model.scene import Scene, Tree
+from ..model.selection import Selection
+from ..support.defaults import (
+    DEFAULT_BASE,
+    DEFAULT_GROWTH,
+    MAX_BASE,
+    MAX_GROWTH,
+    MAX_SH_DEGREE,
+    MIN_BASE,
+    MIN_GROWTH,
+)
+from ..support.errors import FormatError, memory_errors_translated
+from ..support.parallel import on_threads, thread_count
+from ..support.progress import Progress
+from .arguments import Told, path_like, scene_like, telling, whole_within, within
+
+
+def build_lod(
+    scene: Scene,
+    *,
+    method: str = METHODS[0],
+    base: float = DEFAULT_BASE,
+    growth: float = DEFAULT_GROWTH,
+    max_sh: int = MAX_SH_DEGREE,
+    selection: Selection | None = None,
+    refine: bool | int | FitSettings = False,
+    threads: int | None = None,
+    progress: Told = None,
+) -> Tree:
+    """Build the Level-of-Detail tree of a scene; the same scene and options give the same tree.
+
+    Args:
+        scene: without a tree.
+        method: "quick" or "quality".
+        base: of quick, growth of the voxel grid from level to level, 1.1 to 2.0.
+        growth: of quality, the most nodes for each leaf, 1.05 to 2.0.
+        max_sh: SH degrees above this are left out.
+        selection: which splats to keep; all that can be drawn, unless given.
+        refine: fit merged splats to pictures of full detail: True, or in how many steps, or how. The function `refine`
+            does the same and tells what it brought.
+        threads: to work on; None for all processors.
+        progress: called with how much is done.
+
+    Raises:
+        FormatError: the scene has a tree already.
+        InvalidSplatsError: some splats are invalid and `selection` does not drop them, or none is left.
+        ValueError: there is no such method, or an option is out of its range.
+    """
+    if scene_like(scene).tree is not None:
+        raise FormatError("the scene has a Level-of-Detail tree already; extract_leaves gives its splats")
+    if method not in BUILDERS:
+        raise ValueError(f"there is no method {method!r}; give one of {', '.join(BUILDERS)}")
+    within("base", base, MIN_BASE, MAX_BASE)
+    within("growth", growth, MIN_GROWTH, MAX_GROWTH)
+    whole_within("max_sh", max_sh, 0, MAX_SH_DEGREE)
+    fitting = asked_for(refine)
+    settings = BakeSettings(method, base, growth, max_sh, selection or Selection())
+    with on_threads(threads), telling(progress) as told, memory_errors_translated():
+        leaves, tally = select(scene.splats, settings, threads=thread_count(threads))
+        settings.selection.check(tally)
+        made = Tree(*build_tree([leaves], settings, in_chunks=False, progress=told), scene.antialiased, up=scene.up)
+        return made if fitting is None else refined_tree(made, fitting, thread_count(threads), told, None)[0]
+
+
+def refine(
+    tree: Scene,
+    *,
+    steps: int | None = None,
+    seed: int = 0,
+    cameras: CameraPath | Iterable[Camera] | None = None,
+    threads: int | None = None,
+    progress: Told = None,
+    say: Callable[[str], None] | None = None,
+) -> tuple[Tree, Refined]:
+    """Fit the merged splats of a tree to pictures of full detail, as `build-lod --refine` does.
+
+    The links of the tree, the order of its nodes and its leaves stay as they are, bit for bit. The same tree and
+    arguments give the same result for any number of threads.
+
+    Args:
+        tree: of any builder, or read from a file.
+        steps: pictures of cuts that are drawn and compared; None for a number that suits the size of the tree.
+        seed: of the cameras and budgets that are drawn at random.
+        cameras: those for which it is fitted; None for cameras around and inside the scene.
+        threads: to work on; None for all processors.
+        progress: called with how much is done.
+        say: called with a line of text after each stage.
+
+    Returns:
+        the tree, and what the fitting brought on held-out cameras.
+
+    Raises:
+        FormatError: the scene has no tree.
+        InvalidSplatsError: a node has numbers that no splat has.
+        ValueError: a number is out of its range, or there are no cameras.
+        OutOfMemoryError: it does not fit into memory.
+    """
+    if scene_like(tree).tree is None:
+        raise FormatError("the scene has no Level-of-Detail tree; build_lod makes one")
+    settings = checked(FitSettings(steps, seed, None if cameras is None else path_like(cameras)))
+    with telling(progress) as told, memory_errors_translated():
+        return refined_tree(tree, settings, thread_count(threads), told, say)
+
+
+def asked_for(refine: bool | int | FitSettings) -> FitSettings | None:
+    """Return the settings that an argument `refine` stands for; None for not at all.
+
+    Raises:
+        TypeError, ValueError: it stands for none.
+    """
+    if isinstance(refine, bool):
+        return FitSettings() if refine else None
+    if isinstance(refine, FitSettings):
+        return checked(refine)
+    whole_within("refine", refine, 1, MOST_STEPS)
+    return FitSettings(steps=int(refine))
+
+
+def checked(settings: FitSettings) -> FitSettings:
+    """Return settings whose numbers are in their ranges; `ValueError` or `TypeError` otherwise."""
+    if settings.steps is not None:
+        whole_within("steps", settings.steps, 1, MOST_STEPS)
+    whole_within("seed", settings.seed, 0, MOST_SEED)
+    return settings
+
+
+def refined_tree(
+    tree: Scene, settings: FitSettings, threads: int, progress: Progress, say: Callable[[str], None] | None
+) -> tuple[Tree, Refined]:
+    """Return a tree whose merged splats are fitted, and what that brought."""
+    found, report = refined(tree, settings, threads=threads, progress=progress, say=say or (lambda text: None))
+    assert found.tree is not None
+    return Tree(found.splats, found.tree, found.antialiased, up=found.up), report
+
+
+def arrange_chunks(tree: Scene, *, threads: int | None = None, progress: Told = None) -> Tree:
+    """Return a tree with its nodes in the order for streaming; `write` keeps the order that nodes have.
+
+    A chunk of a RAD is the next 65,536 nodes, so this order decides how many chunks a viewer fetches. docs/streaming.md
+    compares it with others; `build-lod --format rad` writes trees in it.
+
+    Args:
+        tree: its nodes in any order that a tree may have: children are consecutive and after their parent.
+        threads: to work on; None for all processors. The order does not depend on it.
+        progress: called with how much is done.
+
+    Raises:
+        FormatError: the scene has no tree.
+        TreeError: the tree is broken.
+    """
+    links = scene_like(tree).tree
+    if links is None:
+        raise FormatError("the scene has no Level-of-Detail tree; build_lod makes one")
+    links.validate()
+    with on_threads(threads), telling(progress) as told, memory_errors_translated():
+        from ..lod.chunk_order import arrange
+
+        splats, links = arrange(tree.splats, links, progress=told)
+    return Tree(splats, links, tree.antialiased, up=tree.up)
+
+
+def extract_leaves(tree: Scene) -> Scene:
+    """Return the splats that a tree was built of, in the order of its leaves.
+
+    Raises:
+        FormatError: the scene has no tree.
+    """
+    from ..extract_leaves import leaves_of
+
+    return leaves_of(scene_like(tree))

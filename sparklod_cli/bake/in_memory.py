@@ -1,0 +1,125 @@
+"""A bake in memory: the splats of an input are one block."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..codecs.encoder import Encoder, Get, results
+from ..codecs.sound import check_scene
+from ..codecs.statistics import Statistics
+from ..lod.builders import BUILDERS
+from ..model.lod_tree import LodTree
+from ..model.scene import Scene
+from ..model.splats import Splats
+from ..support.parallel import on_threads
+from ..support.progress import Progress
+from .output import FileOutput, Output, output_of_kept
+from .records import BuiltTree, Clock
+from .selecting import read_environment, select, split_environment, transformed
+from .settings import BakeSettings
+from .sources import Source, read_source
+
+
+@dataclass
+class InMemory:
+    """Workspace in memory, see `flow.Workspace`.
+
+    Attributes:
+        source, settings, threads, progress: as for `flow.bake`.
+        output: where the tree goes.
+        clock: of the stages.
+    """
+
+    source: Source
+    settings: BakeSettings
+    output: Output
+    clock: Clock
+    threads: int
+    progress: Progress
+    _leaves: Statistics | None = None
+
+    def build(self) -> BuiltTree:
+        """Read the input and build its tree, or keep the one that it has."""
+        settings, threads, progress = self.settings, self.threads, self.progress
+        scene = read_source(self.source, threads=threads, progress=progress)
+        tree = BuiltTree(
+            nodes=None,
+            output=self.output,
+            format=scene.format,
+            notes=scene.notes,
+            read=len(scene),
+            environment=read_environment(settings, threads=threads, progress=progress),
+        )
+        antialiased, up = scene.antialiased, settings.up_of(scene.up)
+        if scene.tree is not None:
+            tree.output, tree.is_ordered = output_of_kept(self.output, self.source, scene, settings)
+            tree.splats = int(np.count_nonzero(scene.tree.is_leaf))
+            tree.nodes = Scene(scene.splats, scene.tree, antialiased, up=up)
+            self.clock.end("read")
+            return tree
+        splats, tally = select(scene.splats, settings, threads=threads)
+        settings.selection.check(tally)
+        splats, far = split_environment(splats, settings)
+        splats = transformed(splats, settings.transform, threads)
+        if far is not None and tree.environment is None:
+            tree.environment = transformed(far, settings.transform, threads)
+        self.clock.end("read")
+        if isinstance(self.output, FileOutput):
+            self._leaves = Statistics.of_leaves(splats, self.output.needed, threads=threads)
+            self.output.check(self._leaves)  # before building, so that what does not fit is said at once
+        tree.splats, tree.dropped, tree.method = len(splats), tally.dropped, settings.method
+        leaves = [splats]
+        del scene, splats, far  # the builder frees its input as it goes, if nobody else holds it: a third of the peak
+        with on_threads(threads):
+            built = build_tree(leaves, settings, in_chunks=self.output.in_chunks, progress=progress)
+        tree.nodes = Scene(*built, antialiased, up=up)
+        self.clock.end("build")
+        return tree
+
+    def order(self, tree: BuiltTree) -> None:
+        """Check a tree, put its nodes into the order of its output, and count them."""
+        scene, output = tree.scene, tree.output
+        check_scene(scene, self.threads)
+        assert scene.tree is not None
+        tree.levels = int(scene.tree.depths().max()) + 1
+        if output.in_chunks and not tree.is_ordered:
+            with on_threads(self.threads):
+                from ..lod.chunk_order import chunk_order
+                from ..lod.families import reordered
+
+                order, child_start = chunk_order(scene.splats, scene.tree, progress=self.progress)
+                built, antialiased, up = [(scene.splats, scene.tree)], scene.antialiased, scene.up
+                tree.nodes = None
+                del scene  # `reordered` frees the nodes as it goes
+                tree.nodes = scene = Scene(*reordered(built, order, child_start), antialiased=antialiased, up=up)
+            self.clock.end("arrange")
+        if isinstance(output, FileOutput) and self._leaves is not None:
+            tree.statistics = Statistics.of_tree(scene, self._leaves, output.needed, threads=self.threads)
+        elif isinstance(output, FileOutput):
+            tree.statistics = Statistics.of_scene(scene, output.needed, threads=self.threads)
+
+    def encode(self, tree: BuiltTree, encoder: Encoder) -> Get:
+        """Encode the windows of a tree."""
+        encoded = list(results(encoder, tree.scene, self.threads, self.progress, "encoding"))
+        return lambda number, name: encoded[number][name]
+
+
+def build_tree(
+    leaves: list[Splats], settings: BakeSettings, *, in_chunks: bool, progress: Progress
+) -> tuple[Splats, LodTree]:
+    """Build the tree of splats, which are taken out of a list so that the builder can free them.
+
+    Args:
+        leaves: a list of these splats.
+        settings: method and its setting.
+        in_chunks: the nodes are put into the order for streaming later.
+    """
+    row = BUILDERS[settings.method]
+    built = [row.load().build(leaves.pop(), getattr(settings, row.setting), progress=progress)]
+    if row.in_bands and not in_chunks:
+        from ..lod.families import banded
+
+        return banded(built)
+    return built.pop()

@@ -1,0 +1,228 @@
+"""A bake out of core: the splats of an input are scattered to blocks in a store, and stages build their tree."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import itertools
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...codecs.encoder import Encoder, Get
+from ...codecs.statistics import Statistics
+from ...lod.builders import BUILDERS
+from ...lod.stage_records import NO_FAMILY, Families, Pending
+from ...model.selection import Tally
+from ...model.splats import Splats
+from ...support.parallel import blocks_of, on_threads
+from ...support.progress import Progress
+from ..output import Output
+from ..records import BuiltTree, Clock
+from .blocks import Stage, cut_into_blocks
+from .job import ORDER, PUBLISHED, ROOT, Job, clean_of, encoded_of, families_of, pending_of, stage_of
+from .nodes import Rows, encode, encoded_chunk, node_stream, rows_of, splats_of, width_of
+from .order import WINDOW_NODES, put_order
+from .reading import Findings, check_findings, first_look, parts_of, scatter
+from .tasks import Engine, Task
+
+#: How many times larger than requested a block may be before the scene is cut again, by what was found of all of it.
+SLACK = 1.3
+
+#: How often a scene is cut at most: by the first look, and by an even sample of what is kept.
+ROUNDS = 2
+
+#: Work of a join for each splat below it, as a share of that of a block: a few per cent of the nodes are left. Chosen.
+JOIN_WORK = 0.1
+
+
+@dataclass
+class InBlocks:
+    """Workspace in a scratch folder, see `flow.Workspace`.
+
+    Attributes:
+        job: of all tasks; `build` and `order` add what they find out.
+        output: where the tree goes.
+        clock: of the stages.
+        engine: runs the tasks.
+        block_splats: of a block, about.
+        progress: called with how much of a stage is done.
+    """
+
+    job: Job
+    output: Output
+    clock: Clock
+    engine: Engine
+    block_splats: int
+    progress: Progress
+
+    def build(self) -> BuiltTree:
+        """Scatter the splats of the input to blocks, and build the tree in stages."""
+        stream, settings = self.job.stream, self.job.settings
+        if not stream.count:
+            settings.selection.check(Tally())
+        findings = self.scatter()
+        self.clock.end("read")
+        self.output.check(findings.statistics)
+        setting = getattr(settings, BUILDERS[settings.method].setting)
+        self.job = job = dataclasses.replace(self.job, plan=self.job.builder().plan(findings.survey(), setting))
+        self.engine.run("building", list(_stages(job)), job, self.progress)
+        self.clock.end("build")
+        return BuiltTree(
+            nodes=None,
+            output=self.output,
+            format=stream.format,
+            notes=stream.notes,
+            read=stream.count,
+            splats=findings.tally.kept,
+            dropped=findings.tally.dropped,
+            method=settings.method,
+            blocks=job.blocks.count,
+        )
+
+    def order(self, tree: BuiltTree) -> None:
+        """Put the order of all nodes into the store."""
+        job = self.job
+        stages = [job.store.get(stage_of(stage.number)) for stage in job.blocks.stages]
+        self.job = job = dataclasses.replace(job, families=tuple(int(stage["counts"][0]) for stage in stages))
+        self.engine.run("ordering", [Task(ORDER, put_order, weight=sum(job.families))], job, self.progress)
+        self.clock.end("order")
+        count, tree.levels = job.store.get(ORDER, ["counts"])["counts"].tolist()
+        tree.statistics = Statistics.merged([Statistics.from_array(stage["statistics"]) for stage in stages])
+        tree.nodes = node_stream(job, count, tree.splats)
+
+    def encode(self, tree: BuiltTree, encoder: Encoder) -> Get:
+        """Encode the windows of the tree; whatever interrupts the rest finds its output published, or a part of it."""
+        job = dataclasses.replace(self.job, encoder=encoder)
+        tasks = [
+            Task(encoded_of(window), encode, (window,), weight=part.stop - part.start)
+            for window, part in enumerate(blocks_of(encoder.count, WINDOW_NODES))
+        ]
+        self.engine.run("encoding", tasks, job, self.progress)
+        self.clock.end("encode")
+        job.store.put(PUBLISHED, {})
+        return functools.partial(encoded_chunk, job.store)
+
+    def scatter(self) -> Findings:
+        """Read the input and put its splats into blocks, of which `job` knows then; return what was found.
+
+        Raises:
+            InvalidSplatsError: no tree can be made of them.
+        """
+        job, block_splats = self.job, self.block_splats
+        job = dataclasses.replace(job, parts=parts_of(job.stream.count, block_splats))
+        center, share = first_look(job.stream, job.settings, -(-job.stream.count // block_splats))
+        blocks = cut_into_blocks(center, math.ceil(share * job.stream.count), block_splats)
+        job = dataclasses.replace(job, blocks=blocks)
+        while True:
+            tasks = [
+                Task(job.part(number), scatter, (number,), weight=stop - start)
+                for number, (start, stop) in enumerate(itertools.pairwise(job.parts))
+            ]
+            self.engine.run("reading", tasks, job, self.progress)
+            arrays = [job.store.get(task.name) for task in tasks]
+            parts = [Findings.from_arrays(each) for each in arrays]
+            findings = Findings.merged(parts)
+            check_findings(findings, job.settings)
+            kept = tuple(itertools.accumulate((part.tally.kept for part in parts), initial=0))
+            self.job = job = dataclasses.replace(job, kept=kept)
+            largest = int(np.sum([np.diff(each["first"]) for each in arrays], axis=0).max())
+            again = cut_into_blocks(findings.sample[:, :3], findings.tally.kept, block_splats)
+            if largest <= SLACK * block_splats or job.round + 1 == ROUNDS or again == job.blocks:
+                return findings
+            for part, group in itertools.product(range(len(parts)), range(len(job.blocks.groups))):
+                job.store.remove(job.splats(part, group))
+            job = dataclasses.replace(job, blocks=again, round=job.round + 1)
+
+
+def _stages(job: Job) -> Iterator[Task]:
+    """Yield the tasks of all stages, and those that remove what they no longer need, as soon as that can be."""
+    blocks = job.blocks
+    ends = {group.stop - 1: number for number, group in enumerate(blocks.groups)}
+    share = job.kept[-1] // blocks.count
+    begun = {stage.block: stage_of(stage.number) for stage in blocks.stages}
+    for stage in blocks.stages:
+        needs = tuple(stage_of(child) for child in stage.children)
+        weight = share if stage.block is not None else math.ceil(JOIN_WORK * share * stage.blocks)
+        yield Task(stage_of(stage.number), build_stage, (stage.number,), needs, weight)
+        if stage.block in ends:
+            group = ends[stage.block]
+            yield Task(clean_of(group), clean, (group,), tuple(begun[block] for block in blocks.groups[group]))
+
+
+def build_stage(job: Job, number: int, *, threads: int, progress: Progress) -> None:
+    """Run a stage of the build; a task.
+
+    Results: families, whose nodes are `rows`; nodes without a parent, or the root of the last stage; at last numbers
+    and statistics of the nodes.
+    """
+    stage, builder = job.blocks.stages[number], job.builder()
+    with on_threads(threads):
+        pending = _begun(job, stage, threads)
+        families, left = builder.advance(pending, stage.region, number, job.plan, progress=progress)
+        del pending
+        _put_families(job, number, families, threads)
+        statistics = [Statistics.of(families.nodes, families.family == NO_FAMILY, job.needed)]
+        if stage.region is None:
+            root, family = left.root()
+            job.store.put(ROOT, {"rows": rows_of(root), "family": np.array([family], np.int64)})
+            statistics.append(Statistics.of(root, np.array([family == NO_FAMILY]), job.needed))
+        else:
+            job.store.put(pending_of(number), left.columns)
+    counts = np.array([len(families), len(families.family)], np.int64)
+    job.store.put(stage_of(number), {"counts": counts, "statistics": Statistics.merged(statistics).array()})
+
+
+def clean(job: Job, group: int, *, threads: int, progress: Progress) -> None:
+    """Remove the splats of a group of blocks whose stages are done; a task."""
+    for part in range(len(job.parts) - 1):
+        job.store.remove(job.splats(part, group))
+    job.store.put(clean_of(group), {})
+
+
+def _begun(job: Job, stage: Stage, threads: int) -> Pending:
+    """Return the nodes that a stage begins with."""
+    if stage.block is None:
+        return Pending.concat([Pending(job.store.get(pending_of(child))) for child in stage.children])
+    splats, index = block_of(job, stage.block, threads)
+    return job.builder().leaves(splats, index, job.plan)
+
+
+def block_of(job: Job, block: int, threads: int) -> tuple[Splats, NDArray[np.int64]]:
+    """Return the splats of a block, and the place of each among all that are kept."""
+    group = next(number for number, blocks in enumerate(job.blocks.groups) if block in blocks)
+    begin = job.blocks.groups[group].start
+    ranges = []
+    for part in range(len(job.parts) - 1):
+        first = job.store.get(job.part(part), ["first"])["first"]
+        ranges.append((first[block : block + 2] - first[begin]).tolist())
+    total = sum(stop - start for start, stop in ranges)
+    rows: Rows = np.empty((total, width_of(job.sh_degree)), np.float32)
+    index, at = np.empty(total, np.int64), 0
+    for part, (start, stop) in enumerate(ranges):
+        if start == stop:
+            continue
+        here, name = slice(at, at + stop - start), job.splats(part, group)
+        rows[here] = job.store.rows(name, "rows", start, stop)
+        index[here] = job.store.rows(name, "index", start, stop)
+        index[here] += job.kept[part]
+        at = here.stop
+    return splats_of(rows, threads), index
+
+
+def _put_families(job: Job, number: int, families: Families, threads: int) -> None:
+    job.store.put(
+        families_of(number),
+        {
+            "batch": families.batch,
+            "key": families.key,
+            "count": families.count,
+            "rows": rows_of(families.nodes, threads),
+            "family": families.family,
+            "center": families.center,
+            "size": families.size,
+        },
+    )

@@ -1,0 +1,221 @@
+"""Whether a bake goes out of core, and what it gets there: a scratch folder, blocks and an engine."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+import shutil
+import tempfile
+import uuid
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ...model.streams import SceneStream
+from ...support.addresses import Place, absolute
+from ...support.errors import FormatError, HasTreeError, OutOfMemoryError, ScratchError
+from ...support.progress import Progress
+from ...support.stdin import name_of
+from ...support.units import count_of, format_size
+from ..fingerprint import files_named_in, source_fingerprint
+from ..output import Output
+from ..records import Clock
+from ..settings import BakeSettings, Resources
+from ..sources import Merged, Source, absolute_source, opened_source
+from . import estimate
+from .job import PUBLISHED, Job
+from .scratch_folder import at_work, scratch_folder
+from .store import Store
+from .tasks import Engine, LocalEngine
+
+if TYPE_CHECKING:
+    from .in_blocks import InBlocks
+
+#: The folder in the scratch folder for what is unpacked of an input.
+UNPACKED = "input"
+
+
+@contextlib.contextmanager
+def blocks_for(
+    source: Source,
+    target: Place,
+    settings: BakeSettings,
+    output: Output,
+    clock: Clock,
+    *,
+    overwrite: bool,
+    threads: int,
+    progress: Progress,
+    resources: Resources,
+    engine: Engine | None,
+    say: Callable[[str], None],
+) -> Iterator[InBlocks | None]:
+    """Open the workspace of a bake that goes out of core, if that is needed or requested; None for one in memory.
+
+    Args:
+        output: of the bake.
+        clock: of its stages.
+
+    Raises:
+        ScratchError: the scratch folder cannot be used, or has too little room.
+        FormatError, OutOfMemoryError: as `flow.bake`.
+    """
+    header = _header_of(source)
+    if header is None:
+        yield None
+        return
+    memory = estimate.default_memory() if resources.memory is None else resources.memory
+    # It reads samples of all inputs, and most bakes in memory need none.
+    fingerprint = functools.lru_cache(1)(lambda: source_fingerprint(source, settings))
+    if files_named_in(settings):
+        fingerprint()  # so that one that is missing is named at once
+    folder = scratch_folder(target, fingerprint, resources.scratch_dir)
+    if engine is not None:
+        folder = absolute(folder)  # other processes work in folders of their own
+    store = Store(folder)
+    is_left = bool(store.names())
+    why = _reason(header, settings, memory, resources, engine, is_left=is_left)
+    whole = _as_a_whole(settings)
+    if why is not None and whole is not None:
+        say(f"{name_of(source)}: goes on in memory, although {why}: {whole}")
+        why = None
+    work = functools.partial(at_work, store, resume=resources.resume, overwrite=overwrite, say=say)
+    if why is None:
+        if is_left:  # refused, or removed
+            with work(fingerprint(), 0):
+                pass
+        yield None
+        return
+    from .in_blocks import InBlocks  # what most bakes do without takes long to load
+
+    splats, degree = header.count, min(header.sh_degree, settings.max_sh)
+    block_splats = resources.block_splats or _block_splats(
+        splats, degree, settings.method, memory, in_chunks=output.in_chunks, threads=threads
+    )
+    needed = estimate.scratch_bytes(settings.method, splats, degree)
+    if isinstance(folder, Path):
+        _check_room(folder, needed)
+    say(
+        f"{name_of(source)}: goes out of core, as {why}; {count_of(splats, 'splat')} in blocks of up to"
+        f" {block_splats:,}, scratch of about {format_size(needed)} in {folder}"
+    )
+    with (
+        work(fingerprint(), block_splats) as block_splats,
+        _opened(source, folder, threads, engine) as stream,
+    ):
+        settings = dataclasses.replace(settings, rgba=settings.rgba and settings.rgba.absolute())
+        job = Job(store, stream, settings, output.needed, output.in_chunks)
+        yield InBlocks(job, output, clock, engine or LocalEngine(threads), block_splats, progress)
+
+
+def has_published(source: Source, target: Place, settings: BakeSettings, resources: Resources) -> bool:
+    """Return whether a bake resumes one that was interrupted when its output, or a part of it, may have been there."""
+    if not resources.resume:
+        return False
+    fingerprint = functools.partial(source_fingerprint, source, settings)
+    return Store(scratch_folder(target, fingerprint, resources.scratch_dir)).has(PUBLISHED)
+
+
+def fits_in_memory(source: Source, settings: BakeSettings, memory: int | None) -> bool:
+    """Return whether an input can be baked in so much memory; an unreadable one fits: whoever bakes it will say why.
+
+    Args:
+        memory: bytes; None for any number.
+    """
+    try:
+        header = _header_of(source)
+    except FormatError:
+        return True
+    if header is None or memory is None:
+        return True
+    return estimate.in_memory_bytes(settings.method, header.count, header.sh_degree) <= memory
+
+
+def _header_of(source: Source) -> SceneStream | None:
+    """Return what the headers of an input say; None for a tree."""
+    try:
+        with opened_source(source) as stream:
+            return stream
+    except HasTreeError:
+        if isinstance(source, Merged):
+            raise
+        return None
+
+
+def _reason(
+    header: SceneStream,
+    settings: BakeSettings,
+    memory: int | None,
+    resources: Resources,
+    engine: Engine | None,
+    *,
+    is_left: bool,
+) -> str | None:
+    """Return why a bake goes out of core, as the end of a sentence; None if it does not."""
+    needed = estimate.in_memory_bytes(settings.method, header.count, header.sh_degree)
+    if memory is not None and needed > memory:
+        allowed = "may take" if resources.memory is None else "--memory gives it"
+        return f"it would take about {format_size(needed)} of memory and {allowed} {format_size(memory)}"
+    if engine is not None:
+        return "a cluster was asked for"
+    if resources.resume and is_left:
+        return "it was interrupted there"
+    return "blocks were asked for" if resources.block_splats else None
+
+
+def _as_a_whole(settings: BakeSettings) -> str | None:
+    """Return why an output is made in memory only, as the end of a sentence; None where it need not be."""
+    if settings.encoding is not None:
+        return "--encoding writes arrays as a whole"
+    if settings.refine is not None:
+        return "--refine fits a whole tree"
+    return None if settings.detail is None else "detail levels are made of a whole tree"
+
+
+def _block_splats(
+    splats: int, sh_degree: int, method: str, memory: int | None, *, in_chunks: bool, threads: int
+) -> int:
+    """Return the splats of a block; raise `OutOfMemoryError` where there is too little memory for the least ones."""
+    size = estimate.block_splats_within(memory, method, splats, sh_degree, in_chunks=in_chunks, threads=threads)
+    if size is None:
+        least = estimate.out_of_core_bytes(
+            method, splats, sh_degree, estimate.LEAST_BLOCK_SPLATS, in_chunks=in_chunks, threads=threads
+        )
+        raise OutOfMemoryError(
+            f"{format_size(memory or 0)} of memory is too little even out of core; give --memory"
+            f" {format_size(1.02 * least)} or more"
+        )
+    return size
+
+
+def _check_room(folder: Path, needed: int) -> None:
+    """Raise `ScratchError` where there is too little room for a scratch folder, which may have some of it already."""
+    nearest = next(parent for parent in (folder.absolute(), *folder.absolute().parents) if parent.is_dir())
+    free = shutil.disk_usage(nearest).free
+    held = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+    if needed > free + held:
+        raise ScratchError(
+            f"{folder} will take about {format_size(needed)}, and {format_size(free)} are free there; free some, or"
+            " choose another disk with --scratch-dir"
+        )
+
+
+@contextlib.contextmanager
+def _opened(source: Source, folder: Place, threads: int, engine: Engine | None) -> Iterator[SceneStream]:
+    """Open the input so that the processes of an engine can open it, too, whatever folders they work in."""
+    from .cluster_engine import ClusterEngine
+
+    if isinstance(folder, Path):
+        with opened_source(absolute_source(source), scratch=folder.absolute() / UNPACKED, threads=threads) as stream:
+            yield stream
+    elif isinstance(engine, ClusterEngine):
+        own = Path(tempfile.gettempdir()) / f"sparklod-{uuid.uuid4().hex}"  # each machine unpacks what it needs
+        try:
+            with opened_source(absolute_source(source), scratch=own, threads=threads) as stream:
+                yield stream
+        finally:
+            engine.remove(own)
+    else:
+        with opened_source(source, threads=threads) as stream:
+            yield stream

@@ -1,0 +1,166 @@
+"""From a binary tree to the nodes that are kept: pruned, in final order, with their geometry and colours."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..model.lod_tree import LodTree
+from ..model.sh import degree_of
+from ..model.splats import COLUMNS, FloatArray, Splats
+from ..support.jit import threads_for, threads_in_use
+from ..support.progress import Progress
+from .kernels import node_rows, pair_cost, prune
+from .kernels.node_rows import fill_leaves, merge_colors
+from .kernels.sort import Keys, Nodes, sort_by_key
+from .pair_tree import BinaryTree, Curve
+
+#: Columns of splats that merged ones have of their node rows, and those that they have of their children.
+GEOMETRY = ("center", "scale", "quat_xyzw", "opacity")
+COLORS = tuple(name for name in COLUMNS if name not in GEOMETRY)
+
+
+@dataclass(frozen=True)
+class PruningGoal:
+    """Bounds of the nodes of a pruned tree, and their order.
+
+    Attributes:
+        most: number of merged nodes.
+        splats: number of splats of the scene under the tree's leaves.
+        is_whole: whether its last node is the root of the scene. Otherwise the nodes without a parent get one later; if
+            one is dropped, its children are left without a parent.
+        highest: ln(size) of rank 0, in units; None for the root's.
+        latest: (N,) ranks that the parents of leaves must be below; empty for any.
+    """
+
+    most: int
+    splats: int
+    is_whole: bool = True
+    highest: float | None = None
+    latest: NDArray[np.int32] = field(default_factory=lambda: np.empty(0, np.int32))
+
+
+@dataclass(frozen=True, eq=False)
+class FinalTree:
+    """Pruned tree in final order.
+
+    If the tree is not whole, node 0 stands for what the nodes without a parent will be under, and is not to be drawn.
+
+    Attributes:
+        splats: M nodes as they are drawn.
+        tree: of them.
+        order: (M,) uint32 node of the binary tree.
+        parents: (F,) uint32 final indices of the merged nodes, in the order of their children.
+        ranks: (F,) int32, ascending.
+        keys: (F,) uint64 places on the curve, ascending within a rank.
+        rows: (F, WIDTH) float32 node rows of `parents`; empty if the tree is whole.
+    """
+
+    splats: Splats
+    tree: LodTree
+    order: Nodes
+    parents: Nodes
+    ranks: NDArray[np.int32]
+    keys: Keys
+    rows: FloatArray
+
+    @property
+    def first_child(self) -> int:
+        """Final index of the first node that has a parent."""
+        return len(self.order) - int(self.tree.child_count[self.parents].sum(dtype=np.int64))
+
+
+def in_final_order(
+    binary: BinaryTree,
+    index: Nodes,
+    columns: dict[str, FloatArray],
+    goal: PruningGoal,
+    curve: Curve,
+    progress: Progress,
+) -> FinalTree:
+    """Prune a tree, and writes its nodes and their colours in final order. The binary tree is of no use afterwards.
+
+    Args:
+        binary: the tree.
+        index: (N,) splat of each of its leaves.
+        columns: of the splats as the leaves are drawn; emptied, so that they are freed one by one where nobody else
+            holds them.
+        goal: bounds and order of its nodes.
+        curve: for the order of nodes of one rank.
+        progress: told of the nodes.
+    """
+    n, hidden = binary.leaves, 0 if goal.is_whole else 1
+    parent, saved, rank = _prune(binary, goal, progress)
+    inner, ranks, keys = _by_rank(binary, rank[: len(rank) - hidden], curve)
+    del rank
+    slots = inner - np.uint32(n)
+    binary.spare = np.empty(0, np.uint32)
+    binary.keep_rows(slots)
+    total = n + len(inner) + hidden
+    progress("ordering", 0, total, "node")
+    order = np.empty(total, np.uint32)
+    tree = LodTree(np.zeros(total, np.uint16), np.zeros(total, np.uint32))
+    root = np.full(hidden, len(parent) - 1, np.uint32)
+    links = order, tree.child_start, tree.child_count
+    parents = prune.lay_out_children(np.concatenate([root, inner]), n, parent, saved, *links)[hidden:]
+    del parent, saved
+    out = Splats.empty(total, degree_of(columns["sh"].shape[1]))
+
+    def fill(name: str) -> None:
+        fill_leaves(order, index, columns.pop(name).reshape(n, -1), getattr(out, name).reshape(total, -1))
+
+    for name in GEOMETRY:
+        fill(name)
+    places = (getattr(out, name)[hidden:] for name in GEOMETRY)
+    node_rows.fill_merged_splats(order[hidden:], n, binary.row, binary.rows, curve.space, *places)
+    weight = binary.rows[binary.row[slots], pair_cost.WEIGHT]
+    binary.rows = rows = binary.rows[binary.row[slots[:0] if goal.is_whole else slots]]  # frees what is not returned
+    weights = np.empty(binary.used, np.float32)
+    weights[:n], weights[inner] = binary.weight, weight
+    for name in COLORS:
+        fill(name)
+    ends = np.concatenate([np.flatnonzero(np.diff(ranks, prepend=ranks[:1] - 1)), [len(inner)]])
+    for begin, end in zip(ends[-2::-1], ends[:0:-1], strict=True):
+        with threads_for(int(end - begin)) as threads:
+            for color in (out.rgb, out.sh.reshape(total, -1)):
+                merge_colors(parents[begin:end], tree.child_start, tree.child_count, order, weights, color, threads)
+        progress("ordering", total - int(begin), total, "node")
+    return FinalTree(out, tree, order, parents, ranks, keys, rows)
+
+
+def _prune(
+    binary: BinaryTree, goal: PruningGoal, progress: Progress
+) -> tuple[Nodes, NDArray[np.int32], NDArray[np.int32]]:
+    """Return parents of all nodes, `saved` of `prune.drop_nodes`, and ranks; frees what only pruning needs."""
+    n, top, blocks = binary.leaves, binary.used - goal.is_whole, threads_in_use()
+    progress("pruning", 0, binary.used, "node")
+    log_size, lost, weight = binary.size[: top + 1], binary.error[: top + 1 - n], np.empty(top + 1 - n, np.float32)
+    children = binary.children[: binary.used - n]
+    parent = prune.fill_usefulness_terms(children, n, goal.splats, top, log_size, lost, weight, blocks)
+    binary.children = children = np.empty((0, 2), np.uint32)
+    saved = np.ones(top + 1 - n, np.int32)
+    if not goal.is_whole:
+        saved[-1] = np.count_nonzero(parent[:-1] == top) - 1 - prune.ROOM
+    # A root that is only to be is one node more.
+    prune.drop_nodes(n, goal.most + (not goal.is_whole), parent, log_size, lost, weight, saved, blocks)
+    if not goal.is_whole:
+        saved[-1] += prune.ROOM
+    highest = log_size[top] if goal.highest is None else np.float32(goal.highest)
+    rank = prune.size_ranks(n, highest, parent, log_size, saved, goal.latest)
+    binary.size = binary.error = np.empty(0, np.float32)
+    return parent, saved, rank
+
+
+def _by_rank(binary: BinaryTree, rank: NDArray[np.int32], curve: Curve) -> tuple[Nodes, NDArray[np.int32], Keys]:
+    """Return the remaining merged nodes, by rank and then along the curve, with both."""
+    slots = np.flatnonzero(rank != prune.NO_RANK).astype(np.uint32)
+    own = rank[slots].astype(np.int64)
+    first = int(own.min(initial=0))
+    bits = 3 * node_rows.CURVE_BITS
+    keys = curve.keys(binary.rows, binary.row[slots], 0) | ((own - first).astype(np.uint64) << np.uint64(bits))
+    with threads_for(len(slots)) as threads:
+        keys, slots = sort_by_key(keys, slots, bits + int(own.max(initial=first) - first).bit_length(), threads)
+    ranks = ((keys >> np.uint64(bits)).astype(np.int64) + first).astype(np.int32)
+    return slots + np.uint32(binary.leaves), ranks, keys & np.uint64((1 << bits) - 1)

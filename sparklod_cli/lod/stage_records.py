@@ -1,0 +1,159 @@
+"""Records of builds in stages, which make a tree block by block where a scene does not fit into memory.
+
+A stage takes the nodes of a region that have no parent yet, gives as many of them parents as it can know without the
+rest of the scene, and hands on what is left: first for each block of splats, then for regions that join several, and
+at last for the whole scene.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..model.splats import COLUMNS, FloatArray, Splats
+from ..support.progress import Progress
+
+#: Number of the family of a leaf, which has no children.
+NO_FAMILY = -1
+
+#: A family's number is that of its stage, shifted by this many bits, and its place among the families of the stage.
+STAGE_BITS = 32
+
+
+@dataclass(frozen=True)
+class Region:
+    """A half-open box of centres, low <= centre < high; infinite where nothing of the scene lies beyond a face.
+
+    Attributes:
+        low, high: corners, world units.
+    """
+
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Survey:
+    """Facts about the whole scene that stages need before any of it is built.
+
+    Attributes:
+        count: N splats that are kept.
+        sh_degree: of them.
+        low, high: corners of the box of their centres, world units.
+        smallest, largest: range of their sizes, 2 * max(scale), world units.
+        sample: an even sample of them, in their order.
+    """
+
+    count: int
+    sh_degree: int
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
+    smallest: float
+    largest: float
+    sample: Splats
+
+
+@dataclass(frozen=True, eq=False)
+class Pending:
+    """Nodes without a parent.
+
+    Attributes:
+        columns: (n, ...) arrays by name: those of `Splats` as the nodes are drawn, and others of their builder.
+    """
+
+    columns: Mapping[str, NDArray[Any]]
+
+    @classmethod
+    def of(cls, splats: Splats, **columns: NDArray[Any]) -> Pending:
+        """Return nodes by how they are drawn, and their other columns."""
+        return cls({**{name: getattr(splats, name) for name in COLUMNS}, **columns})
+
+    def __len__(self) -> int:
+        return len(next(iter(self.columns.values())))
+
+    @property
+    def splats(self) -> Splats:
+        """Nodes as they are drawn."""
+        return Splats(**{name: self.columns[name] for name in COLUMNS})
+
+    def root(self) -> tuple[Splats, int]:
+        """Return the one node that is left at the end, as it is drawn, and the number of its family."""
+        return self.splats, int(self.columns["family"][0])
+
+    @classmethod
+    def concat(cls, parts: list[Pending]) -> Pending:
+        """Return all parts in order."""
+        return cls({name: np.concatenate([part.columns[name] for part in parts]) for name in parts[0].columns})
+
+
+@dataclass(frozen=True, eq=False)
+class Families:
+    """The children that a stage gave to F nodes, in the order of the tree.
+
+    In the tree the root comes first, then all families of all stages by batch and then by key: that of a node comes
+    after the node itself.
+
+    Attributes:
+        batch: (F,) int32, ascending.
+        key: (F, words) uint64, ascending within a batch; the first word counts most.
+        count: (F,) uint16 number of children, at least 1.
+        nodes: (C,) the children of one family after the other, as they are drawn.
+        family: (C,) int64 number of the family of each of these nodes, `NO_FAMILY` for a leaf.
+        center: (F, 3) float32 of the node whose children they are, world units.
+        size: (F,) float32 feature size of that node, as `model.gaussian.spark_size` has it.
+    """
+
+    batch: NDArray[np.int32]
+    key: NDArray[np.uint64]
+    count: NDArray[np.uint16]
+    nodes: Splats
+    family: NDArray[np.int64]
+    center: FloatArray
+    size: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.count)
+
+
+class StagedBuilder(Protocol):
+    """A builder in stages: a module with these functions.
+
+    `plan` is a value of plain numbers and small arrays, the same for all stages, which can be pickled.
+    """
+
+    def plan(self, survey: Survey, setting: float) -> Any:
+        """Return what all stages share.
+
+        Args:
+            survey: of the whole scene.
+            setting: of the builder, base or growth.
+
+        Raises:
+            ValueError: the setting is out of its range.
+        """
+
+    def leaves(self, splats: Splats, index: NDArray[np.int64], plan: Any) -> Pending:
+        """Return splats as nodes without a parent.
+
+        Args:
+            splats: n splats, valid and visible.
+            index: (n,) ascending place of each among all splats of the scene.
+            plan: of `plan`.
+        """
+
+    def advance(
+        self, pending: Pending, region: Region | None, stage: int, plan: Any, *, progress: Progress
+    ) -> tuple[Families, Pending]:
+        """Give nodes parents as far as the rest of the scene cannot matter.
+
+        Args:
+            pending: all nodes without a parent whose centres lie in the region, from blocks in ascending order.
+            region: of the scene; None for all of it, after which one node is left, the root.
+            stage: number of the stage, which is part of the numbers of its families.
+            plan: of `plan`.
+            progress: told of the splats or nodes.
+        """

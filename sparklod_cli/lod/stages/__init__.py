@@ -1,1 +1,0 @@
-"""Builders in stages: a tree made block by block, where the whole scene does not fit into memory."""
