@@ -32,7 +32,8 @@ from sparklod_cli.scenes.finder import view_of
 from sparklod_cli.scenes.loaded import Scenes
 from sparklod_cli.scenes.reading import read_scenes
 from sparklod_cli.simulation.loading import chunks_of
-from sparklod_cli.simulation.streaming import Network, Stream
+from sparklod_cli.simulation.streaming import Stream
+from sparklod_cli.simulation.streaming_settings import Network
 from sparklod_cli.support.parallel import processors
 
 sys.path.insert(0, str(Path(__file__).parents[1]))

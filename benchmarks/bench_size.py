@@ -15,7 +15,7 @@ from scenes import load
 
 import sparklod_cli as sparklod
 from sparklod_cli.codecs import compression, spz
-from sparklod_cli.codecs.compression import MIXED, Run
+from sparklod_cli.codecs.compression import MIXED, DataRun
 from sparklod_cli.codecs.options import DEFAULTS, WriteOptions
 from sparklod_cli.codecs.rad import codec as rad
 from sparklod_cli.codecs.spz_encoder import WAYS
@@ -49,7 +49,10 @@ def of_streams(scene: Scene, options: WriteOptions) -> dict[str, int]:
     level = options.compression_level
     return {
         name: sum(
-            map(len, compression.gzip_member([column], [Run(column.nbytes, WAYS.get(name, MIXED))], level, 1, silent))
+            map(
+                len,
+                compression.gzip_member([column], [DataRun(column.nbytes, WAYS.get(name, MIXED))], level, 1, silent),
+            )
         )
         for name, column in codes.items()
     }

@@ -35,9 +35,9 @@ if TYPE_CHECKING:  # mypy then resolves the modules first, which import this one
     from .codecs.options import RadOptions as RadOptions
     from .codecs.options import SogOptions as SogOptions
     from .codecs.rad.codec import RadChunk as RadChunk
-    from .codecs.rad.records import RadChunkEntry as RadChunkEntry
-    from .codecs.rad.records import RadChunkHeader as RadChunkHeader
-    from .codecs.rad.records import RadHeader as RadHeader
+    from .codecs.rad.rad_header import RadChunkEntry as RadChunkEntry
+    from .codecs.rad.rad_header import RadChunkHeader as RadChunkHeader
+    from .codecs.rad.rad_header import RadHeader as RadHeader
     from .codecs.splat_encoding import SplatEncoding as SplatEncoding
     from .fitting.settings import FitSettings as FitSettings
     from .inspection.report import Report as Report
@@ -59,8 +59,8 @@ if TYPE_CHECKING:  # mypy then resolves the modules first, which import this one
     from .scenes.instances_file import InstancesFileError as InstancesFileError
     from .scenes.instances_file import read_instances as read_instances
     from .scenes.loaded import Cut as Cut
-    from .simulation.streaming import Network as Network
-    from .simulation.streaming import StreamingSettings as StreamingSettings
+    from .simulation.streaming_settings import Network as Network
+    from .simulation.streaming_settings import StreamingSettings as StreamingSettings
     from .support.errors import CameraPathError as CameraPathError
     from .support.errors import FormatError as FormatError
     from .support.errors import InvalidSplatsError as InvalidSplatsError

@@ -61,7 +61,7 @@ def cli() -> None:
 
 
 def run(arguments: list[str] | None = None) -> int:
-    """Runs the command line and returns its exit code; arguments are those of the process unless given."""
+    """Run the command line and return its exit code; arguments are those of the process unless given."""
     with stdout.guarded():
         code = _run(arguments)
     return interrupts.INTERRUPTED if code and interrupts.came() else code
@@ -94,7 +94,7 @@ def _run(arguments: list[str] | None) -> int:
 
 
 def _failed(error: BaseException, verbosity: Verbosity) -> int:
-    """Says in one line what nobody foresaw, or that memory ran out, and returns the exit code.
+    """Say in one line what nobody foresaw, or that memory ran out, and return the exit code.
 
     This is the last guard: whatever gets here is ours to mend, but a person has no use for a traceback.
     """
@@ -118,7 +118,7 @@ def _failed(error: BaseException, verbosity: Verbosity) -> int:
 
 
 def one_thread_of_blas() -> None:
-    """Has numpy's library of linear algebra start no threads: each spins for some 60 ms when numpy is loaded.
+    """Have numpy's library of linear algebra start no threads: each spins for some 60 ms when numpy is loaded.
 
     What it gets are small matrices, and blocks of large ones on threads of our own.
     """

@@ -71,7 +71,7 @@ class Check:
 
 
 def check_all(begun: Callable[[str], None] = lambda name: None) -> list[Check]:
-    """Looks at everything, in the order in which a person would; takes some seconds.
+    """Look at everything, in the order in which a person would; takes some seconds.
 
     Args:
         begun: is told what is about to be looked at.
@@ -140,7 +140,7 @@ def _extras() -> Iterator[Check]:
 
 
 def _print_kernels() -> None:
-    """Loads all that a bake takes, starts the threads of kernels, and prints what there is of kernels, as JSON."""
+    """Load all that a bake takes, starts the threads of kernels, and print what there is of kernels, as JSON."""
     from . import warmup
     from .bake.flow import bake  # noqa: F401
     from .support import jit

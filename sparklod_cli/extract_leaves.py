@@ -11,8 +11,8 @@ import numpy as np
 from .codecs import clamps
 from .codecs.formats import WRITABLE
 from .codecs.options import WriteOptions
-from .codecs.sound import check_scene
-from .codecs.spz_options import like
+from .codecs.spz_encoder import like
+from .codecs.validation import check_scene
 from .io import read_scene, scene_sink
 from .model.scene import Scene
 from .support.addresses import Place

@@ -22,16 +22,6 @@ def test_every_command_has_version_and_help() -> None:
     assert b"Examples:" in sparklod("build-lod", "--help").stdout
 
 
-def test_help_imports_nothing_heavy() -> None:
-    code = "import sys; from sparklod_cli.cli import run; run(sys.argv[1:]); print(*sys.modules, file=sys.stderr)"
-    for arguments in (["--help"], *([command, "--help"] for command in COMMANDS)):
-        result = subprocess.run(
-            [sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=True, cwd=ROOT
-        )
-        modules = set(result.stderr.split())
-        assert not modules & {"numpy", "numba", "plyfile", "zstandard", "tqdm", "PIL", "open3d", "pyvista"}
-
-
 def test_completion_knows_the_options() -> None:
     words = {"COMP_WORDS": "sparklod build-lod --over", "COMP_CWORD": "2", "_SPARKLOD_COMPLETE": "bash_complete"}
     code = "from sparklod_cli.cli import cli; cli(prog_name='sparklod')"

@@ -26,7 +26,7 @@ from sparklod_cli.scenes.finder import CutFinder, view_of
 from sparklod_cli.scenes.loaded import Scenes
 from sparklod_cli.scenes.pages import PagedForest, PagedScene
 from sparklod_cli.scenes.reading import read_scenes
-from sparklod_cli.simulation.streaming import Network, StreamingSettings
+from sparklod_cli.simulation.streaming_settings import Network, StreamingSettings
 from sparklod_cli.support.errors import FormatError, TreeError
 from tests.conftest import FIXTURES
 from tests.lod.forests import transform

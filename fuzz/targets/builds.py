@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from sparklod_cli.codecs.gpu.table import ENCODINGS
+from sparklod_cli.codecs.formats import ENCODINGS
 from sparklod_cli.lod.builders import METHODS
 from sparklod_cli.support.defaults import MAX_BASE, MAX_GROWTH, MIN_BASE, MIN_GROWTH
 

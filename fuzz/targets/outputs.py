@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sparklod_cli.codecs.rad.layout import OPTIONS, choices
+from sparklod_cli.codecs.rad.rad_layout import OPTIONS, choices
 from sparklod_cli.lod.builders import METHODS
 
 from .. import scenes

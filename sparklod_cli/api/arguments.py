@@ -77,21 +77,6 @@ def file_path(path: Path | str) -> Path:
     return Path(path)
 
 
-def within(name: str, value: Any, least: float, most: float) -> None:
-    """Raise ValueError unless a number is from `least` to `most`, and TypeError unless it is a number."""
-    if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
-        raise TypeError(f"{name} is {value!r}; give a number from {least} to {most}")
-    if not least <= value <= most:
-        raise ValueError(f"{name} is {value}; give {least} to {most}")
-
-
-def whole_within(name: str, value: Any, least: int, most: int) -> None:
-    """Check a whole number as `within`."""
-    if isinstance(value, (float, np.floating)):
-        raise TypeError(f"{name} is {value!r}; give a whole number from {least} to {most}")
-    within(name, value, least, most)
-
-
 def viewed_like(value: Any) -> None:
     """Raise TypeError for what cannot be looked at, though Python could iterate over it or fail within it."""
     if isinstance(value, (str, bytes)) or not hasattr(value, "__iter__"):

@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from ..cameras.axes import Axes
-from ..cameras.defaults import ELEVATION
 from ..cameras.formats.table import FORMATS
 from ..cameras.frame import MAX_FRAMES, Settings, direction_of
 from ..cameras.path import CameraPath
-from ..cameras.sources import Orbit, read_path
-from ..cameras.world_transform import similarity
+from ..cameras.sources import Orbit, read_path, similarity
+from ..support.defaults import ELEVATION
 from ..support.errors import CameraPathError
 from .views import Viewed, scenes_of
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ..codecs.rad.codec import RadChunk
-    from ..codecs.rad.records import RadHeader
+    from ..codecs.rad.rad_header import RadHeader
     from ..inspection.report import Report
 
 
@@ -88,9 +88,9 @@ def pack(scene: Scene, encoding: str, *, threads: int | None = None) -> dict[str
         InvalidSplatsError, TreeError: a splat is invalid, or the tree is broken.
         ValueError: there is no such encoding, or no tree for it.
     """
+    from ..codecs.formats import ENCODINGS
     from ..codecs.gpu import dump
-    from ..codecs.gpu.table import ENCODINGS
-    from ..codecs.sound import check_scene
+    from ..codecs.validation import check_scene
 
     if encoding not in ENCODINGS:
         raise ValueError(f"there is no encoding {encoding!r}; give one of {', '.join(ENCODINGS)}")

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from ..render.settings import RenderSettings
     from ..scenes.loaded import Scenes
     from ..simulation.outputs import FrameOutputs, WrittenFrames
-    from ..simulation.streaming import StreamingSettings
+    from ..simulation.streaming_settings import StreamingSettings
     from ..simulation.summary import Summary
     from ..tables.assertions import Assertion, Outcome
     from ..tables.columns import Row

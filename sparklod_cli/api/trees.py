@@ -10,7 +10,7 @@ from ..bake.selecting import select
 from ..bake.settings import BakeSettings
 from ..cameras.camera import Camera
 from ..cameras.path import CameraPath
-from ..fitting.settings import MOST_SEED, MOST_STEPS, FitSettings
+from ..fitting.settings import STEPS, FitSettings
 from ..lod.builders import BUILDERS, METHODS
 from ..model.scene import Scene, Tree
 from ..model.selection import Selection
@@ -26,7 +26,8 @@ from ..support.defaults import (
 from ..support.errors import FormatError, memory_errors_translated
 from ..support.parallel import on_threads, thread_count
 from ..support.progress import Progress
-from .arguments import Told, path_like, scene_like, telling, whole_within, within
+from ..support.setting_fields import Range, whole
+from .arguments import Told, path_like, scene_like, telling
 
 
 def build_lod(
@@ -64,9 +65,9 @@ def build_lod(
         raise FormatError("the scene has a Level-of-Detail tree already; extract_leaves gives its splats")
     if method not in BUILDERS:
         raise ValueError(f"there is no method {method!r}; give one of {', '.join(BUILDERS)}")
-    within("base", base, MIN_BASE, MAX_BASE)
-    within("growth", growth, MIN_GROWTH, MAX_GROWTH)
-    whole_within("max_sh", max_sh, 0, MAX_SH_DEGREE)
+    Range(MIN_BASE, MAX_BASE).check("base", base)
+    Range(MIN_GROWTH, MAX_GROWTH).check("growth", growth)
+    whole(0, MAX_SH_DEGREE).check("max_sh", max_sh)
     fitting = asked_for(refine)
     settings = BakeSettings(method, base, growth, max_sh, selection or Selection())
     with on_threads(threads), telling(progress) as told, memory_errors_translated():
@@ -111,7 +112,7 @@ def refine(
     """
     if scene_like(tree).tree is None:
         raise FormatError("the scene has no Level-of-Detail tree; build_lod makes one")
-    settings = checked(FitSettings(steps, seed, None if cameras is None else path_like(cameras)))
+    settings = FitSettings(steps, seed, None if cameras is None else path_like(cameras))
     with telling(progress) as told, memory_errors_translated():
         return refined_tree(tree, settings, thread_count(threads), told, say)
 
@@ -125,17 +126,9 @@ def asked_for(refine: bool | int | FitSettings) -> FitSettings | None:
     if isinstance(refine, bool):
         return FitSettings() if refine else None
     if isinstance(refine, FitSettings):
-        return checked(refine)
-    whole_within("refine", refine, 1, MOST_STEPS)
+        return refine
+    STEPS.check("refine", refine)
     return FitSettings(steps=int(refine))
-
-
-def checked(settings: FitSettings) -> FitSettings:
-    """Return settings whose numbers are in their ranges; `ValueError` or `TypeError` otherwise."""
-    if settings.steps is not None:
-        whole_within("steps", settings.steps, 1, MOST_STEPS)
-    whole_within("seed", settings.seed, 0, MOST_SEED)
-    return settings
 
 
 def refined_tree(

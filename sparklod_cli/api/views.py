@@ -11,14 +11,13 @@ import numpy as np
 
 from ..cameras.camera import Camera
 from ..cameras.path import CameraPath
-from ..codecs.gpu.table import PRECISIONS
+from ..codecs.formats import PRECISIONS
 from ..images import metrics
 from ..lod import detail_rule
 from ..lod.budget import LARGEST, Budget, parse_budget
 from ..lod.settings import LodSettings
 from ..model.instances import Instance, names_of
 from ..model.scene import DetailScene, Scene
-from ..render.backends import BACKENDS
 from ..render.rasterizer import Image
 from ..render.renderer import Renderer
 from ..render.settings import RenderSettings
@@ -34,7 +33,7 @@ from .arguments import Told, camera_like, path_like, telling, viewed_like
 from .results import ComparisonTable, Frames
 
 if TYPE_CHECKING:
-    from ..simulation.streaming import StreamingSettings
+    from ..simulation.streaming_settings import StreamingSettings
 
 #: A scene, a tree or a scene at several detail levels, or several of them, each with where it stands.
 Viewed = Scene | DetailScene | Instance | Iterable["Scene | DetailScene | Instance"]
@@ -110,8 +109,6 @@ def render(
     camera_like(camera)
     settings = settings or RenderSettings()
     if backend is not None:
-        if backend not in BACKENDS:
-            raise ValueError(f"there is no backend {backend!r}; give one of {', '.join(BACKENDS)}")
         settings = replace(settings, backend=backend)
     with on_threads(threads) as count, memory_errors_translated():
         source = FixedCut(viewed) if isinstance(viewed, Cut) else FixedCut(scenes_of(viewed, count).full())

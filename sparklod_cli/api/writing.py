@@ -8,21 +8,14 @@ from pathlib import Path
 from types import NoneType
 from typing import TYPE_CHECKING
 
-from ..codecs.streamed_sog.names import MANIFEST
+from ..codecs.file_names import MANIFEST
 from ..io import scene_sink, write_whole
 from ..io.details import detail_sink
 from ..model.scene import Scene
-from ..support.defaults import (
-    DEFAULT_COMPRESSION,
-    MAX_COMPRESSION,
-    MAX_FRACTIONAL_BITS,
-    MAX_SH_CODES,
-    MIN_COMPRESSION,
-    MIN_SH_CODES,
-)
+from ..support.defaults import DEFAULT_COMPRESSION
 from ..support.errors import FormatError, InvalidSplatsError, memory_errors_translated
 from ..support.parallel import thread_count
-from .arguments import Told, file_path, scene_like, telling, whole_within
+from .arguments import Told, file_path, scene_like, telling
 from .files import naming, pack
 
 if TYPE_CHECKING:
@@ -30,9 +23,6 @@ if TYPE_CHECKING:
     from ..codecs.options import RadOptions, SogOptions
     from ..lod.detail_rule import DetailSettings
     from ..support.progress import Progress
-
-#: Binary digits after the point of the smallest number of float32.
-MAX_CENTER_BITS = 149
 
 
 @dataclass(frozen=True)
@@ -100,17 +90,14 @@ def write(
     from ..bake.detail_output import DetailOutput
     from ..codecs.formats import WRITABLE, ending_of
     from ..codecs.options import RadOptions, SogOptions, WriteOptions
-    from ..codecs.sound import check_scene
     from ..codecs.splat_encoding import SplatEncoding
+    from ..codecs.validation import check_scene
     from ..lod.detail_rule import DetailSettings
 
     path, count = file_path(path), thread_count(threads)
     form = None if encoding is not None else WRITABLE.get(ending_of(path.name))
     written = None if form is None else form.name
     streamed = encoding is None and path.name == MANIFEST
-    whole_within("compression_level", compression_level, MIN_COMPRESSION, MAX_COMPRESSION)
-    if fractional_bits is not None:
-        whole_within("fractional_bits", fractional_bits, 0, MAX_FRACTIONAL_BITS)
     if (spz_version is not None or fractional_bits is not None) and written != "SPZ":
         raise ValueError(f"{path}: spz_version and fractional_bits are of SPZ; leave them out, or write a .spz")
     if (rad is not None or chunked) and written != "RAD":
@@ -128,11 +115,8 @@ def write(
     ):
         if not isinstance(value, (kind, NoneType)):
             raise TypeError(f"{name} is {value!r}; give {'a ' if name == 'ranges' else ''}{kind.__name__}")
-    if rad is not None and rad.center_bits is not None:
-        whole_within("center_bits", rad.center_bits, -MAX_CENTER_BITS, MAX_CENTER_BITS)
-    for options in (rad, sog):
-        if options is not None and options.sh_codes is not None:
-            whole_within("sh_codes", options.sh_codes, MIN_SH_CODES, MAX_SH_CODES)
+    rad = dataclasses.replace(rad or RadOptions(), chunked=chunked or (rad is not None and rad.chunked))
+    options = WriteOptions(spz_version, fractional_bits, compression_level, rad, sog or SogOptions())
     if not len(scene_like(scene).splats):
         raise InvalidSplatsError(f"{path}: the scene has no splats to write")
     with telling(progress) as told, memory_errors_translated():
@@ -141,21 +125,14 @@ def write(
         with naming(path):
             check_scene(scene, count)
         if streamed:
-            output = DetailOutput(
-                detail or DetailSettings(),
-                WriteOptions(sog=sog or SogOptions()),
-                detail_sink(path, overwrite=overwrite),
-            )
+            output = DetailOutput(detail or DetailSettings(), options, detail_sink(path, overwrite=overwrite))
             return _write_levels(path, scene, environment, output, count, told)
         if form is None or (scene.tree is not None and not form.trees):
             known = ", ".join(ending for ending, each in WRITABLE.items() if each.trees or scene.tree is None)
             what = "a tree" if scene.tree is not None else "a scene"
             raise FormatError(f"{path}: {what} is written as {known}, which the name does not end in")
-        rad = rad or RadOptions()
-        rad = dataclasses.replace(rad, chunked=rad.chunked or chunked)
-        chosen = WriteOptions(spz_version, fractional_bits, compression_level, rad, sog or SogOptions())
         save = scene_sink(path, form, chunked=rad.chunked, overwrite=overwrite)
-        return Written(path, form.name, save(scene, chosen, threads=count, progress=told))
+        return Written(path, form.name, save(scene, options, threads=count, progress=told))
 
 
 def _write_levels(
@@ -174,8 +151,8 @@ def _write_levels(
 
 
 def _write_arrays(path: Path, scene: Scene, encoding: str, *, overwrite: bool, threads: int) -> Written:
+    from ..codecs.formats import NPZ, RAW_SUFFIXES
     from ..codecs.gpu import dump
-    from ..codecs.gpu.table import NPZ, RAW_SUFFIXES
 
     if path.suffix.lower() not in (NPZ, *RAW_SUFFIXES):
         known = ", ".join((NPZ, *RAW_SUFFIXES))

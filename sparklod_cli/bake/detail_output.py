@@ -6,8 +6,8 @@ import dataclasses
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
+from ..codecs.file_names import ENVIRONMENT, folders_of
 from ..codecs.options import WriteOptions
-from ..codecs.streamed_sog.names import ENVIRONMENT, folders_of
 from ..io.writing import Files, SinkTogether
 from ..lod.detail_rule import DetailSettings
 from ..model.scene import DetailScene, Scene

@@ -60,7 +60,7 @@ def bake(
         say: called with a line when it goes out of core, what is left after an interruption, and what fitting brought.
 
     Raises:
-        FormatError, InvalidSplatsError, OutputError: see `read_source`, `Selection.check`, `sound.check_scene` and
+        FormatError, InvalidSplatsError, OutputError: see `read_source`, `Selection.check`, `validation.check_scene` and
             `io.writing.scene_sink`; or the input has a tree, and the settings do not keep it.
         ScratchError: the scratch folder is full, in use, or has the results of another bake.
         OutOfMemoryError: it does not fit into memory.

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..codecs.encoder import Encoder, Get, results
-from ..codecs.sound import check_scene
 from ..codecs.statistics import Statistics
+from ..codecs.validation import check_scene
 from ..lod.builders import BUILDERS
 from ..model.lod_tree import LodTree
 from ..model.scene import Scene

@@ -9,10 +9,10 @@ from typing import Any, Protocol
 
 from ..codecs import clamps
 from ..codecs.encoder import CLAMPED, Encoder, Get, Stored, windows_of
+from ..codecs.file_names import RAD_SUFFIX as RAD
 from ..codecs.formats import WRITABLE, Format
 from ..codecs.options import DEFAULTS, WriteOptions
-from ..codecs.rad.layout import OPTIONS
-from ..codecs.rad.names import SUFFIX as RAD
+from ..codecs.rad.rad_layout import OPTIONS
 from ..codecs.statistics import Statistics
 from ..io.reading import opened, read_stored
 from ..io.writing import SceneSink, Sink, scene_sink, sink
@@ -126,7 +126,7 @@ class ArrayOutput(WholeOutput):
     """Arrays in the layout of a viewer's memory.
 
     Attributes:
-        encoding: of `codecs.gpu.table.ENCODINGS`.
+        encoding: of `codecs.formats.ENCODINGS`.
         raw: their words alone, rather than a .npz.
         sink: writes them.
     """
@@ -161,7 +161,7 @@ class RepackedOutput(WholeOutput):
     def write(self, tree: BuiltTree, encode: Encode, clock: Clock, threads: int, progress: Progress) -> WrittenTree:
         """Copy the chunks."""
         with opened(self.source) as (file, form, more):
-            chunks = form.codec().PackedChunks.of(file, **more)
+            chunks = form.codec().RadReader.open(file, **more)
             size = self.sink.repack(chunks)
         clock.end("write")
         return WrittenTree(

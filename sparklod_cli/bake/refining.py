@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..codecs.sound import check_valid
+from ..codecs.validation import check_valid
 from ..fitting.settings import FitReport, FitSettings
 from ..model.scene import Scene
 from ..model.splats import Splats

@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from ..codecs.sound import is_valid_and_visible
+from ..codecs.validation import is_valid_and_visible
 from ..io.reading import read_rgba, read_scene
 from ..model.selection import Selection, Tally
 from ..model.splats import Splats

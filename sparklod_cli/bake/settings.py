@@ -34,7 +34,7 @@ class BakeSettings:
         rgba: a file of colours and opacities that replace the splats' own, see `io.read_rgba`.
         suffix: of the format, one of `WRITABLE` that holds trees.
         options: how to write it.
-        encoding: of `codecs.gpu.table.ENCODINGS`, to write arrays in that layout instead.
+        encoding: of `codecs.formats.ENCODINGS`, to write arrays in that layout instead.
         raw: write their words alone, rather than as .npz.
         detail: of regions and detail levels, to write a Streamed SOG instead.
         environment: of a Streamed SOG, a file whose splats are always drawn; turned and moved as the scene.

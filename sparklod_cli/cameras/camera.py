@@ -47,7 +47,7 @@ class Camera:
         time: float = 0.0,
         name: str = "",
     ) -> Camera:
-        """A camera at a point that looks at another.
+        """Return a camera at a point that looks at another.
 
         Args:
             eye, target: x, y, z in world units.

@@ -27,7 +27,7 @@ DEFAULT_FPS = 30.0
 MAX_FRAMES = 1 << 20
 
 #: Most cameras of a path that is computed from a few numbers; half an hour at 30 frames a second has fewer.
-MAX_MADE = 1 << 16
+MAX_GENERATED = 1 << 16
 
 #: Largest focal length and coordinate of a principal point, pixels: float32 holds them and their products.
 MOST_PIXELS = 1e15
@@ -118,7 +118,7 @@ class Sampled(Sequence[Frame]):
 
 
 def sampled(count: float, at: Callable[[NDArray[np.int64]], list[Frame]]) -> Sampled:
-    """Computed frames, `count` rounded up and at least one.
+    """Return computed frames, `count` rounded up and at least one.
 
     Args:
         count: number of frames, the result of a formula.
@@ -128,7 +128,7 @@ def sampled(count: float, at: Callable[[NDArray[np.int64]], list[Frame]]) -> Sam
         TooManyCamerasError: the count is `NUMBERED` or more, or not a number.
     """
     if not count < NUMBERED:
-        raise TooManyCamerasError(f"{count:.3g} frames are more than {MAX_MADE:,}")
+        raise TooManyCamerasError(f"{count:.3g} frames are more than {MAX_GENERATED:,}")
     return Sampled(max(math.ceil(count), 1), at)
 
 
@@ -163,7 +163,7 @@ class Settings:
 
 
 def camera_of(pose: Matrix, lens: Lens, time: float, name: str, settings: Settings) -> Camera:
-    """The camera of a rigid pose in OpenGL's axes, with defaults for what neither file nor user says.
+    """Return the camera of a rigid pose in OpenGL's axes, with defaults for what neither file nor user says.
 
     Raises:
         ValueError: the lens makes no sense; the text continues a sentence about the camera.

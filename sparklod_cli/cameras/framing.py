@@ -49,7 +49,7 @@ Item = TypeVar("Item")
 
 
 def framing(center: NDArray[np.floating]) -> tuple[NDArray[np.float64], float]:
-    """The middle of a scene and the radius of a ball around it that most splats are in.
+    """Return the middle of a scene and the radius of a ball around it that most splats are in.
 
     Args:
         center: (N, 3) of the splats, world units. What is not finite is left out.
@@ -70,7 +70,7 @@ def framing(center: NDArray[np.floating]) -> tuple[NDArray[np.float64], float]:
 
 
 def covered(scene: Balls) -> Balls:
-    """The splats that cameras must have in view: 99.9 % of those that are neither backdrop nor sparse.
+    """Return the splats that cameras must have in view: 99.9 % of those that are neither backdrop nor sparse.
 
     Raises:
         InvalidSplatsError: there are no splats with finite numbers.
@@ -84,11 +84,11 @@ def covered(scene: Balls) -> Balls:
     scene, reach = scene.take(near), reach[near]
     dense = _is_dense(Balls(scene.center - middle, scene.radius), radius)
     most = float(np.quantile(reach[dense], COVERED, method="higher"))
-    kept = scene.take(dense & (reach <= most))
+    framed = scene.take(dense & (reach <= most))
     # Nothing is a point: a camera in line with all of them would be in their midst. Nor is anything, far out, smaller
     # than the steps of the numbers there.
-    least = max(SPECK * most, STEPS * float(np.abs(kept.center).max())) or radius
-    return Balls(kept.center, np.maximum(kept.radius, least))
+    least = max(SPECK * most, STEPS * float(np.abs(framed.center).max())) or radius
+    return Balls(framed.center, np.maximum(framed.radius, least))
 
 
 def _is_dense(scene: Balls, size: float) -> NDArray[np.bool_]:
@@ -120,7 +120,7 @@ def middle_of(scene: Balls) -> Matrix:
 
 
 def _support(scene: Balls, camera: Camera) -> tuple[Matrix, Matrix, Matrix]:
-    """How far a scene reaches outwards from the sides of a camera's view, if that were at the origin.
+    """Return the reach of a scene beyond the sides of a camera's view, if the camera were at the origin.
 
     A ball is inside where it is behind all four sides, right, left, top and bottom, so the camera sees all of them
     where its position, times the normal of each side, is at least this reach.
@@ -139,7 +139,7 @@ def _support(scene: Balls, camera: Camera) -> tuple[Matrix, Matrix, Matrix]:
 
 
 def fitted(camera: Camera, scene: Balls) -> Camera:
-    """A camera of the same direction that has a scene just inside its picture.
+    """Return a camera of the same direction that has a scene just inside its picture.
 
     Args:
         camera: whose principal point is the middle of its picture.
@@ -155,7 +155,7 @@ def fitted(camera: Camera, scene: Balls) -> Camera:
 
 
 def distance(cameras: Sequence[Camera], center: Matrix, scene: Balls) -> float:
-    """How far from a point cameras that look at it have a scene in their pictures, world units.
+    """Return the distance from their target, in world units, at which cameras have a scene in their pictures.
 
     Args:
         cameras: at least one, wherever they are; their directions count.
@@ -164,14 +164,14 @@ def distance(cameras: Sequence[Camera], center: Matrix, scene: Balls) -> float:
     """
     local = Balls(scene.center - center, scene.radius)
     needed = []
-    for camera in some(cameras):
+    for camera in sampled_cameras(cameras):
         reach, _, back = _support(local, camera)
         needed.append(float((reach / np.repeat(back, 2)).max()))
     return max(needed)
 
 
-def some(cameras: Sequence[Item]) -> Sequence[Item]:
-    """At most `CAMERAS` of a path, evenly spaced."""
+def sampled_cameras(cameras: Sequence[Item]) -> Sequence[Item]:
+    """Return at most `CAMERAS` of a path, evenly spaced."""
     return cameras[:: -(-len(cameras) // CAMERAS)]
 
 
@@ -186,7 +186,7 @@ def reach(near: float, far: float, cameras: Sequence[Camera], scene: Balls) -> t
     sample = scene.center[:: max(len(scene.center) // SAMPLE, 1)]
     corners = scene.box if scene.box is not None else np.stack([scene.center.min(axis=0), scene.center.max(axis=0)])
     largest = scene.largest if scene.largest is not None else float(scene.radius.max())
-    for camera in some(cameras):
+    for camera in sampled_cameras(cameras):
         away = np.linalg.norm(sample - camera.position, axis=1)
         farthest = float(np.linalg.norm(np.abs(corners - camera.position).max(axis=0)))
         near, far = min(near, float(np.median(away)) / 100), max(far, 2 * (farthest + largest))

@@ -15,7 +15,6 @@ from .axes import Axes
 from .camera import Matrix
 from .frame import DEFAULT_FOV_Y, DEFAULT_FPS, NO_LENS, NUMBERED, Frame, Lens, Sampled, sampled
 from .pose import look_at, normalized
-from .spline import catmull_rom_tangents, centripetal_knots, hermite
 
 #: Mean seconds from one key to the next, if the keys have no times.
 SECONDS = 2.0
@@ -23,6 +22,9 @@ SECONDS = 2.0
 #: Distance at the start of a dolly, in multiples of that at which the scene fits the image, and how many times larger
 #: the scene is at its end.
 DOLLY_START, DOLLY_ZOOM = 4.0, 16.0
+
+#: Smallest step between knots as a share of the mean step, so that no step takes no time.
+SHORTEST = 1e-3
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,7 @@ class Key:
 def frame_looking(
     eye: ArrayLike, target: ArrayLike, up: ArrayLike, lens: Lens = NO_LENS, time: float | None = None, name: str = ""
 ) -> Frame:
-    """A frame at `eye`, (3,), that looks at `target`, (3,), with `up`, (3,), pointing up in the image.
+    """Return a frame at `eye`, (3,), that looks at `target`, (3,), with `up`, (3,), pointing up in the image.
 
     Raises:
         CameraPathError: eye and target are the same point.
@@ -110,7 +112,7 @@ def _looking_at(center: ArrayLike, distance: Matrix, offset: Matrix, up: Matrix)
 def between(
     keys: Sequence[Key], fps: float | None, up: ArrayLike, lens: Lens = NO_LENS, seconds: float = SECONDS
 ) -> Sampled:
-    """Frames from the first key to the last, on a Catmull-Rom spline through all of them.
+    """Return frames from the first key to the last, on a Catmull-Rom spline through all of them.
 
     Eye, target, up axis and field of view are interpolated separately, so that a target of two keys stays in view
     between them. The parameter of the spline is time. Keys without times are spaced centripetally, by the square roots
@@ -192,3 +194,64 @@ def _front(up: Matrix) -> Matrix:
 
 def _spell(point: ArrayLike) -> str:
     return ", ".join(f"{value:g}" for value in np.asarray(point))
+
+
+def centripetal_knots(points: Matrix) -> Matrix:
+    """(n,) knots from 0 on that differ by the square roots of the distances between points.
+
+    Args:
+        points: (n, D), n at least 2. If all are the same, the steps are 1.
+    """
+    with np.errstate(over="ignore"):
+        steps = np.sqrt(np.linalg.norm(np.diff(points, axis=0), axis=1))
+    steps = np.maximum(steps, SHORTEST * steps.mean()) if steps.any() else np.ones(len(steps))
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def catmull_rom_tangents(knots: Matrix, points: Matrix) -> Matrix:
+    """(n, D) tangents of the Catmull-Rom spline with arbitrary knots (Barry and Goldman 1988).
+
+    Each is the tangent of the parabola through a point and its neighbours; at the ends, through the last three points.
+
+    Args:
+        knots: (n,) increasing, n at least 2.
+        points: (n, D).
+    """
+    steps = np.diff(knots)[:, None]
+    slopes = np.diff(points, axis=0) / steps
+    if len(points) == 2:
+        return np.repeat(slopes, 2, axis=0)
+    inner = (slopes[:-1] * steps[1:] + slopes[1:] * steps[:-1]) / (steps[:-1] + steps[1:])
+    return np.concatenate([2 * slopes[:1] - inner[:1], inner, 2 * slopes[-1:] - inner[-1:]])
+
+
+def cardinal_tangents(knots: Matrix, points: Matrix) -> Matrix:
+    """(n, D) tangents along the line from the previous to the next point, as SuperSplat has them.
+
+    Args:
+        knots: (n,) increasing, n at least 2.
+        points: (n, D).
+    """
+    slopes = np.diff(points, axis=0) / np.diff(knots)[:, None]
+    inner = (points[2:] - points[:-2]) / (knots[2:] - knots[:-2])[:, None]
+    return np.concatenate([slopes[:1], inner, slopes[-1:]])
+
+
+def hermite(knots: Matrix, points: Matrix, tangents: Matrix, at: Matrix) -> Matrix:
+    """(m, D) points of the piecewise cubic curve with these points and tangents at the knots.
+
+    Args:
+        knots: (n,) increasing, n at least 2.
+        points: (n, D).
+        tangents: (n, D) derivatives by the parameter.
+        at: (m,) parameters between the first and the last knot.
+    """
+    piece = np.clip(np.searchsorted(knots, at, side="right") - 1, 0, len(knots) - 2)
+    step = np.diff(knots)[piece, None]
+    t = (at[:, None] - knots[piece, None]) / step
+    return (
+        (1 + 2 * t) * (1 - t) ** 2 * points[piece]
+        + t * (1 - t) ** 2 * step * tangents[piece]
+        + t * t * (3 - 2 * t) * points[piece + 1]
+        + t * t * (t - 1) * step * tangents[piece + 1]
+    )

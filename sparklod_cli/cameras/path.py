@@ -10,25 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..support.errors import CameraPathError, TooManyCamerasError
-from .axes import Axes
 from .camera import Camera
 from .formats import own_csv
 from .formats.source import Files, Parsed
 from .formats.table import FORMATS, PathFormat
-from .frame import DEFAULT_FPS, MAX_FRAMES, MAX_MADE, Sampled, Settings, camera_of
+from .frame import DEFAULT_FPS, MAX_FRAMES, MAX_GENERATED, Sampled, Settings, camera_of
 from .pose import rigid, to_opengl
-
-#: Formats of cameras that come from options instead of a file.
-GENERATED = {
-    name: PathFormat(name, title, "", Axes.OPENGL_C2W)
-    for name, title in {
-        "orbit": "an orbit",
-        "dolly": "a dolly",
-        "look_at": "one view",
-        "keyframes": "keyframes",
-    }.items()
-}
-
 
 #: Most that a camera turns from one frame of a movement to the next, degrees: a quarter of the default field of view.
 MOST_TURN = 15.0
@@ -60,7 +47,7 @@ class CameraPath:
         return self.cameras[index]
 
     def follows(self, index: int) -> bool:
-        """Whether a camera goes on from where the one before it was, as frames of a movement do.
+        """Return whether a camera goes on from where the one before it was, as frames of a movement do.
 
         It does if its time is later, its picture has the same size, and it is turned by no more than `MOST_TURN`.
         Cameras of single views have no times of their own, and those around an object are turned by more.
@@ -80,7 +67,7 @@ class CameraPath:
 
 
 def read(files: Files, *, format: str | None = None, settings: Settings | None = None) -> CameraPath:
-    """The cameras of a file.
+    """Return the cameras of a file.
 
     Args:
         files: the file, and those that belong to it.
@@ -113,7 +100,7 @@ def _known(files: Files) -> PathFormat:
 
 
 def cameras_of(parsed: Parsed, form: PathFormat, settings: Settings) -> CameraPath:
-    """The cameras of frames from a file or a generator.
+    """Return the cameras of frames from a file or a generator.
 
     Args:
         parsed: the frames.
@@ -127,7 +114,7 @@ def cameras_of(parsed: Parsed, form: PathFormat, settings: Settings) -> CameraPa
     numbers = range(0, len(parsed.frames), settings.every)
     if not numbers:
         raise CameraPathError("it has no cameras")
-    most = MAX_MADE if isinstance(parsed.frames, Sampled) else MAX_FRAMES
+    most = MAX_GENERATED if isinstance(parsed.frames, Sampled) else MAX_FRAMES
     if len(numbers) > most:
         raise TooManyCamerasError(f"it has {len(numbers):,} cameras, more than {most:,}; leave some out with --every")
     frames = parsed.frames[:: settings.every]

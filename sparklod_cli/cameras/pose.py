@@ -21,7 +21,7 @@ FARTHEST = float(np.finfo(np.float32).max)
 
 
 def to_opengl(matrix: Matrix, axes: Axes) -> Matrix:
-    """A pose as camera-to-world in OpenGL's axes.
+    """Return a pose as camera-to-world in OpenGL's axes.
 
     Args:
         matrix: (4, 4), with 0 0 0 1 as its last row; may have a uniform scale.
@@ -40,7 +40,7 @@ def to_opengl(matrix: Matrix, axes: Axes) -> Matrix:
 
 
 def rigid(matrix: Matrix) -> Matrix:
-    """A camera-to-world matrix without its scale, and with the nearest exact rotation.
+    """Return a camera-to-world matrix without its scale, and with the nearest exact rotation.
 
     Args:
         matrix: (4, 4).
@@ -70,7 +70,7 @@ def rigid(matrix: Matrix) -> Matrix:
 
 
 def pose(rotation: ArrayLike, position: ArrayLike) -> Matrix:
-    """The (4, 4) matrix of a (3, 3) rotation and a (3,) position."""
+    """Return the (4, 4) matrix of a (3, 3) rotation and a (3,) position."""
     matrix = np.eye(4)
     matrix[:3, :3] = rotation
     matrix[:3, 3] = position
@@ -78,7 +78,7 @@ def pose(rotation: ArrayLike, position: ArrayLike) -> Matrix:
 
 
 def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike) -> Matrix:
-    """The (4, 4) camera-to-world matrix, in OpenGL's axes, of a camera at `eye` that looks at `target`.
+    """Return the (4, 4) camera-to-world matrix, in OpenGL's axes, of a camera at `eye` that looks at `target`.
 
     Args:
         eye, target: (3,) world units.
@@ -103,7 +103,7 @@ def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike) -> Matrix:
 
 
 def normalized(vector: ArrayLike) -> Matrix:
-    """A (K,) vector scaled to length 1; NaN if its length is 0 or not finite."""
+    """Return a (K,) vector scaled to length 1; NaN if its length is 0 or not finite."""
     array = np.asarray(vector, np.float64)
     with np.errstate(all="ignore"):
         array = array / np.abs(array).max()  # so that squares neither overflow nor vanish
@@ -111,7 +111,7 @@ def normalized(vector: ArrayLike) -> Matrix:
 
 
 def rotation_of(quat_wxyz: ArrayLike) -> Matrix:
-    """The (3, 3) rotation of a quaternion w x y z of any length but 0.
+    """Return the (3, 3) rotation of a quaternion w x y z of any length but 0.
 
     Raises:
         ValueError: its length is 0 or not finite; the text continues a sentence about it.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,15 +14,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .. import io
+from ..support.defaults import ELEVATION
 from ..support.errors import CameraPathError, SparklodError
+from ..support.untrusted import parse_json
 from . import framing, generators
+from .axes import Axes
 from .camera import Matrix
-from .defaults import ELEVATION
-from .formats.source import Files, Parsed
-from .formats.table import NAMES
+from .formats.source import Files, Json, Parsed, finite
+from .formats.table import NAMES, PathFormat
 from .frame import DEFAULT_FPS, Frame, Settings, camera_of
-from .path import GENERATED, CameraPath, cameras_of, read
-from .world_transform import similarity
+from .path import CameraPath, cameras_of, read
+from .pose import rigid
 
 if TYPE_CHECKING:
     from ..model.balls import Balls
@@ -51,7 +54,7 @@ class CameraFile:
     fits_scene = False
 
     def cameras(self, settings: Settings, scene: Scene) -> CameraPath:
-        """The cameras of the file; the scene is not looked at."""
+        """Return the cameras of the file; the scene is not looked at."""
         return read_path(self.path, self.format, settings)
 
 
@@ -70,7 +73,7 @@ class _Aimed:
     def _aim(
         self, frames: Callable[[], Sequence[Frame]], settings: Settings, scene: Scene, times: float = 1
     ) -> tuple[Any, float]:
-        """What the cameras look at, (3,), and their distance from there.
+        """Return the target of the cameras, (3,), and their distance from there.
 
         Args:
             frames: makes cameras of their directions; called where something is chosen for the scene.
@@ -101,11 +104,11 @@ class Orbit(_Aimed):
     elevation: float = ELEVATION
 
     def cameras(self, settings: Settings, scene: Scene) -> CameraPath:
-        """The cameras around the scene."""
+        """Return the cameras around the scene."""
         up, tilt = settings.up_axis, math.radians(self.elevation)
         around = functools.partial(generators.orbit, self.count, (0.0, 0.0, 0.0), 1, tilt, up)
         center, distance = self._aim(around, settings, scene)
-        return _generated("orbit", generators.orbit(self.count, center, distance, tilt, up), settings)
+        return _generated("an orbit", generators.orbit(self.count, center, distance, tilt, up), settings)
 
 
 @dataclass(frozen=True)
@@ -125,13 +128,13 @@ class Dolly(_Aimed):
     elevation: float = ELEVATION
 
     def cameras(self, settings: Settings, scene: Scene) -> CameraPath:
-        """The cameras on the way to the scene."""
+        """Return the cameras on the way to the scene."""
         up, tilt = settings.up_axis, math.radians(self.elevation)
         count = max(2, round(self.seconds * (settings.fps or DEFAULT_FPS)))
         ahead = functools.partial(generators.dolly, 2, (0.0, 0.0, 0.0), 1, 1, tilt, up)
         center, distance = self._aim(ahead, settings, scene, generators.DOLLY_START)
         last = distance / generators.DOLLY_ZOOM
-        return _generated("dolly", generators.dolly(count, center, distance, last, tilt, up), settings)
+        return _generated("a dolly", generators.dolly(count, center, distance, last, tilt, up), settings)
 
 
 @dataclass(frozen=True)
@@ -147,7 +150,7 @@ class WholeScene:
     fits_scene = True
 
     def cameras(self, settings: Settings, scene: Scene) -> CameraPath:
-        """The camera, in front of the scene."""
+        """Return the camera, in front of the scene."""
         path = Orbit(1, (0.0, 0.0, 0.0), 1.0, self.elevation).cameras(settings, scene)
         fitted = framing.fitted(path.cameras[0], framing.covered(scene()))
         return dataclasses.replace(path, cameras=(fitted,))
@@ -168,9 +171,9 @@ class Views:
     fits_scene = False
 
     def cameras(self, settings: Settings, scene: Scene) -> CameraPath:
-        """The cameras, all at time 0; the scene is not looked at."""
+        """Return the cameras, all at time 0; the scene is not looked at."""
         up = settings.up_axis
-        paths = [_generated("look_at", [generators.frame_looking(*view, up)], settings) for view in self.views]
+        paths = [_generated("one view", [generators.frame_looking(*view, up)], settings) for view in self.views]
         cameras = [path.cameras[0] for path in paths]
         if self.named:
             cameras = [
@@ -195,7 +198,7 @@ class Keyframes:
     fits_scene = False
 
     def cameras(self, settings: Settings, scene: Scene) -> CameraPath:
-        """The cameras on the way; the scene is not looked at."""
+        """Return the cameras on the way; the scene is not looked at."""
         keys = [generators.Key(eye, target) for eye, target in self.views]
         fps, up = settings.fps or DEFAULT_FPS, settings.up_axis
         return _generated("keyframes", generators.between(keys, fps, up, seconds=self.seconds), settings)
@@ -208,7 +211,7 @@ CameraSource = CameraFile | Orbit | Dolly | WholeScene | Views | Keyframes
 
 
 def read_path(path: Path, format: str | None = None, settings: Settings | None = None) -> CameraPath:
-    """The cameras of a file, or of a folder that COLMAP wrote.
+    """Return the cameras of a file, or of a folder that COLMAP wrote.
 
     Args:
         path: of the file or folder.
@@ -228,6 +231,33 @@ def read_path(path: Path, format: str | None = None, settings: Settings | None =
         raise CameraPathError(f"{path}: {error}") from None
 
 
+def similarity(text: str) -> Matrix:
+    """Return a (4, 4) matrix of a rotation, a uniform scale and a translation from 16 numbers, row by row.
+
+    Args:
+        text: the numbers, separated by commas or white space, or JSON: a list of them or of rows.
+
+    Raises:
+        CameraPathError: the text is something else; that of the error continues a sentence about it.
+    """
+    words = re.split(r"[\s,;]+", text.strip())
+    try:
+        if text.lstrip().startswith("["):
+            numbers = Json(parse_json(text), "matrix").matrix(4)
+        else:
+            numbers = [finite(word, "matrix") for word in words]
+    except ValueError:
+        raise CameraPathError("is not JSON") from None
+    if len(numbers) != 16:
+        raise CameraPathError(f"has {len(numbers)} numbers, not 16")
+    matrix = np.array(numbers).reshape(4, 4)
+    try:
+        rigid(matrix)
+    except ValueError as error:
+        raise CameraPathError(f"{error}") from None
+    return matrix
+
+
 def read_world_transform(path: Path) -> Matrix:
     """(4, 4) the rotation, uniform scale and translation of a file of 16 numbers.
 
@@ -242,12 +272,12 @@ def read_world_transform(path: Path) -> Matrix:
         raise CameraPathError(str(error)) from None
 
 
-def _generated(name: str, frames: Sequence[Frame], settings: Settings) -> CameraPath:
-    return cameras_of(Parsed(frames), GENERATED[name], settings)
+def _generated(title: str, frames: Sequence[Frame], settings: Settings) -> CameraPath:
+    return cameras_of(Parsed(frames), PathFormat("", title, "", Axes.OPENGL_C2W), settings)
 
 
 def _fit(frames: Sequence[Frame], center: Point | None, scene: Balls, settings: Settings) -> tuple[Any, float]:
-    """What cameras of these directions look at, (3,), and how far from there they all have the scene in their pictures.
+    """Return the target of cameras, (3,), and the distance from there at which all of them see the whole scene.
 
     Args:
         frames: at least one.
@@ -255,10 +285,10 @@ def _fit(frames: Sequence[Frame], center: Point | None, scene: Balls, settings: 
         scene: all that the splats cover.
         settings: that the cameras are made with.
     """
-    kept = framing.covered(scene)
-    middle = framing.middle_of(kept) if center is None else np.asarray(center, np.float64)
+    visible = framing.covered(scene)
+    middle = framing.middle_of(visible) if center is None else np.asarray(center, np.float64)
     try:
-        cameras = [camera_of(frame.matrix, frame.lens, 0, "", settings) for frame in framing.some(frames)]
+        cameras = [camera_of(frame.matrix, frame.lens, 0, "", settings) for frame in framing.sampled_cameras(frames)]
     except ValueError as error:
         raise CameraPathError(f"the camera {error}") from None
-    return middle, framing.distance(cameras, middle, kept)
+    return middle, framing.distance(cameras, middle, visible)

@@ -80,12 +80,7 @@ class Clamp:
 
 @dataclass(frozen=True)
 class Clamps:
-    """The values of a scene that writing clamps.
-
-    Attributes:
-        splats: number of splats with a value beyond either end, by column of `Splats`; without zeros.
-        ends: the ends of ranges beyond which values lie.
-    """
+    """Values of a scene that writing clamps: number of splats by column of `Splats`, and the ends of their ranges."""
 
     splats: dict[str, int] = field(default_factory=dict)
     ends: tuple[Clamp, ...] = ()
@@ -106,7 +101,7 @@ def matters(column: str, *, above: bool, visible: int, leaves: int) -> bool:
 
 
 def tally(splats: Splats, ranges: Sequence[Range], leaf: NDArray[np.bool_] | None = None) -> Tally:
-    """What lies beyond ranges among some splats of a file.
+    """Count the values of splats that lie beyond ranges.
 
     The loss of a leaf can be seen if a coordinate is clamped; if its colour, as it is displayed on black, changes by
     `STEP` or more, as it is or by a coefficient of SH; or if it grows as a whole or shrinks. That a flat splat gets
@@ -146,14 +141,14 @@ def tally(splats: Splats, ranges: Sequence[Range], leaf: NDArray[np.bool_] | Non
 
 
 def merged(tallies: Sequence[Tally]) -> Tally:
-    """The tally of all splats of one part or more."""
+    """Merge the tallies of one part or more."""
     parts = np.stack(tallies)
     ends = [parts[:, :, 4].min(axis=0), parts[:, :, 5].max(axis=0)]
     return np.column_stack([parts[:, :, :4].sum(axis=0), *ends, parts[:, :, 6:].sum(axis=0)])
 
 
 def clamps_of(found: Tally, ranges: Sequence[Range]) -> Clamps:
-    """What a tally of these ranges says, in their order."""
+    """Return what a tally of these ranges says, in their order."""
     counts: dict[str, int] = {}
     ends = []
     for each, row in zip(ranges, found.tolist(), strict=True):
@@ -174,7 +169,7 @@ def clamps_of(found: Tally, ranges: Sequence[Range]) -> Clamps:
 
 
 def find(splats: Splats, threads: int = 1, ranges: Sequence[Range] = SPZ, tree: LodTree | None = None) -> Clamps:
-    """The values of splats, or of the nodes of a tree, that lie beyond ranges, in the order of the ranges."""
+    """Find the values of splats, or of the nodes of a tree, that lie beyond ranges, in the order of the ranges."""
     if not len(splats):
         return Clamps()
 
@@ -187,7 +182,7 @@ def find(splats: Splats, threads: int = 1, ranges: Sequence[Range] = SPZ, tree: 
 
 @np.errstate(over="ignore")  # of numbers near the end of float32
 def _is_seen(each: Range, values: FloatArray, opacity: FloatArray) -> NDArray[np.bool_]:
-    """(n,) whether the loss can be seen of leaves with values, (n, K), beyond a range."""
+    """Return (n,) whether the loss can be seen of leaves with values, (n, K), beyond a range."""
     if each.column == "center":
         return np.ones(len(values), np.bool_)
     if each.column == "scale":
@@ -201,7 +196,7 @@ def _is_seen(each: Range, values: FloatArray, opacity: FloatArray) -> NDArray[np
 
 
 def _rows_with(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(N,) which rows of an (N, K) mask have a true value. Few do: one by one, this is five times as fast as `any`."""
+    """Return (N,) which rows of an (N, K) mask have a true value; where few do, five times as fast as `any`."""
     rows = np.zeros(len(mask), np.bool_)
     rows[np.flatnonzero(mask) // mask.shape[1]] = True
     return rows

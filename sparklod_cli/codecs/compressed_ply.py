@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..model.scene import Scene
 from ..model.sh import degree_of, notes_on_degree
-from ..model.splats import FloatArray, Splats
-from ..model.streams import SceneStream
+from ..model.splats import FloatArray
 from ..support.defaults import MAX_SH_DEGREE
 from ..support.errors import FormatError
-from ..support.progress import Progress, silent
+from ..support.progress import Progress
 from ..support.units import count_of
 from . import quantize
-from .content import Content, Scratch, rows_in
-from .ply_header import Header, read_header
+from .content import Content, Source, Target, decoder
+from .ply_header import PlyHeader, read_header
 from .stream import Positioned, Rows, decode_rows, rows_between, size_of
 
 #: Splats of a chunk, which share bounds.
@@ -35,32 +33,23 @@ BOUNDS = {
 }
 
 
-def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> Scene:
-    """Reads a compressed PLY file, with or without bounds of colours and SH.
+def open_content(source: Source) -> Content:
+    """Open a compressed PLY file, with or without bounds of colours and SH.
 
     Raises:
         FormatError: the file is not compressed PLY, or cut short.
     """
-    return _content(file).scene(threads, progress)
-
-
-def stream(file: BinaryIO, *, scratch: Scratch, threads: int = 1, progress: Progress = silent) -> SceneStream:
-    """The same splats, block by block; raises as `decode`."""
-    return _content(file).stream(threads)
-
-
-def _content(file: BinaryIO) -> Content:
-    size = size_of(file)
-    header = read_header(file)
+    size = size_of(source.file)
+    header = read_header(source.file)
     count, coefficients = _checked(header)
     trailing = header.check_size(size)
-    degree, source = degree_of(coefficients), Positioned(file)
-    bounds = _read_bounds(source, header, -(-count // CHUNK_SPLATS))
+    degree, file = degree_of(coefficients), Positioned(source.file)
+    bounds = _read_bounds(file, header, -(-count // CHUNK_SPLATS))
 
-    def fill(out: Splats, start: int, threads: int, progress: Progress) -> None:
+    def fill(target: Target, threads: int, progress: Progress) -> None:
         @np.errstate(invalid="ignore", over="ignore")  # absurd bounds overflow
         def unpack(part: slice, rows: NDArray[Any]) -> None:
-            splats, words = rows_in(out, part, start), {name: rows[name].astype(np.uint32) for name in VERTEX}
+            splats, words = target.rows(part), {name: rows[name].astype(np.uint32) for name in VERTEX}
             center = quantize.decode_unorm_11_10_11(words["packed_position"])
             splats.center[:] = _within(bounds["position"], part, center)
             log_scale = quantize.decode_unorm_11_10_11(words["packed_scale"])
@@ -72,22 +61,24 @@ def _content(file: BinaryIO) -> Content:
 
         def unpack_sh(part: slice, rows: NDArray[Any]) -> None:
             codes = rows.view(np.uint8).reshape(len(rows), 3, coefficients)  # all of red come first
-            sh = rows_in(out, part, start).sh
+            sh = target.rows(part).sh
             sh[:] = quantize.decode_centred_8(codes[:, :, : sh.shape[1]].transpose(0, 2, 1))
 
-        stop = start + len(out)
-        decode_rows(_rows(source, header, "vertex", start, stop), unpack, count, threads, progress)
+        decode_rows(_rows(file, header, "vertex", target.start, target.stop), unpack, count, threads, progress)
         if coefficients:
-            decode_rows(_rows(source, header, "sh", start, stop), unpack_sh, count, threads, progress)
+            decode_rows(_rows(file, header, "sh", target.start, target.stop), unpack_sh, count, threads, progress)
 
     facts = {"chunks": header.count("chunk"), "color_bounds": int(bounds["color"] is not None)}
     facts["trailing_bytes"] = trailing
     kept = min(degree, MAX_SH_DEGREE)
-    return Content(count, kept, fill, "compressed PLY", notes=notes_on_degree(degree), header=facts)
+    return Content(count, kept, "compressed PLY", fill, notes=notes_on_degree(degree), header=facts)
+
+
+decode = decoder(open_content)
 
 
 def _within(bounds: FloatArray | None, part: slice, unit: FloatArray) -> FloatArray:
-    """(n, 3) values 0..1 of the splats in `part`, scaled to their chunks' bounds, (chunks, 6): low and high xyz."""
+    """Scale (n, 3) values 0..1 of the splats in `part` to their chunks' bounds, (chunks, 6): low and high xyz."""
     if bounds is None:
         return unit
     of_chunks = bounds[part.start // CHUNK_SPLATS : -(-part.stop // CHUNK_SPLATS)]
@@ -96,14 +87,14 @@ def _within(bounds: FloatArray | None, part: slice, unit: FloatArray) -> FloatAr
     return quantize.between(unit, low, high)
 
 
-def _rows(file: Positioned, header: Header, name: str, start: int, stop: int) -> Iterator[Rows]:
+def _rows(file: Positioned, header: PlyHeader, name: str, start: int, stop: int) -> Iterator[Rows]:
     offset, row_type = header.offset(name), header.row_type(name)
     if offset is None or row_type is None:
         raise FormatError("compressed PLY cannot have list properties")
     return rows_between(file, offset, row_type, start, stop, header.count(name))
 
 
-def _read_bounds(file: Positioned, header: Header, chunks: int) -> dict[str, FloatArray | None]:
+def _read_bounds(file: Positioned, header: PlyHeader, chunks: int) -> dict[str, FloatArray | None]:
     rows = np.concatenate([rows for _, rows in _rows(file, header, "chunk", 0, chunks)] or [np.empty(0)])
     have = rows.dtype.names or ()
     return {
@@ -112,8 +103,8 @@ def _read_bounds(file: Positioned, header: Header, chunks: int) -> dict[str, Flo
     }
 
 
-def _checked(header: Header) -> tuple[int, int]:
-    """Splats, and SH coefficients per channel, after checks of the elements."""
+def _checked(header: PlyHeader) -> tuple[int, int]:
+    """Check the elements, and return the number of splats and of SH coefficients per channel."""
     if header.text:
         raise FormatError("an ascii compressed PLY, but the format is binary")
     count = header.count("vertex")
@@ -137,8 +128,8 @@ def _checked(header: Header) -> tuple[int, int]:
     return count, len(names) // 3
 
 
-def _check_types(header: Header, element: str, names: tuple[str, ...], kind: type[np.generic]) -> tuple[str, ...]:
-    """The names of an element's properties, after a check that these are among them and of this type."""
+def _check_types(header: PlyHeader, element: str, names: tuple[str, ...], kind: type[np.generic]) -> tuple[str, ...]:
+    """Return the names of an element's properties, after a check that `names` are among them and of a type."""
     row_type = header.row_type(element) if element in header.elements else None
     have: tuple[str, ...] = (row_type.names or ()) if row_type else ()
     bad = [name for name in names if row_type is None or name not in have or row_type[name].newbyteorder("=") != kind]

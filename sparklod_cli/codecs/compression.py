@@ -19,7 +19,7 @@ from ..support.progress import Progress
 from .inflate import COMMENTED_HEAD, PLAIN_HEAD
 
 #: Bytes of a block that one thread deflates, or inflates, by itself, and bytes that are read at a time. That blocks of
-#: this size refer to none before them costs 0.05 to 0.2 % of a file (docs/decisions/2026-11-22-inspect-speed.md).
+#: this size refer to none before them costs 0.05 to 0.2 % of a file (docs/decisions/05-spz.md).
 BLOCK, PIECE = 1 << 19, 1 << 17
 
 #: Bytes at the beginning of a block on which the ways to deflate it are compared.
@@ -27,12 +27,7 @@ TRIED = 1 << 16
 
 
 class Way(NamedTuple):
-    """How a block is deflated.
-
-    Attributes:
-        level: of compression; None for the one that was asked for.
-        strategy: of zlib.
-    """
+    """How a block is deflated: the level, None for the one that was chosen, and the strategy of zlib."""
 
     level: int | None = None
     strategy: int = zlib_ng.Z_DEFAULT_STRATEGY
@@ -54,13 +49,8 @@ TRUSTED_SIZE, MAX_RATIO = 1 << 26, 200
 _RAW = -zlib_ng.MAX_WBITS
 
 
-class Run(NamedTuple):
-    """Data of one kind.
-
-    Attributes:
-        size: bytes.
-        ways: to deflate them.
-    """
+class DataRun(NamedTuple):
+    """Bytes of data of one kind, and the ways to deflate them."""
 
     size: int
     ways: tuple[Way, ...] = MIXED
@@ -68,14 +58,14 @@ class Run(NamedTuple):
 
 def gzip_member(
     pieces: Iterable[Any],
-    runs: Sequence[Run],
+    runs: Sequence[DataRun],
     level: int,
     threads: int,
     progress: Progress,
     *,
     comment: bytes = b"",
 ) -> Iterator[bytes]:
-    """One gzip member, piece by piece; the same bytes for any number of threads, and however the data are cut.
+    """Return one gzip member, piece by piece; the same bytes for any number of threads, and however the data are cut.
 
     Blocks are deflated separately, without a reference to one before, and end on a byte boundary with an empty stored
     block, so that together they are one deflate stream, which `inflate.Inflate` reads on several threads.
@@ -85,7 +75,7 @@ def gzip_member(
         runs: what they hold, in order. A block holds data of one, unless all fit into a block.
         level: of compression. Below the default, which means haste, no other is used, and above it no lower one.
         threads: to deflate on.
-        progress: told of the bytes.
+        progress: called with the bytes.
         comment: of the header, without a zero byte; empty for none.
     """
     check = 0
@@ -109,27 +99,27 @@ def gzip_member(
     yield struct.pack("<II", check, total & 0xFFFFFFFF)
 
 
-def _parts_of(runs: Sequence[Run], level: int) -> Iterator[Run]:
-    """The blocks of a member, one at least, and the ways to deflate each at a level."""
+def _parts_of(runs: Sequence[DataRun], level: int) -> Iterator[DataRun]:
+    """Return the blocks of a member, one at least, and the ways to deflate each at a level."""
     total = sum(run.size for run in runs)
     if total <= BLOCK:
-        yield Run(total, (Way(level),))
+        yield DataRun(total, (Way(level),))
         return
     for run in runs:
         ways = tuple(dict.fromkeys(_at_level(way, level) for way in run.ways))
         for start in range(0, run.size, BLOCK):
-            yield Run(min(BLOCK, run.size - start), ways)
+            yield DataRun(min(BLOCK, run.size - start), ways)
 
 
 def _at_level(way: Way, level: int) -> Way:
-    """A way, with the level that it has where one was asked for."""
+    """Return a way, with the level that it has where one was chosen."""
     if way.strategy != zlib_ng.Z_DEFAULT_STRATEGY:
         return way._replace(level=level)
     return Way(level if way.level is None or level < DEFAULT_COMPRESSION else max(level, way.level))
 
 
 def _deflated(block: memoryview, last: bool, ways: tuple[Way, ...]) -> tuple[int, bytes]:
-    """The bytes of a block, and its part of a deflate stream."""
+    """Deflate a block, and return its size and its part of a deflate stream."""
     way = min(ways, key=lambda way: len(_packed(block[:TRIED], way, last=True))) if len(ways) > 1 else ways[0]
     return len(block), _packed(block, way, last=last)
 
@@ -142,9 +132,7 @@ def _packed(block: memoryview, way: Way, *, last: bool) -> bytes:
 
 
 def blocks_of_pieces(pieces: Iterable[Any], sizes: Iterable[int]) -> Iterator[memoryview]:
-    """The data of pieces in blocks of these sizes, which may be 0.
-
-    A block that lies within one piece is a view of it.
+    """Cut the data of pieces into blocks of these sizes, which may be 0; a block within one piece is a view of it.
 
     Raises:
         ValueError: the pieces hold more data, or fewer.
@@ -166,13 +154,13 @@ def blocks_of_pieces(pieces: Iterable[Any], sizes: Iterable[int]) -> Iterator[me
 
 
 def check_promise(total: int, file_size: int) -> None:
-    """Raises `PromiseError` if a header announces more bytes than a file of this size can expand to."""
+    """Raise `PromiseError` if a header announces more bytes than a file of this size can expand to."""
     if total > TRUSTED_SIZE and total > MAX_RATIO * file_size:
         raise PromiseError(f"its header announces {total:,} bytes, more than a file of {file_size:,} bytes can hold")
 
 
 class _Window:
-    """A file of the next `size` bytes of a file."""
+    """The next `size` bytes of a file."""
 
     def __init__(self, file: BinaryIO, size: int) -> None:
         self._file, self._left = file, size
@@ -184,7 +172,7 @@ class _Window:
 
 
 class Unzstd:
-    """Reads a zstd frame, the next `packed` bytes of a file, buffering little more than requested."""
+    """Reader of a zstd frame, the next `packed` bytes of a file, that buffers little more than requested."""
 
     def __init__(self, file: BinaryIO, packed: int, name: str) -> None:
         self._name = name
@@ -192,11 +180,7 @@ class Unzstd:
         self._reader = zstandard.ZstdDecompressor().stream_reader(window, read_size=PIECE)
 
     def read(self, size: int) -> bytes:
-        """The next `size` bytes, or fewer where the data ends.
-
-        Raises:
-            FormatError: the data is corrupt; names the stream.
-        """
+        """Return the next `size` bytes, or fewer where the data ends; raises `FormatError` where they are corrupt."""
         try:
             piece: bytes = self._reader.read(size)
         except zstandard.ZstdError as error:
@@ -205,6 +189,6 @@ class Unzstd:
         return piece
 
     def finish(self) -> None:
-        """Raises `FormatError` unless the stream ends here."""
+        """Raise `FormatError` unless the stream ends here."""
         if self.read(1):
             raise TooLongError(f"stream {self._name} is longer than its table announces")

@@ -1,84 +1,181 @@
-"""What is in a file without a tree: one function fills the columns of a whole scene, or those of a stream's blocks."""
+"""The read contract of all codecs: `open_content` reads a header, and its `Content` fills columns with any splats.
+
+Whole scenes, chosen columns and streams are generic wrappers of `Content.fill`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import BinaryIO, Protocol
+from typing import Any, BinaryIO, Protocol
+
+import numpy as np
 
 from ..model import streams
-from ..model.scene import Scene
+from ..model.lod_tree import LodTree
+from ..model.scene import PLAIN, FileCoding, Scene
 from ..model.splats import COLUMNS, Splats
+from ..support.errors import HasTreeError
 from ..support.progress import Progress, silent
+from .validation import with_valid_tree
 
 #: Opens a file of these bytes, which are made only if they have not been before; for formats whose splats do not lie
-#: one after the other. Whoever gives it closes the file.
+#: one after the other. Whoever passes it closes the file.
 Scratch = Callable[[Callable[[], Iterable[bytes]]], BinaryIO]
 
+#: Opens a file that another one names; raises `FormatError` where it cannot.
+Beside = Callable[[str], BinaryIO]
 
-#: What is said of a file with a tree, which has no stream.
-HAS_TREE = "it is a Level-of-Detail file already; give the splats that it was built from"
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """Open file for a codec.
+
+    Attributes:
+        file: open for reading, at its beginning.
+        beside: opens the files that it names; None if there are none to open.
+        scratch: keeps what has to be unpacked before rows can be read in any order; None to read all rows once.
+        threads: to inflate on.
+        progress: called while a file is unpacked to `scratch`.
+    """
+
+    file: BinaryIO
+    beside: Beside | None = None
+    scratch: Scratch | None = None
+    threads: int = 1
+    progress: Progress = silent
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """Rows of a file to fill.
+
+    Attributes:
+        splats: n rows.
+        start: number in the file of the first.
+        tree: (n,) nodes to fill; None in a file without a tree.
+        columns: of `Splats` to fill; a codec may fill the others, too.
+    """
+
+    splats: Splats
+    start: int = 0
+    tree: LodTree | None = None
+    columns: Collection[str] = COLUMNS
+
+    @property
+    def stop(self) -> int:
+        """Number in the file of the row after the last."""
+        return self.start + len(self.splats)
+
+    def rows(self, part: slice) -> Splats:
+        """Return views of rows, which are counted as those of the file."""
+        views = slice(part.start - self.start, part.stop - self.start)
+        return Splats(**{name: getattr(self.splats, name)[views] for name in COLUMNS})
+
+    def nodes(self, part: slice) -> LodTree | None:
+        """Return views of nodes, counted as `rows`."""
+        views = slice(part.start - self.start, part.stop - self.start)
+        return None if self.tree is None else LodTree(self.tree.child_count[views], self.tree.child_start[views])
 
 
 class Fill(Protocol):
-    """Fills the columns of `out` with the splats of a file from `start` on.
+    """Reads and decodes rows.
 
     Raises:
         FormatError: the file is cut short or corrupt.
     """
 
-    def __call__(self, out: Splats, start: int, threads: int, progress: Progress) -> None: ...
+    def __call__(self, target: Target, threads: int, progress: Progress) -> None: ...
 
 
 @dataclass(frozen=True, eq=False)
 class Content:
-    """A file whose header has been read, and what reads the rest of it.
+    """File whose header has been read.
 
     Attributes:
         count: N splats.
-        sh_degree: as they are read.
-        fill: reads and decodes them.
-        format, antialiased, notes, header, up: as in `Scene`.
+        sh_degree: of the decoded splats.
+        format, antialiased, notes, up, chunk_bytes: as in `Scene`.
+        fill: reads and decodes the splats.
+        header: as in `Scene`; reading all splats may add to it.
+        coding: called when all splats have been read, returns `Scene.coding`.
+        has_tree: whether the splats are the nodes of a tree.
+        block: splats that are read together at least; a stream reads whole ones.
     """
 
     count: int
     sh_degree: int
-    fill: Fill
     format: str
+    fill: Fill
     antialiased: bool = False
     notes: tuple[str, ...] = ()
     header: Mapping[str, int] = field(default_factory=dict)
     up: str | None = None
+    has_tree: bool = False
+    chunk_bytes: tuple[int, ...] | None = None
+    coding: Callable[[], FileCoding] = lambda: PLAIN
+    block: int = 1
 
-    def scene(self, threads: int, progress: Progress) -> Scene:
-        """All splats."""
-        splats = Splats.empty(self.count, self.sh_degree)
-        self.fill(splats, 0, threads, progress)
-        return Scene(splats, None, self.antialiased, self.format, self.notes, self.header, up=self.up)
+    def scene(
+        self,
+        *,
+        columns: Collection[str] = COLUMNS,
+        threads: int = 1,
+        progress: Progress = silent,
+        validate: bool = True,
+    ) -> Scene:
+        """Read all splats.
+
+        Args:
+            columns: of `Splats` to read; the others may be 0.
+            threads: to decode on.
+            progress: called while splats are read.
+            validate: refuse a broken tree.
+
+        Raises:
+            FormatError: the file is cut short or corrupt, or its tree is broken.
+        """
+        make, tree = (Splats.empty if set(COLUMNS) <= set(columns) else Splats.zeros), None
+        if self.has_tree:
+            tree = LodTree(np.empty(self.count, np.uint16), np.empty(self.count, np.uint32))
+        splats = make(self.count, self.sh_degree)
+        self.fill(Target(splats, 0, tree, columns), threads, progress)
+        about = self.antialiased, self.format, self.notes, dict(self.header), self.chunk_bytes, self.coding(), self.up
+        scene = Scene(splats, tree, *about)
+        return with_valid_tree(scene) if validate else scene
 
     def stream(self, threads: int) -> streams.SceneStream:
-        """The splats block by block, each filled by several threads."""
+        """Return the splats block by block, each filled by several threads.
+
+        Raises:
+            HasTreeError: the file has a tree.
+        """
+        if self.has_tree:
+            raise HasTreeError("it is a Level-of-Detail file already; give the splats that it was built from")
 
         def block(start: int, stop: int) -> Splats:
             out = Splats.empty(stop - start, self.sh_degree)
-            self.fill(out, start, threads, silent)
+            self.fill(Target(out, start), threads, silent)
             return out
 
         def read(start: int, stop: int) -> Iterator[Splats]:
-            for first in range(start, stop, streams.BLOCK_SPLATS):
-                yield block(first, min(first + streams.BLOCK_SPLATS, stop))
+            step = self.block * max(1, streams.BLOCK_SPLATS // self.block)
+            for first in range(start - start % self.block, stop, step):
+                yield block(max(first, start), min(first + step, stop))
 
-        about = self.antialiased, self.format, self.notes, self.header, self.up
+        if not self.count:  # there is nothing to read, but the data may be corrupt
+            block(0, 0)
+        about = self.antialiased, self.format, self.notes, dict(self.header), self.up
         return streams.SceneStream(self.count, self.sh_degree, read, *about)
 
 
-def rows_in(splats: Splats, part: slice, start: int = 0) -> Splats:
-    """Views of rows, to be filled.
+def decoder(open_content: Callable[[Source], Content]) -> Callable[..., Scene]:
+    """Return the function that reads a whole scene from a file: `decode(file, *, beside, threads, progress)`."""
 
-    Args:
-        splats: the columns.
-        part: which rows, counted as those of the file.
-        start: number of the first row of the columns in the file.
-    """
-    views = slice(part.start - start, part.stop - start)
-    return Splats(**{name: getattr(splats, name)[views] for name in COLUMNS})
+    def decode(
+        file: BinaryIO, *, beside: Beside | None = None, threads: int = 1, progress: Progress = silent, **more: Any
+    ) -> Scene:
+        content = open_content(Source(file, beside, None, threads, progress))
+        return content.scene(threads=threads, progress=progress, **more)
+
+    return decode

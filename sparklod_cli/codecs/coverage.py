@@ -1,7 +1,7 @@
 """Keeps what a splat covers when its scales are rounded: its opacity makes up for them.
 
 A code of a scale is off by 3 % and more, so that a splat gets up to 7 % larger or smaller, and with it what it adds to
-a picture. See docs/decisions/2026-11-22-rounding.md.
+a picture. See docs/decisions/08-rounding.md.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _ABOVE_1 = np.nextafter(np.float32(1), np.float32(2))
 
 
 def faces(scale: FloatArray, blur: float) -> NDArray[np.float64]:
-    """(N,) sums of the products of two scales each, which the area is proportional to that a splat shows on average.
+    """Return (N,) sums of the products of two scales each, in proportion to the area that a splat shows on average.
 
     Args:
         scale: (N, 3) standard deviations, world units.
@@ -39,7 +39,7 @@ def faces(scale: FloatArray, blur: float) -> NDArray[np.float64]:
 
 
 def kept(opacity: FloatArray, scale: FloatArray, rounded: FloatArray, blur: float) -> FloatArray:
-    """(N,) linear opacities with which splats of rounded scales cover as much as before.
+    """Return (N,) linear opacities with which splats of rounded scales cover as much as before.
 
     A splat of opacity A up to 1 covers A times its area, and keeps an opacity up to 1. A merged one of A above 1 covers
     H(A) times its area, where H are the harmonic numbers (see `model/falloff.py`). It stays above 1, for that is

@@ -59,7 +59,7 @@ class Encoder(Protocol):
         """Beyond which values are counted, see `clamps.tally`; none unless somebody wants to know."""
 
     def encode(self, splats: Splats, tree: LodTree | None, start: int) -> Encoded:
-        """The result of a window.
+        """Encode a window.
 
         Args:
             splats: of the window, all columns.
@@ -68,31 +68,26 @@ class Encoder(Protocol):
         """
 
     def pieces(self, get: Get, *, threads: int, progress: Progress) -> Iterator[bytes]:
-        """The bytes of the file, piece by piece, made of the results of all windows."""
+        """Return the bytes of the file, piece by piece, made of the results of all windows."""
 
 
 class Stored(Protocol):
-    """The codes of a tree's file as they stand in it, with which nodes can be written again bit for bit."""
+    """Codes of a tree's file as they stand in it, with which nodes can be written again bit for bit."""
 
     def like(self, options: WriteOptions) -> WriteOptions:
-        """These options, and where they leave a choice open, that of the file."""
+        """Return the options, and where they leave a choice open, that of the file."""
 
     def keeping(self, encoder: Any, kept: NDArray[np.bool_]) -> Encoder:
-        """An encoder of as many nodes, in the same format and order, that gives some the codes of the file.
-
-        Args:
-            encoder: of the codec.
-            kept: (N,) the nodes that have the same values as in the file.
-        """
+        """Return an encoder of as many nodes in the same order that gives (N,) `kept` ones the codes of the file."""
 
 
 def windows_of(count: int) -> list[slice]:
-    """The windows of a file of so many splats."""
+    """Return the windows of a file of so many splats."""
     return blocks_of(count, CHUNK_NODES)
 
 
 def rows_of(splats: Splats, tree: LodTree | None, part: slice) -> tuple[Splats, LodTree | None]:
-    """Views of some rows."""
+    """Return views of some rows."""
     views = Splats(**{name: getattr(splats, name)[part] for name in COLUMNS})
     return views, None if tree is None else LodTree(tree.child_count[part], tree.child_start[part])
 
@@ -100,15 +95,7 @@ def rows_of(splats: Splats, tree: LodTree | None, part: slice) -> tuple[Splats, 
 def results(
     encoder: Encoder, scene: Scene | NodeStream, threads: int, progress: Progress, stage: str
 ) -> Iterator[Encoded]:
-    """The results of all windows in order, a few encoded ahead.
-
-    Args:
-        encoder: of the scene.
-        scene: what is written.
-        threads: to work on.
-        progress: told of the splats.
-        stage: the word for it.
-    """
+    """Encode all windows of a scene in order, a few ahead; `stage` is the word for it that `progress` gets."""
 
     def encode(part: slice) -> Encoded:
         if isinstance(scene, NodeStream):
@@ -126,7 +113,7 @@ class Kept:
 
     Args:
         folder: of the file, which has no name; None for that of the system.
-        in_memory: bytes up to which they are kept in memory.
+        in_memory: bytes up to which they stay in memory.
     """
 
     def __init__(self, folder: Path | None = None, in_memory: int = 0) -> None:
@@ -144,7 +131,7 @@ class Kept:
         self._file.close()
 
     def put(self, arrays: Encoded) -> None:
-        """Keeps the result of the next window."""
+        """Add the result of the next window."""
         places = {}
         self._file.seek(0, os.SEEK_END)
         for name, array in arrays.items():
@@ -153,7 +140,7 @@ class Kept:
         self._places.append(places)
 
     def get(self, number: int, name: str) -> NDArray[Any]:
-        """An array of a result."""
+        """Return an array of a result."""
         at, dtype, shape = self._places[number][name]
         self._file.seek(at)
         size = math.prod(shape) * dtype.itemsize

@@ -1,4 +1,7 @@
-"""The table of formats: adding one is a module and a row here."""
+"""The tables of file formats and of layouts in a viewer's memory: adding one is a module and a row here.
+
+Imports nothing heavy: `--help` names them.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,8 @@ from dataclasses import dataclass
 from importlib import import_module
 from pathlib import PurePath
 from typing import Any
+
+from ..support import defaults
 
 #: Bytes at the beginning of a file by which its format is recognized.
 HEAD = 1 << 16
@@ -18,8 +23,7 @@ class Format:
 
     Attributes:
         name: for display.
-        module: in this package; has `decode(file, *, threads, progress) -> Scene`, and for files without a tree
-            `stream(file, *, scratch, threads, progress) -> SceneStream`, see `content`.
+        module: in this package; has `open_content(source) -> Content`, see `content`.
         writable: its module also has `encode(scene, options, *, threads, progress) -> Iterator[bytes]`;
             `settled(scene, options) -> WriteOptions`, the options with nothing left open, which raises `FormatError`
             if the scene cannot be written; and `held(options, sh_degree)`, the `clamps.Range`s that it can hold.
@@ -33,15 +37,13 @@ class Format:
         suffixes: lower case, with the dot.
         beginning: a regular expression that the first bytes of its files match; None if any bytes are possible, so that
             only the suffix decides.
-        companions: its files refer to others beside them; `decode` and `stream` take another argument, `beside`, which
-            opens those.
+        companions: its files refer to others beside them, which the `beside` of a source opens.
         folders: those may be in folders there.
-        detailed: its files have several detail levels. Its module also has `decode_levels`, which takes what `decode`
-            takes and gives a `DetailScene`, and `encode_files(scene, options, settings, *, threads, progress)`, which
+        detailed: its files have several detail levels. Its module also has `decode_levels(file, *,
+            threads, progress, beside) -> DetailScene`, and `encode_files(scene, options, settings, *, threads,
+            progress)`, which
             gives the names and contents of the files of one.
-        bare: its files hold nothing but splats, so that nothing can be noted in them, see `noted`.
-        selective: its module also has `examine(file, *, columns, threads, progress) -> Scene`, which decodes only some
-            columns and accepts a broken tree; `beside`, too, where it has companions.
+        bare: its files hold nothing but splats, so that nothing can be noted in them, see `file_notes`.
     """
 
     name: str
@@ -55,7 +57,6 @@ class Format:
     folders: bool = False
     detailed: bool = False
     bare: bool = False
-    selective: bool = False
 
     @property
     def endings(self) -> tuple[str, ...]:
@@ -65,11 +66,11 @@ class Format:
         return *(suffix for suffix in self.suffixes if not self.unbundled.endswith(suffix)), self.unbundled
 
     def codec(self) -> Any:
-        """The module, imported when it is needed."""
+        """Import the module."""
         return import_module(f".{self.module}", __package__)
 
     def begins(self, head: bytes) -> bool:
-        """Whether the first bytes of a file match this format."""
+        """Return True if the first bytes of a file match this format."""
         return self.beginning is not None and re.match(self.beginning, head, re.DOTALL) is not None
 
 
@@ -84,9 +85,9 @@ FORMATS = (
     ),
     Format("PLY", "ply", (".ply",), rb"ply[\r\n]", writable=True),
     # Gzipped up to version 3.
-    Format("SPZ", "spz", (".spz",), rb"\x1f\x8b\x08[\0-\x1f]|NGSP", writable=True, trees=True, selective=True),
+    Format("SPZ", "spz", (".spz",), rb"\x1f\x8b\x08[\0-\x1f]|NGSP", writable=True, trees=True),
     # RADC begins a chunk, which the codec refuses with what to give instead.
-    Format("RAD", "rad.codec", (".rad",), rb"RAD[0C]", writable=True, trees=True, companions=True, selective=True),
+    Format("RAD", "rad.codec", (".rad",), rb"RAD[0C]", writable=True, trees=True, companions=True),
     # Its manifest; a meta.json of SOG is JSON, too.
     Format(
         "Streamed SOG",
@@ -114,15 +115,32 @@ FORMATS = (
 #: The formats that can be written, by how the name of the file ends, see `Format.endings`.
 WRITABLE = {ending: form for form in FORMATS if form.writable for ending in form.endings}
 
+#: By the name that `--encoding` knows: the module in `gpu`, which has `dump(scene, *, threads)`, the arrays of
+#: words of a scene by their names; docs/formats.md has their layout.
+ENCODINGS = {"packed": "packed_splats", "ext": "ext_splats", "lodtree": "lod_tree", "texture": "data_texture"}
+
+#: Layouts after which `gpu.loaded_nodes` measures nodes, as Spark does once it has loaded a file: ExtSplats,
+#: PackedSplats of a file that it loads whole, and those of a RAD file that it streams.
+LOADED = ("ext", "packed", "packed-pages")
+
+#: Precisions of the nodes that cuts are found with: the file's, its half floats, and what Spark has in each layout.
+PRECISIONS = (*defaults.PRECISIONS, *LOADED)
+
+#: Suffix of dumps with a header.
+NPZ = ".npz"
+
+#: Suffixes of dumps without one: nothing but the words of all arrays, one after the other.
+RAW_SUFFIXES = (".bin", ".raw")
+
 
 def ending_of(name: str) -> str:
-    """How a name ends, as `WRITABLE` knows it, in lower case: "meta.json", or the suffix, which may be none of its."""
+    """Return how a name ends, as `WRITABLE` knows it, in lower case: "meta.json", or the suffix, which may be other."""
     name = name.lower()
     return name if any(name == form.unbundled for form in FORMATS) else PurePath(name).suffix
 
 
 def sniff(head: bytes, suffix: str) -> Format | None:
-    """The format of a file by its first `HEAD` bytes, or else by its suffix; None if it has no known format.
+    """Return the format of a file by its first `HEAD` bytes, or else by its suffix; None if it has no known format.
 
     The suffix decides only for formats that may begin with any bytes.
     """

@@ -1,7 +1,7 @@
 """Inflating: gzip members on several threads where their blocks allow it, without buffering more than a few blocks.
 
 The one place that chooses the library: ISA-L (package isal) where it is installed, zlib-ng elsewhere. What they inflate
-is the same; docs/decisions/2026-11-22-inspect-speed.md has their speeds.
+is the same; docs/decisions/05-spz.md has their speeds.
 """
 
 from __future__ import annotations
@@ -49,17 +49,13 @@ _END = b"\x03\0"
 
 
 def raw_unpacker(before: bytes = b"") -> Any:
-    """What inflates a bare deflate stream, as `zlib.decompressobj` does, and raises `ERRORS`.
-
-    Args:
-        before: the data before it, to which it may refer.
-    """
+    """Return what inflates a bare deflate stream that may refer to the data before it; it raises `ERRORS`."""
     more = {"zdict": before} if before else {}
     return _library.decompressobj(-zlib_ng.MAX_WBITS, **more)
 
 
 class Inflate:
-    """Reads a gzip member of a file.
+    """Reader of a gzip member of a file.
 
     Blocks that refer to no data before them, as `compression.gzip_member` writes them, are inflated on several threads;
     all other data on one.
@@ -82,11 +78,7 @@ class Inflate:
         self._check, self._size = 0, 0
 
     def read(self, size: int) -> bytes | memoryview:
-        """The next `size` bytes, or fewer where the data ends.
-
-        Raises:
-            FormatError: the data is corrupt.
-        """
+        """Return the next `size` bytes, or fewer where the data ends; raises `FormatError` where they are corrupt."""
         pieces = []
         while size > 0:
             if not self._rest:
@@ -99,14 +91,7 @@ class Inflate:
         return pieces[0] if len(pieces) == 1 else b"".join(pieces)
 
     def finish(self, *, allow_more: bool) -> None:
-        """Checks that the member ends here with a correct checksum.
-
-        Args:
-            allow_more: the member may go on with data that are not read; nothing is checked.
-
-        Raises:
-            FormatError: the member does not end here, or the checksum is wrong.
-        """
+        """Raise `FormatError` unless the member ends here with a correct checksum, or `allow_more` leaves the rest."""
         if allow_more:
             self.close()
             return
@@ -116,23 +101,23 @@ class Inflate:
             raise TruncatedError("cut short: the gzip checksum is missing")
 
     def close(self) -> None:
-        """Ends the threads, where not all has been read."""
+        """End the threads, where not all has been read."""
         self._pieces.close()
 
     def behind(self) -> bytes:
-        """The first two bytes after the member, or fewer at the end of the file; empty before the member has ended."""
+        """Return the first two bytes after the member, or fewer at the end of the file; none before its end."""
         if self._end is None:
             return b""
         self._file.seek(self._end)
         return self._file.read(2)
 
     def end(self) -> int:
-        """The position of the end of the member in the file, once it has been read."""
+        """Return the position of the end of the member in the file, once it has been read."""
         assert self._end is not None, "the member has not been read to its end"
         return self._end
 
     def _read_head(self) -> tuple[int, bytes]:
-        """Bytes of the head of the member, after which the file is left, and its comment; 0 bytes of any other head."""
+        """Read the head, and return its bytes, after which the file is left, and comment; 0 bytes of any other head."""
         head = self._file.read(_HEAD_SIZE)
         if len(head) == _HEAD_SIZE and head.startswith(PLAIN_HEAD):
             return _HEAD_SIZE, b""
@@ -146,7 +131,7 @@ class Inflate:
         return size, comment
 
     def _all_pieces(self, threads: int) -> Generator[bytes, None, None]:
-        """The data in pieces, none of them empty."""
+        """Yield the data in pieces, none of them empty."""
         start = self._start + self._head_size
         if not self._head_size:
             self._file.seek(start)
@@ -177,7 +162,7 @@ class Inflate:
         self._check, self._size = zlib_ng.crc32(piece, self._check), self._size + len(piece)
 
     def _rest_of(self, unpacker: Any) -> Iterator[bytes]:
-        """The data from the position of the file on, on one thread."""
+        """Yield the data from the position of the file on, on one thread."""
         packed = b""
         while not unpacker.eof:
             packed = unpacker.unconsumed_tail or self._file.read(_PIECE)
@@ -195,7 +180,7 @@ class Inflate:
         self._end = self._file.tell() - len(unpacker.unused_data)
 
     def _check_trailer(self) -> None:
-        """Checks what follows a bare deflate stream in a gzip member."""
+        """Check what follows a bare deflate stream in a gzip member."""
         end, self._end = self.end(), None
         self._file.seek(end)
         trailer = self._file.read(_TRAILER.size)
@@ -207,7 +192,7 @@ class Inflate:
 
 
 def _parts(file: BinaryIO, start: int) -> Iterator[memoryview]:
-    """The bytes of a file from a position on, cut where a flush seems to end, as far as the parts are neither too long.
+    """Cut the bytes of a file where a flush seems to end, as far as the parts are neither too long.
 
     The last flush is the end of the last part. Any four bytes may look like the end of a flush, so that a part need not
     be one; the bits before those are 0.
@@ -230,7 +215,7 @@ def _parts(file: BinaryIO, start: int) -> Iterator[memoryview]:
 
 
 def _alone(part: memoryview) -> tuple[int, bytes | None]:
-    """The size of a part of a deflate stream, and what it inflates to; None if it cannot be inflated by itself."""
+    """Inflate a part of a deflate stream by itself, and return its size and data; None if that cannot be."""
     unpacker = raw_unpacker()
     try:
         data: bytes = unpacker.decompress(part, _MOST_INFLATED)

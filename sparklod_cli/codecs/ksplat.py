@@ -14,15 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..model.gaussian import normalized_quat
-from ..model.scene import Scene
 from ..model.sh import COEFFICIENTS
 from ..model.splats import FloatArray, Splats
-from ..model.streams import SceneStream
 from ..support.errors import FormatError, TruncatedError, VersionError
-from ..support.progress import Progress, silent
+from ..support.progress import Progress
 from ..support.units import count_of
 from . import quantize
-from .content import Content, Scratch, rows_in
+from .content import Content, Source, Target, decoder
 from .stream import Positioned, Rows, decode_rows, rows_between, size_of
 
 HEADER = np.dtype(
@@ -62,7 +60,7 @@ SH_PLACES = np.array(
 
 
 def row_type(level: int, sh_degree: int) -> np.dtype[Any]:
-    """The type of a splat's row."""
+    """Return the type of a splat's row."""
     center, real, sh, _ = LEVELS[level]
     return np.dtype(
         [
@@ -78,7 +76,7 @@ def row_type(level: int, sh_degree: int) -> np.dtype[Any]:
 
 @dataclass(frozen=True)
 class Section:
-    """Where a section lies, and how its centres are decoded.
+    """Place of a section, and coding of its centres.
 
     Attributes:
         first: index of its first splat in the scene.
@@ -102,21 +100,13 @@ class Section:
     steps: int
 
 
-def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> Scene:
-    """Reads a .ksplat file of any compression level.
+def open_content(source: Source) -> Content:
+    """Open a .ksplat file of any compression level.
 
     Raises:
         FormatError: the file is not KSPLAT, of an unknown version, level or SH degree, or cut short.
     """
-    return _content(file).scene(threads, progress)
-
-
-def stream(file: BinaryIO, *, scratch: Scratch, threads: int = 1, progress: Progress = silent) -> SceneStream:
-    """The same splats, block by block; raises as `decode`."""
-    return _content(file).stream(threads)
-
-
-def _content(file: BinaryIO) -> Content:
+    file = source.file
     size = size_of(file)
     header = _read(file, HEADER, 1, "the header")[0]
     level, count = int(header["level"]), int(header["splats"])
@@ -134,12 +124,12 @@ def _content(file: BinaryIO) -> Content:
     degrees = [COEFFICIENTS.index(section.row_type["sh"].shape[0] // 3) for section in sections]
     low, high = header["least_sh"] or np.float32(-DEFAULT_SH), header["most_sh"] or np.float32(DEFAULT_SH)
 
-    source = Positioned(file)
+    positioned = Positioned(file)
 
     def rows(start: int, stop: int) -> Iterator[Rows]:
         for section in sections:
             first, last = max(start - section.first, 0), min(stop - section.first, section.count)
-            for part, some in rows_between(source, section.offset, section.row_type, first, last, section.count):
+            for part, some in rows_between(positioned, section.offset, section.row_type, first, last, section.count):
                 yield slice(section.first + part.start, section.first + part.stop), some
 
     @np.errstate(invalid="ignore", over="ignore")  # absurd numbers overflow
@@ -157,12 +147,15 @@ def _content(file: BinaryIO) -> Content:
         splats.sh[:, :coefficients] = values.reshape(len(some), coefficients, 3)
         splats.sh[:, coefficients:] = 0  # the degree of other sections may be higher
 
-    def fill(out: Splats, start: int, threads: int, progress: Progress) -> None:
-        some = rows(start, start + len(out))
-        decode_rows(some, lambda part, rows: unpack(part, rows, rows_in(out, part, start)), count, threads, progress)
+    def fill(target: Target, threads: int, progress: Progress) -> None:
+        some = rows(target.start, target.stop)
+        decode_rows(some, lambda part, rows: unpack(part, rows, target.rows(part)), count, threads, progress)
 
     facts = {"level": level, "sections": len(sections), "trailing_bytes": size - end}
-    return Content(count, max(degrees, default=0), fill, "KSPLAT", header=facts)
+    return Content(count, max(degrees, default=0), "KSPLAT", fill, header=facts)
+
+
+decode = decoder(open_content)
 
 
 def _centers(section: Section, part: slice, codes: NDArray[np.uint16]) -> FloatArray:

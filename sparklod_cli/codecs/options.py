@@ -2,21 +2,48 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar
 
-from ..support.defaults import DEFAULT_COMPRESSION
+from ..support.defaults import (
+    DEFAULT_COMPRESSION,
+    DEFAULT_SPZ_VERSION,
+    MAX_COMPRESSION,
+    MAX_FRACTIONAL_BITS,
+    MAX_SH_CODES,
+    MIN_COMPRESSION,
+    MIN_SH_CODES,
+    SPZ_VERSIONS,
+)
+from ..support.setting_fields import CheckedSettings, Quantity, setting, whole
+from .rad.rad_layout import AUTO, choices
 
 if TYPE_CHECKING:
     from .splat_encoding import SplatEncoding
 
 
+#: Entries of a palette of spherical harmonics.
+SH_CODES = whole(MIN_SH_CODES, MAX_SH_CODES)
+
+#: Binary digits after the point of a coordinate: the smallest number of float32 has 149.
+CENTER_BITS = whole(-149, 149)
+
+
+def _bits(text: str) -> int | None:
+    if text != "auto" and not text.isdecimal():
+        raise ValueError(f"{text!r} is neither auto nor a whole number")
+    return None if text == "auto" else int(text)
+
+
+def _encoding(option: str, plural: str) -> Any:
+    return setting(AUTO, f"Encoding of {plural}; auto suits the scene.", choices(option), name=f"rad_{option}")
+
+
 @dataclass(frozen=True)
-class RadOptions:
-    """How to write RAD. Encodings are those of `rad.layout.choices`; "auto" suits the scene, see `rad.options`.
+class RadOptions(CheckedSettings):
+    """How to write RAD; encodings are explained in `rad_options`.
 
     Attributes:
-        center, alpha, rgb, scales, orientation, sh: the encoding of each property.
         chunked: write each chunk into a file of its own.
         sh_codes: the most entries of a palette of spherical harmonics, which a label for each splat points into; None
             for coefficients of each splat's own.
@@ -25,16 +52,25 @@ class RadOptions:
         ranges: of the codes; None for those that suit the scene.
     """
 
-    center: str = "auto"
-    alpha: str = "auto"
-    rgb: str = "auto"
-    scales: str = "auto"
-    orientation: str = "auto"
-    sh: str = "auto"
+    HEADING: ClassVar[str] = "RAD"
+
+    center: str = _encoding("center", "centres")
+    alpha: str = _encoding("alpha", "opacities")
+    rgb: str = _encoding("rgb", "colours")
+    scales: str = _encoding("scales", "scales")
+    orientation: str = _encoding("orientation", "rotations")
+    sh: str = _encoding("sh", "spherical harmonics")
     chunked: bool = False
     sh_codes: int | None = None
     center_bits: int | None = None
     ranges: SplatEncoding | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.sh_codes is not None:
+            SH_CODES.check("sh_codes", self.sh_codes)
+        if self.center_bits is not None:
+            CENTER_BITS.check("center_bits", self.center_bits)
 
 
 @dataclass(frozen=True)
@@ -43,33 +79,50 @@ class SogOptions:
 
     Attributes:
         sh_codes: the most entries of the palette of spherical harmonics, which a label for each splat points into; None
-            for as many as suit the number of splats, see `sog.options`.
+            for as many as suit the number of splats, see `sog_writer`.
     """
 
     sh_codes: int | None = None
 
+    def __post_init__(self) -> None:
+        if self.sh_codes is not None:
+            SH_CODES.check("sh_codes", self.sh_codes)
+
 
 @dataclass(frozen=True)
-class WriteOptions:
+class WriteOptions(CheckedSettings):
     """How to write a splat file. PLY and .splat leave no such choice, and ignore all of them.
 
     Attributes:
-        spz_version: 2 (rotations in 3 bytes, off by 13.4 degrees at most) or 3 (in 4 bytes, by 0.35); None for 3.
-        fractional_bits: of SPZ positions, 0 to 24; None for as many as suit the scene, see `spz_options`.
-        compression_level: of SPZ and RAD, 1 (fast) to 9 (small).
         rad: of RAD.
         sog: of SOG.
-        sh_bits: upper bits kept of each SH byte of SPZ, 4 to 8; None for as many as suit the scene, see `sh_bits`.
+        sh_bits: upper bits kept of each SH byte of SPZ, 4 to 8; None for as many as colours need (`statistics.enough`).
             Merged splats keep 4, and 5 of degree 1, as other writers do with all splats.
         covering: opacities make up for the rounding of scales, see `coverage`; False where splats of a tree are written
             in another format, so that they keep their opacities.
     """
 
-    spz_version: int | None = None
-    fractional_bits: int | None = None
-    compression_level: int = DEFAULT_COMPRESSION
-    rad: RadOptions = RadOptions()
-    sog: SogOptions = SogOptions()
+    HEADING: ClassVar[str] = "File format"
+
+    spz_version: int | None = setting(
+        None,
+        "SPZ version: 2 gives files 4 to 8 % smaller, 3 rotations ten times as exact."
+        f"  [default: {DEFAULT_SPZ_VERSION}]",
+        SPZ_VERSIONS,
+    )
+    fractional_bits: int | None = setting(
+        None,
+        "Bits after the binary point of SPZ positions, 0 to 24; auto goes by the extent of the scene and its smallest"
+        " splats.  [default: auto]",
+        Quantity("auto|N", _bits, whole(0, MAX_FRACTIONAL_BITS)),
+    )
+    compression_level: int = setting(
+        DEFAULT_COMPRESSION,
+        "Compression of SPZ and RAD, from 1 (fast) to 9 (small).",
+        whole(MIN_COMPRESSION, MAX_COMPRESSION),
+    )
+    rad: RadOptions = field(default_factory=RadOptions)
+    sog: SogOptions = field(default_factory=SogOptions)
     sh_bits: int | None = None
     covering: bool = True
 

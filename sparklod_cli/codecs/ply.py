@@ -19,7 +19,6 @@ from ..model.gaussian import normalized_quat
 from ..model.scene import Scene
 from ..model.sh import degree_of, notes_on_degree
 from ..model.splats import FloatArray, Splats
-from ..model.streams import SceneStream
 from ..support.defaults import MAX_SH_DEGREE
 from ..support.errors import FormatError, NotSplatsError, TruncatedError
 from ..support.parallel import blocks_of
@@ -27,10 +26,10 @@ from ..support.progress import Progress, silent
 from ..support.untrusted import quoted
 from . import quantize
 from .clamps import Range
-from .content import Content, Scratch, rows_in
-from .noted import comment_of, read_comment
+from .content import Content, Scratch, Source, Target, decoder
+from .file_notes import comment_of, read_comment
 from .options import DEFAULTS, WriteOptions
-from .ply_header import Header, offset_of, read_header
+from .ply_header import PlyHeader, offset_of, read_header
 from .stream import Positioned, Rows, decode_rows, encode_rows, rows_between, size_of
 
 Coding = Callable[[FloatArray], FloatArray]
@@ -46,22 +45,13 @@ COLUMNS: tuple[tuple[str, tuple[str, ...], Coding, Coding], ...] = (
 REQUIRED = tuple(name for _, names, _, _ in COLUMNS for name in names)
 
 
-def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> Scene:
-    """Reads a PLY file.
+def open_content(source: Source) -> Content:
+    """Open a PLY file. An ascii file is unpacked to `scratch`, as binary rows.
 
     Raises:
         FormatError: the file is not PLY, cut short, or does not hold splats.
     """
-    return _content(file, None).scene(threads, progress)
-
-
-def stream(file: BinaryIO, *, scratch: Scratch, threads: int = 1, progress: Progress = silent) -> SceneStream:
-    """The same splats, block by block; raises as `decode`. An ascii file is unpacked to `scratch`, as binary rows."""
-    return _content(file, scratch).stream(threads)
-
-
-def _content(file: BinaryIO, scratch: Scratch | None) -> Content:
-    """The content of a file; without `scratch`, that of an ascii file can only be read as a whole."""
+    file = source.file
     size = size_of(file)
     header = read_header(file)
     coefficients = _checked_coefficients(header)
@@ -69,19 +59,22 @@ def _content(file: BinaryIO, scratch: Scratch | None) -> Content:
     facts |= {"big_endian": int(header.byte_order == ">"), "trailing_bytes": header.check_size(size)}
     degree, count = degree_of(coefficients), header.count("vertex")
     unpack = _unpacking(_row_type(header), coefficients)
-    rows = _rows(file, header, scratch)
+    rows = _rows(file, header, source.scratch)
 
-    def fill(out: Splats, start: int, threads: int, progress: Progress) -> None:
-        some = rows(start, start + len(out))
-        decode_rows(some, lambda part, rows: unpack(rows, rows_in(out, part, start)), count, threads, progress)
+    def fill(target: Target, threads: int, progress: Progress) -> None:
+        some = rows(target.start, target.stop)
+        decode_rows(some, lambda part, rows: unpack(rows, target.rows(part)), count, threads, progress)
 
     noted = read_comment(header.note)
     notes = notes_on_degree(degree) + noted.problems
-    return Content(count, min(degree, MAX_SH_DEGREE), fill, "PLY", notes=notes, header=facts, up=noted.up)
+    return Content(count, min(degree, MAX_SH_DEGREE), "PLY", fill, notes=notes, header=facts, up=noted.up)
+
+
+decode = decoder(open_content)
 
 
 def _unpacking(row_type: np.dtype[Any], coefficients: int) -> Callable[[NDArray[Any], Splats], None]:
-    """What fills the columns of splats from rows."""
+    """Return the function that fills the columns of splats from rows."""
     names = list(row_type.names or ())
     places = {column: _run([names.index(name) for name in parts]) for column, parts, _, _ in COLUMNS}
     rest = _run([names.index(f"f_rest_{index}") for index in range(3 * coefficients)])  # all of red's come first
@@ -90,9 +83,9 @@ def _unpacking(row_type: np.dtype[Any], coefficients: int) -> Callable[[NDArray[
     @np.errstate(over="ignore", invalid="ignore")
     def unpack(rows: NDArray[Any], splats: Splats) -> None:
         matrix = _matrix(rows)
-        for column, _, decoder, _ in COLUMNS:
+        for column, _, decode_column, _ in COLUMNS:
             out = getattr(splats, column)
-            out[...] = decoder(matrix[:, places[column]]).reshape(out.shape)
+            out[...] = decode_column(matrix[:, places[column]]).reshape(out.shape)
         sh = matrix[:, rest].reshape(len(rows), 3, coefficients)
         splats.sh[:] = sh[:, :, : splats.sh.shape[1]].transpose(0, 2, 1)
 
@@ -100,7 +93,7 @@ def _unpacking(row_type: np.dtype[Any], coefficients: int) -> Callable[[NDArray[
 
 
 def _matrix(rows: NDArray[Any]) -> FloatArray:
-    """(n, properties) float32 of structured rows, without a copy if all their fields are float32."""
+    """Return (n, properties) float32 of structured rows, without a copy if all their fields are float32."""
     names = rows.dtype.names or ()
     if rows.flags.c_contiguous and all(rows.dtype[name] == np.float32 for name in names):
         return rows.view(np.float32).reshape(len(rows), len(names))
@@ -111,14 +104,14 @@ def _matrix(rows: NDArray[Any]) -> FloatArray:
 
 
 def _run(places: list[int]) -> slice | list[int]:
-    """A slice if the places are consecutive, since indexing with it makes no copy; otherwise the list."""
+    """Return a slice if the places are consecutive, since indexing with it makes no copy; otherwise the list."""
     first = places[0] if places else 0
     run = slice(first, first + len(places))
     return run if places == list(range(run.start, run.stop)) else places
 
 
-def _checked_coefficients(header: Header) -> int:
-    """SH coefficients per channel, after a check that the vertices are splats."""
+def _checked_coefficients(header: PlyHeader) -> int:
+    """Check that the vertices are splats, and return the number of SH coefficients per channel."""
     if "vertex" not in header.elements:
         raise NotSplatsError("its PLY header has no element vertex")
     have = _row_type(header).names or ()
@@ -133,19 +126,19 @@ def _checked_coefficients(header: Header) -> int:
     return rest // 3
 
 
-def _row_type(header: Header) -> np.dtype[Any]:
+def _row_type(header: PlyHeader) -> np.dtype[Any]:
     row_type = header.row_type("vertex")
     if row_type is None:
         raise NotSplatsError("its vertices have list properties, which splats do not have")
     return row_type
 
 
-def _rows(file: BinaryIO, header: Header, scratch: Scratch | None) -> Callable[[int, int], Iterator[Rows]]:
-    """What gives the vertices from a number to another."""
+def _rows(file: BinaryIO, header: PlyHeader, scratch: Scratch | None) -> Callable[[int, int], Iterator[Rows]]:
+    """Return the function that reads the vertices from a number to another."""
     row_type, count = _row_type(header), header.count("vertex")
 
     def opened() -> tuple[Positioned, int]:
-        """A file of binary rows, and where they begin."""
+        """Return a file of binary rows, and where they begin."""
         if not header.text:
             return Positioned(file), offset_of(file, header, "vertex")
         assert scratch is not None
@@ -161,8 +154,8 @@ def _rows(file: BinaryIO, header: Header, scratch: Scratch | None) -> Callable[[
     return between
 
 
-def _text_rows(file: BinaryIO, header: Header) -> Iterator[Rows]:
-    """The vertices of an ascii file in blocks; plyfile's own reader takes value by value in Python."""
+def _text_rows(file: BinaryIO, header: PlyHeader) -> Iterator[Rows]:
+    """Read the vertices of an ascii file in blocks; plyfile's own reader takes value by value in Python."""
     row_type, vertices = _row_type(header), header.count("vertex")
     file.seek(header.size)
     for name, (_, count) in header.elements.items():
@@ -183,7 +176,7 @@ def _text_rows(file: BinaryIO, header: Header) -> Iterator[Rows]:
 
 
 def settled(scene: Scene, options: WriteOptions) -> WriteOptions:
-    """These options: PLY has no choices.
+    """Return the options: PLY has no choices.
 
     Raises:
         FormatError: the scene is a tree, which PLY cannot hold.
@@ -201,7 +194,7 @@ def held(options: WriteOptions, sh_degree: int) -> tuple[Range, ...]:
 def encode(
     scene: Scene, options: WriteOptions = DEFAULTS, *, threads: int = 1, progress: Progress = silent
 ) -> Iterator[bytes]:
-    """The bytes of a binary PLY file in the layout of Inria's trainer, piece by piece.
+    """Return the bytes of a binary PLY file in the layout of Inria's trainer, piece by piece.
 
     All numbers are finite: for opacities of 0 and 1 and scales of 0, whose logits and logarithms are infinite, those of
     `quantize.FAR` are written, which decode to the same values.

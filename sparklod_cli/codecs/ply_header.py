@@ -20,7 +20,7 @@ MAX_DIGITS = 100
 
 
 @dataclass(frozen=True)
-class Header:
+class PlyHeader:
     """A PLY header.
 
     Attributes:
@@ -38,17 +38,17 @@ class Header:
     note: bytes = b""
 
     def count(self, name: str) -> int:
-        """Rows of an element; 0 if there is none of this name."""
+        """Return the rows of an element; 0 if there is none of this name."""
         return self.elements[name][1] if name in self.elements else 0
 
     def row_type(self, name: str) -> np.dtype[Any] | None:
-        """Type of a row; None if rows have lists, and so no fixed size."""
+        """Return the type of a row; None if rows have lists, and so no fixed size."""
         element = self.elements[name][0]
         has_list = any(isinstance(prop, PlyListProperty) for prop in element.properties)
         return None if has_list else np.dtype(element.dtype(self.byte_order))
 
     def offset(self, name: str) -> int | None:
-        """Where the rows of an element begin in a binary file; None if rows of unknown size come before them."""
+        """Return where the rows of an element begin in a binary file; None if lists come before them."""
         at = self.size
         for other, (_, count) in self.elements.items():
             if other == name:
@@ -60,7 +60,7 @@ class Header:
         return at
 
     def check_size(self, size: int) -> int:
-        """Checks that a file of `size` bytes can hold all rows, before memory is allocated for them.
+        """Check that a file of `size` bytes can hold all rows, before memory is allocated for them.
 
         Returns:
             Bytes after the last row; 0 where their number is unknown.
@@ -81,8 +81,8 @@ class Header:
         return 0 if self.text or any(self.row_type(name) is None for name in self.elements) else -missing
 
 
-def read_header(file: BinaryIO) -> Header:
-    """Reads a header, up to the line end_header, after which the file is left.
+def read_header(file: BinaryIO) -> PlyHeader:
+    """Read a header, up to the line end_header, after which the file is left.
 
     Raises:
         FormatError: the file does not begin with a PLY header.
@@ -115,11 +115,11 @@ def read_header(file: BinaryIO) -> Header:
     except (PlyParseError, ValueError) as error:
         raise FormatError(f"bad PLY header: {quoted(error)}") from None
     elements = {element.name: (element, count) for element, count in zip(parsed, counts, strict=True)}
-    return Header(elements, parsed.text, parsed.byte_order, len(text), note)
+    return PlyHeader(elements, parsed.text, parsed.byte_order, len(text), note)
 
 
-def offset_of(file: BinaryIO, header: Header, name: str) -> int:
-    """Where the rows of an element begin in a binary file; rows with lists before them are read for their sizes.
+def offset_of(file: BinaryIO, header: PlyHeader, name: str) -> int:
+    """Return where rows of an element begin in a binary file; lists before them are read for their sizes.
 
     Raises:
         FormatError: those rows are cut short, or a list has a size that none can have.

@@ -60,37 +60,37 @@ LARGEST_LOG = np.nextafter(np.float32(np.log(np.float64(LARGEST))), np.float32(0
 
 
 def decode_log(values: FloatArray) -> FloatArray:
-    """Natural logarithms to values. Exact up to float32 arithmetic."""
+    """Decode natural logarithms. Exact up to float32 arithmetic."""
     with np.errstate(over="ignore"):
         return np.exp(values)
 
 
 def encode_log(values: FloatArray) -> FloatArray:
-    """Values, 0 or more, to natural logarithms, which are finite for 0 too; their exponentials are finite."""
+    """Encode values, 0 or more, as natural logarithms, finite for 0 too; their exponentials are finite."""
     with np.errstate(divide="ignore"):
         return np.clip(np.log(values), -FAR, LARGEST_LOG)
 
 
 def decode_logit(logit: FloatArray) -> FloatArray:
-    """Logits to 0..1. Exact up to float32 arithmetic."""
+    """Decode logits to 0..1. Exact up to float32 arithmetic."""
     with np.errstate(over="ignore"):
         return 1 / (1 + np.exp(-logit))
 
 
 def encode_logit(values: FloatArray) -> FloatArray:
-    """0..1 to logits, which are finite at both ends too."""
+    """Encode 0..1 as logits, which are finite at both ends too."""
     wide = values.astype(np.float64)
     with np.errstate(divide="ignore"):
         return np.clip(np.log(wide) - np.log1p(-wide), -FAR, FAR).astype(np.float32)
 
 
 def decode_dc(dc: FloatArray) -> FloatArray:
-    """SH DC coefficients to display-referred colours. Exact up to float32 arithmetic."""
+    """Decode SH DC coefficients to display-referred colours. Exact up to float32 arithmetic."""
     return dc * np.float32(SH_C0) + np.float32(0.5)
 
 
 def encode_dc(rgb: FloatArray) -> FloatArray:
-    """Display-referred colours to SH DC coefficients, clamped to the range of float32."""
+    """Encode display-referred colours as SH DC coefficients, clamped to the range of float32."""
     with np.errstate(over="ignore"):
         return np.clip((rgb - np.float32(0.5)) / np.float32(SH_C0), -LARGEST, LARGEST)
 
@@ -100,14 +100,14 @@ def _to_byte(values: NDArray[Any]) -> Bytes:
 
 
 def encode_fixed24(values: FloatArray, fractional_bits: int) -> Bytes:
-    """(..., n) to (..., n, 3): little-endian 24-bit fixed point."""
+    """Encode (..., n) as (..., n, 3): little-endian 24-bit fixed point."""
     fixed = np.rint(np.ldexp(values.astype(np.float64), fractional_bits))
     clamped = np.clip(fixed, -FIXED24_MAX - 1, FIXED24_MAX).astype("<i4")
     return clamped.view(np.uint8).reshape(*values.shape, 4)[..., :3]
 
 
 def decode_fixed24(codes: Bytes, fractional_bits: int) -> FloatArray:
-    """(..., n, 3) to (..., n). Largest error: half of 2 ** -fractional_bits."""
+    """Decode (..., n, 3) to (..., n). Largest error: half of 2 ** -fractional_bits."""
     wide = np.zeros((*codes.shape[:-1], 4), np.uint8)
     wide[..., 1:] = codes
     signed = wide.view("<i4")[..., 0] >> 8
@@ -115,29 +115,29 @@ def decode_fixed24(codes: Bytes, fractional_bits: int) -> FloatArray:
 
 
 def encode_log_scale(scale: FloatArray) -> Bytes:
-    """Linear scales to a byte each; its range is e ** -10 to e ** 5.94."""
+    """Encode linear scales as a byte each; its range is e ** -10 to e ** 5.94."""
     with np.errstate(divide="ignore"):
         return _to_byte((np.log(scale) + SCALE_OFFSET) * SCALE_STEPS)
 
 
 def decode_log_scale(codes: Bytes) -> FloatArray:
-    """Largest error: a factor of e ** (1 / 32), 3.2 %."""
+    """Decode bytes to linear scales. Largest error: a factor of e ** (1 / 32), 3.2 %."""
     return np.exp(codes.astype(np.float32) / SCALE_STEPS - SCALE_OFFSET)
 
 
 def encode_unorm8(values: FloatArray) -> Bytes:
-    """0..1 to a byte."""
+    """Encode 0..1 as a byte."""
     with np.errstate(over="ignore"):
         return _to_byte(values * 255)
 
 
 def decode_unorm8(codes: Bytes) -> FloatArray:
-    """Largest error: 1 / 510."""
+    """Decode bytes to 0..1. Largest error: 1 / 510."""
     return codes.astype(np.float32) / 255
 
 
 def encode_lod_opacity(lod_opacity: FloatArray) -> Bytes:
-    """Spark's D, 0..5, to a byte: the lower half for 0..1, the upper half for 1..5.
+    """Encode Spark's D, 0..5, as a byte: the lower half for 0..1, the upper half for 1..5.
 
     A tie rounds down, so that D = 1, half-way between two codes, stays an opacity (code 127, 0.996) and does not become
     a merged splat's (code 128, D = 1.016).
@@ -147,29 +147,27 @@ def encode_lod_opacity(lod_opacity: FloatArray) -> Bytes:
 
 
 def decode_lod_opacity(codes: Bytes) -> FloatArray:
-    """Largest error: 1 / 255 up to 1, 4 / 255 above."""
+    """Decode bytes to Spark's D. Largest error: 1 / 255 up to 1, 4 / 255 above."""
     value = codes.astype(np.float32) * np.float32(2 / 255)
     return np.where(value <= 1, value, 4 * value - 3)
 
 
 def encode_color(rgb: FloatArray) -> Bytes:
-    """Display-referred colours to bytes of their SH DC coefficients; the range is -0.44..1.44."""
+    """Encode display-referred colours as bytes of their SH DC coefficients; the range is -0.44..1.44."""
     with np.errstate(over="ignore"):
         return _to_byte((rgb - np.float32(0.5)) * np.float32(COLOR_GAIN * 255 / SH_C0) + np.float32(127.5))
 
 
 def decode_color(codes: Bytes) -> FloatArray:
-    """Largest error: SH_C0 / (2 * 0.15 * 255) = 0.0037."""
+    """Decode bytes to display-referred colours. Largest error: SH_C0 / (2 * 0.15 * 255) = 0.0037."""
     return (codes.astype(np.float32) / 255 - np.float32(0.5)) * np.float32(SH_C0 / COLOR_GAIN) + np.float32(0.5)
 
 
 def encode_sh(sh: FloatArray, bits: int = LEAST_SH_BITS) -> Bytes:
-    """(N, K, 3) coefficients to bytes, rounded to multiples of 2 ** (8 - bits) codes; the range is -1..0.99.
+    """Encode (N, K, 3) coefficients as bytes, rounded to multiples of 2 ** (8 - bits) codes; the range is -1..0.99.
 
-    Args:
-        sh: coefficients.
-        bits: upper bits kept of each byte, `LEAST_SH_BITS` to 8; degree 1 keeps `LEAST_SH_BITS_1` at least. The codes
-            of fewer bits are among those of more.
+    `LEAST_SH_BITS` to 8 upper bits are kept; of degree 1 `LEAST_SH_BITS_1` at least. The codes of fewer bits are among
+    those of more.
     """
     bucket: np.float32 | FloatArray = np.float32(2 ** (8 - bits))
     if bits < LEAST_SH_BITS_1:
@@ -185,12 +183,12 @@ def encode_sh(sh: FloatArray, bits: int = LEAST_SH_BITS) -> Bytes:
 
 
 def decode_sh(codes: Bytes) -> FloatArray:
-    """Largest error inside the range, of `LEAST_SH_BITS`: 1 / 32 for degree 1, 1 / 16 above; half for each bit more."""
+    """Decode bytes to coefficients. Largest error of 4 bits: 1 / 32 for degree 1, 1 / 16 above; half for each more."""
     return (codes.astype(np.float32) - 128) / 128
 
 
 def encode_quat_first_three(quat_xyzw: FloatArray) -> Bytes:
-    """(N, 4) unit quaternions to (N, 3) bytes of x y z, of the one of q and -q whose w is not negative.
+    """Encode (N, 4) unit quaternions as (N, 3) bytes of x y z, of the one of q and -q whose w is not negative.
 
     w follows from x y z as the root of a small difference where it is near 0. There, the codes beside the nearest are
     tried as well, and those of the nearest rotation taken.
@@ -211,18 +209,18 @@ def encode_quat_first_three(quat_xyzw: FloatArray) -> Bytes:
 
 
 def decode_quat_first_three(codes: Bytes) -> FloatArray:
-    """(N, 3) bytes to (N, 4) unit quaternions. Largest error: 8 degrees of rotation, where w is near 0."""
+    """Decode (N, 3) bytes to (N, 4) unit quaternions. Largest error: 8 degrees of rotation, where w is near 0."""
     return quat_of_xyz(codes.astype(np.float32) / np.float32(127.5) - 1)
 
 
 def quat_of_xyz(xyz: FloatArray) -> FloatArray:
-    """(N, 4) unit quaternions from (N, 3) x y z, whose w is not negative; too long ones are made shorter."""
+    """Return (N, 4) unit quaternions from (N, 3) x y z, whose w is not negative; too long ones are made shorter."""
     w = np.sqrt(np.maximum(0, 1 - np.einsum("ij,ij->i", xyz, xyz)))
     return normalized_quat(np.concatenate([xyz, w[:, None]], axis=1))
 
 
 def encode_quat_smallest_three(quat_xyzw: FloatArray) -> Bytes:
-    """(N, 4) unit quaternions to (N, 4) bytes, a little-endian uint32.
+    """Encode (N, 4) unit quaternions as (N, 4) bytes, a little-endian uint32.
 
     2 bits are the index of the largest component; of each other one, in order, there is a sign and 9 bits of magnitude
     in units of sqrt(1 / 2) / 511.
@@ -239,7 +237,7 @@ def encode_quat_smallest_three(quat_xyzw: FloatArray) -> Bytes:
 
 
 def decode_quat_smallest_three(codes: Bytes) -> FloatArray:
-    """(N, 4) bytes to (N, 4) unit quaternions. Largest error: 0.35 degrees of rotation."""
+    """Decode (N, 4) bytes to (N, 4) unit quaternions. Largest error: 0.35 degrees of rotation."""
     code = np.ascontiguousarray(codes).view("<u4")[:, 0]
     others = []
     for low in (20, 10, 0):
@@ -249,7 +247,7 @@ def decode_quat_smallest_three(codes: Bytes) -> FloatArray:
 
 
 def quat_of_others(largest: NDArray[Any], a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
-    """(N, 4) unit quaternions from three components, a b c in order; the one at index `largest`, (N,), is missing.
+    """Return (N, 4) unit quaternions from components a b c in order; that at index `largest`, (N,), is missing.
 
     The missing component is taken to be positive.
     """
@@ -265,48 +263,48 @@ def quat_of_others(largest: NDArray[Any], a: FloatArray, b: FloatArray, c: Float
 
 
 def encode_quat_bytes(quat: FloatArray) -> Bytes:
-    """(N, 4) unit quaternions to a byte for each component c: 128 * c + 128."""
+    """Encode (N, 4) unit quaternions as a byte for each component c: 128 * c + 128."""
     return _to_byte(quat * 128 + 128)
 
 
 def decode_quat_bytes(codes: Bytes) -> FloatArray:
-    """(N, 4) bytes to unit quaternions. Largest error: 1.8 degrees of rotation."""
+    """Decode (N, 4) bytes to unit quaternions. Largest error: 1.8 degrees of rotation."""
     return normalized_quat((codes.astype(np.float32) - 128) / 128)
 
 
 def of_range(unit: FloatArray, low: Any, high: Any) -> FloatArray:
-    """0..1 to low..high: low + unit * (high - low), as KSPLAT's and Spark's readers round it."""
+    """Map 0..1 to low..high: low + unit * (high - low), as KSPLAT's and Spark's readers round it."""
     return low + unit * (high - low)
 
 
 def between(unit: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
-    """0..1 to low..high: low * (1 - unit) + high * unit, as PlayCanvas's readers round it, exact at both ends."""
+    """Map 0..1 to low..high: low * (1 - unit) + high * unit, as PlayCanvas's readers round it, exact at both ends."""
     return low * (1 - unit) + high * unit
 
 
 def range_table(low: Any, high: Any, codes: int) -> NDArray[np.float64]:
-    """(..., codes) what the codes 0..codes - 1 mean in equal steps from low to high, (...,), in float64."""
+    """Return (..., codes) values of the codes 0..codes - 1 in equal steps from low to high, (...,), in float64."""
     return np.ascontiguousarray(np.linspace(low, high, codes, axis=-1))
 
 
 def _unorm(code: NDArray[np.uint32], low: int, bits: int) -> FloatArray:
-    """The `bits` bits of codes from bit `low` up as 0..1: all ones are 1."""
+    """Return the `bits` bits of codes from bit `low` up as 0..1: all ones are 1."""
     most = (1 << bits) - 1
     return (code >> np.uint32(low) & np.uint32(most)).astype(np.float32) / np.float32(most)
 
 
 def decode_unorm_11_10_11(code: NDArray[np.uint32]) -> FloatArray:
-    """(N,) words to (N, 3) in 0..1, the first in the top bits. Largest error: half of 1 / 2047, 1 / 1023, 1 / 2047."""
+    """Decode (N,) words to (N, 3) in 0..1, the first in the top bits. Largest error: half a step of each."""
     return np.stack([_unorm(code, 21, 11), _unorm(code, 11, 10), _unorm(code, 0, 11)], axis=1)
 
 
 def decode_unorm_8888(code: NDArray[np.uint32]) -> FloatArray:
-    """(N,) words to (N, 4) in 0..1, the first in the top bits. Largest error: 1 / 510."""
+    """Decode (N,) words to (N, 4) in 0..1, the first in the top bits. Largest error: 1 / 510."""
     return np.stack([_unorm(code, low, 8) for low in (24, 16, 8, 0)], axis=1)
 
 
 def decode_quat_2_10_10_10(code: NDArray[np.uint32]) -> FloatArray:
-    """(N,) words to (N, 4) unit quaternions w x y z.
+    """Decode (N,) words to (N, 4) unit quaternions w x y z.
 
     2 bits are the index of the largest component; each other one, in order, has 10 bits for -sqrt(1 / 2)..sqrt(1 / 2).
     Largest error: 0.28 degrees of rotation.
@@ -316,7 +314,7 @@ def decode_quat_2_10_10_10(code: NDArray[np.uint32]) -> FloatArray:
 
 
 def decode_centred_8(codes: Bytes) -> FloatArray:
-    """Bytes to -4..4: the middles of 256 steps, but for the first and the last, which are the ends.
+    """Decode bytes to -4..4: the middles of 256 steps, but for the first and the last, which are the ends.
 
     Largest error: 1 / 32.
     """

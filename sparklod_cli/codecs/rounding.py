@@ -5,11 +5,13 @@ Imports nothing heavy: `--help` names the encodings.
 
 from __future__ import annotations
 
+import functools
 import io
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from ..support.errors import FormatError
+from .formats import WRITABLE
 from .options import WriteOptions
 
 if TYPE_CHECKING:
@@ -33,29 +35,26 @@ def _ext(scene: Scene, threads: int) -> Splats:
     return ext_splats.unpack(ext_splats.pack(scene.splats, threads=threads), threads=threads)
 
 
-def _spz(scene: Scene, threads: int) -> Splats:
-    from . import spz
-
+def _file(form: str, scene: Scene, threads: int) -> Splats:
+    codec = WRITABLE[form].codec()
     options = WriteOptions(compression_level=1)  # the bytes live for a moment only, so they need not be small
-    data = b"".join(spz.encode(scene, options, threads=threads))
-    return spz.decode(io.BytesIO(data), threads=threads).splats
-
-
-def _rad(scene: Scene, threads: int) -> Splats:
-    from .rad import codec as rad
-
-    options = WriteOptions(compression_level=1)  # as for SPZ
-    data = b"".join(rad.encode(scene, options, threads=threads))
-    return rad.decode(io.BytesIO(data), threads=threads).splats
+    data = b"".join(codec.encode(scene, options, threads=threads))
+    splats: Splats = codec.decode(io.BytesIO(data), threads=threads).splats
+    return splats
 
 
 #: Round trips by the name that `--through` knows: PackedSplats as Spark has them for such a scene, ExtSplats, and SPZ
 #: and RAD as build-lod writes them.
-ROUND_TRIPS: dict[str, Callable[[Scene, int], Splats]] = {"packed": _packed, "ext": _ext, "spz": _spz, "rad": _rad}
+ROUND_TRIPS: dict[str, Callable[[Scene, int], Splats]] = {
+    "packed": _packed,
+    "ext": _ext,
+    "spz": functools.partial(_file, ".spz"),
+    "rad": functools.partial(_file, ".rad"),
+}
 
 
 def after(through: str | None, file: Path, scene: Scene, threads: int = 1) -> Splats:
-    """The splats of a scene, encoded and decoded.
+    """Encode and decode the splats of a scene.
 
     Args:
         through: one of `ROUND_TRIPS`; None leaves the splats as they are.

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..model.scene import Scene
 from ..model.splats import Splats
-from ..model.streams import SceneStream
 from ..support.errors import FormatError, TruncatedError
 from ..support.progress import Progress, silent
 from . import quantize
 from .clamps import Range
-from .content import Content, Scratch, rows_in
+from .content import Content, Source, Target, decoder
 from .options import DEFAULTS, WriteOptions
 from .stream import Positioned, decode_rows, encode_rows, rows_between, size_of
 
@@ -34,49 +33,43 @@ assert ROW.itemsize == 32
 HELD = (Range("rgb", -0.5 / 255, 255.5 / 255), Range("sh", 0, 0))
 
 
-def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> Scene:
-    """Reads a .splat file. The format has no header: any file whose size is a multiple of 32 is accepted.
+def open_content(source: Source) -> Content:
+    """Open a .splat file. The format has no header: any file whose size is a multiple of 32 is accepted.
 
     Raises:
         TruncatedError: the size is not a multiple of 32.
     """
-    return _content(file).scene(threads, progress)
-
-
-def stream(file: BinaryIO, *, scratch: Scratch, threads: int = 1, progress: Progress = silent) -> SceneStream:
-    """The same splats, block by block; raises as `decode`."""
-    return _content(file).stream(threads)
-
-
-def _content(file: BinaryIO) -> Content:
-    size = size_of(file)
+    size = size_of(source.file)
     if size % ROW.itemsize:
         raise TruncatedError(f"cut short, or not .splat: its {size:,} bytes are not a multiple of {ROW.itemsize}")
-    count, source = size // ROW.itemsize, Positioned(file)
+    count, file = size // ROW.itemsize, Positioned(source.file)
 
-    def fill(out: Splats, start: int, threads: int, progress: Progress) -> None:
+    def fill(target: Target, threads: int, progress: Progress) -> None:
         def decode_part(part: slice, rows: NDArray[Any]) -> None:
-            splats = rows_in(out, part, start)
+            splats = target.rows(part)
             splats.center[:] = rows["center"]
             splats.scale[:] = rows["scale"]
             splats.rgb[:] = quantize.decode_unorm8(rows["rgb"])
             splats.opacity[:] = quantize.decode_unorm8(rows["opacity"])
             splats.quat_xyzw[:] = quantize.decode_quat_bytes(rows["quat_wxyz"])[:, [1, 2, 3, 0]]
 
-        rows = rows_between(source, 0, ROW, start, start + len(out), count)
+        rows = rows_between(file, 0, ROW, target.start, target.stop, count)
         decode_rows(rows, decode_part, count, threads, progress)
 
-    return Content(count, 0, fill, "SPLAT")
+    return Content(count, 0, "SPLAT", fill)
+
+
+decode = decoder(open_content)
 
 
 def importance_order(splats: Splats) -> NDArray[np.intp]:
-    """(N,) indices by descending importance, the product of scales and opacity, as antimatter15's converter sorts."""
+    """Return (N,) indices by descending product of scales and opacity, as antimatter15's converter sorts."""
     importance = splats.scale.astype(np.float64).prod(axis=1) * splats.opacity
     return np.argsort(-importance, kind="stable")
 
 
 def settled(scene: Scene, options: WriteOptions) -> WriteOptions:
-    """These options: .splat has no choices.
+    """Return the options: .splat has no choices.
 
     Raises:
         FormatError: the scene is a tree, which .splat cannot hold.
@@ -94,7 +87,7 @@ def held(options: WriteOptions, sh_degree: int) -> Sequence[Range]:
 def encode(
     scene: Scene, options: WriteOptions = DEFAULTS, *, threads: int = 1, progress: Progress = silent
 ) -> Iterator[bytes]:
-    """The bytes of a .splat file, piece by piece, in order of importance and without SH.
+    """Return the bytes of a .splat file, piece by piece, in order of importance and without SH.
 
     Raises:
         FormatError: the scene is a tree, which .splat cannot hold.

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..model.splats import FloatArray
 from . import quantize
-from .octahedral import Words, to_code
+from .spark_codings import Words, to_code
 
 #: Scales below this are encoded as 0: e ** -30.
 SCALE_ZERO = np.float32(np.exp(-30))
@@ -60,7 +60,7 @@ class SplatEncoding:
         return 2 if self.lod_opacity else 1
 
     def sh_max(self, degree: int) -> np.float32:
-        """The largest coefficient of a degree."""
+        """Return the largest coefficient of a degree."""
         return np.float32((self.sh1_max, self.sh2_max, self.sh3_max)[degree - 1])
 
 
@@ -70,25 +70,25 @@ DEFAULT = SplatEncoding()
 
 @np.errstate(over="ignore")
 def encode_linear(values: FloatArray, low: float, high: float) -> Words:
-    """Numbers to codes, low..high to 0..255; they are clamped to the range."""
+    """Encode numbers as codes, low..high to 0..255; they are clamped to the range."""
     first, width = np.float32(low), np.float32(high) - np.float32(low)
     return to_code((values - first) / width * np.float32(255), 255)
 
 
 def decode_linear(codes: NDArray[np.uint8], low: float, high: float) -> FloatArray:
-    """Largest error: (high - low) / 510."""
+    """Decode codes to low..high. Largest error: (high - low) / 510."""
     return quantize.of_range(codes.astype(np.float32) / np.float32(255), np.float32(low), np.float32(high))
 
 
 def nearest_log(values: FloatArray) -> FloatArray:
-    """Natural logarithms, rounded once."""
+    """Return natural logarithms, rounded once."""
     found: FloatArray = np.log(values.astype(np.float64)).astype(np.float32)
     return found
 
 
 @np.errstate(over="ignore")  # a stranger's range may be any
 def nearest_exp(values: FloatArray) -> FloatArray:
-    """Exponentials, rounded once."""
+    """Return exponentials, rounded once."""
     found: FloatArray = np.exp(values.astype(np.float64)).astype(np.float32)
     return found
 
@@ -101,12 +101,12 @@ def encode_log_scale(
     log: Callable[[FloatArray], FloatArray] = nearest_log,
     least: np.float32 = SCALE_ZERO,
 ) -> Words:
-    """Linear scales to codes: 0 for scales below e ** -30, 1..255 for logarithms from low to high.
+    """Encode linear scales: 0 for scales below e ** -30, 1..255 for logarithms from low to high.
 
     Args:
         scale: of any shape.
         low, high: ends of the range.
-        log: of Spark's worker, `spark_math.log`, or rounded once.
+        log: of Spark's worker, `spark_codings.log`, or rounded once.
         least: scales below it are 0.
     """
     first = np.float32(low)
@@ -120,7 +120,7 @@ def encode_log_scale(
 
 @np.errstate(over="ignore")  # a stranger's range may be any
 def log_scale_table(low: float, high: float, *, exp: Callable[[FloatArray], FloatArray] = nearest_exp) -> FloatArray:
-    """(256,) linear scales of the codes. Largest error: a factor of e ** ((high - low) / 508); exact for 0."""
+    """Return (256,) linear scales of the codes. Largest error: a factor of e ** ((high - low) / 508); none for 0."""
     first = np.float32(low)
     logs = first + np.arange(-1, 255, dtype=np.float32) * ((np.float32(high) - first) / np.float32(254))
     table = exp(logs)

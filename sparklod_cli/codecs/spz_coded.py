@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
+from typing import BinaryIO
 
 import numpy as np
 
@@ -12,9 +13,12 @@ from ..model.gaussian import spark_size
 from ..model.lod_tree import LodTree
 from ..model.nodes import CHUNK_NODES
 from ..model.splats import COLUMNS, FloatArray, Splats
+from ..support.progress import Progress, silent
+from .content import Content, Source
 from .kernels.spz_codes import fill_extremes, fill_sizes, look_up
 from .quantize import Bytes
-from .spz_layout import LINKS, Layout, column_of
+from .spz_layout import LINKS, Layout, StreamRows, column_of
+from .spz_reader import read_codes
 
 #: By column of `Splats`, what is called with all of its codes, (n, bytes) at a time, as they are read.
 Watch = Mapping[str, Callable[[Bytes], None]]
@@ -23,43 +27,55 @@ Watch = Mapping[str, Callable[[Bytes], None]]
 BYTES = ("opacity", "rgb", "scale")
 
 
-def sound(layout: Layout) -> bool:
-    """Whether no code stands for an invalid splat (`splats.INVALID`): positions of version 1 are floats."""
-    return layout.version > 1
+def read_coded(
+    file: BinaryIO,
+    *,
+    columns: Collection[str] = COLUMNS,
+    watch: Watch | None = None,
+    threads: int = 1,
+    progress: Progress = silent,
+) -> CodedSpz:
+    """Read the codes of a file.
+
+    Args:
+        file: open for reading.
+        columns: of `Splats` whose codes are kept beside those of the tree; all of a file that may hold invalid splats.
+        watch: sees the codes of other columns, too.
+        threads: to inflate on.
+        progress: called with the bytes that are read.
+
+    Raises:
+        FormatError: as `open_content`.
+    """
+
+    def see(rows: StreamRows) -> None:
+        if watch and rows[0].column in watch:
+            watch[rows[0].column](rows[2])
+
+    content, layout, codes = read_codes(Source(file, threads=threads), columns, see)
+    progress("reading", layout.total, layout.total, "B")
+    return CodedSpz(**vars(content), layout=layout, codes=codes)
 
 
 @dataclass(frozen=True, eq=False)
-class CodedSpz:
-    """An SPZ file whose data have been unpacked and checked; its tree may be broken.
+class CodedSpz(Content):
+    """SPZ file whose columns stay as codes in memory, a third to a half of what they decode to; its tree may be broken.
 
     Attributes:
         layout: of the file.
-        codes: (N, bytes) of streams, by name; of a column that was not asked for there are none.
-        sh_degree: as it is decoded.
-        antialiased, format, notes, header, up: as in `Scene`.
+        codes: (N, bytes) of streams, by name; of a column that was not requested there are none.
     """
 
-    layout: Layout
-    codes: Mapping[str, Bytes]
-    sh_degree: int
-    antialiased: bool
-    format: str
-    notes: tuple[str, ...] = ()
-    header: Mapping[str, int] = field(default_factory=dict)
-    up: str | None = None
-
-    @property
-    def count(self) -> int:
-        """N splats."""
-        return self.layout.count
+    layout: Layout = field(kw_only=True)
+    codes: Mapping[str, Bytes] = field(kw_only=True)
 
     @property
     def sound(self) -> bool:
-        """As the function."""
-        return sound(self.layout)
+        """Whether no code stands for an invalid splat (`splats.INVALID`): positions of version 1 are floats."""
+        return self.layout.version > 1
 
     def decode(self, part: slice, columns: Collection[str] = COLUMNS) -> tuple[Splats, LodTree | None]:
-        """Some splats, and their part of the tree, if there is one; several threads may ask.
+        """Decode some splats, and their part of the tree, if there is one, on any thread.
 
         Args:
             part: which splats; may end behind the last.
@@ -80,7 +96,7 @@ class CodedSpz:
         return splats, None if tree is None else LodTree(tree.child_count[part], tree.child_start[part])
 
     def table(self, column: str) -> FloatArray:
-        """(256,) what each byte stands for in a column of `BYTES`."""
+        """Return the (256,) values of the bytes of a column of `BYTES`."""
         return self._tables[column]
 
     @functools.cached_property
@@ -91,10 +107,7 @@ class CodedSpz:
     @functools.cached_property
     def _zeros(self) -> Splats:
         """Zeros that all blocks share."""
-        splats = Splats.zeros(min(self.count, CHUNK_NODES), self.sh_degree)
-        for name in COLUMNS:
-            getattr(splats, name).flags.writeable = False
-        return splats
+        return Splats.zeros(min(self.count, CHUNK_NODES), self.sh_degree).frozen()
 
     @functools.cached_property
     def _factors(self) -> FloatArray:
@@ -104,11 +117,11 @@ class CodedSpz:
         return spark_size(splats)
 
     def fill_sizes(self, part: slice, out: FloatArray) -> None:
-        """The feature sizes of some splats, as `gaussian.spark_size` computes them."""
+        """Fill the feature sizes of some splats, as `gaussian.spark_size` computes them."""
         fill_sizes(self.codes["scales"][part], self.codes["alphas"][part], self.table("scale"), self._factors, out)
 
     def extremes(self, part: slice) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Of some splats of a sound file: (n,) opacities, largest scales, and largest absolute coordinates."""
+        """Return (n,) opacities, largest scales and largest absolute coordinates of some splats of a sound file."""
         positions, scales, alphas = (self.codes[name][part] for name in ("positions", "scales", "alphas"))
         found = np.empty((3, len(scales)), np.float32)
         tables = self.table("opacity"), self.table("scale")
@@ -118,8 +131,8 @@ class CodedSpz:
 
     @functools.cached_property
     def tree(self) -> LodTree | None:
-        """The children of all nodes, which are views of the codes; None without a tree."""
-        if not self.layout.has_tree:
+        """Children of all nodes, as views of the codes; None without a tree."""
+        if not self.has_tree:
             return None
         links = [stream for stream in self.layout.streams() if stream.name in LINKS]
         return LodTree(**{stream.column: stream.decode(self.codes[stream.name])[:, 0] for stream in links})

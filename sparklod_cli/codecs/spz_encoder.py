@@ -1,10 +1,10 @@
-"""Encodes the windows of an SPZ file, whose streams hold one column of all splats each."""
+"""Encodes the windows of an SPZ file: the settled choices, the values to code, and streams of a column each."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -12,18 +12,98 @@ from numpy.typing import NDArray
 
 from ..model.lod_tree import LodTree
 from ..model.scene import Scene
-from ..model.splats import Splats
+from ..model.splats import FloatArray, Splats
 from ..model.streams import NodeStream
+from ..support.defaults import DEFAULT_SPZ_VERSION, MAX_FRACTIONAL_BITS, SPZ_VERSIONS
+from ..support.errors import FormatError
 from ..support.parallel import blocks_of
 from ..support.progress import Progress, silent
-from . import clamps, compression
+from . import clamps, compression, coverage, quantize
 from .clamps import Range
-from .compression import Run
+from .compression import DataRun
 from .encoder import CLAMPED, Encoded, Get, rows_of, windows_of
-from .noted import comment_of
+from .file_notes import comment_of
 from .options import WriteOptions
+from .quantize import Bytes
 from .spz_layout import ANTIALIASED, HEADER, LOD, MAGIC, Layout, column_of
-from .spz_values import opacities, sh_codes
+from .statistics import ALL_BITS, Statistics, enough, fine_bits
+
+#: The largest code that a coordinate is given, 2 ** 23 - 2. Writers clamp what does not fit to the code after it, of
+#: either sign, so `inspect` takes a coordinate that has that one for clamped.
+LAST_CODE = quantize.FIXED24_MAX - 1
+
+
+def largest_fractional_bits(largest: float) -> int:
+    """Return the most fractional bits, 0 to 24, with which 24-bit fixed point holds this magnitude of a coordinate.
+
+    Raises:
+        FormatError: not even whole units fit.
+    """
+    if np.rint(largest) > LAST_CODE:
+        reach = f"{largest:.0f}" if largest < 1e7 else f"{largest:.3g}"
+        raise FormatError(f"coordinates reach {reach}, SPZ holds at most {LAST_CODE}: scale the scene down")
+    bits = MAX_FRACTIONAL_BITS
+    while bits and np.rint(largest * 2.0**bits) > LAST_CODE:
+        bits -= 1
+    return bits
+
+
+def needed(options: WriteOptions) -> frozenset[str]:
+    """Return the statistics by which `settled` settles these options."""
+    needed = {"reach"}
+    if options.fractional_bits is None:
+        needed.add("leaf_scale")
+    if options.sh_bits is None:
+        needed.add("leaf_sh")
+    return frozenset(needed)
+
+
+def settled(scene: Scene | Statistics, options: WriteOptions) -> WriteOptions:
+    """Return the options with nothing left open: `encode` writes the scene with them.
+
+    Positions get as many fractional bits as all nodes allow, up to where a step is far below the smallest splats of
+    full detail (`statistics.STEPS_A_SPLAT`): merged splats are larger. SH get as many bits as colours need (`enough`).
+
+    Args:
+        scene: or the statistics of one that are `needed`.
+        options: that may leave choices open.
+
+    Raises:
+        FormatError: a coordinate does not fit the fractional bits; the text names the most that would.
+        ValueError: there are no such bits.
+    """
+    version = DEFAULT_SPZ_VERSION if options.spz_version is None else options.spz_version
+    found = scene if isinstance(scene, Statistics) else Statistics.of_scene(scene, needed(options))
+    assert found.reach is not None
+    bits, most = options.fractional_bits, largest_fractional_bits(found.reach)
+    if bits is None:
+        assert found.leaf_scale is not None
+        bits = max(0, min(most, fine_bits(found.leaf_scale)))
+    if bits > most:
+        raise FormatError(f"a coordinate does not fit {bits} fractional bits; use at most {most}")
+    sh_bits = options.sh_bits
+    if sh_bits is None:
+        sh_bits = quantize.LEAST_SH_BITS if found.leaf_sh is None else enough(found.leaf_sh)
+    if not quantize.LEAST_SH_BITS <= sh_bits <= ALL_BITS:
+        raise ValueError(f"sh_bits is {sh_bits}, not {quantize.LEAST_SH_BITS} to {ALL_BITS}")
+    return dataclasses.replace(options, spz_version=version, fractional_bits=bits, sh_bits=sh_bits)
+
+
+def like(header: Mapping[str, int], options: WriteOptions) -> WriteOptions:
+    """Return the options, and where they leave a choice open, that of the SPZ file which a scene was read from.
+
+    Its values then stay as they are. A version that is not written becomes the newest one that is; a scene from
+    another format, by its `Scene.header`, leaves the choice open.
+    """
+    version, bits = options.spz_version, options.fractional_bits
+    if "fractional_bits" not in header:
+        return options
+    if version is None:
+        version = int(header["version"])
+        version = version if version in SPZ_VERSIONS else max(SPZ_VERSIONS)
+    bits = int(header["fractional_bits"]) if bits is None else bits
+    return dataclasses.replace(options, spz_version=version, fractional_bits=bits)
+
 
 #: How streams are deflated; the others have repetitions of all kinds.
 WAYS = {
@@ -36,19 +116,24 @@ WAYS = {
 
 @dataclass(frozen=True)
 class SpzEncoder:
-    """The encoder of a file, see `encoder.Encoder`: the result of a window has its part of each stream, by its name.
+    """Encoder of a file, see `encoder.Encoder`: the result of a window has its part of each stream, by its name.
 
     Attributes:
         layout: of the file.
         options: with nothing left open.
         ranges: beyond which values are counted; none unless somebody wants to know.
         up: as in `Scene`.
+        stored: (N, bytes or more) codes of streams by name, see `kept`. Of SH, there may be more coefficients than are
+            written.
+        kept: (N,) nodes that get their codes of `stored`; None for none.
     """
 
     layout: Layout
     options: WriteOptions
     ranges: tuple[Range, ...] = ()
     up: str | None = None
+    stored: Mapping[str, Bytes] = field(default_factory=dict)
+    kept: NDArray[np.bool_] | None = None
 
     @property
     def count(self) -> int:
@@ -61,7 +146,7 @@ class SpzEncoder:
         return self.layout.sh_degree
 
     def encode(self, splats: Splats, tree: LodTree | None, start: int) -> Encoded:
-        """The result of a window, wherever it begins."""
+        """Encode a window, wherever it begins."""
         streams = self.layout.streams()
         codes = {stream.name: np.empty((len(splats), stream.size), np.uint8) for stream in streams}
         bits, sh_bits = self.layout.fractional_bits, self.options.sh_bits
@@ -76,12 +161,17 @@ class SpzEncoder:
                 else:
                     values = np.ascontiguousarray(stream.encode(column_of(some, links, stream)))
                 codes[stream.name][part] = values.view(np.uint8).reshape(-1, stream.size)
+        if self.kept is not None:
+            here = slice(start, start + len(splats))
+            kept = self.kept[here]
+            for name, stored in self.stored.items():
+                codes[name][kept] = stored[here][kept, : codes[name].shape[1]]
         return codes | (
             {CLAMPED: clamps.tally(splats, self.ranges, None if tree is None else tree.is_leaf)} if self.ranges else {}
         )
 
     def pieces(self, get: Get, *, threads: int, progress: Progress) -> Iterator[bytes]:
-        """The header and all streams, as one gzip member."""
+        """Return the header and all streams, as one gzip member, piece by piece."""
         layout = self.layout
         fields = layout.version, layout.count, layout.sh_degree, layout.fractional_bits, layout.flags, 0
 
@@ -92,7 +182,7 @@ class SpzEncoder:
                     yield get(number, stream.name)
 
         runs = [
-            Run(stream.size * layout.count, WAYS.get(stream.name, compression.MIXED)) for stream in layout.streams()
+            DataRun(stream.size * layout.count, WAYS.get(stream.name, compression.MIXED)) for stream in layout.streams()
         ]
         runs[0] = runs[0]._replace(size=runs[0].size + HEADER.size)
         comment = "" if self.up is None else comment_of(up=self.up)
@@ -108,13 +198,12 @@ def encoder(
     threads: int = 1,
     progress: Progress = silent,
 ) -> SpzEncoder:
-    """The encoder of a scene.
+    """Return the encoder of a scene, of which nothing is read; `threads` and `progress` are not needed.
 
     Args:
-        scene: of which nothing is read.
+        scene: to write.
         options: settled.
         ranges: beyond which the results count values, see `clamps.tally`.
-        threads, progress: not needed.
 
     Raises:
         ValueError: the options are not settled.
@@ -128,3 +217,37 @@ def encoder(
     flags = (ANTIALIASED if scene.antialiased else 0) | (LOD if tree else 0)
     layout = Layout(options.spz_version, count, sh_degree, options.fractional_bits, flags)
     return SpzEncoder(layout, options, ranges, scene.up)
+
+
+def to_code(
+    splats: Splats, is_leaf: NDArray[np.bool_] | None, fractional_bits: int, sh_bits: int, *, covering: bool
+) -> Splats:
+    """Return the values that the streams of a file are coded from; those of a file stay as they are.
+
+    Args:
+        splats: N splats or nodes.
+        is_leaf: (N,) which of them are leaves; None for splats without a tree.
+        fractional_bits: of the positions, a step of which is too thin to matter.
+        sh_bits: bits kept of the SH bytes of leaves; merged splats keep `quantize.LEAST_SH_BITS`.
+        covering: opacities make up for the rounding of scales.
+    """
+    sh = splats.sh
+    if sh.shape[1] and len(sh):
+        sh = quantize.decode_sh(sh_codes(sh, is_leaf, sh_bits))
+    return dataclasses.replace(splats, opacity=opacities(splats, fractional_bits, covering=covering), sh=sh)
+
+
+def opacities(splats: Splats, fractional_bits: int, *, covering: bool) -> FloatArray:
+    """Return (N,) linear opacities that make up for the rounding of scales, if `covering`."""
+    if not covering:
+        return splats.opacity
+    rounded = quantize.decode_log_scale(quantize.encode_log_scale(splats.scale))
+    return coverage.kept(splats.opacity, splats.scale, rounded, 2.0**-fractional_bits)
+
+
+def sh_codes(sh: FloatArray, is_leaf: NDArray[np.bool_] | None, sh_bits: int) -> Bytes:
+    """Return (N, K, 3) bytes of SH, of which merged splats keep fewer bits."""
+    codes = quantize.encode_sh(sh, sh_bits)
+    if is_leaf is not None and sh_bits > quantize.LEAST_SH_BITS:
+        codes[~is_leaf] = quantize.encode_sh(sh[~is_leaf], quantize.LEAST_SH_BITS)
+    return codes

@@ -16,7 +16,7 @@ from ..model.sh import COEFFICIENTS
 from ..model.splats import Splats
 from ..support.defaults import MAX_SH_DEGREE
 from . import quantize
-from .sh_bits import ALL_BITS
+from .statistics import ALL_BITS
 
 MAGIC = 0x5053474E  # "NGSP"
 HEADER = struct.Struct("<IIIBBBB")  # magic, version, splats, SH degree, fractional bits, flags, reserved
@@ -58,7 +58,7 @@ StreamRows = tuple[Stream, slice, quantize.Bytes]
 
 
 def column_of(splats: Splats, tree: LodTree | None, stream: Stream) -> NDArray[Any]:
-    """The column that a stream holds."""
+    """Return the column that a stream holds."""
     column: NDArray[Any] = getattr(splats if hasattr(splats, stream.column) else tree, stream.column)
     return column
 
@@ -74,7 +74,7 @@ class Layout:
     flags: int
 
     def streams(self) -> list[Stream]:
-        """The streams in file order."""
+        """Return the streams in file order."""
         q, bits, coefficients = quantize, self.fractional_bits, COEFFICIENTS[self.sh_degree]
         table = [
             Stream("positions", 6, "center", lambda codes: codes.view("<f2"), lambda center: center.astype("<f2"))
@@ -105,7 +105,7 @@ class Layout:
                 3 * coefficients,  # coefficient-major, r g b innermost
                 "sh",
                 lambda codes: q.decode_sh(codes.reshape(-1, coefficients, 3)[:, : COEFFICIENTS[MAX_SH_DEGREE]]),
-                lambda sh: q.encode_sh(sh, ALL_BITS),  # what is dropped of them is by now, see `spz_values`
+                lambda sh: q.encode_sh(sh, ALL_BITS),  # what is dropped of them is by now, see `spz_encoder.sh_codes`
             ),
         ]
         if self.flags & LOD:

@@ -7,6 +7,7 @@ memory is settled by those of its pieces.
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -17,10 +18,225 @@ from numpy.typing import NDArray
 from ..model.scene import Scene
 from ..model.sh import COEFFICIENTS
 from ..model.splats import FloatArray, Splats
+from ..support.defaults import MAX_SH_DEGREE
 from ..support.parallel import blocks_of, ordered_map
-from .binades import Binades
-from .magnitudes import Magnitudes
-from .sh_bits import ShBytes
+from . import quantize
+
+#: A bin has the float32 of the same upper bits: sign, exponent and 7 bits of the mantissa, so its ends are at most
+#: 0.8 % apart.
+_SHIFT = 16
+_BINS = 1 << 15
+
+#: Values that are counted at a time: they and their bins stay in the processor's cache.
+_VALUES = 1 << 17
+
+
+def _of_bins(bins: NDArray[np.uint32]) -> NDArray[np.float64]:
+    return (bins << np.uint32(_SHIFT)).view(np.float32).astype(np.float64)
+
+
+#: Ends of the bins. The last ones are of infinity and NaN.
+with np.errstate(invalid="ignore", over="ignore"):
+    UPPER = _of_bins(np.arange(1, _BINS + 1, dtype=np.uint32))
+    LOWER = _of_bins(np.arange(_BINS, dtype=np.uint32))
+
+
+@dataclass(frozen=True, eq=False)
+class Magnitudes:
+    """Counts of positive and of negative values.
+
+    Attributes:
+        positive, negative: (bins,) counts by magnitude, ascending; 0 is positive, -0 negative.
+        lowest, highest: of all values and 0.
+    """
+
+    positive: NDArray[np.int64]
+    negative: NDArray[np.int64]
+    lowest: float
+    highest: float
+
+    @classmethod
+    def of(cls, values: FloatArray) -> Magnitudes:
+        """Count all values of (N, ...) float32."""
+        counts, lowest, highest = np.zeros(2 * _BINS, np.int64), 0.0, 0.0
+        rows = max(1, _VALUES * len(values) // max(values.size, 1))
+        for start in range(0, len(values), rows):
+            flat = np.ascontiguousarray(values[start : start + rows], np.float32).reshape(-1)
+            lowest, highest = min(lowest, float(flat.min(initial=0))), max(highest, float(flat.max(initial=0)))
+            counts += np.bincount(flat.view(np.uint32) >> np.uint32(_SHIFT), minlength=2 * _BINS)
+        return cls(counts[:_BINS], counts[_BINS:], lowest, highest)
+
+    @classmethod
+    def merged(cls, parts: Sequence[Magnitudes]) -> Magnitudes:
+        """Merge the counts of one part or more, in any order."""
+        positive = np.sum([part.positive for part in parts], axis=0)
+        negative = np.sum([part.negative for part in parts], axis=0)
+        return cls(positive, negative, min(part.lowest for part in parts), max(part.highest for part in parts))
+
+    @property
+    def count(self) -> int:
+        """Number of values."""
+        return int(self.positive.sum() + self.negative.sum())
+
+
+def tops(counts: NDArray[np.int64], total: int, most: float, beyond: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the magnitudes above which lie at most these shares of `total` values; `most` is the largest magnitude."""
+    above = np.cumsum(counts[::-1])[::-1]  # of each bin and all larger ones
+    first = [int(np.count_nonzero(above > share * total)) for share in beyond]
+    return np.minimum([UPPER[each - 1] if each else 0.0 for each in first], most)
+
+
+#: Where the binades of float32 begin, those of subnormal numbers, too; what is below the first is 0. Last is infinity.
+ENDS = np.append(np.ldexp(np.float32(1), np.arange(-149, 128)), np.float32(np.inf))
+
+#: Values that are sorted at a time.
+_SORTED_ROWS = 1 << 18
+
+
+@dataclass(frozen=True, eq=False)
+class Binades:
+    """Counts of values of at least 0, by binade: the range from a power of two to the next.
+
+    Attributes:
+        count: (binades,) int64: of 0, then of each binade, then of infinity.
+        least, most: (binades,) float64 smallest and largest value of each; infinity and 0 of empty ones.
+        unknown: the number of values that are not a number.
+    """
+
+    count: NDArray[np.int64]
+    least: NDArray[np.float64]
+    most: NDArray[np.float64]
+    unknown: int = 0
+
+    @classmethod
+    def of(cls, values: FloatArray) -> Binades:
+        """Count (N,) float32 values of at least 0."""
+        parts = [
+            cls._of_sorted(np.sort(values[start : start + _SORTED_ROWS]))
+            for start in range(0, len(values), _SORTED_ROWS)
+        ]
+        return cls.merged(parts) if parts else cls._of_sorted(values)
+
+    @classmethod
+    def _of_sorted(cls, values: FloatArray) -> Binades:
+        known = len(values) - int(np.count_nonzero(np.isnan(values)))  # which are last
+        at = np.concatenate([[0], np.searchsorted(values[:known], ENDS), [known]])
+        count = np.diff(at)
+        least, most = np.full(len(count), np.inf), np.zeros(len(count))
+        filled = np.flatnonzero(count)
+        least[filled], most[filled] = values[at[filled]], values[at[filled + 1] - 1]
+        return cls(count, least, most, len(values) - known)
+
+    @classmethod
+    def merged(cls, parts: Sequence[Binades]) -> Binades:
+        """Merge the counts of one part or more, in any order."""
+        return cls(
+            np.sum([part.count for part in parts], axis=0),
+            np.min([part.least for part in parts], axis=0),
+            np.max([part.most for part in parts], axis=0),
+            sum(part.unknown for part in parts),
+        )
+
+    def quantile(self, share: float) -> float:
+        """Return a value of the same binade as the quantile of all values, linearly interpolated as numpy does.
+
+        It is the quantile itself where the values on either side of it lie in two binades. Infinity where a value
+        is not a number; 0 of no values.
+        """
+        if self.unknown:
+            return float("inf")
+        total = int(self.count.sum())
+        if not total:
+            return 0.0
+        place = share * (total - 1)
+        rank = int(place)
+        until = np.cumsum(self.count)
+        first, second = np.searchsorted(until, [rank, min(rank + 1, total - 1)], side="right")
+        if first == second:
+            return float(self.least[first])
+        low, high = float(self.most[first]), float(self.least[second])
+        return low + (high - low) * (place - rank)
+
+
+#: All bits of a byte.
+ALL_BITS = 8
+
+#: Largest root mean square, over splats and directions, of what dropping bits changes of a splat's colour: with
+#: it, SH alone cost what 58 dB and more are, see docs/decisions/08-rounding.md.
+LARGEST_ERROR = 0.009
+
+#: Splats that are counted at a time: they and their codes stay in the processor's cache.
+_SH_ROWS = 1 << 13
+
+
+@dataclass(frozen=True, eq=False)
+class ShBytes:
+    """Counts of SH as bytes of SPZ: (degrees, 256) int64 of each code, and how many coefficients have none exactly."""
+
+    count: NDArray[np.int64]
+    between: int
+
+    @classmethod
+    def of(cls, sh: FloatArray) -> ShBytes:
+        """Count (N, K, 3) coefficients."""
+        count, between = np.zeros((MAX_SH_DEGREE, 256), np.int64), 0
+        for start in range(0, len(sh), _SH_ROWS):
+            part = sh[start : start + _SH_ROWS]
+            codes = quantize.encode_sh(part, ALL_BITS)
+            between += int(np.count_nonzero(quantize.decode_sh(codes) != part))
+            for degree in range(MAX_SH_DEGREE):
+                own = codes[:, COEFFICIENTS[degree] : COEFFICIENTS[degree + 1]]
+                count[degree] += np.bincount(own.reshape(-1), minlength=256)
+        return cls(count, between)
+
+    @classmethod
+    def merged(cls, parts: Sequence[ShBytes]) -> ShBytes:
+        """Merge the counts of one part or more, in any order."""
+        return cls(np.sum([part.count for part in parts], axis=0), sum(part.between for part in parts))
+
+    def error(self, bits: int) -> float:
+        """Return the root mean square that keeping so many bits changes of a colour, over splats and directions.
+
+        The mean square of a basis function over all directions is 1 / (4 * pi).
+        """
+        codes = np.broadcast_to(np.arange(256, dtype=np.uint8)[:, None, None], (256, COEFFICIENTS[MAX_SH_DEGREE], 3))
+        whole = quantize.decode_sh(np.ascontiguousarray(codes))
+        square = np.square(quantize.decode_sh(quantize.encode_sh(whole, bits)) - whole, dtype=np.float64)[:, :, 0]
+        total = 0.0
+        for degree, count in enumerate(self.count):
+            if count.any():
+                coefficients = 2 * degree + 3
+                total += coefficients * float(count @ square[:, COEFFICIENTS[degree]]) / float(count.sum())
+        return math.sqrt(total / (4 * math.pi))
+
+
+def enough(found: ShBytes) -> int:
+    """Return the fewest bits of the SH of full detail of which `LARGEST_ERROR` is true; all of SH that are such codes.
+
+    Those come from SPZ, and stay as they are, however often they are written.
+    """
+    most = LARGEST_ERROR if found.between else 0.0
+    every = range(quantize.LEAST_SH_BITS, ALL_BITS)
+    return next((bits for bits in every if found.error(bits) <= most), ALL_BITS)
+
+
+#: A step of the positions is at most a 16th of the standard deviation of a small splat, so that rounding shifts it by
+#: at most a 32nd; small are the splats at this quantile of the largest scales. See docs/decisions.
+STEPS_A_SPLAT, SMALL_QUANTILE = 16, 0.01
+
+
+#: Fractional bits of the smallest float32: with these, nothing is rounded.
+EXACT_BITS = 149
+
+
+def fine_bits(leaf_scale: Binades) -> int:
+    """Return the fractional bits with which a step is far below the smallest splats of full detail (`STEPS_A_SPLAT`).
+
+    A step is a power of two, so the binade of the small splats is all that matters; without a size, `EXACT_BITS`.
+    """
+    small = leaf_scale.quantile(SMALL_QUANTILE)
+    return math.ceil(math.log2(STEPS_A_SPLAT / small)) if 0 < small < math.inf else EXACT_BITS
+
 
 #: What can be counted: the largest coordinate, the largest scale of each leaf, how many times as long as wide it is,
 #: the SH bytes of leaves, and the magnitudes of columns.
@@ -32,18 +248,17 @@ _BLOCK = 1 << 16
 
 @dataclass(frozen=True, eq=False)
 class Statistics:
-    """Statistics of splats.
+    """Statistics of splats; those that were not requested are None.
 
     Attributes:
         count: N splats, which are nodes where there is a tree.
         sh_degree: of them.
         tree: whether they are nodes of a tree.
-        reach: the largest magnitude of a coordinate; None where it was not asked for.
-        leaf_scale: the largest scale of each leaf, or splat where there is no tree; None where not asked for.
-        magnitudes: of the values of "rgb", "scale", "sh1", "sh2" and "sh3", as far as they were asked for.
-        leaf_sh: SH of leaves, or of splats where there is no tree; None where not asked for, or without SH.
-        leaf_length: of each leaf, or splat where there is no tree, the largest scale as a multiple of the middle one;
-            None where not asked for.
+        reach: the largest magnitude of a coordinate.
+        leaf_scale: the largest scale of each leaf, or splat where there is no tree.
+        magnitudes: of the values of "rgb", "scale", "sh1", "sh2" and "sh3".
+        leaf_sh: SH of leaves, or of splats where there is no tree; None without SH.
+        leaf_length: of each leaf, or splat where there is no tree, the largest scale as a multiple of the middle one.
     """
 
     count: int
@@ -57,10 +272,10 @@ class Statistics:
 
     @classmethod
     def of(cls, splats: Splats, leaf: NDArray[np.bool_] | None = None, needed: Collection[str] = ALL) -> Statistics:
-        """Counts splats.
+        """Count N splats or nodes.
 
         Args:
-            splats: N splats or nodes.
+            splats: of all columns.
             leaf: (N,) which nodes are leaves; None for splats that are no nodes.
             needed: what to count, of `ALL`.
         """
@@ -85,26 +300,19 @@ class Statistics:
 
     @classmethod
     def of_scene(cls, scene: Scene, needed: Collection[str] = ALL, *, threads: int = 1) -> Statistics:
-        """Counts the splats of a scene."""
+        """Count the splats of a scene."""
         return cls._of_blocks(scene.splats, None if scene.tree is None else scene.tree.is_leaf, needed, threads)
 
     @classmethod
     def of_leaves(cls, splats: Splats, needed: Collection[str] = ALL, *, threads: int = 1) -> Statistics:
-        """Counts splats that will be the leaves of a tree, for `of_tree`."""
+        """Count splats that will be the leaves of a tree, for `of_tree`."""
         return cls._of_blocks(splats, np.ones(len(splats), np.bool_), needed, threads)
 
     @classmethod
     def of_tree(
         cls, scene: Scene, leaves: Statistics, needed: Collection[str] = ALL, *, threads: int = 1
     ) -> Statistics:
-        """As `of_scene`, of a tree whose leaves have been counted.
-
-        Args:
-            scene: the tree.
-            leaves: of `of_leaves`, asked for the same.
-            needed: what to count, of `ALL`.
-            threads: to count on.
-        """
+        """Count as `of_scene` the nodes of a tree whose `leaves` `of_leaves` has counted for the same needs."""
         assert scene.tree is not None
         inner = scene.splats.take(np.flatnonzero(scene.tree.child_count))
         return cls.merged([leaves, cls._of_blocks(inner, np.zeros(len(inner), np.bool_), needed, threads)])
@@ -113,7 +321,7 @@ class Statistics:
     def _of_blocks(
         cls, splats: Splats, leaf: NDArray[np.bool_] | None, needed: Collection[str], threads: int
     ) -> Statistics:
-        """As `of`, block by block."""
+        """Count as `of`, block by block."""
 
         def count(part: slice) -> Statistics:
             return cls.of(splats.take(part), None if leaf is None else leaf[part], needed)
@@ -125,7 +333,7 @@ class Statistics:
 
     @classmethod
     def merged(cls, parts: Sequence[Statistics]) -> Statistics:
-        """Those of all splats of one part or more, which were asked for the same.
+        """Merge the statistics of one part or more, for the same needs.
 
         Raises:
             ValueError: the parts are not of one scene: they differ in SH degree, or in whether they have a tree.
@@ -145,7 +353,7 @@ class Statistics:
         )
 
     def array(self) -> NDArray[np.uint8]:
-        """The bytes of these statistics, tens of KB, from which `from_array` makes them again."""
+        """Return the bytes of these statistics, tens of KB, from which `from_array` makes them again."""
         columns: dict[str, Any] = {"facts": [self.count, self.sh_degree, self.tree]}
         if self.reach is not None:
             columns["reach"] = self.reach
@@ -161,7 +369,7 @@ class Statistics:
 
     @classmethod
     def from_array(cls, array: NDArray[np.uint8]) -> Statistics:
-        """The statistics of `array`."""
+        """Return the statistics of `array`."""
         with np.load(io.BytesIO(array.tobytes()), allow_pickle=False) as file:
             columns = {name: values.item() if values.ndim == 0 else values for name, values in file.items()}
         count, sh_degree, tree = columns.pop("facts").tolist()
@@ -181,7 +389,7 @@ class Statistics:
 
 
 def lengths(scale: FloatArray) -> FloatArray:
-    """(N,) how many times as long as wide splats are: the largest scale by the middle one; 1 for those of no width."""
+    """Return (N,) the largest scale of splats by the middle one; 1 for those of no width."""
     x, y, z = scale.T
     largest = np.maximum(np.maximum(x, y), z)
     middle = np.maximum(np.minimum(x, y), np.minimum(np.maximum(x, y), z))

@@ -27,7 +27,7 @@ Read = Callable[[int], bytes | memoryview]
 
 
 def size_of(file: BinaryIO) -> int:
-    """Bytes of a file, which is left at its beginning."""
+    """Return the bytes of a file, which is left at its beginning."""
     size = file.seek(0, io.SEEK_END)
     file.seek(0)
     return size
@@ -47,7 +47,7 @@ class Positioned:
         self._descriptor = file.fileno() if plain else None
 
     def read(self, at: int, size: int) -> bytes:
-        """The `size` bytes from `at` on, or fewer at the end of the file."""
+        """Return the `size` bytes from `at` on, or fewer at the end of the file."""
         if self._descriptor is None:
             with self._lock:
                 self._file.seek(at)
@@ -61,7 +61,7 @@ class Positioned:
         return data
 
     def reader(self, at: int) -> Read:
-        """What reads on from a position; for one thread."""
+        """Return a reader that resumes at an offset (not thread-safe)."""
 
         def read(size: int) -> bytes:
             nonlocal at
@@ -73,7 +73,7 @@ class Positioned:
 
 
 def rows_of(read: Read, row_type: np.dtype[Any], count: int, what: str = "splats") -> Iterator[Rows]:
-    """`count` rows in blocks of at least `BLOCK_ROWS` rows and `BLOCK_BYTES` bytes, read when they are asked for.
+    """Read `count` rows in blocks of at least `BLOCK_ROWS` rows and `BLOCK_BYTES` bytes, when they are asked for.
 
     Raises:
         TruncatedError: the data ends early.
@@ -90,7 +90,7 @@ def rows_between(
     count: int,
     what: str = "splats",
 ) -> Iterator[Rows]:
-    """The rows from `start` to `stop`, of `count` that begin at `offset` in a file; blocks and errors as `rows_of`."""
+    """Read rows from `start` to `stop`, of `count` that begin at `offset` in a file; blocks and errors as `rows_of`."""
     read = file.reader(offset + start * row_type.itemsize)
     yield from _rows(read, row_type, start, stop, count, what)
 
@@ -109,7 +109,7 @@ def _rows(read: Read, row_type: np.dtype[Any], start: int, stop: int, count: int
 def decode_rows(
     rows: Iterator[Rows], decode: Callable[[slice, NDArray[Any]], None], count: int, threads: int, progress: Progress
 ) -> None:
-    """Calls `decode` with every block of rows, on several threads, while this thread reads on."""
+    """Call `decode` with every block of rows, on several threads, while this thread reads on."""
 
     def run(item: Rows) -> int:
         part, content = item
@@ -121,7 +121,7 @@ def decode_rows(
 
 
 def encode_rows(encode: Callable[[slice], bytes], count: int, threads: int, progress: Progress) -> Iterator[bytes]:
-    """The bytes of `count` rows in blocks, in order: `encode` is called with each block's rows, on several threads."""
+    """Return the bytes of `count` rows in order: `encode` is called with blocks of rows, on several threads."""
     parts = blocks_of(count)
     for part, piece in zip(parts, ordered_map(encode, parts, threads), strict=True):
         yield piece

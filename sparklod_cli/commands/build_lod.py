@@ -3,30 +3,51 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..codecs.streamed_sog.names import MANIFEST
+from ..codecs.options import SogOptions, WriteOptions
 from ..support import interrupts
+from ..support.addresses import Place
 from ..support.errors import SparklodError
 from ..support.printable import MOST, shortened
 from ..support.stdin import DASH, name_of
-from .build_lod_inputs import Inputs, check_inputs, input_options, record_of
-from .build_lod_jobs import job_of
-from .build_lod_outputs import BY_DATE, VERIFY, Outputs, check_formats
-from .command import COMMON, Command, option
-from .console import say
-from .options.baking import STREAMED_SOG, baking_options, check_method, method_of
-from .options.cluster import OF_CLUSTERS, check_cluster, cluster_of, cluster_options
-from .options.common import General, common_options, output_option, overwrite_option
-from .options.refining import check_refining
-from .options.resources import HEADING as LARGE
-from .options.resources import OF_BAKES, resources_options
-from .paths import NAMELESS, Folder, OutputPath, claim_stdout, is_same_place, keep_apart, with_chunks
-from .usage import exclude, options_of
+from .build_lod_files import FORMS, VERIFY, BakedFiles, check_formats, check_inputs, record_of
+from .build_lod_text import report_baked, report_extracted
+from .command import Command
+from .console import Console, say
+from .option_groups import COMMON, check_declared, exclude, flags_set, is_set, parameters_of, values_of, with_options
+from .options.baking import (
+    OF_TREES,
+    ClusterOptions,
+    DetailOptions,
+    PaletteOptions,
+    ResourceOptions,
+    SelectionOptions,
+    TransformOptions,
+    TreeOptions,
+)
+from .options.common import General
+from .paths import NAMELESS, Folder, claim_stdout, is_same_place, keep_apart, with_chunks
+
+if TYPE_CHECKING:
+    from ..bake.out_of_core.cluster_engine import ClusterEngine
+    from ..bake.records import Baked
+    from ..bake.settings import BakeSettings
+    from ..bake.sources import Source
+    from ..extract_leaves import Extracted
+
+    #: Result of a job; None where the output was there already.
+    Outcome = Baked | Extracted | None
+
+    #: Makes the outputs of inputs, and yields what came of each, in order.
+    Make = Callable[[Sequence[tuple[Source, Place]]], Iterator[Outcome | SparklodError]]
 
 EXAMPLES = """
 \b
@@ -54,48 +75,64 @@ Examples:
   sparklod build-lod scene-lod.spz --unlod -o scene.sog # for PlayCanvas
 """
 
+
 BOTH = "--output cannot be used with --output-dir"
 
 
-@click.command("build-lod", cls=Command, epilog=EXAMPLES, context_settings={"show_default": True})
-@input_options
-@output_option(
-    "Output of a single input, or a folder for all outputs; - is standard output.  [default: NAME-lod.spz beside the"
-    f" input; NAME-lod.rad with --format rad, NAME-lod/{MANIFEST} with --format {STREAMED_SOG}, NAME-lod.npz with"
-    " --encoding, NAME-unlod.spz with --unlod, NAME-lod-refined.spz of a NAME-lod.spz with --refine]",
-    addresses=True,
+@dataclass(frozen=True)
+class BuildLodOptions:
+    """Options of the command, group by group."""
+
+    files: BakedFiles = field(default_factory=BakedFiles)
+    tree: TreeOptions = field(default_factory=TreeOptions)
+    selection: SelectionOptions = field(default_factory=SelectionOptions)
+    transform: TransformOptions = field(default_factory=TransformOptions)
+    written: WriteOptions = field(default_factory=WriteOptions)
+    palette: PaletteOptions = field(default_factory=PaletteOptions)
+    detail: DetailOptions = field(default_factory=DetailOptions)
+    resources: ResourceOptions = field(default_factory=ResourceOptions)
+    cluster: ClusterOptions = field(default_factory=ClusterOptions)
+    general: General = field(default_factory=General)
+
+    def bake_settings(self, ctx: click.Context) -> BakeSettings:
+        """Return the settings of bakes; loads numpy."""
+        from ..bake.settings import BakeSettings
+
+        files = self.files
+        return BakeSettings(
+            **self.tree.settings(streamed_sog=files.is_streamed_sog),
+            selection=self.selection.selection(),
+            transform=self.transform.transform(),
+            up=self.transform.up if is_set(ctx, "up") else None,
+            rgba=self.selection.rgba,
+            suffix=files.suffix,
+            options=self.write_options(),
+            encoding=files.encoding,
+            raw=files.is_raw,
+            detail=self.detail.settings if files.is_streamed_sog else None,
+            environment=self.detail.environment,
+            environment_beyond=self.detail.environment_beyond,
+            refine=files.refining.settings(),
+            camera_path=files.refining.camera_path,
+            converts=files.format_is_chosen,
+            unused=tuple(flags_set(ctx, (*OF_TREES, "environment_beyond"))),
+        )
+
+    def write_options(self) -> WriteOptions:
+        """Return the write options; what nobody chose is left to the library, which may take it from the input."""
+        form, codes = self.files.form, self.palette.cluster_sh
+        rad = dataclasses.replace(self.written.rad, chunked=form is not None and FORMS[form][1], sh_codes=codes)
+        return dataclasses.replace(self.written, rad=rad, sog=SogOptions(codes))
+
+
+HEADINGS = (
+    *(COMMON, "Tree", "Selection", "Rotation, scale and position", "File format", "RAD", "Streamed SOG", "Refining"),
+    *("Large scenes", "Cluster"),
 )
-@option(
-    "--output-dir",
-    heading=COMMON,
-    metavar="DIR",
-    type=OutputPath(folder=True, addresses=True),
-    help="Folder for the outputs; created if it does not exist.",
-    show_default=False,
-)
-@overwrite_option
-@option(
-    "--skip-existing",
-    heading=LARGE,
-    metavar="[=verify]",
-    type=click.Choice([BY_DATE, VERIFY]),
-    bare=BY_DATE,
-    help="Bake nothing whose output is there already, of the same inputs and settings; a small file beside each output,"
-    " NAME.sparklod.json, tells of what it is. Files whose size and date are unchanged are not read;"
-    " --skip-existing=verify reads all, and so finds damage that left both as they were.",
-)
-@option(
-    "--unlod",
-    heading=COMMON,
-    is_flag=True,
-    help="Write the leaves of Level-of-Detail files instead: the original splats as the file holds them, rounded, with"
-    " opacities that make up for it. As SPZ or, by the name of FILE, .rad, .ply, .sog, DIR/meta.json (an unpacked SOG)"
-    " or .splat, which has no SH.",
-)
-@baking_options
-@resources_options
-@cluster_options
-@common_options
+
+
+@click.command("build-lod", cls=Command, headings=HEADINGS, epilog=EXAMPLES, context_settings={"show_default": True})
+@with_options(BuildLodOptions)
 @click.pass_context
 def build_lod(ctx: click.Context, /, **_: Any) -> None:
     """Bake splat files into Level-of-Detail files for Spark, PlayCanvas, SuperSplat and Babylon.js.
@@ -113,14 +150,21 @@ def build_lod(ctx: click.Context, /, **_: Any) -> None:
     An input that fails does not stop the others; the exit status is 1 if any did. With --workers or --scheduler,
     several inputs are baked side by side (extra cluster).
     """
-    general, given, outputs = options_of(ctx, General), options_of(ctx, Inputs), _outputs(ctx)
-    check_inputs(ctx, given, outputs)
-    instances = given.instances()
-    _check(ctx, given, [each.file for each in instances if each.file is not None], outputs, general)
+    output = ctx.params["output"]
+    if isinstance(output, Folder):  # an --output that names a folder is an --output-dir
+        if ctx.params["output_dir"] is not None:
+            raise click.UsageError(BOTH)
+        ctx.params.update(output=None, output_dir=output.path)
+    options = values_of(ctx, BuildLodOptions)
+    files, general = options.files, options.general
+    check_inputs(ctx, files)
+    instances = files.instances()
+    _check(ctx, options, [instance.file for instance in instances if instance.file is not None])
     failed = False
-    with general.console() as console, cluster_of(ctx, general, console) as engine:
-        make, report = job_of(ctx, outputs, general, console, engine)
-        pairs = list(given.jobs(instances, outputs, console.say))
+    memory = options.resources.memory
+    with general.console() as console, options.cluster.engine(ctx, general, memory, console) as engine:
+        make, report = _job_of(ctx, options, console, engine)
+        pairs = list(files.jobs(instances, console.say))
         for (source, target), outcome in zip(pairs, make(pairs), strict=True):
             if isinstance(outcome, SparklodError):
                 failed = True
@@ -142,45 +186,96 @@ def build_lod(ctx: click.Context, /, **_: Any) -> None:
         ctx.exit(1)
 
 
-def _outputs(ctx: click.Context) -> Outputs:
-    """Return where outputs go; an --output that names a folder is an --output-dir."""
-    output = ctx.params["output"]
-    if isinstance(output, Folder):
-        if ctx.params["output_dir"] is not None:
+def _check(ctx: click.Context, options: BuildLodOptions, named: list[Path]) -> None:
+    """Raise a `click.UsageError` where options contradict each other, or the names of files; `named` by --scene."""
+    files = options.files
+    inputs, output = files.inputs, files.output
+    if output is not None:
+        if files.output_dir is not None:
             raise click.UsageError(BOTH)
-        ctx.params.update(output=None, output_dir=output.path)
-    return options_of(ctx, Outputs)
-
-
-def _check(ctx: click.Context, given: Inputs, named: list[Path], outputs: Outputs, general: General) -> None:
-    """Raises a `click.UsageError` where options contradict each other, or the names of files."""
-    inputs = given.inputs
-    if outputs.output is not None:
-        if outputs.output_dir is not None:
-            raise click.UsageError(BOTH)
-        if len(inputs) > 1 and not given.merge:
+        if len(inputs) > 1 and not files.merge:
             raise click.UsageError(
                 f"--output takes one input, not {len(inputs)}; add --merge to bake them as one scene, or name a folder"
             )
     elif DASH in inputs:
         raise click.UsageError(NAMELESS)
-    targets = [outputs.output] if outputs.output is not None else [outputs.target(source) for source in inputs]
-    if outputs.may_replace_inputs and not given.is_merged:
+    targets = [output] if output is not None else [files.target(source) for source in inputs]
+    if files.may_replace_inputs and not files.is_merged:
         targets = [target for source, target in zip(inputs, targets, strict=True) if not is_same_place(source, target)]
-    if outputs.is_chunked or outputs.is_folder or outputs.is_streamed_sog:
+    if files.is_chunked or files.is_folder or files.is_streamed_sog:
         targets = with_chunks(targets)
-    keep_apart(ctx, {"output" if outputs.output_dir is None else "output_dir": targets, "scene": named})
-    claim_stdout(ctx, "output", as_json=general.as_json, binary=True)
-    if ctx.params["rgba"] is not None and len(inputs) > 1:
+    keep_apart(ctx, {"output" if files.output_dir is None else "output_dir": targets, "scene": named})
+    claim_stdout(ctx, "output", as_json=options.general.as_json, binary=True)
+    if options.selection.rgba is not None and len(inputs) > 1:
         raise click.UsageError(f"--rgba takes one input, not {len(inputs)}")
-    if ctx.params["skip_existing"] and outputs.output == DASH:
+    if files.skip_existing and output == DASH:
         raise click.UsageError("--skip-existing needs an output that can be there already; name a file")
-    check_formats(ctx, outputs)
-    check_cluster(ctx)
-    check_refining(ctx)
-    if outputs.unlod:
-        exclude(ctx, (*OF_BAKES, *OF_CLUSTERS, "refine", "skip_existing"), "--unlod")
+    check_formats(ctx, files)
+    check_declared(ctx)
+    if is_set(ctx, "scheduler"):
+        exclude(ctx, ["workers"], "--scheduler, whose workers run already")
+    if is_set(ctx, "refine"):
+        exclude(ctx, ["scratch_dir", "resume"], "--refine, which needs the whole tree in memory")
+    of_clusters = parameters_of(ClusterOptions)
+    if files.unlod:
+        exclude(ctx, (*parameters_of(ResourceOptions), *of_clusters, "refine", "skip_existing"), "--unlod")
     else:
-        check_method(ctx, method_of(ctx, streamed_sog=outputs.is_streamed_sog))
+        options.tree.check(ctx, streamed_sog=files.is_streamed_sog)
     if DASH in inputs:
-        exclude(ctx, OF_CLUSTERS, "standard input, which workers cannot read; save it to a file first")
+        exclude(ctx, of_clusters, "standard input, which workers cannot read; save it to a file first")
+
+
+def _job_of(
+    ctx: click.Context, options: BuildLodOptions, console: Console, engine: ClusterEngine | None
+) -> tuple[Make, Callable[..., None]]:
+    """Return a function that makes the outputs of inputs, and one that reports an output; loads numpy."""
+    console.announce_compiling()
+    files, threads = options.files, options.general.threads
+    shared: dict[str, Any] = {"overwrite": files.overwrite, "progress": console.progress}
+    if files.unlod:
+        from ..extract_leaves import extract_leaves
+
+        how: dict[str, Any] = {"suffix": files.suffix, "options": options.write_options(), "threads": threads}
+        return _one_by_one(functools.partial(extract_leaves, **how, **shared)), report_extracted
+    from ..bake.flow import bake
+
+    settings = options.bake_settings(ctx)
+    make: Callable[..., Baked | None] = bake
+    if files.skip_existing is not None:
+        from ..bake.skipping import bake_unless_there
+
+        make = functools.partial(bake_unless_there, verify=files.skip_existing == VERIFY)
+    resources = options.resources.resources()
+    if engine is not None:
+        resources = dataclasses.replace(resources, memory=engine.memory)
+    here = functools.partial(
+        make, settings=settings, resources=resources, engine=engine, threads=threads, say=console.say, **shared
+    )
+    alone = _one_by_one(here)
+    if engine is None:
+        return alone, report_baked
+    from ..bake.side_by_side import bake_side_by_side
+
+    side_by_side: Make = functools.partial(
+        bake_side_by_side,
+        make=make,
+        settings=settings,
+        engine=engine,
+        resources=resources,
+        bake_large=functools.partial(_outcome, here),
+        **shared,
+    )
+    return lambda pairs: (side_by_side if len(pairs) > 1 else alone)(pairs), report_baked
+
+
+def _one_by_one(make: Callable[..., Outcome]) -> Make:
+    """Return a function that makes outputs of inputs one after the other."""
+    return lambda pairs: (_outcome(make, *pair) for pair in pairs)
+
+
+def _outcome(make: Callable[..., Outcome], source: Source, target: Place) -> Outcome | SparklodError:
+    """Return the result for an input, or its error, so that one which fails does not stop the others."""
+    try:
+        return make(source, target)
+    except SparklodError as error:
+        return error

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from importlib import import_module
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import click
 
-Decorated = TypeVar("Decorated", bound=Callable[..., Any])
+if TYPE_CHECKING:
+    from ..support.setting_fields import Setting
+
 
 #: Headings that several commands have: of what most people need, and of what every command has.
 COMMON, GENERAL = "Common options", "General"
@@ -41,25 +43,16 @@ class Option(click.Option):
     """An option that stands under a heading of `--help`.
 
     Args:
-        heading: of these.
+        declared: its declaration.
+        heading: of `--help`.
         bare: its value where it stands alone; another one follows after "=", never as the next argument.
     """
 
-    def __init__(self, *arguments: Any, heading: str = GENERAL, bare: str | None = None, **attributes: Any) -> None:
+    def __init__(
+        self, *arguments: Any, declared: Setting, heading: str = GENERAL, bare: str | None = None, **attributes: Any
+    ) -> None:
         super().__init__(*arguments, **attributes)
-        self.heading, self.bare = heading, bare
-
-
-def option(*names: str, heading: str, **attributes: Any) -> Callable[[Decorated], Decorated]:
-    """`click.option` with the heading under which `--help` has it."""
-    return click.option(*names, cls=Option, heading=heading, **attributes)
-
-
-def with_options(command: Decorated, *options: Callable[[Decorated], Decorated]) -> Decorated:
-    """The command with these options, in the order in which `--help` lists them."""
-    for add in reversed(options):
-        command = add(command)
-    return command
+        self.declared, self.heading, self.bare = declared, heading, bare
 
 
 class Command(click.Command):
@@ -81,7 +74,7 @@ class Command(click.Command):
         return super().parse_args(ctx, [*(bare.get(arg, arg) for arg in args[:end]), *args[end:]])
 
     def by_heading(self, ctx: click.Context) -> dict[str, list[click.Parameter]]:
-        """The options that `--help` lists, by heading, in the order of both."""
+        """Return the options that `--help` lists, by heading, in the order of both."""
         listed: dict[str, list[click.Parameter]] = {heading: [] for heading in self.headings}
         last: list[click.Parameter] = []
         for param in self.get_params(ctx):
@@ -114,6 +107,8 @@ class Group(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name not in self.rows:
             return None
+        if cmd_name == help.name:
+            return help
         name = cmd_name.replace("-", "_")
         command: click.Command = getattr(import_module(f".{name}", __package__), name)
         return command
@@ -126,24 +121,41 @@ class Group(click.Group):
         return super().resolve_command(ctx, args)
 
     def unknown(self, name: str) -> str:
-        """What to say of a command that there is not: which one was meant, or which there are."""
+        """Return the error for an unknown command, with the command that was probably meant, or all of them."""
         meant = near_command(name, list(self.rows))
         hint = f"did you mean {meant}?" if meant else f"the commands are {', '.join(self.rows)}"
         return f"there is no command {name!r}; {hint}"
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """The rows, without loading a command."""
+        """Write the rows, without loading a command."""
         with formatter.section("Commands"):
             formatter.write_dl(list(self.rows.items()))
 
 
 def near_command(name: str, names: Sequence[str]) -> str | None:
-    """The command that somebody meant by another name, if that can be told."""
+    """Return the command that was probably meant by another name, or None."""
     import difflib  # which takes a millisecond, and is needed after a mistake only
 
     plain = name.lower().replace("_", "-")
     if plain in names or plain in ALIASES:
         return plain if plain in names else ALIASES[plain]
-    for found in difflib.get_close_matches(plain, [*names, *ALIASES], n=1, cutoff=0.7):
-        return ALIASES.get(found, found)
+    for near in difflib.get_close_matches(plain, [*names, *ALIASES], n=1, cutoff=0.7):
+        return ALIASES.get(near, near)
     return None
+
+
+@click.command("help", cls=Command)
+@click.argument("command", required=False)
+@click.pass_context
+def help(ctx: click.Context, command: str | None) -> None:
+    """Print the help of COMMAND, or of sparklod itself, as --help does."""
+    parent = ctx.parent
+    assert parent is not None and isinstance(parent.command, Group)
+    if command is None:
+        click.echo(parent.get_help())
+        return
+    named = parent.command.get_command(parent, command)
+    if named is None:
+        raise click.UsageError(parent.command.unknown(command), parent)
+    with named.make_context(command, [], parent=parent, resilient_parsing=True) as child:
+        click.echo(child.get_help())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from time import monotonic
 from types import TracebackType
@@ -35,24 +35,24 @@ def size_of(size: int) -> str:
 
 
 def is_terminal(stream: TextIO | None) -> bool:
-    """Whether a stream is a terminal; one that is closed is None."""
+    """Return whether a stream is a terminal; one that is closed is None."""
     return stream is not None and stream.isatty()
 
 
 def say(text: str) -> None:
-    """Prints one line on standard error unless that is closed, shortened and without control characters."""
+    """Print one line on standard error unless that is closed, shortened and without control characters."""
     _echo(printable(text, MOST))
 
 
 def say_error(text: str) -> None:
-    """Prints an error on standard error, in colour on terminals unless NO_COLOR is set (no-color.org)."""
+    """Print an error on standard error, in colour on terminals unless NO_COLOR is set (no-color.org)."""
     plain = os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb"
     prefix = "error:" if plain else click.style("error:", fg="red", bold=True)
     _echo(f"{prefix} {printable(text, MOST)}")
 
 
 def say_usage_error(error: click.ClickException) -> None:
-    """Prints the usage of the command, how to get its help, and in the last line what is wrong."""
+    """Print the usage of the command, how to get its help, and in the last line what is wrong."""
     ctx = error.ctx if isinstance(error, click.UsageError) else None
     if isinstance(error, getattr(click.exceptions, "NoArgsIsHelpError", ())) and ctx is not None:  # since click 8.2
         _echo(ctx.get_help())
@@ -66,7 +66,7 @@ def say_usage_error(error: click.ClickException) -> None:
 
 
 def _meant(error: click.NoSuchOption) -> str:
-    """Which option was meant: one that is spelled nearly so, or one that has a value of that name (--quality)."""
+    """Return a hint at the option with a similar name, or with a value of that name (--quality)."""
     value = error.option_name.lstrip("-")
     for param in error.ctx.command.params if error.ctx is not None else ():
         if isinstance(param.type, click.Choice) and value in param.type.choices:
@@ -75,7 +75,7 @@ def _meant(error: click.NoSuchOption) -> str:
 
 
 def for_screen(pieces: Iterable[bytes]) -> Iterator[bytes]:
-    """The lines of a table without control characters, a piece at a time."""
+    """Yield the lines of a table without control characters, a piece at a time."""
     for piece in pieces:
         yield "\n".join(printable(line) for line in piece.decode("utf-8", "replace").split("\n")).encode()
 
@@ -87,7 +87,7 @@ def _echo(text: str) -> None:
 
 @contextlib.contextmanager
 def _unheard() -> Iterator[None]:
-    """Ignores failures to print: work goes on where standard error is closed, gone or full."""
+    """Ignore failures to print: work goes on where standard error is closed, gone or full."""
     try:
         yield
     except OSError:
@@ -120,7 +120,7 @@ class Console:
         return self._quiet
 
     def clear(self) -> None:
-        """Removes the progress bar."""
+        """Remove the progress bar."""
         if self._bar is not None:
             self._bar.close()
             self._bar = None
@@ -135,7 +135,7 @@ class Console:
             say(text)
 
     def detail(self, text: str) -> None:
-        """Prints a line with `--verbose` only."""
+        """Print a line with `--verbose` only."""
         if self._verbose:
             self.say(text)
 
@@ -162,7 +162,60 @@ class Console:
             self.say(f"{stage}: {amount} ({100 * done / total:.0f} %), {now - self._stage_start:.0f} s")
 
     def announce_compiling(self) -> None:
-        """Prints messages about kernels that are compiled, until this console ends."""
-        from .compiling import Reporter
+        """Print messages about kernels that are compiled, until this console ends."""
+        self._ended.callback(_CompilingReporter(self).listen())
 
-        self._ended.callback(Reporter(self).listen())
+
+class _CompilingReporter:
+    """Announces the first kernel that is compiled, shows a bar, and prints at the end how long all of them took.
+
+    Args:
+        console: prints it.
+    """
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._begun = self._done = 0
+        self._seconds = 0.0
+        self._troubles: set[str] = set()
+
+    def listen(self) -> Callable[[], None]:
+        """Start listening to the compiler; return the function that stops it."""
+        from ..support import jit
+
+        stop = jit.listen(self._begin, self._end, self._say_once)
+
+        def close() -> None:
+            stop()
+            if self._done:
+                self._console.say(f"compiled {count_of(self._done, 'kernel')} in {self._seconds:.1f} s")
+
+        return close
+
+    def _say_once(self, trouble: str) -> None:
+        """Print each trouble once: what is wrong with the cache is wrong for every kernel."""
+        if trouble not in self._troubles:
+            self._troubles.add(trouble)
+            self._console.say(trouble)
+
+    def _begin(self, _name: str) -> None:
+        if not self._begun:
+            self._announce()
+        self._begun += 1
+        self._show()
+
+    def _announce(self) -> None:
+        from ..support import jit
+        from ..warmup import missing
+
+        advance = f"once; sparklod warmup compiles all {len(missing())} in advance"
+        often = advance if jit.CACHE_FOLDER else "in every run: no cache can be written"
+        self._console.say(f"Compiling kernels for this machine, half a minute or less ({often}) ...")
+
+    def _end(self, seconds: float) -> None:
+        self._done += 1
+        self._seconds += seconds
+        self._show()
+
+    def _show(self) -> None:
+        self._console.progress("compiling", self._done, 0, "kernel")  # how many a command needs is not known

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from .. import __version__
 from ..support.printable import printable
-from .command import GENERAL, Command, option
-from .console import Console, count_of
-from .options.common import verbose_option
+from .command import Command
+from .console import count_of
+from .option_groups import values_of, with_options
+from .options.common import Messages, quiet_flag, verbose_flag
 
 if TYPE_CHECKING:
     from ..doctor import Check
@@ -26,28 +27,32 @@ Examples:
 """
 
 
+@dataclass(frozen=True)
+class _Messages(Messages):
+    quiet: bool = quiet_flag("Print problems only.")
+    verbose: bool = verbose_flag("Print what is being checked.")
+
+
 @click.command("doctor", cls=Command, epilog=EXAMPLES)
-@option("--json", "as_json", heading=GENERAL, is_flag=True, help="Print one JSON object on standard output.")
-@option("-q", "--quiet", heading=GENERAL, is_flag=True, help="Print problems only.")
-@verbose_option("Print what is being checked.")
-@click.version_option(__version__, package_name="sparklod")
+@with_options(_Messages)
 @click.pass_context
-def doctor(ctx: click.Context, as_json: bool, quiet: bool, verbose: bool) -> None:
+def doctor(ctx: click.Context, /, **_: Any) -> None:
     """Check the installation: packages, extras, OpenGL, compiled kernels, threads and memory.
 
     A problem is something that baking needs; a note is something optional that is missing, or could be better. Each
     comes with a line on what to do. The exit status is 1 if there is a problem, else 0.
     """
-    with Console(quiet=quiet, verbose=verbose) as console:
+    messages = values_of(ctx, _Messages)
+    with messages.console() as console:
         from ..doctor import check_all
 
         checks = check_all(lambda name: console.detail(f"checking {name}"))
         problems = [check for check in checks if check.state == "problem"]
-        if as_json:
+        if messages.as_json:
             about = {"ok": not problems, "checks": [dataclasses.asdict(check) for check in checks]}
             click.echo(json.dumps(about, indent=2))
         else:
-            for line in _lines(problems if quiet else checks):
+            for line in _lines(problems if messages.quiet else checks):
                 click.echo(line)
         notes = sum(check.state == "note" for check in checks)
         console.say(f"{count_of(len(problems), 'problem')}, {count_of(notes, 'note')}")
@@ -55,7 +60,7 @@ def doctor(ctx: click.Context, as_json: bool, quiet: bool, verbose: bool) -> Non
 
 
 def _lines(checks: list[Check]) -> list[str]:
-    """A line for each check, in columns, and one below for what to do."""
+    """Return a line for each check, in columns, and one below it with the advice."""
     width = max((len(check.name) for check in checks), default=0)
     lines = []
     for check in checks:

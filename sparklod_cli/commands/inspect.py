@@ -2,22 +2,32 @@
 
 from __future__ import annotations
 
-import functools
+import dataclasses
+import json
+import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from ..support.errors import OutOfMemoryError, SparklodError, StdoutError
+from ..support.printable import printable
+from ..support.stdin import name_of
 from .command import Command
-from .inspect_job import Job
-from .options.common import General, common_options, overwrite_option
-from .options.inspecting import Checks, Output, check_usage, inspect_options
+from .console import Console, count_of, size_of
+from .inspect_text import finding_line, lines
+from .option_groups import argument, values_of, with_options
+from .options.common import General, quiet_flag
+from .options.inspecting import Checks, InspectOutput, check_usage
 from .paths import InputPath, keep_apart, name_outputs
-from .usage import options_of
 
 if TYPE_CHECKING:
+    from ..api.inspect_jobs import DrawSettings, Inspected
+    from ..inspection.checking import CheckSettings
     from ..inspection.expectations import Expectations
-    from ..inspection.report import ReportSettings
+    from ..inspection.html import Section
+    from ..inspection.report import Report, ReportSettings
 
 EXAMPLES = """
 \b
@@ -32,13 +42,25 @@ Examples:
 """
 
 
+@dataclass(frozen=True)
+class _General(General):
+    quiet: bool = quiet_flag("Print only what other options ask for, and errors.")
+
+
+@dataclass(frozen=True)
+class InspectOptions:
+    """Options of the command, group by group."""
+
+    files: tuple[Path, ...] = argument(InputPath(stdin=True), metavar="FILE...", required=True)
+    checks: Checks = dataclasses.field(default_factory=Checks)
+    output: InspectOutput = dataclasses.field(default_factory=InspectOutput)
+    general: _General = dataclasses.field(default_factory=_General)
+
+
 @click.command("inspect", cls=Command, epilog=EXAMPLES, context_settings={"show_default": True})
-@click.argument("files", metavar="FILE...", nargs=-1, required=True, type=InputPath(stdin=True))
-@inspect_options
-@overwrite_option
-@functools.partial(common_options, quiet="Print only what other options ask for, and errors.")
+@with_options(InspectOptions)
 @click.pass_context
-def inspect(ctx: click.Context, /, files: tuple[Path, ...], **_: Any) -> None:
+def inspect(ctx: click.Context, /, **_: Any) -> None:
     """Report on splat files and check them.
 
     Reads every format that build-lod reads, and the .npz files that build-lod --encoding writes; a FILE of - is
@@ -47,9 +69,9 @@ def inspect(ctx: click.Context, /, files: tuple[Path, ...], **_: Any) -> None:
 
     A file that cannot be read is a finding, too, and does not stop the others.
     """
-    name_outputs(ctx, files[0])
-    general = options_of(ctx, General)
-    checks, output = options_of(ctx, Checks), options_of(ctx, Output)
+    name_outputs(ctx, ctx.params["files"][0])
+    options = values_of(ctx, InspectOptions)
+    files, checks, output, general = options.files, options.checks, options.output, options.general
     keep_apart(ctx)
     check_usage(ctx, len(files), checks, output, as_json=general.as_json)
     with general.console() as console:
@@ -74,15 +96,17 @@ def inspect(ctx: click.Context, /, files: tuple[Path, ...], **_: Any) -> None:
         settings = CheckSettings(
             _report_settings(checks, output, expected, as_json=general.as_json), expected, original, checks.check
         )
-        job = Job(console, general, output, settings, drawn, checks.fail_on)
+        job = _Job(console, general, output, settings, drawn, checks)
         worst = max(job.inspect(file) for file in files)
         job.write_page()
     if worst:
         ctx.exit(worst)
 
 
-def _report_settings(checks: Checks, output: Output, expected: Expectations | None, *, as_json: bool) -> ReportSettings:
-    """What the report must have for what is printed and checked."""
+def _report_settings(
+    checks: Checks, output: InspectOutput, expected: Expectations | None, *, as_json: bool
+) -> ReportSettings:
+    """Return settings of a report that has all that is printed and checked."""
     from ..inspection.report import HEADER_FIELDS, ReportSettings
 
     field = output.field or ""
@@ -104,3 +128,104 @@ def _report_settings(checks: Checks, output: Output, expected: Expectations | No
         chunks=output.chunks or output.chunks_out is not None or field.startswith("chunks"),
         at_once=True if drawn or output.histogram or checks.leaves_of is not None else None,
     )
+
+
+@dataclass
+class _Job:
+    """What is done with every file, and the page that grows meanwhile."""
+
+    console: Console
+    general: General
+    output: InspectOutput
+    settings: CheckSettings
+    drawn: DrawSettings
+    checks: Checks
+    sections: list[Section] = dataclasses.field(default_factory=list)
+
+    def inspect(self, file: Path) -> int:
+        """Print the report of a file and return its exit status; one too large for memory does not stop the others."""
+        from ..api.inspect_jobs import inspect_file
+
+        start, name = time.perf_counter(), name_of(file)
+        try:
+            inspected = inspect_file(
+                file, self.settings, self.drawn, threads=self.general.threads, progress=self.console.progress
+            )
+        except OutOfMemoryError as error:
+            self.console.error(f"{name}: {error}")
+            return 1
+        self.console.clear()
+        status = self._report(name, inspected)
+        if inspected.section is not None:
+            self.sections.append(inspected.section)
+        self.console.detail(f"  {name}: {inspected.report.format or 'not read'}, {time.perf_counter() - start:.2f} s")
+        return status
+
+    def _report(self, name: str, inspected: Inspected) -> int:
+        """Print the results for a file and return the exit status."""
+        report, holds = inspected.report, self.settings.holds
+        status = 3 if holds and report.fails(self.checks.fail_on) else 0
+        if report.format is None and not holds:
+            status = 1
+            for finding in report.findings or []:
+                self.console.error(f"{name}: {finding.message}")
+        try:
+            self._print(name, report)
+        except StdoutError:
+            raise  # of no file
+        except SparklodError as error:
+            self.console.error(f"{name}: {error}")
+            status = 1
+        if report.format is not None and self.settings.report.chunks:
+            status = max(status, self._print_chunks(name, report))
+        for quantity, text in inspected.histograms.items():
+            click.echo(f"\n  {quantity}\n{text}")
+        if inspected.picture is not None:
+            description, size = inspected.picture
+            self.console.say(f"{self.drawn.plot}  {description.partition(';')[0]}, {size_of(size)}")
+        elif inspected.problem is not None and self.drawn.plot is not None:
+            self.console.error(f"{name}: {inspected.problem}")
+            status = max(status, 1)
+        elif inspected.problem is not None:
+            self.console.say(f"{name}: no picture on the page: {inspected.problem}")
+        return status
+
+    def _print_chunks(self, name: str, report: Report) -> int:
+        """Print the table of the chunks, or its path, and return the exit status."""
+        from ..inspection.chunks import lines as lines_of_chunks
+
+        if report.chunks is None:
+            self.console.error(f"{name}: its chunks cannot be told, for it does not hold all of its splats")
+            return 1
+        if self.output.chunks and not self.general.as_json:
+            click.echo("\n".join(lines_of_chunks(report.chunks)))
+        if self.drawn.chunks is not None:
+            self.console.say(f"{self.drawn.chunks.path}  table of {count_of(len(report.chunks), 'chunk')}")
+        return 0
+
+    def _print(self, name: str, report: Report) -> None:
+        """Print the report of one file to standard output."""
+        plain = report.as_dict()
+        if self.general.as_json:
+            click.echo(json.dumps(plain, allow_nan=False))
+        elif self.output.field:
+            if report.format is not None:
+                value = report.value_at(self.output.field)
+                click.echo(printable(value) if isinstance(value, str) else json.dumps(value))
+        elif self.settings.holds:
+            for finding in report.findings or []:
+                click.echo(finding_line(name, finding, self.checks.style))
+            if not report.findings:
+                noun = "node" if report.tree is not None else "splat"
+                self.console.say(f"{name}: nothing is wrong with its {count_of(report.splats or 0, noun)}")
+        elif report.format is not None and not self.console.quiet:
+            click.echo("\n".join(lines(name, plain)))
+
+    def write_page(self) -> None:
+        """Write the page, if there is an option for it."""
+        if self.drawn.html is None:
+            return
+        from ..api.inspect_jobs import write_page
+
+        size = write_page(self.drawn.html, self.sections, overwrite=self.drawn.overwrite)
+        self.console.say(f"{self.drawn.html}  page of {count_of(len(self.sections), 'file')}, {size_of(size)}")

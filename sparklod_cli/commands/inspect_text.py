@@ -22,7 +22,7 @@ MOST_DEPTHS = 64
 
 
 def lines(name: str, report: dict[str, Any]) -> Iterator[str]:
-    """The lines of a report on a file, given as its JSON."""
+    """Yield the lines of a report on a file, given as its JSON."""
     tree, values = report["tree"], report["values"]
     noun = "node" if tree else "splat"
     size = "" if report["bytes"] is None else f", {size_of(report['bytes'])}"
@@ -156,7 +156,7 @@ def _values(values: dict[str, Any]) -> Iterator[str]:
 
 
 def finding_line(file: str, found: Finding, style: str) -> str:
-    """A finding in a line, as text or as an annotation of GitHub Actions."""
+    """Return a finding in a line, as text or as an annotation of GitHub Actions."""
     if style == "text":
         return f"{printable(file)}: {found.severity}: {found.code}: {printable(found.message, MOST)}"
     kind = {"note": "notice"}.get(found.severity, found.severity)

@@ -13,13 +13,12 @@ from typing import Any
 
 import click
 
-from ..codecs.sog.names import META
-from ..codecs.streamed_sog.names import MANIFEST
+from ..codecs.file_names import MANIFEST, META
 from ..support.addresses import Address, Place, place_of
 from ..support.stdin import DASH
 from ..tables.files import FORMS
 from .console import is_terminal
-from .usage import flag_of
+from .option_groups import flag_of
 
 #: What a place is taken by.
 INPUT, OUTPUT = "an input", "an output"
@@ -45,6 +44,7 @@ class _NamedPath(click.Path):
         self.folder = folder
         self.suffixes = suffixes
         self.addresses = addresses
+        self.unit = "DIR" if folder else "FILE"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         text = os.fsdecode(value)
@@ -125,12 +125,12 @@ def require_suffix(flag: str, output: Place, endings: Iterable[str]) -> None:
     """
     if output == DASH or output.suffix or _is_stream(output):
         return
-    names = ", ".join(each if each.startswith(".") else f"/{each}" for each in endings)
+    names = ", ".join(ending if ending.startswith(".") else f"/{ending}" for ending in endings)
     raise click.UsageError(f"{flag} {output} has no suffix to tell the format; end it in {names}, or in / for a folder")
 
 
 def keep_apart(ctx: click.Context, stands_for: Mapping[str, Iterable[Place]] | None = None) -> None:
-    """Raises a `click.UsageError` if an output of a command is also an input or another output of it.
+    """Raise a `click.UsageError` if an output of a command is also an input or another output of it.
 
     Also raises one if the suffix of an output is that of another format than what is written.
 
@@ -167,19 +167,19 @@ def keep_apart(ctx: click.Context, stands_for: Mapping[str, Iterable[Place]] | N
 
 
 def with_chunks(headers: Iterable[Place]) -> list[Place]:
-    """Outputs of several files each, and the files beside them that are replaced or removed with them."""
+    """Return outputs of several files, and the files beside them that are replaced or removed with them."""
     from ..io import chunk_files
     from ..io.details import detail_files
 
     chunks: list[Place] = []
     for header in headers:
-        beside = detail_files if header.name == MANIFEST else chunk_files
-        chunks += [header, *(beside(header) if isinstance(header, Path) else ())]
+        others = detail_files if header.name == MANIFEST else chunk_files
+        chunks += [header, *(others(header) if isinstance(header, Path) else ())]
     return chunks
 
 
 def claim_stdout(ctx: click.Context, name: str, *, as_json: bool, binary: bool = False) -> None:
-    """Raises a `click.UsageError` where an output is - and standard output is taken, or no place for it.
+    """Raise a `click.UsageError` where an output is - and standard output is taken, or no place for it.
 
     Args:
         ctx: of the command.
@@ -197,7 +197,7 @@ def claim_stdout(ctx: click.Context, name: str, *, as_json: bool, binary: bool =
 
 
 def is_same_place(one: Place, other: Place) -> bool:
-    """Whether two paths are of the same file, whatever links and spellings lead there."""
+    """Return whether two paths are of the same file, whatever links and spellings lead there."""
     if DASH in (one, other):
         return False
     return _place(one) == _place(other) or (_identity(one) is not None and _identity(one) == _identity(other))
@@ -208,9 +208,9 @@ def _keep_apart(outputs: Iterable[Place], inputs: Iterable[Place]) -> None:
     places = dict[str, str]()
     for path in _all_read(inputs):
         places[_place(path)] = INPUT
-        found = _identity(path)
-        if found is not None:
-            files.add(found)
+        identity = _identity(path)
+        if identity is not None:
+            files.add(identity)
     for path in outputs:
         if path == DASH or _is_stream(path):
             continue
@@ -241,10 +241,10 @@ def _identity(path: Place) -> tuple[int, int] | None:
     if isinstance(path, Address):
         return None
     try:
-        found = path.stat()
+        status = path.stat()
     except (OSError, ValueError):
         return None
-    return found.st_dev, found.st_ino
+    return status.st_dev, status.st_ino
 
 
 def _is_stream(path: Place) -> bool:
@@ -258,7 +258,7 @@ def _is_stream(path: Place) -> bool:
 
 
 def _place(path: Place) -> str:
-    """The path of a file that exists or not: the same for all links and spellings. Or its address."""
+    """Return the path of a file that exists or not: the same for all links and spellings. Or its address."""
     if isinstance(path, Address):
         return path.url
     place = os.path.realpath(path)
@@ -268,7 +268,7 @@ def _place(path: Place) -> str:
 
 @functools.lru_cache(256)
 def _folds_case(folder: str) -> bool:
-    """Whether a folder ignores the case of names, judged by its own name."""
+    """Return whether a folder ignores the case of names, judged by its own name."""
     path = Path(folder)
     try:
         return path.name.swapcase() != path.name and path.samefile(path.with_name(path.name.swapcase()))
@@ -277,13 +277,13 @@ def _folds_case(folder: str) -> bool:
 
 
 def stem_of(source: Place) -> str:
-    """What outputs made of an input are named after: the input, or its folder where it is an unpacked SOG."""
+    """Return the stem of the names of outputs: that of the input, or of its folder where it is an unpacked SOG."""
     whole = source if isinstance(source, Address) else source.absolute()
     return whole.parent.name if source.name in (META, MANIFEST) else whole.stem or whole.name
 
 
 def file_of(text: str) -> Path | None:
-    """The file that the text of an option names; None if there is no such file, as the text means something else."""
+    """Return the file that the text of an option names; None if there is none, as the text means something else."""
     try:
         return Path(text) if Path(text).is_file() else None
     except (OSError, ValueError):

@@ -4,31 +4,32 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import functools
+import json
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from ..images.defaults import THUMBNAIL_SIZE, THUMBNAIL_SUPERSAMPLE
-from .command import COMMON, Command
-from .options import appearance, cameras, comparison, cut, inputs, pictures, streamed_sog, streaming
-from .options.camera_options import camera_options
-from .options.common import General, common_options
+from .command import Command
+from .console import Console, count_of, size_of
+from .option_groups import COMMON, check_declared, exclude, flags_set, values_of, with_options
+from .options.cameras import PictureCameras
+from .options.common import General, json_flag
+from .options.cut import Inputs, PictureCut, PictureStreaming, check_scenes
+from .options.pictures import Appearance, Comparison, PictureFiles, check_sizes
 from .paths import claim_stdout, keep_apart, name_outputs
-from .usage import exclude, given, options_of
 
 if TYPE_CHECKING:
-    from ..api.jobs import ViewedFiles
+    from ..api.jobs import Drawn, ViewedFiles
     from ..cameras.path import CameraPath
     from ..images.output import Output
-    from ..images.sequence import PictureSettings
+    from ..images.sequence import Pictures, PictureSettings
     from ..model.instances import Instance
     from ..scenes.loaded import Scenes
-    from .console import Console
 
 EXAMPLES = """
 \b
@@ -46,75 +47,55 @@ Examples:
 """
 
 HEADINGS = (
-    *(COMMON, inputs.HEADING, cameras.HEADING, cut.HEADING, streamed_sog.HEADING, streaming.HEADING),
-    *(appearance.HEADING, comparison.HEADING, pictures.HEADING),
+    *(COMMON, "Inputs", "Cameras", "Cut", "Streamed SOG", "Streaming"),
+    *("Appearance", "Comparison", "Output"),
 )
 
 
 @dataclass(frozen=True)
-class RenderOptions:
-    """The values of the options of the command, group by group."""
+class _General(General):
+    as_json: bool = json_flag("Print what was drawn as one JSON object on standard output.")
 
-    inputs: inputs.Inputs
-    cameras: cameras.PictureCameras
-    cut: cut.PictureCut
-    detail: streamed_sog.Detail
-    streaming: streaming.PictureStreaming
-    appearance: appearance.Appearance
-    comparison: comparison.Comparison
-    pictures: pictures.Pictures
-    general: General
+
+@dataclass(frozen=True)
+class RenderOptions:
+    """Options of the command, group by group."""
+
+    pictures: PictureFiles = field(default_factory=PictureFiles)
+    inputs: Inputs = field(default_factory=Inputs)
+    cameras: PictureCameras = field(default_factory=PictureCameras)
+    cut: PictureCut = field(default_factory=PictureCut)
+    streaming: PictureStreaming = field(default_factory=PictureStreaming)
+    appearance: Appearance = field(default_factory=Appearance)
+    comparison: Comparison = field(default_factory=Comparison)
+    general: _General = field(default_factory=_General)
 
     @classmethod
     def of(cls, ctx: click.Context) -> RenderOptions:
-        """The groups of a command line, checked.
+        """Return the options of a command line, checked.
 
         Raises:
-            click.UsageError: options contradict each other, or have nothing to do.
+            click.UsageError: options contradict each other, or have no effect.
         """
-        read = options_of(ctx, inputs.Inputs)
         if ctx.params["compare"]:
-            name_outputs(ctx, read.first)
-        asked = cls(
-            read,
-            options_of(ctx, cameras.PictureCameras),
-            options_of(ctx, cut.PictureCut),
-            options_of(ctx, streamed_sog.Detail),
-            options_of(ctx, streaming.PictureStreaming),
-            options_of(ctx, appearance.Appearance),
-            options_of(ctx, comparison.Comparison),
-            options_of(ctx, pictures.Pictures),
-            options_of(ctx, General),
-        )
-        asked.comparison.check(ctx, asked.appearance)
-        asked.pictures.check(ctx)
-        asked.cameras.check(ctx)
-        asked.cut.check(ctx)
-        asked.detail.check(ctx)
-        if asked.cut.full:
-            exclude(ctx, streamed_sog.OPTIONS, "--full")
-        asked.streaming.check(ctx)
-        if asked.streaming.after is not None:
-            exclude(ctx, ["full", "continuous", "compare"], "--after")
-        asked.appearance.check(ctx)
-        claim_stdout(ctx, "output", as_json=asked.general.as_json)
-        if not asked.pictures.thumbnail:
-            return asked
-        small = dataclasses.replace(asked.cameras, size=THUMBNAIL_SIZE)
-        fine = dataclasses.replace(asked.appearance, supersample=THUMBNAIL_SUPERSAMPLE)
-        return dataclasses.replace(asked, cameras=small, appearance=fine)
+            name_outputs(ctx, values_of(ctx, Inputs).first)
+        check_declared(ctx)
+        options = values_of(ctx, cls)
+        options.comparison.check(ctx, options.appearance)
+        options.cameras.check(ctx)
+        options.streaming.check(ctx)
+        options.appearance.check(ctx)
+        claim_stdout(ctx, "output", as_json=options.general.as_json)
+        if not options.pictures.thumbnail:
+            return options
+        small = dataclasses.replace(options.cameras, size=THUMBNAIL_SIZE)
+        fine = dataclasses.replace(options.appearance.render, supersample=THUMBNAIL_SUPERSAMPLE)
+        look = dataclasses.replace(options.appearance, render=fine)
+        return dataclasses.replace(options, cameras=small, appearance=look)
 
 
 @click.command("render", cls=Command, headings=HEADINGS, epilog=EXAMPLES, context_settings={"show_default": True})
-@pictures.picture_options
-@inputs.input_options
-@functools.partial(camera_options, still=True)
-@functools.partial(cut.cut_options, pictures=True)
-@streamed_sog.detail_options
-@functools.partial(streaming.streaming_options, pictures=True)
-@appearance.appearance_options
-@comparison.comparison_options
-@functools.partial(common_options, json="Print what was drawn as one JSON object on standard output.")
+@with_options(RenderOptions)
 @click.pass_context
 def render(ctx: click.Context, /, **_: Any) -> None:
     """Draw pictures of splat files as a viewer draws them.
@@ -128,92 +109,91 @@ def render(ctx: click.Context, /, **_: Any) -> None:
 
     Coordinates are those of the files; --up, --world-transform and --camera-axes bring cameras into them.
     """
-    asked = RenderOptions.of(ctx)
-    if asked.comparison.compare:
+    options = RenderOptions.of(ctx)
+    if options.comparison.compare:
         from .render_compare import compare
 
-        ctx.exit(compare(ctx, asked))
-    _draw(ctx, asked)
+        ctx.exit(compare(ctx, options))
+    _draw(ctx, options)
 
 
-def _draw(ctx: click.Context, asked: RenderOptions) -> None:
-    """Draws pictures."""
+def _draw(ctx: click.Context, options: RenderOptions) -> None:
+    """Draw pictures."""
     start = time.perf_counter()
-    look, general = asked.appearance, asked.general
-    budget = None if asked.cut.full else asked.cut.one_budget()
-    instances = asked.inputs.instances()
+    look, general = options.appearance, options.general
+    budget = None if options.cut.full else options.cut.one_budget()
+    instances = options.inputs.instances()
     # What is wrong with the output is said before much is read.
-    _output(ctx, asked, asked.cameras.least_count())
+    _output(ctx, options, options.cameras.least_count())
     with general.console() as console:
         from ..api.jobs import draw_files
-        from .render_text import report
 
         console.announce_compiling()
 
         def place(path: CameraPath) -> tuple[Output, PictureSettings]:
-            return _place(ctx, asked, instances, path)
+            return _place(ctx, options, instances, path)
 
         def ready(path: CameraPath, scenes: Scenes) -> None:
-            streamed_sog.check_scenes(ctx, scenes)
-            for note in (*path.notes, *scenes.notes, *_upside_down(asked, scenes)):
+            check_scenes(ctx, scenes)
+            for note in (*path.notes, *scenes.notes, *_upside_down(options, scenes)):
                 console.say(note)
             console.detail(f"  read in {time.perf_counter() - start:.2f} s")
 
-        with usage_errors(asked):
+        with usage_errors(options):
             drawn = draw_files(
-                viewed_files(asked, instances, console),
+                viewed_files(options, instances, console),
                 budget,
-                asked.cut.settings(1, asked.detail.rule()),
+                options.cut.settings(),
                 look.settings(),
                 place,
                 fit_planes=fit_planes(ctx),
                 through=look.through,
-                loading=asked.streaming.loading(),
-                reference=asked.comparison.diff,
-                overwrite=asked.pictures.overwrite,
+                loading=options.streaming.loading(),
+                reference=options.comparison.diff,
+                overwrite=options.pictures.overwrite,
                 ready=ready,
             )
         console.clear()
-        report(console, drawn, time.perf_counter() - start, as_json=general.as_json)
+        _report(console, drawn, time.perf_counter() - start, as_json=general.as_json)
 
 
-def viewed_files(asked: RenderOptions, instances: list[Instance], console: Console) -> ViewedFiles:
-    """The files and the cameras that look at them."""
+def viewed_files(options: RenderOptions, instances: list[Instance], console: Console) -> ViewedFiles:
+    """Return the files and the cameras that look at them."""
     from ..api.jobs import ViewedFiles
 
     return ViewedFiles(
         instances,
-        asked.cameras.camera_source(),
-        asked.cameras.settings(),
-        asked.cut.precision,
-        asked.general.threads,
+        options.cameras.camera_source(),
+        options.cameras.settings(),
+        options.cut.precision,
+        options.general.threads,
         console.progress,
     )
 
 
 def fit_planes(ctx: click.Context) -> bool:
-    """Whether the near and the far plane may move apart, so that a view of the whole scene clips nothing."""
-    return not given(ctx, ["near", "far"])
+    """Return whether the near and the far plane may move apart, so that a view of the whole scene clips nothing."""
+    return not flags_set(ctx, ["near", "far"])
 
 
 @contextlib.contextmanager
-def usage_errors(asked: RenderOptions) -> Iterator[None]:
-    """Turns errors that the values of options cause into usage errors."""
+def usage_errors(options: RenderOptions) -> Iterator[None]:
+    """Turn errors that the values of options cause into usage errors."""
     from ..api.jobs import UnfitError
 
     try:
-        with asked.cameras.usage_errors():
+        with options.cameras.usage_errors():
             yield
     except UnfitError as error:
         raise click.UsageError(str(error)) from None
 
 
-def _upside_down(asked: RenderOptions, scenes: Scenes) -> list[str]:
-    """Notes on files whose format has y up, where cameras assume that it is down.
+def _upside_down(options: RenderOptions, scenes: Scenes) -> list[str]:
+    """Return notes on files whose format has y up, where cameras assume that it is down.
 
     The default stays: SPZ files converted from trained PLY often keep y down, and so do those of build-lod.
     """
-    if scenes.up is not None or asked.cameras.up is not None or asked.cameras.camera_path is not None:
+    if scenes.up is not None or options.cameras.up is not None or options.cameras.camera_path is not None:
         return []
     plain = (loaded for loaded in scenes.loaded if loaded.scene.format.startswith("SPZ") and not loaded.is_tree)
     return [
@@ -223,18 +203,18 @@ def _upside_down(asked: RenderOptions, scenes: Scenes) -> list[str]:
     ]
 
 
-def _output(ctx: click.Context, asked: RenderOptions, cameras: int) -> Output:
-    """Where the pictures of some cameras go."""
-    assert asked.inputs.first is not None  # or there would be no instances
-    return asked.pictures.place(
-        ctx, asked.inputs.first, cameras, sheet=asked.pictures.sheet or len(asked.cameras.views) > 1
+def _output(ctx: click.Context, options: RenderOptions, cameras: int) -> Output:
+    """Return the output of the pictures of some cameras."""
+    assert options.inputs.first is not None  # or there would be no instances
+    return options.pictures.place(
+        ctx, options.inputs.first, cameras, sheet=options.pictures.sheet or len(options.cameras.views) > 1
     )
 
 
 def _place(
-    ctx: click.Context, asked: RenderOptions, instances: list[Instance], path: CameraPath
+    ctx: click.Context, options: RenderOptions, instances: list[Instance], path: CameraPath
 ) -> tuple[Output, PictureSettings]:
-    """Where the pictures of a path go, and how they become files.
+    """Return the output of the pictures of a path, and how they become files.
 
     Raises:
         click.UsageError: they do not fit into the output, or it would replace an input.
@@ -243,26 +223,77 @@ def _place(
     from ..images import animation
     from ..images.sequence import PictureSettings, frame_rate
 
-    look, output = asked.appearance, _output(ctx, asked, len(path.cameras))
+    look, output = options.appearance, _output(ctx, options, len(path.cameras))
     if output.form == "npy":
         exclude(ctx, look.of_pictures(), "a .npy, which holds numbers")
     settings = PictureSettings(
         background=look.background_for(ctx, output.form),
         bar=not look.no_bar,
-        gain=asked.comparison.gain,
-        jpeg_quality=asked.pictures.jpeg_quality,
-        jobs=asked.pictures.jobs,
-        threads=asked.general.threads,
+        gain=options.comparison.gain,
+        jpeg_quality=options.pictures.jpeg_quality,
+        jobs=options.pictures.jobs,
+        threads=options.general.threads,
     )
-    bar = (look.color_by is not None or asked.comparison.diff is not None) and settings.bar
-    pictures.check_sizes(output, path.cameras, look.supersample, bar=bar)
-    keep_apart(ctx, {**files_read(asked, instances), "output": output.paths(path.numbers)})
-    output.check(path.numbers, overwrite=asked.pictures.overwrite)
+    bar = (look.render.color_by is not None or options.comparison.diff is not None) and settings.bar
+    check_sizes(output, path.cameras, look.render.supersample, bar=bar)
+    keep_apart(ctx, {**files_read(options, instances), "output": output.paths(path.numbers)})
+    output.check(path.numbers, overwrite=options.pictures.overwrite)
     if output.kind == "animation":
         animation.check(output.form, frame_rate(path))
     return output, settings
 
 
-def files_read(asked: RenderOptions, instances: list[Instance]) -> dict[str, list[Path]]:
+def files_read(options: RenderOptions, instances: list[Instance]) -> dict[str, list[Path]]:
     """For `keep_apart`: by the name of an option, the files that it names without being one."""
-    return {"scene": asked.inputs.read(instances), "world_transform": asked.cameras.files()}
+    return {"scene": options.inputs.read(instances), "world_transform": options.cameras.files()}
+
+
+def _report(console: Console, drawn: Drawn, seconds: float, *, as_json: bool) -> None:
+    """Print a line on the pictures, with `as_json` an object too, and a warning if nothing is visible.
+
+    Args:
+        console: prints the line.
+        drawn: the pictures.
+        seconds: duration of the whole command.
+        as_json: print one JSON object on standard output.
+    """
+    written, output, settings = drawn.pictures, drawn.output, drawn.render
+    if not any(frame["splats"] for frame in written.frames):
+        console.say("warning: the picture is empty, for the first chunk has not arrived yet (--after)")
+    elif written.empty:
+        console.say(
+            "warning: nothing is in view; cameras and scene may not share their axes (--camera-axes,"
+            " --world-transform, --up), or nothing lies between --near and --far"
+        )
+    if as_json:
+        whole = {
+            "output": str(output.name),
+            "format": output.form,
+            "kind": output.kind,
+            "bytes": written.bytes,
+            "frames": written.frames,
+            "seconds": round(seconds, 3),
+        }
+        click.echo(json.dumps(whole if written.gain is None else whole | {"gain": written.gain}, allow_nan=False))
+    name = "standard output" if output.name is None else output.name
+    console.say(f"{name}  {_describe(written)}, {seconds:.2f} s")
+    console.detail(
+        f"  {drawn.path.format}, {size_of(written.bytes)} of {output.form}; {settings.style} by {settings.backend},"
+        f" from {settings.raster.near:g} to {settings.raster.far:g} units away"
+    )
+
+
+def _describe(written: Pictures) -> str:
+    """ "60 frames, 1280 x 720, 499,102 to 500,000 splats"."""
+    frames = written.frames
+    sizes = dict.fromkeys(f"{frame['width']} x {frame['height']}" for frame in frames)
+    splats = sorted({frame["splats"] for frame in frames})
+    parts = [count_of(len(frames), "frame")] if len(frames) > 1 else []
+    parts.append(next(iter(sizes)) + (" and others" if len(sizes) > 1 else ""))
+    least = "" if splats[0] == splats[-1] else f"{splats[0]:,} to "
+    parts.append(least + count_of(splats[-1], "splat"))
+    if written.gain is not None:
+        worst = min(frame["psnr_db"] for frame in frames)
+        parts.append(f"PSNR {worst:.2f} dB" + (" or more" if len(frames) > 1 else ""))
+        parts.append(f"differences times {written.gain:g}" if written.gain != 1 else "differences as they are")
+    return ", ".join(parts)

@@ -14,7 +14,7 @@ import click
 from ..support.stdin import DASH
 from .console import Console, count_of, for_screen, is_terminal
 from .options.common import table_form
-from .options.streamed_sog import check_scenes
+from .options.cut import check_scenes
 from .paths import Folder, keep_apart
 
 if TYPE_CHECKING:
@@ -27,17 +27,17 @@ if TYPE_CHECKING:
     from .render import RenderOptions
 
 
-def compare(ctx: click.Context, asked: RenderOptions) -> int:
-    """Compares, writes the table and the charts, and prints the summary; returns the exit status."""
-    budgets = asked.comparison.budgets(asked.cut.budget)
-    asserts = asked.comparison.assertions(budgets)
-    table = _table(asked)
-    instances = asked.inputs.instances()
+def compare(ctx: click.Context, options: RenderOptions) -> int:
+    """Compare, writes the table and the charts, and print the summary; returns the exit status."""
+    budgets = options.comparison.budgets(options.cut.budget)
+    asserts = options.comparison.assertions(budgets)
+    table = _table(options)
+    instances = options.inputs.instances()
     from ..api.jobs import compare_files
     from .render import files_read, fit_planes, usage_errors, viewed_files
 
-    keep_apart(ctx, files_read(asked, instances))
-    with asked.general.console() as console:
+    keep_apart(ctx, files_read(options, instances))
+    with options.general.console() as console:
         console.announce_compiling()
         start = time.perf_counter()
 
@@ -50,75 +50,75 @@ def compare(ctx: click.Context, asked: RenderOptions) -> int:
             console.clear()  # a bar and a table do not go together on one screen
             return for_screen(pieces) if is_terminal(sys.stdout) and table.form != "parquet" else pieces
 
-        with usage_errors(asked):
+        with usage_errors(options):
             compared = compare_files(
-                viewed_files(asked, instances, console),
+                viewed_files(options, instances, console),
                 budgets,
-                _limited(asked),
-                asked.appearance.settings(max_sh=asked.comparison.max_sh),
+                _limited(options),
+                dataclasses.replace(options.appearance.settings(), max_sh=options.comparison.max_sh),
                 table,
                 fit_planes=fit_planes(ctx),
                 asserts=asserts,
-                plot=asked.comparison.plot,
-                overwrite=asked.pictures.overwrite,
+                plot=options.comparison.plot,
+                overwrite=options.pictures.overwrite,
                 ready=ready,
                 passed=passed,
             )
         console.clear()
         console.detail(f"  {compared.pictures:,} pictures, {time.perf_counter() - start:.2f} s")
-        return _report(console, asked, compared, [at for at, _ in asserts])
+        return _report(console, options, compared, [at for at, _ in asserts])
 
 
-def _table(asked: RenderOptions) -> TableOutput:
-    """Where the table goes: nowhere if only the summary is printed, to a terminal or as JSON."""
+def _table(options: RenderOptions) -> TableOutput:
+    """Return the output of the table: none if only the summary is printed, to a terminal or as JSON."""
     from ..tables.comparison import COLUMNS
     from ..tables.output import TableOutput
 
-    output = asked.pictures.output
+    output = options.pictures.output
     assert not isinstance(output, Folder)  # see `name_outputs`
-    nowhere = _on_screen(asked) or (output is None and asked.general.as_json)
+    nowhere = _on_screen(options) or (output is None and options.general.as_json)
     return TableOutput(
         path=None if output == DASH else output,
         form=None if nowhere else table_form("--output", output),
         columns=COLUMNS,
-        overwrite=asked.pictures.overwrite,
+        overwrite=options.pictures.overwrite,
     )
 
 
-def _on_screen(asked: RenderOptions) -> bool:
-    """Whether the summary is printed instead of the table, which would scroll by on a terminal."""
-    return asked.pictures.output is None and not asked.general.as_json and is_terminal(sys.stdout)
+def _on_screen(options: RenderOptions) -> bool:
+    """Return whether the summary is printed instead of the table, which would scroll by on a terminal."""
+    return options.pictures.output is None and not options.general.as_json and is_terminal(sys.stdout)
 
 
-def _limited(asked: RenderOptions) -> LodSettings:
-    """Settings of cuts that only the budget limits, not the size of a pixel, unless a limit was given."""
-    settings = asked.cut.settings(1, asked.detail.rule())
+def _limited(options: RenderOptions) -> LodSettings:
+    """Return settings of cuts that only the budget limits, not the size of a pixel, unless a limit was given."""
+    settings = options.cut.settings()
     if settings.pixel_scale_limit is None and settings.render_scale == 1:
         return dataclasses.replace(settings, pixel_scale_limit=0.0)
     return settings
 
 
-def _report(console: Console, asked: RenderOptions, compared: Compared, about: Sequence[int | None]) -> int:
-    """Prints the results of a comparison; returns the exit status.
+def _report(console: Console, options: RenderOptions, compared: Compared, about: Sequence[int | None]) -> int:
+    """Print the results of a comparison; return the exit status.
 
     Args:
         console: prints them.
-        asked: values of the options.
+        options: values of the options.
         compared: the results.
         about: for each assertion the index of its budget; None for all budgets.
     """
     summary, outcomes = compared.summary, compared.outcomes
-    if asked.general.as_json:
+    if options.general.as_json:
         held = [{"assert": each.assertion.text, "held": each.held, "value": each.value} for each in outcomes]
         figures = [each.as_dict() for each in summary]
         frames = len(compared.path.cameras)
         whole = {"frames": frames, "leaves": compared.leaves, "budgets": figures, "asserts": held}
         click.echo(json.dumps(whole, allow_nan=False))
-    told = lines(summary, compared.path, compared.leaves)
-    if _on_screen(asked):
-        click.echo("\n".join(told))
+    texts = lines(summary, compared.path, compared.leaves)
+    if _on_screen(options):
+        click.echo("\n".join(texts))
     else:
-        for line in told:
+        for line in texts:
             console.say(line)
     for at, outcome in zip(about, outcomes, strict=True):
         of = f", at a budget of {outcome.worst['budget']:,}" if at is None and outcome.worst is not None else ""
@@ -130,7 +130,7 @@ def _report(console: Console, asked: RenderOptions, compared: Compared, about: S
 
 
 def lines(summary: Sequence[BudgetSummary], path: CameraPath, leaves: int) -> Iterator[str]:
-    """The summary as a person reads it; with popping where frames follow each other."""
+    """Yield the summary as a person reads it; with popping where frames follow each other."""
     sizes = list(dict.fromkeys((camera.width, camera.height) for camera in path.cameras))
     size = f"{sizes[0][0]} x {sizes[0][1]}" + (" and others" if len(sizes) > 1 else "")
     yield f"  {count_of(len(path.cameras), 'frame')} of {size}, against {count_of(leaves, 'splat')}, on black and white"

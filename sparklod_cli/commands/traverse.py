@@ -2,27 +2,41 @@
 
 from __future__ import annotations
 
-import functools
 import json
 import sys
 import time
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import click
 
-from .command import COMMON, Command
+from ..simulation.streaming_settings import StreamingSettings
+from ..support.stdin import DASH
+from ..tables.files import FORMS
+from .command import Command
 from .console import Console, for_screen, is_terminal
-from .options import cameras, cut, inputs, streamed_sog, streaming
-from .options import table as tables
-from .options.camera_options import camera_options
-from .options.common import General, common_options
-from .paths import claim_stdout, keep_apart, name_outputs
-from .usage import options_of
+from .option_groups import COMMON, check_declared, exclude, flag, option, refuse, values_of, with_options
+from .options.cameras import Cameras
+from .options.common import (
+    General,
+    assert_errors,
+    assert_option,
+    json_flag,
+    output_option,
+    overwrite_flag,
+    plot_option,
+    table_form,
+)
+from .options.cut import Cut, Inputs, check_scenes
+from .paths import OutputPath, claim_stdout, keep_apart, name_outputs
 
 if TYPE_CHECKING:
     from ..api.jobs import Traversed
     from ..cameras.path import CameraPath
     from ..scenes.loaded import Scenes
+    from ..simulation.outputs import FrameOutputs
+    from ..tables.assertions import Assertion
 
 #: Below this share of splats in front of the cameras, path and scene probably do not share their axes.
 LEAST_IN_FRONT = 0.05
@@ -38,22 +52,112 @@ Examples:
   sparklod traverse scene-lod.spz --look-at 0,-1,4:0,0,0 --indices-out cuts --padded
 """
 
-HEADINGS = (
-    *(COMMON, inputs.HEADING, cameras.HEADING, cut.HEADING, streamed_sog.HEADING),
-    *(streaming.HEADING, tables.HEADING),
-)
+#: Options that say what is in the table.
+OF_TABLES = ("form", "per_instance", "no_timing")
+
+
+@dataclass(frozen=True)
+class FrameTable:
+    """Options of the outputs of a traversal."""
+
+    HEADING: ClassVar[str] = "Output"
+
+    output: Path | None = output_option(
+        "Write the table to FILE: .csv, .json or .parquet; - is standard output.  [default: standard output, but for a"
+        " terminal, which gets the summary]"
+    )
+    overwrite: bool = overwrite_flag()
+    summary: bool | None = option(
+        "Print what the frames come to, on standard error.  [default: if that is a terminal]",
+        flags=("--summary/--no-summary",),
+        heading=COMMON,
+    )
+    asserts: tuple[str, ...] = assert_option(
+        "Condition that must hold, such as 'churn_p95<0.2'; the exit status is 3 if it does not.", heading=COMMON
+    )
+    plot: Path | None = plot_option("Draw charts of the table and the path over the scene, as a .png.", heading=COMMON)
+    form: str | None = option(
+        "Format of the table.  [default: by the suffix of --output, or csv]", tuple(FORMS), flags=("--format",)
+    )
+    per_instance: bool = flag("Write a row for each instance, besides that of all together.")
+    no_timing: bool = flag(
+        "Leave out traverse_ms, the time that each traversal took, so that two runs write the same bytes."
+    )
+    indices_out: Path | None = option(
+        "Write the nodes of every cut to DIR, as .npy of uint32.", OutputPath(folder=True)
+    )
+    padded: bool = flag(
+        "With --indices-out: pad each file to rows of 16,384 nodes, as Spark's index texture has them.",
+        needs="indices_out",
+    )
+
+    def check(self, ctx: click.Context, *, as_json: bool) -> None:
+        """Raise a `click.UsageError` where options contradict each other, or have no effect."""
+        if as_json and self.output is None:
+            exclude(ctx, OF_TABLES, "--json without --output, which writes no table")
+        elif self.summary_on_stdout(as_json=as_json):
+            refuse(ctx, OF_TABLES, "is of the table, and a terminal gets the summary; redirect it, or add --output")
+
+    def summary_on_stdout(self, *, as_json: bool) -> bool:
+        """Return whether the summary is printed instead of the table, which would scroll by on a terminal."""
+        return self.output is None and not as_json and is_terminal(sys.stdout)
+
+    def outputs(self, *, as_json: bool) -> FrameOutputs:
+        """Return the table and the other outputs.
+
+        Raises:
+            click.UsageError: the suffix of --output promises something else.
+        """
+        from ..simulation import columns
+        from ..simulation.outputs import FrameOutputs
+        from ..tables.output import TableOutput
+
+        nowhere = self.output is None and (as_json or self.summary_on_stdout(as_json=as_json))
+        table = TableOutput(
+            path=None if self.output == DASH else self.output,
+            form=None if nowhere else table_form("--output", self.output, self.form),
+            columns=columns.select(timing=not self.no_timing),
+            overwrite=self.overwrite,
+        )
+        return FrameOutputs(table, self.indices_out, self.padded, self.plot, self.overwrite)
+
+    def assertions(self) -> list[Assertion]:
+        """Return the assertions.
+
+        Raises:
+            click.UsageError: an assertion cannot be understood.
+        """
+        from ..simulation.columns import COLUMNS, LOADING
+        from ..tables import assertions
+
+        with assert_errors():
+            return [assertions.parse(text, (*COLUMNS, *LOADING)) for text in self.asserts]
+
+
+HEADINGS = (COMMON, "Inputs", "Cameras", "Cut", "Streamed SOG", "Streaming", "Output")
+
+
+@dataclass(frozen=True)
+class _General(General):
+    as_json: bool = json_flag(
+        "Print the summary as one JSON object on standard output; write a table only to --output."
+    )
+
+
+@dataclass(frozen=True)
+class TraverseOptions:
+    """Options of the command, group by group."""
+
+    table: FrameTable = field(default_factory=FrameTable)
+    inputs: Inputs = field(default_factory=Inputs)
+    cameras: Cameras = field(default_factory=Cameras)
+    cut: Cut = field(default_factory=Cut)
+    streaming: StreamingSettings = field(default_factory=StreamingSettings)
+    general: _General = field(default_factory=_General)
 
 
 @click.command("traverse", cls=Command, headings=HEADINGS, epilog=EXAMPLES, context_settings={"show_default": True})
-@tables.table_options
-@inputs.input_options
-@camera_options
-@cut.cut_options
-@streamed_sog.detail_options
-@streaming.streaming_options
-@functools.partial(
-    common_options, json="Print the summary as one JSON object on standard output; write a table only to --output."
-)
+@with_options(TraverseOptions)
 @click.pass_context
 def traverse(ctx: click.Context, /, **_: Any) -> None:
     """Simulate what a viewer draws of Level-of-Detail files or Streamed SOG along a camera path.
@@ -66,24 +170,19 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
 
     Coordinates are those of the files; --up, --world-transform and --camera-axes bring cameras into them.
     """
-    files, where, lod = options_of(ctx, inputs.Inputs), options_of(ctx, cameras.Cameras), options_of(ctx, cut.Cut)
-    name_outputs(ctx, files.first)
-    network, place, general = (
-        options_of(ctx, streaming.Streaming),
-        options_of(ctx, tables.Table),
-        options_of(ctx, General),
-    )
-    levels = options_of(ctx, streamed_sog.Detail)
-    for group in (where, lod, levels, network):
-        group.check(ctx)
-    place.check(ctx, as_json=general.as_json)
+    name_outputs(ctx, values_of(ctx, Inputs).first)
+    check_declared(ctx)
+    options = values_of(ctx, TraverseOptions)
+    table, general = options.table, options.general
+    options.cameras.check(ctx)
+    table.check(ctx, as_json=general.as_json)
     claim_stdout(ctx, "output", as_json=general.as_json)
-    budget = lod.one_budget()
-    instances = files.instances()
-    besides = {"scene": files.read(instances), "world_transform": where.files()}
+    budget = options.cut.one_budget()
+    instances = options.inputs.instances()
+    besides = {"scene": options.inputs.read(instances), "world_transform": options.cameras.files()}
     keep_apart(ctx, besides)
-    outputs = place.outputs(as_json=general.as_json)
-    asserts = place.assertions()
+    outputs = table.outputs(as_json=general.as_json)
+    asserts = table.assertions()
     start = time.perf_counter()
     with general.console() as console:
         from ..api.jobs import UnfitError, ViewedFiles, traverse_files
@@ -91,23 +190,28 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
         def ready(path: CameraPath, scenes: Scenes) -> None:
             for note in path.notes:
                 console.say(note)
-            streamed_sog.check_scenes(ctx, scenes)
+            check_scenes(ctx, scenes)
             keep_apart(ctx, {**besides, "indices_out": outputs.index_files(path.numbers, len(instances))})
 
         console.announce_compiling()
         screen = outputs.table.on_stdout and is_terminal(sys.stdout)
-        files_viewed = ViewedFiles(
-            instances, where.camera_source(), where.settings(), lod.precision, general.threads, console.progress
+        files = ViewedFiles(
+            instances,
+            options.cameras.camera_source(),
+            options.cameras.settings(),
+            options.cut.precision,
+            general.threads,
+            console.progress,
         )
         try:
-            with where.usage_errors():
+            with options.cameras.usage_errors():
                 traversed = traverse_files(
-                    files_viewed,
+                    files,
                     budget,
-                    lod.settings(1, levels.rule()),
-                    network.settings(),
+                    options.cut.settings(),
+                    options.streaming,
                     outputs,
-                    by_instance=place.per_instance,
+                    by_instance=table.per_instance,
                     asserts=asserts,
                     ready=ready,
                     passed=for_screen if screen and outputs.table.form != "parquet" else None,
@@ -125,12 +229,12 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
                 f"warning: only {written.in_front:.1%} of the splats lie in front of the cameras; path and scene may"
                 " not share their axes (--camera-axes, --world-transform, --up)"
             )
-        on_stdout = place.summary_on_stdout(as_json=general.as_json)
-        ctx.exit(_report(console, traversed, place.summary, as_json=general.as_json, on_stdout=on_stdout))
+        on_stdout = table.summary_on_stdout(as_json=general.as_json)
+        ctx.exit(_report(console, traversed, table.summary, as_json=general.as_json, on_stdout=on_stdout))
 
 
 def _report(console: Console, traversed: Traversed, summary: bool | None, *, as_json: bool, on_stdout: bool) -> int:
-    """Prints the results of a traversal; returns the exit status.
+    """Print the results of a traversal; return the exit status.
 
     Args:
         console: prints them on standard error.

@@ -51,7 +51,7 @@ STOPS = {
 
 
 def lines(summary: Summary) -> list[str]:
-    """The lines of a summary, none longer than `WIDTH`."""
+    """Return the lines of a summary, none longer than `WIDTH`."""
     return [_cut(line) for line in _lines(summary)]
 
 
@@ -80,7 +80,7 @@ def _row(name: str, text: str) -> str:
 
 
 def _loading(figures: Row) -> str:
-    """What a visitor waits for who opens the page in front of the first camera."""
+    """Return a phrase on the waiting times of a visitor who opens the page in front of the first camera."""
     parts = []
     for what, name in (("first picture", "first_picture"), ("90 %", "resident_90"), ("all", "resident_all")):
         seconds, size = figures[f"{name}_s"], figures.get(f"{name}_bytes")
@@ -103,7 +103,7 @@ def _moment(moment: Moment) -> str:
 
 
 def _said(value: float, style: str) -> str:
-    """A number with its unit."""
+    """Return a number with its unit."""
     if style == "count":
         return f"{round(value):,}"
     if style == "share":

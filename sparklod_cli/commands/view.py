@@ -3,23 +3,25 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import json
 import os
 import sys
 import threading
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import click
 
 from ..support.printable import printable
-from .command import COMMON, Command
+from ..support.setting_fields import Quantity, Range, whole
+from ..support.units import parse_count
+from .command import Command
 from .console import Console, count_of, size_of
-from .options.common import General, common_options
-from .options.viewing import PAGE, SERVER, Page, Place, view_options
-from .paths import InputPath, keep_apart
-from .usage import options_of
+from .option_groups import COMMON, argument, check_declared, flag, option, values_of, with_options
+from .options.common import General, json_flag, overwrite_flag, quiet_flag, verbose_flag
+from .parameter_types import Direction, View
+from .paths import InputPath, OutputPath, keep_apart
 
 if TYPE_CHECKING:
     from ..api.viewing import Prepared, Server
@@ -38,19 +40,88 @@ Examples:
 """
 
 
-@click.command(
-    "view", cls=Command, headings=(COMMON, PAGE, SERVER), epilog=EXAMPLES, context_settings={"show_default": True}
-)
-@click.argument("files", metavar="FILE...", nargs=-1, required=True, type=InputPath())
-@view_options
-@functools.partial(
-    common_options,
-    json="Print the address and the files as one JSON object on standard output.",
-    quiet="Print nothing but the address, and errors.",
-    verbose="Print each request.",
-)
+@dataclass(frozen=True)
+class _Page:
+    """Options of what the page shows at first, and what it is made of."""
+
+    HEADING: ClassVar[str] = "Page"
+
+    look_at: Any = option(
+        "Place the camera at EYE, looking at TARGET, each x,y,z.  [default: it sees the whole scene]",
+        View(),
+        heading=COMMON,
+    )
+    camera_path: Path | None = option(
+        "Play the cameras of a file, or of a folder written by COLMAP.", InputPath(), heading=COMMON
+    )
+    spark_dir: Path | None = option(
+        "Take Spark, or PlayCanvas, and three.js from the node_modules of a folder.  [default: from a CDN]",
+        InputPath(),
+        heading=COMMON,
+        metavar="DIR",
+    )
+    budget: int | None = option(
+        "Most splats of trees that are drawn, such as 500k.  [default: as Spark chooses for the device]",
+        Quantity("N", parse_count, whole(1)),
+    )
+    up: tuple[float, float, float] | None = option(
+        "Direction that is up, as an axis such as -y or as x,y,z.  [default: the axis that the files note, or -y, as"
+        " training leaves scenes]",
+        Direction(),
+    )
+    fov: float | None = option(
+        "Vertical field of view, in degrees.  [default: 60]", Range(above=0, below=180, unit="DEGREES")
+    )
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Options of where the page is served, or written."""
+
+    HEADING: ClassVar[str] = "Server"
+
+    export: Path | None = option(
+        "Write the page and the files into a folder, for any web server, in place of serving them.",
+        OutputPath(folder=True),
+        heading=COMMON,
+        excludes=("host", "port", "cors", "no_open"),
+    )
+    overwrite: bool = overwrite_flag(needs="export")
+    port: int = option("Port to listen on.", whole(0, 65_535), 0, show_default="any that is free")
+    host: str = option(
+        "Address to listen on; 0.0.0.0 lets everybody on the network read the files.",
+        default="127.0.0.1",
+        metavar="NAME",
+        show_default="127.0.0.1, for this machine alone",
+    )
+    cors: bool = flag("Let pages of other origins read the files.")
+    no_open: bool = flag("Open no browser.")
+
+
+@dataclass(frozen=True)
+class _General(General):
+    as_json: bool = json_flag("Print the address and the files as one JSON object on standard output.")
+    quiet: bool = quiet_flag("Print nothing but the address, and errors.")
+    verbose: bool = verbose_flag("Print each request.")
+
+
+@dataclass(frozen=True)
+class _ViewOptions:
+    """Options of the command, group by group."""
+
+    files: tuple[Path, ...] = argument(InputPath(), metavar="FILE...", required=True)
+    page: _Page = field(default_factory=_Page)
+    place: _Place = field(default_factory=_Place)
+    general: _General = field(default_factory=_General)
+
+
+HEADINGS = (COMMON, "Page", "Server")
+
+
+@click.command("view", cls=Command, headings=HEADINGS, epilog=EXAMPLES, context_settings={"show_default": True})
+@with_options(_ViewOptions)
 @click.pass_context
-def view(ctx: click.Context, /, files: tuple[Path, ...], **_: Any) -> None:
+def view(ctx: click.Context, /, **_: Any) -> None:
     """Show splat files in Spark or PlayCanvas, in a browser.
 
     Serves a page and the files that it shows, prints its address and opens it in a browser, until Ctrl-C ends it. The
@@ -61,9 +132,10 @@ def view(ctx: click.Context, /, files: tuple[Path, ...], **_: Any) -> None:
     PlayCanvas, everything else in Spark; both, and three.js, come from a CDN unless --spark-dir names a folder that
     has them.
     """
-    general, page, place = options_of(ctx, General), options_of(ctx, Page), options_of(ctx, Place)
+    options = values_of(ctx, _ViewOptions)
+    files, page, place, general = options.files, options.page, options.place, options.general
     keep_apart(ctx)
-    place.check(ctx)
+    check_declared(ctx)
     with general.console() as console:
         from ..api import viewing
 
@@ -87,7 +159,7 @@ def view(ctx: click.Context, /, files: tuple[Path, ...], **_: Any) -> None:
 
 
 def _serve(console: Console, server: Server, prepared: Prepared, *, opens: bool, as_json: bool) -> None:
-    """Serves until an interrupt, which is how a server ends."""
+    """Serve until an interrupt, which is how a server ends."""
     with server, contextlib.suppress(KeyboardInterrupt):
         click.echo(json.dumps({"url": server.url, "files": _files(prepared)}) if as_json else server.url)
         sys.stdout.flush()
@@ -101,7 +173,7 @@ def _serve(console: Console, server: Server, prepared: Prepared, *, opens: bool,
 
 
 def _open(console: Console, url: str) -> None:
-    """Opens a browser, or says that there is none."""
+    """Open a browser, or says that there is none."""
     import webbrowser
 
     # Without a display, Python would start a browser for terminals, in ours.

@@ -6,28 +6,32 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from ..support.setting_fields import CheckedSettings, setting, whole
+
 if TYPE_CHECKING:
     from ..cameras.path import CameraPath
 
-#: The most steps that can be asked for, far more than pay, and hours of work; and the largest seed.
-MOST_STEPS, MOST_SEED = 1_000_000, (1 << 32) - 1
+#: Numbers of steps, up to far more than pay, and hours of work; and seeds.
+STEPS, SEED = whole(1, 1_000_000), whole(0, (1 << 32) - 1)
 
 #: Shares of the leaves at which trees are judged.
 SHARES = (0.02, 0.05, 0.1, 0.25, 0.5)
 
 
 @dataclass(frozen=True)
-class FitSettings:
+class FitSettings(CheckedSettings):
     """Settings of fitting the merged splats of a tree.
 
     Attributes:
-        steps: pictures of cuts that are drawn and compared; None for a number that suits the size of the tree.
-        seed: of the cameras and budgets that are drawn at random; 0 or more.
         path: training cameras; None for cameras that are placed around and inside the scene.
     """
 
-    steps: int | None = None
-    seed: int = 0
+    steps: int | None = setting(
+        None,
+        "Pictures of cuts that are drawn and compared; None for a number that suits the size of the tree.",
+        STEPS,
+    )
+    seed: int = setting(0, "Seed of the cameras and budgets that --refine draws at random.", SEED, needs="refine")
     path: CameraPath | None = None
 
 

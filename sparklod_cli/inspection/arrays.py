@@ -38,7 +38,7 @@ class Facts:
 
 
 def examine(arrays: Arrays, settings: ReportSettings, *, threads: int = 1) -> tuple[Facts, Scene | None]:
-    """Examines the arrays of one of `gpu.table.ENCODINGS`; returns the facts, and the splats if they are complete.
+    """Examines the arrays of one of `codecs.formats.ENCODINGS`; returns the facts, and the splats if they are complete.
 
     Args:
         arrays: by name; the names identify the encoding.

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from ..codecs.promises import Violation
-from ..codecs.rad.promises import ERRORS as RAD_ERRORS
-from ..codecs.rad.promises import WARNINGS as RAD_WARNINGS
-from ..codecs.streamed_sog.promises import ERRORS as STREAMED_SOG_ERRORS
-from ..codecs.streamed_sog.promises import WARNINGS as STREAMED_SOG_WARNINGS
+from ..codecs.rad.rad_rules import ERRORS as RAD_ERRORS
+from ..codecs.rad.rad_rules import WARNINGS as RAD_WARNINGS
+from ..codecs.streamed_sog.manifest_rules import ERRORS as STREAMED_SOG_ERRORS
+from ..codecs.streamed_sog.manifest_rules import WARNINGS as STREAMED_SOG_WARNINGS
+from ..codecs.validation import RuleViolation
 
 ERROR, WARNING, NOTE = "error", "warning", "note"
 
@@ -97,7 +97,7 @@ class Finding:
         return CODES[self.code][0]
 
 
-def findings_of(violations: Iterable[Violation]) -> list[Finding]:
+def findings_of(violations: Iterable[RuleViolation]) -> list[Finding]:
     """A finding for each code: the text of its first violation, and how many more there are."""
     by_code: dict[str, list[str]] = {}
     for each in violations:

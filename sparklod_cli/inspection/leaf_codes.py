@@ -11,15 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..codecs import coverage
-from ..codecs.octahedral import STEPS_8_8_8, encode_axis_angle, encode_lod_alpha
-from ..codecs.rad.encoding import rounded
-from ..codecs.rad.encodings import CODINGS
-from ..codecs.rad.layout import PROPERTIES, Row
-from ..codecs.sh_bits import ALL_BITS, ShBytes, enough
+from ..codecs.rad.property_codings import CODINGS
+from ..codecs.rad.rad_encoder import rounded
+from ..codecs.rad.rad_layout import PROPERTIES, Row
+from ..codecs.spark_codings import STEPS_8_8_8, encode_axis_angle, encode_lod_alpha
+from ..codecs.spz_encoder import to_code
 from ..codecs.spz_layout import LOD, Layout
-from ..codecs.spz_values import to_code
-from ..codecs.statistics import Statistics
-from ..codecs.steps import fine_bits
+from ..codecs.statistics import ALL_BITS, ShBytes, Statistics, enough, fine_bits
 from ..model.scene import Scene
 from ..model.sh import COEFFICIENTS
 from ..model.splats import FloatArray, Splats

@@ -7,12 +7,10 @@ from collections import Counter
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from ..codecs.rad.codec import name_of
-from ..codecs.rad.encodings import LARGEST_F16
-from ..codecs.rad.header import ENCODING_KEYS
-from ..codecs.rad.layout import BY_NAME, PROPERTIES, SIZES
-from ..codecs.rad.records import RadChunkHeader, RadHeader
-from ..codecs.rad.survey import survey_chunks, survey_file
+from ..codecs.rad.property_codings import LARGEST_F16
+from ..codecs.rad.rad_header import ENCODING_KEYS, RadChunkHeader, RadHeader
+from ..codecs.rad.rad_layout import BY_NAME, PROPERTIES, SIZES
+from ..codecs.rad.rad_reader import scan_chunks, scan_header
 from ..codecs.splat_encoding import log_scale_table
 from ..io import opened
 from ..support.printable import MOST, printable
@@ -110,10 +108,10 @@ def survey(path: Path, *, check: bool) -> Survey | None:
     with opened(path) as (file, form, more):
         if form.name != FORMAT:
             return None
-        header, violations = survey_file(file, more["beside"])
+        header, violations = scan_header(file, more["beside"])
         gathered = _Gathered()
         if not any(each.fatal for each in violations):
-            for chunk in survey_chunks(file, more["beside"], header, paddings=check):
+            for chunk in scan_chunks(file, more["beside"], header, paddings=check):
                 violations += chunk.violations
                 if chunk.header is not None:
                     gathered.add(chunk.header)
@@ -122,7 +120,7 @@ def survey(path: Path, *, check: bool) -> Survey | None:
         return Survey(None, None, findings_of(violations), fatal)
     facts = _facts(header, gathered)
     noted = header.noted
-    head = Head(name_of(header), facts.bytes, header.count, header.max_sh, noted.antialiased, noted.up)
+    head = Head(header.format, facts.bytes, header.count, header.max_sh, noted.antialiased, noted.up)
     return Survey(head, facts, findings_of(violations), [])
 
 

@@ -12,8 +12,7 @@ import numpy as np
 from ..codecs.stream import size_of
 from ..codecs.streamed_sog.chunks import Chunk
 from ..codecs.streamed_sog.manifest import VERSION, Manifest, ManifestNode
-from ..codecs.streamed_sog.promises import level_counts
-from ..codecs.streamed_sog.survey import survey_file, survey_splats
+from ..codecs.streamed_sog.manifest_rules import level_counts, scan_files, scan_splats
 from ..io import opened
 from ..support.printable import MOST, printable
 from ..support.progress import Progress, silent
@@ -131,12 +130,12 @@ def survey(path: Path, *, check: bool, threads: int = 1, progress: Progress = si
         if form.name != FORMAT:
             return None
         size = size_of(file)
-        manifest, files, violations = survey_file(file, more["beside"])
+        manifest, files, violations = scan_files(file, more["beside"])
         fatal = [each for each in violations if each.fatal]
         if fatal:
             return Survey(None, None, findings_of(violations), findings_of(fatal))
         if check:
-            found = survey_splats(more["beside"], manifest, files, threads=threads, progress=progress)
+            found = scan_splats(more["beside"], manifest, files, threads=threads, progress=progress)
             violations = [*violations, *found]
     chunks = {name: chunk for name, chunk in files.items() if isinstance(chunk, Chunk)}
     facts = _facts(manifest, chunks, size)

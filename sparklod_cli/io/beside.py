@@ -7,9 +7,8 @@ from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import BinaryIO
 
+from ..codecs.file_names import MANIFEST, META
 from ..codecs.formats import HEAD, sniff
-from ..codecs.sog.names import META
-from ..codecs.streamed_sog.names import MANIFEST
 from ..support.addresses import Place
 from ..support.errors import FormatError, UnreadableError
 from ..support.stdin import DASH
@@ -49,7 +48,7 @@ def _named_in(path: Path) -> list[Path]:
         form = sniff(head, "")
         if form is not None and not form.companions:
             return []
-        from ..codecs.rad import header as rad_header  # what most jobs do without, as what follows
+        from ..codecs.rad import rad_header  # what most jobs do without, as what follows
         from ..codecs.streamed_sog.manifest import MAX_MANIFEST, parse
 
         file.seek(0)
@@ -63,7 +62,7 @@ def _named_in(path: Path) -> list[Path]:
 
 def _images_of(path: Path) -> list[Path]:
     """Return the images that the meta.json of an unpacked SOG names."""
-    from ..codecs.sog.files import MAX_META, names_beside
+    from ..codecs.sog.sog_container import MAX_META, names_beside
 
     if not path.is_file() or path.stat().st_size > MAX_META:
         return []

@@ -9,10 +9,9 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..codecs.sog.files import MAX_META, names_beside
-from ..codecs.sog.names import META
+from ..codecs.file_names import META, chunk_folder, folders_of, is_chunk_folder, is_in_manifest, is_of_streamed_sog
+from ..codecs.sog.sog_container import MAX_META, names_beside
 from ..codecs.streamed_sog.manifest import MAX_MANIFEST, Manifest, parse
-from ..codecs.streamed_sog.names import chunk_name, folders_of, is_folder, is_named, is_ours
 from ..support import atomic, atomic_set
 from ..support.addresses import Address, Place
 from ..support.errors import FormatError, OutputError
@@ -23,7 +22,7 @@ from .reading import opened
 from .writing import Files, SinkTogether, check_header, send_together
 
 #: The folder that every output has.
-FIRST = chunk_name(0, 0)
+FIRST = chunk_folder(0, 0)
 
 
 def detail_sink(path: Place, *, overwrite: bool) -> SinkTogether:
@@ -121,11 +120,12 @@ def _former(target: Place) -> list[str]:
         metas = parse(_content(target, MAX_MANIFEST)).names()
         for meta in metas:
             folder = target.parent / meta.partition("/")[0]
-            if is_named(meta) and not (isinstance(folder, Path) and folder.is_symlink()):
+            if is_in_manifest(meta) and not (isinstance(folder, Path) and folder.is_symlink()):
                 found.append(meta)
                 with contextlib.suppress(OSError):
                     images = names_beside(_content(target.parent / meta, MAX_META))
-                    found += [name for name in (meta.removesuffix(META) + image for image in images) if is_ours(name)]
+                    names = (meta.removesuffix(META) + image for image in images)
+                    found += [name for name in names if is_of_streamed_sog(name)]
     standing = set(_standing(target))
     return [name for name in dict.fromkeys(found) if name in standing]
 
@@ -138,13 +138,13 @@ def _content(path: Place, most: int) -> bytes:
 def _standing(target: Place) -> list[str]:
     """Return the files in folders beside a manifest that are called as those of an output."""
     if isinstance(target, Address):
-        return sorted(name for name in target.parent.files() if is_ours(name))
+        return sorted(name for name in target.parent.files() if is_of_streamed_sog(name))
     found = list[str]()
     with contextlib.suppress(OSError):
         for folder in target.parent.iterdir():
-            if is_folder(folder.name) and folder.is_dir() and not folder.is_symlink():
+            if is_chunk_folder(folder.name) and folder.is_dir() and not folder.is_symlink():
                 found += [f"{folder.name}/{file.name}" for file in folder.iterdir()]
-    return sorted(name for name in found if is_ours(name))
+    return sorted(name for name in found if is_of_streamed_sog(name))
 
 
 @dataclass(frozen=True)

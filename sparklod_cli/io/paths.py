@@ -8,8 +8,7 @@ import stat
 from pathlib import Path, PurePath
 from typing import BinaryIO
 
-from ..codecs.rad import names as rad_names
-from ..codecs.sog import names as sog_names
+from ..codecs.file_names import META, rad_chunk_number, sog_image_number
 from ..support.printable import near
 
 #: Names in a folder that are compared with one that is missing: more take longer than a person expects of an error.
@@ -39,9 +38,9 @@ def number_of(name: str, header: str) -> int | None:
 
     They are the images of a meta.json, and the chunks of any other header.
     """
-    if header.lower() == sog_names.META:
-        return sog_names.number_of(name)
-    return rad_names.number_of(name, PurePath(header).stem)
+    if header.lower() == META:
+        return sog_image_number(name)
+    return rad_chunk_number(name, PurePath(header).stem)
 
 
 def reason_unreadable(error: OSError) -> str:

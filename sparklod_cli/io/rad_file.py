@@ -9,13 +9,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from ..codecs.promises import check
-from ..codecs.rad import promises
-from ..codecs.rad.by_chunk import ByChunk, bytes_decoded
-from ..codecs.rad.codec import RadChunk, name_of, read_chunk
-from ..codecs.rad.header import read_header
-from ..codecs.rad.places import file_of
-from ..codecs.rad.records import RadHeader
+from ..codecs.rad import rad_rules
+from ..codecs.rad.codec import RadChunk, read_chunk
+from ..codecs.rad.rad_header import RadHeader, read_header
+from ..codecs.rad.rad_reader import RadReader, decoded_bytes, file_of
+from ..codecs.validation import check_rules
 from ..model.lod_tree import LodTree
 from ..model.scene import FileCoding
 from ..model.splats import FloatArray, Splats
@@ -30,7 +28,7 @@ FORMAT = "RAD"
 
 #: Files whose decoded columns take more bytes than this, or than this share of the free memory, are read chunk by
 #: chunk: what is computed of them takes as much again, and chunk by chunk is no slower
-#: (docs/decisions/2026-11-22-files-larger-than-memory.md).
+#: (docs/decisions/14-cuts.md).
 AT_ONCE, SHARE = 1 << 28, 0.25
 
 
@@ -47,7 +45,7 @@ class RadFile:
     path: Path
     header: RadHeader
     about: Mapping[str, int]
-    _chunks: ByChunk = field(repr=False)
+    _reader: RadReader = field(repr=False)
 
     @classmethod
     def open(cls, path: Path) -> RadFile | None:
@@ -59,13 +57,13 @@ class RadFile:
         with _opened(path) as found:
             if found is None:
                 return None
-            chunks = ByChunk.of(*found)
-        return cls(path, chunks.header, chunks.facts, chunks)
+            reader = RadReader.open(*found)
+        return cls(path, reader.header, reader.facts, reader)
 
     @property
     def format(self) -> str:
         """As `Scene.format`."""
-        return name_of(self.header)
+        return self.header.format
 
     @property
     def chunk_bytes(self) -> tuple[int, ...]:
@@ -76,7 +74,7 @@ class RadFile:
     def fits(self) -> bool:
         """Whether it is small enough to be read at once."""
         free = available_memory()
-        return bytes_decoded(self.header) <= (AT_ONCE if free is None else min(AT_ONCE, SHARE * free))
+        return decoded_bytes(self.header) <= (AT_ONCE if free is None else min(AT_ONCE, SHARE * free))
 
     def chunks(
         self, columns: Collection[str], *, thorough: bool, threads: int
@@ -92,7 +90,7 @@ class RadFile:
         """
         with _opened(self.path) as found:
             assert found is not None
-            yield from self._chunks.read_all(*found, columns, thorough=thorough, threads=threads)
+            yield from self._reader.reopened(*found).chunks(columns, thorough=thorough, threads=threads)
 
     def chunk(self, number: int, columns: Collection[str]) -> tuple[Splats, LodTree | None, FileCoding]:
         """Return one chunk and its coding; only these columns are unpacked. Several threads may ask.
@@ -102,7 +100,7 @@ class RadFile:
         """
         with _opened(self.path) as found:
             assert found is not None
-            return self._chunks.read(number, *found, columns, thorough=False)
+            return self._reader.reopened(*found).chunk(number, columns)
 
 
 @contextlib.contextmanager
@@ -156,5 +154,5 @@ def _opened_plain(path: Path) -> Iterator[BinaryIO]:
 
 def _header(file: BinaryIO) -> RadHeader:
     header = read_header(file)
-    check(promises.violations(header))
+    check_rules(rad_rules.violations(header))
     return header

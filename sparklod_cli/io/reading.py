@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 from ..codecs import rgba
+from ..codecs.content import Content, Source
 from ..codecs.encoder import Stored
-from ..codecs.formats import FORMATS, HEAD, Format, sniff
-from ..codecs.gpu.table import NPZ, RAW_SUFFIXES
+from ..codecs.formats import FORMATS, HEAD, NPZ, RAW_SUFFIXES, Format, sniff
 from ..model.scene import DetailScene, Scene
 from ..model.splats import COLUMNS, FloatArray
 from ..support.addresses import Place, size_of
@@ -41,8 +41,8 @@ def read_scene(path: Place, *, threads: int = 1, progress: Progress = silent) ->
         FormatError: it is not a file, empty, of no known format, or broken.
     """
     with opened(path) as (file, form, more):
-        scene: Scene = form.codec().decode(file, threads=threads, progress=progress, **more)
-    return scene
+        content: Content = form.codec().open_content(Source(file, threads=threads, **more))
+        return content.scene(threads=threads, progress=progress)
 
 
 def read_stored(path: Place) -> Stored:
@@ -89,12 +89,8 @@ def examine_scene(
         FormatError: as `read_scene`, but for the tree.
     """
     with opened(path) as (file, form, more):
-        codec = form.codec()
-        if form.selective:
-            scene: Scene = codec.examine(file, columns=columns, threads=threads, progress=progress, **more)
-        else:
-            scene = codec.decode(file, threads=threads, progress=progress, **more)
-    return scene
+        content: Content = form.codec().open_content(Source(file, threads=threads, **more))
+        return content.scene(columns=columns, threads=threads, progress=progress, validate=False)
 
 
 def read_coded(

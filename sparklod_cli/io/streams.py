@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, Protocol
 
+from ..codecs.content import Content, Source
 from ..model.splats import Splats
 from ..model.streams import Placed, SceneStream, merged
 from ..model.transforms import Transform
@@ -256,10 +257,9 @@ class _Source:
 
         with contextlib.ExitStack() as stack:
             file, form, more = stack.enter_context(opened(self.path))
-            codec: Any = form.codec()
-            stream: SceneStream = codec.stream(
-                file, scratch=scratch, threads=self.threads, progress=self.progress, **more
-            )
+            source = Source(file, scratch=scratch, threads=self.threads, progress=self.progress, **more)
+            content: Content = form.codec().open_content(source)
+            stream = content.stream(self.threads)
             closing = stack.pop_all()
         return closing, stream
 

@@ -24,7 +24,7 @@ from ..support.stdout import ReaderGoneError, guarded
 from .paths import number_of, reason_of
 
 if TYPE_CHECKING:
-    from ..codecs.rad.repacking import PackedChunks
+    from ..codecs.rad.rad_reader import RadReader
 
 
 #: Path or address of a header.
@@ -286,7 +286,7 @@ class SceneSink:
             return self.together((name, (content,)) for name, content in files)
         return self.together(codec.encode_chunked(scene, options, self.stem, threads=threads, progress=progress))
 
-    def repack(self, chunks: PackedChunks) -> int:
+    def repack(self, chunks: RadReader) -> int:
         """Write the chunks of a RAD file as they stand, and return how many bytes were written.
 
         Raises:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..codecs.sound import check_valid
+from ..codecs.validation import check_valid
 from ..model.splats import Splats
 from ..support.errors import InvalidSplatsError
 from ..support.jit import threads_for

@@ -7,18 +7,20 @@ from dataclasses import dataclass, field
 
 from ..model.instances import SPARK, Foveation
 from ..support.defaults import PRESETS
+from ..support.setting_fields import CheckedSettings, Range, setting
 from .detail_rule import DetailRule
+
+#: Factors that the traversal multiplies in float32.
+FACTOR = Range(0, 10**12)
 
 
 @dataclass(frozen=True)
-class LodSettings:
+class LodSettings(CheckedSettings):
     """How a viewer finds its cuts.
 
     Attributes:
         budget: maximum number of splats, all instances together; by default that of Spark 2 on a desktop.
         foveation: weight of nodes by direction, for instances without their own foveation; by default Spark 2's.
-        pixel_scale_limit: nodes of this pixel scale or less are not refined; None for the pixel scale of a pixel.
-        render_scale: multiplies the pixel scale of a pixel, Spark's `lodRenderScale`.
         continuous: width of continuous cuts, the ratio of the pixel scales between which a node fades into its
             children, above 1 (see `continuous`); None for ordinary cuts.
         detail: how detail levels of Streamed SOG are chosen; all but this and the budget is of trees.
@@ -26,8 +28,16 @@ class LodSettings:
 
     budget: int = PRESETS["desktop"]
     foveation: Foveation = SPARK
-    pixel_scale_limit: float | None = None
-    render_scale: float = 1.0
+    pixel_scale_limit: float | None = setting(
+        None,
+        "Stop refining nodes of this size over distance, or smaller.  [default: that of a pixel, times"
+        " --lod-render-scale]",
+        FACTOR,
+        excludes=("lod_render_scale",),
+    )
+    render_scale: float = setting(
+        1.0, "Stop refining nodes smaller than this many pixels.", FACTOR, name="lod_render_scale"
+    )
     continuous: float | None = None
     detail: DetailRule = field(default_factory=DetailRule)
 

@@ -6,7 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from ..support.defaults import MAX_SH_DEGREE
+from ..support.defaults import FARTHEST, MAX_SH_DEGREE, MAX_SUPERSAMPLE
+from ..support.setting_fields import CheckedSettings, Range, setting, whole
+from .backends import BACKENDS
 
 #: Pixels squared that are added to the covariance on the screen, for which opacity makes up: Spark's `blurAmount`.
 BLUR = 0.3
@@ -33,44 +35,74 @@ SORTINGS = ("exact", "counting16")
 #: What splats are sorted by: the distance from the camera, or along its axis.
 SORTS = ("radial", "z")
 
+#: Distances of the near and the far plane, world units.
+DISTANCE = Range(above=0, most=FARTHEST, unit="D")
+
 
 @dataclass(frozen=True)
-class RasterSettings:
+class RasterSettings(CheckedSettings):
     """How splats become pixels.
 
+    Both profiles are exp(-z^2 / 2) up to D = 1. Above, Spark's is 1 - (1 - exp(-z^2 / 2)) ** exp((D^2 - 1) / e), and
+    that of its LoD design exp(-D / 2 * (z - (D - 1))^2).
+
     Attributes:
-        near, far: splats nearer or farther along the axis are not drawn, world units.
-        profile: one of `PROFILES`; both are exp(-z^2 / 2) up to D = 1. Above, Spark's is
-            1 - (1 - exp(-z^2 / 2)) ** exp((D^2 - 1) / e), and that of its LoD design exp(-D / 2 * (z - (D - 1))^2).
-        sort: one of `SORTS`.
         max_radius: no splat is drawn farther from its centre, pixels.
     """
 
-    near: float = 0.01
-    far: float = 1000.0
-    profile: str = PROFILES[0]
-    sort: str = SORTS[0]
+    near: float = setting(
+        0.01,
+        "Distance of the near plane along the optical axis, in world units; nearer splats are left out."
+        "  [default: 0.01, or less where the camera is chosen for the scene]",
+        DISTANCE,
+    )
+    far: float = setting(
+        1000.0,
+        "Distance of the far plane along the optical axis, in world units; farther splats are left out."
+        "  [default: 1000, or more where the camera is chosen for the scene]",
+        DISTANCE,
+    )
+    profile: str = setting(
+        PROFILES[0],
+        "Falloff of splats with a LoD opacity above 1: as Spark 2 draws it (spark), or as its LoD design describes it"
+        " (shifted).",
+        PROFILES,
+    )
+    sort: str = setting(
+        SORTS[0], "Order of the splats: by distance from the camera (radial), or along its axis (z).", SORTS
+    )
     max_radius: float = MAX_PIXEL_RADIUS
 
 
 @dataclass(frozen=True)
-class RenderSettings:
+class RenderSettings(CheckedSettings):
     """How pictures are drawn.
 
     Attributes:
         raster: how splats become pixels.
-        style: one of `STYLES`.
-        backend: a name in `backends.BACKENDS`.
-        color_by: one of `COLOR_BY`; None for the colours of the splats.
-        supersample: samples along each side of a pixel, which is their mean.
         max_sh: degrees of spherical harmonics above this are left out.
         options: of the backend.
     """
 
     raster: RasterSettings = field(default_factory=RasterSettings)
-    style: str = "splats"
-    backend: str = "numba"
-    color_by: str | None = None
-    supersample: int = 1
+    style: str = setting(
+        STYLES[0],
+        "Shape of each splat: its Gaussian, one opaque pixel (points), or an opaque disc, in the order of the file"
+        " (billboards) or from far to near (sorted-billboards).",
+        STYLES,
+    )
+    backend: str = setting(
+        "numba",
+        "Renderer: numba is the reference, osmesa is OpenGL in software, open3d is a quick look.",
+        tuple(BACKENDS),
+    )
+    color_by: str | None = setting(
+        None,
+        "Colour splats by a quantity, unlit, with a colour bar beside the picture.  [default: their own colours]",
+        COLOR_BY,
+    )
+    supersample: int = setting(
+        1, "Draw each pixel as the mean of N x N samples, up to 4 x 4.", whole(1, MAX_SUPERSAMPLE)
+    )
     max_sh: int = MAX_SH_DEGREE
     options: Mapping[str, Any] = field(default_factory=dict)

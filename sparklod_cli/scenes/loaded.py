@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..codecs.gpu.table import PRECISIONS
+from ..codecs.formats import PRECISIONS
 from ..lod import detail_rule
 from ..lod.budget import Budget
 from ..lod.continuous import faded

@@ -119,7 +119,7 @@ class LoadedScene:
 
 
 def nodes_of(splats: Splats, tree: LodTree, coding: FileCoding, *, precision: str, threads: int) -> Nodes:
-    """Return nodes as a traversal reads them, in one of `gpu.table.PRECISIONS`."""
+    """Return nodes as a traversal reads them, in one of `codecs.formats.PRECISIONS`."""
     if precision == "float32":
         return Nodes.of(splats, tree)
     if precision == "float16":

@@ -7,7 +7,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from ..codecs.gpu.table import PRECISIONS
+from ..codecs.formats import PRECISIONS
 from ..codecs.rounding import after
 from ..io import examine_scene, read_levels, size_of_input
 from ..io.details import has_levels, read_level_files

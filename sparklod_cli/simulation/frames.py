@@ -21,7 +21,8 @@ from ..support.progress import Progress, silent
 from ..tables.columns import Row
 from .columns import COLUMNS, OF_TREES
 from .loading import Viewer
-from .streaming import Stream, StreamingSettings
+from .streaming import Stream
+from .streaming_settings import StreamingSettings
 
 
 @dataclass(frozen=True)

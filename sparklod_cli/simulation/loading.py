@@ -17,7 +17,8 @@ from ..scenes.loaded import Cut, Scenes
 from ..tables.columns import Row
 from .chunk_cache import Chunks, header_answers
 from .columns import LOADING
-from .streaming import Stream, StreamingSettings
+from .streaming import Stream
+from .streaming_settings import StreamingSettings
 
 #: The share of a cut that makes a picture almost what it will be; chosen.
 MOST = 0.9

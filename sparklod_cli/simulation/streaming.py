@@ -6,55 +6,10 @@ import copy
 import math
 from collections import deque
 from collections.abc import Iterable
-from dataclasses import dataclass, field
 from heapq import heappop, heappush
 
 from .chunk_cache import ChunkCache, Chunks
-
-
-@dataclass(frozen=True)
-class Network:
-    """The network between a viewer and the files. The default delivers everything at once.
-
-    Attributes:
-        bandwidth: bytes/s, shared equally by all transfers under way.
-        latency: seconds from the request for a chunk to its first byte, during which it uses no bandwidth.
-        fetchers: maximum number of concurrent requests; None for that of the viewer: 3 in Spark (`numFetchers`), 2
-            in PlayCanvas, which shows Streamed SOG.
-
-    Raises:
-        ValueError: a value is out of range.
-    """
-
-    bandwidth: float = math.inf
-    latency: float = 0.0
-    fetchers: int | None = None
-
-    def __post_init__(self) -> None:
-        if not self.bandwidth > 0:
-            raise ValueError(f"a bandwidth of {self.bandwidth:g} bytes/s brings nothing; make it more than 0")
-        if not 0 <= self.latency < math.inf:
-            raise ValueError(f"a latency of {self.latency:g} s is not possible; make it 0 or more")
-        if self.fetchers is not None and self.fetchers < 1:
-            raise ValueError(f"{self.fetchers} fetchers bring nothing; make it 1 or more")
-
-    @property
-    def instant(self) -> bool:
-        """Whether everything arrives at once."""
-        return self.bandwidth == math.inf and self.latency == 0
-
-
-@dataclass(frozen=True)
-class StreamingSettings:
-    """Network and cache of a viewer.
-
-    Attributes:
-        network: the network; by default everything arrives at once.
-        chunk_cache: capacity of the cache in chunks of 65,536 nodes; None for all.
-    """
-
-    network: Network = field(default_factory=Network)
-    chunk_cache: int | None = None
+from .streaming_settings import Network
 
 
 class Stream:

@@ -56,12 +56,11 @@ BLEND = 1.25
 #: Largest distance of the far plane, in world units, so that it fits a float32.
 FARTHEST = 1e37
 
+#: Elevation in degrees, above their target, of the cameras of an orbit, a dolly and the overview; cameras of an orbit.
+ELEVATION, ORBIT = 15.0, 60
+
 #: Axes that may point up in an input; the splats are rotated so that y does.
 UP_AXES = ("y", "-y", "z", "-z")
-
-#: Streamed SOG, as the tools of its makers write it: splats of a chunk file, the longest side of a region in world
-#: units, and the splats below which a region is not divided.
-DETAIL_CHUNK_SPLATS, DETAIL_EXTENT, DETAIL_MIN_SPLATS = 524_288, 16.0, 8_192
 
 #: Growth of the tree that the detail levels of a Streamed SOG are cut from: as it is not written, it keeps all nodes.
 DETAIL_GROWTH = MAX_GROWTH

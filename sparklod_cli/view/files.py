@@ -12,11 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import quote
 
+from ..codecs.file_names import MANIFEST, META
 from ..codecs.formats import FORMATS, HEAD, sniff
-from ..codecs.rad.header import MAGIC, read_header
-from ..codecs.rad.records import RadHeader
-from ..codecs.sog.names import META
-from ..codecs.streamed_sog.names import MANIFEST
+from ..codecs.rad.rad_header import MAGIC, RadHeader, read_header
 from ..io.beside import companions, in_folder, path_beside
 from ..io.details import read_level_files
 from ..io.paths import open_plain, reason_unreadable

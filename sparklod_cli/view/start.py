@@ -12,16 +12,15 @@ import numpy as np
 
 from ..cameras import framing
 from ..cameras.camera import Camera, Matrix
-from ..cameras.defaults import ELEVATION
 from ..cameras.frame import DEFAULT_FOV_Y, Settings
 from ..cameras.sources import Views, WholeScene
-from ..codecs.rad.codec import count_leaves, read_chunk
-from ..codecs.rad.places import file_of
-from ..codecs.rad.records import RadHeader
+from ..codecs.rad.rad_header import RadHeader
+from ..codecs.rad.rad_reader import count_leaves, file_of, read_chunk
 from ..io import examine_scene, read_levels
 from ..io.paths import open_plain, reason_of
 from ..model.balls import USED, Balls, balls_of
 from ..model.splats import Splats
+from ..support.defaults import ELEVATION
 from ..support.errors import InvalidSplatsError, SparklodError, UnreadableError
 from ..support.progress import Progress, silent
 from .files import ShownFile

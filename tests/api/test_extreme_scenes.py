@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 
 import sparklod_cli as sparklod
 from fuzz.laws import check_passes
+from sparklod_cli.codecs.file_names import MANIFEST
 from sparklod_cli.codecs.options import RadOptions, SogOptions
-from sparklod_cli.codecs.rad.layout import OPTIONS, choices
-from sparklod_cli.codecs.streamed_sog.names import MANIFEST
+from sparklod_cli.codecs.rad.rad_layout import OPTIONS, choices
 from sparklod_cli.lod.builders import METHODS
 from sparklod_cli.lod.detail_rule import DetailSettings
 from sparklod_cli.model.gaussian import normalized_quat

@@ -12,11 +12,10 @@ import pytest
 import sparklod_cli as sparklod
 from sparklod_cli.bake.flow import bake
 from sparklod_cli.bake.settings import BakeSettings
-from sparklod_cli.codecs.formats import WRITABLE
-from sparklod_cli.codecs.gpu.table import ENCODINGS
+from sparklod_cli.codecs.file_names import MANIFEST
+from sparklod_cli.codecs.formats import ENCODINGS, WRITABLE
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
 from sparklod_cli.codecs.splat_encoding import SplatEncoding
-from sparklod_cli.codecs.streamed_sog.names import MANIFEST
 from sparklod_cli.extract_leaves import extract_leaves
 from sparklod_cli.io import write_whole
 from sparklod_cli.lod.detail_rule import DetailSettings

@@ -8,12 +8,22 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from sparklod_cli.cameras.axes import Axes
 from sparklod_cli.cameras.formats.source import Parsed
+from sparklod_cli.cameras.formats.table import PathFormat
 from sparklod_cli.cameras.frame import Frame, Lens, Settings
-from sparklod_cli.cameras.generators import Key, between, dolly, orbit
-from sparklod_cli.cameras.path import GENERATED, cameras_of
+from sparklod_cli.cameras.generators import (
+    Key,
+    between,
+    cardinal_tangents,
+    catmull_rom_tangents,
+    centripetal_knots,
+    dolly,
+    hermite,
+    orbit,
+)
+from sparklod_cli.cameras.path import cameras_of
 from sparklod_cli.cameras.pose import look_at
-from sparklod_cli.cameras.spline import cardinal_tangents, catmull_rom_tangents, centripetal_knots, hermite
 from sparklod_cli.support.errors import CameraPathError
 
 DOWN_Y = (0.0, -1.0, 0.0)
@@ -146,7 +156,9 @@ def test_both_tangents_reproduce_straight_lines_and_catmull_rom_parabolas() -> N
 
 
 def test_generated_cameras_have_times_by_the_frame_rate() -> None:
-    path = cameras_of(Parsed(orbit(4, (0, 0, 0), 1, 0, DOWN_Y)), GENERATED["orbit"], Settings(fps=2))
+    path = cameras_of(
+        Parsed(orbit(4, (0, 0, 0), 1, 0, DOWN_Y)), PathFormat("", "an orbit", "", Axes.OPENGL_C2W), Settings(fps=2)
+    )
     assert [camera.time for camera in path.cameras] == [0, 0.5, 1, 1.5]
     assert path.format == "an orbit"
     assert path.notes == ()

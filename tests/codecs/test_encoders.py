@@ -10,11 +10,10 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from sparklod_cli.codecs import clamps, encoder, sh_labels, spz
+from sparklod_cli.codecs import clamps, encoder, sh_palette, spz
 from sparklod_cli.codecs.options import DEFAULTS, RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import codec as rad
-from sparklod_cli.codecs.rad import options as rad_options
-from sparklod_cli.codecs.rad import palette
+from sparklod_cli.codecs.rad import rad_encoder, rad_options
 from sparklod_cli.codecs.sh_palette import cluster
 from sparklod_cli.lod import quality, quick
 from sparklod_cli.model.scene import Scene
@@ -105,14 +104,14 @@ def test_windows_are_encoded_anywhere_and_count_what_they_clamp(
 def test_a_palette_of_a_sample_is_nearly_as_good_as_one_of_all(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = Scene(*quick.build(random_splats(8_000, sh_degree=1), 1.5))
     nodes, options = node_stream(scene), rad.settled(scene, PALETTE)
-    whole = palette.Palette.of(scene, 40, 1, silent)
-    assert palette.Palette.of(nodes, 40, 1, silent).labels is not None  # of all nodes
-    monkeypatch.setattr(palette, "SAMPLE", 2_048)
+    whole = rad_encoder.Palette.of(scene, 40, 1, silent)
+    assert rad_encoder.Palette.of(nodes, 40, 1, silent).labels is not None  # of all nodes
+    monkeypatch.setattr(rad_encoder, "SAMPLE", 2_048)
     monkeypatch.setattr(encoder, "CHUNK_NODES", 3_000)
-    sampled = palette.Palette.of(nodes, 40, 1, silent)
+    sampled = rad_encoder.Palette.of(nodes, 40, 1, silent)
     assert sampled.labels is None
 
-    def error(found: palette.Palette) -> float:
+    def error(found: rad_encoder.Palette) -> float:
         return float(np.square(found.codes[found.labels_of(scene.splats, 0)] - scene.splats.sh).mean())
 
     assert error(sampled) < 1.1 * error(whole)
@@ -125,7 +124,7 @@ def test_a_palette_of_a_sample_is_nearly_as_good_as_one_of_all(monkeypatch: pyte
 def test_labels_name_the_nearest_code(codes: int, slack: float) -> None:
     sh = random_splats(8_000, sh_degree=1).sh
     table = cluster(sh[:6_000], codes).codes
-    labels = sh_labels.labels_of(sh, table)
+    labels = sh_palette.labels_of(sh, table)
     rows, wide = sh.reshape(len(sh), -1).astype(np.float64), table.reshape(len(table), -1).astype(np.float64)
     half = np.square(wide).sum(axis=1) / 2
     nearest = np.concatenate([(half - part @ wide.T).argmin(axis=1) for part in np.array_split(rows, 8)])

@@ -10,8 +10,7 @@ from importlib import import_module
 import numpy as np
 import pytest
 
-from sparklod_cli.codecs.formats import FORMATS, WRITABLE, Format, ending_of
-from sparklod_cli.codecs.gpu.table import ENCODINGS
+from sparklod_cli.codecs.formats import ENCODINGS, FORMATS, WRITABLE, Format, ending_of
 from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
@@ -28,9 +27,7 @@ def parameters(function: object) -> dict[str, bool]:
 @pytest.mark.parametrize("form", FORMATS, ids=lambda form: form.module)
 def test_a_codec_has_the_signatures_of_all(form: Format) -> None:
     codec = form.codec()
-    more = {"beside": True} if form.companions else {}
-    assert parameters(codec.decode) == {"file": False, "threads": True, "progress": True} | more
-    assert hasattr(codec, "examine") == form.selective
+    assert parameters(codec.open_content) == {"source": False}
     assert hasattr(codec, "encode") == hasattr(codec, "settled") == form.writable
     if form.writable:
         more = {"scratch": True} if form.trees else {}
@@ -40,7 +37,8 @@ def test_a_codec_has_the_signatures_of_all(form: Format) -> None:
     assert hasattr(codec, "encode_files") == (form.unbundled is not None or form.detailed)
     assert hasattr(codec, "decode_levels") == form.detailed
     if form.detailed:
-        assert parameters(codec.decode_levels) == parameters(codec.decode)
+        named = {"threads": True, "progress": True, "beside": True}
+        assert parameters(codec.decode_levels) == {"file": False} | named
     assert hasattr(codec, "encoder") == hasattr(codec, "needed") == form.trees
     if form.trees:
         assert parameters(codec.needed) == {"options": False}
@@ -82,7 +80,7 @@ def test_what_holds_no_tree_says_so_before_a_byte_is_written(suffix: str) -> Non
 def test_tables_load_nothing_heavy() -> None:
     """`--help` names what stands in them."""
     program = (
-        "import sys; from sparklod_cli.codecs import formats, rounding; from sparklod_cli.codecs.gpu import table;"
+        "import sys; from sparklod_cli.codecs import file_names, formats, rounding;"
         "from sparklod_cli.tables import files; from sparklod_cli.cameras.formats import table;"
         "assert not {'numpy', 'numba'} & set(sys.modules), 'heavy'"
     )

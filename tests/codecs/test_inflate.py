@@ -14,7 +14,7 @@ import pytest
 from zlib_ng import zlib_ng
 
 from sparklod_cli.codecs import compression, inflate
-from sparklod_cli.codecs.compression import BLOCK, Run
+from sparklod_cli.codecs.compression import BLOCK, DataRun
 from sparklod_cli.codecs.inflate import FLUSHED, Inflate
 from sparklod_cli.support.errors import ChecksumError, FormatError, TruncatedError
 from sparklod_cli.support.progress import silent
@@ -42,7 +42,7 @@ def flushed(blocks: Iterable[bytes], flush: int) -> bytes:
 
 
 def ours(data: bytes, comment: bytes = b"") -> bytes:
-    return b"".join(compression.gzip_member([data], [Run(len(data))], 5, 1, silent, comment=comment))
+    return b"".join(compression.gzip_member([data], [DataRun(len(data))], 5, 1, silent, comment=comment))
 
 
 @functools.cache

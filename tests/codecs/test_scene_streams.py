@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sparklod_cli.codecs.sog.files import Files
+from sparklod_cli.codecs.sog.sog_container import SogFiles
 from sparklod_cli.io import PlacedFile, open_stream, open_streams, read_scene
 from sparklod_cli.io import streams as idle_streams
 from sparklod_cli.model import streams
@@ -142,8 +142,8 @@ def test_a_scratch_folder_without_room_is_named(tmp_path: Path) -> None:
 
 def test_short_reads_decode_the_palette_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     calls = []
-    pixels = Files.pixels
-    monkeypatch.setattr(Files, "pixels", lambda *given: calls.append(given[1:3]) or pixels(*given))
+    pixels = SogFiles.pixels
+    monkeypatch.setattr(SogFiles, "pixels", lambda *given: calls.append(given[1:3]) or pixels(*given))
     path = put(WRITERS["SOG"]["2"].write(Scene(random_splats(99, sh_degree=1))), tmp_path, "SOG")
     with open_stream(path) as stream:
         for start in range(9):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli.codecs import sh_palette
-from sparklod_cli.codecs.kernels import cells, nearest, row_hash
+from sparklod_cli.codecs.kernels import sh_clustering
 from sparklod_cli.codecs.sh_palette import MAX_CODES, ShPalette, cluster, visible_weight
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.support import jit
@@ -107,7 +107,7 @@ def test_equal_rows_share_a_code_and_zeros_of_either_sign_are_equal() -> None:
 
 
 def test_rows_with_equal_hashes_are_told_apart(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(row_hash, "hash_rows", lambda bits: np.zeros(len(bits), np.uint64))
+    monkeypatch.setattr(sh_clustering, "hash_rows", lambda bits: np.zeros(len(bits), np.uint64))
     sh = np.repeat(coefficients(30, 3), 2, axis=0)
     assert np.array_equal(cluster(sh, 60).expand(), sh)
 
@@ -196,7 +196,7 @@ def test_a_cell_is_cut_across_its_principal_axis() -> None:
     weight = rng.exponential(1, 1500)
     members = np.arange(1500, dtype=np.uint32)[::-1].copy()
     cuts, errors = np.empty(1, np.int64), np.empty((1, 2))
-    cells.halve_cells(rows, weight, members, np.array([0]), np.array([1500]), cuts, errors, np.empty(1500))
+    sh_clustering.halve_cells(rows, weight, members, np.array([0]), np.array([1500]), cuts, errors, np.empty(1500))
     with_first, expected = halved(rows, weight)
     ours = np.zeros(1500, bool)
     ours[members[: cuts[0]]] = True
@@ -209,7 +209,7 @@ def test_cells_of_one_two_and_equal_rows_are_cut_in_the_middle() -> None:
     rows = np.array([[1, 2, 3], [4, 5, 6], [4, 5, 6], [4, 5, 6], [4, 5, 6], [7, 8, 9], [0, 0, 0]], np.float32)
     begin, end = np.array([0, 1, 5]), np.array([1, 5, 7])
     cuts, errors = np.empty(3, np.int64), np.empty((3, 2))
-    cells.halve_cells(rows, np.ones(7), np.arange(7, dtype=np.uint32), begin, end, cuts, errors, np.empty(7))
+    sh_clustering.halve_cells(rows, np.ones(7), np.arange(7, dtype=np.uint32), begin, end, cuts, errors, np.empty(7))
     assert cuts.tolist() == [0, 3, 6]
     assert errors == pytest.approx(0)
 
@@ -219,7 +219,7 @@ def test_codes_are_the_weighted_means_of_their_cells() -> None:
     rows, weight = rng.normal(size=(60, 9)).astype(np.float32), rng.exponential(1, 60)
     members, begin = rng.permutation(60).astype(np.uint32), np.array([0, 10, 10, 60])
     codes = np.full((3, 9), 7, np.float32)
-    cells.average_cells(rows, weight, members, begin, codes)
+    sh_clustering.average_cells(rows, weight, members, begin, codes)
     parts = members[:10], members[10:]
     means = [np.average(rows[part], axis=0, weights=weight[part]) for part in parts]
     assert codes[[0, 2]] == pytest.approx(np.array(means), abs=1e-6)
@@ -227,7 +227,7 @@ def test_codes_are_the_weighted_means_of_their_cells() -> None:
 
 
 def test_neighbours_are_the_nearest_codes_where_all_groups_are_searched() -> None:
-    codes = flat(coefficients(nearest.GROUP + 100, 3))
+    codes = flat(coefficients(sh_clustering.GROUP + 100, 3))
     codes += np.random.default_rng(0).normal(0, 1e-3, codes.shape).astype(np.float32)
     near, distance = sh_palette._neighbours(codes)
     away = distances(codes, codes)
@@ -252,7 +252,7 @@ def test_pruning_by_distance_changes_no_label() -> None:
     found = []
     for known in (distance, np.zeros_like(distance)):
         labels, errors = np.empty(len(rows), np.int32), np.empty(len(rows), np.float32)
-        nearest.choose_codes(rows, members, begin, codes, near, known, labels, errors)
+        sh_clustering.choose_codes(rows, members, begin, codes, near, known, labels, errors)
         found.append((labels, errors))
     assert np.array_equal(found[0][0], found[1][0])
     assert found[0][1] == pytest.approx(((rows - codes[found[0][0]]) ** 2).sum(axis=1), rel=1e-4, abs=1e-6)

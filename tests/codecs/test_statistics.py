@@ -3,17 +3,40 @@
 from __future__ import annotations
 
 import dataclasses
+import io
+import math
 from types import ModuleType
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from sparklod_cli.codecs import spz, statistics
+from sparklod_cli.codecs import quantize, spz, statistics
 from sparklod_cli.codecs.options import DEFAULTS, RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import codec as rad
-from sparklod_cli.codecs.statistics import ALL, Statistics
+from sparklod_cli.codecs.statistics import (
+    ALL,
+    ALL_BITS,
+    EXACT_BITS,
+    LARGEST_ERROR,
+    LOWER,
+    SMALL_QUANTILE,
+    STEPS_A_SPLAT,
+    UPPER,
+    Binades,
+    Magnitudes,
+    ShBytes,
+    Statistics,
+    enough,
+    fine_bits,
+    tops,
+)
+from sparklod_cli.lod import quick
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.sh import COEFFICIENTS
+from sparklod_cli.model.transforms import sh_basis
 from sparklod_cli.support.errors import FormatError
 from tests.scenes import random_splats
 
@@ -118,3 +141,126 @@ def test_pieces_of_different_scenes_are_refused() -> None:
     parts = [Statistics.of(random_splats(3, sh_degree=degree)) for degree in (0, 1)]
     with pytest.raises(ValueError, match="cannot be merged"):
         Statistics.merged(parts)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_tops_are_above_quantiles_by_less_than_a_hundredth(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    values = (rng.normal(size=(20_001, 3)) * np.exp(rng.normal(0, 3, size=(20_001, 1)))).astype(np.float32)
+    found = Magnitudes.of(values)
+    assert (found.count, found.lowest, found.highest) == (values.size, values.min(), values.max())
+    size = np.abs(values).reshape(-1)
+    for share in (0.0, 1e-3, 1e-2, 0.5):
+        (top,) = tops(found.positive + found.negative, size.size, float(size.max()), np.array([share]))
+        assert np.count_nonzero(size > top) <= share * size.size
+        exact = np.sort(size)[::-1][int(share * size.size)]
+        assert exact * (1 - 1e-6) <= top <= exact * 1.009
+
+
+def test_signs_and_ends_are_kept_apart() -> None:
+    found = Magnitudes.of(np.array([[-2.5, 0.0, 0.75], [1e-30, 4e30, -1e-42]], np.float32))
+    assert (found.positive.sum(), found.negative.sum()) == (4, 2)
+    for counts, values in ((found.positive, [0, 1e-30, 0.75, 4e30]), (found.negative, [1e-42, 2.5])):
+        bins = np.flatnonzero(counts)
+        assert (LOWER[bins] <= values).all() and (values < UPPER[bins]).all()
+    assert tops(found.negative, 6, 2.5, np.array([0.0])) == [2.5]
+
+
+def test_no_values_have_no_ends() -> None:
+    found = Magnitudes.of(np.empty((0, 3), np.float32))
+    assert (found.count, found.lowest, found.highest) == (0, 0, 0)
+    assert tops(found.positive, 1, 0, np.array([0.0, 0.5])).tolist() == [0, 0]
+
+
+def bits_of(values: np.ndarray) -> int:
+    """Fractional bits by the quantile itself."""
+    small = float(np.quantile(values.astype(np.float64), SMALL_QUANTILE)) if len(values) else 0.0
+    return math.ceil(math.log2(STEPS_A_SPLAT / small)) if small > 0 else EXACT_BITS
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_bits_are_those_of_the_quantile(seed: int) -> None:
+    """Few values, so that the quantile lies between two of them that are far apart."""
+    rng = np.random.default_rng(seed)
+    spread = rng.uniform(0, 4)
+    values = np.exp(rng.normal(rng.uniform(-40, 40), spread, size=rng.integers(1, 400))).astype(np.float32)
+    values[rng.random(len(values)) < rng.choice([0, 0.01, 0.02])] = 0
+    assert fine_bits(Binades.of(values)) == bits_of(values)
+
+
+def test_a_quantile_between_two_binades_is_exact() -> None:
+    values = np.array([1.5, 1.75, 200, 300], np.float32)
+    found = Binades.of(values)
+    assert found.quantile(0.5) == np.quantile(values, 0.5) == 100.875
+    assert found.quantile(0) == found.quantile(0.2) == 1.5
+    assert found.quantile(1) == 300
+
+
+@pytest.mark.parametrize("small", [1.0, 2.0**-149, 2.0**-126, 2.0**127, np.nextafter(np.float32(2), np.float32(0))])
+def test_powers_of_two_and_the_ends_of_float32_have_their_own_binade(small: float) -> None:
+    values = np.full(7, small, np.float32)
+    assert fine_bits(Binades.of(values)) == bits_of(values)
+
+
+@pytest.mark.parametrize("values", [[], [0, 0, 5], [1, math.nan], [math.inf, math.inf]])
+def test_without_a_size_nothing_is_rounded(values: list[float]) -> None:
+    assert fine_bits(Binades.of(np.array(values, np.float32))) == EXACT_BITS
+
+
+def sh_of(degree: int, spread: float, count: int = 400, seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return rng.normal(0, spread, (count, COEFFICIENTS[degree], 3)).clip(-1, 0.99).astype(np.float32)
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_the_error_is_that_of_colours_over_all_directions(degree: int) -> None:
+    sh = quantize.decode_sh(quantize.encode_sh(sh_of(degree, 0.2), ALL_BITS))
+    found = ShBytes.of(sh)
+    rng = np.random.default_rng(1)
+    direction = rng.normal(size=(1_000, 3))
+    basis = sh_basis(direction / np.linalg.norm(direction, axis=1, keepdims=True), degree)
+    for bits in range(4, 8):
+        off = quantize.decode_sh(quantize.encode_sh(sh, bits)) - sh
+        seen = np.sqrt(np.square(np.einsum("dk,nkc->dnc", basis, off)).mean())
+        assert found.error(bits) == pytest.approx(seen, rel=0.05)
+    assert found.error(ALL_BITS) == 0
+
+
+@pytest.mark.parametrize(("degree", "spread", "bits"), [(3, 0.002, 4), (1, 0.2, 4), (2, 0.2, 6), (3, 0.2, 7)])
+def test_stronger_sh_keep_more_bits(degree: int, spread: float, bits: int) -> None:
+    found = ShBytes.of(sh_of(degree, spread))
+    assert enough(found) == bits
+    assert found.error(bits) <= LARGEST_ERROR
+    assert bits == 4 or found.error(bits - 1) > LARGEST_ERROR
+
+
+@settings(max_examples=30)
+@given(st.integers(4, 8), st.integers(1, 3), st.integers(0, 2**32 - 1))
+def test_codes_keep_the_bits_that_they_have(bits: int, degree: int, seed: int) -> None:
+    sh = quantize.decode_sh(quantize.encode_sh(sh_of(degree, 0.3, seed=seed), bits))
+    found = ShBytes.of(sh)
+    assert found.between == 0
+    kept = enough(found)
+    assert kept <= bits
+    np.testing.assert_array_equal(quantize.decode_sh(quantize.encode_sh(sh, kept)), sh)
+
+
+def test_leaves_decide_and_merged_splats_keep_the_fewest() -> None:
+    splats = random_splats(500, sh_degree=3, seed=5)
+    nodes, tree = quick.build(splats)
+    scene = Scene(dataclasses.replace(nodes), tree)
+    bits = spz.settled(scene, DEFAULTS).sh_bits
+    assert bits is not None and bits > 4
+    assert bits == spz.settled(Scene(splats), DEFAULTS).sh_bits
+    back = spz.decode(io.BytesIO(b"".join(spz.encode(scene)))).splats.sh
+    for rows, kept in ((tree.is_leaf, bits), (~tree.is_leaf, 4)):
+        np.testing.assert_array_equal(back[rows], quantize.decode_sh(quantize.encode_sh(nodes.sh[rows], kept)))
+
+
+def test_bits_may_be_given() -> None:
+    scene = Scene(random_splats(50, sh_degree=2))
+    for bits in range(4, 9):
+        back = spz.decode(io.BytesIO(b"".join(spz.encode(scene, WriteOptions(sh_bits=bits))))).splats.sh
+        assert math.log2(np.abs(back - scene.splats.sh).max()) < -bits
+    with pytest.raises(ValueError, match="sh_bits is 3, not 4 to 8"):
+        spz.settled(scene, WriteOptions(sh_bits=3))

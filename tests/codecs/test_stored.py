@@ -13,9 +13,8 @@ from sparklod_cli.codecs import spz
 from sparklod_cli.codecs.encoder import Kept, results
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import codec as rad
-from sparklod_cli.codecs.rad.layout import OPTIONS, choices
-from sparklod_cli.codecs.spz_options import like
-from sparklod_cli.codecs.spz_stored import KeepingEncoder
+from sparklod_cli.codecs.rad.rad_layout import OPTIONS, choices
+from sparklod_cli.codecs.spz_encoder import like
 from sparklod_cli.lod import quick
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats, same_rows
@@ -110,8 +109,7 @@ def test_a_choice_of_another_coding_is_heeded() -> None:
     asked = WriteOptions(spz_version=2, fractional_bits=bits - 1)
     assert stored.like(asked) == asked
     encoder = stored.keeping(spz.encoder(scene, spz.settled(scene, asked)), np.ones(len(scene), bool))
-    assert isinstance(encoder, KeepingEncoder)
-    assert {*encoder.codes} == {"alphas", "colors", "scales", "sh"}
+    assert {*encoder.stored} == {"alphas", "colors", "scales", "sh"}
 
 
 @pytest.mark.parametrize("given", ENCODINGS, ids=lambda options: "-".join(getattr(options, name) for name in OPTIONS))

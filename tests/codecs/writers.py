@@ -21,17 +21,17 @@ from fixtures import (
     by_hand_splat,
     by_hand_streamed_sog,
 )
-from sparklod_cli.codecs import octahedral, ply, quantize, sh_palette, splat, spz
+from sparklod_cli.codecs import ply, quantize, sh_palette, spark_codings, splat, spz
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import codec as rad
-from sparklod_cli.codecs.rad.encodings import LARGEST_F16
-from sparklod_cli.codecs.rad.header import ENCODING_KEYS
-from sparklod_cli.codecs.rad.layout import choices
-from sparklod_cli.codecs.rad.options import HALF
+from sparklod_cli.codecs.rad.property_codings import LARGEST_F16
+from sparklod_cli.codecs.rad.rad_header import ENCODING_KEYS
+from sparklod_cli.codecs.rad.rad_layout import choices
+from sparklod_cli.codecs.rad.rad_options import HALF
 from sparklod_cli.codecs.sog import codec as sog
-from sparklod_cli.codecs.sog import codings
-from sparklod_cli.codecs.sog.codebook import codebook
-from sparklod_cli.codecs.sog.writing import LARGE, SEEN
+from sparklod_cli.codecs.sog import texel_codings as codings
+from sparklod_cli.codecs.sog.sog_writer import LARGE, SEEN
+from sparklod_cli.codecs.sog.texel_codings import codebook
 from sparklod_cli.codecs.splat_encoding import SplatEncoding
 from sparklod_cli.model import morton
 from sparklod_cli.model.scene import Scene
@@ -456,7 +456,7 @@ def rad_precision(
             "ln_0r8": 1.001 * (log_range[1] - log_range[0]) / 508,
         }[scales],
         # Near half a turn, w follows from x y z by a difference of nearly equal numbers: 2 ** -11 of 1 makes w 0.031.
-        degrees={"f32": 0.05, "f16": 3.6, "oct88r8": stated_degrees(octahedral.decode_axis_angle)}[
+        degrees={"f32": 0.05, "f16": 3.6, "oct88r8": stated_degrees(spark_codings.decode_axis_angle)}[
             encodings["orientation"]
         ],
         opacity=1.001 * alpha,

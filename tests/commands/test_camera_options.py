@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +14,8 @@ from click.testing import CliRunner, Result
 from sparklod_cli.cameras import generators
 from sparklod_cli.cameras.framing import FILLED
 from sparklod_cli.cameras.path import CameraPath
-from sparklod_cli.commands.options.camera_options import camera_options
+from sparklod_cli.commands.option_groups import values_of, with_options
 from sparklod_cli.commands.options.cameras import Cameras
-from sparklod_cli.commands.usage import options_of
 from sparklod_cli.model.balls import Balls
 from sparklod_cli.support.errors import CameraPathError
 from tests.cameras.known import FOLDER, KNOWN, SIZE, check_pose
@@ -40,11 +37,11 @@ def run(*arguments: str | Path, scene: Any = scene_of_shells) -> tuple[Result, l
     found: list[CameraPath] = []
 
     @click.command()
-    @camera_options
+    @with_options(Cameras)
     @click.argument("inputs", nargs=-1)
     @click.pass_context
     def command(ctx: click.Context, **_: Any) -> None:
-        asked = options_of(ctx, Cameras)
+        asked = values_of(ctx, Cameras)
         asked.check(ctx)
         with asked.usage_errors():
             found.append(asked.camera_source().cameras(asked.settings(), scene))
@@ -252,10 +249,3 @@ def test_the_help_lists_formats_and_axes() -> None:
     text = " ".join(run("--help")[0].output.split())
     for said in ("EYE:TARGET", "'EYE:TARGET ...'", "WxH", "auto|sparklod|csv|nerfstudio", "opengl-c2w|opencv-c2w"):
         assert said in text
-
-
-def test_help_needs_nothing_heavy() -> None:
-    module = "sparklod_cli.commands.options.camera_options"
-    code = f"import sys, {module}; print([m for m in ('numpy', 'numba') if m in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout == "[]\n"

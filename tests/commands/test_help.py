@@ -11,6 +11,7 @@ import pytest
 
 from sparklod_cli.cli import COMMANDS, cli, run
 from sparklod_cli.commands.command import ALIASES, COMMON, GENERAL, Command
+from tests.conftest import ROOT
 
 COMMAND_NAMES = [name for name in COMMANDS if name != "help"]
 
@@ -119,21 +120,39 @@ def test_an_option_that_there_is_not_names_the_one_that_was_meant(
     assert err.splitlines()[-1] == f"error: there is no option {wrong}; did you mean {meant}?"
 
 
-def test_help_loads_no_command_and_nothing_heavy() -> None:
-    code = (
-        "import sys; from sparklod_cli.cli import run; run(['--help']);"
-        "print(*[name for name in sys.modules if name.split('.')[0] in ('numpy', 'numba', 'tqdm')"
-        " or name.startswith('sparklod_cli.commands.build')])"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.splitlines()[-1] == ""
+@pytest.mark.parametrize("arguments", [(), *((name,) for name in COMMANDS)], ids=" ".join)
+def test_help_loads_nothing_heavy(arguments: tuple[str, ...]) -> None:
+    code = "import sys; from sparklod_cli.cli import run; run(sys.argv[1:]); print(*sys.modules, file=sys.stderr)"
+    command = [sys.executable, "-c", code, *arguments, "--help"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT)
+    loaded = {name.split(".")[0] for name in done.stderr.split()}
+    assert not loaded & {"numpy", "numba", "plyfile", "zstandard", "tqdm", "PIL", "open3d", "pyvista"}
+    assert arguments or "sparklod_cli.commands.build_lod" not in done.stderr.split()
 
 
-@pytest.mark.parametrize("name", COMMAND_NAMES)
-def test_the_help_of_a_command_loads_nothing_heavy(name: str) -> None:
-    code = (
-        f"import sys; from sparklod_cli.cli import run; run([{name!r}, '--help']);"
-        "print(*[name for name in sys.modules if name in ('numpy', 'numba', 'tqdm')])"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.splitlines()[-1] == ""
+#: The headings of the commands that have most options, between the common ones and the general ones.
+HEADINGS = {
+    "render": ["Inputs", "Cameras", "Cut", "Streamed SOG", "Streaming", "Appearance", "Comparison", "Output"],
+    "traverse": ["Inputs", "Cameras", "Cut", "Streamed SOG", "Streaming", "Output"],
+}
+
+
+@pytest.mark.parametrize("name", HEADINGS)
+def test_options_stand_under_headings_the_common_ones_first(name: str) -> None:
+    command = command_of(name)
+    groups = command.by_heading(click.Context(command))
+    assert [*groups] == [COMMON, *HEADINGS[name], GENERAL]
+    assert len(groups[COMMON]) == 10
+    general = {"--threads", "--json", "--quiet", "--verbose", "--version", "--help"}
+    assert {max(param.opts, key=len) for param in groups[GENERAL]} == general
+
+
+@pytest.mark.parametrize("name", ["render", "traverse"])
+def test_help_texts_are_phrases_that_end_in_a_point(name: str) -> None:
+    for param in command_of(name).params:
+        if isinstance(param, click.Option):
+            assert param.help, param.name
+            text = param.help.partition("  [default")[0]
+            assert text[0].isupper(), param.name
+            assert text.endswith((".", "design)")), text
+            assert not re.search(r"\bso (much|many)\b|\bwhat is\b|\bthere\b[.]", text), text

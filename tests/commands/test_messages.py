@@ -12,7 +12,7 @@ import pytest
 
 from sparklod_cli.cli import run
 from sparklod_cli.codecs import ply
-from sparklod_cli.commands.reports import CLAMPED_BY_SPZ
+from sparklod_cli.commands.build_lod_text import CLAMPED_BY_SPZ
 from sparklod_cli.io import read_scene
 from sparklod_cli.model.scene import Scene
 from tests.conftest import FIXTURES

@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 
-from sparklod_cli.cameras.formats.colmap_models import MODELS
+from sparklod_cli.cameras.formats.colmap import MODELS
 from sparklod_cli.cameras.formats.table import FORMATS, PLAYCANVAS
 from sparklod_cli.cameras.path import read
 from tests.cameras.known import text_file

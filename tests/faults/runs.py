@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sparklod_cli.codecs.rad import header as rad_header
+from sparklod_cli.codecs.rad import rad_header
 from sparklod_cli.io import read_scene
 from tests.conftest import FIXTURES, ROOT
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli.cli import run
-from sparklod_cli.codecs.gpu.table import ENCODINGS
+from sparklod_cli.codecs.formats import ENCODINGS
 from sparklod_cli.inspection.report import ReportSettings, inspect
 from sparklod_cli.io import read_arrays
 from tests.conftest import FIXTURES

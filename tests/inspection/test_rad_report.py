@@ -14,7 +14,7 @@ import pytest
 
 from sparklod_cli.cli import run
 from sparklod_cli.codecs.rad import codec as codec
-from sparklod_cli.codecs.rad import survey as rad_survey
+from sparklod_cli.codecs.rad import rad_reader
 from sparklod_cli.inspection import leaves, rad
 from sparklod_cli.inspection.html import Section, page
 from sparklod_cli.inspection.rad import PropertyFacts
@@ -116,7 +116,7 @@ def test_a_field_of_the_headers_needs_no_data(
     def fail(*arguments: object, **options: object) -> None:
         raise AssertionError("the file is decoded")
 
-    monkeypatch.setattr(codec, "examine", fail)
+    monkeypatch.setattr(codec, "open_content", fail)
     path = PALETTE.write(tmp_path / "a.rad")
     assert run(["inspect", str(path), "--field", name]) == 0
     assert capsys.readouterr().out.strip() == expected
@@ -136,8 +136,8 @@ def test_headers_alone_give_what_the_whole_file_gives(name: str, tmp_path: Path)
 def test_the_headers_of_many_chunks_are_not_kept(tmp_path: Path) -> None:
     path = tree(24 * 50, chunk=24).write(tmp_path / "a.rad")
     with path.open("rb") as file:
-        header, _ = rad_survey.survey_file(file, lambda name: file)
-        chunks = rad_survey.survey_chunks(file, lambda name: file, header, paddings=True)
+        header, _ = rad_reader.scan_header(file, lambda name: file)
+        chunks = rad_reader.scan_chunks(file, lambda name: file, header, paddings=True)
         assert next(chunks).number == 0
         assert file.tell() < header.bytes + header.chunks[0].bytes + header.chunks[1].bytes
 

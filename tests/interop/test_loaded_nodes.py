@@ -13,8 +13,8 @@ from sparklod_cli.cli import run
 from sparklod_cli.codecs import spz
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import codec as rad
-from sparklod_cli.codecs.rad.layout import choices
-from sparklod_cli.codecs.rad.options import HALF
+from sparklod_cli.codecs.rad.rad_layout import choices
+from sparklod_cli.codecs.rad.rad_options import HALF
 from sparklod_cli.codecs.splat_encoding import SplatEncoding
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quick

@@ -20,7 +20,7 @@ from sparklod_cli.model.nodes import CHUNK_NODES, Nodes
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.scenes.reading import read_scenes
 from sparklod_cli.simulation.frames import Simulation
-from sparklod_cli.simulation.streaming import Network, StreamingSettings
+from sparklod_cli.simulation.streaming_settings import Network, StreamingSettings
 from tests.conftest import real_scene
 from tests.interop.spark import NODE, PageUpdate, Spark
 from tests.interop.test_traversal import FOV_Y, FOVEATIONS, LOD_SCALES, SPARKS_CONES, Tree, baked, cameras, scene

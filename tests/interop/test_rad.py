@@ -18,12 +18,11 @@ import pytest
 from sparklod_cli.cli import run
 from sparklod_cli.codecs import coverage
 from sparklod_cli.codecs.gpu import packed_splats
-from sparklod_cli.codecs.octahedral import encode_lod_alpha
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import codec as rad
-from sparklod_cli.codecs.rad.header import read_chunk_header, read_header
-from sparklod_cli.codecs.rad.layout import choices
-from sparklod_cli.codecs.rad.records import RadHeader
+from sparklod_cli.codecs.rad.rad_header import RadHeader, read_chunk_header, read_header
+from sparklod_cli.codecs.rad.rad_layout import choices
+from sparklod_cli.codecs.spark_codings import encode_lod_alpha
 from sparklod_cli.codecs.splat_encoding import SplatEncoding
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quick
@@ -48,9 +47,9 @@ ALONE = SplatEncoding(lod_opacity=True)
 SHARE = 2e-3
 LAYOUTS = ("Packed", "Ext")
 
-#: Error of a rotation in a file, in degrees. oct88r8: see `octahedral.decode_axis_angle`. The others have x, y and z,
-#: which are off by up to 2 ** -12 or 2 ** -25 each, together by r = sqrt(3) times that; as in `laws.SPZ_DEGREES`, w is
-#: off by up to sqrt(2 * r).
+#: Error of a rotation in a file, in degrees. oct88r8: see `spark_codings.decode_axis_angle`. The others have x, y and
+#: z, which are off by up to 2 ** -12 or 2 ** -25 each, together by r = sqrt(3) times that; as in `laws.SPZ_DEGREES`,
+#: w is off by up to sqrt(2 * r).
 DEGREES = {"oct88r8": 1.94} | {
     name: np.degrees(2 * np.hypot(np.sqrt(2 * r), r))
     for name, r in (("f16", np.sqrt(3) * 2.0**-12), ("f32", np.sqrt(3) * 2.0**-25))

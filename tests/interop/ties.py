@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sparklod_cli.codecs import octahedral
+from sparklod_cli.codecs import spark_codings
 from sparklod_cli.codecs.gpu import ext_splats, packed_splats
 from sparklod_cli.codecs.splat_encoding import SplatEncoding
 from sparklod_cli.model.gaussian import lod_opacity
@@ -63,7 +63,7 @@ def packed_steps(splats: Splats, encoding: SplatEncoding) -> dict[str, Steps]:
         "alpha": linear(alpha, 0, encoding.alpha_max, 255),
         "center": half(splats.center),
         "log_scale": (np.where(log < -30, 0, 1 + log_scale), error * np.abs(log).clip(1, 50)),
-    } | rotation(splats, octahedral.STEPS_8_8_8)
+    } | rotation(splats, spark_codings.STEPS_8_8_8)
 
 
 def packed_codes(words: Words) -> dict[str, NDArray[Any]]:
@@ -77,7 +77,7 @@ def ext_steps(splats: Splats) -> dict[str, Steps]:
     with np.errstate(divide="ignore"):
         log_scale = half(np.log(splats.scale.astype(np.float64)).astype(np.float32))
     steps = {"alpha": half(np.where(d > 1, (d + 3) / 4, d)), "rgb": half(splats.rgb), "log_scale": log_scale}
-    return steps | rotation(splats, octahedral.STEPS_10_10_12)
+    return steps | rotation(splats, spark_codings.STEPS_10_10_12)
 
 
 def ext_codes(words: Words) -> dict[str, NDArray[Any]]:

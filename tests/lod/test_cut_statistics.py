@@ -60,9 +60,9 @@ def expected(case: Case, cut: TreeCut, instances: list[int], waiting: set[tuple[
         "level_min": min(level, default=None),
         "level_mean": pytest.approx(sum(level) / len(level)) if level else None,
         "level_max": max(level, default=None),
-        "px_p50": pytest.approx(np.percentile(pixels, 50), rel=1e-6) if pixels else None,
-        "px_p95": pytest.approx(np.percentile(pixels, 95), rel=1e-6) if pixels else None,
-        "overdraw": pytest.approx(
+        "projected_px_p50": pytest.approx(np.percentile(pixels, 50), rel=1e-6) if pixels else None,
+        "projected_px_p95": pytest.approx(np.percentile(pixels, 95), rel=1e-6) if pixels else None,
+        "overdraw_estimate": pytest.approx(
             sum(areas) / (SIZE[0] * SIZE[1]), rel=1e-5, abs=(1 + len(areas)) / 1024 / SIZE[0] / SIZE[1]
         ),
     }
@@ -129,20 +129,20 @@ def test_one_splat_in_a_cut_has_the_size_and_overdraw_of_its_place() -> None:
     """At distance 1 the picture is 2 wide, 100 pixels."""
     ahead = at_distance([0, 0, -1], 0.1)
     assert (ahead.in_frustum, ahead.outside, ahead.behind) == (1, 0, 0)
-    assert ahead.px_p50 == ahead.px_p95 == pytest.approx(5)
+    assert ahead.projected_px_p50 == ahead.projected_px_p95 == pytest.approx(5)
     # 0.1 is two standard deviations, so the radius is sqrt(8) / 2 * 5 pixels.
-    assert ahead.overdraw == pytest.approx(math.pi * (math.sqrt(8) / 2 * 5) ** 2 / 100**2, rel=1e-3)
-    assert at_distance([0, 0, -1], 1e6).overdraw == pytest.approx(1)  # it fills the picture, not more
+    assert ahead.overdraw_estimate == pytest.approx(math.pi * (math.sqrt(8) / 2 * 5) ** 2 / 100**2, rel=1e-3)
+    assert at_distance([0, 0, -1], 1e6).overdraw_estimate == pytest.approx(1)  # it fills the picture, not more
     beside, behind = at_distance([1.1, 0, -1], 0.1), at_distance([0, 0, 1], 0.1)
-    assert (beside.outside, beside.px_p50, beside.overdraw) == (1, None, 0)
-    assert (behind.behind, behind.px_p95, behind.overdraw) == (1, None, 0)
+    assert (beside.outside, beside.projected_px_p50, beside.overdraw_estimate) == (1, None, 0)
+    assert (behind.behind, behind.projected_px_p95, behind.overdraw_estimate) == (1, None, 0)
     assert at_distance([0, 0, 0], 0.1).behind == 1  # where the camera is, nothing is seen
     assert at_distance([0, 1, -1], 0.1).in_frustum == 1  # on the edge
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
 def test_a_size_that_is_not_finite_fills_the_picture(bad: float) -> None:
-    assert at_distance([0, 0, -1], bad).overdraw == pytest.approx(1)
+    assert at_distance([0, 0, -1], bad).overdraw_estimate == pytest.approx(1)
 
 
 def test_an_empty_cut_has_no_figures() -> None:

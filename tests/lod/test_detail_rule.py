@@ -27,9 +27,9 @@ def test_other_texts_are_refused(text: str) -> None:
         ({"levels": ()}, r"levels are \(\); give 1 to 15 shares below 1 and above 0, descending"),
         ({"levels": (0.5, float("nan"))}, "levels are"),
         ({"levels": tuple(1 / (2 + each) for each in range(16))}, "give 1 to 15 shares"),
-        ({"chunk_splats": 0}, "chunk_splats is 0; give more than 0"),
+        ({"chunk_splats": 0}, "chunk_splats is 0; give 1 or more"),
         ({"extent": float("nan")}, "extent is nan; give more than 0"),
-        ({"min_splats": -1}, "min_splats is -1; give more than 0"),
+        ({"min_splats": -1}, "min_splats is -1; give 1 or more"),
     ],
 )
 def test_numbers_that_mean_nothing_are_refused(how: dict[str, Any], message: str) -> None:

@@ -12,7 +12,7 @@ import pytest
 
 from fixtures import by_hand_ksplat, by_hand_splat
 from sparklod_cli.cli import run
-from sparklod_cli.codecs.gpu.table import ENCODINGS
+from sparklod_cli.codecs.formats import ENCODINGS
 from sparklod_cli.lod import quality, quick
 from sparklod_cli.lod.builders import METHODS
 from sparklod_cli.model.selection import REASONS, Selection

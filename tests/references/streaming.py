@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from fractions import Fraction
 
 from sparklod_cli.simulation.chunk_cache import Chunks
-from sparklod_cli.simulation.streaming import Network
+from sparklod_cli.simulation.streaming_settings import Network
 
 #: Seconds; of two events nearer than this, rounding decides which comes first.
 TIE = Fraction(1, 10**9)

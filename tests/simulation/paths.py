@@ -14,7 +14,7 @@ from sparklod_cli.lod.settings import LodSettings
 from sparklod_cli.model.instances import Cones, Frustum
 from sparklod_cli.scenes.loaded import Scenes
 from sparklod_cli.simulation.frames import Simulation
-from sparklod_cli.simulation.streaming import Network, StreamingSettings
+from sparklod_cli.simulation.streaming_settings import Network, StreamingSettings
 from sparklod_cli.tables.columns import Row
 from tests.conftest import FIXTURES
 

@@ -22,7 +22,7 @@ from sparklod_cli.scenes.reading import read_scenes
 from sparklod_cli.simulation.columns import OF_TREES
 from sparklod_cli.simulation.frames import Simulation
 from sparklod_cli.simulation.loading import Loader
-from sparklod_cli.simulation.streaming import Network, StreamingSettings
+from sparklod_cli.simulation.streaming_settings import Network, StreamingSettings
 from tests.lod.details import row_of_regions
 from tests.streamed import write_streamed
 

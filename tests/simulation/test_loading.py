@@ -13,7 +13,7 @@ from sparklod_cli.scenes.finder import CutFinder, view_of
 from sparklod_cli.scenes.loaded import Scenes
 from sparklod_cli.simulation.columns import LOADING
 from sparklod_cli.simulation.loading import Loader
-from sparklod_cli.simulation.streaming import Network, StreamingSettings
+from sparklod_cli.simulation.streaming_settings import Network, StreamingSettings
 from tests.simulation.paths import SPARK, resting, rows_of
 
 AT = resting(1).cameras[0]

@@ -11,7 +11,8 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from sparklod_cli.simulation.chunk_cache import Chunks
-from sparklod_cli.simulation.streaming import Network, Stream
+from sparklod_cli.simulation.streaming import Stream
+from sparklod_cli.simulation.streaming_settings import Network
 from tests.references.streaming import NaiveCache, Twin, roots_first
 
 MB = 1_000_000

@@ -13,8 +13,7 @@ import pytest
 
 import sparklod_cli as sparklod
 from sparklod_cli.api import viewing
-from sparklod_cli.codecs.rad.header import pack_header, read_chunk_header
-from sparklod_cli.codecs.rad.records import RadChunkEntry, RadHeader
+from sparklod_cli.codecs.rad.rad_header import RadChunkEntry, RadHeader, pack_header, read_chunk_header
 from sparklod_cli.io import read_levels
 from sparklod_cli.support.errors import CameraPathError, FormatError, SparklodError
 from sparklod_cli.view.files import shown_files

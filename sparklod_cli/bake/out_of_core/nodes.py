@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ...codecs import encoder as codec_encoder
 from ...codecs.encoder import windows_of
-from ...codecs.sound import check_valid
+from ...codecs.validation import check_valid
 from ...model.lod_tree import LodTree
 from ...model.sh import COEFFICIENTS, degree_of
 from ...model.splats import COLUMNS, Splats

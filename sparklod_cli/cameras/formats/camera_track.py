@@ -13,14 +13,14 @@ UP = (0.0, 1.0, 0.0)
 
 
 def recognises(files: Files) -> bool:
-    """Whether its frames have a position and a target."""
+    """Return whether its frames have a position and a target."""
     frames = files.json.first("frames") if files.json else None
     items = frames.value if frames else None
     return isinstance(items, list) and bool(items) and Json(items[0]).has("position", "target")
 
 
 def parse(files: Files, settings: Settings) -> Parsed:
-    """Its frames. The field of view is vertical, in degrees."""
+    """Return its frames. The field of view is vertical, in degrees."""
     root = files.object()
     fps = root.get("frameRate").number() if root.has("frameRate") else None
     if fps is not None and not fps > 0:
@@ -32,5 +32,5 @@ def parse(files: Files, settings: Settings) -> Parsed:
 
 def _frame(item: Json, up: tuple[float, ...]) -> Frame:
     lens = Lens(fov=math.radians(item.get("fov").number())) if item.has("fov") else Lens()
-    own = item.get("up").numbers(3) if item.has("up") else up
-    return frame_looking(item.get("position").numbers(3), item.get("target").numbers(3), own, lens)
+    up_axis = item.get("up").numbers(3) if item.has("up") else up
+    return frame_looking(item.get("position").numbers(3), item.get("target").numbers(3), up_axis, lens)

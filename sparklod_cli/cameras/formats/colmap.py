@@ -5,12 +5,12 @@ from __future__ import annotations
 import re
 import struct
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
 from ...support.errors import CameraPathError
 from ..frame import NO_LENS, Frame, Lens, Settings
-from .colmap_models import MODELS, Model, lens_of
-from .source import Files, Parsed, finite, posed
+from .source import Files, Parsed, finite, posed, side
 
 #: An image of images.bin: number, rotation w x y z, translation x y z, and number of its camera; its name follows.
 IMAGE = struct.Struct("<I7dI")
@@ -28,12 +28,59 @@ IMAGE_WORDS = 10
 
 COMMENT = "# Image list with two lines of data per image"
 
+
+@dataclass(frozen=True)
+class Model:
+    """A camera model.
+
+    Attributes:
+        name: in cameras.txt; cameras.bin has the index in `MODELS` instead.
+        focals: number of focal lengths, 1 or 2; 0 for a model that a pinhole camera cannot replace.
+        others: number of parameters after the principal point, all of the distortion.
+    """
+
+    name: str
+    focals: int
+    others: int
+
+    @property
+    def count(self) -> int:
+        """Number of parameters of a camera."""
+        return self.focals + 2 + self.others
+
+    @property
+    def distorts(self) -> bool:
+        """Whether its images may differ from those of a pinhole camera."""
+        return self.others > 0 or "FISHEYE" in self.name
+
+
+MODELS = (
+    Model("SIMPLE_PINHOLE", 1, 0),
+    Model("PINHOLE", 2, 0),
+    Model("SIMPLE_RADIAL", 1, 1),
+    Model("RADIAL", 1, 2),
+    Model("OPENCV", 2, 4),
+    Model("OPENCV_FISHEYE", 2, 4),
+    Model("FULL_OPENCV", 2, 8),
+    Model("FOV", 2, 1),
+    Model("SIMPLE_RADIAL_FISHEYE", 1, 1),
+    Model("RADIAL_FISHEYE", 1, 2),
+    Model("THIN_PRISM_FISHEYE", 2, 8),
+    Model("RAD_TAN_THIN_PRISM_FISHEYE", 2, 12),
+    Model("SIMPLE_DIVISION", 1, 1),
+    Model("DIVISION", 2, 1),
+    Model("SIMPLE_FISHEYE", 1, 0),
+    Model("FISHEYE", 2, 0),
+    Model("EUCM", 2, 2),
+    Model("EQUIRECTANGULAR", 0, 0),
+)
+
 #: The cameras by their numbers, each with its model and its lens.
 Cameras = dict[int, tuple[Model, Lens]]
 
 
 def recognises(files: Files) -> bool:
-    """Whether the file begins with the comment of images.txt, or like images.bin with a rotation."""
+    """Return whether the file begins with the comment of images.txt, or like images.bin with a rotation."""
     data = _images(files)
     if data.lstrip().startswith(COMMENT.encode()):
         return True
@@ -44,13 +91,13 @@ def recognises(files: Files) -> bool:
 
 
 def _images(files: Files) -> bytes:
-    """The bytes of images.bin or images.txt, or else of the first file."""
+    """Return the bytes of images.bin or images.txt, or else of the first file."""
     named = (files.contents[name] for name in ("images.bin", "images.txt") if name in files.contents)
     return next(named, files.data)
 
 
 def parse(files: Files, settings: Settings) -> Parsed:
-    """Its images, sorted by name: COLMAP writes them in any order."""
+    """Return its images, sorted by name: COLMAP writes them in any order."""
     if "cameras.bin" in files.contents:
         cameras = dict(_binary_cameras(files.contents["cameras.bin"]))
     else:
@@ -73,7 +120,7 @@ def parse(files: Files, settings: Settings) -> Parsed:
 
 
 def _natural(name: str) -> list[tuple[int, str]]:
-    """A key that sorts 9 before 10 in names."""
+    """Return a key that sorts 9 before 10 in names."""
     parts = [(part.lstrip("0") if index % 2 else part) for index, part in enumerate(re.split(r"([0-9]+)", name))]
     return [(len(part) if index % 2 else 0, part) for index, part in enumerate(parts)]
 
@@ -156,7 +203,7 @@ class _Reader:
         self._data, self._name, self._at = data, name, 0
 
     def expect(self, count: int, least: int) -> None:
-        """Checks that `count` items of at least `least` bytes can follow."""
+        """Check that `count` items of at least `least` bytes can follow."""
         if count > (len(self._data) - self._at) // least:
             raise CameraPathError(f"{self._name} announces {count:,} items, more than it can hold")
 
@@ -165,7 +212,7 @@ class _Reader:
         return layout.unpack_from(self._data, self._at - layout.size)
 
     def text(self) -> str:
-        """The text up to a zero byte."""
+        """Return the text up to a zero byte."""
         end = self._data.find(b"\0", self._at)
         if end < 0:
             raise CameraPathError(f"{self._name} ends inside a name")
@@ -177,3 +224,17 @@ class _Reader:
         self._at += size
         if self._at > len(self._data):
             raise CameraPathError(f"{self._name} ends before all of its data")
+
+
+def lens_of(model: Model, width: float, height: float, numbers: list[float], way: str) -> Lens:
+    """Return the lens of a camera, without its distortion.
+
+    Raises:
+        CameraPathError: the number of parameters or the size is wrong, or it is not a pinhole camera.
+    """
+    if not model.focals:
+        raise CameraPathError(f"{way} is {model.name}, which is not a pinhole camera")
+    if len(numbers) != model.count:
+        raise CameraPathError(f"{way} has {len(numbers)} parameters, not the {model.count} of {model.name}")
+    principal = numbers[model.focals], numbers[model.focals + 1]
+    return Lens((side(width, way), side(height, way)), (numbers[0], numbers[model.focals - 1]), principal)

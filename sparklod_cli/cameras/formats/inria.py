@@ -10,13 +10,13 @@ from .source import Files, Json, Parsed
 
 
 def recognises(files: Files) -> bool:
-    """Whether it is a list of positions and rotations."""
+    """Return whether it is a list of positions and rotations."""
     items = files.json.value if files.json else None
     return isinstance(items, list) and bool(items) and Json(items[0]).has("position", "rotation")
 
 
 def parse(files: Files, settings: Settings) -> Parsed:
-    """Its cameras in the order of the file: test cameras come first."""
+    """Return its cameras in the order of the file: test cameras come first."""
     return Parsed([_frame(item) for item in files.object().items()])
 
 

@@ -15,12 +15,12 @@ PINHOLES = ("perspective", "fisheye")
 
 
 def recognises(files: Files) -> bool:
-    """Whether it has a camera_path."""
+    """Return whether it has a camera_path."""
     return files.json is not None and files.json.has("camera_path")
 
 
 def parse(files: Files, settings: Settings) -> Parsed:
-    """Its frames. Keyframes are ignored, since the frames are interpolated from them already."""
+    """Return its frames. Keyframes are ignored, since the frames are interpolated from them already."""
     root = files.object()
     kind = root.get("camera_type").text() if root.has("camera_type") else PINHOLES[0]
     if kind not in PINHOLES:
@@ -35,7 +35,7 @@ def parse(files: Files, settings: Settings) -> Parsed:
 
 
 def _frame(item: Json, size: tuple[int, int] | None) -> Frame:
-    """The field of view is vertical, in degrees, as in three.js; its aspect is that of the size."""
+    """Return the field of view is vertical, in degrees, as in three.js; its aspect is that of the size."""
     fov = math.radians(item.get("fov").number()) if item.has("fov") else None
     matrix = np.array(item.get("camera_to_world").matrix(4)).reshape(4, 4)
     return Frame(matrix, Lens(size, fov=fov))

@@ -28,7 +28,7 @@ HALF = 0.5
 
 
 def recognises(files: Files) -> bool:
-    """Whether it is JSON of that class, or begins with three whole numbers and a row of four."""
+    """Return whether it is JSON of that class, or begins with three whole numbers and a row of four."""
     if files.json is not None:
         return files.json.has("class_name") and files.json.value["class_name"] == CLASS
     rows = [line.split() for line in (files.text or "").split("\n", 2)[:2]]
@@ -39,7 +39,7 @@ def recognises(files: Files) -> bool:
 
 
 def parse(files: Files, settings: Settings) -> Parsed:
-    """Its cameras; a .log has no lenses."""
+    """Return its cameras; a .log has no lenses."""
     suffix = files.path.suffix.lower()
     if suffix == ".json":
         _check_json(files)
@@ -87,7 +87,7 @@ def _check_log(files: Files) -> None:
 
 
 def load_open3d() -> ModuleType:
-    """Imports Open3D.
+    """Import Open3D.
 
     Raises:
         CameraPathError: it is not installed, or a library that it needs does not load.

@@ -17,7 +17,7 @@ COLUMNS = {*POSITION, *QUAT, *TARGET, *UP, *SIZE, "time", "fov", "name"}
 
 
 def recognises(files: Files) -> bool:
-    """Whether its first line names the columns of a pose."""
+    """Return whether its first line names the columns of a pose."""
     names = set(_names((files.text or "").split("\n", 1)[0]))
     return names >= {*POSITION, *QUAT} or names >= {*POSITION, *TARGET}
 
@@ -27,13 +27,13 @@ def _names(line: str) -> list[str]:
 
 
 def resembles(files: Files) -> bool:
-    """Whether it looks like a failed attempt: it is named .csv, or its first line names some of the columns."""
+    """Return whether it looks like a failed attempt: it is named .csv, or its first line names some of the columns."""
     names = _names((files.text or "").split("\n", 1)[0])
     return files.path.suffix.lower() == ".csv" or len(COLUMNS.intersection(names)) > 1
 
 
 def lacking(names: Collection[str]) -> str:
-    """The error about missing columns."""
+    """Return the error about missing columns."""
     missing = min(([name for name in POSITION + way if name not in names] for way in (TARGET, QUAT)), key=len)
     return (
         f"its first line, which names the columns, lacks {', '.join(missing)}; a camera needs {', '.join(POSITION)},"
@@ -42,7 +42,7 @@ def lacking(names: Collection[str]) -> str:
 
 
 def parse(files: Files, settings: Settings) -> Parsed:
-    """Its rows."""
+    """Return its rows."""
     lines = files.lines() or [""]
     names = _names(lines[0])
     if not recognises(files):

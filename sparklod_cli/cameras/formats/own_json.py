@@ -18,12 +18,12 @@ FORMAT, VERSION = "sparklod-camera-path", 1
 
 
 def recognises(files: Files) -> bool:
-    """Whether its field format says so."""
+    """Return whether its field format says so."""
     return files.json is not None and files.json.has("format") and files.json.value["format"] == FORMAT
 
 
 def parse(files: Files, settings: Settings) -> Parsed:
-    """Its frames, or those between its keyframes."""
+    """Return its frames, or those between its keyframes."""
     root = files.object()
     if root.has("version") and root.get("version").value != VERSION:
         raise CameraPathError(f"version {brief(root.value['version'])} is unknown, only {VERSION} is read")
@@ -77,7 +77,7 @@ def _key(item: Json) -> Key:
 
 
 def _lens(item: Json, default: Lens) -> Lens:
-    """The lens of an object, whose fields override those of the whole file."""
+    """Return the lens of an object, whose fields override those of the whole file."""
     size, focal, principal, fov = (item.first(key) for key in ("size", "focal", "principal", "fov"))
     if size is not None:
         width, height = (side(number, size.way) for number in size.numbers(2))

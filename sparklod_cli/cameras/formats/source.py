@@ -54,13 +54,13 @@ class Files:
             return None
 
     def lines(self) -> list[str]:
-        """The lines of the first file; `CameraPathError` if it is not text."""
+        """Return the lines of the first file; `CameraPathError` if it is not text."""
         if self.text is None:
             raise CameraPathError("it is not a text file")
         return self.text.splitlines()
 
     def object(self) -> Json:
-        """The first file as JSON; `CameraPathError` if it is not JSON."""
+        """Return the first file as JSON; `CameraPathError` if it is not JSON."""
         if self.json is None:
             raise CameraPathError("it is not JSON, or cut short")
         return self.json
@@ -94,49 +94,49 @@ class Json:
     way: str = ""
 
     def has(self, *keys: str) -> bool:
-        """Whether it is an object with all of these keys, none of them null."""
+        """Return whether it is an object with all of these keys, none of them null."""
         return isinstance(self.value, dict) and all(self.value.get(key) is not None for key in keys)
 
     def get(self, key: str) -> Json:
-        """The value of a key of an object."""
+        """Return the value of a key of an object."""
         if not self.has(key):
             raise CameraPathError(f"{self.way or 'it'} has no {key!r}")
         return Json(self.value[key], f"{self.way}.{key}" if self.way else key)
 
     def first(self, *keys: str) -> Json | None:
-        """The value of the first of these keys that an object has; None if it has none."""
+        """Return the value of the first of these keys that an object has; None if it has none."""
         return next((self.get(key) for key in keys if self.has(key)), None)
 
     def find(self, *keys: str) -> Json | None:
-        """The value at the end of nested keys; None if one is missing."""
+        """Return the value at the end of nested keys; None if one is missing."""
         here: Json | None = self
         for key in keys:
             here = here.first(key) if here else None
         return here
 
     def items(self) -> Iterator[Json]:
-        """The items of a list."""
+        """Return the items of a list."""
         if not isinstance(self.value, list):
             raise CameraPathError(f"{self.way or 'it'} is not a list")
         return (Json(item, f"{self.way}[{index}]") for index, item in enumerate(self.value))
 
     def number(self) -> float:
-        """A finite number."""
+        """Return a finite number."""
         return finite(self.value, self.way)
 
     def numbers(self, *counts: int) -> list[float]:
-        """A list of finite numbers, of one of the lengths `counts`; of any length without them."""
+        """Return a list of finite numbers, of one of the lengths `counts`; of any length without them."""
         if not isinstance(self.value, list) or (counts and len(self.value) not in counts):
             raise CameraPathError(f"{self.way} is not a list of {' or '.join(map(str, counts)) or 'some'} numbers")
         return [finite(item, self.way) for item in self.value]
 
     def pair(self) -> tuple[float, float]:
-        """Two finite numbers."""
+        """Return two finite numbers."""
         first, second = self.numbers(2)
         return first, second
 
     def matrix(self, *rows: int, columns: int = 4) -> list[float]:
-        """Finite numbers of a matrix, row by row, from a list of rows or of all numbers.
+        """Return the finite numbers of a matrix, row by row, from a list of rows or of all numbers.
 
         Args:
             rows: numbers of rows that are accepted.
@@ -148,18 +148,18 @@ class Json:
         return self.numbers(*(columns * count for count in rows))
 
     def side(self) -> int:
-        """Pixels along a side of an image."""
+        """Return pixels along a side of an image."""
         return side(self.number(), self.way)
 
     def text(self) -> str:
-        """A text."""
+        """Return a text."""
         if not isinstance(self.value, str):
             raise CameraPathError(f"{self.way} is not a text")
         return self.value
 
 
 def posed(quat_wxyz: Sequence[float], position: Sequence[float], way: str) -> Matrix:
-    """The (4, 4) pose of a quaternion and a position; `CameraPathError`, naming their place, if the length is 0."""
+    """Return the (4, 4) pose of a quaternion and a position; `CameraPathError`, naming the place, for length 0."""
     try:
         return pose(rotation_of(quat_wxyz), position)
     except ValueError as error:
@@ -167,7 +167,7 @@ def posed(quat_wxyz: Sequence[float], position: Sequence[float], way: str) -> Ma
 
 
 def finite(value: Any, way: str) -> float:
-    """A finite number from a number or its digits; `CameraPathError`, naming its place, for anything else."""
+    """Return a finite number from a number or its digits; `CameraPathError`, naming its place, for anything else."""
     try:
         number = float(value) if not isinstance(value, bool) else math.nan
     except (TypeError, ValueError, OverflowError):
@@ -178,12 +178,12 @@ def finite(value: Any, way: str) -> float:
 
 
 def brief(value: Any) -> str:
-    """A value of a file as an error quotes it: on one line, and shortened."""
+    """Return a value of a file as an error quotes it: on one line, and shortened."""
     return f"a {type(value).__name__}" if isinstance(value, (dict, list)) else repr(value)[:30]
 
 
 def side(number: float, way: str) -> int:
-    """Pixels along a side of an image; `CameraPathError`, naming its place, for an impossible number."""
+    """Return pixels along a side of an image; `CameraPathError`, naming its place, for an impossible number."""
     if not 1 <= number <= MAX_SIDE or number != int(number):
         raise CameraPathError(f"{way} of {number:g} is not a number of pixels")
     return int(number)

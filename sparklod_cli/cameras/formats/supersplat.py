@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from ...support.errors import CameraPathError
 from ..camera import Matrix
 from ..frame import Frame, Lens, Settings, sampled
-from ..generators import along, frame_looking
-from ..spline import cardinal_tangents, hermite
+from ..generators import along, cardinal_tangents, frame_looking, hermite
 from .source import Files, Json, Parsed, brief
 
 UP = (0.0, 1.0, 0.0)
@@ -29,7 +28,7 @@ VERSION = 2
 
 
 def recognises(files: Files) -> bool:
-    """Whether it is one of the three."""
+    """Return whether it is one of the three."""
     root = files.json
     if root is None:
         return False
@@ -43,7 +42,7 @@ def recognises(files: Files) -> bool:
 
 @np.errstate(all="ignore")  # numbers may have any size; the resulting poses are checked
 def parse(files: Files, settings: Settings) -> Parsed:
-    """The frames of its first animation, or else its views."""
+    """Return the frames of its first animation, or else its views."""
     root = files.object()
     if root.has("poseSets"):
         return _of_document(root, settings)
@@ -61,7 +60,7 @@ def parse(files: Files, settings: Settings) -> Parsed:
 
 
 def _of_track(track: Json, fov: float, first_version: bool, settings: Settings) -> Parsed:
-    """An item of animTracks. Version 1 has one field of view for all keys, and at first counted in seconds."""
+    """Return an item of animTracks. Version 1 has one field of view for all keys, and at first counted in seconds."""
     rate = _positive(track, "frameRate", FRAME_RATE)
     times = np.array(track.get("keyframes").get("times").numbers())
     if not track.has("frameRate"):
@@ -82,7 +81,7 @@ def _of_track(track: Json, fov: float, first_version: bool, settings: Settings) 
 
 
 def _of_document(root: Json, settings: Settings) -> Parsed:
-    """The frames of a project; poses beyond the end of its time line are ignored."""
+    """Return the frames of a project; poses beyond the end of its time line are ignored."""
     line = root.get("timeline")
     count, rate = line.get("frames").number(), _positive(line, "frameRate", FRAME_RATE)
     fov = root.find("camera", "fov")
@@ -101,14 +100,14 @@ def _of_document(root: Json, settings: Settings) -> Parsed:
 
 
 def _whole(frames: float) -> float:
-    """Rounded; infinity stays infinite."""
+    """Return a number rounded; infinity stays infinite."""
     return float(round(frames)) if math.isfinite(frames) else frames
 
 
 def _values(view: Json, fov: float) -> list[float]:
     """Position, target and field of view in degrees."""
-    own = view.get("fov").number() if view.has("fov") else fov
-    return [*view.get("position").numbers(3), *view.get("target").numbers(3), own]
+    degrees = view.get("fov").number() if view.has("fov") else fov
+    return [*view.get("position").numbers(3), *view.get("target").numbers(3), degrees]
 
 
 def _positive(place: Json, key: str, default: float) -> float:
@@ -121,7 +120,7 @@ def _positive(place: Json, key: str, default: float) -> float:
 def _curve(
     times: Matrix, points: Matrix, smoothness: float, length: float | None, step: bool
 ) -> Callable[[Matrix], Matrix]:
-    """The interpolation between keys.
+    """Return the interpolation between keys.
 
     Args:
         times: (n,) of the keys, frames.
@@ -144,7 +143,7 @@ def _curve(
 
 
 def _sampled(curve: Callable[[Matrix], Matrix], count: float, rate: float, settings: Settings) -> Parsed:
-    """All frames of a path of `count` frames; --fps changes their number, not the duration."""
+    """Return all frames of a path of `count` frames; --fps changes their number, not the duration."""
     fps = settings.fps or rate
 
     def at(numbers: NDArray[np.int64]) -> list[Frame]:
@@ -156,6 +155,6 @@ def _sampled(curve: Callable[[Matrix], Matrix], count: float, rate: float, setti
 
 
 def _looking(sample: Matrix | list[float], time: float | None, settings: Settings) -> Frame:
-    """A frame whose field of view spans the longer side of the image."""
+    """Return a frame whose field of view spans the longer side of the image."""
     lens = Lens(fov=math.radians(sample[6]), fov_along="longer")
     return frame_looking(sample[:3], sample[3:6], settings.up or UP, lens, time)

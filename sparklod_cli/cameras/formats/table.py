@@ -38,7 +38,7 @@ class PathFormat:
     names: tuple[tuple[str, ...], ...] = ()
 
     def parser(self) -> Any:
-        """The module, imported when it is needed."""
+        """Return the module, imported when it is needed."""
         return import_module(f".{self.module}", __package__)
 
 

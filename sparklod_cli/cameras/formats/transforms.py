@@ -15,14 +15,14 @@ PANORAMAS = ("EQUIRECTANGULAR", "OMNIDIRECTIONAL", "VR180")
 
 
 def recognises(files: Files) -> bool:
-    """Whether its frames have a transform_matrix."""
+    """Return whether its frames have a transform_matrix."""
     frames = files.json.first("frames") if files.json else None
     items = frames.value if frames else None
     return isinstance(items, list) and bool(items) and Json(items[0]).has("transform_matrix")
 
 
 def parse(files: Files, settings: Settings) -> Parsed:
-    """Its frames, in the order of the file."""
+    """Return its frames, in the order of the file."""
     root = files.object()
     items = list(root.get("frames").items())
     notes = []
@@ -43,7 +43,7 @@ def _frame(item: Json, root: Json) -> Frame:
 
 
 def _lens(item: Json, root: Json) -> Lens:
-    """The lens of a frame: each value is that of the frame, or else of the whole file."""
+    """Return the lens of a frame: each value is that of the frame, or else of the whole file."""
 
     def number(key: str) -> float | None:
         place = item if item.has(key) else root

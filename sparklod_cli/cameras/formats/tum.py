@@ -12,7 +12,7 @@ COLUMNS = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
 
 
 def recognises(files: Files) -> bool:
-    """Whether its first line that is not a comment has eight numbers."""
+    """Return whether its first line that is not a comment has eight numbers."""
     words = next(_rows((files.text or "").splitlines()), (0, []))[1]
     try:
         return len([float(word) for word in words]) == len(COLUMNS)
@@ -21,7 +21,7 @@ def recognises(files: Files) -> bool:
 
 
 def parse(files: Files, settings: Settings) -> Parsed:
-    """Its poses, one per line."""
+    """Return its poses, one per line."""
     return Parsed([_frame(words, f"line {number}") for number, words in _rows(files.lines())])
 
 

@@ -15,7 +15,7 @@ from ...model.splats import FloatArray, Splats
 from ...support.errors import FormatError
 from ...support.parallel import for_blocks
 from .. import quantize
-from ..octahedral import Words
+from ..spark_codings import Words
 
 WIDTH = 2048
 SPLATS_A_ROW = WIDTH // 2
@@ -35,7 +35,7 @@ GAIN, LARGEST = 4, 65504
 
 
 def pack(splats: Splats, *, threads: int = 1) -> dict[str, Words]:
-    """Splats as the viewer uploads them: "texture" (H, 2048, 4) uint32, H = ceil(N / 1024), at least 1; unused is 0.
+    """Pack splats as the viewer uploads them: "texture" (H, 2048, 4) uint32, H = ceil(N / 1024), at least 1.
 
     The viewer multiplies M^T M with M = diag(scale) R. Its R, by rows, is the transpose of the matrix that turns local
     into world axes, so that M^T M is the covariance A diag(scale ** 2) A^T with A local to world, as here.
@@ -62,7 +62,7 @@ def pack(splats: Splats, *, threads: int = 1) -> dict[str, Words]:
 
 
 def dump(scene: Scene, *, threads: int = 1) -> dict[str, Words]:
-    """The texture of a scene; it does not hold the children of a tree."""
+    """Return the texture of a scene; it does not hold the children of a tree."""
     return pack(scene.splats, threads=threads)
 
 
@@ -82,7 +82,7 @@ class Texels:
 
 
 def unpack(arrays: Mapping[str, NDArray[Any]], count: int) -> Texels:
-    """The first `count` splats of a texture that `pack` made.
+    """Return the first `count` splats of a texture that `pack` made.
 
     Largest errors: the centre is exact; 2 ** -11 of each element of the covariance, or 2 ** -27 if that is more, for
     splats that were not shrunk; 1 / 510 of each channel of rgba.
@@ -107,6 +107,6 @@ def unpack(arrays: Mapping[str, NDArray[Any]], count: int) -> Texels:
 
 
 def _encode_covariance(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Covariances times `GAIN`, scaled down to `LARGEST` where necessary; the largest element is on the diagonal."""
+    """Multiply covariances by `GAIN`, scaled down to `LARGEST`; the largest element is on the diagonal."""
     stored = values * GAIN
     return stored * (LARGEST / np.maximum(stored.max(axis=1, keepdims=True), LARGEST))

@@ -14,34 +14,34 @@ from numpy.typing import NDArray
 from ...model.scene import Scene
 from ...support.errors import FormatError
 from ...support.untrusted import ZIP_ERRORS, quoted, quoted_value
-from .. import npy
-from .table import ENCODINGS
+from .. import rgba
+from ..formats import ENCODINGS
 
 Arrays = dict[str, NDArray[Any]]
 
 
 def pack(scene: Scene, encoding: str, threads: int = 1) -> Arrays:
-    """The arrays of a scene in one of `table.ENCODINGS`, by their names: uint32 words, see docs/formats.md."""
+    """Return the arrays of a scene in one of `formats.ENCODINGS`, by name: uint32 words, see docs/formats.md."""
     module = import_module(f".{ENCODINGS[encoding]}", __package__)
     arrays: Arrays = module.dump(scene, threads=threads)
     return arrays
 
 
 def encode_npz(arrays: Arrays) -> Iterator[bytes]:
-    """The bytes of a .npz file of these arrays; the same arrays give the same bytes."""
+    """Return the bytes of a .npz file of these arrays; the same arrays give the same bytes."""
     file = io.BytesIO()
     np.savez(file, **arrays)  # type: ignore[arg-type]
     yield file.getvalue()
 
 
 def encode_raw(arrays: Arrays) -> Iterator[bytes]:
-    """The little-endian words of all the arrays, one after the other."""
+    """Return the little-endian words of all the arrays, one after the other."""
     for words in arrays.values():
         yield words.astype("<u4", copy=False).tobytes()
 
 
 def decode_npz(file: BinaryIO) -> Arrays | None:
-    """The arrays of a .npz file; None where a file is something else.
+    """Read the arrays of a .npz file; None where a file is something else.
 
     Raises:
         FormatError: an array is compressed, cut short or of no plain numbers.
@@ -63,10 +63,10 @@ def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
     try:
         with archive.open(member) as file:
             data = io.BytesIO(file.read())
-        layout = npy.read_layout(data)
+        layout = rgba.read_layout(data)
         if layout is None:
             raise FormatError("is not a .npy file")
-        return npy.read_values(data, layout)
+        return rgba.read_values(data, layout)
     except (*ZIP_ERRORS, OSError) as error:
         raise FormatError(f"its member {quoted_value(member.filename)} is damaged: {quoted(error)}") from None
     except FormatError as error:

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from ...model.scene import Scene
 from ...model.splats import FloatArray, Splats
 from ...support.parallel import for_blocks
-from .. import octahedral
-from ..octahedral import STEPS_10_10_12, Words
+from .. import spark_codings
+from ..spark_codings import STEPS_10_10_12, Words
 
 SPLAT_0 = np.dtype(
     [
@@ -46,7 +46,7 @@ _EXPONENT = np.uint32(27)
 
 
 def pack(splats: Splats, *, threads: int = 1) -> dict[str, Words]:
-    """Splats in Spark's layout: "ext0" and "ext1" (N, 4) uint32, and by SH degree "sh1", "sh2", "sh3a" and "sh3b".
+    """Pack splats in Spark's layout: "ext0", "ext1" (N, 4) uint32, and by SH degree "sh1", "sh2", "sh3a", "sh3b".
 
     A colour of 65520 or more becomes infinite, as in Spark. The formulas are those of Spark's `encode_ext_splat` and
     `encode_ext_rgb`.
@@ -58,11 +58,11 @@ def pack(splats: Splats, *, threads: int = 1) -> dict[str, Words]:
     def encode(part: slice) -> None:
         first, second = arrays["ext0"][part].view(SPLAT_0)[:, 0], arrays["ext1"][part].view(SPLAT_1)[:, 0]
         first["center"] = splats.center[part]
-        first["alpha"] = octahedral.encode_lod_alpha(splats.opacity[part])
+        first["alpha"] = spark_codings.encode_lod_alpha(splats.opacity[part])
         second["rgb"] = splats.rgb[part]
         # Rounded to float32 first, as in Spark, which decides ties.
         second["log_scale"] = np.log(splats.scale[part].astype(np.float64)).astype(np.float32)
-        u, v, angle = octahedral.encode_axis_angle(splats.quat_xyzw[part], STEPS_10_10_12)
+        u, v, angle = spark_codings.encode_axis_angle(splats.quat_xyzw[part], STEPS_10_10_12)
         second["rotation"] = u | v << np.uint32(10) | angle << np.uint32(20)
         words = encode_sh(splats.sh[part])
         for index, name in enumerate(sh_names):
@@ -74,12 +74,12 @@ def pack(splats: Splats, *, threads: int = 1) -> dict[str, Words]:
 
 
 def dump(scene: Scene, *, threads: int = 1) -> dict[str, Words]:
-    """The arrays of a scene, with or without a tree."""
+    """Return the arrays of a scene, with or without a tree."""
     return pack(scene.splats, threads=threads)
 
 
 def unpack(arrays: Mapping[str, NDArray[Any]], *, threads: int = 1) -> Splats:
-    """Splats of the arrays of `pack`; the SH arrays present determine the degree.
+    """Return the splats of the arrays of `pack`; the SH arrays present determine the degree.
 
     Largest errors, apart from that of float32:
 
@@ -95,19 +95,19 @@ def unpack(arrays: Mapping[str, NDArray[Any]], *, threads: int = 1) -> Splats:
     """
     degree = max((degree for name, degree in SH_ARRAYS.items() if name in arrays), default=0)
     sh_names = _sh_names(degree)
-    found = octahedral.checked_words(arrays, dict.fromkeys(("ext0", "ext1", *sh_names), 4))
+    found = spark_codings.checked_words(arrays, dict.fromkeys(("ext0", "ext1", *sh_names), 4))
     first, second = found["ext0"].view(SPLAT_0)[:, 0], found["ext1"].view(SPLAT_1)[:, 0]
     splats = Splats.empty(len(first), degree)
 
     @np.errstate(over="ignore", invalid="ignore")  # arbitrary words may overflow
     def decode(part: slice) -> None:
         splats.center[part] = first["center"][part]
-        splats.opacity[part] = octahedral.decode_lod_alpha(first["alpha"][part].astype(np.float32))
+        splats.opacity[part] = spark_codings.decode_lod_alpha(first["alpha"][part].astype(np.float32))
         splats.rgb[part] = second["rgb"][part]
         splats.scale[part] = np.exp(second["log_scale"][part].astype(np.float64))
         rotation = second["rotation"][part]
         u, v = rotation & np.uint32(1023), rotation >> np.uint32(10) & np.uint32(1023)
-        splats.quat_xyzw[part] = octahedral.decode_axis_angle(u, v, rotation >> np.uint32(20), STEPS_10_10_12)
+        splats.quat_xyzw[part] = spark_codings.decode_axis_angle(u, v, rotation >> np.uint32(20), STEPS_10_10_12)
         for index, name in enumerate(sh_names):
             some = splats.sh[part, 4 * index : 4 * index + 4]
             some[:] = decode_sh(found[name][part, : some.shape[1]])
@@ -121,7 +121,7 @@ def _sh_names(degree: int) -> list[str]:
 
 
 def encode_sh(sh: FloatArray) -> Words:
-    """(N, K, 3) SH coefficients to (N, K) words: a byte of magnitude and a sign per channel, and a shared exponent.
+    """Encode (N, K, 3) SH as (N, K) words: a byte of magnitude and a sign per channel, and a shared exponent.
 
     The exponent is that of the largest channel rounded down, between -15 and 16, and the bytes are 0..2 ** exponent in
     255 steps. So a magnitude above that power of two is clamped to it, which loses up to half of the largest channel.
@@ -135,13 +135,13 @@ def encode_sh(sh: FloatArray) -> Words:
     step = np.ldexp(np.float32(1), exponent - EXPONENT_BIAS) / np.float32(255)
     words = exponent.astype(np.uint32) << _EXPONENT
     for channel, magnitude, (byte, sign) in zip(channels, magnitudes, _BITS, strict=True):
-        words |= octahedral.to_code(magnitude / step, 255) << byte
+        words |= spark_codings.to_code(magnitude / step, 255) << byte
         words |= (channel < 0).astype(np.uint32) << sign
     return words
 
 
 def decode_sh(words: Words) -> FloatArray:
-    """(N, K) words to (N, K, 3) SH coefficients.
+    """Decode (N, K) words to (N, K, 3) SH coefficients.
 
     Largest error: let m be the largest channel of a coefficient, between 2 ** -15 and 2 ** 17, and p the power of two
     not above it. A channel up to p is off by at most p / 510; one above p becomes p, which is off by less than m / 2.

@@ -19,7 +19,7 @@ from ...model.nodes import Nodes
 from ...model.scene import PLAIN, FileCoding, ScaleCoding
 from ...model.splats import FloatArray, Splats
 from ...support.parallel import for_blocks
-from .. import octahedral, quantize, spark_math, splat_encoding
+from .. import quantize, spark_codings, splat_encoding
 from ..splat_encoding import SplatEncoding
 
 Recode = Callable[[FloatArray], FloatArray]
@@ -34,25 +34,20 @@ _LEAST = np.finfo(np.float32).smallest_subnormal
 _SAME = np.float32(2**-20)
 
 
-class Layout(NamedTuple):
-    """What splats in memory keep of numbers.
-
-    Attributes:
-        alpha: of alphas, 0..2.
-        scale: of linear scales.
-    """
+class LoadedPrecision(NamedTuple):
+    """What splats in memory keep of numbers: of alphas, 0..2, and of linear scales."""
 
     alpha: Recode
     scale: Recode
 
 
 def nodes(splats: Splats, tree: LodTree, layout: str, coding: FileCoding = PLAIN, *, threads: int = 1) -> Nodes:
-    """The nodes of a tree as Spark's traversal reads them.
+    """Return the nodes of a tree as Spark's traversal reads them.
 
     Args:
         splats: N, as they were decoded; their centres, scales and opacities matter.
         tree: of them.
-        layout: one of `table.LOADED`.
+        layout: one of `formats.LOADED`.
         coding: of the file that they were read from. Scales that do not come from its codes, or of splats that were not
             read from a file, are taken to be those that Spark has.
         threads: to work on.
@@ -65,9 +60,9 @@ def nodes(splats: Splats, tree: LodTree, layout: str, coding: FileCoding = PLAIN
         @np.errstate(over="ignore", invalid="ignore")
         def measure(part: slice, start: int = rows.start, recode: Recode = recode) -> None:
             part = slice(start + part.start, start + part.stop)
-            alpha = held.alpha(octahedral.stored_lod_alpha(splats.opacity[part]))
+            alpha = held.alpha(spark_codings.stored_lod_alpha(splats.opacity[part]))
             x, y, z = recode(np.ascontiguousarray(splats.scale[part].T))
-            factor = np.float32(2) * size_factor(octahedral.lod_opacity_of_alpha(alpha))
+            factor = np.float32(2) * size_factor(spark_codings.lod_opacity_of_alpha(alpha))
             found.center[part] = splats.center[part].astype(np.float16)
             found.size[part] = (factor * ((x + y + z) / np.float32(3))).astype(np.float16)
 
@@ -75,19 +70,19 @@ def nodes(splats: Splats, tree: LodTree, layout: str, coding: FileCoding = PLAIN
     return found
 
 
-def _layout(name: str, packed_range: tuple[float, float] | None) -> Layout:
-    """What one of `table.LOADED` keeps, with the range of logarithms that a file sets for PackedSplats."""
+def _layout(name: str, packed_range: tuple[float, float] | None) -> LoadedPrecision:
+    """Return one of `formats.LOADED`, with the range of logarithms that a file sets for PackedSplats."""
     if name == "ext":
-        scales = spark_math.exp(_HALVES.astype(np.float32))
-        return Layout(
+        scales = spark_codings.exp(_HALVES.astype(np.float32))
+        return LoadedPrecision(
             lambda alpha: alpha.astype(np.float16).astype(np.float32),
-            lambda scale: scales[spark_math.log(scale).astype(np.float16).view(np.uint16)],
+            lambda scale: scales[spark_codings.log(scale).astype(np.float16).view(np.uint16)],
         )
     own = SplatEncoding(lod_opacity=True)
     low, high = own.ln_scale_min, own.ln_scale_max
     if name == "packed" and packed_range is not None:
         low, high = packed_range
-    table = splat_encoding.log_scale_table(low, high, exp=spark_math.exp)
+    table = splat_encoding.log_scale_table(low, high, exp=spark_codings.exp)
 
     def alpha_held(alpha: FloatArray) -> FloatArray:
         codes = splat_encoding.encode_linear(alpha, 0, own.alpha_max)
@@ -95,19 +90,13 @@ def _layout(name: str, packed_range: tuple[float, float] | None) -> Layout:
 
     def scale_held(scale: FloatArray) -> FloatArray:
         known = np.where(np.isnan(scale), _LEAST, scale)
-        return table[splat_encoding.encode_log_scale(known, low, high, log=spark_math.log, least=_LEAST)]
+        return table[splat_encoding.encode_log_scale(known, low, high, log=spark_codings.log, least=_LEAST)]
 
-    return Layout(alpha_held, scale_held)
+    return LoadedPrecision(alpha_held, scale_held)
 
 
 class _Codes(NamedTuple):
-    """The codes of a file's scales.
-
-    Attributes:
-        of: whole numbers from 0 on, of scales.
-        ours: the scale of each, as `Splats` has it.
-        theirs: the same as Spark has it.
-    """
+    """Codes of a file's scales: whole numbers from 0 on, and the scale of each in `Splats` and in Spark."""
 
     of: Callable[[FloatArray], NDArray[np.unsignedinteger[Any]]]
     ours: FloatArray
@@ -116,18 +105,18 @@ class _Codes(NamedTuple):
 
 @np.errstate(over="ignore", invalid="ignore")
 def _codes(coding: ScaleCoding) -> _Codes | None:
-    """Those of a coding; None for plain numbers."""
+    """Return the codes of a coding; None for plain numbers."""
     if coding.name == "ln_0r8":
         low, high = coding.low, coding.high
         ours = splat_encoding.log_scale_table(low, high)
-        theirs = splat_encoding.log_scale_table(low, high, exp=spark_math.exp)
+        theirs = splat_encoding.log_scale_table(low, high, exp=spark_codings.exp)
         return _Codes(lambda scale: splat_encoding.encode_log_scale(scale, low, high), ours, theirs)
     if coding.name == "spz":
         logs = np.arange(256, dtype=np.float32) / quantize.SCALE_STEPS - quantize.SCALE_OFFSET
-        return _Codes(quantize.encode_log_scale, np.exp(logs), spark_math.exp(logs))
+        return _Codes(quantize.encode_log_scale, np.exp(logs), spark_codings.exp(logs))
     if coding.name == "ln_f16":
         logs = _HALVES.astype(np.float32)
-        return _Codes(_half_log, np.exp(logs), spark_math.exp(logs))
+        return _Codes(_half_log, np.exp(logs), spark_codings.exp(logs))
     return None
 
 
@@ -137,12 +126,7 @@ def _half_log(scale: FloatArray) -> NDArray[np.uint16]:
 
 
 def _recoded(coding: ScaleCoding, held: Recode) -> Recode:
-    """What a layout keeps of scales that come from codes: the last bits of those are others in Spark.
-
-    Args:
-        coding: of the scales in the file.
-        held: what the layout keeps of numbers.
-    """
+    """Return what a layout keeps (`held`) of scales that come from codes, whose last bits are others in Spark."""
     codes = _codes(coding)
     if codes is None:
         return held

@@ -15,7 +15,7 @@ from ...model.scene import Scene
 from ...model.splats import FloatArray, Splats
 from ...support.errors import FormatError
 from ...support.parallel import for_blocks
-from ..octahedral import Words, checked_words
+from ..spark_codings import Words, checked_words
 
 NODE = np.dtype(
     [
@@ -31,7 +31,7 @@ assert NODE.itemsize == 16
 def pack(
     splats: Splats, tree: LodTree, *, size: Callable[[Splats], FloatArray] = spark_size, threads: int = 1
 ) -> dict[str, Words]:
-    """Splats and their tree in the layout of Spark's traversal: "lod_tree" (N, 4) uint32.
+    """Pack splats and their tree in the layout of Spark's traversal: "lod_tree" (N, 4) uint32.
 
     Spark measures splats after their coding: for the same words as Spark's, pass splats that were packed and unpacked
     by `ext_splats` or `packed_splats`. A coordinate or a size of 65520 or more becomes infinite, as in Spark.
@@ -59,7 +59,7 @@ def pack(
 
 
 def dump(scene: Scene, *, threads: int = 1) -> dict[str, Words]:
-    """The words of a scene that is a tree.
+    """Return the words of a scene that is a tree.
 
     Raises:
         ValueError: it is none.
@@ -70,7 +70,7 @@ def dump(scene: Scene, *, threads: int = 1) -> dict[str, Words]:
 
 
 def unpack(arrays: Mapping[str, NDArray[Any]]) -> Nodes:
-    """The nodes of the array of `pack`.
+    """Return the nodes of the array of `pack`.
 
     Largest errors: 2 ** -11 of each coordinate and of the size, or 2 ** -25 if that is more; children are exact.
 

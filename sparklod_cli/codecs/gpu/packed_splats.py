@@ -17,8 +17,8 @@ from ...model.sh import COEFFICIENTS
 from ...model.splats import FloatArray, Splats
 from ...support.errors import FormatError
 from ...support.parallel import for_blocks
-from .. import octahedral
-from ..octahedral import STEPS_8_8_8, Words
+from .. import spark_codings
+from ..spark_codings import STEPS_8_8_8, Words
 from ..splat_encoding import DEFAULT, SplatEncoding, decode_linear, encode_linear, encode_log_scale, log_scale_table
 
 SPLAT = np.dtype(
@@ -41,12 +41,12 @@ SH_BITS = {1: 7, 2: 8, 3: 6}
 
 
 def of_scene(scene: Scene) -> SplatEncoding:
-    """The encoding that Spark sets up for a scene: an LoD tree has LoD opacities."""
+    """Return the encoding that Spark sets up for a scene: an LoD tree has LoD opacities."""
     return SplatEncoding(lod_opacity=scene.tree is not None)
 
 
 def pack(splats: Splats, encoding: SplatEncoding = DEFAULT, *, threads: int = 1) -> dict[str, Words]:
-    """Splats in Spark's layout: "packed" (N, 4) uint32, and by degree "sh1" (N, 2), "sh2" (N, 4) and "sh3" (N, 4).
+    """Pack splats in Spark's layout: "packed" (N, 4) uint32, and by degree "sh1" (N, 2), "sh2" and "sh3" (N, 4).
 
     Values are clamped to the ranges of their codes; a coordinate of 65520 or more becomes infinite, as in Spark. The
     formulas are those of Spark's `encode_packed_splat` and `encode_sh1` to `encode_sh3`, described on its page about
@@ -62,11 +62,11 @@ def pack(splats: Splats, encoding: SplatEncoding = DEFAULT, *, threads: int = 1)
         rows = arrays["packed"][part].view(SPLAT)[:, 0]
         rows["rgb"] = encode_linear(splats.rgb[part], encoding.rgb_min, encoding.rgb_max)
         opacity = splats.opacity[part]
-        alpha = octahedral.encode_lod_alpha(opacity) if encoding.lod_opacity else opacity
+        alpha = spark_codings.encode_lod_alpha(opacity) if encoding.lod_opacity else opacity
         rows["alpha"] = encode_linear(alpha, 0, encoding.alpha_max)
         rows["center"] = splats.center[part]
         rows["log_scale"] = encode_log_scale(splats.scale[part], *log_range)
-        u, v, rows["angle"] = octahedral.encode_axis_angle(splats.quat_xyzw[part], STEPS_8_8_8)
+        u, v, rows["angle"] = spark_codings.encode_axis_angle(splats.quat_xyzw[part], STEPS_8_8_8)
         rows["axis"][:, 0], rows["axis"][:, 1] = u, v
         for degree in degrees:
             sh = splats.sh[part, COEFFICIENTS[degree - 1] : COEFFICIENTS[degree]].reshape(len(rows), -1)
@@ -77,12 +77,12 @@ def pack(splats: Splats, encoding: SplatEncoding = DEFAULT, *, threads: int = 1)
 
 
 def dump(scene: Scene, *, threads: int = 1) -> dict[str, Words]:
-    """The arrays of a scene, in the encoding of `of_scene`."""
+    """Return the arrays of a scene, in the encoding of `of_scene`."""
     return pack(scene.splats, of_scene(scene), threads=threads)
 
 
 def unpack(arrays: Mapping[str, NDArray[Any]], encoding: SplatEncoding = DEFAULT, *, threads: int = 1) -> Splats:
-    """Splats of the arrays of `pack`; arrays of SH may be missing from the highest degree down.
+    """Return the splats of the arrays of `pack`; arrays of SH may be missing from the highest degree down.
 
     Largest errors inside the ranges, apart from that of float32:
 
@@ -99,7 +99,7 @@ def unpack(arrays: Mapping[str, NDArray[Any]], encoding: SplatEncoding = DEFAULT
     present = tuple(degree for degree in SH_WORDS if f"sh{degree}" in arrays)
     if present != tuple(range(1, len(present) + 1)):
         raise FormatError(f"SH arrays of degree {present}, but not of all lower degrees")
-    found = octahedral.checked_words(arrays, {"packed": 4} | {f"sh{degree}": SH_WORDS[degree] for degree in present})
+    found = spark_codings.checked_words(arrays, {"packed": 4} | {f"sh{degree}": SH_WORDS[degree] for degree in present})
     packed = found["packed"].view(SPLAT)[:, 0]
     splats = Splats.empty(len(packed), len(present))
     scales = log_scale_table(encoding.ln_scale_min, encoding.ln_scale_max)
@@ -109,10 +109,10 @@ def unpack(arrays: Mapping[str, NDArray[Any]], encoding: SplatEncoding = DEFAULT
         splats.center[part] = rows["center"]
         splats.rgb[part] = decode_linear(rows["rgb"], encoding.rgb_min, encoding.rgb_max)
         alpha = decode_linear(rows["alpha"], 0, encoding.alpha_max)
-        splats.opacity[part] = octahedral.decode_lod_alpha(alpha)
+        splats.opacity[part] = spark_codings.decode_lod_alpha(alpha)
         splats.scale[part] = scales[rows["log_scale"]]
         u, v = rows["axis"].T
-        splats.quat_xyzw[part] = octahedral.decode_axis_angle(u, v, rows["angle"], STEPS_8_8_8)
+        splats.quat_xyzw[part] = spark_codings.decode_axis_angle(u, v, rows["angle"], STEPS_8_8_8)
         for degree in present:
             sh = decode_sh(found[f"sh{degree}"][part], SH_BITS[degree], encoding.sh_max(degree), 3 * (2 * degree + 1))
             splats.sh[part, COEFFICIENTS[degree - 1] : COEFFICIENTS[degree]] = sh.reshape(len(rows), -1, 3)
@@ -122,10 +122,10 @@ def unpack(arrays: Mapping[str, NDArray[Any]], encoding: SplatEncoding = DEFAULT
 
 
 def encode_sh(values: FloatArray, bits: int, most: np.float32) -> Words:
-    """(N, numbers) SH coefficients, clamped to -most..most, to (N, words) with `bits` bits each in two's complement."""
+    """Encode (N, numbers) SH, clamped to -most..most, as (N, words), `bits` bits each in two's complement."""
     top = np.float32(2 ** (bits - 1) - 1)
     steps = np.clip(values * (top / most), -top, top)
-    codes = octahedral.round_half_away(steps).astype(np.int32).view(np.uint32) & np.uint32(2**bits - 1)
+    codes = spark_codings.round_half_away(steps).astype(np.int32).view(np.uint32) & np.uint32(2**bits - 1)
     words = np.zeros((-(-codes.shape[1] * bits // 32), len(codes)), np.uint32)
     for index, column in enumerate(np.ascontiguousarray(codes.T)):
         word, offset = divmod(index * bits, 32)
@@ -136,7 +136,7 @@ def encode_sh(values: FloatArray, bits: int, most: np.float32) -> Words:
 
 
 def decode_sh(words: Words, bits: int, most: np.float32, numbers: int) -> FloatArray:
-    """(N, words) to (N, numbers), the inverse of `encode_sh`. Largest error: most / (2 ** bits - 2)."""
+    """Decode (N, words) to (N, numbers), the inverse of `encode_sh`. Largest error: most / (2 ** bits - 2)."""
     columns = np.ascontiguousarray(words.T)
     codes = np.empty((numbers, len(words)), np.uint32)
     for index in range(numbers):

@@ -1,32 +1,27 @@
-"""The chunks of a folder of Streamed SOG: SOG scenes, of which some splats are wanted at some rows."""
+"""The chunks of a folder of Streamed SOG: SOG scenes, of which some splats are read to some rows."""
 
 from __future__ import annotations
 
 import contextlib
 import posixpath
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import BinaryIO
 
-from ...model.scene import Scene
 from ...model.splats import COLUMNS, Splats
-from ...model.streams import SceneStream
 from ...support.errors import FormatError
 from ...support.parallel import ordered_map
-from ...support.progress import Progress
-from ...support.units import count_of
+from ...support.progress import Progress, silent
 from ...support.untrusted import quoted_value
-from ..promises import error_of
+from ..content import Beside, Source
+from ..file_names import MANIFEST
 from ..sog import codec as sog
-from .names import MANIFEST
-
-#: Opens a file by its path below the folder of the manifest.
-Beside = Callable[[str], BinaryIO]
+from ..validation import error_of
 
 
 @dataclass(frozen=True)
 class Piece:
-    """Some splats of a chunk: the first, how many, and the row that the first of them gets."""
+    """Run of splats of a chunk: the first, how many, and the row that the first of them gets."""
 
     start: int
     count: int
@@ -35,14 +30,14 @@ class Piece:
 
 @dataclass(frozen=True)
 class Chunk:
-    """A chunk, as far as its meta.json tells, and what is wanted of it.
+    """Chunk, as far as its meta.json tells, and the pieces of it to read.
 
     Attributes:
         name: path of its meta.json.
         count: all its splats.
         sh_degree, antialiased: as of a scene.
         bytes: of all its files.
-        pieces: what is wanted.
+        pieces: to read.
     """
 
     name: str
@@ -54,82 +49,76 @@ class Chunk:
 
     @property
     def rows(self) -> int:
-        """How many splats are wanted."""
+        """Number of splats in the pieces."""
         return sum(piece.count for piece in self.pieces)
 
 
 def open_chunk(beside: Beside | None, name: str, pieces: Sequence[Piece] | None, row: int = 0) -> Chunk:
-    """A chunk whose meta.json is read.
+    """Read the meta.json of a chunk.
 
     Args:
         beside: opens files.
         name: path of the meta.json.
-        pieces: what is wanted; None for all of it.
-        row: that the first splat gets where all are wanted.
+        pieces: to read; None for all of it.
+        row: of the first splat where all are read.
 
     Raises:
         FormatError: it is no SOG; names it.
     """
 
-    def never(pieces: object) -> BinaryIO:
-        raise AssertionError("only the header is read")
-
-    with _opened(beside, name) as (file, images):
-        found: SceneStream = sog.stream(file, scratch=never, beside=images)
+    with _opened(beside, name) as source:
+        content = sog.open_content(source)
     return Chunk(
         name,
-        found.count,
-        found.sh_degree,
-        found.antialiased,
-        found.header["bytes"],
-        (Piece(0, found.count, row),) if pieces is None else tuple(pieces),
+        content.count,
+        content.sh_degree,
+        content.antialiased,
+        content.header["bytes"],
+        (Piece(0, content.count, row),) if pieces is None else tuple(pieces),
     )
 
 
-def check_count(chunk: Chunk, count: int) -> None:
-    """Raises `FormatError` where a chunk has another number of splats than its runs."""
-    if chunk.count != count:
-        has = count_of(chunk.count, "splat")
-        text = f"{quoted_value(chunk.name)} has {has}, but its runs in {MANIFEST} have {count:,}"
-        raise error_of("streamed-sog.runs", text)
-
-
-def filled(beside: Beside | None, chunks: Sequence[Chunk], sh_degree: int, threads: int, progress: Progress) -> Splats:
-    """The wanted splats of chunks, each at its row; several chunks at a time, on several threads.
+def read_pieces(
+    beside: Beside | None,
+    chunks: Sequence[Chunk],
+    out: Splats,
+    threads: int = 1,
+    progress: Progress = silent,
+    first_row: int = 0,
+) -> None:
+    """Fill rows with the pieces of chunks, several chunks at a time, on several threads.
 
     Args:
         beside: opens files.
-        chunks: whose pieces together have every row once.
-        sh_degree: of the result; coefficients that a chunk does not have are 0.
+        chunks: whose pieces together have every row of `out` once.
+        out: SH coefficients that a chunk does not have become 0.
         threads: to decode with.
         progress: called when a chunk is decoded.
+        first_row: that the first row of `out` has in the pieces.
 
     Raises:
         FormatError: a chunk is broken; names it.
     """
-    count = sum(chunk.rows for chunk in chunks)
-    out = Splats.empty(count, sh_degree)
     together = min(threads, len(chunks))
 
     def work(chunk: Chunk) -> int:
-        with _opened(beside, chunk.name) as (file, images):
-            scene: Scene = sog.decode(file, threads=max(1, threads // together), beside=images)
-        if (len(scene), scene.splats.sh_degree) != (chunk.count, chunk.sh_degree):
+        with _opened(beside, chunk.name) as source:
+            splats = sog.open_content(source).scene(threads=max(1, threads // together)).splats
+        if (len(splats), splats.sh_degree) != (chunk.count, chunk.sh_degree):
             raise FormatError(f"{quoted_value(chunk.name)} was changed while it was read; start again")
         for piece in chunk.pieces:
-            _copy(out, piece, scene.splats)
+            _copy(out, piece, piece.row - first_row, splats)
         return chunk.rows
 
     done = 0
     for rows in ordered_map(work, chunks, together):
         done += rows
-        progress("reading", done, count, "splat")
-    return out
+        progress("reading", done, len(out), "splat")
 
 
-def _copy(out: Splats, piece: Piece, splats: Splats) -> None:
-    """Copies a piece of a chunk to its rows."""
-    source, target = slice(piece.start, piece.start + piece.count), slice(piece.row, piece.row + piece.count)
+def _copy(out: Splats, piece: Piece, row: int, splats: Splats) -> None:
+    """Copy a piece of a chunk to rows."""
+    source, target = slice(piece.start, piece.start + piece.count), slice(row, row + piece.count)
     for name in COLUMNS:
         column = getattr(out, name)
         if name == "sh":
@@ -141,8 +130,8 @@ def _copy(out: Splats, piece: Piece, splats: Splats) -> None:
 
 
 @contextlib.contextmanager
-def _opened(beside: Beside | None, name: str) -> Iterator[tuple[BinaryIO, Beside]]:
-    """The meta.json of a chunk, and what opens the files beside that; errors of the body name the chunk."""
+def _opened(beside: Beside | None, name: str) -> Iterator[Source]:
+    """Open the meta.json of a chunk, and what opens the files beside that; errors of the body name the chunk."""
     if beside is None:
         raise FormatError(f"{MANIFEST} names {quoted_value(name)}, but other files cannot be opened here")
     folder = posixpath.dirname(name)
@@ -156,6 +145,6 @@ def _opened(beside: Beside | None, name: str) -> Iterator[tuple[BinaryIO, Beside
         raise error_of("streamed-sog.chunk-files", str(error)) from None
     with opened as file:
         try:
-            yield file, images
+            yield Source(file, images)
         except FormatError as error:
             raise error_of("streamed-sog.chunk-files", f"{quoted_value(name)}: {error}") from None

@@ -5,9 +5,191 @@ As a scene it is full detail, level 0, and the environment; `decode_levels` read
 
 from __future__ import annotations
 
-from .reading import decode as decode
-from .reading import decode_levels as decode_levels
-from .reading import stream as stream
+from dataclasses import dataclass
+from typing import BinaryIO
 
-# from .writing import encode_files as encode_files
-from .writing import encode_files as encode_files
+import numpy as np
+from numpy.typing import NDArray
+
+from ...model.scene import Bounds, Counts, DetailScene
+from ...model.sh import COEFFICIENTS
+from ...model.splats import COLUMNS, Splats
+from ...support.errors import FormatError
+from ...support.progress import Progress, silent
+from ...support.units import count_of
+from ...support.untrusted import quoted_value
+from ..compression import check_promise
+from ..content import Beside, Content, Source, Target, decoder
+from ..file_names import MANIFEST
+from ..stream import size_of
+from ..validation import check_rules, error_of
+from .chunks import Chunk, Piece, open_chunk, read_pieces
+from .manifest import MAX_MANIFEST, VERSION, Manifest, parse
+from .manifest_rules import run_violations, violations
+from .streamed_writer import encode_files as encode_files
+
+Index = NDArray[np.int64]
+
+
+def open_content(source: Source) -> Content:
+    """Open level 0, chunk after chunk, and then the environment.
+
+    Nothing is unpacked to `scratch`: where blocks are read, one chunk at a time stays in memory.
+
+    Raises:
+        FormatError: the file is no manifest, a chunk is missing or no SOG, or the runs do not tile the chunks.
+    """
+    return _open(source, full_detail=True)[1]
+
+
+decode = decoder(open_content)
+
+
+def decode_levels(
+    file: BinaryIO, *, threads: int = 1, progress: Progress = silent, beside: Beside | None = None
+) -> DetailScene:
+    """Read all detail levels, in whatever order the runs lie in the chunks.
+
+    Regions are in the order of the tree, depth first.
+
+    Args:
+        file: the manifest.
+        threads: to decode with.
+        progress: called when a chunk is decoded.
+        beside: opens the files that a manifest names, which may be in folders; None if there are none to open.
+
+    Raises:
+        FormatError: as `open_content`; also where another fatal rule of `manifest_rules` is broken.
+    """
+    layout, content = _open(Source(file, beside, threads=threads), full_detail=False)
+    bounds, children, errors = layout.bounds(), layout.children(), layout.errors()
+    scene, environment = content.scene(threads=threads, progress=progress), None
+    splats = scene.splats
+    if layout.manifest.environment is not None:
+        total = int(layout.counts.sum())
+        splats, environment = splats.take(slice(0, total)), splats.take(slice(total, None))
+    about = scene.antialiased, scene.format, scene.notes, scene.header, scene.up
+    return DetailScene(splats, layout.counts, bounds, children, errors, environment, *about)
+
+
+@dataclass(frozen=True, eq=False)
+class RegionLayout:
+    """Manifest as arrays: R regions in the order of the tree, L detail levels.
+
+    Attributes:
+        manifest: as parsed.
+        file, offset, count, level, region: (n,) int64, of the runs that are not empty, in the order of the files, which
+            they tile.
+        counts: (R, L) splats of each region at each level.
+    """
+
+    manifest: Manifest
+    file: Index
+    offset: Index
+    count: Index
+    level: Index
+    region: Index
+    counts: Counts
+
+    def starts(self) -> Counts:
+        """Return (n,) the first splat of each run in a `DetailScene`, where they lie level after level."""
+        flat = self.counts.T.ravel()
+        before = np.cumsum(flat) - flat
+        return before[self.level * len(self.counts) + self.region]
+
+    def bounds(self) -> Bounds:
+        """Return (R, 2, 3) lowest and highest corner of each region; all must have a bound."""
+        return np.array([node.bound for _, node in self.manifest.regions()], np.float64)
+
+    def children(self) -> Index:
+        """Return (R - 1, 2) the tree as in `DetailScene`; it must be a binary one."""
+        nodes = self.manifest.nodes
+        numbers = np.empty(len(nodes), np.int64)
+        inner = [number for number, node in enumerate(nodes) if node.children]
+        numbers[inner] = np.arange(len(inner))
+        numbers[[number for number, _ in self.manifest.regions()]] = -1 - np.arange(len(self.counts))
+        return numbers[np.array([nodes[number].children for number in inner], np.int64).reshape(-1, 2)]
+
+    def errors(self) -> NDArray[np.float64] | None:
+        """Return (R, L) the error of each region at each level, as numbers; None unless all regions have some."""
+        found = [node.errors for _, node in self.manifest.regions()]
+        return None if None in found else np.array(found, np.float64)
+
+
+def layout_of(manifest: Manifest) -> RegionLayout:
+    """Return the layout of a manifest, whose runs must tile the files that they are in."""
+    rows = [
+        (run.file, run.offset, run.count, level, region)
+        for region, (_, node) in enumerate(manifest.regions())
+        for level, run in (node.runs or {}).items()
+        if run.count
+    ]
+    table = np.array(rows, np.int64).reshape(-1, 5)
+    file, offset, count, level, region = np.ascontiguousarray(table[np.lexsort((table[:, 1], table[:, 0]))].T)
+    counts = np.zeros((sum(1 for _ in manifest.regions()), manifest.levels), np.int64)
+    counts[region, level] = count
+    return RegionLayout(manifest, file, offset, count, level, region, counts)
+
+
+def _open(source: Source, *, full_detail: bool) -> tuple[RegionLayout, Content]:
+    """Read a manifest, and open its chunks: those of level 0, or all."""
+    size, beside = size_of(source.file), source.beside
+    manifest = parse(source.file.read(MAX_MANIFEST + 1))
+    check_rules(run_violations(manifest) if full_detail else violations(manifest))
+    layout = layout_of(manifest)
+    chosen = layout.level == 0 if full_detail else np.ones(len(layout.level), np.bool_)
+    rows = np.cumsum(layout.count * chosen) - layout.count if full_detail else layout.starts()
+    files, first = np.unique(layout.file, return_index=True)
+    names, chunks = set[str](), list[Chunk]()
+    ends = np.append(first[1:], len(layout.file))
+    for file, begin, end in zip(files.tolist(), first.tolist(), ends.tolist(), strict=False):
+        here = begin + np.flatnonzero(chosen[begin:end])
+        if not len(here):
+            continue
+        name = manifest.filenames[file]
+        if name in names:
+            raise FormatError(f"{MANIFEST} names {quoted_value(name)} twice")
+        names.add(name)
+        pieces = [Piece(int(layout.offset[run]), int(layout.count[run]), int(rows[run])) for run in here]
+        chunks.append(open_chunk(beside, name, pieces))
+        if chunks[-1].count != (expected := int(layout.count[begin:end].sum())):
+            has = count_of(chunks[-1].count, "splat")
+            text = f"{quoted_value(name)} has {has}, but its runs in {MANIFEST} have {expected:,}"
+            raise error_of("streamed-sog.runs", text)
+    if not chunks:
+        raise FormatError(f"{MANIFEST} has no splats of {'level 0' if full_detail else 'any level'}")
+    if manifest.environment is not None:
+        chunks.append(open_chunk(beside, manifest.environment, None, sum(chunk.rows for chunk in chunks)))
+    count, degree = sum(chunk.rows for chunk in chunks), max(chunk.sh_degree for chunk in chunks)
+    size += sum(chunk.bytes for chunk in chunks)
+    check_promise(count * 4 * (14 + 3 * COEFFICIENTS[degree]), size)
+    last: dict[int, Splats] = {}
+
+    def decoded(chunk: Chunk, row: int) -> Splats:
+        if row not in last:
+            last.clear()
+            splats = Splats.empty(chunk.rows, degree)
+            read_pieces(beside, [chunk], splats, source.threads, first_row=row)
+            last[row] = splats
+        return last[row]
+
+    def fill(target: Target, threads: int, progress: Progress) -> None:
+        if len(target.splats) == count:
+            read_pieces(beside, chunks, target.splats, threads, progress)
+            return
+        end = 0
+        for chunk in chunks:
+            begin, end = end, end + chunk.rows
+            start, stop = max(target.start, begin), min(target.stop, end)
+            if start < stop:
+                rows, splats = target.rows(slice(start, stop)), decoded(chunk, begin)
+                for column in COLUMNS:
+                    getattr(rows, column)[:] = getattr(splats, column)[start - begin : stop - begin]
+        if target.stop == count:
+            last.clear()
+
+    regions, levels = layout.counts.shape
+    header = {"version": VERSION, "levels": levels, "regions": regions, "bytes": size}
+    antialiased, note = any(chunk.antialiased for chunk in chunks), manifest.noted
+    form = f"Streamed SOG {VERSION}"
+    return layout, Content(count, degree, form, fill, antialiased, note.problems, header, note.up)

@@ -7,7 +7,9 @@ report can be made of a file that breaks it.
 from __future__ import annotations
 
 import bisect
+import decimal
 import functools
+import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -15,8 +17,8 @@ from typing import Any
 from ...support.errors import FormatError, VersionError
 from ...support.untrusted import parse_json, quoted_value
 from .. import quantize
-from ..noted import Noted, read_note
-from .names import MANIFEST
+from ..file_names import MANIFEST
+from ..file_notes import FileNote, read_note
 
 #: The version that is read and written. A manifest from before versions has none.
 VERSION = 1
@@ -39,13 +41,19 @@ MAX_NODES = 1 << 17
 #: The largest magnitude of a coordinate of a bound: that of float32.
 LARGEST = float(quantize.LARGEST)
 
+#: Significant digits: those of a float32.
+DIGITS = 7
+
+_DOWN = decimal.Context(prec=DIGITS, rounding=decimal.ROUND_FLOOR)
+_UP = decimal.Context(prec=DIGITS, rounding=decimal.ROUND_CEILING)
+
 Corner = tuple[float, float, float]
 Bound = tuple[Corner, Corner]
 
 
 @dataclass(frozen=True)
 class Run:
-    """Splats of a region at a detail level: `count` of them from `offset` on in a file, by its number."""
+    """Run of splats of a region at a detail level: `count` of them from `offset` on in a file, by its number."""
 
     file: int
     offset: int
@@ -54,7 +62,7 @@ class Run:
 
 @dataclass(frozen=True)
 class ManifestNode:
-    """A node of the tree of regions.
+    """Node of the tree of regions.
 
     Attributes:
         bound: lowest and highest corner in world units; None where it is missing, or is not of finite numbers.
@@ -73,7 +81,7 @@ class ManifestNode:
 
 @dataclass(frozen=True)
 class Manifest:
-    """A lod-meta.json.
+    """Contents of a lod-meta.json.
 
     Attributes:
         levels: how many detail levels there are.
@@ -90,12 +98,12 @@ class Manifest:
     head: Mapping[str, Any] = field(default_factory=dict)
 
     @functools.cached_property
-    def noted(self) -> Noted:
+    def noted(self) -> FileNote:
         """Note of sparklod in "asset"."""
         return read_note(self.head.get("asset"))
 
     def place(self, number: int) -> str:
-        """Where a node is in the file: "tree.children[0]"."""
+        """Return where a node is in the file: "tree.children[0]"."""
         way = list[str]()
         while (parent := self.nodes[number].parent) >= 0:
             way.append(f".children[{bisect.bisect_left(self.nodes[parent].children, number)}]")
@@ -103,16 +111,16 @@ class Manifest:
         return "tree" + "".join(reversed(way))
 
     def regions(self) -> Iterator[tuple[int, ManifestNode]]:
-        """The nodes without children, and their numbers."""
+        """Return the nodes without children, and their numbers."""
         return ((number, node) for number, node in enumerate(self.nodes) if not node.children)
 
     def names(self) -> list[str]:
-        """The files that it names."""
+        """Return the files that it names."""
         return [*self.filenames, *([] if self.environment is None else [self.environment])]
 
 
 def parse(data: bytes) -> Manifest:
-    """The manifest of the bytes of a lod-meta.json.
+    """Parse the bytes of a lod-meta.json.
 
     Raises:
         VersionError: it is of another version than 1.
@@ -142,7 +150,7 @@ def parse(data: bytes) -> Manifest:
 
 
 def _nodes(tree: Any, levels: int, files: int) -> tuple[ManifestNode, ...]:
-    """The nodes of a tree, however deep, root first and depth first."""
+    """Return the nodes of a tree, however deep, root first and depth first."""
     keys = {str(level): level for level in range(levels)}
     parents, ordinals, children = list[int](), list[int](), list[list[int]]()
     values = list[tuple[Bound | None, dict[int, Run] | None, Any]]()
@@ -183,7 +191,7 @@ def _nodes(tree: Any, levels: int, files: int) -> tuple[ManifestNode, ...]:
 
 
 class _RunError(Exception):
-    """A value below `lods` that cannot be: where, what it is, and what it must be."""
+    """Impossible value below `lods`: where, what it is, and what it must be."""
 
     def __init__(self, place: str, value: Any, wanted: str) -> None:
         super().__init__(place)
@@ -191,7 +199,7 @@ class _RunError(Exception):
 
 
 def _runs(lods: Any, keys: Mapping[str, int], files: int) -> dict[int, Run]:
-    """The runs of a region by detail level; `keys` has the levels by their names."""
+    """Return the runs of a region by detail level; `keys` has the levels by their names."""
     if not isinstance(lods, dict):
         raise _RunError("", lods, "an object of runs")
     runs = dict[int, Run]()
@@ -231,3 +239,57 @@ def _wrong(place: str, value: Any, wanted: str) -> FormatError:
     if value is None:
         return FormatError(f"{MANIFEST} has no {place}, which must be {wanted}")
     return FormatError(f"{place} of {MANIFEST} is {quoted_value(value)}, not {wanted}")
+
+
+def serialise(manifest: Manifest) -> bytes:
+    """Return the bytes of a lod-meta.json.
+
+    Bounds are rounded outward, so that they still enclose what they enclosed. `lodLevels` comes early, since a file is
+    recognised by it, and the tree last.
+    """
+    head = dict(manifest.head)
+    first: dict[str, Any] = {key: head.pop(key) for key in ("version", "asset", "count", "counts") if key in head}
+    first |= {"lodLevels": manifest.levels} | head
+    if manifest.environment is not None:
+        first["environment"] = manifest.environment
+    first["filenames"] = list(manifest.filenames)
+    return b'%b,"tree":%b}' % (_json(first)[:-1].encode(), _tree(manifest.nodes).encode())
+
+
+def _tree(nodes: tuple[ManifestNode, ...]) -> str:
+    """Write the tree, node by node from its end, since it may be deeper than functions can call themselves."""
+    texts = [""] * len(nodes)
+    for number in reversed(range(len(nodes))):
+        node = nodes[number]
+        parts = []
+        if node.bound is not None:
+            low, high = node.bound
+            corners = (
+                _json_list(_rounded(_DOWN, each) for each in low),
+                _json_list(_rounded(_UP, each) for each in high),
+            )
+            parts.append('"bound":{{"min":{},"max":{}}}'.format(*corners))
+        if node.children:
+            parts.append(f'"children":{_json_list(texts[child] for child in node.children)}')
+            for child in node.children:
+                texts[child] = ""
+        if node.runs is not None:
+            parts.append(f'"lods":{_json({str(level): vars(run) for level, run in node.runs.items()})}')
+        if node.errors is not None:
+            parts.append(f'"errors":{_json_list(f"{error:.{DIGITS}g}" for error in node.errors)}')
+        texts[number] = "{" + ",".join(parts) + "}"
+    return texts[0]
+
+
+def _rounded(rounding: decimal.Context, number: float) -> str:
+    """Round a number of a bound to one side, but not out of float32; with few enough digits it stays as it is."""
+    rounded = float(rounding.create_decimal(repr(number)))
+    return f"{rounded:.{DIGITS}g}" if abs(rounded) <= LARGEST else repr(number)
+
+
+def _json_list(texts: Any) -> str:
+    return f"[{','.join(texts)}]"
+
+
+def _json(value: Mapping[str, Any]) -> str:
+    return json.dumps(value, separators=(",", ":"))

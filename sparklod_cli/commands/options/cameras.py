@@ -1,4 +1,4 @@
-"""The cameras that look at a scene: their source, and settings that override those of their file."""
+"""Options of the cameras that look at a scene: their source, and settings that override those of their file."""
 
 from __future__ import annotations
 
@@ -12,17 +12,18 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import click
 
 from ...cameras.axes import Axes
-from ...cameras.defaults import ELEVATION, ORBIT
+from ...cameras.formats.table import FORMATS
+from ...support.defaults import ELEVATION, ORBIT
 from ...support.errors import CameraPathError, TooManyCamerasError
-from ..paths import file_of
-from ..usage import flag_of, is_given, refuse
+from ...support.setting_fields import Range, whole
+from ..option_groups import COMMON, flag, flag_of, is_set, option, refuse
+from ..parameter_types import POINT, Direction, Size, View, Views
+from ..paths import InputPath, file_of
 
 if TYPE_CHECKING:
     from ...cameras.camera import Matrix
     from ...cameras.frame import Settings
     from ...cameras.sources import CameraSource
-
-HEADING = "Cameras"
 
 #: The options that are each a source of cameras, of which one can be given.
 SOURCES = ("camera_path", "orbit", "dolly", "look_at", "keyframes", "views")
@@ -44,47 +45,84 @@ ONLY_WITH = {
     "world_transform": ("camera_path", "look_at", "views", "keyframes"),
 }
 
-#: Options that say which frames a path has.
-OF_PATHS = ("fps", "every")
-
 #: Characters of a --world-transform given as numbers; any other text names a file.
 NUMERIC = set("0123456789+-.,eE ")
+
+#: Durations in seconds, and frames per second.
+SECONDS, RATE = Range(above=0, most=1e6, unit="S"), Range(above=0, most=1e6, unit="N")
+
+
+def _orbit_option(default: str) -> Any:
+    help = f"Place N cameras around the scene.  [default, without any source of cameras: {default}]"
+    return option(help, whole(1, 1 << 20), heading=COMMON)
 
 
 @dataclass(frozen=True)
 class Cameras:
-    """The values of the options of `camera_options.camera_options`; None for those not given.
+    """Values of the options of cameras; None for those not given."""
 
-    Attributes:
-        camera_path, orbit, dolly, look_at, keyframes: sources of cameras.
-        camera_format, camera_axes: of `camera_path`.
-        center, distance, elevation: of orbits and dollies, world units and degrees.
-        up: x, y and z.
-        seconds: of orbits, of dollies and between keyframes.
-        world_transform: 16 numbers, or the name of a file of them.
-        size: width and height, pixels.
-        fov: vertical, degrees.
-        fps: frames a second.
-        every: only every so many cameras are taken.
-    """
+    HEADING: ClassVar[str] = "Cameras"
 
-    camera_path: Path | None
-    orbit: int | None
-    dolly: bool
-    look_at: Any
-    keyframes: Any
-    camera_format: str | None
-    camera_axes: str | None
-    center: tuple[float, ...] | None
-    distance: float | None
-    elevation: float | None
-    up: tuple[float, float, float] | None
-    seconds: float | None
-    world_transform: str | None
-    size: tuple[int, int] | None
-    fov: float | None
-    fps: float | None
-    every: int
+    camera_path: Path | None = option(
+        "Read the cameras from a file, or from a folder written by COLMAP.", InputPath(), heading=COMMON
+    )
+    orbit: int | None = _orbit_option(f"an orbit of {ORBIT}")
+    look_at: Any = option("Place one camera at EYE that looks at TARGET, each x,y,z.", View(), heading=COMMON)
+    size: tuple[int, int] | None = option(
+        "Width and height of the images, in pixels; the vertical field of view is kept."
+        "  [default: the file's, or 1280x720]",
+        Size(),
+        heading=COMMON,
+    )
+    dolly: bool = flag("Move the camera straight towards the scene, from far to near.")
+    keyframes: Any = option(
+        "Move the camera smoothly through two or more views, separated by spaces or semicolons.", Views()
+    )
+    camera_format: str | None = option(
+        "Format of --camera-path; auto recognises it by its content.  [default: auto]",
+        ("auto", *(form.name for form in FORMATS)),
+    )
+    camera_axes: str | None = option(
+        "Axes of the matrices of --camera-path: y up (opengl) or down (opencv), camera to world (c2w) or world to"
+        " camera (w2c).  [default: those of its format]",
+        tuple(axes.value for axes in Axes),
+    )
+    center: tuple[float, ...] | None = option(
+        "Point that --orbit and --dolly look at.  [default: the middle of the scene]", POINT
+    )
+    distance: float | None = option(
+        "Distance from that point, in world units: of --orbit, and of the first camera of --dolly."
+        "  [default: where the scene fits the image; 4 times that with --dolly]",
+        Range(above=0, unit="D"),
+    )
+    elevation: float | None = option(
+        f"Angle of --orbit and --dolly above that point, in degrees.  [default: {ELEVATION:g}]",
+        Range(-89, 89, unit="DEGREES"),
+    )
+    up: tuple[float, float, float] | None = option(
+        "Direction that is up, as an axis such as -y or as x,y,z, for cameras of which only eye and target are known."
+        "  [default: the axis that the files note, or -y, as training leaves scenes with y down; y in SuperSplat's"
+        " files]",
+        Direction(),
+    )
+    world_transform: str | None = option(
+        "Transform from the world of the cameras to that of the splats: 16 numbers with commas between, row by row, or"
+        " a file of them.",
+        metavar="MATRIX",
+    )
+    fov: float | None = option(
+        "Vertical field of view, in degrees.  [default: the file's, or 60]",
+        Range(above=0, below=180, unit="DEGREES"),
+    )
+    seconds: float | None = option(
+        "Duration of --orbit, of --dolly, and of --keyframes from one view to the next, in seconds.  [default: 2; of"
+        " --orbit, N frames at --fps]",
+        SECONDS,
+    )
+    fps: float | None = option(
+        "Frames per second of the path; times are counted by it.  [default: the file's times, or 30]", RATE
+    )
+    every: int = option("Take every K-th camera of the path.", whole(1, unit="K"), 1)
 
     #: Without a source there is one camera that sees the whole scene, in place of an orbit.
     still: ClassVar[bool] = False
@@ -95,25 +133,22 @@ class Cameras:
         return next((name for name in SOURCES if getattr(self, name, None)), AROUND)
 
     @property
-    def each_view(self) -> tuple[Any, ...]:
+    def all_views(self) -> tuple[Any, ...]:
         """The views of `--view`."""
         return ()
 
     def check(self, ctx: click.Context) -> None:
-        """Raises a `click.UsageError` where options contradict each other, or have nothing to do."""
+        """Raise a `click.UsageError` where options contradict each other, or have no effect."""
         sources = [flag_of(ctx, name) for name in SOURCES if getattr(self, name, None)]
         if len(sources) > 1:
             raise click.UsageError(f"{' and '.join(sources)} cannot be used together; give one source of cameras")
         for name, known in ONLY_WITH.items():
-            if is_given(ctx, name) and self.source not in known:
+            if is_set(ctx, name) and self.source not in known:
                 named = [flag_of(ctx, each) for each in known if each in ctx.params]
                 refuse(ctx, [name], f"can only be used with {' or '.join(named)}")
         if self.source not in PATHS and not self._orbits:
-            refuse(
-                ctx,
-                (*OF_PATHS, "seconds"),
-                "cannot be used with a camera that does not move; give a path, such as --orbit",
-            )
+            still = "cannot be used with a camera that does not move; give a path, such as --orbit"
+            refuse(ctx, ("fps", "every", "seconds"), still)
         if self._orbits and self.seconds is not None:
             refuse(ctx, ["fps"], "cannot be used with --seconds of an orbit, which decides it")
         if self.up is not None and not any(self.up):
@@ -125,20 +160,20 @@ class Cameras:
         return self.orbit is not None or (self.source == AROUND and not self.still)
 
     def least_count(self) -> int:
-        """The number of cameras, or the least number as far as it is known before a file is read."""
-        if self.each_view:
-            return len(self.each_view)
+        """Return the number of cameras, or the least number as far as it is known before a file is read."""
+        if self.all_views:
+            return len(self.all_views)
         if self.dolly or self.keyframes:
             return 2 if self.every == 1 else 1
         return -(-(self.orbit or 1) // self.every)
 
     def files(self) -> list[Path]:
-        """The file that the text of --world-transform names, if it does."""
+        """Return the file that the text of --world-transform names, if it does."""
         matrix = self.world_transform and file_of(self.world_transform)
         return [matrix] if matrix else []
 
     def camera_source(self) -> CameraSource:
-        """The source of the cameras, for the library."""
+        """Return the source of the cameras, for the library."""
         from ...cameras import generators, sources
 
         elevation = ELEVATION if self.elevation is None else self.elevation
@@ -147,8 +182,8 @@ class Cameras:
             return sources.CameraFile(
                 self.camera_path, None if self.camera_format in (None, "auto") else self.camera_format
             )
-        if self.each_view or self.look_at:
-            return sources.Views(self.each_view or (self.look_at,), named=bool(self.each_view))
+        if self.all_views or self.look_at:
+            return sources.Views(self.all_views or (self.look_at,), named=bool(self.all_views))
         if self.keyframes:
             return sources.Keyframes(self.keyframes, seconds)
         if self.dolly:
@@ -158,7 +193,7 @@ class Cameras:
         return sources.Orbit(self.orbit or (1 if self.still else ORBIT), self.center, self.distance, elevation)
 
     def settings(self) -> Settings:
-        """Settings that override those of a camera file.
+        """Return settings that override those of a camera file.
 
         Raises:
             click.UsageError: the numbers of --world-transform are no transform.
@@ -179,7 +214,7 @@ class Cameras:
 
     @contextlib.contextmanager
     def usage_errors(self) -> Iterator[None]:
-        """Turns the error that an option asks for too many cameras into a usage error that names the option."""
+        """Turn the error that an option asks for too many cameras into a usage error that names the option."""
         try:
             yield
         except TooManyCamerasError as error:
@@ -191,21 +226,26 @@ class Cameras:
 
 @dataclass(frozen=True)
 class PictureCameras(Cameras):
-    """The values of `camera_options` with `still`: without a source there is one camera, and there is `--view`."""
+    """Options of the cameras of pictures: without a source there is one camera, and there is `--view`."""
 
-    views: tuple[Any, ...] = ()
+    orbit: int | None = _orbit_option("one camera that sees the whole scene")
+    views: tuple[Any, ...] = option(
+        "Place a camera as --look-at does; several --view make a contact sheet.",
+        View(),
+        flags=("--view",),
+        multiple=True,
+    )
 
     still: ClassVar[bool] = True
 
     @property
-    def each_view(self) -> tuple[Any, ...]:
+    def all_views(self) -> tuple[Any, ...]:
         return self.views
 
 
 def _world(value: str) -> Matrix:
-    """The (4, 4) matrix of --world-transform, which is a text of numbers or names a file."""
-    from ...cameras.sources import read_world_transform
-    from ...cameras.world_transform import similarity
+    """Return the (4, 4) matrix of --world-transform, which is a text of numbers or names a file."""
+    from ...cameras.sources import read_world_transform, similarity
 
     if "," in value and not set(value) - NUMERIC:
         try:

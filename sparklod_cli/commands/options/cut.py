@@ -1,110 +1,150 @@
-"""Which splats a viewer draws of Level-of-Detail trees: the budget, and how much nodes count by size and direction."""
+"""Options of what a viewer draws: files, budget, cut, detail levels, and how chunks get to the viewer."""
 
 from __future__ import annotations
 
-import functools
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import click
 
-from ...codecs.gpu import table
+from ...codecs.formats import PRECISIONS
 from ...lod import detail_rule
+from ...lod.settings import FACTOR, LodSettings
+from ...model.instances import Cones, Foveation, Frustum
+from ...simulation.streaming_settings import StreamingSettings
 from ...support import defaults
-from ..command import COMMON, option, with_options
-from ..usage import exclude, flag_of, require
-from .common import Command
-from .types import Quantity, Real
+from ...support.setting_fields import Quantity, Range
+from ...support.units import parse_time
+from ..option_groups import COMMON, argument, flag, option, parameters_of, refuse, require
+from ..paths import InputPath
 
 if TYPE_CHECKING:
     from ...lod.budget import Budget
-    from ...lod.detail_rule import DetailRule
-    from ...lod.settings import LodSettings
-    from ...model.instances import Foveation
-
-HEADING = "Cut"
+    from ...model.instances import Instance
+    from ...scenes.loaded import Scenes
 
 #: A key of `defaults.PRESETS`.
 DEFAULT_PRESET = "desktop"
 
-#: The options of `cut_options` that have no effect where full detail is drawn.
-CUTS = (
-    "budget",
-    "preset",
-    "lod_splat_scale",
-    "lod_render_scale",
-    "pixel_scale_limit",
-    "cone_fov0",
-    "cone_fov",
-    "cone_foveate",
-    "outside_foveate",
-    "behind_foveate",
-    "precision",
-    "continuous",
-    "blend",
+#: Options of the foveation cones, which --outside-foveate replaces, and of nodes, which Streamed SOG does not have.
+CONES = ("cone_fov0", "cone_fov", "cone_foveate")
+NODES = (
+    *("lod_render_scale", "pixel_scale_limit", *CONES, "outside_foveate", "behind_foveate"),
+    *("precision", "continuous", "blend"),
 )
 
-#: Options of the cones, which --outside-foveate replaces.
-CONES = ("cone_fov0", "cone_fov", "cone_foveate")
+#: Options of cuts, which have no effect where full detail is drawn.
+CUTS = ("budget", "preset", "lod_splat_scale", *NODES)
 
-#: Options of numbers that the traversal multiplies in float32, and the most that each may be.
-MULTIPLIED = ("lod_render_scale", "pixel_scale_limit", "cone_foveate", "outside_foveate", "behind_foveate")
-MOST_MULTIPLIED = 1e12
+#: Options for Streamed SOG alone, and options of loading, without which all chunks are resident.
+DETAIL = parameters_of(detail_rule.DetailRule)
+LOADING = ("after", "bandwidth", "latency", "fetchers", "chunk_cache")
+
+#: Angles of cones, and weights of nodes where 1 is that of nodes in the middle.
+DEGREES = Range(0, 180, unit="DEGREES")
+PRIORITY = "of 1, which is that of nodes in the middle"
 
 
-def _budgets(text: str) -> tuple[Budget, ...]:
+@dataclass(frozen=True)
+class Inputs:
+    """The splat files, each an instance; or an instances file, which names them."""
+
+    HEADING: ClassVar[str] = "Inputs"
+
+    files: tuple[Path, ...] = argument(InputPath(), metavar="[FILE]...")
+    scene: Path | None = option(
+        "Read an instances file: JSON that lists splat files and where they stand (see docs/traverse.md).", InputPath()
+    )
+
+    @property
+    def first(self) -> Path | None:
+        """The file that outputs are named after; None where there is no input."""
+        return self.scene or next(iter(self.files), None)
+
+    def instances(self) -> list[Instance]:
+        """Return the instances: each FILE once, untransformed, or those of the instances file.
+
+        Raises:
+            click.UsageError: there is neither, or there are both.
+            InstancesFileError: the instances file cannot be read.
+        """
+        from ...model.instances import instances_of
+        from ...scenes.instances_file import read_instances
+
+        if not self.files and self.scene is None:
+            raise click.UsageError("a FILE is missing; name one, or an instances file with --scene")
+        if self.files and self.scene is not None:
+            raise click.UsageError("FILE cannot be used with --scene, which names the files")
+        return instances_of(self.files) if self.scene is None else read_instances(self.scene)
+
+    def read(self, instances: Sequence[Instance]) -> list[Path]:
+        """Return the splat files of instances, for `keep_apart`: an instances file names them."""
+        return [instance.file for instance in instances if instance.file is not None]
+
+
+def _parse_budgets(text: str) -> tuple[Budget, ...]:
     from ...lod.budget import parse_budgets
 
     return parse_budgets(text)
 
 
+def _budget_option(unit: str, several: str = "") -> Any:
+    return option(
+        f"Largest number of splats to draw, such as 500k, or a share of the leaves, such as 5%{several}."
+        "  [default: that of --preset]",
+        Quantity(unit, _parse_budgets),
+        heading=COMMON,
+        excludes=("preset",),
+    )
+
+
 @dataclass(frozen=True)
 class Cut:
-    """The values of the options of `cut_options`; None for those not given.
+    """Options of the cuts of trees, and of how detail levels of Streamed SOG are chosen."""
 
-    Attributes:
-        budget: counts of splats, or shares of the leaves; one, but for comparisons.
-        preset: a key of `defaults.PRESETS`; None for the default.
-        lod_splat_scale: multiplies the budget.
-        lod_render_scale: pixels; smaller nodes are not refined.
-        pixel_scale_limit: the same as size over distance.
-        cone_fov0, cone_fov: full angles of the foveation cones, degrees.
-        cone_foveate, outside_foveate, behind_foveate: priorities, of 1.
-        precision: one of `table.PRECISIONS`.
-    """
+    HEADING: ClassVar[str] = "Cut"
 
-    budget: tuple[Budget, ...] | None
-    preset: str | None
-    lod_splat_scale: float
-    lod_render_scale: float
-    pixel_scale_limit: float | None
-    cone_fov0: float
-    cone_fov: float
-    cone_foveate: float
-    outside_foveate: float | None
-    behind_foveate: float | None
-    precision: str
-
-    def check(self, ctx: click.Context) -> None:
-        """Raises a `click.UsageError` where options contradict each other, or numbers are out of reach."""
-        if self.outside_foveate is not None:
-            exclude(ctx, CONES, "--outside-foveate")
-        if self.budget is not None:
-            exclude(ctx, ["preset"], "--budget")
-        if self.pixel_scale_limit is not None:
-            exclude(ctx, ["lod_render_scale"], "--pixel-scale-limit")
-        for name in MULTIPLIED:
-            value = getattr(self, name)
-            if value is not None and value > MOST_MULTIPLIED:
-                raise click.UsageError(
-                    f"{flag_of(ctx, name)} {value:g} is too large; it must be at most {MOST_MULTIPLIED:g}"
-                )
+    budget: tuple[Budget, ...] | None = _budget_option("N|P%")
+    preset: str | None = option(
+        "Budget of a device: Spark 2's, or that of Spark's LoD design with preview-desktop and mobile."
+        f"  [default: {DEFAULT_PRESET}; for Streamed SOG PlayCanvas's, {detail_rule.BUDGET:,} splats]",
+        tuple(defaults.PRESETS),
+    )
+    lod_splat_scale: float = option("Factor by which the budget is multiplied.", Range(above=0), 1.0)
+    lod: LodSettings = field(default_factory=LodSettings)
+    cone_fov0: float = option(
+        "Full angle of the inner foveation cone, in degrees: full priority inside it.", DEGREES, defaults.CONE_FOV0
+    )
+    cone_fov: float = option(
+        "Full angle of the outer cone, in degrees, where priority has fallen to --cone-foveate.",
+        DEGREES,
+        defaults.CONE_FOV,
+    )
+    cone_foveate: float = option(f"Priority of nodes at the outer cone, {PRIORITY}.", FACTOR, defaults.CONE_FOVEATE)
+    outside_foveate: float | None = option(
+        "Priority of nodes outside the frustum, in place of the cones, as in Spark's LoD design.",
+        FACTOR,
+        excludes=CONES,
+    )
+    behind_foveate: float | None = option(
+        f"Priority of nodes behind the camera.  [default: {defaults.BEHIND_FOVEATE:g}; 1 with --outside-foveate]",
+        FACTOR,
+    )
+    precision: str = option(
+        "Precision of the centres and sizes that cuts are found with: the file's, its half floats, or what Spark has of"
+        " the file, for the same cuts to the last node: ext with extSplats, else packed, or packed-pages of a RAD file"
+        " that it streams.",
+        PRECISIONS,
+        PRECISIONS[0],
+    )
 
     def one_budget(self) -> Budget:
-        """The budget, or that of the preset, times --lod-splat-scale.
+        """Return the budget, or that of the preset, times --lod-splat-scale.
 
         Raises:
-            click.UsageError: several are given, or it is out of reach.
+            click.UsageError: several are given, or it is out of range.
         """
         from ...lod.budget import LARGEST, Budget
 
@@ -123,27 +163,11 @@ class Cut:
             )
         return scaled
 
-    def settings(self, budget: int, detail: DetailRule) -> LodSettings:
-        """Settings of the cuts, with a budget in splats and how detail levels of Streamed SOG are chosen."""
-        from ...lod.settings import LodSettings
-
-        return LodSettings(
-            budget=budget,
-            foveation=self._foveation(),
-            pixel_scale_limit=self.pixel_scale_limit,
-            render_scale=self.lod_render_scale,
-            continuous=self.width,
-            detail=detail,
-        )
-
-    @property
-    def width(self) -> float | None:
-        """The width of continuous cuts; None for ordinary ones."""
-        return None
+    def settings(self) -> LodSettings:
+        """Return settings of the cuts, but for the budget."""
+        return replace(self.lod, foveation=self._foveation())
 
     def _foveation(self) -> Foveation:
-        from ...model.instances import Cones, Frustum
-
         behind = self.behind_foveate
         if self.outside_foveate is not None:
             return Frustum(self.outside_foveate, 1.0 if behind is None else behind)
@@ -153,133 +177,61 @@ class Cut:
 
 @dataclass(frozen=True)
 class PictureCut(Cut):
-    """The values of the options of `cut_options` with `pictures`.
+    """Options of the cuts that pictures show."""
 
-    Attributes:
-        full: draw full detail.
-        continuous: nodes fade into their children.
-        blend: ratio of the pixel scales between which they do.
-    """
+    budget: tuple[Budget, ...] | None = _budget_option("N|P%,...", "; with --compare several, such as 5%,500k")
+    full: bool = flag(
+        "Draw full detail: all leaves, however many there are.", heading=COMMON, excludes=(*CUTS, *DETAIL)
+    )
+    continuous: bool = flag(
+        "Blend nodes and their children where one replaces the other, so that nothing pops; draws 18 to 40 % more"
+        " splats than the budget."
+    )
+    blend: float | None = option(
+        f"With --continuous: ratio of the pixel scales between which nodes blend.  [default: {defaults.BLEND:g}]",
+        Range(above=1),
+        needs="continuous",
+    )
 
-    full: bool
-    continuous: bool
-    blend: float | None
+    def settings(self) -> LodSettings:
+        width = (self.blend or defaults.BLEND) if self.continuous else None
+        return replace(super().settings(), continuous=width)
+
+
+@dataclass(frozen=True)
+class PictureStreaming:
+    """Options of how chunks get to a viewer whose first pictures are drawn."""
+
+    HEADING: ClassVar[str] = "Streaming"
+
+    after: float | None = option(
+        "Draw what a visitor sees this long after opening a page with the files, such as 500ms, who waits in front of"
+        " the camera; with --bandwidth.  [default: what is drawn once every chunk has arrived]",
+        Quantity("TIME", parse_time),
+        needs="bandwidth",
+        excludes=("full", "continuous", "compare"),
+    )
+    streaming: StreamingSettings = field(default_factory=StreamingSettings)
 
     def check(self, ctx: click.Context) -> None:
-        super().check(ctx)
-        if self.full:
-            exclude(ctx, CUTS, "--full")
-        if not self.continuous:
-            require(ctx, ["blend"], "--continuous")
+        """Raise a `click.UsageError` where an option has no effect."""
+        if self.after is None:
+            require(ctx, LOADING, "--after")
 
-    @property
-    def width(self) -> float | None:
-        return (self.blend or defaults.BLEND) if self.continuous else None
+    def loading(self) -> tuple[StreamingSettings, float] | None:
+        """Return how chunks get to a viewer, and the seconds that it has had for them; None where all are resident."""
+        return None if self.after is None else (self.streaming, self.after)
 
 
-def cut_options(command: Command, *, pictures: bool = False) -> Command:
-    """The options of `Cut`.
-
-    Args:
-        command: that gets them.
-        pictures: those of `PictureCut`, too.
-    """
-    add = functools.partial(option, heading=HEADING)
-    several = "; with --compare several, such as 5%,500k" if pictures else ""
-    priority = "of 1, which is that of nodes in the middle"
-    of_pictures = (
-        option("--full", heading=COMMON, is_flag=True, help="Draw full detail: all leaves, however many there are."),
-        add(
-            "--continuous",
-            is_flag=True,
-            help="Blend nodes and their children where one replaces the other, so that nothing pops; draws 18 to 40 %"
-            " more splats than the budget.",
-        ),
-        add(
-            "--blend",
-            metavar="X",
-            type=Real(1, min_open=True),
-            help="With --continuous: ratio of the pixel scales between which nodes blend."
-            f"  [default: {defaults.BLEND:g}]",
-        ),
-    )
-    return with_options(
-        command,
-        option(
-            "--budget",
-            heading=COMMON,
-            type=Quantity("N|P%,..." if pictures else "N|P%", _budgets),
-            help="Largest number of splats to draw, such as 500k, or a share of the leaves, such as 5%"
-            f"{several}.  [default: that of --preset]",
-        ),
-        *(of_pictures if pictures else ()),
-        add(
-            "--preset",
-            type=click.Choice(list(defaults.PRESETS)),
-            help="Budget of a device: Spark 2's, or that of Spark's LoD design with preview-desktop and mobile."
-            f"  [default: {DEFAULT_PRESET}; for Streamed SOG PlayCanvas's, {detail_rule.BUDGET:,} splats]",
-        ),
-        add(
-            "--lod-splat-scale",
-            metavar="X",
-            type=Real(0, min_open=True),
-            default=1.0,
-            help="Factor by which the budget is multiplied.",
-        ),
-        add(
-            "--lod-render-scale",
-            metavar="X",
-            type=Real(0),
-            default=1.0,
-            help="Stop refining nodes smaller than this many pixels.",
-        ),
-        add(
-            "--pixel-scale-limit",
-            metavar="X",
-            type=Real(0),
-            help="Stop refining nodes of this size over distance, or smaller.  [default: that of a pixel, times"
-            " --lod-render-scale]",
-        ),
-        add(
-            "--cone-fov0",
-            metavar="DEGREES",
-            type=Real(0, 180),
-            default=defaults.CONE_FOV0,
-            help="Full angle of the inner foveation cone, in degrees: full priority inside it.",
-        ),
-        add(
-            "--cone-fov",
-            metavar="DEGREES",
-            type=Real(0, 180),
-            default=defaults.CONE_FOV,
-            help="Full angle of the outer cone, in degrees, where priority has fallen to --cone-foveate.",
-        ),
-        add(
-            "--cone-foveate",
-            metavar="X",
-            type=Real(0),
-            default=defaults.CONE_FOVEATE,
-            help=f"Priority of nodes at the outer cone, {priority}.",
-        ),
-        add(
-            "--outside-foveate",
-            metavar="X",
-            type=Real(0),
-            help="Priority of nodes outside the frustum, in place of the cones, as in Spark's LoD design.",
-        ),
-        add(
-            "--behind-foveate",
-            metavar="X",
-            type=Real(0),
-            help="Priority of nodes behind the camera."
-            f"  [default: {defaults.BEHIND_FOVEATE:g}; 1 with --outside-foveate]",
-        ),
-        add(
-            "--precision",
-            type=click.Choice(table.PRECISIONS),
-            default=table.PRECISIONS[0],
-            help="Precision of the centres and sizes that cuts are found with: the file's, its half floats, or what"
-            " Spark has of the file, for the same cuts to the last node: ext with extSplats, else packed, or"
-            " packed-pages of a RAD file that it streams.",
-        ),
-    )
+def check_scenes(ctx: click.Context, scenes: Scenes) -> None:
+    """Raise a `click.UsageError` where an option is for trees or Streamed SOG, and the files are something else."""
+    if scenes.details:
+        streamed = "is for trees; use --budget, --budget-mode and --lod-multiplier for Streamed SOG"
+        refuse(ctx, (*NODES, "chunk_cache", "indices_out", "padded"), streamed)
+    elif scenes.trees:
+        refuse(ctx, DETAIL, "is for Streamed SOG, and no file is; --budget and --preset are for trees, too")
+    else:
+        plain = (
+            "is for Level-of-Detail files, and no file is one, so that all splats are drawn; bake one with build-lod"
+        )
+        refuse(ctx, (*CUTS, *LOADING, *DETAIL), plain)

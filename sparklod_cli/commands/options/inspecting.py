@@ -2,27 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import click
 
 from ...support.defaults import MAX_SH_DEGREE, PLOT_BY
+from ...support.setting_fields import Quantity, Range, whole
 from ...support.units import parse_size
-from ..command import COMMON, option, with_options
+from ..option_groups import COMMON, flag, option, refuse
 from ..paths import InputPath, OutputPath
-from ..usage import refuse
-from .common import Command, assert_errors, assert_option, plot_option, table_form
-from .types import Quantity, Real
+from .common import assert_errors, assert_option, overwrite_flag, plot_option, table_form
 
 if TYPE_CHECKING:
     from ...inspection.expectations import Expectations
     from ...tables.output import TableOutput
 
-CHECKS, REPORT, PICTURES = "Checks", "Report", "Pictures"
+PICTURES = "Pictures"
 
 
 def _print_schema(ctx: click.Context, param: click.Parameter, value: bool) -> None:
@@ -31,181 +29,53 @@ def _print_schema(ctx: click.Context, param: click.Parameter, value: bool) -> No
         ctx.exit()
 
 
-OPTIONS: tuple[Callable[[Command], Command], ...] = (
-    option(
-        "--check",
-        heading=COMMON,
-        is_flag=True,
-        help="Look for everything that can be wrong, and print a line for each finding instead of a report.",
-    ),
-    assert_option(
-        "Expect this of every file, such as 'nodes<5M', 'bytes<=40MB' or 'tree.depth<24'; can be given several"
-        " times. The exit status is 3 if it does not hold."
-    ),
-    option("--require-lod", heading=COMMON, is_flag=True, help="Expect a Level-of-Detail tree."),
-    option(
-        "--leaves-of",
-        heading=COMMON,
-        metavar="FILE",
-        type=InputPath(),
-        help="Expect the leaves to be exactly the splats of this file, within the rounding of the format.",
-    ),
-    option(
-        "--expect",
-        heading=COMMON,
-        metavar="FILE",
-        type=InputPath(),
-        help="Take expectations from a .toml or .json file.",
-    ),
-    option(
-        "--stats", heading=COMMON, is_flag=True, help="Report statistics of all quantities, not only of the main ones."
-    ),
-    option(
-        "--field",
-        heading=COMMON,
-        metavar="NAME",
-        help="Print one value of the JSON report, such as tree.leaves, instead of a report.",
-    ),
-    option(
-        "--html",
-        heading=COMMON,
-        metavar="FILE",
-        type=OutputPath(suffixes=[".html", ".htm"]),
-        help="Write the reports as one HTML page, with pictures.",
-    ),
-    option(
-        "--fail-on",
-        heading=CHECKS,
-        type=click.Choice(["error", "warning"]),
-        default="error",
-        help="Lowest severity of a finding that makes the exit status 3.",
-    ),
-    option(
-        "--format",
-        "style",
-        heading=CHECKS,
-        type=click.Choice(["text", "github"]),
-        default="text",
-        help="How findings are printed; github prints annotations for GitHub Actions.",
-    ),
-    option(
-        "--max-bytes",
-        heading=CHECKS,
-        type=Quantity("SIZE", parse_size),
-        help="Expect files of at most this size, such as 3MB.",
-    ),
-    option(
-        "--min-splats",
-        heading=CHECKS,
-        metavar="N",
-        type=click.IntRange(0),
-        help="Expect at least N splats; in a tree, leaves.",
-    ),
-    option(
-        "--max-splats",
-        heading=CHECKS,
-        metavar="N",
-        type=click.IntRange(0),
-        help="Expect at most N splats; in a tree, leaves.",
-    ),
-    option("--sh", heading=CHECKS, metavar="N", type=click.IntRange(0, MAX_SH_DEGREE), help="Expect this SH degree."),
-    option(
-        "--max-growth",
-        heading=CHECKS,
-        metavar="X",
-        type=Real(1),
-        help="Expect a tree with at most X nodes for each leaf.",
-    ),
-    option(
-        "--histogram",
-        heading=REPORT,
-        metavar="NAME",
-        multiple=True,
-        help="Print a histogram of a quantity that --stats lists; can be given several times.",
-    ),
-    option(
-        "--chunks",
-        heading=REPORT,
-        is_flag=True,
-        help="Print a table of the chunks; with --json, put it into the report. Files without chunks have those of"
-        " 65,536 splats in which a viewer would stream them.",
-    ),
-    option(
-        "--chunks-out",
-        heading=REPORT,
-        metavar="FILE",
-        type=OutputPath(),
-        help="Write the table of the chunks of a single file to FILE: .csv, .json or .parquet.",
-    ),
-    option(
-        "--json-schema",
-        heading=REPORT,
-        is_flag=True,
-        is_eager=True,
-        expose_value=False,
-        callback=_print_schema,
-        help="Print the JSON Schema of --json and exit.",
-    ),
-    plot_option("Draw the structure of a single file as a .png, with pyvista.", PICTURES),
-    option(
-        "--plot-level",
-        heading=PICTURES,
-        metavar="N",
-        type=click.IntRange(0),
-        help="Draw the nodes at this depth of the tree.  [default: the leaves]",
-    ),
-    option(
-        "--plot-by",
-        heading=PICTURES,
-        type=click.Choice(PLOT_BY),
-        default=PLOT_BY[0],
-        help="What the colours of the picture show.",
-    ),
-)
-
-
-def inspect_options(command: Command) -> Command:
-    """Adds the options of this module, of which `Checks`, `Output` and `Pictures` have the values."""
-    return with_options(command, *OPTIONS)
-
-
 @dataclass(frozen=True)
 class Checks:
-    """What files are held to.
+    """Options of what files are checked for."""
 
-    Attributes:
-        check: everything that can be wrong.
-        fail_on: the lowest severity of a finding that is a failure.
-        asserts, max_bytes, min_splats, max_splats, sh, require_lod, max_growth: expectations of options.
-        expect: a file of others.
-        leaves_of: a file whose splats the leaves should be.
-    """
+    HEADING: ClassVar[str] = "Checks"
 
-    check: bool
-    fail_on: str
-    asserts: tuple[str, ...]
-    max_bytes: int | None
-    min_splats: int | None
-    max_splats: int | None
-    sh: int | None
-    require_lod: bool
-    max_growth: float | None
-    expect: Path | None
-    leaves_of: Path | None
+    check: bool = flag(
+        "Look for everything that can be wrong, and print a line for each finding instead of a report.", heading=COMMON
+    )
+    asserts: tuple[str, ...] = assert_option(
+        "Expect this of every file, such as 'nodes<5M', 'bytes<=40MB' or 'tree.depth<24'; can be given several times."
+        " The exit status is 3 if it does not hold.",
+        heading=COMMON,
+    )
+    require_lod: bool = flag("Expect a Level-of-Detail tree.", heading=COMMON)
+    leaves_of: Path | None = option(
+        "Expect the leaves to be exactly the splats of this file, within the rounding of the format.",
+        InputPath(),
+        heading=COMMON,
+    )
+    expect: Path | None = option("Take expectations from a .toml or .json file.", InputPath(), heading=COMMON)
+    fail_on: str = option("Lowest severity of a finding that makes the exit status 3.", ("error", "warning"), "error")
+    style: str = option(
+        "How findings are printed; github prints annotations for GitHub Actions.",
+        ("text", "github"),
+        "text",
+        flags=("--format",),
+    )
+    max_bytes: int | None = option("Expect files of at most this size, such as 3MB.", Quantity("SIZE", parse_size))
+    min_splats: int | None = option("Expect at least N splats; in a tree, leaves.", whole(0))
+    max_splats: int | None = option("Expect at most N splats; in a tree, leaves.", whole(0))
+    sh: int | None = option("Expect this SH degree.", whole(0, MAX_SH_DEGREE))
+    max_growth: float | None = option("Expect a tree with at most X nodes for each leaf.", Range(1))
 
     @property
     def has_expectations(self) -> bool:
-        """Whether there are any, of options or of a file."""
+        """Whether there are expectations, of options or of a file."""
         numbers = (self.max_bytes, self.min_splats, self.max_splats, self.sh, self.max_growth)
         return bool(self.asserts or self.require_lod or self.expect) or any(each is not None for each in numbers)
 
     @property
     def holds(self) -> bool:
-        """Whether findings are asked for."""
+        """Whether findings are printed."""
         return self.check or self.has_expectations or self.leaves_of is not None
 
     def expectations(self) -> Expectations | None:
-        """Those of the file, and of the options, which take the place of the file's; None where there are none.
+        """Return the expectations of the file, overridden by those of the options; None where there are none.
 
         Raises:
             click.UsageError: an assertion cannot be understood.
@@ -228,35 +98,38 @@ class Checks:
 
 
 @dataclass(frozen=True)
-class Output:
-    """What is printed and written.
+class InspectOutput:
+    """Options of what is printed and drawn."""
 
-    Attributes:
-        style: of findings.
-        stats: all quantities.
-        field: of the report, alone.
-        histogram: quantities that are drawn as text.
-        chunks: print a table of the chunks.
-        chunks_out: file of that table.
-        html, plot: files of a page and of a picture.
-        plot_level, plot_by: what the picture shows.
-        overwrite: replace files that exist.
-    """
+    HEADING: ClassVar[str] = "Report"
 
-    style: str
-    stats: bool
-    field: str | None
-    histogram: tuple[str, ...]
-    chunks: bool
-    chunks_out: Path | None
-    html: Path | None
-    plot: Path | None
-    plot_level: int | None
-    plot_by: str
-    overwrite: bool
+    overwrite: bool = overwrite_flag()
+    stats: bool = flag("Report statistics of all quantities, not only of the main ones.", heading=COMMON)
+    field: str | None = option(
+        "Print one value of the JSON report, such as tree.leaves, instead of a report.", metavar="NAME", heading=COMMON
+    )
+    html: Path | None = option(
+        "Write the reports as one HTML page, with pictures.", OutputPath(suffixes=[".html", ".htm"]), heading=COMMON
+    )
+    histogram: tuple[str, ...] = option(
+        "Print a histogram of a quantity that --stats lists; can be given several times.", metavar="NAME", multiple=True
+    )
+    chunks: bool = flag(
+        "Print a table of the chunks; with --json, put it into the report. Files without chunks have those of 65,536"
+        " splats in which a viewer would stream them."
+    )
+    chunks_out: Path | None = option(
+        "Write the table of the chunks of a single file to FILE: .csv, .json or .parquet.", OutputPath()
+    )
+    json_schema: bool = flag("Print the JSON Schema of --json and exit.", is_eager=True, callback=_print_schema)
+    plot: Path | None = plot_option("Draw the structure of a single file as a .png, with pyvista.", heading=PICTURES)
+    plot_level: int | None = option(
+        "Draw the nodes at this depth of the tree.  [default: the leaves]", whole(0), heading=PICTURES
+    )
+    plot_by: str = option("What the colours of the picture show.", PLOT_BY, PLOT_BY[0], heading=PICTURES)
 
     def table(self) -> TableOutput | None:
-        """Where the table of the chunks is written; None for nowhere.
+        """Return the output of the table of the chunks; None without one.
 
         Raises:
             click.UsageError: no table is written by that suffix.
@@ -271,13 +144,13 @@ class Output:
         )
 
 
-def check_usage(ctx: click.Context, count: int, checks: Checks, output: Output, *, as_json: bool) -> None:
-    """Raises a `click.UsageError` where options exclude each other or would do nothing.
+def check_usage(ctx: click.Context, count: int, checks: Checks, output: InspectOutput, *, as_json: bool) -> None:
+    """Raise a `click.UsageError` where options exclude each other or would do nothing.
 
     Args:
         ctx: of the command.
         count: how many files there are.
-        checks, output: what was given.
+        checks, output: options.
         as_json: --json was given.
     """
     if output.plot is not None and count > 1:

@@ -1,26 +1,52 @@
-"""Outputs of `sparklod render`: files of pictures, and their formats."""
+"""Options of `sparklod render`: the look of pictures, comparisons, and the files that pictures are written to."""
 
 from __future__ import annotations
 
-import functools
+import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import click
 
+from ...codecs.rounding import ROUND_TRIPS
 from ...images.defaults import JPEG_QUALITY, MOVING, STILL, THUMBNAIL_SIZE, THUMBNAIL_SUPERSAMPLE
-from ..command import COMMON, option, with_options
-from ..paths import Folder, require_suffix, stem_of
-from ..usage import exclude, require
-from .common import Command, output_option, overwrite_option
+from ...render.settings import OF_PIXELS, SORTINGS, RenderSettings
+from ...support import defaults
+from ...support.setting_fields import Range, whole
+from ..option_groups import COMMON, exclude, flag, is_set, option, require
+from ..parameter_types import Background
+from ..paths import Folder, InputPath, require_suffix, stem_of
+from .common import assert_errors, assert_option, output_option, overwrite_flag, plot_option
 
 if TYPE_CHECKING:
     from ...cameras.camera import Camera
     from ...images.output import Output
+    from ...images.pixels import Color
+    from ...lod.budget import Budget
+    from ...tables.assertions import Assertion
 
-HEADING = "Output"
+#: Options that styles, and backends, have no use for.
+UNSTYLED = {
+    "points": ("profile", "sort"),
+    "billboards": ("profile", "sort"),
+    "sorted-billboards": ("profile",),
+}
+UNKNOWN_TO = {"open3d": ("profile", "sort")}
+
+#: The budgets to compare, unless others are given.
+DEFAULT_BUDGETS = "2%,5%,10%,25%,50%"
+
+#: Options that --compare, and --thumbnail, have no use for.
+NOT_COMPARED = (
+    *("full", "preset", "lod_splat_scale", "background", "alpha", "supersample", "style", "color_by", "no_bar"),
+    *("through", "diff", "gain", "sheet", "jobs", "thumbnail", "jpeg_quality"),
+)
+NO_THUMBNAIL = (
+    *("size", "supersample", "camera_path", "orbit", "dolly", "look_at", "views", "keyframes", "center", "distance"),
+    *("sheet", "fps", "every"),
+)
 
 #: Pixels that are drawn for a picture: the floats of more do not fit into the memory of most machines.
 MOST_PIXELS = 1 << 27
@@ -28,40 +54,177 @@ MOST_PIXELS = 1 << 27
 #: Pixels along a side of a file, by its form.
 MOST_SIDE = {"webp": 16_383, "jpg": 65_500}
 
-#: Options that --thumbnail decides, and cameras that do not see the whole scene.
-NO_THUMBNAIL = (
-    *("size", "supersample", "camera_path", "orbit", "dolly", "look_at", "views", "keyframes", "center", "distance"),
-    *("sheet", "fps", "every"),
-)
+
+@dataclass(frozen=True)
+class Appearance:
+    """Options of the look of pictures."""
+
+    HEADING: ClassVar[str] = "Appearance"
+
+    background: Color | None = option(
+        "Colour behind the splats: '#rrggbb', black, white or transparent.", Background(), "black", heading=COMMON
+    )
+    alpha: bool = flag("Keep alpha, as --background transparent does.")
+    render: RenderSettings = field(default_factory=RenderSettings)
+    no_bar: bool = flag("Leave out the colour bar of --color-by or --diff.")
+    through: str | None = option(
+        "Draw splats as Spark's PackedSplats or ExtSplats, SPZ or RAD round them; cuts stay those of the file."
+        "  [default: as in the file]",
+        tuple(ROUND_TRIPS),
+    )
+    sorting: str | None = option(
+        "With --backend osmesa: sort exactly, or by 16 bits of the depth as antimatter15's viewer does (counting16)."
+        "  [default: exact]",
+        SORTINGS,
+        needs="backend=osmesa",
+    )
+    sort_throttle: float | None = option(
+        "With --backend osmesa: keep the order until the cosine between the view directions falls below 1 - X, such as"
+        " 0.01.  [default: 0]",
+        Range(0, 2),
+        needs="backend=osmesa",
+    )
+
+    def check(self, ctx: click.Context) -> None:
+        """Raise a `click.UsageError` where options contradict each other, or have no effect."""
+        render, raster = self.render, self.render.raster
+        if not raster.near < raster.far:
+            raise click.UsageError(f"--near {raster.near:g} must be less than --far {raster.far:g}")
+        if render.style != "splats":
+            exclude(ctx, ["backend"], f"--style {render.style}, which every picture gets from one renderer")
+        exclude(ctx, UNSTYLED.get(render.style, ()), f"--style {render.style}")
+        exclude(ctx, UNKNOWN_TO.get(render.backend, ()), f"--backend {render.backend}")
+        if render.color_by == "overdraw":
+            exclude(ctx, ["sort", "style", "backend"], "--color-by overdraw, which counts splats")
+        if is_set(ctx, "background") and self.background is not None:
+            exclude(ctx, ["alpha"], "--background, which fills what is transparent")
+
+    @property
+    def keeps_alpha(self) -> bool:
+        """Whether pictures of pixels keep alpha."""
+        return self.alpha or self.background is None
+
+    def background_for(self, ctx: click.Context, form: str) -> Color | None:
+        """Return the background of a file of some form; None keeps alpha, as floats do unless a background is given.
+
+        Raises:
+            click.UsageError: a file of this form has no alpha.
+        """
+        from ...images.output import WITH_ALPHA
+
+        if self.keeps_alpha and form not in WITH_ALPHA:
+            raise click.UsageError(f".{form} has no alpha; write .png or .webp, or name a --background such as black")
+        return None if self.keeps_alpha or (form == "npy" and not is_set(ctx, "background")) else self.background
+
+    def settings(self) -> RenderSettings:
+        """Return the settings of pictures, with the options of the backend."""
+        options = {"sorting": self.sorting, "throttle": self.sort_throttle}
+        known = {name: value for name, value in options.items() if value is not None}
+        return dataclasses.replace(self.render, options=known)
+
+    def of_pictures(self) -> tuple[str, ...]:
+        """Return the options that cannot be used with a file of numbers, by what its numbers are."""
+        return ("no_bar", "background", "alpha") if self.render.color_by in OF_PIXELS else ("no_bar",)
 
 
 @dataclass(frozen=True)
-class Pictures:
-    """The values of the options of `picture_options`; None for those not given.
+class Comparison:
+    """Options of comparisons: of cuts with full detail (`--compare`), and of one file with another (`--diff`)."""
 
-    Attributes:
-        output: a file, a name with a place for a number, a folder for files named after the input, or -.
-        overwrite: replace files that exist.
-        thumbnail: a small picture of the whole scene.
-        sheet: put all pictures on a contact sheet.
-        jobs: pictures to work on at a time.
-        jpeg_quality: of .jpg, 1 to 100.
+    HEADING: ClassVar[str] = "Comparison"
+
+    compare: bool = flag(
+        "Measure how far the cuts of each --budget are from full detail, as a table instead of pictures.",
+        excludes=NOT_COMPARED,
+    )
+    asserts: tuple[str, ...] = assert_option(
+        "With --compare: a condition that must hold, such as 'psnr_min>30', or '5%:psnr>30' for one of the budgets; the"
+        " exit status is 3 if it does not.",
+        needs="compare",
+    )
+    plot: Path | None = plot_option("With --compare: draw charts of the table as a .png.", needs="compare")
+    max_sh: int = option(
+        "With --compare: highest degree of spherical harmonics to draw.",
+        whole(0, defaults.MAX_SH_DEGREE),
+        defaults.MAX_SH_DEGREE,
+        needs="compare",
+    )
+    diff: Path | None = option("Draw the difference from the picture of another file, and print its PSNR.", InputPath())
+    gain: float | None = option(
+        "Factor by which --diff multiplies differences.  [default: chosen for the pictures]",
+        Range(above=0),
+        needs="diff",
+    )
+
+    def check(self, ctx: click.Context, appearance: Appearance) -> None:
+        """Raise a `click.UsageError` where options contradict each other, or have no effect."""
+        if self.compare:
+            return
+        if self.diff is None:
+            if appearance.render.color_by is None:
+                require(ctx, ["no_bar"], "--color-by or --diff")
+            return
+        exclude(ctx, ["color_by"], "--diff, which compares the splats' own colours")
+        if appearance.keeps_alpha:
+            raise click.UsageError("--diff compares pictures without alpha; name a --background such as black")
+
+    def budgets(self, budgets: Sequence[Budget] | None) -> Sequence[Budget]:
+        """Return the budgets to compare: those given, or `DEFAULT_BUDGETS`."""
+        from ...lod.budget import parse_budgets
+
+        return parse_budgets(DEFAULT_BUDGETS) if budgets is None else budgets
+
+    def assertions(self, budgets: Sequence[Budget]) -> list[tuple[int | None, Assertion]]:
+        """Return the assertions, each with the index of its budget, which stands before a colon; None for all budgets.
+
+        Raises:
+            click.UsageError: an assertion cannot be understood.
+        """
+        from ...tables import assertions
+        from ...tables.comparison import COLUMNS
+
+        parsed: list[tuple[int | None, Assertion]] = []
+        texts = [budget.text for budget in budgets]
+        for text in self.asserts:
+            name, colon, rest = text.rpartition(":")
+            name = name.strip()
+            if colon and name not in texts:
+                raise click.UsageError(f"--assert {text!r}: {name} is not one of the budgets, {', '.join(texts)}")
+            with assert_errors():
+                assertion = dataclasses.replace(assertions.parse(rest, COLUMNS), text=text.strip())
+            parsed.append((texts.index(name) if colon else None, assertion))
+        return parsed
+
+
+@dataclass(frozen=True)
+class PictureFiles:
+    """Options of the files of pictures.
+
+    The output is a file, a name with a place for a number, a folder for files named after the input, or -.
     """
 
-    output: Path | Folder | None
-    overwrite: bool
-    thumbnail: bool
-    sheet: bool
-    jobs: int
-    jpeg_quality: int
+    HEADING: ClassVar[str] = "Output"
 
-    def check(self, ctx: click.Context) -> None:
-        """Raises a `click.UsageError` where options contradict each other."""
-        if self.thumbnail:
-            exclude(ctx, NO_THUMBNAIL, "--thumbnail")
+    output: Path | Folder | None = output_option(
+        "Write a .png, .jpg, .webp or .npy (floats), or with out.%04d.png one for each camera; a .mp4, .webm, .gif or"
+        " .webp for an animation; with --compare a .csv, .json or .parquet; or into the folder FILE as NAME.png; - is"
+        " standard output.  [default: NAME.png beside the first FILE; with --compare standard output]"
+    )
+    overwrite: bool = overwrite_flag()
+    thumbnail: bool = flag(
+        f"Draw a small picture of the whole scene: {THUMBNAIL_SIZE[0]}x{THUMBNAIL_SIZE[1]} pixels, each the mean of"
+        f" {THUMBNAIL_SUPERSAMPLE} x {THUMBNAIL_SUPERSAMPLE} samples, to NAME-thumbnail.png.",
+        heading=COMMON,
+        excludes=NO_THUMBNAIL,
+    )
+    sheet: bool = flag("Put the pictures of all cameras on one contact sheet.")
+    jobs: int = option(
+        "Number of pictures to work on at a time: while one is drawn, others are sorted and written.", whole(1, 256), 2
+    )
+    jpeg_quality: int = option("Quality of a .jpg, from 1 to 100.", whole(1, 100), JPEG_QUALITY)
 
     def place(self, ctx: click.Context, scene: Path, cameras: int, *, sheet: bool) -> Output:
-        """Where the pictures of some cameras go.
+        """Return the output of the pictures of some cameras.
 
         Args:
             ctx: of the command.
@@ -89,7 +252,7 @@ class Pictures:
 
 
 def check_sizes(output: Output, cameras: Sequence[Camera], supersample: int, *, bar: bool) -> None:
-    """Raises a `click.UsageError` where a picture is larger than can be drawn, or than its file can be.
+    """Raise a `click.UsageError` where a picture is larger than can be drawn, or than its file can be.
 
     Args:
         output: where the pictures go.
@@ -115,41 +278,3 @@ def check_sizes(output: Output, cameras: Sequence[Camera], supersample: int, *, 
         raise click.UsageError(
             f"the cameras have pictures of several sizes, and those of one {output.kind} must be alike; give a --size"
         )
-
-
-def picture_options(command: Command) -> Command:
-    """The options of `Pictures`."""
-    add = functools.partial(option, heading=HEADING)
-    width, height = THUMBNAIL_SIZE
-    return with_options(
-        command,
-        output_option(
-            "Write a .png, .jpg, .webp or .npy (floats), or with out.%04d.png one for each camera; a .mp4,"
-            " .webm, .gif or .webp for an animation; with --compare a .csv, .json or .parquet; or into the folder FILE"
-            " as NAME.png; - is standard output.  [default: NAME.png beside the first FILE; with --compare standard"
-            " output]"
-        ),
-        overwrite_option,
-        option(
-            "--thumbnail",
-            heading=COMMON,
-            is_flag=True,
-            help=f"Draw a small picture of the whole scene: {width}x{height} pixels, each the mean of"
-            f" {THUMBNAIL_SUPERSAMPLE} x {THUMBNAIL_SUPERSAMPLE} samples, to NAME-thumbnail.png.",
-        ),
-        add("--sheet", is_flag=True, help="Put the pictures of all cameras on one contact sheet."),
-        add(
-            "--jobs",
-            metavar="N",
-            type=click.IntRange(1, 256),
-            default=2,
-            help="Number of pictures to work on at a time: while one is drawn, others are sorted and written.",
-        ),
-        add(
-            "--jpeg-quality",
-            metavar="N",
-            type=click.IntRange(1, 100),
-            default=JPEG_QUALITY,
-            help="Quality of a .jpg, from 1 to 100.",
-        ),
-    )

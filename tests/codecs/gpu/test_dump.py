@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from sparklod_cli.cli import run
+from sparklod_cli.codecs.formats import ENCODINGS
 from sparklod_cli.codecs.gpu import dump
-from sparklod_cli.codecs.gpu.table import ENCODINGS
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quick
 from sparklod_cli.model.scene import Scene

@@ -10,9 +10,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sparklod_cli.codecs import quantize, spark_math
+from sparklod_cli.codecs import quantize, spark_codings
+from sparklod_cli.codecs.formats import LOADED
 from sparklod_cli.codecs.gpu import ext_splats, loaded_nodes, lod_tree, packed_splats
-from sparklod_cli.codecs.gpu.table import LOADED
 from sparklod_cli.codecs.splat_encoding import SplatEncoding, log_scale_table
 from sparklod_cli.lod import quick
 from sparklod_cli.model.lod_tree import LodTree
@@ -72,10 +72,10 @@ def test_codes_are_decoded_as_spark_decodes_them(scene: Scene, layout: str, codi
     codes = np.random.default_rng(0).integers(1, 256, (len(scene), 3)).astype(np.uint8)
     logs = codes.astype(np.float32) / 16 - 10
     if coding.name == "ln_0r8":
-        ours, theirs = log_scale_table(-12, 9)[codes], log_scale_table(-12, 9, exp=spark_math.exp)[codes]
+        ours, theirs = log_scale_table(-12, 9)[codes], log_scale_table(-12, 9, exp=spark_codings.exp)[codes]
     else:
         ours = quantize.decode_log_scale(codes) if coding.name == "spz" else np.exp(logs)
-        theirs = spark_math.exp(logs)
+        theirs = spark_codings.exp(logs)
     assert not np.array_equal(ours, theirs)
     known = nodes(with_scales(scene, ours), layout, FileCoding((coding,), 1))
     assert np.array_equal(known.size, nodes(with_scales(scene, theirs), layout).size)

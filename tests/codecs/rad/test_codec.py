@@ -17,13 +17,10 @@ from sparklod_cli import __version__
 from sparklod_cli.codecs import clamps
 from sparklod_cli.codecs.options import DEFAULTS, RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import codec as rad
-from sparklod_cli.codecs.rad import fitting
-from sparklod_cli.codecs.rad import options as rad_options
-from sparklod_cli.codecs.rad.header import read_header
-from sparklod_cli.codecs.rad.records import RadHeader
+from sparklod_cli.codecs.rad import rad_options
+from sparklod_cli.codecs.rad.rad_header import RadHeader, read_header
 from sparklod_cli.codecs.splat_encoding import SplatEncoding
-from sparklod_cli.codecs.statistics import Statistics
-from sparklod_cli.codecs.steps import SMALL_QUANTILE, STEPS_A_SPLAT
+from sparklod_cli.codecs.statistics import SMALL_QUANTILE, STEPS_A_SPLAT, Statistics
 from sparklod_cli.io import examine_scene, read_scene
 from sparklod_cli.model.gaussian import linear_opacity, lod_opacity
 from sparklod_cli.model.lod_tree import LodTree
@@ -128,7 +125,7 @@ def test_columns_that_are_not_asked_for_are_0_but_damage_to_them_is_found() -> N
     data = bytearray(WHOLE.read_bytes())
     data[data.index(b'"r8_delta"') + 1] = ord("s")
     with pytest.raises(FormatError, match="rgb"):
-        rad.examine(io.BytesIO(bytes(data)), columns=("center",))
+        rad.decode(io.BytesIO(bytes(data)), columns=("center",))
 
 
 def test_a_chunk_alone_says_what_to_give_instead() -> None:
@@ -354,7 +351,8 @@ def test_the_order_of_splats_does_not_change_a_range(large: Scene) -> None:
     rgb[::64] *= 3
     splats = dataclasses.replace(large.splats, rgb=rgb)
     shuffled = splats.take(np.random.default_rng(1).permutation(len(splats)))
-    assert fitting.fitted(Statistics.of_scene(Scene(shuffled))) == fitting.fitted(Statistics.of_scene(Scene(splats)))
+    one, other = (rad_options.fitted(Statistics.of_scene(Scene(some))) for some in (shuffled, splats))
+    assert one == other
 
 
 def test_colours_and_scales_of_a_wide_range_are_float16() -> None:
@@ -412,15 +410,15 @@ def test_centres_beyond_float16_are_refused(encoding: str) -> None:
 
 
 def test_an_unknown_encoding_is_named_with_those_there_are() -> None:
-    with pytest.raises(ValueError, match=r"rgb is 'r9', not one of auto, r8_delta, r8, f16, f32"):
+    with pytest.raises(ValueError, match="no rad rgb 'r9'; give one of auto, r8_delta, r8, f16, f32"):
         chosen(random_splats(1), rgb="r9")
 
 
 @pytest.mark.parametrize("scene", [Scene(random_splats(1)), Scene(random_splats(0))])
 def test_ranges_of_hardly_any_splats_are_not_empty(scene: Scene) -> None:
-    assert isinstance(fitting.fitted(Statistics.of_scene(scene)), SplatEncoding)
+    assert isinstance(rad_options.fitted(Statistics.of_scene(scene)), SplatEncoding)
     flat = dataclasses.replace(scene.splats, scale=np.full_like(scene.splats.scale, 0.5))
-    assert isinstance(fitting.fitted(Statistics.of_scene(Scene(flat))), SplatEncoding)
+    assert isinstance(rad_options.fitted(Statistics.of_scene(Scene(flat))), SplatEncoding)
 
 
 # --- Spark's own files ------------------------------------------------------------------------------------------------

@@ -15,8 +15,8 @@ import pytest
 
 from fixtures import by_hand_rad
 from sparklod_cli.codecs.rad import codec as rad
-from sparklod_cli.codecs.rad.header import read_header
-from sparklod_cli.codecs.rad.layout import RANGES
+from sparklod_cli.codecs.rad.rad_header import read_header
+from sparklod_cli.codecs.rad.rad_layout import RANGES
 from sparklod_cli.support.errors import FormatError, PromiseError
 from tests.codecs.sog.test_damaged import VALUES, places_of, replaced
 from tests.codecs.test_damaged import attempt, content
@@ -105,7 +105,7 @@ def with_property(name: str, piece: bytes) -> bytes:
 )
 def test_data_that_are_not_those_of_the_splats_say_what_they_are(piece: bytes, message: str) -> None:
     with pytest.raises(FormatError, match=message):
-        rad.examine(io.BytesIO(with_property("rgb", piece)))
+        rad.decode(io.BytesIO(with_property("rgb", piece)), validate=False)
 
 
 def test_a_deflate_bomb_is_not_unpacked() -> None:
@@ -114,7 +114,7 @@ def test_a_deflate_bomb_is_not_unpacked() -> None:
     data = with_property("rgb", bomb)
     tracemalloc.start()
     with pytest.raises(FormatError, match="more than the 72 bytes"):
-        rad.examine(io.BytesIO(data))
+        rad.decode(io.BytesIO(data), validate=False)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 4e6

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sparklod_cli.codecs.kernels import texels
-from sparklod_cli.codecs.sog import codings
+from sparklod_cli.codecs.sog import texel_codings as codings
 from tests.references.sog_quats import decode_quat
 
 RNG = np.random.default_rng(2)

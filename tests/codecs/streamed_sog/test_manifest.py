@@ -10,10 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sparklod_cli.codecs.file_names import is_of_streamed_sog
 from sparklod_cli.codecs.streamed_sog import manifest as manifests
-from sparklod_cli.codecs.streamed_sog.manifest import LARGEST, Manifest, ManifestNode, Run, parse
-from sparklod_cli.codecs.streamed_sog.names import is_ours
-from sparklod_cli.codecs.streamed_sog.serialising import serialise
+from sparklod_cli.codecs.streamed_sog.manifest import LARGEST, Manifest, ManifestNode, Run, parse, serialise
 from sparklod_cli.support.errors import FormatError, VersionError
 
 BOUND = {"min": [-1, 0, 0.5], "max": [1, 2, 3e5]}
@@ -160,7 +159,7 @@ def test_bounds_are_rounded_outward_to_7_digits(low: float, high: float) -> None
 
 @pytest.mark.parametrize("name", ["0_0/meta.json", "12_345/means_l.webp", "env/env.sog", "env/meta.json"])
 def test_names_of_an_output(name: str) -> None:
-    assert is_ours(name)
+    assert is_of_streamed_sog(name)
 
 
 @pytest.mark.parametrize(
@@ -178,4 +177,4 @@ def test_names_of_an_output(name: str) -> None:
     ],
 )
 def test_other_names_are_not_of_an_output(name: str) -> None:
-    assert not is_ours(name)
+    assert not is_of_streamed_sog(name)

@@ -18,7 +18,13 @@ print(*sorted(sys.modules))
 """
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
     assert "sparklod_cli.codecs.ply" in loaded
-    others = ("cameras.pose", "codecs.sog.files", "codecs.streamed_sog.manifest", "codecs.rad.codec", "codecs.gpu.dump")
-    others += ("bake.out_of_core.cluster", "bake.out_of_core.in_blocks", "bake.skipping", "scenes.instances_file")
+    others = ("cameras.pose", "codecs.sog.sog_container", "codecs.streamed_sog.manifest", "codecs.rad.codec")
+    others += (
+        "codecs.gpu.dump",
+        "bake.out_of_core.cluster",
+        "bake.out_of_core.in_blocks",
+        "bake.skipping",
+        "scenes.instances_file",
+    )
     assert {f"sparklod_cli.{name}" for name in others}.intersection(loaded) == set()
     assert "PIL" not in loaded

@@ -12,8 +12,8 @@ import pytest
 from sparklod_cli.codecs import spz
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import codec as rad
-from sparklod_cli.codecs.rad import layout as rad_layout
-from sparklod_cli.codecs.rad.header import read_chunk_header, read_header
+from sparklod_cli.codecs.rad import rad_layout
+from sparklod_cli.codecs.rad.rad_header import read_chunk_header, read_header
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quick
 from sparklod_cli.model.scene import Scene
@@ -277,9 +277,9 @@ def test_the_encoding_that_is_advised_holds_the_values(
         (["--encoding", "ext", "--format", "rad"], "--format cannot be used with --encoding"),
         (["--encoding", "ext", "--cluster-sh", "9"], "--cluster-sh is an option of RAD and SOG, not of --encoding"),
         (["--encoding", "ext", "--compression-level", "9"], "an option of SPZ and RAD, not of --encoding"),
-        (["--unlod", "-o", "x.ply", "--rad-rgb", "f32"], "--rad-rgb is an option of RAD, not of .ply"),
+        (["--unlod", "-o", "x.ply", "--rad-rgb", "f32"], "--rad-rgb is an option of RAD, not of PLY"),
         (["--unlod", "-o", "x.ply", "--format", "rad"], "--format rad writes .rad, not .ply"),
-        (["--unlod", "-o", "x.splat", "--compression-level", "2"], "an option of SPZ and RAD, not of .splat"),
+        (["--unlod", "-o", "x.splat", "--compression-level", "2"], "an option of SPZ and RAD, not of SPLAT"),
         (["--format", "rad", "--rad-center", "r8"], "--rad-center"),
         (["--format", "rad", "--cluster-sh", "1"], "2<=x<=65536"),
         (["--format", "rad", "--cluster-sh", "65537"], "2<=x<=65536"),

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from sparklod_cli.codecs import ply
+from sparklod_cli.codecs.file_names import ENVIRONMENT_FILE
 from sparklod_cli.codecs.options import WriteOptions
-from sparklod_cli.codecs.streamed_sog.names import ENVIRONMENT_FILE
 from sparklod_cli.io import read_scene
 from sparklod_cli.model.scene import Scene
 from tests.commands.build_lod.runs import ONE, SMALL, build
@@ -288,7 +288,7 @@ def test_other_outputs_have_no_detail(scene: Path, tmp_path: Path, capsys: pytes
         (["-o", MANIFEST, "--method", "quick", "--growth", "1.2"], "an option of --method quality, not of quick"),
         (["-o", MANIFEST, "--environment", "b.ply", "--environment-beyond", "3"], "cannot be used with --environment"),
         (["-o", MANIFEST, "--environment-beyond", "0"], "--environment-beyond"),
-        (["-o", MANIFEST, "--chunk-splats", "0"], "'0' is too few; give 1 or more"),
+        (["-o", MANIFEST, "--chunk-splats", "0"], "'0' is out of range; give 1 or more"),
         (["-o", MANIFEST, "--region-extent", "nan"], "--region-extent"),
         *((["-o", MANIFEST, "--levels", text], f"{text!r} is neither auto nor shares") for text in ("", "9%,9%", "2")),
         (["-o", MANIFEST, "--levels", "100%"], "above 0% and below 100%"),

@@ -1,0 +1,170 @@
+"""The encodings of RAD's properties, as pairs of encode and decode over a whole column of a chunk.
+
+A column is stored number by number: all x, then all y, then all z. The formulas are those of Spark 2.2.0's `rad.rs`.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...model.splats import FloatArray
+from ...support.parallel import blocks_of
+from .. import spark_codings, splat_encoding
+from ..quantize import Bytes
+from ..spark_codings import STEPS_8_8_8
+
+#: Largest finite float16. Larger values are clamped to it: rounded they would be infinite.
+LARGEST_F16 = np.float32(65504)
+
+#: Largest float16 whose exponential float32 holds, a step below `quantize.LARGEST_LOG`.
+LARGEST_LOG_F16 = np.float16(88.6875)
+
+#: Splats that are coded at a time: they and what is computed of them stay in the processor's cache.
+BLOCK = 1 << 13
+
+#: Every code of a byte.
+_ALL = np.arange(256, dtype=np.uint8)
+
+
+class Coding(NamedTuple):
+    """Pair of functions.
+
+    Attributes:
+        encode: (N, numbers) values, and the ends of the range of their codes, to bytes of any shape.
+        decode: the bytes, N, the numbers of a splat, and the ends of the range to (N, numbers) values.
+    """
+
+    encode: Callable[[NDArray[Any], float, float], NDArray[Any]]
+    decode: Callable[[Bytes, int, int, float, float], NDArray[Any]]
+
+    def rounded(self, values: NDArray[Any], low: float, high: float) -> NDArray[Any]:
+        """Return (N, numbers) values as they are decoded."""
+        codes = np.ascontiguousarray(self.encode(values, low, high)).reshape(-1).view(np.uint8)
+        return np.ascontiguousarray(self.decode(codes, len(values), values.shape[1], low, high))
+
+
+def _plain(code: str, most: np.float32 | None = None) -> Coding:
+    """Return the coding of plain numbers of a type."""
+
+    def encode(values: NDArray[Any], low: float, high: float) -> NDArray[Any]:
+        planes = values.T if most is None else np.clip(values.T, -most, most)
+        return np.ascontiguousarray(planes, code)
+
+    def decode(codes: Bytes, count: int, numbers: int, low: float, high: float) -> NDArray[Any]:
+        return codes.view(code).reshape(numbers, count).T
+
+    return Coding(encode, decode)
+
+
+def _by_bytes(coding: Coding, size: int) -> Coding:
+    """Return the coding of numbers of another coding with their lowest bytes first, then their next ones."""
+
+    def encode(values: NDArray[Any], low: float, high: float) -> NDArray[Any]:
+        planes = coding.encode(values, low, high).view(np.uint8)
+        return np.ascontiguousarray(planes.reshape(-1, size).T)
+
+    def decode(codes: Bytes, count: int, numbers: int, low: float, high: float) -> NDArray[Any]:
+        whole = np.ascontiguousarray(codes.reshape(size, -1).T).reshape(-1)
+        return coding.decode(whole, count, numbers, low, high)
+
+    return Coding(encode, decode)
+
+
+def _by_differences(coding: Coding) -> Coding:
+    """Return the coding of bytes of another coding as differences from those of the splat before, modulo 256."""
+
+    def encode(values: NDArray[Any], low: float, high: float) -> NDArray[Any]:
+        planes = coding.encode(values, low, high)
+        return np.diff(planes, axis=1, prepend=np.zeros((len(planes), 1), np.uint8))
+
+    def decode(codes: Bytes, count: int, numbers: int, low: float, high: float) -> NDArray[Any]:
+        whole = np.cumsum(codes.reshape(numbers, count), axis=1, dtype=np.uint8)
+        return coding.decode(whole.reshape(-1), count, numbers, low, high)
+
+    return Coding(encode, decode)
+
+
+def _by_table(
+    encode: Callable[[FloatArray, float, float], NDArray[Any]], table: Callable[[float, float], FloatArray]
+) -> Coding:
+    """Return the coding of a byte a number; the table has the values of all 256."""
+
+    def encode_planes(values: FloatArray, low: float, high: float) -> NDArray[Any]:
+        planes = np.empty((values.shape[1], len(values)), np.uint8)
+        for part in blocks_of(len(values), BLOCK):
+            planes[:, part] = encode(np.ascontiguousarray(values[part].T), low, high)
+        return planes
+
+    def decode(codes: Bytes, count: int, numbers: int, low: float, high: float) -> NDArray[Any]:
+        with np.errstate(over="ignore", invalid="ignore"):  # a stranger's range may be any
+            values = table(low, high)
+        return values[codes.reshape(numbers, count).T]
+
+    return Coding(encode_planes, decode)
+
+
+def _encode_signed(values: FloatArray, low: float, high: float) -> NDArray[Any]:
+    steps = values / np.float32(high)
+    steps *= np.float32(127)
+    np.clip(steps, -127, 127, out=steps)
+    steps += np.copysign(spark_codings.ALMOST_HALF, steps)
+    return steps.astype(np.int8).view(np.uint8)
+
+
+def _signed_table(low: float, high: float) -> FloatArray:
+    return _ALL.view(np.int8) / np.float32(127) * np.float32(high)
+
+
+def _encode_log(values: NDArray[Any], low: float, high: float) -> NDArray[Any]:
+    with np.errstate(divide="ignore"):
+        return np.minimum(np.log(values.astype(np.float64)), LARGEST_LOG_F16).astype(np.float32)
+
+
+def _decode_log_f16(codes: Bytes, count: int, numbers: int, low: float, high: float) -> NDArray[Any]:
+    with np.errstate(over="ignore", invalid="ignore"):  # a stranger's logarithm may be any
+        return np.exp(_F16.decode(codes, count, numbers, low, high).astype(np.float32))
+
+
+def _encode_octahedral(quat_xyzw: NDArray[Any], low: float, high: float) -> NDArray[Any]:
+    codes = np.empty((len(quat_xyzw), 3), np.uint8)
+    for part in blocks_of(len(quat_xyzw), BLOCK):
+        for number, found in enumerate(spark_codings.encode_axis_angle(quat_xyzw[part], STEPS_8_8_8)):
+            codes[part, number] = found
+    return codes
+
+
+def _decode_octahedral(codes: Bytes, count: int, numbers: int, low: float, high: float) -> NDArray[Any]:
+    u, v, angle = codes.reshape(count, 3).T
+    return spark_codings.decode_axis_angle(u, v, angle, STEPS_8_8_8)
+
+
+_F32, _F16 = _plain("<f4"), _plain("<f2", LARGEST_F16)
+_R8 = _by_table(splat_encoding.encode_linear, functools.partial(splat_encoding.decode_linear, _ALL))
+_S8 = _by_table(_encode_signed, _signed_table)
+
+#: By name. Largest errors inside the range of the codes, apart from that of float32:
+#: f16, f16_lebytes: 2 ** -11 of a number, or 2 ** -25 if that is more. r8, r8_delta: (max - min) / 510.
+#: s8, s8_delta: max / 254. ln_0r8: a factor of e ** ((max - min) / 508). ln_f16: a factor of e ** (2 ** -11 *
+#: abs(ln(scale))). oct88r8, which takes and gives whole quaternions and is stored splat by splat: 1.94 degrees.
+CODINGS = {
+    "f32": _F32,
+    "f16": _F16,
+    "f32_lebytes": _by_bytes(_F32, 4),
+    "f16_lebytes": _by_bytes(_F16, 2),
+    "r8": _R8,
+    "r8_delta": _by_differences(_R8),
+    "s8": _S8,
+    "s8_delta": _by_differences(_S8),
+    "ln_0r8": _by_table(splat_encoding.encode_log_scale, splat_encoding.log_scale_table),
+    "ln_f16": Coding(
+        lambda values, low, high: _plain("<f2").encode(_encode_log(values, low, high), low, high), _decode_log_f16
+    ),
+    "oct88r8": Coding(_encode_octahedral, _decode_octahedral),
+    "u16": _plain("<u2"),
+    "u32": _plain("<u4"),
+}

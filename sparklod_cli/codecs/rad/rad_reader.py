@@ -1,0 +1,391 @@
+"""Reads RAD files: whole, by ranges of splats, chunk by chunk, or as packed chunks."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from typing import BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...model.lod_tree import LodTree
+from ...model.scene import FileCoding, ScaleCoding
+from ...model.sh import COEFFICIENTS
+from ...model.splats import COLUMNS, FloatArray, Splats
+from ...support.defaults import MAX_SH_DEGREE
+from ...support.errors import FormatError, TruncatedError
+from ...support.parallel import ordered_map
+from ...support.progress import Progress
+from .. import compression
+from ..content import Beside, Content, Source, Target
+from ..stream import size_of
+from ..validation import RuleViolation, check_rules, error_of
+from . import rad_rules
+from .chunk_decoder import PackedChunk, fill
+from .rad_header import (
+    Files,
+    RadChunkEntry,
+    RadChunkHeader,
+    RadHeader,
+    in_files,
+    in_one_file,
+    padding,
+    read_chunk_header,
+    read_header,
+)
+from .rad_layout import BY_NAME, encodings_of
+from .rad_rules import broken
+
+
+@contextlib.contextmanager
+def file_of(entry: RadChunkEntry, file: BinaryIO, beside: Beside | None) -> Iterator[BinaryIO]:
+    """Open the file that has a chunk: `file`, which has the header, or one that is closed afterwards."""
+    if entry.filename is None:
+        yield file
+        return
+    with _open_beside(entry.filename, beside) as own:
+        yield own
+
+
+def _open_beside(name: str, beside: Beside | None) -> BinaryIO:
+    if beside is None:
+        raise FormatError("its chunks are in files beside it; give it as a file in their folder")
+    return beside(name)
+
+
+def bytes_of(entry: RadChunkEntry, header: RadHeader, file: BinaryIO) -> bytes:
+    """Return the bytes of a chunk from the file that has it; raises `TruncatedError` where that ends before."""
+    start = entry.start(header)
+    lacking = start + entry.bytes - size_of(file)
+    if lacking > 0:  # before so much memory is asked for
+        raise TruncatedError(f"cut short: {lacking:,} of {entry.bytes:,} bytes of a chunk are missing")
+    file.seek(start)
+    return file.read(entry.bytes)
+
+
+@dataclass(frozen=True, eq=False)
+class RadReader:
+    """RAD file whose header has been read and checked.
+
+    Attributes:
+        header: of the file.
+        file: open for reading.
+        beside: opens the files that the header names.
+        palette: (codes, K, 3) of SH; None without one.
+    """
+
+    header: RadHeader
+    file: BinaryIO
+    beside: Beside | None = None
+    palette: FloatArray | None = None
+
+    @classmethod
+    def open(cls, file: BinaryIO, beside: Beside | None = None) -> RadReader:
+        """Read the header of a file, and its palette.
+
+        Raises:
+            FormatError: the file is not RAD, breaks a fatal rule of `rad_rules`, or its first chunk is damaged.
+        """
+        size = size_of(file)
+        header = read_header(file)
+        sizes = {}
+        for name in header.filenames:
+            with _open_beside(name, beside) as own:
+                sizes[name] = size_of(own)
+        check_rules(rad_rules.violations(header, size, sizes))
+        _check_promise(header.count, header, size + sum(sizes.values()))
+        reader = cls(header, file, beside)
+        first = reader.first()
+        return reader if first is None else dataclasses.replace(reader, palette=first.palette(header))
+
+    def reopened(self, file: BinaryIO, beside: Beside | None) -> RadReader:
+        """Return a reader of the same file, opened again."""
+        return dataclasses.replace(self, file=file, beside=beside)
+
+    @property
+    def facts(self) -> dict[str, int]:
+        """As `Scene.header`: chunks, their size in splats, whether they are files of their own, and codes of SH."""
+        header = self.header
+        facts = {"version": 1, "chunks": len(header.chunks), "chunk_size": header.chunk_size}
+        facts |= {"header_bytes": header.bytes, "chunked": int(header.chunked)}
+        return facts | ({"sh_codes": len(self.palette)} if self.palette is not None else {})
+
+    @property
+    def encodings(self) -> dict[str, str]:
+        """Encodings of the properties of the first chunk, by the field of `RadOptions`."""
+        first = self.first()
+        return {} if first is None else encodings_of(first.header.properties)
+
+    def in_one_file(self) -> Iterator[bytes]:
+        """Return the bytes of one file that holds all chunks as they stand."""
+        return in_one_file(self.header, [entry.bytes for entry in self.header.chunks], self.raw())
+
+    def in_files(self, stem: str) -> Files:
+        """Return a file for each chunk as it stands, and their header; see `rad_header.in_files`."""
+        return in_files(self.header, self.raw(), stem)
+
+    def first(self) -> PackedChunk | None:
+        """Read the first chunk; None where there is none."""
+        return next(self.packed(range(min(1, len(self.header.chunks)))), None)
+
+    def raw(self, numbers: range | None = None) -> Iterator[bytes]:
+        """Read the bytes of chunks, all by default, when they are asked for."""
+        for number in range(len(self.header.chunks)) if numbers is None else numbers:
+            entry = self.header.chunks[number]
+            with file_of(entry, self.file, self.beside) as source:
+                yield bytes_of(entry, self.header, source)
+
+    def packed(self, numbers: range | None = None) -> Iterator[PackedChunk]:
+        """Read chunks, all by default, when they are asked for.
+
+        Raises:
+            FormatError: a chunk is cut short, or not the one that the header means.
+        """
+        numbers = range(len(self.header.chunks)) if numbers is None else numbers
+        for number, data in zip(numbers, self.raw(numbers), strict=True):
+            yield PackedChunk.of(data, number, self.header)
+
+    def decode(
+        self,
+        packed: PackedChunk,
+        columns: Collection[str] = COLUMNS,
+        target: tuple[Splats, LodTree | None] | None = None,
+        *,
+        thorough: bool = True,
+    ) -> tuple[Splats, LodTree | None]:
+        """Decode a chunk: its splats, and its nodes where there is a tree, whose children have the file's numbers.
+
+        Args:
+            packed: the chunk.
+            columns: of `Splats`; the others are 0.
+            target: rows to fill; None for new ones.
+            thorough: unpack the other columns, too, which finds what is corrupt.
+
+        Raises:
+            FormatError: the chunk is corrupt.
+        """
+        splats, tree = target or _new_rows(packed.header.count, self.header)
+        if fill(packed, self.header, splats, tree, self.palette, columns, thorough=thorough) is not None:
+            raise error_of("rad.palette", f"chunk {packed.number:,} has labels of SH, but there is no palette")
+        return splats, tree
+
+    def chunks(
+        self, columns: Collection[str], *, thorough: bool, threads: int
+    ) -> Iterator[tuple[int, Splats, LodTree | None]]:
+        """Decode all chunks in order, a few at a time: the index of the first splat of each, splats and nodes."""
+
+        def work(packed: PackedChunk) -> tuple[int, Splats, LodTree | None]:
+            return packed.header.base, *self.decode(packed, columns, thorough=thorough)
+
+        return ordered_map(work, self.packed(), threads)
+
+    def chunk(self, number: int, columns: Collection[str]) -> tuple[Splats, LodTree | None, FileCoding]:
+        """Decode these columns of a chunk by its number from 0, and return its splats, nodes and coding."""
+        (packed,) = self.packed(range(number, number + 1))
+        return *self.decode(packed, columns, thorough=False), self.coding([packed.scale_coding()])
+
+    def coding(self, scales: list[ScaleCoding]) -> FileCoding:
+        """Return how a file holds its scales, by those of its chunks."""
+        ranges = self.header.encoding
+        packed_range = None if ranges is None else (ranges.ln_scale_min, ranges.ln_scale_max)
+        return FileCoding(tuple(scales), self.header.chunk_size, packed_range)
+
+    def content(self) -> Content:
+        """Return the content of the file."""
+        header, size = self.header, self.header.chunk_size
+        codings = [ScaleCoding()] * max(len(header.chunks), 1)
+
+        def fill_rows(target: Target, threads: int, progress: Progress) -> None:
+            def work(packed: PackedChunk) -> int:
+                codings[packed.number] = packed.scale_coding()
+                base, stop = packed.header.base, packed.header.base + packed.header.count
+                first, last = max(base, target.start), min(stop, target.stop)
+                part = slice(first, last)
+                if (first, last) == (base, stop):
+                    self.decode(packed, target.columns, (target.rows(part), target.nodes(part)))
+                else:
+                    splats, out = self.decode(packed, target.columns)[0], target.rows(part)
+                    for name in COLUMNS:
+                        getattr(out, name)[:] = getattr(splats, name)[first - base : last - base]
+                return last
+
+            if target.start < target.stop:
+                numbers = range(target.start // size, -(-target.stop // size))
+                for done in ordered_map(work, self.packed(numbers), threads):
+                    progress("reading", done, header.count, "splat")
+
+        return Content(
+            header.count,
+            header.max_sh,
+            header.format,
+            fill_rows,
+            header.noted.antialiased,
+            header.noted.problems,
+            self.facts,
+            header.noted.up,
+            header.lod_tree,
+            tuple(entry.bytes for entry in header.chunks),
+            lambda: self.coding(codings),
+            max(size, 1),
+        )
+
+
+def open_content(source: Source) -> Content:
+    """Open a RAD file, whole or with chunks in files of their own; raises `FormatError` as `RadReader.open`."""
+    return RadReader.open(source.file, source.beside).content()
+
+
+@dataclass(frozen=True, eq=False)
+class RadChunk:
+    """One chunk of a file.
+
+    Attributes:
+        header: its own.
+        splats: of the chunk; SH are 0 where they are labels and the palette is not known.
+        tree: the columns of its nodes, whose children have the numbers of the file; None where there is no tree.
+        palette: (codes, K, 3) SH coefficients, of the first chunk of a file that has some.
+        labels: (N,) into the palette, where that is not known.
+    """
+
+    header: RadChunkHeader
+    splats: Splats
+    tree: LodTree | None
+    palette: FloatArray | None
+    labels: NDArray[np.uint32] | None
+
+
+def read_chunk(file: BinaryIO, entry: RadChunkEntry, header: RadHeader, palette: FloatArray | None = None) -> RadChunk:
+    """Read one chunk, and nothing but its bytes.
+
+    Args:
+        file: that of the header, or the chunk's own where the entry names one.
+        entry: one of the header's.
+        header: of the file, see `rad_header.read_header`.
+        palette: that of the file's first chunk; labels stay labels without.
+
+    Raises:
+        FormatError: the chunk is cut short, corrupt, or not the one that the header means.
+        ValueError: the palette is of another SH degree than the file.
+    """
+    room = COEFFICIENTS[min(header.max_sh, MAX_SH_DEGREE)], 3
+    if palette is not None and np.shape(palette)[1:] != room:
+        raise ValueError(f"the palette has the shape {np.shape(palette)}; that of this file has (codes, {room[0]}, 3)")
+    check_rules(rad_rules.violations(header))
+    packed = PackedChunk.of(bytes_of(entry, header, file), header.chunks.index(entry), header)
+    _check_promise(packed.header.count, header, entry.bytes)
+    own = packed.palette(header)
+    palette = own if own is not None or palette is None else np.asarray(palette, np.float32)
+    splats, tree = _new_rows(packed.header.count, header)
+    labels = fill(packed, header, splats, tree, palette, COLUMNS)
+    return RadChunk(packed.header, splats, tree, own, labels)
+
+
+def count_leaves(file: BinaryIO, header: RadHeader, beside: Beside | None) -> int:
+    """Return the number of leaves of a tree, of which only the numbers of children are read.
+
+    Args:
+        file: that of the header.
+        header: of a tree.
+        beside: opens the files that the header names; None if there are none to open.
+
+    Raises:
+        FormatError: a chunk is cut short, corrupt, or not the one that the header means.
+    """
+    leaves = 0
+    for number, entry in enumerate(header.chunks):
+        with file_of(entry, file, beside) as source:
+            start = entry.start(header)
+            source.seek(start)
+            chunk = read_chunk_header(source)
+            check_rules(rad_rules.chunk_violations(header, number, chunk, entry.bytes))
+            leaves += chunk.count
+            for each in chunk.properties:
+                if each.name == "child_count":
+                    source.seek(start + chunk.bytes + each.offset)
+                    packed = PackedChunk(number, chunk, memoryview(source.read(each.bytes)))
+                    children = packed.values(dataclasses.replace(each, offset=0), BY_NAME[each.name], chunk.count)
+                    leaves -= int(np.count_nonzero(children))
+    return leaves
+
+
+@dataclass(frozen=True)
+class ChunkScan:
+    """Header of a chunk.
+
+    Attributes:
+        number: from 0.
+        header: as read; None where it cannot be.
+        violations: of its rules.
+    """
+
+    number: int
+    header: RadChunkHeader | None
+    violations: tuple[RuleViolation, ...]
+
+
+def scan_header(file: BinaryIO, beside: Beside) -> tuple[RadHeader, tuple[RuleViolation, ...]]:
+    """Read the header of a file, and return it with its violations, those about the files of chunks among them.
+
+    Raises:
+        FormatError: the header cannot be read.
+    """
+    size = size_of(file)
+    header = read_header(file)
+    sizes = {name: _size_or_reason(name, beside) for name in header.filenames}
+    return header, tuple(rad_rules.violations(header, size, sizes))
+
+
+def _size_or_reason(name: str, beside: Beside) -> int | str:
+    """Return the bytes of a file that the header names, or why it cannot be opened."""
+    try:
+        with beside(name) as file:
+            return size_of(file)
+    except FormatError as error:
+        return str(error)
+
+
+def scan_chunks(file: BinaryIO, beside: Beside, header: RadHeader, *, paddings: bool) -> Iterator[ChunkScan]:
+    """Read the headers of the chunks, one after the other.
+
+    Args:
+        file: with the header.
+        beside: opens the files of chunks.
+        header: of the file, with chunks where it says.
+        paddings: look at the padding of properties, too.
+    """
+    for number, entry in enumerate(header.chunks):
+        with file_of(entry, file, beside) as source:
+            start = entry.start(header)
+            source.seek(start)
+            try:
+                chunk = read_chunk_header(source)
+            except FormatError as error:
+                violation = broken("chunk-header", f"chunk {number:,}: {error}")
+                yield ChunkScan(number, None, (violation,))
+                continue
+            violations = list(rad_rules.chunk_violations(header, number, chunk, entry.bytes))
+            if paddings and not any(each.fatal for each in violations):
+                for each in chunk.properties:
+                    source.seek(start + chunk.bytes + each.offset + each.bytes)
+                    if any(source.read(padding(each.bytes))):
+                        text = f"bytes behind {each.name} of chunk {number:,} are not zeros"
+                        violations.append(broken("padding", text, fatal=False))
+            yield ChunkScan(number, chunk, tuple(violations))
+
+
+def decoded_bytes(header: RadHeader) -> int:
+    """Return the bytes of all columns of splats in memory."""
+    return header.count * 4 * (14 + 3 * COEFFICIENTS[header.max_sh])
+
+
+def _new_rows(count: int, header: RadHeader) -> tuple[Splats, LodTree | None]:
+    tree = LodTree(np.empty(count, np.uint16), np.empty(count, np.uint32)) if header.lod_tree else None
+    return Splats.zeros(count, header.max_sh), tree
+
+
+def _check_promise(count: int, header: RadHeader, size: int) -> None:
+    """Raise `PromiseError` if a file or a chunk of this size can hardly have so many splats."""
+    compression.check_promise(decoded_bytes(dataclasses.replace(header, count=count)), size)

@@ -1,0 +1,254 @@
+"""Files of a SOG scene, meta.json and images, in a zip or a folder; sizes are checked before decoding."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import threading
+import zipfile
+from collections.abc import Iterable, Iterator
+from typing import IO, Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...support.errors import ChecksumError, FormatError, NotSplatsError
+from ...support.units import count_of
+from ...support.untrusted import ZIP_ERRORS, parse_json, quoted, quoted_value
+from ..compression import check_promise
+from ..content import Beside
+from ..file_names import META
+from ..stream import size_of
+from .webp_images import PIECE, Pixels, WebPHeader, pixels_of, read_header
+
+#: Largest meta.json, bytes; codebooks take 15,000.
+MAX_META = 1 << 22
+
+#: Compression methods of a zip that SOG uses, and the flag of an encrypted member.
+METHODS, ENCRYPTED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED), 1
+
+#: Permissions of the members of a zip that is written, and the system that has them, 3 for Unix.
+MODE, UNIX = 0o100644 << 16, 3
+
+#: Texels that an image may have: a multiple of the splats, and some more, since writers make images square or round
+#: sides up to powers of two.
+SPARE_FACTOR, SPARE_TEXELS = 4, 1 << 16
+
+
+class Meta:
+    """Values of a meta.json, which are checked when they are read; a sequence of keys leads to each."""
+
+    def __init__(self, data: bytes) -> None:
+        try:
+            self.root = parse_json(data)
+        except ValueError as error:
+            raise FormatError(f"{META} is not JSON: {error}") from None
+        if not isinstance(self.root, dict):
+            raise NotSplatsError(f"its {META} is not that of a SOG")
+
+    def has(self, key: str) -> bool:
+        """Return True if there is such a key at the top level, with a value other than null."""
+        return self.root.get(key) is not None
+
+    def _get(self, *way: str | int) -> Any:
+        value = self.root
+        try:
+            for key in way:
+                value = value[key]
+        except (KeyError, IndexError, TypeError):
+            raise FormatError(f"{META} has no {_spell(way)}") from None
+        return value
+
+    def integer(self, *way: str | int) -> int:
+        """Return a whole number."""
+        value = self._get(*way)
+        if type(value) is not int:
+            raise FormatError(f"{_spell(way)} of {META} is not a whole number")
+        return value
+
+    def number(self, *way: str | int) -> float:
+        """Return a finite number."""
+        return _finite(self._get(*way), way)
+
+    def numbers(self, count: int, *way: str | int, first_may_be_null: bool = False) -> NDArray[np.float64]:
+        """Return (count,) finite numbers.
+
+        Args:
+            count: required length of the list.
+            way: keys that lead to the list.
+            first_may_be_null: the first number may be null, as an old writer left it in codebooks; it is extrapolated
+                by the mean step.
+        """
+        values = self._get(*way)
+        if not isinstance(values, list) or len(values) != count:
+            raise FormatError(f"{_spell(way)} of {META} is not a list of {count} numbers")
+        if first_may_be_null and values[0] is None:
+            rest = [_finite(value, way) for value in values[1:]]
+            values = [rest[0] + (rest[0] - rest[-1]) / (count - 1), *rest]
+        return np.array([_finite(value, way) for value in values])
+
+    def name(self, *way: str | int) -> str:
+        """Return a text."""
+        value = self._get(*way)
+        if not isinstance(value, str):
+            raise FormatError(f"{_spell(way)} of {META} is not the name of a file")
+        return value
+
+
+def _spell(way: tuple[str | int, ...]) -> str:
+    return ".".join(map(str, way))
+
+
+def _finite(value: Any, way: tuple[str | int, ...]) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < 1e38:
+        raise FormatError(f"{_spell(way)} of {META} has {str(value)[:20]!r}, which is not a finite number")
+    return float(value)
+
+
+def names_beside(data: bytes) -> list[str]:
+    """Return the files that a meta.json names, as far as it can be parsed; otherwise none."""
+    try:
+        root = Meta(data).root
+    except FormatError:
+        return []
+    lists = (value.get("files") for value in root.values() if isinstance(value, dict))
+    return [name for names in lists if isinstance(names, list) for name in names if isinstance(name, str)]
+
+
+class SogFiles:
+    """Files of a SOG scene.
+
+    Attributes:
+        meta: its meta.json.
+        size: bytes of all its files, which bound the sizes that images may announce.
+    """
+
+    def __init__(self, file: BinaryIO, beside: Beside | None) -> None:
+        self.size = size_of(file)
+        zipped = file.read(2) == b"PK"
+        file.seek(0)
+        self._archive = _Archive(file, self.size) if zipped else None
+        self._beside = beside
+        data = self._archive.read(META) if self._archive else file.read(MAX_META + 1)
+        if len(data) > MAX_META:
+            raise FormatError(f"{META} has more than {MAX_META:,} bytes, too many for a SOG")
+        self.meta = Meta(data)
+        self._sizes = {} if self._archive else {name: self._size_beside(name) for name in self._names()}
+        self.size += sum(self._sizes.values())
+
+    def _names(self) -> list[str]:
+        textures = {"means": 2, "scales": 1, "quats": 1, "sh0": 1} | ({"shN": 2} if self.meta.has("shN") else {})
+        return [
+            self.meta.name(texture, "files", index) for texture, count in textures.items() for index in range(count)
+        ]
+
+    def _open_beside(self, name: str) -> BinaryIO:
+        if self._beside is None:
+            raise FormatError(f"{META} names {quoted_value(name)}, but other files cannot be opened here")
+        return self._beside(name)
+
+    def _size_beside(self, name: str) -> int:
+        with self._open_beside(name) as file:
+            return size_of(file)
+
+    @contextlib.contextmanager
+    def _opened(self, name: str, most: int) -> Iterator[tuple[WebPHeader, IO[bytes]]]:
+        """Open an image that may have at most `most` texels, and read its header."""
+        with self._archive.opened(name) if self._archive else self._open_beside(name) as file:
+            header = read_header(file.read, name)
+            if header.width * header.height > most:
+                raise FormatError(f"{quoted_value(name)} has {header.width} x {header.height} texels, far too many")
+            check_promise(4 * header.width * header.height, self.size)
+            yield header, file
+
+    def sides(self, texture: str, index: int, most: int) -> tuple[int, int]:
+        """Return the width and height in the header of an image; `FormatError` if it has more than `most` texels."""
+        with self._opened(self.meta.name(texture, "files", index), most) as (header, _):
+            return header.width, header.height
+
+    def pixels(self, texture: str, index: int, count: int) -> Pixels:
+        """Decode the first `count` pixels of an image, row by row.
+
+        Raises:
+            FormatError: it is corrupt, or has fewer, or far more.
+        """
+        name = self.meta.name(texture, "files", index)
+        with self._opened(name, SPARE_FACTOR * count + SPARE_TEXELS) as (header, file):
+            total = header.width * header.height
+            if total < count:
+                raise FormatError(f"{quoted_value(name)} has {count_of(total, 'texel')} for {count_of(count, 'splat')}")
+            return pixels_of(header, file.read, name)[:count]
+
+    def bytes_of(self, texture: str, index: int) -> int:
+        """Return the bytes of an image, as they are stored."""
+        name = self.meta.name(texture, "files", index)
+        return self._archive.bytes_of(name) if self._archive else self._sizes[name]
+
+
+class _Archive:
+    """Zip with a meta.json, possibly inside a folder, and files beside it."""
+
+    def __init__(self, file: BinaryIO, size: int) -> None:
+        self._size, self._lock = size, threading.Lock()
+        try:
+            self._zip = zipfile.ZipFile(file)
+        except ZIP_ERRORS as error:
+            raise FormatError(f"not a complete zip archive: {quoted(error)}") from None
+        names = [name for name in self._zip.namelist() if name == META or name.endswith("/" + META)]
+        if not names:
+            raise NotSplatsError(f"a zip archive without {META} is not a SOG")
+        self._folder = min(names, key=len).removesuffix(META)
+
+    def _member(self, name: str) -> zipfile.ZipInfo:
+        try:
+            return self._zip.getinfo(self._folder + name)
+        except KeyError:
+            raise FormatError(f"{META} names {quoted_value(name)}, which is not in the archive") from None
+
+    def bytes_of(self, name: str) -> int:
+        """Return the bytes of a member as it is stored."""
+        return self._member(name).compress_size
+
+    def read(self, name: str) -> bytes:
+        """Return the content of a member."""
+        with self.opened(name) as file:
+            return b"".join(iter(lambda: file.read(PIECE), b""))
+
+    @contextlib.contextmanager
+    def opened(self, name: str) -> Iterator[IO[bytes]]:
+        """Open a member, whose checksum is checked at the end, also if its content turns out to be corrupt."""
+        member = self._member(name)
+        if member.compress_type not in METHODS or member.flag_bits & ENCRYPTED:
+            raise FormatError(f"{quoted_value(name)} is encrypted, or compressed by a method that SOG does not use")
+        check_promise(member.file_size, self._size)
+        try:
+            with self._lock:
+                opened = self._zip.open(member)
+            with opened as file:
+                try:
+                    yield file
+                finally:
+                    while file.read(PIECE):
+                        pass
+        except ZIP_ERRORS as error:
+            kind = ChecksumError if "CRC" in str(error) else FormatError
+            raise kind(f"{quoted_value(name)} cannot be unpacked: {quoted(error)}") from None
+
+
+def zipped(files: Iterable[tuple[str, bytes]]) -> Iterator[bytes]:
+    """Return the bytes of a zip, piece by piece: the same for the same files, as its members have no dates.
+
+    Args:
+        files: names and contents, in the order of the archive.
+    """
+    # A buffer that is emptied member by member could not be sought, and sizes would follow the members' contents
+    # instead of standing before them.
+    buffer, done = io.BytesIO(), 0
+    with zipfile.ZipFile(buffer, "w") as archive:
+        for name, content in files:
+            member = zipfile.ZipInfo(name)  # of 1980, the earliest date
+            member.create_system, member.external_attr = UNIX, MODE
+            archive.writestr(member, content)
+            yield buffer.getvalue()[done:]
+            done = buffer.tell()
+    yield buffer.getvalue()[done:]

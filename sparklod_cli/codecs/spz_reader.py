@@ -1,0 +1,222 @@
+"""Reads SPZ: versions 1 to 3 (a header and streams in a gzip member) and 4 (a plain header, a zstd frame a stream)."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Collection, Iterator
+from typing import BinaryIO
+
+import numpy as np
+
+from ..model.scene import FileCoding, ScaleCoding
+from ..model.sh import notes_on_degree
+from ..model.splats import COLUMNS
+from ..support.defaults import MAX_SH_DEGREE
+from ..support.errors import FormatError, MembersError, NotSplatsError, TruncatedError, VersionError
+from ..support.parallel import ordered_map
+from ..support.progress import Progress
+from . import compression
+from .content import Content, Source, Target
+from .file_notes import FileNote, read_comment
+from .inflate import GZIP_MAGIC, Inflate
+from .quantize import Bytes
+from .spz_layout import ANTIALIASED, EXTENSIONS, HEADER, MAGIC, Layout, Stream, StreamRows, column_of
+from .stream import Positioned, Read, rows_between, rows_of, size_of
+
+HEADER_V4 = struct.Struct("<IIIBBBBI12s")  # ..., streams, offset of the table of streams, reserved
+STREAM_SIZES = struct.Struct("<QQ")  # of a version 4 stream: compressed, uncompressed
+
+#: Versions that are read.
+READABLE = (1, 2, 3, 4)
+
+#: How all versions hold scales.
+CODING = FileCoding((ScaleCoding("spz"),), 1)
+
+_TREE = ("child_count", "child_start")
+
+
+def open_content(source: Source) -> Content:
+    """Open any SPZ file, plain or LoD. With `scratch`, its streams are unpacked to that.
+
+    The header of its scene has the flags, the reserved byte and, once all is read, the number of bytes after the data.
+
+    Raises:
+        FormatError: the file is not SPZ, of an unknown version or SH degree, cut short or corrupt, or announces far
+            more splats than its size can hold.
+    """
+    return _open(source)[0]
+
+
+def read_codes(
+    source: Source, columns: Collection[str] = COLUMNS, see: Callable[[StreamRows], None] = lambda rows: None
+) -> tuple[Content, Layout, dict[str, Bytes]]:
+    """Read the codes of a file: (N, bytes) of the streams of columns and of the tree, by name.
+
+    Args:
+        source: the file.
+        columns: of `Splats`; all of a file of version 1.
+        see: called with the rows of all streams.
+
+    Raises:
+        FormatError: as `open_content`.
+    """
+    content, layout, rows = _open(source)
+    columns = {*(columns if layout.version > 1 else COLUMNS), *_TREE}
+    codes = {
+        each.name: np.empty((layout.count, each.size), np.uint8) for each in layout.streams() if each.column in columns
+    }
+    for each, part, some in rows:
+        if each.name in codes:
+            codes[each.name][part] = some
+        see((each, part, some))
+    return content, layout, codes
+
+
+def _open(source: Source) -> tuple[Content, Layout, Iterator[StreamRows]]:
+    """Open a file: its content, its layout, and the rows of its streams, which can be read once."""
+    file, note, header = source.file, FileNote(), dict[str, int]()
+    size = size_of(file)
+    plain = file.read(4) == struct.pack("<I", MAGIC)
+    file.seek(0)
+    if plain:
+        layout, rows = _read_v4(file, size, header)
+    else:
+        inflate = Inflate(file, source.threads)
+        layout, rows = _read_gzip(inflate, size, header)
+        note = read_comment(inflate.comment)
+
+    def unpacked() -> Iterator[bytes]:
+        done = 0
+        for _, _, codes in rows:
+            yield codes.tobytes()
+            done += codes.size
+            source.progress("reading", done, layout.total, "B")
+
+    def read(target: Target) -> Iterator[StreamRows]:
+        if source.scratch is None:
+            yield from rows
+            return
+        positioned, offset = Positioned(source.scratch(unpacked)), 0
+        for each in layout.streams():
+            between = rows_between(
+                positioned, offset, each.row_type, target.start, target.stop, layout.count, each.name
+            )
+            for part, codes in between:
+                yield each, part, codes
+            offset += each.size * layout.count
+
+    def fill(target: Target, threads: int, progress: Progress) -> None:
+        def decode(item: StreamRows) -> int:
+            stream, part, codes = item
+            if stream.column in target.columns or stream.column in _TREE:
+                column = column_of(target.splats, target.tree, stream)
+                out = column[part.start - target.start : part.stop - target.start]
+                out[...] = stream.decode(codes).reshape(out.shape)
+            return codes.size
+
+        done = 0
+        for count in ordered_map(decode, read(target), threads):
+            done += count
+            progress("reading", done, layout.total, "B")
+
+    notes = notes_on_degree(layout.sh_degree) + note.problems
+    if header.get("unknown_streams"):
+        notes += (f"{header['unknown_streams']} streams of an unknown kind are left out",)
+    content = Content(
+        layout.count,
+        min(layout.sh_degree, MAX_SH_DEGREE),
+        f"SPZ {layout.version}" + " LoD" * layout.has_tree,
+        fill,
+        bool(layout.flags & ANTIALIASED),
+        notes,
+        header,
+        note.up,
+        layout.has_tree,
+        coding=lambda: CODING,
+    )
+    return content, layout, rows
+
+
+def _checked(layout: Layout, file_size: int, header: dict[str, int]) -> Layout:
+    """Check that a layout can be read and that the file is large enough for it, and add its fields to a header."""
+    if layout.version not in READABLE:
+        raise VersionError(f"SPZ version {layout.version} is unknown, only 1 to 4 are read")
+    if layout.sh_degree > (4 if layout.version == 4 else MAX_SH_DEGREE):
+        raise VersionError(f"SPZ version {layout.version} has no SH degree {layout.sh_degree}")
+    if layout.fractional_bits > 31:
+        raise FormatError(f"{layout.fractional_bits} fractional bits; at most 31 can be read")
+    compression.check_promise(layout.total, file_size)
+    header |= {"version": layout.version, "fractional_bits": layout.fractional_bits, "flags": layout.flags}
+    return layout
+
+
+def _rows(layout: Layout, read: Read, stream: Stream) -> Iterator[StreamRows]:
+    for part, codes in rows_of(read, stream.row_type, layout.count, stream.name):
+        yield stream, part, codes
+
+
+def _read_gzip(inflate: Inflate, size: int, header: dict[str, int]) -> tuple[Layout, Iterator[StreamRows]]:
+    head = inflate.read(HEADER.size)
+    if len(head) < HEADER.size:
+        raise TruncatedError("cut short inside the SPZ header")
+    magic, *fields, reserved = HEADER.unpack(head)
+    if magic != MAGIC:
+        raise NotSplatsError("a gzip file, but not of SPZ")
+    layout = _checked(Layout(*fields), size, header)
+    header["reserved"] = reserved
+
+    def rows() -> Iterator[StreamRows]:
+        try:
+            for stream in layout.streams():
+                yield from _rows(layout, inflate.read, stream)
+        except TruncatedError as error:
+            if inflate.behind() == GZIP_MAGIC:
+                raise MembersError(
+                    f"{error}; its data continue in a second gzip member, which Spark does not read"
+                ) from None
+            raise
+        inflate.finish(allow_more=bool(layout.flags & EXTENSIONS))
+        if layout.flags & EXTENSIONS:  # the end of the member is not searched for
+            return
+        header["trailing_bytes"] = size - inflate.end()
+        header["trailing_members"] = int(inflate.behind() == GZIP_MAGIC)
+
+    return layout, rows()
+
+
+def _read_v4(file: BinaryIO, size: int, header: dict[str, int]) -> tuple[Layout, Iterator[StreamRows]]:
+    head = file.read(HEADER_V4.size)
+    if len(head) < HEADER_V4.size:
+        raise TruncatedError("cut short inside the SPZ header")
+    _, version, count, sh_degree, bits, flags, streams, table, reserved = HEADER_V4.unpack(head)
+    if version != 4:
+        raise VersionError(f"SPZ version {version} must be gzipped, only version 4 is not")
+    layout = _checked(Layout(version, count, sh_degree, bits, flags), size, header)
+    expected = layout.streams()
+    if streams < len(expected):
+        raise FormatError(f"{streams} streams, but SH degree {sh_degree} and flags {flags:#x} need {len(expected)}")
+    header |= {"reserved": int(any(reserved)), "unknown_streams": streams - len(expected)}
+    at = table + streams * STREAM_SIZES.size
+    if at > size:
+        raise TruncatedError("cut short inside the table of streams")
+    file.seek(table)
+    sizes = list(STREAM_SIZES.iter_unpack(file.read(streams * STREAM_SIZES.size)))
+    for stream, (packed, unpacked) in zip(expected, sizes, strict=False):
+        if unpacked != stream.size * count:
+            raise FormatError(
+                f"stream {stream.name} has {unpacked:,} bytes, but {count:,} splats need {stream.size * count:,}"
+            )
+        at += packed
+        if at > size:
+            raise TruncatedError(f"cut short inside stream {stream.name}")
+
+    def rows() -> Iterator[StreamRows]:
+        for stream, (packed, _) in zip(expected, sizes, strict=False):
+            end = file.tell() + packed
+            unzstd = compression.Unzstd(file, packed, stream.name)
+            yield from _rows(layout, unzstd.read, stream)
+            unzstd.finish()
+            file.seek(end)
+        header["trailing_bytes"] = size - end if streams == len(expected) else 0
+
+    return layout, rows()

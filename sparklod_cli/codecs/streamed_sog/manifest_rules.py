@@ -1,0 +1,361 @@
+"""Rules for a Streamed SOG: of its manifest, its chunk files and their splats, for reports and for the reader."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...model.gaussian import covariance
+from ...model.morton import order_of_cells
+from ...model.splats import FloatArray, Splats
+from ...support.errors import FormatError
+from ...support.parallel import blocks_of
+from ...support.progress import Progress, silent
+from ...support.units import count_of
+from ...support.untrusted import quoted_value
+from ..content import Beside
+from ..sog import texel_codings
+from ..validation import RuleViolation
+from .chunks import Chunk, open_chunk, read_pieces
+from .manifest import MAX_MANIFEST, Bound, Manifest, ManifestNode, Run, parse
+
+#: Meaning of each code; the text of a violation has the values. Values of the wrong kind, which
+#: the parser refuses, have the codes "container.corrupt" and "container.version", as in other formats.
+ERRORS = {
+    "streamed-sog.nodes": "a node of the tree has neither two children nor runs, or it has both",
+    "streamed-sog.bounds": "a bound is missing, not finite, or begins beyond its end",
+    "streamed-sog.union": "the bound of an inner node is not the union of its children's",
+    "streamed-sog.extents": "splats of a region lie outside of its bound",
+    "streamed-sog.errors": "errors are not one a level, finite, from 0 on, 0 at level 0 and never decreasing",
+    "streamed-sog.counts": "count or counts is not the sum of the runs",
+    "streamed-sog.filenames": "the name of a chunk file leads elsewhere, or is there twice",
+    "streamed-sog.chunk-files": "a chunk file is missing, damaged or no SOG",
+    "streamed-sog.mixed": "a chunk file has runs of more than one detail level",
+    "streamed-sog.runs": "the runs in a chunk file overlap, leave a gap, or are not all of its splats",
+    "streamed-sog.environment": "the environment is missing, damaged or no SOG",
+}
+WARNINGS = {
+    "streamed-sog.old": "version, count or counts is missing, as in files from before version 1",
+    "streamed-sog.unused": "no region refers to a chunk file",
+    "streamed-sog.full-detail": "a region has no splats at level 0, so that it never has full detail",
+    "streamed-sog.coarsest": "a region has no splats at the coarsest level, and disappears where a viewer asks for it",
+    "streamed-sog.decreasing": "a detail level has no fewer splats than the level before",
+    "streamed-sog.lod-errors": "lodErrors does not say whether the regions have errors, or only some of them have",
+    "streamed-sog.kind": "SH degree or antialias of a chunk file is not that of the first one",
+    "streamed-sog.order": "the splats of a run are not in Morton order",
+}
+
+#: By how much two equal bounds may differ, as a share of their largest number: seven digits are written.
+ROUNDING = 1e-5
+
+
+def broken(code: str, text: str, *, fatal: bool = True) -> RuleViolation:
+    """Return a violation by the last part of its code."""
+    return RuleViolation(f"streamed-sog.{code}", text, fatal)
+
+
+def regions_of(manifest: Manifest) -> Iterator[tuple[int, Mapping[int, Run], ManifestNode]]:
+    """Return the number of each region, its runs, and its node; not the leaves of a broken tree that have no runs."""
+    return ((number, node.runs, node) for number, node in manifest.regions() if node.runs is not None)
+
+
+def is_box(bound: Bound) -> bool:
+    """Return True if no end of a bound is below its beginning."""
+    return all(low <= high for low, high in zip(*bound, strict=True))
+
+
+def violations(manifest: Manifest) -> Iterator[RuleViolation]:
+    """Yield the broken rules of a manifest."""
+    yield from _nodes(manifest)
+    yield from _names(manifest)
+    yield from run_violations(manifest)
+    yield from _counts(manifest)
+    yield from _details(manifest)
+    yield from _unions(manifest)
+    yield from _errors(manifest)
+
+
+def file_violations(manifest: Manifest, files: Mapping[str, Chunk | str]) -> Iterator[RuleViolation]:
+    """Yield the broken rules about `files`: by name, what the meta.json of each says, or why it cannot be read."""
+    ends = [0] * len(manifest.filenames)
+    for _, runs, _ in regions_of(manifest):
+        for run in runs.values():
+            ends[run.file] = max(ends[run.file], run.offset + run.count)
+    first: Chunk | None = None
+    for name, end in zip(manifest.filenames, ends, strict=True):
+        found = files.get(name)
+        if isinstance(found, str):
+            yield broken("chunk-files", found)
+        elif found is not None:
+            if end and found.count != end:
+                text = f"{quoted_value(name)} has {count_of(found.count, 'splat')}, but its runs end at {end:,}"
+                yield broken("runs", text)
+            first = first or found
+            if (found.sh_degree, found.antialiased) != (first.sh_degree, first.antialiased):
+                text = f"{quoted_value(name)} has {_kind_of(found)}; the first chunk file has {_kind_of(first)}"
+                yield broken("kind", text, fatal=False)
+    environment = None if manifest.environment is None else files.get(manifest.environment)
+    if isinstance(environment, str):
+        yield broken("environment", environment)
+
+
+def _kind_of(file: Chunk) -> str:
+    return f"SH degree {file.sh_degree} and {'' if file.antialiased else 'no '}antialias"
+
+
+def leads_away(name: str) -> bool:
+    """Return True if a name means something else than a file in the manifest's folder or in one below."""
+    return any(part in ("", ".", "..") for part in name.split("/")) or any(mark in name for mark in "\\:\0?#")
+
+
+def _nodes(manifest: Manifest) -> Iterator[RuleViolation]:
+    for number, node in enumerate(manifest.nodes):
+        if len(node.children) not in (0, 2) or bool(node.children) == (node.runs is not None):
+            having = count_of(len(node.children), "child", "children")
+            place = manifest.place(number)  # not of every node: there may be many, and deep ones
+            text = f"{place} has {having} and {'no ' * (node.runs is None)}lods; a node has two children or lods"
+            yield broken("nodes", text)
+        if node.bound is None:
+            yield broken("bounds", f"{manifest.place(number)} has no bound of six numbers that are finite in float32")
+        elif not is_box(node.bound):
+            text = f"the bound of {manifest.place(number)} is {_text(node.bound)}, the wrong way round"
+            yield broken("bounds", text, fatal=False)
+
+
+def _names(manifest: Manifest) -> Iterator[RuleViolation]:
+    for name, times in Counter(manifest.filenames).items():
+        if leads_away(name):
+            text = f"filenames has {quoted_value(name)}, which is not a file below the folder of the manifest"
+            yield broken("filenames", text)
+        if times > 1:
+            yield broken("filenames", f"filenames has {quoted_value(name)} {times:,} times")
+    if manifest.environment is not None and leads_away(manifest.environment):
+        text = f"environment is {quoted_value(manifest.environment)}, which is not below the folder of the manifest"
+        yield broken("environment", text)
+
+
+def run_violations(manifest: Manifest) -> Iterator[RuleViolation]:
+    """Check the runs in each chunk file, which hold one level and lie end to end."""
+    by_file: list[list[tuple[int, int, int, int]]] = [[] for _ in manifest.filenames]
+    for number, held, _ in regions_of(manifest):
+        for level, run in held.items():
+            if run.count:
+                by_file[run.file].append((run.offset, run.count, level, number))
+    for name, runs in zip(manifest.filenames, by_file, strict=True):
+        if not runs:
+            yield broken("unused", f"no region refers to {quoted_value(name)}", fatal=False)
+        levels = sorted({level for _, _, level, _ in runs})
+        if len(levels) > 1:
+            text = f"{quoted_value(name)} has runs of the levels {', '.join(map(str, levels))}"
+            yield broken("mixed", text, fatal=False)
+        at = 0
+        for offset, count, level, number in sorted(runs):
+            if offset != at:
+                where = f"{manifest.place(number)}.lods.{level} begins at splat {offset:,} of {quoted_value(name)}"
+                yield broken("runs", f"{where}, but the run before it ends at {at:,}")
+            at = max(at, offset + count)
+
+
+def _counts(manifest: Manifest) -> Iterator[RuleViolation]:
+    missing = [name for name in ("version", "count", "counts") if manifest.head.get(name) is None]
+    if missing:
+        yield broken("old", f"it has no {', '.join(missing)}, as before version 1", fatal=False)
+    held = level_counts(manifest)
+    counts = manifest.head.get("counts")
+    if counts is not None and counts != held:
+        text = f"counts is {quoted_value(counts)}, but the runs have {quoted_value(held)} splats"
+        yield broken("counts", text, fatal=False)
+    count = manifest.head.get("count")
+    if count is not None and count != sum(held):
+        text = f"count is {quoted_value(count)}, but the runs have {count_of(sum(held), 'splat')}"
+        yield broken("counts", text, fatal=False)
+    for level, (finer, coarser) in enumerate(itertools.pairwise(held), 1):
+        if coarser >= finer:
+            text = f"level {level} has {count_of(coarser, 'splat')}, level {level - 1} has {finer:,}"
+            yield broken("decreasing", text, fatal=False)
+
+
+def level_counts(manifest: Manifest) -> list[int]:
+    """Return the number of splats of each level: the sums of the runs."""
+    held = [0] * manifest.levels
+    for _, runs, _ in regions_of(manifest):
+        for level, run in runs.items():
+            held[level] += run.count
+    return held
+
+
+def _details(manifest: Manifest) -> Iterator[RuleViolation]:
+    """Check the levels that each region has."""
+    for number, runs, _ in regions_of(manifest):
+        held = {level for level, run in runs.items() if run.count}
+        if 0 not in held:
+            yield broken("full-detail", f"{manifest.place(number)} has no splats at level 0", fatal=False)
+        last = manifest.levels - 1
+        if last not in held:
+            yield broken("coarsest", f"{manifest.place(number)} has no splats at level {last}", fatal=False)
+
+
+def _unions(manifest: Manifest) -> Iterator[RuleViolation]:
+    for number, node in enumerate(manifest.nodes):
+        below = [bound for child in node.children if (bound := manifest.nodes[child].bound) is not None]
+        if node.bound is None or not below or len(below) != len(node.children) or not all(map(is_box, below)):
+            continue
+        low = [min(bound[0][axis] for bound in below) for axis in range(3)]
+        high = [max(bound[1][axis] for bound in below) for axis in range(3)]
+        size = max(map(abs, (*low, *high)))
+        given = (*node.bound[0], *node.bound[1])
+        if any(abs(a - b) > ROUNDING * size for a, b in zip(given, (*low, *high), strict=True)):
+            children = _text(((low[0], low[1], low[2]), (high[0], high[1], high[2])))
+            text = (
+                f"the bound of {manifest.place(number)} is {_text(node.bound)}, but that of its children is {children}"
+            )
+            yield broken("union", text, fatal=False)
+
+
+def _text(bound: Bound) -> str:
+    return " to ".join(" ".join(f"{x:.7g}" for x in corner) for corner in bound)
+
+
+def _errors(manifest: Manifest) -> Iterator[RuleViolation]:
+    regions = list(regions_of(manifest))
+    for number, runs, node in regions:
+        if node.errors is not None and (wrong := _wrong_errors(node.errors, runs, manifest.levels)) is not None:
+            text, fatal = wrong
+            place = f"{manifest.place(number)}.errors is {quoted_value(node.errors)}"
+            yield broken("errors", f"{place}, {text}", fatal=fatal)
+    having = sum(node.errors is not None for _, _, node in regions)
+    says = manifest.head.get("lodErrors")
+    if 0 < having < len(regions):
+        text = f"{having:,} of {count_of(len(regions), 'region')} have errors"
+        yield broken("lod-errors", text, fatal=False)
+    elif bool(having) != bool(says):
+        text = f"lodErrors is {quoted_value(says)}, but {'all' if having else 'no'} regions have errors"
+        yield broken("lod-errors", text, fatal=False)
+
+
+def _wrong_errors(errors: Any, runs: Mapping[int, Run], levels: int) -> tuple[str, bool] | None:
+    """Return what is wrong with the errors of a region, and if that is fatal. Levels without splats do not count."""
+    if not isinstance(errors, list) or len(errors) != levels:
+        return f"not one for each of {count_of(levels, 'level')}", True
+    if not all(type(each) in (int, float) and math.isfinite(each) and each >= 0 for each in errors):
+        return "not finite numbers from 0 on", True
+    if errors[0]:
+        return "not 0 at level 0", False
+    held = [errors[level] for level, run in sorted(runs.items()) if run.count]
+    return ("which decrease", False) if held != sorted(held) else None
+
+
+#: By how much a splat may lie outside of its bound: a share of its own extent, by which codes of 8 bits change it; of
+#: its largest scale, since they turn it by up to 1.1 degrees; of the bound; and, for codes of logarithms of 16 bits, of
+#: the distance from the origin plus 1, or half a step of these codes where that is more.
+LOOSE_EXTENT, LOOSE_TURN, LOOSE_BOUND, LOOSE_CENTER = 0.25, 0.02, 1e-3, 2e-4
+
+#: Cells along each axis in which the order of a run is looked at; writers sort by as many, or by more.
+CELLS = 1 << 10
+
+#: Share of a run's splats that may come after one that they precede, since codes move centres into the next cell: in
+#: files of splat-transform it is up to 0.009, in no order at all 0.5. And the least number of them that is told of.
+OUT_OF_ORDER, FEW = 0.05, 16
+
+
+def scan_files(file: BinaryIO, beside: Beside) -> tuple[Manifest, dict[str, Chunk | str], list[RuleViolation]]:
+    """Read the manifest, each file that it names, or why that cannot be read, and the rules that they break.
+
+    Raises:
+        FormatError: the manifest cannot be parsed.
+    """
+    manifest = parse(file.read(MAX_MANIFEST + 1))
+    found = list(violations(manifest))
+    files: dict[str, Chunk | str] = {}
+    for name in manifest.names():
+        if leads_away(name):
+            continue  # a violation says so
+        files[name] = _chunk_or_reason(beside, name)
+    return manifest, files, [*found, *file_violations(manifest, files)]
+
+
+def _chunk_or_reason(beside: Beside, name: str) -> Chunk | str:
+    """Read the meta.json of a file, or return why it cannot be read."""
+    try:
+        return open_chunk(beside, name, None)
+    except FormatError as error:
+        return str(error)
+
+
+def scan_splats(
+    beside: Beside,
+    manifest: Manifest,
+    files: Mapping[str, Chunk | str],
+    *,
+    threads: int = 1,
+    progress: Progress = silent,
+) -> Iterator[RuleViolation]:
+    """Yield the rules about splats that `files` of `scan_files` break; one chunk file at a time is decoded."""
+    total = sum(chunk.count for chunk in files.values() if isinstance(chunk, Chunk))
+    done = 0
+    runs: list[list[tuple[int, int, Run]]] = [[] for _ in manifest.filenames]
+    for number, held, _ in regions_of(manifest):
+        for level, run in held.items():
+            runs[run.file].append((number, level, run))
+    for name, here in zip(manifest.filenames, runs, strict=True):
+        chunk = files.get(name)
+        if not isinstance(chunk, Chunk):
+            continue
+        try:
+            splats = Splats.empty(chunk.rows, chunk.sh_degree)
+            read_pieces(beside, [chunk], splats, threads)
+        except FormatError as error:
+            yield broken("chunk-files", str(error))
+            continue
+        if any(level for _, level, _ in here) and (invalid := splats.invalid()):
+            count = int(np.count_nonzero(np.any(list(invalid.values()), axis=0)))
+            text = f"{count_of(count, 'splat')} of {quoted_value(name)} have a number that is not finite"
+            yield RuleViolation("values.non-finite", text, fatal=False)
+            continue
+        steps = np.ptp(texel_codings.sign_log(splats.center), axis=0) / texel_codings.LAST_WORD if len(splats) else 0.0
+        for number, level, run in here:
+            part = splats.take(slice(run.offset, run.offset + run.count))
+            what = f"{manifest.place(number)} at level {level}"
+            bound = manifest.nodes[number].bound
+            outside = _outside(part, np.array(bound), steps) if bound is not None and is_box(bound) else 0
+            if outside:
+                yield broken("extents", f"{count_of(outside, 'splat')} of {what} lie outside of its bound", fatal=False)
+            descents = _descents(part.center)
+            if descents > max(FEW, OUT_OF_ORDER * run.count):
+                text = f"{descents:,} of {count_of(run.count, 'splat')} of {what} come after one that they precede"
+                yield broken("order", text, fatal=False)
+        done += chunk.count
+        progress("checking", done, total, "splat")
+
+
+def _outside(splats: Splats, bound: NDArray[np.float64], steps: NDArray[np.float64] | float) -> int:
+    """Count the splats of a run that lie outside of a (2, 3) bound with the ellipsoids of one standard deviation.
+
+    `steps` are (3,) those of the codes of centres, as shares of the distance from the origin plus 1.
+    """
+    loose, step = LOOSE_BOUND * np.abs(bound[1] - bound[0]), np.maximum(LOOSE_CENTER, np.expm1(steps) / 2)
+    count = 0
+    for block in blocks_of(len(splats)):
+        center = splats.center[block].astype(np.float64)
+        extent = np.sqrt(covariance(splats.scale[block], splats.quat_xyzw[block])[:, [0, 3, 5]])
+        turned = LOOSE_TURN * np.maximum.reduce(splats.scale[block].T)[:, None]
+        reach = (1 - LOOSE_EXTENT) * extent - turned - loose - step * (1 + np.abs(center))
+        count += int(np.count_nonzero(np.any((center - reach < bound[0]) | (center + reach > bound[1]), axis=1)))
+    return count
+
+
+def _descents(center: FloatArray) -> int:
+    """Return how many splats come after one that they precede on the Morton curve."""
+    wide = center.astype(np.float64)
+    low, extent = wide.min(axis=0, initial=np.inf), np.ptp(wide, axis=0) if len(wide) else 0
+    scaled = (wide - low) / np.where(extent > 0, extent, 1) * CELLS
+    order = order_of_cells(np.minimum(scaled, CELLS - 1).astype(np.uint32))
+    rank = np.empty(len(order), np.int64)
+    rank[order] = np.arange(len(order))
+    return int(np.count_nonzero(np.diff(rank) < 0))

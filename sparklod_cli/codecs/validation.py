@@ -1,0 +1,101 @@
+"""Validation: of splats and trees that were read or will be written, and of the rules of formats with many."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..model.lod_tree import LodTree
+from ..model.scene import Scene
+from ..model.selection import EXAMINED
+from ..model.splats import COLUMNS, UNIT_TOLERANCE, Splats, describe_invalid
+from ..support.errors import FormatError, InvalidSplatsError, TreeError
+from ..support.parallel import blocks_of, ordered_map
+from .kernels.drawable import count_doubtful
+
+
+@dataclass(frozen=True)
+class RuleViolation:
+    """Rule of a format that a file breaks.
+
+    Attributes:
+        code: for `inspect`, such as "rad.sizes".
+        text: what is wrong, with the values.
+        fatal: a viewer, or this reader, cannot read the file, or would read something else than was written.
+    """
+
+    code: str
+    text: str
+    fatal: bool = True
+
+
+def check_rules(violations: Iterable[RuleViolation]) -> None:
+    """Raise a `FormatError` with the code and the text of the first fatal violation."""
+    for violation in violations:
+        if violation.fatal:
+            raise error_of(violation.code, violation.text)
+
+
+def error_of(code: str, text: str) -> FormatError:
+    """Return the error for a broken rule, which has its code."""
+    error = FormatError(text)
+    error.code = code
+    return error
+
+
+def with_valid_tree(scene: Scene) -> Scene:
+    """Return a scene whose tree, if it has one, is valid; its leaves have a `child_start` of 0.
+
+    Raises:
+        FormatError: its tree is broken.
+    """
+    if scene.tree is None:
+        return scene
+    try:
+        scene.tree.validate()
+    except TreeError as error:
+        raise FormatError(f"its Level-of-Detail tree is broken: {error}") from error
+    return dataclasses.replace(scene, tree=LodTree(scene.tree.child_count, scene.tree.first_child()))
+
+
+def is_valid_and_visible(splats: Splats, threads: int) -> tuple[bool, bool]:
+    """Return whether splats are beyond doubt valid, and visible; where not, `Splats.invalid` and `Selection` tell.
+
+    Rounding differs from theirs, so a rotation has to be nearer to a unit one.
+    """
+    tolerance = np.float32(UNIT_TOLERANCE / 2)
+
+    def counts(part: slice) -> tuple[int, int]:
+        columns = (getattr(splats, name)[part].reshape(-1) for name in COLUMNS)
+        doubtful, invisible = count_doubtful(*columns, tolerance)
+        return int(doubtful), int(invisible)
+
+    tallies = list(ordered_map(counts, blocks_of(len(splats), EXAMINED), threads))
+    return not any(doubtful for doubtful, _ in tallies), not any(invisible for _, invisible in tallies)
+
+
+def check_valid(splats: Splats, threads: int) -> None:
+    """Check that splats can be written.
+
+    Raises:
+        InvalidSplatsError: one is invalid.
+    """
+    if not is_valid_and_visible(splats, threads)[0] and (invalid := splats.invalid()):
+        raise InvalidSplatsError(f"{describe_invalid(invalid)}; such splats are not written, leave them out")
+
+
+def check_scene(scene: Scene, threads: int) -> None:
+    """Check that a scene can be written: `check_valid`, and its tree if it has one.
+
+    Raises:
+        InvalidSplatsError: a splat is invalid.
+        TreeError: the tree is broken, or of another number of nodes.
+    """
+    if scene.tree is not None:
+        if len(scene.tree) != len(scene.splats):
+            raise TreeError(f"the tree has {len(scene.tree):,} nodes, but there are {len(scene.splats):,} splats")
+        scene.tree.validate()
+    check_valid(scene.splats, threads)

@@ -1,0 +1,198 @@
+"""What `sparklod build-lod` says of a file that it wrote."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from ..support.addresses import Place
+from ..support.stdin import DASH, name_of
+from ..support.units import format_size
+from .console import Console, count_of, size_of
+
+if TYPE_CHECKING:
+    from ..bake.records import Baked, WrittenDetail
+    from ..bake.refining import Refined
+    from ..codecs.clamps import Clamp
+    from ..extract_leaves import Extracted
+
+#: What clamping does to a scene and what to do about it, by column of `Splats` and whether the upper end clamps.
+CLAMPED_BY_SPZ = {
+    ("scale", False): ("scales", "mostly how thick flat splats are; --format rad keeps them"),
+    ("scale", True): ("scales", "such splats, of a sky perhaps, shrink; --format rad keeps them"),
+    ("rgb", False): ("colours", "darker than black, so the loss is hardly visible"),
+    ("rgb", True): ("colours", "brighter than white, so the loss is hardly visible"),
+    ("sh", False): ("SH", "reflections get weaker; render --diff shows whether it matters"),
+    ("sh", True): ("SH", "reflections get weaker; render --diff shows whether it matters"),
+}
+_THIN, _WIDE = "mostly how thick flat splats are; --rad-scales ln_f16 keeps them", "--rad-scales ln_f16 keeps them"
+_FAR, _COLORS = "--rad-center f32_lebytes keeps them", "the loss is hardly visible; --rad-rgb {wide} keeps them"
+#: What can be seen of clamped values, by the same.
+CONSEQUENCES = {
+    ("center", False): "splats are farther away",
+    ("center", True): "splats are farther away",
+    ("scale", False): "splats are smaller",
+    ("scale", True): "splats are larger",
+    ("rgb", False): "colours are darker",
+    ("rgb", True): "colours are brighter",
+    ("sh", False): "reflections are stronger",
+    ("sh", True): "reflections are stronger",
+}
+#: "{wide}" is the encoding that holds the values.
+CLAMPED_BY_RAD = {
+    ("center", True): ("coordinates", _FAR),
+    ("scale", False): ("scales", _THIN),
+    ("scale", True): ("scales", _WIDE),
+    ("rgb", False): ("colours", _COLORS),
+    ("rgb", True): ("colours", _COLORS),
+    ("sh", True): ("SH", "reflections get weaker; --rad-sh {wide} keeps them"),
+}
+
+#: Words for columns of which leaves have values that an output clamps, and the share of splats from which it is said.
+COLUMNS = {"center": "centres", "scale": "scales", "rgb": "colours", "sh": "reflections (SH)"}
+LEAST_SHARE = 0.001
+
+
+def report_baked(console: Console, source: Place, target: Place, baked: Baked) -> None:
+    """Print a line about the file, and one for each thing that a person should know."""
+    from ..model.selection import describe
+
+    console.say(
+        f"{name_of(source)}  {count_of(baked.splats, 'splat')}, SH {baked.sh_degree}  ->  {_name(target)} "
+        f" {_contents(baked)}, {size_of(baked.bytes)}, {_total(baked.seconds)}"
+    )
+    if baked.detail is not None and len(baked.detail.levels) > 1:
+        console.say(f"  {_levels(baked.detail)}")
+    if baked.refine is not None:
+        console.say(f"  {_refined(baked.refine)}")
+    if baked.dropped:
+        console.say(f"  left out: {describe(baked.dropped)}")
+    for note in baked.notes:
+        console.say(f"  {note}")
+    consequences = _consequences(baked)
+    if consequences:
+        console.say(f"  {consequences}")
+    for clamp in baked.clamps:
+        console.detail(f"  {_clamped(clamp, baked)}")
+    tree = f"{baked.method} tree" if baked.method is not None else "the same tree"
+    tree += ", refined" if baked.refine is not None else ""
+    console.detail(f"  {baked.format} -> {tree} -> {_written(baked)}; {_stages(baked.seconds)}")
+    if baked.blocks is not None:
+        written, read = (format_size(size or 0) for size in (baked.scratch_bytes_written, baked.scratch_bytes_read))
+        console.detail(f"  out of core in {count_of(baked.blocks, 'block')}; scratch: {written} written, {read} read")
+
+
+def _contents(baked: Baked) -> str:
+    """Return a phrase on the contents of the output."""
+    detail = baked.detail
+    if detail is None:
+        chunks = f", {count_of(baked.chunks, 'chunk')}" if baked.chunks else ""
+        return f"{count_of(baked.nodes, 'node')}, depth {baked.levels - 1}{chunks}"
+    environment = f", environment of {count_of(detail.environment, 'splat')}" if detail.environment else ""
+    return (
+        f"{count_of(len(detail.levels), 'detail level')} of {count_of(detail.regions, 'region')},"
+        f" {count_of(detail.chunks, 'chunk file')}{environment}"
+    )
+
+
+def _refined(refined: Refined) -> str:
+    """Return a phrase on the PSNR of cuts before and after the fitting, on held-out cameras."""
+    gains = [
+        f"{100 * share:g} % {before:.2f} -> {refined.psnr_after[share]:.2f}"
+        for share, before in refined.psnr_before.items()
+    ]
+    seen = f"held-out PSNR {', '.join(gains)} dB" if refined.psnr_before else "no held-out camera sees anything of it"
+    early = "" if refined.is_complete else ", interrupted"
+    return (
+        f"refined in {count_of(refined.steps, 'step')}{early}: {seen};"
+        f" {100 * refined.kept:.3g} % of the merged splats are new"
+    )
+
+
+def _levels(detail: WrittenDetail) -> str:
+    """Return the detail levels after full detail, and how far they are from it."""
+    levels = (
+        f"{level.splats:,} splats ({100 * level.share:.3g} %, error at most {level.worst_error:.2g})"
+        for level in detail.levels[1:]
+    )
+    return f"levels below full detail: {', '.join(levels)}"
+
+
+def _written(baked: Baked) -> str:
+    """Return the format of the output and the choices that were made for it."""
+    if baked.detail is not None:
+        return "Streamed SOG"
+    if baked.arrays:
+        return ", ".join(f"{name} uint32{list(shape)}" for name, shape in baked.arrays.items())
+    if baked.chunks is None:
+        return f"SPZ {baked.version} LoD, {baked.fractional_bits} fractional bits"
+    palette = f", a palette of {baked.sh_codes:,} SH" if baked.sh_codes else ""
+    encodings = ", ".join(f"{name} {encoding}" for name, encoding in baked.encodings.items())
+    return f"RAD LoD, {encodings}{palette}"
+
+
+def _consequences(baked: Baked) -> str:
+    """Return a line on the visible effect of clamping; empty where nothing of it can be seen."""
+    from ..codecs.clamps import matters
+
+    shares: dict[str, float] = {}
+    for clamp in baked.clamps:
+        if matters(clamp.column, above=clamp.above, visible=clamp.visible, leaves=baked.splats):
+            text = CONSEQUENCES[clamp.column, clamp.above]
+            shares[text] = max(shares.get(text, 0.0), 100 * clamp.visible / baked.splats)
+    if not shares:
+        return ""
+    form, more = (
+        ("SPZ", "--format rad keeps more of them") if baked.chunks is None else ("RAD", "-v says what keeps them")
+    )
+    return f"{' and '.join(f'{share:.2g} % of {text}' for text, share in shares.items())} than {form} can hold; {more}"
+
+
+def _clamped(clamp: Clamp, baked: Baked) -> str:
+    """Return a line on clamped values: the number of nodes, the largest value, and the consequence."""
+    from ..codecs.rad.property_codings import LARGEST_F16
+
+    form, table = ("SPZ", CLAMPED_BY_SPZ) if baked.chunks is None else ("RAD", CLAMPED_BY_RAD)
+    name, advice = table[clamp.column, clamp.above]
+    share = f"{count_of(clamp.splats, 'node')} ({100 * clamp.splats / baked.nodes:.3g} %)"
+    name += f" of degree {clamp.degree}" if clamp.degree else ""
+    where, way = ("above", "up") if clamp.above else ("below", "down")
+    where = "beyond ±" if clamp.both else f"{where} "
+    farthest = clamp.farthest or 0.0  # no -0
+    advice = advice.format(wide="f16" if abs(farthest) <= LARGEST_F16 else "f32")
+    return (
+        f"{name} of {share} are {where}{clamp.end:.3g}, {way} to {farthest:.3g}, and are clamped to what {form} holds:"
+        f" {advice}"
+    )
+
+
+def report_extracted(console: Console, source: Place, target: Place, extracted: Extracted) -> None:
+    """Print a line about the file."""
+    console.say(
+        f"{name_of(source)}  {count_of(extracted.nodes, 'node')}  ->  {_name(target)} "
+        f" {count_of(extracted.splats, 'splat')}, SH {extracted.sh_degree}, {size_of(extracted.bytes)},"
+        f" {_total(extracted.seconds)}"
+    )
+    losses = ["holds no reflections (SH)"] if extracted.drops_sh else []
+    losses += [
+        f"clamps the {COLUMNS[column]} of {100 * count / extracted.splats:.3g} % of the splats"
+        for column, count in extracted.clamped.items()
+        if count >= LEAST_SHARE * extracted.splats
+    ]
+    if losses:
+        console.say(f"  {extracted.output_format} {', and '.join(losses)}")
+    if extracted.up_lost is not None:
+        up = extracted.up_lost
+        console.say(f"  {up} is up, which this format cannot note; give --up={up} to render, traverse and view")
+    console.detail(f"  {extracted.format}; {_stages(extracted.seconds)}")
+
+
+def _name(target: Place) -> str:
+    return "standard output" if target == DASH else str(target)
+
+
+def _total(seconds: dict[str, float]) -> str:
+    return f"{sum(seconds.values()):.1f} s"
+
+
+def _stages(seconds: dict[str, float]) -> str:
+    return ", ".join(f"{stage} {value:.2f} s" for stage, value in seconds.items())

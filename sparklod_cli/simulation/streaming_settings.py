@@ -1,0 +1,58 @@
+"""`Network` and `StreamingSettings`: how chunks get to a viewer and stay with it. Imports nothing heavy."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+from ..lod import detail_rule
+from ..support.defaults import FETCHERS
+from ..support.setting_fields import CheckedSettings, Quantity, Range, setting, whole
+from ..support.units import parse_bandwidth, parse_time
+
+
+@dataclass(frozen=True)
+class Network(CheckedSettings):
+    """The network between a viewer and the files, whose transfers share the bandwidth (bytes/s) equally.
+
+    The default delivers everything at once. The latency (seconds) uses no bandwidth.
+
+    Raises:
+        ValueError: a value is out of range.
+    """
+
+    bandwidth: float = setting(
+        math.inf,
+        "Simulate streaming over a network of this bandwidth, such as 20Mbit.  [default: every chunk is resident]",
+        Quantity("RATE", parse_bandwidth, Range(above=0)),
+    )
+    latency: float = setting(
+        0.0,
+        "Time from a request to the first byte, such as 60ms.  [default: 0ms]",
+        Quantity("TIME", parse_time, Range(0, below=math.inf)),
+        needs="bandwidth",
+    )
+    fetchers: int | None = setting(
+        None,
+        f"Number of chunks that are fetched at a time.  [default: {FETCHERS}; {detail_rule.FETCHERS} of Streamed SOG]",
+        whole(1, 1000),
+        needs="bandwidth",
+    )
+
+    @property
+    def instant(self) -> bool:
+        """Whether everything arrives at once."""
+        return self.bandwidth == math.inf and self.latency == 0
+
+
+@dataclass(frozen=True)
+class StreamingSettings(CheckedSettings):
+    """Network and cache of a viewer; by default everything arrives at once, and all chunks fit into memory."""
+
+    HEADING: ClassVar[str] = "Streaming"
+
+    network: Network = field(default_factory=Network)
+    chunk_cache: int | None = setting(
+        None, "Number of chunks, of 65,536 nodes each, that fit into memory.  [default: all]", whole(1)
+    )

@@ -1,0 +1,163 @@
+"""Declarations of settings: a field of a dataclass makes the option of the command line, its help and the API's check.
+
+Imports nothing heavy: `--help` reads the declarations.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import numbers
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+#: Key of a `Setting` in the metadata of its field.
+SETTING = "setting"
+
+
+@dataclass(frozen=True)
+class Range:
+    """Range of a number.
+
+    Attributes:
+        least, most: ends that belong to it; None for no end.
+        above, below: ends that do not belong to it; None for no end.
+        whole: the numbers are integers.
+        unit: placeholder of a number in `--help`.
+    """
+
+    least: float | None = None
+    most: float | None = None
+    above: float | None = None
+    below: float | None = None
+    whole: bool = False
+    unit: str = "X"
+
+    def __contains__(self, number: float) -> bool:
+        return not (
+            number != number
+            or (self.least is not None and number < self.least)
+            or (self.most is not None and number > self.most)
+            or (self.above is not None and number <= self.above)
+            or (self.below is not None and number >= self.below)
+        )
+
+    def __str__(self) -> str:
+        if self.least is not None:
+            return f"{self.least} or more" if self.most is None else f"{self.least} to {self.most}"
+        ends = (("more than", self.above), ("less than", self.below), ("at most", self.most))
+        return " and ".join(f"{words} {end}" for words, end in ends if end is not None)
+
+    def check(self, name: str, value: Any) -> None:
+        """Raise TypeError unless a value is a number, and ValueError unless it is in the range; both name it."""
+        if isinstance(value, bool) or not isinstance(value, numbers.Integral if self.whole else numbers.Real):
+            raise TypeError(f"{name} is {value!r}; give a {'whole ' * self.whole}number, {self}")
+        if float(value) not in self:
+            raise ValueError(f"{name} is {value}; give {self}")
+
+
+def whole(least: int, most: int | None = None, unit: str = "N") -> Range:
+    """Return a range of integers."""
+    return Range(least, most, whole=True, unit=unit)
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """Number or list as text with a unit, such as 20Mbit.
+
+    Attributes:
+        unit: placeholder of the text in `--help`.
+        parse: returns the value of a text, or raises a ValueError that says what is wrong.
+        range: of the value; None for any.
+    """
+
+    unit: str
+    parse: Callable[[str], Any]
+    range: Range | None = None
+
+    def check(self, name: str, value: Any) -> None:
+        """Check a value as `Range.check` does."""
+        if self.range is not None:
+            self.range.check(name, value)
+
+
+@dataclass(frozen=True)
+class Setting:
+    """Declaration of a setting.
+
+    Attributes:
+        help: of the option, which documents the field, too. It says the default where the value does not.
+        kind: a `Range`, a `Quantity`, a tuple of choices, or a parameter type of the command line; None for text, and
+            for flags, whose default is False.
+        name: of the parameter of a command, from which its flag is made; empty for that of the field.
+        needs: parameter without which the option does nothing; with "=VALUE", one that must have that value.
+        excludes: parameters that cannot be given together with the option.
+        attributes: further ones of the option.
+    """
+
+    help: str
+    kind: Any = None
+    name: str = ""
+    needs: str = ""
+    excludes: tuple[str, ...] = ()
+    attributes: Mapping[str, Any] = field(default_factory=dict)
+
+    def check(self, name: str, value: Any) -> None:
+        """Raise TypeError or ValueError unless the declaration allows a value."""
+        if isinstance(self.kind, (Range, Quantity)):
+            self.kind.check(name, value)
+        elif isinstance(self.kind, tuple) and value not in self.kind:
+            noun = (self.name or name).replace("_", " ")
+            raise ValueError(f"there is no {noun} {value!r}; give one of {', '.join(map(str, self.kind))}")
+
+
+def setting(
+    default: Any,
+    help: str,
+    kind: Any = None,
+    *,
+    name: str = "",
+    needs: str = "",
+    excludes: tuple[str, ...] = (),
+    **attributes: Any,
+) -> Any:
+    """Return a dataclass field with a default value and a `Setting`, whose attributes the other arguments are."""
+    declared = Setting(help, kind, name, needs, excludes, attributes)
+    return field(default=default, metadata={SETTING: declared})
+
+
+def setting_of(kind: type[Any], name: str) -> Any:
+    """Return a field with the declaration of a field of another dataclass."""
+    declared = next(each for each in dataclasses.fields(kind) if each.name == name)
+    return field(default=declared.default, metadata=declared.metadata)
+
+
+def settings_in(kind: type[Any]) -> Iterator[tuple[dataclasses.Field[Any], Setting | None]]:
+    """Yield the fields of a dataclass that are settings, and those that are groups of settings, with None."""
+    for each in dataclasses.fields(kind):
+        declared = each.metadata.get(SETTING)
+        if declared is not None or dataclasses.is_dataclass(each.default_factory):
+            yield each, declared
+
+
+class CheckedSettings:
+    """Base of dataclasses of settings: their values are checked, and their docstrings have the help of the fields.
+
+    Raises:
+        TypeError, ValueError: a value is not what its field's declaration allows. A default, such as None, always is.
+    """
+
+    def __init_subclass__(cls) -> None:
+        declared = {name: each for name, each in vars(cls).items() if isinstance(each, dataclasses.Field)}
+        helps = [f"    {name}: {each.metadata[SETTING].help}" for name, each in declared.items() if each.metadata]
+        if helps and cls.__doc__:
+            text = inspect.cleandoc(cls.__doc__)
+            heading = "" if "\nAttributes:\n" in text else "\n\nAttributes:"
+            cls.__doc__ = "\n".join([text + heading, *helps])
+
+    def __post_init__(self) -> None:
+        for each, declared in settings_in(type(self)):
+            value = getattr(self, each.name)
+            if declared is not None and value is not each.default:
+                declared.check(each.name, value)
