@@ -21,10 +21,9 @@ from typing import Literal
 
 from . import __version__
 from .support import machine
-from .support.optional import DISTRIBUTION, install_hint, pip_install
+from .support.optional import DISTRIBUTION, install_hint, pip_install, required_by
 from .support.parallel import processors
 from .support.python_process import program_command
-from .support.requirements import required_by
 
 #: ok: works. note: something optional is missing, or could be better. problem: baking does not work.
 State = Literal["ok", "note", "problem"]
@@ -146,7 +145,7 @@ def _print_kernels() -> None:
     from .bake.flow import bake  # noqa: F401
     from .support import jit
 
-    jit.load_compiler()
+    jit.load_numba()
     about = {
         "folder": None if jit.CACHE_FOLDER is None else str(jit.CACHE_FOLDER.resolve()),
         "wanted": len(warmup.units()),

@@ -16,8 +16,7 @@ from typing import Any, NamedTuple
 
 from .support import jit
 from .support.errors import SparklodError
-from .support.jit_cache import stem_of
-from .support.kernel_sources import PACKAGE
+from .support.kernel_cache import PACKAGE, KernelCache, stem_of
 from .support.progress import Progress, silent
 from .support.python_process import program_command
 
@@ -32,15 +31,25 @@ SECONDS = (1, 3)
 
 
 class Unit(NamedTuple):
-    """A kernel and one of the signatures that it declares, as `jit_types.describe` has it."""
+    """A kernel and the number of one of the signatures that it declares."""
 
     kernel: jit.Kernel
-    signature: str
+    number: int
 
     @property
     def name(self) -> str:
         """ "module.function", for display."""
         return stem_of(self.kernel.py_func)
+
+    @property
+    def is_cached(self) -> bool:
+        """Whether the cache has its machine code."""
+        folder = jit.CACHE_FOLDER
+        if folder is None:
+            return False
+        return KernelCache(self.kernel.py_func, folder, jit.report_trouble).is_cached(
+            self.kernel.signatures[self.number]
+        )
 
 
 def units() -> list[Unit]:
@@ -50,13 +59,13 @@ def units() -> list[Unit]:
         name = ".".join([PACKAGE.name, *path.relative_to(PACKAGE).with_suffix("").parts])
         members = vars(importlib.import_module(name)).values()
         kernels = [each for each in members if isinstance(each, jit.Kernel) and each.__module__ == name]
-        found += [Unit(kernel, signature) for kernel in kernels for signature in kernel.examples]
+        found += [Unit(kernel, number) for kernel in kernels for number in range(len(kernel.declared))]
     return found
 
 
 def missing() -> list[Unit]:
     """Return those of `units` that are not in the cache."""
-    return [unit for unit in units() if not unit.kernel.is_cached(unit.signature)]
+    return [unit for unit in units() if not unit.is_cached]
 
 
 def duration(count: int, processes: int = 1) -> str:
@@ -136,7 +145,7 @@ class _Child:
         assert process.stdin is not None
         assert process.stdout is not None
         assert process.stderr is not None
-        request = json.dumps([unit.kernel.__module__, unit.kernel.py_func.__name__, unit.signature])
+        request = json.dumps([unit.kernel.__module__, unit.kernel.py_func.__name__, unit.number])
         try:
             process.stdin.write(f"{request}\n")
             process.stdin.flush()
@@ -159,6 +168,7 @@ class _Child:
 def _compile_requested() -> None:
     """Compile the kernels that are named on standard input, and print a line for each."""
     for line in sys.stdin:
-        module, name, signature = json.loads(line)
-        getattr(importlib.import_module(module), name).prepare(signature)
+        module, name, number = json.loads(line)
+        kernel = getattr(importlib.import_module(module), name)
+        kernel.dispatcher.compile(kernel.signatures[number])
         print(flush=True)

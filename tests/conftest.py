@@ -69,19 +69,24 @@ def _refuse_undeclared_types() -> None:
 
     Such a kernel would be compiled when it is called, whatever a warm-up has compiled. Tests may call them so.
     """
+    import numba
+
     from sparklod_cli.support import jit
-    from sparklod_cli.support.jit_types import describe
+    from sparklod_cli.support.jit_types import as_declared
 
-    find = jit.Kernel._find
+    call = jit.Kernel.__call__
 
-    def checked(kernel: Any, key: Any, arguments: tuple[Any, ...]) -> Any:
-        caller = sys._getframe(2).f_globals["__name__"]
-        if caller.startswith("sparklod_cli.") and kernel.declared(arguments) is None:
-            name, types = kernel.py_func.__name__, describe(arguments)
-            raise AssertionError(f"{caller} calls {name} with types that it does not declare: {types}")
-        return find(kernel, key, arguments)
+    def checked(kernel: Any, *arguments: Any) -> Any:
+        caller = sys._getframe(1).f_globals["__name__"]
+        if caller.startswith("sparklod_cli."):
+            declared = kernel.declared[0] if kernel.declared else ()
+            types = tuple(numba.typeof(as_declared(*each)) for each in zip(declared, arguments, strict=True))
+            if types not in kernel.signatures:
+                name = kernel.py_func.__name__
+                raise AssertionError(f"{caller} calls {name} with types that it does not declare: {types}")
+        return call(kernel, *arguments)
 
-    jit.Kernel._find = checked  # type: ignore[method-assign]
+    jit.Kernel.__call__ = checked  # type: ignore[method-assign]
 
 
 @pytest.fixture(autouse=True)

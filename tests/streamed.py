@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from fixtures import by_hand_sog, by_hand_streamed_sog
-from sparklod_cli.model.detail import DetailScene
+from sparklod_cli.model.scene import DetailScene
 from sparklod_cli.model.splats import Splats
 
 

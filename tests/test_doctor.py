@@ -14,8 +14,7 @@ from sparklod_cli import doctor, warmup
 from sparklod_cli.doctor import Check, check_all
 from sparklod_cli.render.gl import context
 from sparklod_cli.support import jit, machine
-from sparklod_cli.support.optional import install_hint, pip_install
-from sparklod_cli.support.requirements import Required
+from sparklod_cli.support.optional import Required, install_hint, pip_install
 
 HEALTHY = {"folder": "/nowhere/kernels-1", "wanted": 35, "missing": 0, "layer": "omp", "threads": 4}
 

@@ -16,7 +16,7 @@ from sparklod_cli.io import companions, read_levels, read_scene
 from sparklod_cli.io.details import detail_files, detail_sink
 from sparklod_cli.io.identity import files_of
 from sparklod_cli.io.paths import leads_away
-from sparklod_cli.support import leftovers
+from sparklod_cli.support import atomic
 from sparklod_cli.support.addresses import Address
 from sparklod_cli.support.errors import OutputError
 from tests.conftest import FIXTURES
@@ -290,4 +290,4 @@ def test_names_that_lead_away_with_folders_too(name: str) -> None:
 
 @pytest.fixture(autouse=True)
 def first_run() -> None:
-    leftovers.sweep.cache_clear()
+    atomic.sweep.cache_clear()

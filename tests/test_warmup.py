@@ -21,16 +21,19 @@ from sparklod_cli.cli import run
 from sparklod_cli.codecs.kernels import drawable, spz_codes
 from sparklod_cli.commands.console import Console
 from sparklod_cli.lod.kernels import sort
-from sparklod_cli.support import jit, jit_link
-from sparklod_cli.support.jit_cache import stem_of
+from sparklod_cli.support import jit
+from sparklod_cli.support.kernel_cache import start_of, stem_of
 from sparklod_cli.warmup import Unit
 from tests.conftest import FIXTURES, ROOT
 
-#: Runs command lines of JSON one after the other; prints their exit statuses, and whether numba was loaded to compile.
+#: Runs command lines of JSON one after the other; prints their exit statuses, and the kernels that were compiled.
 RUN = """
 import json, sys
 from sparklod_cli.cli import run
-print(json.dumps([[run(command) for command in json.loads(sys.argv[1])], "numba" in sys.modules]))
+from sparklod_cli.support import jit
+compiled = []
+jit.listen(compiled.append, lambda seconds: None, compiled.append)
+print(json.dumps([[run(command) for command in json.loads(sys.argv[1])], compiled]))
 """
 
 PACKAGE = ROOT / "sparklod_cli"
@@ -98,7 +101,7 @@ def test_commands_that_combine_much_find_all_kernels_compiled(tmp_path: Path) ->
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
     line = [sys.executable, "-c", RUN, json.dumps([[*command, "--quiet"] for command in commands])]
     done = subprocess.run(line, cwd=tmp_path, capture_output=True, text=True, check=True, env=environment)
-    assert json.loads(done.stdout.splitlines()[-1]) == [[0] * len(commands), not jit_link.is_tested()], done.stderr
+    assert json.loads(done.stdout.splitlines()[-1]) == [[0] * len(commands), []], done.stderr
 
 
 @pytest.fixture
@@ -109,7 +112,7 @@ def few(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Unit]:
     folder.mkdir()
     monkeypatch.setattr(jit, "CACHE_FOLDER", folder)
     kernels = [spz_codes.count_bytes, spz_codes.look_up, drawable.count_doubtful]
-    units = [Unit(kernel, signature) for kernel in kernels for signature in kernel.examples]
+    units = [Unit(kernel, number) for kernel in kernels for number in range(len(kernel.declared))]
     monkeypatch.setattr(warmup, "units", lambda: units)
     return units
 
@@ -137,7 +140,8 @@ def test_a_command_that_compiles_says_how_many_kernels_a_warmup_would(
     kernel = few[0].kernel
     with Console(quiet=False, verbose=False) as console:
         console.announce_compiling()
-        jit.Kernel(kernel.py_func, kernel.options, kernel.signatures).prepare(few[0].signature)
+        again = jit.Kernel(kernel.py_func, kernel.options, kernel.declared)
+        again.dispatcher.compile(again.signatures[0])
     first, last = capsys.readouterr().err.splitlines()
     assert first.startswith("Compiling kernels for this machine")
     assert f"sparklod warmup compiles all {len(few)} in advance" in first
@@ -154,7 +158,7 @@ def test_a_kernel_that_does_not_compile_is_named_with_the_reason(monkeypatch: py
     def absent() -> None: ...
 
     absent.__module__ = sort.__name__
-    monkeypatch.setattr(warmup, "missing", lambda: [Unit(jit.Kernel(absent, sort.sort_pass.options), "()")])
+    monkeypatch.setattr(warmup, "missing", lambda: [Unit(jit.Kernel(absent, sort.sort_pass.options), 0)])
     with pytest.raises(warmup.SparklodError, match=r"sort\.absent cannot be compiled: AttributeError: .*absent"):
         warmup.warm_up(processes=1)
 
@@ -175,9 +179,7 @@ def test_the_children_import_nothing_from_the_working_directory(
 
 def test_the_tests_say_that_they_compile(tmp_path: Path) -> None:
     assert jit.CACHE_FOLDER is not None
-    (signature,) = spz_codes.count_bytes.examples
-    absent = spz_codes.count_bytes._path(signature)
-    ignore = shutil.ignore_patterns("*.inner", absent.name if absent else "spz_codes.count_bytes*")
+    ignore = shutil.ignore_patterns(f"{start_of(spz_codes.count_bytes.py_func)}*")
     shutil.copytree(jit.CACHE_FOLDER, tmp_path / jit.CACHE_FOLDER.name, ignore=ignore)
     line = [sys.executable, "-m", "pytest", "tests/support/test_ticks.py", "-q", "-p", "no:cacheprovider"]
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}

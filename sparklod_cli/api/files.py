@@ -14,7 +14,7 @@ from ..io import examine_scene, rad_file, read_scene
 from ..model.scene import Scene, Tree
 from ..model.splats import COLUMNS, FloatArray
 from ..support.errors import FormatError, InvalidSplatsError, TreeError, memory_errors_translated
-from ..support.threads import thread_count
+from ..support.parallel import thread_count
 from .arguments import Told, scene_like, telling
 
 if TYPE_CHECKING:

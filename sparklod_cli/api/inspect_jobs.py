@@ -11,8 +11,8 @@ from ..inspection import checking
 from ..inspection.checking import CheckSettings as CheckSettings
 from ..io import check_writable, write_whole
 from ..support.errors import SparklodError, memory_errors_translated
+from ..support.parallel import on_threads
 from ..support.progress import Progress, silent
-from ..support.threads import on_threads
 from ..tables.output import TableOutput
 
 if TYPE_CHECKING:

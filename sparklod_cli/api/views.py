@@ -16,9 +16,8 @@ from ..images import metrics
 from ..lod import detail_rule
 from ..lod.budget import LARGEST, Budget, parse_budget
 from ..lod.settings import LodSettings
-from ..model.detail import DetailScene
 from ..model.instances import Instance, names_of
-from ..model.scene import Scene
+from ..model.scene import DetailScene, Scene
 from ..render.rasterizer import Image
 from ..render.renderer import Renderer
 from ..render.settings import RenderSettings
@@ -28,7 +27,7 @@ from ..scenes.loaded_scene import UNNAMED
 from ..scenes.reading import read_scenes
 from ..support.defaults import BLEND
 from ..support.errors import FormatError, memory_errors_translated
-from ..support.threads import on_threads, thread_count
+from ..support.parallel import on_threads, thread_count
 from ..tables.comparison import COLUMNS as OF_COMPARISON
 from .arguments import Told, camera_like, path_like, telling, viewed_like
 from .results import ComparisonTable, Frames

@@ -10,11 +10,10 @@ from ..codecs.file_names import ENVIRONMENT, folders_of
 from ..codecs.options import WriteOptions
 from ..io.writing import Files, SinkTogether
 from ..lod.detail_rule import DetailSettings
-from ..model.detail import DetailScene
-from ..model.scene import Scene
+from ..model.scene import DetailScene, Scene
 from ..model.splats import Splats
+from ..support.parallel import on_threads
 from ..support.progress import Progress
-from ..support.threads import on_threads
 from .output import Encode, WholeOutput
 from .records import BuiltTree, Clock, WrittenDetail, WrittenLevel, WrittenTree
 

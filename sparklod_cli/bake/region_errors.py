@@ -14,16 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras.pose import FARTHEST, rotation_of
-from ..model.detail import DetailScene
+from ..model.falloff import MAX_STD_DEV, MIN_ALPHA, STD_DEV_PER_D
 from ..model.gaussian import lod_opacity
+from ..model.scene import DetailScene
 from ..model.sh import degree_of
 from ..render.kernels.ellipse import Limits
 from ..render.kernels.project import TILE, ShadedColumns
 from ..render.kernels.region_errors import compare_levels
 from ..render.kernels.shade import add_sh
-from ..render.settings import BLUR, CLIP, MAX_STD_DEV, MIN_ALPHA, STD_DEV_PER_D
+from ..render.settings import BLUR, CLIP
+from ..support.parallel import on_threads
 from ..support.progress import Progress, silent
-from ..support.threads import on_threads
 
 Errors = NDArray[np.float64]
 

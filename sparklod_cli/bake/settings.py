@@ -10,8 +10,7 @@ from ..fitting.settings import FitSettings
 from ..lod.builders import METHODS
 from ..lod.detail_rule import DetailSettings
 from ..model.selection import Selection
-from ..model.transforms import Transform
-from ..model.up_axis import rotated
+from ..model.transforms import Transform, rotated
 from ..support.addresses import Place
 from ..support.defaults import DEFAULT_BASE, DEFAULT_GROWTH, MAX_SH_DEGREE
 

@@ -10,7 +10,7 @@ from typing import overload
 import numpy as np
 from numpy.typing import NDArray
 
-from ..model.up_axis import AXES
+from ..model.transforms import AXES
 from ..support.errors import TooManyCamerasError
 from .axes import Axes
 from .camera import Camera, Matrix

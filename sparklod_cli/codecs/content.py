@@ -12,9 +12,8 @@ from typing import Any, BinaryIO, Protocol
 import numpy as np
 
 from ..model import streams
-from ..model.coding import PLAIN, FileCoding
 from ..model.lod_tree import LodTree
-from ..model.scene import Scene
+from ..model.scene import PLAIN, FileCoding, Scene
 from ..model.splats import COLUMNS, Splats
 from ..support.errors import HasTreeError
 from ..support.progress import Progress, silent

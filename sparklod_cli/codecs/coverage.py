@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ..model.falloff import nearly_harmonic
 from ..model.splats import FloatArray
 
 #: Largest factor by which an opacity grows for an area that was lost, somewhat more than rounding can take. What loses
@@ -20,9 +21,6 @@ LEAST_GROWTH = 1 / 16
 
 #: The smallest float32 above 1.
 _ABOVE_1 = np.nextafter(np.float32(1), np.float32(2))
-
-#: Euler's constant, of the harmonic numbers.
-_EULER = 0.5772156649015329
 
 
 def faces(scale: FloatArray, blur: float) -> NDArray[np.float64]:
@@ -44,8 +42,8 @@ def kept(opacity: FloatArray, scale: FloatArray, rounded: FloatArray, blur: floa
     """Return (N,) linear opacities with which splats of rounded scales cover as much as before.
 
     A splat of opacity A up to 1 covers A times its area, and keeps an opacity up to 1. A merged one of A above 1 covers
-    H(A) times its area, the integral of its falloff 1 - (1 - exp(-z ** 2 / 2)) ** A, where H are the harmonic numbers.
-    It stays above 1, for that is another falloff. Where nothing is rounded, the opacity stays as it is, bit for bit.
+    H(A) times its area, where H are the harmonic numbers (see `model/falloff.py`). It stays above 1, for that is
+    another falloff. Where nothing is rounded, the opacity stays as it is, bit for bit.
 
     Args:
         opacity: (N,) linear opacities.
@@ -60,7 +58,6 @@ def kept(opacity: FloatArray, scale: FloatArray, rounded: FloatArray, blur: floa
     grown = np.minimum(wide * ratio, 1)
     merged = np.flatnonzero(~(opacity <= 1))  # usually few
     most = wide[merged]
-    covered = np.log(most) + _EULER + (1 - _EULER) / most  # H(A), within 1.5 %
-    slope = most / (most + 0.5)  # of H(A) by ln(A), within 4 %
+    covered, slope = nearly_harmonic(most)
     grown[merged] = np.maximum(most * np.exp(covered * (ratio[merged] - 1) / slope), _ABOVE_1)
     return np.where(ratio == 1, opacity, grown).astype(np.float32)

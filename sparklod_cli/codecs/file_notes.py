@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from .. import __version__
-from ..model.up_axis import AXES
+from ..model.transforms import AXES
 from ..support.untrusted import parse_json, quoted_value
 
 #: How the "generator" of a note of sparklod begins; its version follows.

@@ -8,7 +8,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from ..model.coding import FileCoding, ScaleCoding
+from ..model.scene import FileCoding, ScaleCoding
 from ..model.sh import notes_on_degree
 from ..model.splats import COLUMNS
 from ..support.defaults import MAX_SH_DEGREE

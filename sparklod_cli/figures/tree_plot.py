@@ -21,16 +21,17 @@ from ..render.color_scales import (
     Coloring,
     log_marks,
     log_range,
+    nice_step,
     ramp,
     range_of,
     smooth,
+    ticks,
     top_opacity,
     whole_numbers,
     with_ends,
 )
 from ..support.defaults import DEFAULT_BASE, PLOT_BY
 from ..support.errors import SparklodError
-from ..support.ticks import nice_step, ticks
 from .geometry import Points, bounds, box_lines, cells, evenly, is_drawable, level_of_step, viewpoint, wall_lines
 from .pyvista_scene import Stage, write_png
 

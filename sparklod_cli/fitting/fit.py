@@ -11,8 +11,8 @@ from ..cameras.camera import Camera
 from ..model.lod_tree import LodTree
 from ..model.splats import Splats
 from ..render.settings import RasterSettings
+from ..support.parallel import on_threads
 from ..support.progress import Progress, silent
-from ..support.threads import on_threads
 from .cameras import HELD_OUT, Place, placed, split_path
 from .nodes import FittedNodes
 from .optimiser import ROUNDS, STAGES, Optimiser, default_steps, rates_at

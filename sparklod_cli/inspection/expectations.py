@@ -11,8 +11,7 @@ from typing import Any
 
 from ..io import read_text
 from ..support.errors import SparklodError
-from ..support.printable import printable
-from ..support.similar import near
+from ..support.printable import near, printable
 from ..support.untrusted import QUOTED, parse_json, parse_toml, quoted, quoted_value
 from ..tables.assertions import BadAssertionError, Condition, is_number, number_text, parse_condition
 from .findings import Finding

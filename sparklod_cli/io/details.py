@@ -12,7 +12,7 @@ from pathlib import Path
 from ..codecs.file_names import META, chunk_folder, folders_of, is_chunk_folder, is_in_manifest, is_of_streamed_sog
 from ..codecs.sog.sog_container import MAX_META, names_beside
 from ..codecs.streamed_sog.manifest import MAX_MANIFEST, Manifest, parse
-from ..support import atomic_set, folders
+from ..support import atomic, atomic_set
 from ..support.addresses import Address, Place
 from ..support.errors import FormatError, OutputError
 from ..support.stdin import DASH
@@ -75,7 +75,7 @@ def _write(path: Place, files: Files, *, overwrite: bool) -> int:
     if isinstance(target, Address):
         return send_together(target, placed(), former=[target.parent / name for name in former], overwrite=overwrite)
     try:
-        with folders.created(target.parent):
+        with atomic.created(target.parent):
             return atomic_set.write(
                 target.parent,
                 placed(),

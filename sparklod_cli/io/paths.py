@@ -9,7 +9,7 @@ from pathlib import Path, PurePath
 from typing import BinaryIO
 
 from ..codecs.file_names import META, rad_chunk_number, sog_image_number
-from ..support.similar import near
+from ..support.printable import near
 
 #: Names in a folder that are compared with one that is missing: more take longer than a person expects of an error.
 MOST_NAMES = 10_000

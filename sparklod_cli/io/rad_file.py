@@ -14,8 +14,8 @@ from ..codecs.rad.codec import RadChunk, read_chunk
 from ..codecs.rad.rad_header import RadHeader, read_header
 from ..codecs.rad.rad_reader import RadReader, decoded_bytes, file_of
 from ..codecs.validation import check_rules
-from ..model.coding import FileCoding
 from ..model.lod_tree import LodTree
+from ..model.scene import FileCoding
 from ..model.splats import FloatArray, Splats
 from ..support.errors import UnreadableError
 from ..support.machine import available_memory

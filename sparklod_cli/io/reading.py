@@ -13,8 +13,7 @@ from ..codecs import rgba
 from ..codecs.content import Content, Source
 from ..codecs.encoder import Stored
 from ..codecs.formats import FORMATS, HEAD, NPZ, RAW_SUFFIXES, Format, sniff
-from ..model.detail import DetailScene
-from ..model.scene import Scene
+from ..model.scene import DetailScene, Scene
 from ..model.splats import COLUMNS, FloatArray
 from ..support.addresses import Place, size_of
 from ..support.errors import FormatError, UnknownFormatError, UnreadableError

@@ -16,9 +16,8 @@ from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, Protocol
 
 from ..codecs.content import Content, Source
-from ..model.merged import Placed, merged
 from ..model.splats import Splats
-from ..model.streams import SceneStream
+from ..model.streams import Placed, SceneStream, merged
 from ..model.transforms import Transform
 from ..support import atomic
 from ..support.addresses import Address, Place
@@ -93,7 +92,7 @@ def open_streams(
     threads: int = 1,
     progress: Progress = silent,
 ) -> Iterator[SceneStream]:
-    """Yield the splats of several files, each where it stands, as those of one scene; see `model.merged`.
+    """Yield the splats of several files, each where it stands, as those of one scene; see `streams.merged`.
 
     Nothing is kept open between reads, and the header of a file that is named twice is read once.
 

@@ -15,7 +15,7 @@ from ..codecs.encoder import Encoder, Get
 from ..codecs.formats import Format
 from ..codecs.options import WriteOptions
 from ..model.scene import Scene
-from ..support import atomic, atomic_set, folders
+from ..support import atomic, atomic_set
 from ..support.addresses import Address, Place
 from ..support.errors import OutputError, StdoutError
 from ..support.progress import Progress, silent
@@ -86,7 +86,7 @@ def write_whole(path: Place, pieces: Iterable[bytes], *, overwrite: bool) -> int
             with path.open("wb") as file:
                 return sum(map(file.write, pieces))
         target = Path(os.path.realpath(path))
-        with folders.created(target.parent):
+        with atomic.created(target.parent):
             return atomic.write(target, pieces, overwrite=overwrite)
     except FileExistsError:
         raise _taken(path) from None
@@ -166,7 +166,7 @@ def write_together(path: Place, files: Files, *, overwrite: bool) -> int:
         return send_together(target, placed, former=_chunks_at(target), overwrite=overwrite)
     header = target
     try:
-        with folders.created(header.parent):
+        with atomic.created(header.parent):
             return atomic_set.write(
                 header.parent,
                 placed,

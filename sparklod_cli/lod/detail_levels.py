@@ -4,7 +4,7 @@ Splats of an opacity above 1 become ones of opacity 1, for formats that hold no 
 has the alpha p(z) = 1 - (1 - exp(-z^2 / 2)) ** A, flat on top. A plain Gaussian of opacity 1 and k times the scale has
 g(z) = exp(-z^2 / (2 k^2)). Both are isotropic on the screen, in standard deviations of the splat, so k depends on A
 alone. It is the one that covers as much: the integral of p over the plane is 2 pi H(A), with the harmonic number H (see
-`kernels/profile.py`), that of g is 2 pi k^2, so k = sqrt(H(A)).
+`model/falloff.py`), that of g is 2 pi k^2, so k = sqrt(H(A)).
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..model.detail import DetailScene
+from ..model.falloff import harmonic
 from ..model.gaussian import covariance, spark_size
 from ..model.lod_tree import LodTree
+from ..model.scene import DetailScene
 from ..model.splats import Splats
 from ..support.progress import Progress, silent
 from .detail_rule import DetailSettings
-from .kernels.profile import harmonic
 from .kernels.tree_links import find_parents
 from .regions import divide, extents, united
 

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..model.detail import DetailScene
 from ..model.gaussian import spark_size
+from ..model.scene import DetailScene
 from ..model.splats import Splats
 from .detail_choice import Chains, Distances, Distant, Levels, RegionBounds, choose
 from .detail_rule import LEAST_BASE_DISTANCE, DetailRule

@@ -50,7 +50,7 @@ LAST = np.iinfo(np.int32).max
 def build(splats: Splats, growth: float = DEFAULT_GROWTH, *, progress: Progress = silent) -> tuple[Splats, LodTree]:
     """Build a Level-of-Detail tree whose cuts are close to full detail.
 
-    The result does not depend on the number of threads (`support.threads`). Each input splat is one leaf, bit for bit.
+    The result does not depend on the number of threads. Each input splat is one leaf, bit for bit.
     The root is node 0, siblings are consecutive and come after their parent. Any prefix of the nodes is a coarser
     scene: the children of larger nodes come first, and along a Morton curve within a step of size.
 

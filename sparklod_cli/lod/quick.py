@@ -59,7 +59,7 @@ LEVELS = 4096
 def build(splats: Splats, base: float = DEFAULT_BASE, *, progress: Progress = silent) -> tuple[Splats, LodTree]:
     """Build a Level-of-Detail tree.
 
-    The result does not depend on the number of threads (`support.threads`). Each input splat is one leaf, bit for bit.
+    The result does not depend on the number of threads. Each input splat is one leaf, bit for bit.
     The root is node 0, siblings are consecutive and come after their parent. Any prefix of the nodes is a coarser
     scene: nodes whose parents were made at a coarser level come first, and along a Morton curve within a level.
 

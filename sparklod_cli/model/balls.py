@@ -38,18 +38,18 @@ class Balls:
     largest: float | None = None
 
     def take(self, index: NDArray[np.bool_]) -> Balls:
-        """Those of a mask (N,)."""
+        """Return the balls of a mask (N,)."""
         return Balls(self.center[index], self.radius[index])
 
     @classmethod
     def concat(cls, parts: Iterable[Balls]) -> Balls:
-        """All balls of several parts; at least one part."""
+        """Concatenate the balls of several parts, at least one."""
         every = list(parts)
         return cls(np.concatenate([part.center for part in every]), np.concatenate([part.radius for part in every]))
 
 
 def balls_of(splats: Splats, index: NDArray[Any] | slice, object_to_world: Matrix) -> Balls:
-    """What some splats cover where they stand; those without finite numbers are left out.
+    """Return what some splats cover where they stand; those without finite numbers are left out.
 
     Args:
         splats: all of an object.

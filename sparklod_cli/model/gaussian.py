@@ -32,7 +32,7 @@ THOMSEN_P = 1.6075
 
 
 def rotation_matrix(x: Any, y: Any, z: Any, w: Any, one: Any = 1.0) -> tuple[Any, ...]:
-    """The 9 elements, row by row, of the rotation by a unit quaternion, local to world; `one` is of the type of x."""
+    """Return the 9 elements, row by row, of the rotation by a unit quaternion; `one` is of the type of x."""
     two = one + one
     return (
         *(one - two * (y * y + z * z), two * (x * y - w * z), two * (x * z + w * y)),
@@ -42,17 +42,17 @@ def rotation_matrix(x: Any, y: Any, z: Any, w: Any, one: Any = 1.0) -> tuple[Any
 
 
 def lod_opacity_above_1(opacity: Any, one: Any, e: Any) -> Any:
-    """D of linear opacity A above 1: sqrt(1 + e * ln A) (Spark's LoD design); `one` and `e` of the type of A."""
+    """Return D of linear opacity A above 1: sqrt(1 + e * ln A) (Spark's LoD design); `one` and `e` of the type of A."""
     return np.sqrt(one + e * np.log(opacity))
 
 
 def linear_opacity_above_1(lod_opacity: Any, one: Any, e: Any) -> Any:
-    """Linear opacity A of D above 1: exp((D ** 2 - 1) / e), the inverse of `lod_opacity_above_1`."""
+    """Return linear opacity A of D above 1: exp((D ** 2 - 1) / e), the inverse of `lod_opacity_above_1`."""
     return np.exp((lod_opacity * lod_opacity - one) / e)
 
 
 def normalized_quat(quat: FloatArray) -> FloatArray:
-    """Unit quaternions from (N, 4) of any length; one of length 0 or that is not finite becomes NaN."""
+    """Return unit quaternions from (N, 4) of any length; one of length 0 or that is not finite becomes NaN."""
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         length = np.sqrt(np.einsum("ij,ij->i", quat, quat))
         extreme = np.flatnonzero(~((length > MIN_LENGTH) & (length < MAX_LENGTH)))
@@ -67,7 +67,7 @@ def normalized_quat(quat: FloatArray) -> FloatArray:
 
 
 def covariance(scale: FloatArray, quat_xyzw: FloatArray) -> NDArray[np.float64]:
-    """(N, 6) covariances R diag(scale ** 2) R^T, xx xy xz yy yz zz, of (N, 3) scales and (N, 4) unit quaternions.
+    """Return (N, 6) covariances R diag(scale ** 2) R^T, xx xy xz yy yz zz, of (N, 3) scales and (N, 4) quaternions.
 
     In float64, because elements of a thin splat's covariance are small differences of large numbers.
     """
@@ -77,18 +77,18 @@ def covariance(scale: FloatArray, quat_xyzw: FloatArray) -> NDArray[np.float64]:
 
 
 def rotation_matrices(quat_xyzw: FloatArray) -> NDArray[np.float64]:
-    """(3, 3, N) rotations, world axis by local axis, of (N, 4) unit quaternions, local to world."""
+    """Return (3, 3, N) rotations, world axis by local axis, of (N, 4) unit quaternions, local to world."""
     return np.array(rotation_matrix(*quat_xyzw.T.astype(np.float64))).reshape(3, 3, -1)
 
 
 def moved(points: FloatArray, matrix: NDArray[np.float64]) -> FloatArray:
-    """(N, 3) float32 points under a (4, 4) affine transform."""
+    """Return (N, 3) float32 points under a (4, 4) affine transform."""
     result: FloatArray = (points @ matrix[:3, :3].T + matrix[:3, 3]).astype(np.float32)
     return result
 
 
 def placed(splats: Splats, matrix: NDArray[np.float64]) -> Splats:
-    """Splats under a (4, 4) rotation, uniform scale and translation; their SH are not rotated."""
+    """Return splats under a (4, 4) rotation, uniform scale and translation; their SH are not rotated."""
     size = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
     turn = quat_of_rotation(matrix[:3, :3] / size)
     x, y, z, w = splats.quat_xyzw.T
@@ -103,7 +103,7 @@ def placed(splats: Splats, matrix: NDArray[np.float64]) -> Splats:
 
 
 def quat_of_rotation(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(4,) unit x y z w, of either sign, of a (3, 3) rotation.
+    """Return (4,) unit x y z w, of either sign, of a (3, 3) rotation.
 
     The eigenvector of Bar-Itzhack's matrix, which needs no special cases.
     """
@@ -121,7 +121,7 @@ def quat_of_rotation(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def lod_opacity(opacity: FloatArray) -> FloatArray:
-    """(N,) LoD opacity D, Spark's parameter, of linear opacity A: A up to 1, sqrt(1 + e * ln A) above."""
+    """Return (N,) LoD opacity D, Spark's parameter, of linear opacity A: A up to 1, sqrt(1 + e * ln A) above."""
     d = np.array(opacity, np.float32)
     above = d > 1  # usually few
     d[above] = lod_opacity_above_1(d[above], np.float32(1), np.float32(np.e))
@@ -129,7 +129,7 @@ def lod_opacity(opacity: FloatArray) -> FloatArray:
 
 
 def linear_opacity(lod_opacity: FloatArray) -> FloatArray:
-    """(N,) linear opacity A of LoD opacity D, the inverse of `lod_opacity`: D up to 1, exp((D ** 2 - 1) / e) above."""
+    """Return (N,) linear opacity A of LoD opacity D: D up to 1, exp((D ** 2 - 1) / e) above."""
     linear = np.array(lod_opacity, np.float32)
     above = linear > 1
     linear[above] = linear_opacity_above_1(linear[above], np.float32(1), np.float32(np.e))
@@ -137,7 +137,7 @@ def linear_opacity(lod_opacity: FloatArray) -> FloatArray:
 
 
 def size_factor(lod_opacity: FloatArray, out: FloatArray | None = None) -> FloatArray:
-    """(N,) 1 + 0.7 * max(0, D - 1), the ratio of a splat's feature size to 2 * mean(scale); into `out` if given."""
+    """Return (N,) 1 + 0.7 * max(0, D - 1), the ratio of feature size to 2 * mean(scale); into `out` if given."""
     factor: FloatArray = np.subtract(lod_opacity, np.float32(1), out=out)
     np.maximum(factor, 0, out=factor)
     factor *= np.float32(SIZE_PER_D)
@@ -147,7 +147,7 @@ def size_factor(lod_opacity: FloatArray, out: FloatArray | None = None) -> Float
 
 @np.errstate(over="ignore", invalid="ignore")  # reports ask for that of scales that are not finite, too
 def spark_size(splats: Splats) -> FloatArray:
-    """(N,) feature size, 2 * mean(scale) * (1 + 0.7 * max(0, D - 1)): what Spark 2.2.0 writes into its nodes.
+    """Return (N,) feature size, 2 * mean(scale) * (1 + 0.7 * max(0, D - 1)): what Spark 2.2.0 writes into its nodes.
 
     Inferred from its output, see docs/decisions/14-cuts.md; its `encode_lod_tree` computes the same.
     """
@@ -163,5 +163,5 @@ def spark_size(splats: Splats) -> FloatArray:
 
 
 def design_size(splats: Splats) -> FloatArray:
-    """(N,) 2 * max(scale) * max(1, D): feature size in Spark's LoD design, by which its quick builder sorts."""
+    """Return (N,) 2 * max(scale) * max(1, D): feature size in Spark's LoD design, by which its quick builder sorts."""
     return 2 * splats.scale.max(axis=1) * np.maximum(lod_opacity(splats.opacity), 1)

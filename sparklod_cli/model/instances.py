@@ -1,4 +1,4 @@
-"""`Instance`: a scene and where it stands."""
+"""`Instance`: a scene, where it stands, and how much its nodes count by their direction (foveation)."""
 
 from __future__ import annotations
 
@@ -10,10 +10,46 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from .detail import DetailScene
-from .foveation import Foveation
-from .scene import Scene
+from ..support.defaults import BEHIND_FOVEATE, CONE_FOV, CONE_FOV0, CONE_FOVEATE
+from .scene import DetailScene, Scene
 from .transforms import LARGEST, SKEW, Transform
+
+
+@dataclass(frozen=True)
+class Cones:
+    """Foveation by the angle to the optical axis, Spark 2's.
+
+    Attributes:
+        fov0: full angle of the inner cone, in degrees; inside it everything has weight 1. 0 for no inner cone.
+        fov: full angle of the outer cone, in degrees; between the cones the weight falls linearly in the cosine.
+        foveate: weight at the outer cone; from there it goes on to `behind` at 90 degrees off the axis.
+        behind: weight behind the camera.
+    """
+
+    fov0: float = 0.0
+    fov: float = 0.0
+    foveate: float = 1.0
+    behind: float = 1.0
+
+
+@dataclass(frozen=True)
+class Frustum:
+    """Foveation by the edges of the picture, as in Spark's LoD design.
+
+    Attributes:
+        outside: weight in front of the camera but outside the frustum.
+        behind: weight behind the camera.
+    """
+
+    outside: float = 1.0
+    behind: float = 1.0
+
+
+Foveation = Cones | Frustum
+
+#: Spark 2's.
+SPARK = Cones(CONE_FOV0, CONE_FOV, CONE_FOVEATE, BEHIND_FOVEATE)
+
 
 Matrix = NDArray[np.float64]
 
@@ -72,7 +108,7 @@ class Instance:
 
 
 def names_of(files: Sequence[Path], taken: Collection[str] = ()) -> list[str]:
-    """A name for each file, numbered where several have the same; none is `TOTAL` or in `taken`."""
+    """Return a name for each file, numbered where several have the same; none is `TOTAL` or in `taken`."""
     seen = {TOTAL, *taken}
     counts: dict[str, int] = {}
     names = []
@@ -89,5 +125,5 @@ def names_of(files: Sequence[Path], taken: Collection[str] = ()) -> list[str]:
 
 
 def instances_of(files: Sequence[Path]) -> list[Instance]:
-    """One instance of each file, where the file has it."""
+    """Return one instance of each file, where the file has it."""
     return [Instance(file, name) for file, name in zip(files, names_of(files), strict=True)]

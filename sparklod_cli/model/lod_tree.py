@@ -52,7 +52,7 @@ class LodTree:
         return np.where(self.is_leaf, np.uint32(0), self.child_start)
 
     def depths(self) -> NDArray[np.int32]:
-        """(M,) int32 number of edges from the root to each node, of a tree that `validate` accepts."""
+        """Return (M,) int32 number of edges from the root to each node, of a tree that `validate` accepts."""
         depth = np.zeros(len(self), np.int32)
         frontier = np.zeros(1, np.int64)
         level = 0
@@ -66,7 +66,7 @@ class LodTree:
         return depth
 
     def validate(self) -> None:
-        """Checks that this is a single tree with root 0, in linear time.
+        """Check that this is a single tree with root 0, in linear time.
 
         Each node but the root is the child of exactly one node, which comes before it. As in Spark, nothing is asked of
         the `child_start` of a leaf.

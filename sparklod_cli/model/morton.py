@@ -24,7 +24,7 @@ _SPREADING = (
 
 
 def order(center: FloatArray) -> NDArray[np.intp]:
-    """The order of points along the Morton curve of their bounding box, whose axes are each cut into 2 ** BITS cells.
+    """Return the order of points along the Morton curve of their box, which has 2 ** BITS cells along each axis.
 
     Points of one cell keep their order.
 
@@ -44,7 +44,7 @@ def order(center: FloatArray) -> NDArray[np.intp]:
 
 
 def order_of_cells(cells: NDArray[np.unsignedinteger[Any]]) -> NDArray[np.intp]:
-    """The order of points by the numbers of their cells along each axis.
+    """Return the order of points by the numbers of their cells along each axis.
 
     The curve takes the bits of z, y and x in turns, z first. Points of one cell keep their order.
 
@@ -61,7 +61,7 @@ def order_of_cells(cells: NDArray[np.unsignedinteger[Any]]) -> NDArray[np.intp]:
 
 
 def _spread(words: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Words of `BITS` bits with two zeros between any two of these."""
+    """Return words of `BITS` bits with two zeros between any two of these."""
     for places, kept in _SPREADING:
         words = (words | words << np.uint64(places)) & np.uint64(kept)
     return words

@@ -29,5 +29,5 @@ class Nodes:
 
     @classmethod
     def of(cls, splats: Splats, tree: LodTree) -> Nodes:
-        """The nodes of a tree in full precision, with Spark's feature sizes."""
+        """Return the nodes of a tree in full precision, with Spark's feature sizes."""
         return cls(splats.center, spark_size(splats), tree)

@@ -1,19 +1,67 @@
-"""`Scene`, what one splat file holds: splats, their tree if they have one, and what belongs to the file as a whole."""
+"""What one splat file holds: `Scene`, splats and their tree if they have one, and what belongs to the file as a whole.
+
+`DetailScene` is one whose regions each exist at several detail levels, as Streamed SOG holds it. `FileCoding` tells how
+a file holds its scales: what it takes to know the numbers that another reader has of them.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import functools
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ..support.errors import InvalidSplatsError
-from .coding import PLAIN, FileCoding
 from .lod_tree import LodTree
 from .sh import COEFFICIENTS
 from .splats import Splats, describe_invalid
-from .up_axis import AXES
+from .transforms import AXES
+
+
+@dataclass(frozen=True)
+class ScaleCoding:
+    """The codes that some scales are decoded from.
+
+    Attributes:
+        name: "spz", or one of RAD's "ln_0r8" and "ln_f16"; empty for plain numbers, which all readers have alike.
+        low, high: ends of the range of the logarithms, where the codes have one.
+    """
+
+    name: str = ""
+    low: float = 0.0
+    high: float = 0.0
+
+
+@dataclass(frozen=True)
+class FileCoding:
+    """What a file says of its codes.
+
+    Attributes:
+        scales: of each run of splats, in order.
+        run: splats of each run but the last.
+        packed_range: ends of the range of logarithms in which Spark packs the scales of the file as PackedSplats, where
+            the file sets one (RAD's "splatEncoding"); None for Spark's own.
+    """
+
+    scales: tuple[ScaleCoding, ...]
+    run: int
+    packed_range: tuple[float, float] | None = None
+
+    def parts(self, count: int) -> Iterator[tuple[slice, ScaleCoding]]:
+        """Return the rows of `count` splats, as few slices as their codings allow."""
+        start = 0
+        for number, coding in enumerate(self.scales):
+            last = number + 1 == len(self.scales)
+            if last or self.scales[number + 1] != coding:
+                stop = count if last else min((number + 1) * self.run, count)
+                yield slice(start, stop), coding
+                start = stop
+
+
+#: That of splats that were not read from codes.
+PLAIN = FileCoding((ScaleCoding(),), 1)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -31,8 +79,8 @@ class Scene:
         notes: what the reader had to leave out, for display.
         header: numbers of the file's header that the splats do not tell, by name ("version", "fractional_bits").
         chunk_bytes: of each of its chunks in the file, where its format has chunks; None elsewhere.
-        coding: how the file holds its scales; `coding.PLAIN` where it has the very numbers.
-        up: the axis that points up, one of `up_axis.AXES` ("y", "-z"); None where the file does not say.
+        coding: how the file holds its scales; `PLAIN` where it has the very numbers.
+        up: the axis that points up, one of `transforms.AXES` ("y", "-z"); None where the file does not say.
     """
 
     splats: Splats
@@ -65,7 +113,7 @@ class Scene:
         antialiased: bool = False,
         up: str | None = None,
     ) -> Scene:
-        """A scene of N splats from arrays of numbers, which are copied only where they are not C-contiguous float32.
+        """Return a scene of N splats from arrays, which are copied only where they are not C-contiguous float32.
 
         Args:
             center: (N, 3) world units.
@@ -129,7 +177,7 @@ class Tree(Scene):
 
 
 def _column(name: str, values: ArrayLike, shape: tuple[int, ...]) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
-    """A column of `Splats` from numbers of this very shape."""
+    """Return a column of `Splats` from numbers of this very shape."""
     array = np.asarray(values)
     if array.dtype.kind not in "fiu":
         raise ValueError(f"{name} holds {array.dtype}; give real numbers")
@@ -137,3 +185,83 @@ def _column(name: str, values: ArrayLike, shape: tuple[int, ...]) -> np.ndarray[
         raise ValueError(f"{name} has the shape {array.shape}; give {shape}, a row for each splat")
     with np.errstate(over="ignore"):
         return np.ascontiguousarray(array, np.float32)
+
+
+Bounds = NDArray[np.float64]
+Counts = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class DetailScene:
+    """Splats of all detail levels, and the regions whose level a viewer chooses one by one.
+
+    Level 0 is full detail; the levels of a region stand for the same splats. The splats of a region at a level are its
+    run. Runs lie level after level, and in a level region after region.
+
+    Attributes:
+        splats: N splats, those of all levels.
+        counts: (R, L) int64 splats of each region at each level; 0 where a region has no such level.
+        bounds: (R, 2, 3) float64 lowest and highest corner of each region, in world units.
+        children: (R - 1, 2) int64 the binary tree over the regions: its inner nodes, root first and before their
+            children. A number from 0 on is an inner node, -1 - r is region r.
+        errors: (R, L) float64 how far each level of a region is from its level 0, 0 there and not decreasing from level
+            to level; None where nobody measured it.
+        environment: splats far outside, which are drawn whatever the levels are; None without.
+        antialiased: trained with the opacity compensation of Mip-Splatting.
+        format, notes, header, up: as of `Scene`.
+    """
+
+    splats: Splats
+    counts: Counts
+    bounds: Bounds
+    children: NDArray[np.int64]
+    errors: NDArray[np.float64] | None = None
+    environment: Splats | None = None
+    antialiased: bool = False
+    format: str = ""
+    notes: tuple[str, ...] = ()
+    header: Mapping[str, int] = field(default_factory=dict)
+    up: str | None = None
+
+    def __post_init__(self) -> None:
+        regions, levels = self.counts.shape
+        shapes = {"bounds": (regions, 2, 3), "children": (regions - 1, 2)}
+        shapes |= {} if self.errors is None else {"errors": (regions, levels)}
+        for name, shape in shapes.items():
+            if getattr(self, name).shape != shape:
+                raise ValueError(f"{name} has the shape {getattr(self, name).shape}; expected {shape}")
+        if self.counts.sum() != len(self.splats):
+            raise ValueError(f"counts are of {self.counts.sum():,} splats, but there are {len(self.splats):,}")
+
+    @property
+    def regions(self) -> int:
+        """How many regions there are."""
+        return len(self.counts)
+
+    @property
+    def levels(self) -> int:
+        """How many detail levels there are."""
+        return self.counts.shape[1]
+
+    @functools.cached_property
+    def starts(self) -> Counts:
+        """(R, L) the first splat of each run."""
+        flat = self.counts.T.ravel()
+        return np.ascontiguousarray((np.cumsum(flat) - flat).reshape(self.levels, self.regions).T)
+
+    def run(self, region: int, level: int) -> slice:
+        """Return the splats of a region at a level."""
+        start = int(self.starts[region, level])
+        return slice(start, start + int(self.counts[region, level]))
+
+    def level(self, level: int) -> slice:
+        """Return the splats of a level, of all regions."""
+        before = int(self.counts[:, :level].sum())
+        return slice(before, before + int(self.counts[:, level].sum()))
+
+    def scene(self) -> Scene:
+        """Return full detail as a plain scene: level 0, then the environment."""
+        splats = self.splats.take(self.level(0))
+        if self.environment is not None:
+            splats = Splats.concat([splats, self.environment])
+        return Scene(splats, None, self.antialiased, self.format, self.notes, self.header, up=self.up)

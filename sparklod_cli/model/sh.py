@@ -27,7 +27,7 @@ COEFFICIENTS = (0, 3, 8, 15, 24)
 
 
 def degree_of(coefficients: int) -> int:
-    """The degree with this many coefficients per channel above the constant term.
+    """Return the degree with this many coefficients per channel above the constant term.
 
     Raises:
         FormatError: no degree has this many.
@@ -40,5 +40,5 @@ def degree_of(coefficients: int) -> int:
 
 
 def notes_on_degree(degree: int) -> tuple[str, ...]:
-    """A reader's notes on a file of this degree: one if coefficients above MAX_SH_DEGREE are dropped."""
+    """Return a reader's notes on a file of this degree: one if coefficients above MAX_SH_DEGREE are dropped."""
     return (f"SH degree {degree} is cut to {MAX_SH_DEGREE}",) if degree > MAX_SH_DEGREE else ()

@@ -82,19 +82,19 @@ class Splats:
 
     @classmethod
     def empty(cls, count: int, sh_degree: int) -> Splats:
-        """Uninitialised columns for `count` splats, for a decoder or a kernel to fill."""
+        """Return uninitialised columns for `count` splats, for a decoder or a kernel to fill."""
         shapes = {"opacity": (count,), "quat_xyzw": (count, 4), "sh": (count, COEFFICIENTS[sh_degree], 3)}
         return cls(**{name: np.empty(shapes.get(name, (count, 3)), np.float32) for name in COLUMNS})
 
     @classmethod
     def zeros(cls, count: int, sh_degree: int) -> Splats:
-        """Columns of zeros, which take no memory until they are written to."""
+        """Return columns of zeros, which take no memory until they are written to."""
         columns = cls.empty(0, sh_degree)
         return cls(**{name: np.zeros((count, *getattr(columns, name).shape[1:]), np.float32) for name in COLUMNS})
 
     @classmethod
     def concat(cls, parts: Sequence[Splats]) -> Splats:
-        """All parts in order; they must have the same SH degree."""
+        """Concatenate parts, which must have the same SH degree."""
         return cls(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in COLUMNS})
 
     def frozen(self) -> Splats:
@@ -103,11 +103,11 @@ class Splats:
         return self if all(columns[name] is getattr(self, name) for name in COLUMNS) else Splats(**columns)
 
     def take(self, index: NDArray[Any] | slice) -> Splats:
-        """The splats of an index array, a boolean mask or a slice: the one way to filter, permute and truncate."""
+        """Return the splats of an index array, a mask or a slice: the one way to filter, permute and truncate."""
         return Splats(**{name: np.ascontiguousarray(getattr(self, name)[index]) for name in COLUMNS})
 
     def invalid(self) -> dict[str, NDArray[np.bool_]]:
-        """(N,) masks of invalid splats, by the kinds of `INVALID` that occur; a splat is in at most one mask.
+        """Return (N,) masks of invalid splats, by the kinds of `INVALID` that occur; a splat is in at most one mask.
 
         This is the only definition of a valid splat. Readers return what a file contains; their callers reject or drop
         invalid splats.
@@ -129,7 +129,7 @@ class Splats:
         return found
 
     def is_valid(self) -> NDArray[np.bool_]:
-        """(N,) bool, false for invalid splats."""
+        """Return (N,) bool, false for invalid splats."""
         valid = np.ones(len(self), np.bool_)
         for mask in self.invalid().values():
             valid &= ~mask
@@ -149,7 +149,7 @@ class Splats:
         return finite
 
     def with_max_sh(self, degree: int) -> Splats:
-        """These splats without the SH coefficients above `degree`."""
+        """Return these splats without the SH coefficients above `degree`."""
         keep = COEFFICIENTS[degree]
         if keep >= self.sh.shape[1]:
             return self
@@ -160,7 +160,7 @@ COLUMNS = tuple(field.name for field in dataclasses.fields(Splats))
 
 
 def same_rows(one: Splats, other: Splats) -> NDArray[np.bool_]:
-    """(N,) which of as many splats have the same values, bit for bit."""
+    """Return (N,) which of as many splats have the same values, bit for bit."""
     same = np.ones(len(one), bool)
     for name in COLUMNS:
         a, b = (getattr(splats, name).reshape(len(one), -1).view(np.uint32) for splats in (one, other))
@@ -169,7 +169,7 @@ def same_rows(one: Splats, other: Splats) -> NDArray[np.bool_]:
 
 
 def describe_invalid(invalid: dict[str, NDArray[np.bool_]]) -> str:
-    """ "3 of 50 splats are not finite (NaN, infinite, or a rotation of length 0; the first is splat 7)", for messages.
+    """Return a message such as "3 of 50 splats are invalid (3 a scale below 0; the first is splat 7)".
 
     Args:
         invalid: the masks of `Splats.invalid`, not empty.
@@ -180,7 +180,7 @@ def describe_invalid(invalid: dict[str, NDArray[np.bool_]]) -> str:
 
 
 def describe_counts(counts: dict[str, int], total: int, first: int) -> str:
-    """As `describe_invalid`: of `total` splats, so many are invalid, by kind, and this is the first."""
+    """Return the message of `describe_invalid` for numbers of splats by kind, of `total`, and the first place."""
     if set(counts) == {"non_finite"}:
         what = "not finite (NaN, infinite, or a rotation of length 0"
     else:

@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+import bisect
+import dataclasses
+import itertools
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
+
+from ..support.errors import SparklodError
 from ..support.progress import Progress, silent
+from ..support.units import count_of
 from .lod_tree import LodTree
 from .scene import Scene
+from .sh import COEFFICIENTS
 from .splats import COLUMNS, Splats
+from .transforms import Transform, common, rotated
 
 #: Splats of a block that a scene is read in, unless its format has other ones: some 30 MB with SH of degree 3.
 BLOCK_SPLATS = 1 << 17
@@ -36,7 +45,7 @@ class SceneStream:
     up: str | None = None
 
     def blocks(self) -> Iterator[Splats]:
-        """All splats, in order."""
+        """Read all splats, in order."""
         return self.read(0, self.count)
 
 
@@ -61,13 +70,13 @@ class NodeStream:
     up: str | None = None
 
     def windows(self, rows: int) -> Iterator[tuple[Splats, LodTree]]:
-        """All nodes, in order, so many at a time."""
+        """Read all nodes, in order, so many at a time."""
         for start in range(0, self.count, rows):
             yield self.read(start, min(start + rows, self.count))
 
 
 def stream_of(scene: Scene) -> SceneStream:
-    """A stream of a scene in memory, which has no tree."""
+    """Return a stream of a scene in memory, which has no tree."""
     assert scene.tree is None
 
     def read(start: int, stop: int) -> Iterator[Splats]:
@@ -79,7 +88,7 @@ def stream_of(scene: Scene) -> SceneStream:
 
 
 def collected(stream: SceneStream, progress: Progress = silent) -> Scene:
-    """All of a stream in memory, which takes no more of it than the scene and a block."""
+    """Read all of a stream into memory, which takes no more of it than the scene and a block."""
     splats, done = Splats.empty(stream.count, stream.sh_degree), 0
     for block in stream.blocks():
         part = slice(done, done := done + len(block))
@@ -87,3 +96,83 @@ def collected(stream: SceneStream, progress: Progress = silent) -> Scene:
             getattr(splats, name)[part] = getattr(block, name)
         progress("reading", done, stream.count, "splat")
     return Scene(splats, None, stream.antialiased, stream.format, stream.notes, stream.header, up=stream.up)
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """A scene and where it stands.
+
+    Attributes:
+        stream: its splats.
+        name: in messages.
+        transform: turns, scales and moves them.
+    """
+
+    stream: SceneStream
+    name: str
+    transform: Transform = dataclasses.field(default_factory=Transform)
+
+
+def merged(parts: Sequence[Placed]) -> SceneStream:
+    """Merge scenes into one: their splats in this order, of the highest SH degree; lower ones are padded with zeros.
+
+    It is antialiased if most of the splats are; notes tell where they differ. An axis points up that does in all of
+    them. What is wrong with one of them is raised with its name.
+
+    Args:
+        parts: at least one.
+    """
+    firsts = tuple(itertools.accumulate((part.stream.count for part in parts), initial=0))
+    degree = max(part.stream.sh_degree for part in parts)
+    antialiased, notes = _antialiased(parts)
+    notes += tuple(f"{part.name}: {note}" for part in parts for note in part.stream.notes)
+    return SceneStream(
+        firsts[-1],
+        degree,
+        _Read(tuple(parts), firsts, degree),
+        antialiased,
+        " and ".join(sorted({part.stream.format for part in parts})),
+        tuple(dict.fromkeys(notes)),
+        up=common(rotated(part.stream.up, part.transform.rotation) for part in parts),
+    )
+
+
+def _antialiased(parts: Sequence[Placed]) -> tuple[bool, tuple[str, ...]]:
+    """Return whether most splats are antialiased, and notes where they differ."""
+    count = sum(part.stream.count for part in parts)
+    found = sum(part.stream.count for part in parts if part.stream.antialiased)
+    most = 2 * found > count
+    if found in (0, count):
+        return most, ()
+    kind = "antialiased" if most else "not antialiased"
+    text = f"{found:,} of {count_of(count, 'splat')} are antialiased, and the others are not; all are written as {kind}"
+    return most, (text,)
+
+
+@dataclass(frozen=True, eq=False)
+class _Read:
+    """`SceneStream.read` of several scenes; can be pickled if their streams can."""
+
+    parts: tuple[Placed, ...]
+    firsts: tuple[int, ...]
+    sh_degree: int
+
+    def __call__(self, start: int, stop: int) -> Iterator[Splats]:
+        number = bisect.bisect_right(self.firsts, start) - 1
+        while start < stop:
+            part, first, last = self.parts[number], self.firsts[number], min(self.firsts[number + 1], stop)
+            try:
+                for splats in part.stream.read(start - first, last - first):
+                    yield part.transform.apply(_padded(splats, self.sh_degree))
+            except SparklodError as error:
+                raise type(error)(f"{part.name}: {error}") from None
+            start, number = last, number + 1
+
+
+def _padded(splats: Splats, sh_degree: int) -> Splats:
+    """Return splats of at least this SH degree; coefficients that they lack are 0."""
+    if splats.sh_degree >= sh_degree:
+        return splats
+    sh = np.zeros((len(splats), COEFFICIENTS[sh_degree], 3), np.float32)
+    sh[:, : splats.sh.shape[1]] = splats.sh
+    return dataclasses.replace(splats, sh=sh)

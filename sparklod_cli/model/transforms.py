@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -31,6 +31,38 @@ from ..support.parallel import blocks_of
 from .gaussian import quat_of_rotation, rotation_matrices
 from .sh import COEFFICIENTS, SH_C1, SH_C2, SH_C3
 from .splats import FloatArray, Splats
+
+#: Unit vectors of the axes, by name.
+AXES: dict[str, tuple[float, float, float]] = {
+    "x": (1.0, 0.0, 0.0),
+    "-x": (-1.0, 0.0, 0.0),
+    "y": (0.0, 1.0, 0.0),
+    "-y": (0.0, -1.0, 0.0),
+    "z": (0.0, 0.0, 1.0),
+    "-z": (0.0, 0.0, -1.0),
+}
+
+
+def rotated(axis: str | None, rotation: ArrayLike) -> str | None:
+    """Return the axis nearest to where a rotation takes an axis; None for None.
+
+    The nearest one, since a rotation by a few degrees levels a scene whose axis was only roughly up.
+
+    Args:
+        axis: one of `AXES`.
+        rotation: (3, 3) matrix that multiplies column vectors.
+    """
+    if axis is None:
+        return None
+    up = np.asarray(rotation, np.float64) @ AXES[axis]
+    return max(AXES, key=lambda name: float(up @ AXES[name]))
+
+
+def common(axes: Iterable[str | None]) -> str | None:
+    """Return the axis that all scenes have up; None where one is unknown or two differ."""
+    distinct = set(axes)
+    return distinct.pop() if len(distinct) == 1 else None
+
 
 Matrix = NDArray[np.float64]
 
@@ -96,7 +128,7 @@ class Transform:
 
     @classmethod
     def from_euler(cls, x: float, y: float, z: float) -> Transform:
-        """A rotation by x, then y, then z degrees about the fixed axes; multiples of 90 are exact.
+        """Return a rotation by x, then y, then z degrees about the fixed axes; multiples of 90 are exact.
 
         Raises:
             ValueError: an angle is not finite.
@@ -115,7 +147,7 @@ class Transform:
 
     @classmethod
     def from_quat(cls, quat_xyzw: ArrayLike) -> Transform:
-        """A rotation by a (4,) quaternion x y z w of any length but 0.
+        """Return a rotation by a (4,) quaternion x y z w of any length but 0.
 
         Raises:
             ValueError: it has another shape, or a length of 0 or not finite.
@@ -132,7 +164,7 @@ class Transform:
 
     @classmethod
     def from_up(cls, axis: str) -> Transform:
-        """The rotation after which `axis`, one of `UP_AXES`, is +y; see the conventions of this module.
+        """Return the rotation after which `axis`, one of `UP_AXES`, is +y; see the conventions of this module.
 
         Raises:
             ValueError: there is no such axis.
@@ -150,7 +182,7 @@ class Transform:
         scale: float = 1.0,
         translate: Sequence[float] = (0, 0, 0),
     ) -> Transform:
-        """What the options --up, --rotate, --scale and --translate mean together: one after another, in this order.
+        """Return the transform of the options --up, --rotate, --scale and --translate, in this order.
 
         Args:
             up: one of `UP_AXES`.
@@ -182,17 +214,17 @@ class Transform:
         return matrix
 
     def then(self, after: Transform) -> Transform:
-        """This transform followed by another, as one."""
+        """Return this transform followed by another, as one."""
         translation = after.scale * (after.rotation @ self.translation) + after.translation
         return Transform(after.rotation @ self.rotation, after.scale * self.scale, translation)
 
     def inverse(self) -> Transform:
-        """The transform that undoes this one."""
+        """Return the transform that undoes this one."""
         back = self.rotation.T
         return Transform(back, 1 / self.scale, -(back @ self.translation) / self.scale)
 
     def apply(self, splats: Splats) -> Splats:
-        """Splats rotated, scaled and moved: computed in float64, rounded once to float32.
+        """Return splats rotated, scaled and moved: computed in float64, rounded once to float32.
 
         The identity returns `splats` itself, and columns that a transform leaves alone are shared, not copied.
         Quaternions keep their length, so that invalid ones stay invalid, and are not brought to one hemisphere:
@@ -224,7 +256,7 @@ class Transform:
 
 
 def sh_rotations(rotation: Matrix, degree: int) -> list[Matrix]:
-    """For each degree from 1 to `degree`, what multiplies its SH coefficients where splats are turned by `rotation`.
+    """Return what a rotation multiplies the SH coefficients of each degree from 1 to `degree` by.
 
     A colour f(d) = Y(d) c becomes f(R^-1 d), so Y(d) c' = Y(R^-1 d) c for all d: c' = X c, where X is the solution of
     Y(d) X = Y(R^-1 d). It is exact, as the functions of a degree turn among themselves; least squares over more
@@ -249,7 +281,7 @@ def sh_rotations(rotation: Matrix, degree: int) -> list[Matrix]:
 
 
 def sh_basis(directions: Matrix, degree: int) -> Matrix:
-    """(N, K) real spherical harmonics of degree 1 to `degree` in (N, 3) unit directions, ordered as `Splats.sh` is.
+    """Return (N, K) real spherical harmonics of degree 1 to `degree` in (N, 3) unit directions, as `Splats.sh`.
 
     The polynomials and signs are those of the code that trained 3D Gaussian Splatting (`eval_sh` there); the rasterizer
     has them in `kernels/shade.py`.
@@ -280,7 +312,7 @@ def _third(x: Matrix, y: Matrix, z: Matrix) -> list[Matrix]:
 
 
 def _directions() -> Matrix:
-    """(SAMPLES, 3) unit vectors, spread evenly: a spiral from pole to pole by the golden angle."""
+    """Return (SAMPLES, 3) unit vectors, spread evenly: a spiral from pole to pole by the golden angle."""
     index = np.arange(SAMPLES)
     z = 1 - (2 * index + 1) / SAMPLES
     angle = index * (math.pi * (3 - math.sqrt(5)))
@@ -296,7 +328,7 @@ def _cosine_and_sine(degrees: float) -> tuple[float, float]:
 
 
 def _quat_product(rotation: Matrix) -> Matrix:
-    """(4, 4) that multiplies quaternions x y z w from the left by that of a rotation, of w >= 0."""
+    """Return (4, 4) that multiplies quaternions x y z w from the left by that of a rotation, of w >= 0."""
     quat = quat_of_rotation(rotation)
     quat[np.abs(quat) < SNAP] = 0
     first = quat[3] or quat[np.argmax(np.abs(quat))]  # half turns have no w: then the largest part is positive
@@ -305,7 +337,7 @@ def _quat_product(rotation: Matrix) -> Matrix:
 
 
 def _multiplied(matrix: Matrix, rows: FloatArray) -> Matrix:
-    """(N, K) rows times a (K, K) matrix, as (N, K) float64.
+    """Return (N, K) rows times a (K, K) matrix, as (N, K) float64.
 
     Sums are in a fixed order, which BLAS would choose by processor and threads; columns are what einsum is fast with.
     """
@@ -314,7 +346,7 @@ def _multiplied(matrix: Matrix, rows: FloatArray) -> Matrix:
 
 
 def _turn_sh(of_degrees: list[Matrix], sh: FloatArray, out: FloatArray) -> None:
-    """Fills (N, K, 3) coefficients with those of turned splats, degree by degree; as `_multiplied`."""
+    """Fill (N, K, 3) coefficients with those of turned splats, degree by degree; as `_multiplied`."""
     count, start = len(sh), 0
     for turn in of_degrees:
         part = slice(start, start + len(turn))

@@ -40,7 +40,7 @@ class Backend:
     module: str
 
     def draw(self, splats: ShadedSplats, camera: Camera, settings: RasterSettings, **options: Any) -> Image:
-        """What a camera sees; see `Draw`. Options are those of the module's function."""
+        """Draw splats; see `Draw`. Options are those of the module's function."""
         return cast(Draw, import_module(self.module, __package__).draw)(splats, camera, settings, **options)
 
 

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from ..cameras.camera import Camera
 from ..model.gaussian import lod_opacity, moved, spark_size
 from ..model.splats import FloatArray
+from ..render.color_scales import ticks
 from ..scenes.finder import CutSource
 from ..scenes.loaded import Part
 from ..scenes.loaded_scene import Index, LoadedScene
 from ..support.errors import SparklodError
 from ..support.progress import Progress, silent
-from ..support.ticks import ticks
 from .color_scales import (
     CLIPPED,
     MAGMA,
@@ -58,7 +58,7 @@ class Scale:
     log: bool = False
 
     def rgb(self, values: FloatArray) -> NDArray[np.float32]:
-        """(..., 3) colours, 0..1, of numbers; NaN has the first colour."""
+        """Return (..., 3) colours, 0..1, of numbers; NaN has the first colour."""
         values = np.asarray(values, np.float64)
         if self.log:
             values = np.log10(np.clip(values, 1e-30, 1e30))
@@ -69,7 +69,7 @@ class Scale:
 
 
 def values_of(by: str, part: Part) -> FloatArray:
-    """(M,) the numbers that some splats are coloured by: "level", "lod-opacity", "size" or "chunk".
+    """Return (M,) the numbers that some splats are coloured by: "level", "lod-opacity", "size" or "chunk".
 
     A level is a depth in a tree, or a detail level. Sizes are in world units; splats of files without either are of
     level 0.
@@ -82,7 +82,7 @@ def values_of(by: str, part: Part) -> FloatArray:
 
 
 def scale_of_splats(by: str, source: CutSource, cameras: Sequence[Camera], progress: Progress = silent) -> Scale:
-    """The scale of a colour that is of splats, for all that cameras may see; of whole numbers, for what they do see.
+    """Return the scale of a number of splats, for all that cameras may see; of whole numbers, for what they do see.
 
     Args:
         by: "level", "lod-opacity", "size" or "chunk".
@@ -107,7 +107,7 @@ def scale_of_splats(by: str, source: CutSource, cameras: Sequence[Camera], progr
 
 
 def scale_of_depth(source: CutSource, cameras: Sequence[Camera], settings: RasterSettings) -> Scale:
-    """From the nearest splats to the farthest that cameras see, but for a few."""
+    """Return the scale from the nearest splats to the farthest that cameras see, but for a few."""
     parts = source.candidates().parts
     every = max(1, sum(len(part.index) for part in parts) // SAMPLE)
     centers = np.concatenate([moved(part.splats.center[::every], part.object_to_world) for part in parts])
@@ -128,13 +128,13 @@ def scale_of_depth(source: CutSource, cameras: Sequence[Camera], settings: Raste
 
 
 def scale_of_overdraw(counts: Sequence[FloatArray]) -> Scale:
-    """From none to the most that but a few pixels of some pictures have."""
+    """Return the scale from none to the most that all but a few pixels of some pictures have."""
     most = max(float(np.percentile(count, 99.9)) for count in counts)
     return _linear("overdraw", 0.0, max(1.0, float(math.ceil(most))), MAGMA, ends=True)
 
 
 def _whole(by: str, title: str, source: CutSource, cameras: Sequence[Camera], progress: Progress) -> Scale:
-    """From the least to the most that some cameras see; others may see less, or more."""
+    """Return the scale from the least to the most that some cameras see; others may see less, or more."""
     every = -(-len(cameras) // CUTS)
     some = cameras[::every]
     ends = []
@@ -149,7 +149,7 @@ def _whole(by: str, title: str, source: CutSource, cameras: Sequence[Camera], pr
 
 
 def numbers_of(by: str, scene: LoadedScene, index: Index) -> NDArray[np.int64]:
-    """(M,) the "level" or the "chunk" of some splats of a file; without levels, all are of level 0."""
+    """Return (M,) the "level" or the "chunk" of some splats of a file; without levels, all are of level 0."""
     if by == "chunk":
         return scene.chunk_of(index)
     return np.zeros(len(index), np.int64) if scene.depth is None else scene.depth[index].astype(np.int64)

@@ -43,7 +43,7 @@ class Coloring:
 
 
 def ramp(stops: tuple[str, ...], count: int) -> NDArray[np.uint8]:
-    """(count, 3) colours, evenly spaced along a ramp; a single one is from its middle."""
+    """Return (count, 3) colours, evenly spaced along a ramp; a single one is from its middle."""
     table = np.array([list(bytes.fromhex(stop)) for stop in stops], np.float64)
     at = np.linspace(0, len(table) - 1, count) if count > 1 else np.array([(len(table) - 1) / 2])
     channels = [np.interp(at, np.arange(len(table)), channel) for channel in table.T]
@@ -51,13 +51,13 @@ def ramp(stops: tuple[str, ...], count: int) -> NDArray[np.uint8]:
 
 
 def range_of(values: NDArray[Any]) -> tuple[int, int]:
-    """The ends of a scale for some whole numbers: few of them at either end take no colours from the others."""
+    """Return the ends of a scale for some whole numbers: few of them at either end take no colours from the others."""
     low, high = np.percentile(values, [CLIPPED, 100 - CLIPPED]) if np.ptp(values) > 1 else (values.min(), values.max())
     return int(low), int(high)
 
 
 def whole_numbers(title: str, values: NDArray[Any], low: int, high: int) -> Coloring:
-    """A colour for each whole number from low to high; (N,) values beyond have the colour of that end."""
+    """Return a colour for each whole number from low to high; (N,) values beyond have the colour of that end."""
     count = high - low + 1
     colors = ramp(VIRIDIS, count)
     every = math.ceil(count / 12)
@@ -72,18 +72,18 @@ def whole_numbers(title: str, values: NDArray[Any], low: int, high: int) -> Colo
 
 
 def smooth(title: str, at: FloatArray, stops: tuple[str, ...], marks: list[Mark]) -> Coloring:
-    """A ramp without steps, for (N,) places on it, 0..1; those beyond have the colour of that end."""
+    """Return a ramp without steps, for (N,) places on it, 0..1; those beyond have the colour of that end."""
     colors = ramp(stops, 256)
     return Coloring(title, colors[np.rint(255 * np.clip(at, 0, 1)).astype(np.intp)], colors, tuple(marks))
 
 
 def top_opacity(values: FloatArray) -> float:
-    """Where a scale of D ends: at 1, or above it at the next tenth."""
+    """Return where a scale of D ends: at 1, or above it at the next tenth."""
     return max(1.0, math.ceil(10 * float(np.percentile(values, 100 - CLIPPED))) / 10)
 
 
 def log_range(logs: FloatArray) -> tuple[float, float]:
-    """The ends of a logarithmic scale, in powers of ten: what is as good as all the same gets no more contrast."""
+    """Return the ends of a logarithmic scale, in powers of ten, at least LEAST_DECADES apart."""
     low, high = (float(end) for end in np.percentile(logs, [CLIPPED, 100 - CLIPPED]))
     if high - low < LEAST_DECADES:
         low, high = (low + high - LEAST_DECADES) / 2, (low + high + LEAST_DECADES) / 2
@@ -91,7 +91,7 @@ def log_range(logs: FloatArray) -> tuple[float, float]:
 
 
 def log_marks(low: float, high: float) -> list[Mark]:
-    """Round numbers on a scale between two powers of ten."""
+    """Return round numbers on a scale between two powers of ten."""
     span = high - low
     factors = (1,) if span > 2.5 else (1, 2, 5) if span > 0.8 else (1, 1.25, 1.5, 2, 2.5, 3, 4, 5, 6, 8)
     decades = range(math.floor(low), math.ceil(high) + 1)
@@ -100,6 +100,21 @@ def log_marks(low: float, high: float) -> list[Mark]:
 
 
 def with_ends(marks: list[Mark], low: str | None, high: str | None, apart: float) -> list[Mark]:
-    """The marks of a scale with those of its ends, and without those that are nearer to them than `apart`."""
+    """Return the marks of a scale with those of its ends, and without those that are nearer to them than `apart`."""
     ends = [(place, text) for place, text in ((0.0, low), (1.0, high)) if text is not None]
     return [mark for mark in marks if all(abs(mark[0] - place) > apart for place, _ in ends)] + ends
+
+
+def nice_step(least: float) -> float:
+    """Return the smallest number of the form 1, 2 or 5 times a power of ten that is not below `least`."""
+    power = 10.0 ** math.floor(math.log10(least))
+    return next(step for step in (power, 2 * power, 5 * power, 10 * power, 20 * power) if step >= least * (1 - 1e-9))
+
+
+def ticks(low: float, high: float, least: float) -> list[tuple[float, str]]:
+    """Return round numbers from `low` to `high`, at least `least` apart, and their texts."""
+    step = nice_step(least)
+    digits = max(0, -math.floor(math.log10(step) + 1e-9))
+    first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
+    plain = step > 1e-5 and max(abs(low), abs(high)) < 1e7
+    return [(step * n, f"{step * n:.{digits}f}" if plain else f"{step * n:.6g}") for n in range(first, last + 1)]

@@ -8,13 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras.camera import Camera
+from ..model.falloff import MIN_ALPHA
 from ..model.splats import FloatArray
 from . import rasterizer
-from .kernels import backward, project_gradients
-from .kernels.project_gradients import CENTER, LOD_OPACITY, LOG_SCALE, RGB, TURN
+from .kernels import backward
+from .kernels.backward import CENTER, LOD_OPACITY, LOG_SCALE, RGB, TURN
 from .kernels.shade import sh_gradients
 from .rasterizer import Image, Projected, Tiles
-from .settings import MIN_ALPHA, RasterSettings
+from .settings import RasterSettings
 from .shading import ShadedSplats
 
 
@@ -56,7 +57,7 @@ class Drawing:
     tiles: Tiles
 
     def gradients(self, by_image: Image) -> SplatGradients:
-        """Derivatives of a loss by each splat, the same for any number of threads.
+        """Return derivatives of a loss by each splat, the same for any number of threads.
 
         Where a splat ends (at a number of standard deviations, at the least alpha, behind opaque ones) is held
         constant, and so is the shape of a splat whose axes are shortened to the largest radius.
@@ -72,9 +73,9 @@ class Drawing:
         drawn = backward.Drawn(screen, boxes, self.tiles.start, self.tiles.splats, self.tiles.stop, across)
         by_image = np.ascontiguousarray(by_image, np.float32)
         backward.weigh_tiles(drawn, first, np.float32(MIN_ALPHA), self.image, by_image, sums)
-        found = np.zeros((len(self.splats), project_gradients.GRADIENT_COLUMNS), np.float32)
+        found = np.zeros((len(self.splats), backward.GRADIENT_COLUMNS), np.float32)
         arguments = rasterizer.arguments(self.splats, self.camera, self.settings)
-        project_gradients.carry_back(*arguments, project_gradients.Rows(screen, first, sums), found)
+        backward.carry_back(*arguments, backward.Rows(screen, first, sums), found)
         return SplatGradients(
             center=found[:, CENTER : CENTER + 3],
             log_scale=found[:, LOG_SCALE : LOG_SCALE + 3],
@@ -85,7 +86,7 @@ class Drawing:
 
 
 def draw(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> Drawing:
-    """The picture that `rasterizer.draw` draws, with what its gradients need.
+    """Draw the picture of `rasterizer.draw`, and keep what its gradients need.
 
     Raises:
         ValueError: the settings have the profile `shifted`, whose gradients are not implemented.
@@ -102,7 +103,7 @@ def draw(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> Draw
 def by_sh(
     center: FloatArray, eye: NDArray[np.float64], coefficients: int, rgb: FloatArray, by_rgb: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Derivatives by a splat's own colour and its spherical harmonics, of those by the colour that a camera sees.
+    """Return derivatives by a splat's own colour and its SH, of those by the colour that a camera sees.
 
     The direction from the camera to a splat is held constant.
 

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from ..cameras.camera import Camera
 from ..cameras.pose import FARTHEST, FLIP
+from ..model.falloff import MAX_STD_DEV, MIN_ALPHA, STD_DEV_PER_D
 from ..support.jit import threads_in_use
-from .kernels import ellipse, project, raster, tiles
-from .settings import BLUR, CLIP, MAX_STD_DEV, MIN_ALPHA, STD_DEV_PER_D, RasterSettings
+from .kernels import ellipse, project, raster
+from .settings import BLUR, CLIP, RasterSettings
 from .shading import ShadedSplats
 
 Image = NDArray[np.float32]
@@ -60,7 +61,7 @@ class Tiles:
 
 
 def draw(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> Image:
-    """What a camera sees: (height, width, 4) float32, red, green, blue, multiplied by alpha, and alpha; 0..1.
+    """Draw what a camera sees: (height, width, 4) float32, red, green, blue, multiplied by alpha, and alpha; 0..1.
 
     The image is the same for any number of threads.
     """
@@ -68,9 +69,9 @@ def draw(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> Imag
 
 
 def draw_projected(seen: Projected, camera: Camera, settings: RasterSettings) -> tuple[Image, Tiles]:
-    """The picture of splats on the screen, and its tiles."""
+    """Draw splats on the screen; return the picture and its tiles."""
     across, down = tiles_across(camera)
-    start, order = tiles.sort_into_tiles(seen.keys, seen.boxes, across, down, CHUNKS * threads_in_use())
+    start, order = raster.sort_into_tiles(seen.keys, seen.boxes, across, down, CHUNKS * threads_in_use())
     drawn = Tiles(start, order, np.empty(across * down, np.int64))
     image = np.empty((camera.height, camera.width, 4), np.float32)
     is_design = settings.profile == "shifted"
@@ -79,7 +80,7 @@ def draw_projected(seen: Projected, camera: Camera, settings: RasterSettings) ->
 
 
 def tiles_across(camera: Camera) -> tuple[int, int]:
-    """Numbers of tiles across and down the picture of a camera.
+    """Return numbers of tiles across and down the picture of a camera.
 
     Raises:
         ValueError: the picture is larger than `MAX_SIDE`.
@@ -90,7 +91,7 @@ def tiles_across(camera: Camera) -> tuple[int, int]:
 
 
 def project_splats(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> Projected:
-    """The splats on the screen; `screen` and `boxes` are buffers, which the next call overwrites."""
+    """Project splats onto the screen; `screen` and `boxes` are buffers, which the next call overwrites."""
     tiles_across(camera)
     screen, boxes, keys = _buffers(len(splats))
     project.project(*arguments(splats, camera, settings), settings.sort == "radial", screen, keys, boxes)
@@ -100,7 +101,7 @@ def project_splats(splats: ShadedSplats, camera: Camera, settings: RasterSetting
 def arguments(
     splats: ShadedSplats, camera: Camera, settings: RasterSettings
 ) -> tuple[project.ShadedColumns, NDArray[np.float32], ellipse.Lens, ellipse.Limits]:
-    """What the kernels take for splats, a camera and settings: `splats`, `world_to_camera`, `lens` and `limits`."""
+    """Return the arguments of kernels: splats, world to camera, `Lens` and `Limits`."""
     columns = project.ShadedColumns(splats.center, splats.scale, splats.quat_xyzw, splats.lod_opacity, splats.rgb)
     lens = ellipse.Lens(*map(np.float32, (*camera.focal, *camera.principal, camera.width, camera.height)))
     near, far, radius = settings.near, settings.far, settings.max_radius
@@ -109,7 +110,7 @@ def arguments(
 
 
 def _buffers(count: int) -> tuple[NDArray[np.float32], NDArray[np.int16], NDArray[np.uint64]]:
-    """Working memory for projected splats, reused by each thread, because the first access to new memory is slow."""
+    """Return working memory for projected splats, kept by each thread, as the first access to new memory is slow."""
     if len(getattr(_kept, "keys", ())) < count:
         _kept.screen, _kept.boxes = _aligned(count), np.empty((count, 4), np.int16)
         _kept.keys = np.empty(count, np.uint64)
@@ -117,13 +118,13 @@ def _buffers(count: int) -> tuple[NDArray[np.float32], NDArray[np.int16], NDArra
 
 
 def _aligned(count: int) -> NDArray[np.float32]:
-    """(count, `project.COLUMNS`) of which each row is one line of the processor's cache."""
+    """Return (count, `project.COLUMNS`) of which each row is one line of the processor's cache."""
     floats = np.empty((count + 1) * project.COLUMNS, np.float32)
     first = -floats.ctypes.data % CACHE_LINE // floats.itemsize
     return floats[first : first + count * project.COLUMNS].reshape(count, project.COLUMNS)
 
 
 def world_to_camera(camera: Camera) -> NDArray[np.float32]:
-    """(3, 4): into axes with y down, looking along z; of cameras at the end of float32's range, clipped to that."""
+    """Return the (3, 4) matrix into axes with y down, looking along z, clipped to the range of float32."""
     turned = camera.camera_to_world @ FLIP
     return np.clip(np.linalg.inv(turned)[:3], -FARTHEST, FARTHEST).astype(np.float32)

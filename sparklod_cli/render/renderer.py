@@ -73,7 +73,7 @@ class Renderer:
         return color_by.scale_of_splats(by, self.source, cameras, progress)
 
     def draw(self, camera: Camera) -> Drawn:
-        """The picture of a camera.
+        """Draw the picture of a camera.
 
         Raises:
             BackendError: the backend cannot draw here.
@@ -96,7 +96,7 @@ class Renderer:
         return Drawn(averaged(image, self.settings.supersample), None, len(cut))
 
     def _shaded(self, cut: Cut, camera: Camera) -> ShadedSplats:
-        """Colours that are not the splats' own are not lit either."""
+        """Shade splats, without SH where colours are not their own."""
         degree = self.settings.max_sh if self.settings.color_by is None else 0
         return shade([(part.splats.with_max_sh(degree), part.object_to_world) for part in cut.parts], camera)
 
@@ -117,7 +117,7 @@ class Renderer:
         return averaged(counts[..., None], self.settings.supersample)[..., 0]
 
     def _depth(self, cut: Cut, camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """(H, W) the mean depth of the visible splats, world units, NaN where there is none; and (H, W) alpha."""
+        """Return (H, W) mean depths of the visible splats, world units, NaN where there is none, and (H, W) alpha."""
         raster, fine = self.settings.raster, finer(camera, self.settings.supersample)
         with _KERNELS:
             shaded = self._shaded(cut, fine)
@@ -141,7 +141,7 @@ class Renderer:
 
 
 def finer(camera: Camera, times: int) -> Camera:
-    """The same camera with `times` as many pixels along each side."""
+    """Return the same camera with `times` as many pixels along each side."""
     if times == 1:
         return camera
     return dataclasses.replace(
@@ -154,7 +154,7 @@ def finer(camera: Camera, times: int) -> Camera:
 
 
 def averaged(image: Image, times: int) -> Image:
-    """(H, W, C) means of squares of `times` x `times` pixels."""
+    """Return (H, W, C) means of squares of `times` x `times` pixels."""
     if times == 1:
         return image
     height, width = image.shape[0] // times, image.shape[1] // times

@@ -10,15 +10,8 @@ from ..support.defaults import FARTHEST, MAX_SH_DEGREE, MAX_SUPERSAMPLE
 from ..support.setting_fields import CheckedSettings, Range, setting, whole
 from .backends import BACKENDS
 
-#: How far out a splat is drawn, in standard deviations: Spark's `maxStdDev`, sqrt(8); a merged one farther, by this for
-#: each that its D is above 1.
-MAX_STD_DEV, STD_DEV_PER_D = 8**0.5, 0.7
-
 #: Pixels squared that are added to the covariance on the screen, for which opacity makes up: Spark's `blurAmount`.
 BLUR = 0.3
-
-#: Where a splat adds less than half a step of 8 bits, it is not drawn: Spark's `minAlpha`.
-MIN_ALPHA = 0.5 / 255
 
 #: No splat is drawn farther from its centre, in pixels of the final picture: Spark's `maxPixelRadius`.
 MAX_PIXEL_RADIUS = 512.0

@@ -37,7 +37,7 @@ class ShadedSplats:
 
 
 def shade(parts: Sequence[tuple[Splats, Matrix]], camera: Camera) -> ShadedSplats:
-    """Splats with their places, (4, 4) object to world, as a camera sees them.
+    """Shade splats with their places, (4, 4) object to world, as a camera sees them.
 
     Spherical harmonics are those of the direction from the camera to a splat's centre, in the space of its object.
     """

@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras.camera import Camera
+from ..model.falloff import MIN_ALPHA
 from ..model.gaussian import size_factor
 from . import rasterizer
 from .backends import BACKENDS
 from .kernels import bands
 from .rasterizer import Image
-from .settings import CLIP, MIN_ALPHA, RasterSettings
+from .settings import CLIP, RasterSettings
 from .shading import ShadedSplats
 
 #: How opaque a billboard is.
@@ -48,7 +49,7 @@ def draw(
     settings: RasterSettings,
     options: Mapping[str, Any] | None = None,
 ) -> Image:
-    """What a camera sees; the image is that of `rasterizer.draw`.
+    """Draw what a camera sees, as `rasterizer.draw` does.
 
     Args:
         style: one of `settings.STYLES`. "points" are opaque, a pixel each, "billboards" discs of one opacity, as wide
@@ -94,7 +95,7 @@ def draw(
 
 
 def on_screen(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> OnScreen:
-    """The splats between near and far whose centres are inside the picture, or within `CLIP` of it."""
+    """Return the splats between near and far whose centres are inside the picture, or within `CLIP` of it."""
     local = (splats.center - camera.position.astype(np.float32)) @ camera.camera_to_world[:3, :3].astype(np.float32)
     depth = -local[:, 2]
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -112,7 +113,7 @@ def on_screen(splats: ShadedSplats, camera: Camera, settings: RasterSettings) ->
 
 
 def overdraw(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> NDArray[np.float32]:
-    """(height, width) number of splats blended into each pixel, including hidden ones.
+    """Return (height, width) number of splats blended into each pixel, including hidden ones.
 
     Splats are those that the backend numba draws.
     """

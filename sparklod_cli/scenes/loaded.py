@@ -17,13 +17,12 @@ from ..lod.detail_traversal import DetailForest, DetailTraversal
 from ..lod.settings import LodSettings
 from ..lod.traversal import Forest, Traversal, TreeCut, TreeInstance
 from ..model.balls import Balls, balls_of
-from ..model.foveation import Foveation
 from ..model.gaussian import placed
-from ..model.instances import Instance, Matrix
+from ..model.instances import Foveation, Instance, Matrix
 from ..model.nodes import Nodes
 from ..model.scene import Scene
 from ..model.splats import Splats
-from ..model.up_axis import common, rotated
+from ..model.transforms import common, rotated
 from ..support.units import count_of
 from .loaded_scene import Index, LoadedDetail, LoadedScene, nodes_of
 from .pages import PagedForest, PagedScene, sampled_balls
@@ -131,7 +130,7 @@ class Scenes:
 
     @property
     def up(self) -> str | None:
-        """The axis of the world that points up, one of `up_axis.AXES`, where all files say the same; else None."""
+        """The axis of the world that points up, one of `transforms.AXES`, where all files say the same; else None."""
         placed = zip(self.instances, self.of_instance, strict=True)
         return common(rotated(loaded.scene.up, at.transform.rotation) for at, loaded in placed)
 

@@ -12,11 +12,9 @@ from numpy.typing import NDArray
 from ..codecs.gpu import loaded_nodes, lod_tree
 from ..io.details import LevelFiles
 from ..lod.detail_traversal import DetailFiles
-from ..model.coding import FileCoding
-from ..model.detail import DetailScene
 from ..model.lod_tree import LodTree
 from ..model.nodes import CHUNK_NODES, Nodes
-from ..model.scene import Scene
+from ..model.scene import DetailScene, FileCoding, Scene
 from ..model.splats import COLUMNS, Splats
 
 Index = NDArray[np.signedinteger]

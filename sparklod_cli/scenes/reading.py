@@ -12,10 +12,9 @@ from ..codecs.rounding import after
 from ..io import examine_scene, read_levels, size_of_input
 from ..io.details import has_levels, read_level_files
 from ..io.rad_file import RadFile
-from ..model.detail import DetailScene
 from ..model.instances import Instance
 from ..model.nodes import CHUNK_NODES
-from ..model.scene import Scene
+from ..model.scene import DetailScene, Scene
 from ..model.selection import Selection, describe
 from ..model.splats import COLUMNS
 from ..support.errors import FormatError, InvalidSplatsError, SparklodError, TreeError, memory_errors_translated

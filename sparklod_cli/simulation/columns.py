@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from ..support.errors import SparklodError
-from ..support.similar import near
+from ..support.printable import near
 from ..tables.columns import FRAME, Column
 
 COLUMNS = (

@@ -41,7 +41,7 @@ class Address:
     url: str
 
     def __str__(self) -> str:
-        """The address without a password, or a query, which may be a signature."""
+        """Return the address without a password, or a query, which may be a signature."""
         return redacted(self.url)
 
     def __repr__(self) -> str:
@@ -75,22 +75,22 @@ class Address:
         return Address(f"{scheme}://{folder}{query}") if folder else self
 
     def exists(self) -> bool:
-        """Whether there is a file or folder."""
+        """Return whether there is a file or folder."""
         with self._opened() as (system, path):
             return bool(system.exists(path))
 
     def is_file(self) -> bool:
-        """Whether it is a file."""
+        """Return whether it is a file."""
         with self._opened() as (system, path):
             return bool(system.isfile(path))
 
     def is_dir(self) -> bool:
-        """Whether it is a folder."""
+        """Return whether it is a folder."""
         with self._opened() as (system, path):
             return bool(system.isdir(path))
 
     def size(self) -> int:
-        """Bytes of the file."""
+        """Return the size of the file in bytes."""
         with self._opened() as (system, path):
             size = system.info(path)["size"]
         if size is None:
@@ -98,14 +98,14 @@ class Address:
         return int(size)
 
     def version(self) -> str:
-        """A text that is another one when the file was changed."""
+        """Return a text that changes with the file."""
         with self._opened() as (system, path):
             return str(system.ukey(path))
 
     def open(
         self, mode: Literal["rb"] = "rb", buffering: int = READ_AHEAD, *, size: int | None = None
     ) -> io.BufferedReader:
-        """Opens the file for reading, wherever in it.
+        """Open the file for reading, wherever in it.
 
         Args:
             mode: as of a path.
@@ -115,7 +115,7 @@ class Address:
         return io.BufferedReader(_Ranged(self, self.size() if size is None else size), buffering)
 
     def read(self, start: int, stop: int) -> bytes:
-        """Some bytes of the file."""
+        """Read a range of bytes of the file."""
         with self._opened() as (system, path):
             data = bytes(system.cat_file(path, start=start, end=stop))
         if len(data) > stop - start:
@@ -123,7 +123,7 @@ class Address:
         return data
 
     def write(self, pieces: Iterable[bytes | memoryview]) -> int:
-        """Writes the file, which appears when all of it is there, and returns its size.
+        """Write the file, which appears when all of it is there, and return its size.
 
         It is made as a temporary file on this machine first, so that nothing is sent of what fails halfway.
         """
@@ -137,7 +137,7 @@ class Address:
         return size
 
     def unlink(self, missing_ok: bool = False) -> None:
-        """Removes the file."""
+        """Remove the file."""
         try:
             with self._opened() as (system, path):
                 system.rm_file(path)
@@ -146,7 +146,7 @@ class Address:
                 raise
 
     def files(self) -> list[str]:
-        """The names of all files in this folder and those in it, as they are below it."""
+        """Return the names of all files in this folder and those in it, as they are below it."""
         with self._opened() as (system, path):
             try:
                 found = system.find(path)
@@ -157,7 +157,7 @@ class Address:
 
     @contextlib.contextmanager
     def _opened(self) -> Iterator[tuple[Any, str]]:
-        """The file system of the address, and what the latter is called there."""
+        """Return the file system of the address, and what the latter is called there."""
         system, path = _system(self.url)
         try:
             yield system, path
@@ -173,7 +173,7 @@ class Address:
             raise OSError(errno.EIO, f"{type(error).__name__}: {self._shown(error)}", str(self)) from None
 
     def _shown(self, error: Exception | str) -> str:
-        """The text of an error, which may have the address in it, or parts that must not be shown."""
+        """Return the text of an error, which may have the address in it, or parts that must not be shown."""
         return without_secrets(str(error), self.url)
 
 
@@ -212,7 +212,7 @@ Place = Path | Address
 
 
 def place_of(text: str) -> Place:
-    """What a text names: an address, or a path; file:// is a path."""
+    """Return the address or path that a text names; file:// is a path."""
     match = ADDRESS.match(text)
     if match is None:
         return Path(text)
@@ -222,17 +222,17 @@ def place_of(text: str) -> Place:
 
 
 def absolute(place: Place) -> Place:
-    """The same file for a process whose working folder is another one; - stays what it is."""
+    """Return the path of a file for a process with another working folder; - stays as it is."""
     return place if isinstance(place, Address) or str(place) == "-" else place.absolute()
 
 
 def size_of(place: Place) -> int:
-    """Bytes of a file, wherever it is."""
+    """Return the size of a file in bytes, wherever it is."""
     return place.size() if isinstance(place, Address) else place.stat().st_size
 
 
 def _cut(url: str) -> tuple[str, str]:
-    """An address before its query, and the query with its mark, which only those of the web have."""
+    """Return an address before its query, and the query with its mark, which only those of the web have."""
     if not url.lower().rpartition("::")[2].startswith(("http://", "https://")):
         return url, ""
     path, mark, query = url.partition("?")
@@ -241,7 +241,7 @@ def _cut(url: str) -> tuple[str, str]:
 
 @functools.lru_cache(maxsize=64)
 def _system(url: str) -> tuple[Any, str]:
-    """The file system that opens an address, and what the address is called there."""
+    """Return the file system that opens an address, and what the address is called there."""
     with optional_import("addresses are opened by fsspec and packages for each service", "cloud"):
         import fsspec
 

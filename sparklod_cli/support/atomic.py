@@ -7,13 +7,82 @@ name, and is locked while its writer is alive, so that the next run can recognis
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
+import re
+import secrets
+import shutil
 import stat
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-from . import leftovers
+try:
+    import fcntl
+except ImportError:  # Windows, where a file that is open cannot be removed by others
+    fcntl = None  # type: ignore[assignment]
+
+HAS_LOCKS = fcntl is not None
+
+#: Names of incomplete files, and of folders of several of them.
+PARTS, STAGES = ".sparklod-{}.part", ".sparklod-{}.parts"
+
+#: Folders are removed with all that is in them, so their names must be ours to the letter.
+_STAGE = re.compile(r"\.sparklod-[0-9a-f]{16}\.parts")
+
+
+def unique(name: str) -> str:
+    """Return `PARTS` or `STAGES` with a number that nobody else has."""
+    return name.format(secrets.token_hex(8))
+
+
+def lock(descriptor: int) -> None:
+    """Lock a file or folder until it is closed or its process ends; do nothing where there are no locks."""
+    if fcntl is not None:
+        with contextlib.suppress(OSError):
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+
+
+def try_lock(descriptor: int) -> bool:
+    """Lock a file as `lock` does, without waiting; return False if somebody else has locked it."""
+    if fcntl is None:
+        return True
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:  # a file system without locks
+        return True
+    return True
+
+
+@functools.lru_cache(256)
+def sweep(folder: Path) -> None:
+    """Remove what killed writers have left in a folder; once, as it may get thousands of files."""
+    with contextlib.suppress(OSError):
+        for path in [*folder.glob(PARTS.format("*")), *folder.glob(STAGES.format("*"))]:
+            with contextlib.suppress(OSError):
+                if fcntl is not None:
+                    _remove_unlocked(path)
+                elif path.match(PARTS.format("*")):
+                    path.unlink()
+
+
+def _remove_unlocked(path: Path) -> None:
+    """Remove a file or folder of this user that no process has locked; raise `OSError` if one has."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)  # it may be read-only
+    try:
+        status = os.fstat(descriptor)
+        is_stage = stat.S_ISDIR(status.st_mode) and _STAGE.fullmatch(path.name)
+        if (is_stage or stat.S_ISREG(status.st_mode)) and status.st_uid == os.geteuid():
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if is_stage:
+                shutil.rmtree(path)
+            else:
+                path.unlink()
+    finally:
+        os.close(descriptor)
+
 
 #: The flag that opens an unnamed file in a folder; None where the system has none.
 UNNAMED: int | None = getattr(os, "O_TMPFILE", None)
@@ -28,7 +97,7 @@ _COPY_BYTES = 1 << 20  # per read when a file is copied
 
 
 def write(target: Path, pieces: Iterable[bytes | memoryview], *, overwrite: bool, sync: bool = True) -> int:
-    """Writes a file that appears only when it is complete, and returns its size in bytes.
+    """Write a file that appears only when it is complete, and return its size in bytes.
 
     A new file gets the permissions that the umask allows. A replacement gets the permissions of the file it replaces,
     except set-user-id, set-group-id and sticky, and never has more while it is written.
@@ -43,7 +112,7 @@ def write(target: Path, pieces: Iterable[bytes | memoryview], *, overwrite: bool
         FileExistsError: the file exists, and `overwrite` is not set.
         OSError: the file system reported an error.
     """
-    leftovers.sweep(target.parent)
+    sweep(target.parent)
     descriptor = _open_unnamed(target, overwrite)
     if descriptor is None:
         return _write_named(target, pieces, overwrite, sync)
@@ -61,7 +130,7 @@ def write(target: Path, pieces: Iterable[bytes | memoryview], *, overwrite: bool
 
 
 def fill(file: BinaryIO, pieces: Iterable[bytes | memoryview], *, sync: bool = True) -> int:
-    """Writes the content of a file and syncs it, if that is asked for; returns its size in bytes."""
+    """Write the content of a file, sync it if requested, and return its size in bytes."""
     size = sum(map(file.write, pieces))
     file.flush()
     if sync:
@@ -70,7 +139,7 @@ def fill(file: BinaryIO, pieces: Iterable[bytes | memoryview], *, sync: bool = T
 
 
 def _replaced_mode(target: Path, overwrite: bool) -> int | None:
-    """Permissions of the file that will be replaced; None if there is none."""
+    """Return permissions of the file that will be replaced; None if there is none."""
     try:
         return stat.S_IMODE(target.stat().st_mode) & 0o777 if overwrite else None
     except FileNotFoundError:
@@ -78,13 +147,13 @@ def _replaced_mode(target: Path, overwrite: bool) -> int | None:
 
 
 def _first_mode(target: Path, overwrite: bool) -> int:
-    """Permissions to create a file with, before the umask: never more than the complete file will have."""
+    """Return permissions to create a file with, before the umask: never more than the complete file will have."""
     mode = _replaced_mode(target, overwrite)
     return 0o666 if mode is None else mode & 0o600
 
 
 def _open_unnamed(target: Path, overwrite: bool) -> int | None:
-    """Opens an unnamed file in the folder of `target`; None if that is impossible."""
+    """Open an unnamed file in the folder of `target`; None if that is impossible."""
     if UNNAMED is None or not OPEN_FILES.exists():
         return None
     try:
@@ -94,7 +163,7 @@ def _open_unnamed(target: Path, overwrite: bool) -> int | None:
 
 
 def _name(file: BinaryIO, target: Path, overwrite: bool) -> None:
-    """Gives a complete, unnamed file its name."""
+    """Give a complete, unnamed file its name."""
     number = file.fileno()
     mode = _replaced_mode(target, overwrite)
     if mode is None:
@@ -106,7 +175,7 @@ def _name(file: BinaryIO, target: Path, overwrite: bool) -> None:
             mode = _replaced_mode(target, overwrite)  # another process created it first
     if mode is not None:
         os.fchmod(number, mode)
-    leftovers.lock(number)
+    lock(number)
     temporary = _part_of(target)
     try:
         _link(number, temporary)  # link() cannot replace a file, so it has two names for a moment
@@ -121,7 +190,7 @@ def _link(number: int, path: Path) -> None:
 
 
 def _write_named(target: Path, pieces: Iterable[bytes | memoryview], overwrite: bool, sync: bool) -> int:
-    """As `write`, with a file that has a temporary name until it is complete."""
+    """Write a file as `write` does, under a temporary name until it is complete."""
     temporary, descriptor = _open_part(target, overwrite)
     try:
         with os.fdopen(descriptor, "w+b") as file:
@@ -129,7 +198,7 @@ def _write_named(target: Path, pieces: Iterable[bytes | memoryview], overwrite: 
             mode = _replaced_mode(target, overwrite)
             if mode is not None:
                 temporary.chmod(mode)
-            if not leftovers.HAS_LOCKS:
+            if not HAS_LOCKS:
                 file.close()  # Windows cannot rename an open file
             rename(temporary, target, overwrite)
     finally:
@@ -138,16 +207,16 @@ def _write_named(target: Path, pieces: Iterable[bytes | memoryview], overwrite: 
 
 
 def _part_of(target: Path) -> Path:
-    """A unique temporary name in the folder of a file."""
-    return target.with_name(leftovers.unique(leftovers.PARTS))
+    """Return a unique temporary name in the folder of a file."""
+    return target.with_name(unique(PARTS))
 
 
 def _open_part(target: Path, overwrite: bool) -> tuple[Path, int]:
-    """Creates a locked temporary file in the folder of `target`; returns its path and descriptor."""
+    """Create a locked temporary file in the folder of `target`; return its path and descriptor."""
     while True:
         temporary = _part_of(target)
         descriptor = os.open(temporary, _FLAGS | os.O_CREAT | os.O_EXCL, _first_mode(target, overwrite))
-        leftovers.lock(descriptor)
+        lock(descriptor)
         with contextlib.suppress(FileNotFoundError):  # another process removed it before it was locked
             if os.path.samestat(os.fstat(descriptor), temporary.stat()):
                 return temporary, descriptor
@@ -155,7 +224,7 @@ def _open_part(target: Path, overwrite: bool) -> tuple[Path, int]:
 
 
 def rename(temporary: Path, target: Path, overwrite: bool) -> None:
-    """Gives a complete file its name; `FileExistsError` if that is taken, and `overwrite` is not set."""
+    """Give a complete file its name; `FileExistsError` if that is taken, and `overwrite` is not set."""
     if overwrite:
         temporary.replace(target)
         return
@@ -167,3 +236,16 @@ def rename(temporary: Path, target: Path, overwrite: bool) -> None:
         if target.exists():
             raise FileExistsError from None
         temporary.replace(target)
+
+
+@contextlib.contextmanager
+def created(folder: Path) -> Iterator[None]:
+    """Create a folder for the time of a context, which removes those that it created if they are empty at its end."""
+    new = [each for each in (folder, *folder.parents) if not each.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        yield
+    finally:
+        with contextlib.suppress(OSError):  # the first that has something in it ends this
+            for each in new:
+                each.rmdir()

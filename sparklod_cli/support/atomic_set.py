@@ -15,7 +15,7 @@ import stat
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from pathlib import Path, PurePosixPath
 
-from . import atomic, leftovers
+from . import atomic
 
 #: The folder inside the hidden one for the files that are being replaced.
 FORMER = "former"
@@ -28,7 +28,7 @@ def write(
     overwrite: bool,
     outdated: Callable[[Collection[str]], Iterable[str]] = lambda names: (),
 ) -> int:
-    """Writes files of one folder, and of folders there, that appear together; returns their size in bytes.
+    """Write files of one folder, and of folders there, that appear together; return their size in bytes.
 
     The last file is the one that readers open first. Where files are replaced, that one is taken away before any other
     is touched, and is the last to get its name: for that time, some milliseconds, there is none. An error or an
@@ -48,7 +48,7 @@ def write(
             a link. It has the path.
         OSError: the file system reported an error.
     """
-    leftovers.sweep(folder)
+    atomic.sweep(folder)
     with _stage(folder) as stage:
         size, names = 0, list[str]()
         for name, pieces in files:
@@ -80,13 +80,13 @@ def write(
 
 
 def _folders_of(names: Iterable[str]) -> list[str]:
-    """The folders that files are in, by their names, those first that others are in."""
+    """Return the folders that files are in, by their names, those first that others are in."""
     found = {str(parent) for name in names for parent in PurePosixPath(name).parents if parent.name}
     return sorted(found, key=lambda folder: (folder.count("/"), folder))
 
 
 def _remove_empty(folders: Iterable[Path]) -> None:
-    """Removes folders that have nothing in them."""
+    """Remove folders that have nothing in them."""
     for folder in reversed(list(folders)):
         with contextlib.suppress(OSError):
             folder.rmdir()
@@ -105,7 +105,7 @@ def _refuse_existing(paths: Iterable[Path]) -> None:
 
 
 def _put_aside(stage: Path, names: Sequence[str]) -> None:
-    """Moves the files that will be replaced into the hidden folder; their permissions go over to the new ones."""
+    """Move the files that will be replaced into the hidden folder; their permissions go over to the new ones."""
     for name in names:
         former, part = stage.parent / name, stage / name
         with contextlib.suppress(FileNotFoundError):
@@ -119,7 +119,7 @@ def _put_aside(stage: Path, names: Sequence[str]) -> None:
 
 
 def _undo(stage: Path, names: Sequence[str]) -> None:
-    """Takes the names away again that files have been given, and gives former files theirs back, the last file last.
+    """Take the names away again that files have been given, and give former files theirs back, the last file last.
 
     What has been done is seen in the folders, so that an interrupt between two steps is undone, too.
     """
@@ -138,7 +138,7 @@ def _undo(stage: Path, names: Sequence[str]) -> None:
 
 @contextlib.contextmanager
 def _stage(folder: Path) -> Iterator[Path]:
-    """A new hidden folder, locked, which nobody else can look into; it is removed at the end."""
+    """Return a new hidden folder, locked, which nobody else can look into; it is removed at the end."""
     stage, descriptor = _open_stage(folder)
     try:
         yield stage
@@ -149,15 +149,15 @@ def _stage(folder: Path) -> Iterator[Path]:
 
 
 def _open_stage(folder: Path) -> tuple[Path, int | None]:
-    """Creates a locked, hidden folder; its path, and the descriptor that holds the lock, None where there are none."""
+    """Create a locked, hidden folder; its path, and the descriptor that holds the lock, None where there are none."""
     while True:
-        stage = folder / leftovers.unique(leftovers.STAGES)
+        stage = folder / atomic.unique(atomic.STAGES)
         stage.mkdir(0o700)
-        if not leftovers.HAS_LOCKS:
+        if not atomic.HAS_LOCKS:
             return stage, None
         with contextlib.suppress(FileNotFoundError):  # another process removed it before it was locked
             descriptor = os.open(stage, os.O_RDONLY | os.O_CLOEXEC)
-            leftovers.lock(descriptor)
+            atomic.lock(descriptor)
             if stage.exists():
                 return stage, descriptor
             os.close(descriptor)

@@ -111,7 +111,7 @@ class OutOfMemoryError(SparklodError):
 
 @contextlib.contextmanager
 def memory_errors_translated() -> Iterator[None]:
-    """Translates every error of the body that means memory ran out into an `OutOfMemoryError` that names the array."""
+    """Translate every error of the body that means memory ran out into an `OutOfMemoryError` that names the array."""
     try:
         yield
     except Exception as error:
@@ -122,7 +122,7 @@ def memory_errors_translated() -> Iterator[None]:
 
 
 def out_of_memory(error: BaseException) -> str | None:
-    """The message for an error that means memory ran out; None for any other error."""
+    """Return the message for an error that means memory ran out; None for any other error."""
     text = str(error).lower()
     is_out_of_memory = (
         isinstance(error, MemoryError)
@@ -136,7 +136,7 @@ def out_of_memory(error: BaseException) -> str | None:
 
 
 def _array_of(error: Any) -> str:
-    """The shape and size of the array that numpy could not allocate, from its `MemoryError`; empty for other errors."""
+    """Return shape and size of the array that numpy could not allocate, of its `MemoryError`; else empty."""
     shape, dtype = getattr(error, "shape", None), getattr(error, "dtype", None)
     if not shape or dtype is None:
         return ""

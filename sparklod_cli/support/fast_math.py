@@ -14,7 +14,7 @@ ROOT_HALF = np.int32(0x3F3504F3)
 
 @kernel(inline=True)
 def exp2(t):
-    """2 ** t of a float32 t from -126 to 0, with a relative error of at most 2e-7."""
+    """Return 2 ** t of a float32 t from -126 to 0, with a relative error of at most 2e-7."""
     whole = np.int32(np.int32(t) - np.int32(1))
     part = t - f32(whole)  # above 0, at most 1
     p = f32(0.0018775767)
@@ -28,7 +28,7 @@ def exp2(t):
 
 @kernel(inline=True)
 def log2(v):
-    """The binary logarithm of a positive normal float32, with a relative error of at most 4e-7, near 1 as well."""
+    """Return log2 of a positive normal float32, with a relative error of at most 4e-7, near 1 as well."""
     bits = np.float32(v).view(np.int32)
     whole = np.int32((bits - ROOT_HALF) >> np.int32(23))
     m = np.int32(bits - np.int32(whole << np.int32(23))).view(np.float32)  # from sqrt(1 / 2) to sqrt(2)

@@ -51,7 +51,7 @@ _leaving = threading.Lock()
 
 
 def handle() -> None:
-    """Makes signals raise `KeyboardInterrupt`, or end the process at once while kernels are being compiled.
+    """Make signals raise `KeyboardInterrupt`, or end the process at once while kernels are being compiled.
 
     Ending at once loses nothing: outputs and the kernel cache are consistent at all times.
     """
@@ -82,7 +82,7 @@ def handle() -> None:
 
 
 def came() -> bool:
-    """Whether a signal has interrupted the run.
+    """Return whether a signal has interrupted the run.
 
     A failure after that is a consequence: libraries turn a `KeyboardInterrupt` into errors of their own, as the import
     of numpy's C modules does.
@@ -92,7 +92,7 @@ def came() -> bool:
 
 @contextlib.contextmanager
 def deferred() -> Iterator[Callable[[], bool]]:
-    """Lets work that can stop early do so by itself at the first Ctrl-C; yields the function that tells it to.
+    """Let work that can stop early do so by itself at the first Ctrl-C; yield the function that tells it to.
 
     `came` knows of that Ctrl-C. A second one, and every other signal, interrupts as ever, and so does the first one
     after the context has ended. Without `handle`, as in a library, nothing is deferred.
@@ -106,13 +106,13 @@ def deferred() -> Iterator[Callable[[], bool]]:
 
 
 def ignore() -> None:
-    """Ignores the signals; called at the end of the process, when all work is done."""
+    """Ignore the signals; called at the end of the process, when all work is done."""
     for number in ENDING:
         signal.signal(number, signal.SIG_IGN)
 
 
 def _raise_again_where_lost(interrupt: Callable[[int, FrameType | None], None], number: int, writer: int) -> None:
-    """Has an interruption raised again that came inside `__del__` or a callback of a weak reference, as imports use.
+    """Have an interruption raised again that came inside `__del__` or a callback of a weak reference, as imports use.
 
     Python prints what is raised there and goes on.
     """
@@ -129,7 +129,7 @@ def _raise_again_where_lost(interrupt: Callable[[int, FrameType | None], None], 
 
 
 def _watch(reader: int, handled: list[signal.Signals]) -> None:
-    """Runs in its own thread and ends the process while the main thread is inside LLVM."""
+    """Watch for signals, in a thread of its own, and end the process while the main thread is inside LLVM."""
     main = threading.main_thread().ident
     assert main is not None
     while True:
@@ -142,14 +142,14 @@ def _watch(reader: int, handled: list[signal.Signals]) -> None:
 
 
 def _waits(number: int) -> bool:
-    """Whether the watching thread sees a first Ctrl-C that is deferred."""
+    """Return whether the watching thread sees a first Ctrl-C that is deferred."""
     waits = number == signal.SIGINT and _deferral.lasts and not _deferral.seen
     _deferral.seen |= waits
     return waits
 
 
 def _leave_if_compiling() -> None:
-    """Ends the process if one of its threads is compiling."""
+    """End the process if one of its threads is compiling."""
     for frame in sys._current_frames().values():
         at: FrameType | None = frame
         while at is not None:

@@ -1,16 +1,20 @@
-"""Kernels: functions that are compiled, and run as machine code. numba, which compiles, is loaded only to compile."""
+"""Kernels: functions that numba compiles, and the threads that they run on. numba is loaded when one is called."""
 
 from __future__ import annotations
 
 import contextlib
 import functools
-import inspect
 import os
-from collections.abc import Callable, Hashable, Iterator, Sequence
+import sys
+import threading
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any
+
+from .jit_types import as_declared, example
+from .kernel_cache import SETTINGS, Trouble, cache_folder
 
 #: How long OpenMP's threads spin while they wait for one another at the end of a parallel loop. By default they
 #: spin for milliseconds, which on a busy machine takes the processor from the thread they wait for: four concurrent
@@ -24,12 +28,6 @@ if "OMP_WAIT_POLICY" not in os.environ:
     for _name, _value in WAIT_SETTINGS.items():
         os.environ.setdefault(_name, _value)
 
-from . import jit_cache, jit_link, jit_threads  # noqa: E402
-from .errors import SparklodError, out_of_memory  # noqa: E402
-from .jit_cache import CODE, SUFFIX, Trouble, is_whole, start_of  # noqa: E402
-from .jit_types import describe, example, fits, key_of  # noqa: E402
-from .kernel_sources import PACKAGE, digest_of, sources_of  # noqa: E402
-
 #: Called with the name of a kernel when its compilation begins, and with its duration in seconds when it ends.
 Begun = Callable[[str], None]
 Done = Callable[[float], None]
@@ -38,30 +36,8 @@ Done = Callable[[float], None]
 #: Chosen; no difference was measured up to 65,536 (docs/decisions/2026-11-21-kernels.md).
 PARALLEL_ROWS = 4096
 
-
-def _cache_folder() -> Path | None:
-    """The folder for compiled code, or None if none is writable.
-
-    Its name is a digest of the code that compiles; the names of files depend on the sources of their kernels.
-    """
-    here = Path(__file__)
-    digest = digest_of(sources_of(here) | sources_of(here.with_name("jit_numba.py")))
-    given = os.environ.get("NUMBA_CACHE_DIR")
-    places = [Path(given)] if given else [PACKAGE / "__pycache__"]
-    if not given:
-        with contextlib.suppress(RuntimeError):  # no home directory
-            places.append(Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sparklod")
-    for place in places:
-        folder = place / f"kernels-{digest}"
-        with contextlib.suppress(OSError):
-            folder.mkdir(parents=True, exist_ok=True)
-            if os.access(folder, os.W_OK):
-                return folder
-    return None
-
-
 #: The folder for compiled code; None if kernels have to be compiled in every process.
-CACHE_FOLDER = _cache_folder()
+CACHE_FOLDER = cache_folder(Path(__file__))
 
 
 class prange:  # noqa: N801 - it is numba's, and Python's `range` where kernels are not compiled
@@ -72,7 +48,7 @@ class prange:  # noqa: N801 - it is numba's, and Python's `range` where kernels 
 
 
 def prefetch(array: Any, index: int) -> None:
-    """In a compiled kernel: asks the processor to fetch an element of a C-contiguous row of records; changes nothing.
+    """Ask the processor to fetch an element of a C-contiguous row of records; in Python, do nothing.
 
     For loops that read elements in an order that the processor cannot foresee: with some iterations' notice, their
     cache misses overlap. An index beyond the end is harmless.
@@ -90,138 +66,53 @@ class Options:
 
 
 class Kernel:
-    """A function that runs as machine code, one for each combination of types of its arguments.
-
-    Machine code comes from the cache, or from numba where the cache has none.
+    """A function that runs as machine code, which is compiled, or loaded from the cache, when it is first called.
 
     Args:
         function: the Python function.
         options: how to compile it.
-        signatures: the types that Python calls it with, see `kernel`.
+        declared: the types that Python calls it with, for each signature, see `kernel`.
 
     Attributes:
         py_func: the Python function.
         options: how to compile it.
-        signatures: the types that Python calls it with.
-        compiler: see `jit_numba.compiler_of`; None as long as nothing had to be compiled.
-        called: what runs with arguments of the types of a key, see `jit_types.key_of`.
+        declared: the types that Python calls it with.
+        built: see `jit_numba.dispatcher_of`; None until it is needed.
     """
 
-    def __init__(
-        self, function: Callable[..., Any], options: Options, signatures: Sequence[Sequence[Any]] = ()
-    ) -> None:
+    def __init__(self, function: Callable[..., Any], options: Options, declared: Sequence[Sequence[Any]] = ()) -> None:
         functools.update_wrapper(self, function)
-        self.py_func, self.options, self.signatures = function, options, signatures
-        self.compiler: Any = None
-        self.called: dict[Hashable, Callable[..., Any]] = {}
-        self._called: dict[str, Callable[..., Any]] = {}
+        self.py_func, self.options, self.declared = function, options, declared
+        self.built: Any = None
 
-    def __call__(self, *arguments: Any, **named: Any) -> Any:
-        if named or self.py_func.__defaults__:
-            bound = inspect.signature(self.py_func).bind(*arguments, **named)
-            bound.apply_defaults()
-            arguments = bound.args
-        key = key_of(arguments)
-        called = self.called.get(key)
-        if called is None:
-            called = self._find(key, arguments)
-        return called(*arguments)
+    def __call__(self, *arguments: Any) -> Any:
+        if self.declared:  # signatures differ in the types of numbers only
+            arguments = tuple(map(as_declared, self.declared[0], arguments))
+        if self.options.parallel:
+            with _one_at_a_time():
+                return self.dispatcher(*arguments)
+        return self.dispatcher(*arguments)
 
     def __reduce__(self) -> str:
         return self.py_func.__qualname__
 
+    @property
+    def dispatcher(self) -> Any:
+        """numba's function, which may be called with arguments of any types that it can be compiled for."""
+        return self.built or load_numba().dispatcher_of(self)
+
     @functools.cached_property
-    def examples(self) -> dict[str, tuple[Any, ...]]:
-        """Arguments of each declared signature, by their description."""
-        every = [tuple(map(example, types)) for types in self.signatures]
-        return {str(describe(arguments)): arguments for arguments in every}
+    def signatures(self) -> list[tuple[Any, ...]]:
+        """numba's types of the arguments of each declared signature."""
+        import numba
 
-    def declared(self, arguments: tuple[Any, ...]) -> str | None:
-        """Return the description of the declared signature that arguments fit; None if there is none."""
-        text = describe(arguments)
-        return next((declared for declared in self.examples if text is not None and fits(text, declared)), None)
-
-    def _find(self, key: Hashable | None, arguments: tuple[Any, ...]) -> Callable[..., Any]:
-        """What to call with arguments of these types."""
-        text = None if key is None else self.declared(arguments) or describe(arguments)
-        if text is None:
-            return self._guarded(self._dispatcher())
-        called = self._called.get(text)
-        if called is None:
-            called = self._called[text] = self._guarded(self.prepare(text, arguments))
-        self.called[key] = called
-        return called
-
-    def _guarded(self, called: Callable[..., Any]) -> Callable[..., Any]:
-        return jit_threads.guarded(called) if self.options.parallel else called
-
-    def prepare(self, text: str, arguments: tuple[Any, ...] = ()) -> Callable[..., Any]:
-        """Load machine code, or compile it if the cache has none.
-
-        Args:
-            text: types, as `jit_types.describe` has them.
-            arguments: of these types; unnecessary where the kernel declares them.
-        """
-        path = self._path(text)
-        called = None if path is None else self._load(path)
-        return self._compile(path, self.examples.get(text, arguments)) if called is None else called
-
-    def is_cached(self, text: str) -> bool:
-        """Return True if this process can load machine code for types that `jit_types.describe` describes as `text`."""
-        if CACHE_FOLDER is None:
-            return False
-        path = self._path(text)
-        # Where machine code is not linked, numba names the file.
-        files = [*([] if path is None else [path]), *CACHE_FOLDER.glob(f"{start_of(self.py_func)}-*{SUFFIX}")]
-        with contextlib.suppress(OSError):
-            return any(file.is_file() and is_whole(file.read_bytes()) for file in files)
-        return False
-
-    def _path(self, text: str) -> Path | None:
-        """The file of machine code for types; None if there cannot be one."""
-        if CACHE_FOLDER is None or not jit_link.is_tested():
-            return None
-        return CACHE_FOLDER / f"{start_of(self.py_func)}-{jit_cache.digest(text)}{CODE}"
-
-    def _dispatcher(self) -> Callable[..., Any]:
-        """What numba calls with arguments of any types, or refuses them with."""
-        dispatcher: Callable[..., Any] = load_compiler().compiler_of(self).dispatcher
-        return dispatcher
-
-    def _load(self, path: Path) -> Callable[..., Any] | None:
-        """Loads machine code from a file; None if there is none, or none that can be used."""
-        try:
-            content = jit_cache.read(path)
-            return None if content is None else jit_link.link(jit_link.MachineCode.from_bytes(content), self.py_func)
-        except Exception as error:
-            if out_of_memory(error):
-                raise
-        jit_cache.discard(path, report_trouble)
-        return None
-
-    def _compile(self, path: Path | None, arguments: tuple[Any, ...]) -> Callable[..., Any]:
-        """Compiles the kernel, and writes the machine code to a file if it can be linked, as it is in this process."""
-        compiler = load_compiler().compiler_of(self)
-        if jit_link.is_tested():
-            try:
-                code = compiler.machine_code(arguments)
-                linked = None if code is None else jit_link.link(code, self.py_func)
-            except Exception as error:
-                if out_of_memory(error):
-                    raise
-            else:
-                if path is not None and code is not None:
-                    jit_cache.write(path, code.pieces(), report_trouble)
-                if linked is not None:
-                    return linked
-        called: Callable[..., Any] = compiler.compile(arguments)
-        return called
+        return [tuple(numba.typeof(example(each)) for each in types) for types in self.declared]
 
 
 def kernel(
     *types: Any, parallel: bool = False, nogil: bool = False, inline: bool = False, contract: bool = False
 ) -> Callable[[Callable[..., Any]], Any]:
-    """Decorator for a compiled function.
+    """Decorate a function that is compiled.
 
     Without fastmath, because results must not depend on the number of threads. Machine code is cached in the
     package, or in the user's cache directory if the package is read-only; if neither is writable, every run compiles.
@@ -247,26 +138,75 @@ def kernel(
 
 
 def _is_disabled() -> bool:
-    """Whether the environment asks numba to compile nothing."""
+    """Return True if the environment asks numba to compile nothing."""
     try:
         return bool(int(os.environ.get("NUMBA_DISABLE_JIT") or 0))
     except ValueError:
         return False
 
 
+def load_numba() -> ModuleType:
+    """Import `jit_numba` and, with it, numba.
+
+    Raises:
+        ImportError: numba is missing or broken.
+        MemoryError: LLVM does not fit into memory.
+        SparklodError: numba's settings in the current folder are malformed.
+    """
+    try:
+        from . import jit_numba
+    except ImportError:
+        raise
+    except Exception as error:  # of the parser, or of numba where values are of no type that it knows
+        reasons = f"{error} {error.__cause__} {error.__context__}"  # llvmlite: its library is not there
+        if "failed to map segment" in reasons or "annot allocate memory" in reasons:
+            raise MemoryError from error
+        if not SETTINGS.exists():
+            raise
+        from .errors import SparklodError  # here, so that no kernel depends on its source
+
+        raise SparklodError(
+            f"{SETTINGS} in the current folder, which numba reads, is malformed"
+            f" ({' '.join(str(error).split())}); correct it, remove it, or work in another folder"
+        ) from None
+    return jit_numba
+
+
+# Threads
+
+#: Held while a parallel kernel runs on a layer that is not thread-safe. Reentrant, because a signal handler or a
+#: finaliser can call a kernel in the thread that holds it.
+_running = threading.RLock()
+
+#: True in a process that was forked from one that had started threads: it has one thread.
+_has_one_thread = False
+
+
 def use_threads(count: int) -> None:
-    """Runs kernels that this thread calls on `count` threads, or on all if there are fewer."""
-    jit_threads.layer().use(count)
+    """Run kernels that this thread calls on `count` threads, or on all if there are fewer.
+
+    Raises:
+        ValueError: `count` is less than 1.
+    """
+    load_numba()
+    import numba
+
+    if count < 1:
+        raise ValueError(f"kernels cannot run on {count} threads")
+    numba.set_num_threads(min(count, 1 if _has_one_thread else numba.config.NUMBA_NUM_THREADS))
 
 
 def threads_in_use() -> int:
-    """The number of threads that kernels called by this thread run on."""
-    return jit_threads.layer().in_use()
+    """Return the number of threads that kernels called by this thread run on."""
+    load_numba()
+    import numba
+
+    return int(numba.get_num_threads())
 
 
 @contextlib.contextmanager
 def threads_for(rows: int) -> Iterator[int]:
-    """Runs kernels inside on one thread if there are fewer than PARALLEL_ROWS rows; yields the number of threads.
+    """Run kernels inside on one thread if there are fewer than PARALLEL_ROWS rows; yield the number of threads.
 
     Waking the other threads takes longer than processing a few thousand rows; on a busy machine, where the threads
     sleep, a thousand times longer.
@@ -279,60 +219,64 @@ def threads_for(rows: int) -> Iterator[int]:
         use_threads(threads)
 
 
+@functools.cache
 def threading_layer() -> str:
-    """The layer that runs parallel loops: omp, tbb or workqueue. Starts its threads.
+    """Start the threads, and return the layer that runs parallel loops: omp, tbb or workqueue.
 
     Raises:
         ValueError: no threading layer can be loaded.
     """
-    return jit_threads.layer().name
+    threads_in_use()
+    import numba
+
+    return str(numba.threading_layer())
 
 
-def load_compiler() -> ModuleType:
-    """Import `jit_numba` and, with it, numba, which otherwise happens when something has to be compiled.
+def _one_at_a_time() -> contextlib.AbstractContextManager[Any]:
+    """Return a context for a call of a parallel kernel, in which others wait where the layer is not thread-safe.
 
-    Raises:
-        ImportError: numba is missing or broken.
-        SparklodError: its settings in the current folder are malformed.
+    numba's own layer, workqueue, which is used where neither TBB nor OpenMP is installed, aborts the process if two
+    threads run parallel loops at the same time.
     """
-    try:
-        from . import jit_numba
-    except ImportError:
-        raise
-    except Exception as error:  # of the parser, or of numba where values are of no type that it knows
-        if not jit_cache.SETTINGS.exists():
-            raise
-        raise SparklodError(
-            f"{jit_cache.SETTINGS} in the current folder, which numba reads, is malformed"
-            f" ({' '.join(str(error).split())}); correct it, remove it, or work in another folder"
-        ) from None
-    return jit_numba
+    return _running if threading_layer() == "workqueue" else contextlib.nullcontext()
 
 
-#: Who is told of compilations and of a cache that does not work, see `listen`.
+def _after_fork() -> None:
+    global _running, _has_one_thread
+    _running = threading.RLock()  # another thread of the parent may hold the lock
+    if f"{__package__}.jit_numba" in sys.modules:
+        _has_one_thread = load_numba().restart_on_one_thread()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_after_fork)
+
+
+# Who is told of compilations, and of a cache that does not work
+
 _listeners: list[tuple[Begun, Done, Trouble]] = []
 
 
 def report_begun(name: str) -> None:
-    """Tells listeners which kernel is being compiled."""
+    """Report to listeners which kernel is being compiled."""
     for begun, _, _ in _listeners:
         begun(name)
 
 
 def report_done(seconds: float) -> None:
-    """Tells listeners how long that took."""
+    """Report to listeners how long that took."""
     for _, done, _ in _listeners:
         done(seconds)
 
 
 def report_trouble(text: str) -> None:
-    """Tells listeners what is wrong with the cache."""
+    """Report to listeners what is wrong with the cache."""
     for _, _, trouble in _listeners:
         trouble(text)
 
 
 def listen(begun: Begun, done: Done, trouble: Trouble) -> Callable[[], None]:
-    """Reports what happens when kernels are called for the first time.
+    """Report what happens when kernels are called for the first time.
 
     Args:
         begun: called with the name of each kernel that has to be compiled because it is not in the cache.

@@ -15,7 +15,7 @@ UNLIMITED = 1 << 60
 
 
 def total_memory() -> int | None:
-    """Bytes of memory of the machine, or the limit of the container if that is lower."""
+    """Return bytes of memory of the machine, or the limit of the container if that is lower."""
     physical = _meminfo("MemTotal")
     if physical is None:
         try:
@@ -26,7 +26,7 @@ def total_memory() -> int | None:
 
 
 def available_memory() -> int | None:
-    """Bytes that can be allocated before the system swaps or the container kills the process."""
+    """Return bytes that can be allocated before the system swaps or the container kills the process."""
     available = _meminfo("MemAvailable")
     if available is None:
         return None
@@ -34,7 +34,7 @@ def available_memory() -> int | None:
 
 
 def processor_quota() -> float | None:
-    """Processor time that a container grants, in processors, such as 1.5; None without a limit."""
+    """Return processor time that a container grants, in processors, such as 1.5; None without a limit."""
     found = []
     for folder in _groups("cpu"):
         words = (_text(folder / "cpu.max") or "").split()  # version 2
@@ -54,7 +54,7 @@ def _meminfo(name: str) -> int | None:
 
 
 def _memory_limits() -> Iterator[tuple[int, int]]:
-    """Memory limit and usage in bytes of each cgroup of this process."""
+    """Return memory limit and usage in bytes of each cgroup of this process."""
     for folder in _groups("memory"):
         for limit_name, used_name in (
             ("memory.max", "memory.current"),  # version 2
@@ -66,7 +66,7 @@ def _memory_limits() -> Iterator[tuple[int, int]]:
 
 
 def _groups(controller: str) -> list[Path]:
-    """The folders of the cgroups (versions 1 and 2) of this process, and of their ancestors."""
+    """Return the folders of the cgroups (versions 1 and 2) of this process, and of their ancestors."""
     root = Path("/sys/fs/cgroup")
     folders = {root, root / controller}  # in a container, its own group is the root
     for line in (_text(Path("/proc/self/cgroup")) or "").splitlines():

@@ -1,4 +1,4 @@
-"""Imports of packages that only an extra of sparklod brings, and how to install what is missing."""
+"""Packages that sparklod and its extras require: whether they are met, by metadata alone, and how to install them."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import contextlib
 import os
 import sys
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 from .errors import SparklodError
@@ -24,7 +25,7 @@ _ENVIRONMENTS = ("VIRTUAL_ENV", "CONDA_PREFIX")
 def optional_import(
     purpose: str, extra: str = "", error: type[SparklodError] = SparklodError, *, package: str = ""
 ) -> Iterator[None]:
-    """Turns a failed import inside it into an error that says what to install.
+    """Turn failed imports inside into an error that says what to install.
 
     The import stays a statement, so that type checkers and import-linter see it.
 
@@ -65,7 +66,7 @@ def install_hint(extra: str = "", *options: str) -> str:
     """
     from importlib import metadata  # takes long to load
 
-    from .requirements import required_by
+    from .optional import required_by
 
     checkout = _checkout()
     if checkout is not None:
@@ -81,7 +82,7 @@ def install_hint(extra: str = "", *options: str) -> str:
 
 
 def _checkout() -> Path | None:
-    """The folder of the repository that this package is in, or was installed from; None if there is none any more."""
+    """Return the folder of the repository that this package is in, or was installed from, if there is one."""
     import json
     from importlib import metadata
     from urllib.parse import unquote, urlsplit
@@ -93,3 +94,60 @@ def _checkout() -> Path | None:
         if address.scheme == "file" and "dir_info" in source:
             folders.append(Path(unquote(address.path)))
     return next((folder for folder in folders if (folder / "pyproject.toml").is_file()), None)
+
+
+@dataclass(frozen=True)
+class Required:
+    """A distribution that another one requires.
+
+    Attributes:
+        name: its name for pip.
+        least: the minimum version; empty for any.
+        version: the installed version; None if it is not installed.
+    """
+
+    name: str
+    least: str
+    version: str | None
+
+    @property
+    def missing(self) -> bool:
+        """Whether it has to be installed or upgraded."""
+        from packaging.version import Version
+
+        return self.version is None or bool(self.least and Version(self.version) < Version(self.least))
+
+    @property
+    def found(self) -> str:
+        """ "2.4.6", "is missing", or "1.20, older than 1.26"."""
+        if self.version is None:
+            return "is missing"
+        return f"{self.version}, older than {self.least}" if self.missing else self.version
+
+
+def required_by(distribution: str, extra: str = "") -> Iterator[Required]:
+    """Yield the requirements of an installed distribution or, if an extra is given, those of the extra alone.
+
+    Raises:
+        importlib.metadata.PackageNotFoundError: the distribution is not installed.
+    """
+    from importlib import metadata  # takes long to load
+
+    from packaging.requirements import Requirement
+
+    for line in metadata.requires(distribution) or []:
+        requirement = Requirement(line)
+        is_basic, is_of_extra = (
+            requirement.marker is None or requirement.marker.evaluate({"extra": name}) for name in ("", extra)
+        )
+        if not is_of_extra or (extra and is_basic):
+            continue
+        least = next((each.version for each in requirement.specifier if each.operator == ">="), "")
+        try:
+            version = metadata.version(requirement.name)
+        except metadata.PackageNotFoundError:
+            yield Required(requirement.name, least, None)
+            continue
+        yield Required(requirement.name, least, version)
+        for inner in sorted(requirement.extras):
+            yield from required_by(requirement.name, inner)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
+from pathlib import Path
 
 #: Maximum length of a message, in characters. A path can have 4,096, and strings in a file have no limit.
 MOST = 500
@@ -28,7 +30,7 @@ _BYTES = range(0xDC80, 0xDD00)
 
 
 def printable(text: str, most: int | None = None) -> str:
-    """A text on one line that cannot control a terminal or a log.
+    """Return a text on one line that cannot control a terminal or a log.
 
     Unprintable characters are escaped as in Python strings: control characters, line ends, directional marks and lone
     surrogates. So is the start of a GitHub Actions command. What addresses must not show is hidden, see `redacted`.
@@ -62,7 +64,7 @@ def without_secrets(text: str, url: str) -> str:
 
 
 def shortened(text: str, most: int | None) -> str:
-    """A text of at most `most` characters: the beginning and the end of a longer one."""
+    """Return a text of at most `most` characters: the beginning and the end of a longer one."""
     if most is None or len(text) <= most:
         return text
     end = (most - len(GAP)) // 4
@@ -76,3 +78,18 @@ def _escaped(mark: str) -> str:
     if code > 0xFFFF:
         return f"\\U{code:08x}"
     return _SHORT.get(mark) or (f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}")
+
+
+def near(name: str, known: Iterable[str], *, cutoff: float = 0.6, folder: Path | None = None) -> str:
+    """Return the end of an error about an unknown name, ", did you mean ...?"; empty if no known name is similar.
+
+    Args:
+        name: the unknown name.
+        known: names that exist.
+        cutoff: how similar they must be, 0 to 1, as `difflib` measures it.
+        folder: of the names, where they are files.
+    """
+    import difflib  # which takes a millisecond, and is needed after a mistake only
+
+    found = difflib.get_close_matches(name, list(known), n=3, cutoff=cutoff)
+    return f", did you mean {' or '.join(str(folder / each) if folder else each for each in found)}?" if found else ""

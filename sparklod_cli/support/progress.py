@@ -12,4 +12,4 @@ class Progress(Protocol):
 
 
 def silent(stage: str, done: int, total: int, unit: str) -> None:
-    """A `Progress` that does nothing."""
+    """Report nothing."""

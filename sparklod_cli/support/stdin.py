@@ -14,12 +14,12 @@ DASH = Path("-")
 
 
 def name_of(path: object) -> str:
-    """The name of an input, a path or what has one as its text, in messages."""
+    """Return the name of an input, a path or what has one as its text, in messages."""
     return "standard input" if path == DASH else str(path)
 
 
 def spooled() -> BinaryIO:
-    """All of standard input, read into a temporary file on the first call, at its beginning. Must not be closed.
+    """Return standard input as a temporary file, at its beginning, which must not be closed.
 
     Raises:
         UnreadableError: standard input is closed, or a terminal.

@@ -17,7 +17,7 @@ class ReaderGoneError(StdoutError):
 
 @contextlib.contextmanager
 def guarded() -> Iterator[None]:
-    """A context in which a failed write to standard output raises `StdoutError` or `ReaderGoneError`."""
+    """Have failed writes to standard output inside raise `StdoutError` or `ReaderGoneError`."""
     before = sys.stdout
     sys.stdout = _GuardedStream(before)
     try:
@@ -27,7 +27,7 @@ def guarded() -> Iterator[None]:
 
 
 def silence(stream: Any) -> None:
-    """Redirects a broken stream to the null device, since the interpreter flushes it at exit, which would fail."""
+    """Redirect a broken stream to the null device, since the interpreter flushes it at exit, which would fail."""
     with contextlib.suppress(OSError, ValueError):
         null = os.open(os.devnull, os.O_WRONLY)
         os.dup2(null, stream.fileno())
@@ -81,7 +81,7 @@ class _GuardedStream:
 
 
 def reserve() -> None:
-    """Opens those of standard input, output and error that are closed, so that no other file gets their descriptors.
+    """Open those of standard input, output and error that are closed, so that no other file gets their descriptors.
 
     Such a file would receive what libraries print. In Python they remain closed, as they were at startup.
     """

@@ -17,12 +17,12 @@ BANDWIDTH = rf"{NUMBER}{PREFIX}(?P<unit>(?i:bits?|bytes?)|b|B)(?:/s|ps)?"
 
 
 def count_of(count: int, noun: str, plural: str | None = None) -> str:
-    """ "1 node", "1,234 nodes"; "2 leaves" with a plural of its own."""
+    """Return a text such as "1 node", "1,234 nodes", or "2 leaves" with a plural of its own."""
     return f"{count:,} {noun if count == 1 else plural or noun + 's'}"
 
 
 def format_size(size: float) -> str:
-    """ "12.3 GB", "350 MB", "2 kB": bytes in words, of powers of 1000."""
+    """Return a number of bytes as "12.3 GB", "350 MB" or "2 kB", of powers of 1000."""
     for name, power in (("GB", 10**9), ("MB", 10**6)):
         if size >= power:
             return f"{size / power:,.1f} {name}" if size < 10 * power or name == "GB" else f"{size / power:,.0f} {name}"
@@ -30,7 +30,7 @@ def format_size(size: float) -> str:
 
 
 def parse_bandwidth(text: str) -> float:
-    """Bytes per second of a text such as 20Mbit, 20Mbit/s, 20Mbps (bits) or 2.5MB/s, 2.5MBps, 2.5Mbyte (bytes).
+    """Parse a bandwidth such as 20Mbit, 20Mbit/s, 20Mbps (bits) or 2.5MB/s, 2.5MBps, 2.5Mbyte (bytes) to bytes/s.
 
     As a letter, b is a bit and B a byte; words may have either case. k, M, G and T are powers of 1000, or of 1024 with
     an i.
@@ -66,7 +66,7 @@ def parse_time(text: str) -> float:
 
 
 def parse_count(text: str) -> int:
-    """A whole number of a text such as 65536, 500k or 1.5M; k, M, G and T are powers of 1000.
+    """Parse a whole number such as 65536, 500k or 1.5M; k, M, G and T are powers of 1000.
 
     Raises:
         ValueError: the text is not a count.
@@ -81,7 +81,7 @@ def parse_count(text: str) -> int:
 
 
 def parse_size(text: str) -> int:
-    """Bytes of a text such as 3000000, 3M, 3 MB or 3MiB: k, M, G and T are powers of 1000, or of 1024 with an i.
+    """Parse a number of bytes such as 3000000, 3M, 3 MB or 3MiB: powers of 1000, or of 1024 with an i.
 
     Raises:
         ValueError: the text is not a size.

@@ -33,7 +33,7 @@ ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, Run
 
 
 def parse_json(data: str | bytes, *, keep_surrogates: bool = False, depth: int = MAX_DEPTH) -> Any:
-    """The value of a JSON text.
+    """Parse a JSON text.
 
     Integers beyond 64 bits become the nearest floats, at most `LARGEST`. NaN and Infinity, which Python writes, and
     1e999 are accepted, so callers must check that numbers are finite.
@@ -57,7 +57,7 @@ def parse_json(data: str | bytes, *, keep_surrogates: bool = False, depth: int =
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """The table of a TOML text, as `parse_json`, but integers must fit 64 bits, as TOML requires."""
+    """Parse a TOML text as `parse_json` does, but integers must fit 64 bits, as TOML requires."""
     if sys.version_info >= (3, 11):
         import tomllib
     else:
@@ -80,7 +80,7 @@ def _too_deep(depth: int) -> ValueError:
 
 
 def _checked(root: Any, depth: int, *, replace_surrogates: bool) -> Any:
-    """Checks a parsed value level by level, since recursion would fail on the nesting it guards against."""
+    """Check a parsed value level by level, since recursion would fail on the nesting it guards against."""
     whole = [root]  # in a list, so that every value is an item of a container
     containers: list[Any] = [whole]
     for _ in range(depth + 1):
@@ -104,15 +104,15 @@ def _checked(root: Any, depth: int, *, replace_surrogates: bool) -> Any:
 
 
 def well_formed(text: str) -> str:
-    """A text with U+FFFD in place of lone surrogates, which cannot be encoded."""
+    """Return a text with U+FFFD in place of lone surrogates, which cannot be encoded."""
     return _SURROGATE.sub("\ufffd", text)
 
 
 def quoted_value(value: Any) -> str:
-    """A value as quoted in an error: on one line and shortened, at any nesting depth."""
+    """Return a value as quoted in an error: on one line and shortened, at any nesting depth."""
     return printable(reprlib.repr(value), QUOTED)
 
 
 def quoted(error: Exception) -> str:
-    """The message of a library's error, shortened: it may itself quote much of a file."""
+    """Return the message of a library's error, shortened: it may itself quote much of a file."""
     return printable(str(error), 2 * QUOTED)

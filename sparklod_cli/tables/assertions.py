@@ -13,7 +13,7 @@ from types import MappingProxyType
 from typing import Any
 
 from ..support.errors import SparklodError
-from ..support.similar import near
+from ..support.printable import near
 from ..support.units import PREFIXES
 from .columns import Column, Row
 from .statistics import STATISTICS, Number, is_statistic, numbers, statistic, totals

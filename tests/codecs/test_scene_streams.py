@@ -13,10 +13,9 @@ from sparklod_cli.codecs.sog.sog_container import SogFiles
 from sparklod_cli.io import PlacedFile, open_stream, open_streams, read_scene
 from sparklod_cli.io import streams as idle_streams
 from sparklod_cli.model import streams
-from sparklod_cli.model.merged import Placed, merged
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
-from sparklod_cli.model.streams import SceneStream, collected, stream_of
+from sparklod_cli.model.streams import Placed, SceneStream, collected, merged, stream_of
 from sparklod_cli.model.transforms import Transform
 from sparklod_cli.support.errors import FormatError, HasTreeError, OutputError, UnreadableError
 from tests.codecs.test_round_trip import CASES, star

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from sparklod_cli.support.jit_cache import CODE, INNER, SUFFIX
+from sparklod_cli.support.kernel_cache import SUFFIX
 from tests.conftest import ROOT
 from tests.faults.runs import ENVIRONMENT
 
@@ -56,4 +56,4 @@ def test_first_runs_side_by_side_share_an_empty_cache(tmp_path: Path) -> None:
     assert Path(ends[0][0]).parent == cache
     assert any(count for _, count, _ in ends)
     assert finish(start(cache)) == (ends[0][0], 0, ends[0][2])  # the cache that they left is complete
-    assert not [path for path in cache.rglob("*") if path.suffix not in (CODE, INNER, SUFFIX) and path.is_file()]
+    assert not [path for path in cache.rglob("*") if path.suffix != SUFFIX and path.is_file()]

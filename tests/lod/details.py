@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sparklod_cli.lod.traversal import View
-from sparklod_cli.model.detail import DetailScene
+from sparklod_cli.model.scene import DetailScene
 from tests.scenes import random_splats
 
 

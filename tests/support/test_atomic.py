@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from sparklod_cli.support import atomic, leftovers
+from sparklod_cli.support import atomic
 from tests.conftest import ROOT
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="POSIX only")
@@ -47,7 +47,7 @@ def has_unnamed_files(folder: Path) -> bool:
 @pytest.fixture(params=[True, False], ids=["unnamed", "named"])
 def unnamed(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> bool:
     """Whether files have no name before they are complete."""
-    leftovers.sweep.cache_clear()
+    atomic.sweep.cache_clear()
     if not request.param:
         monkeypatch.setattr(atomic, "UNNAMED", None)
     elif not has_unnamed_files(tmp_path):
@@ -80,7 +80,7 @@ def test_a_writer_that_is_killed_leaves_whole_files_only(overwrite: bool, unname
             data = (folder / name).read_bytes()
             assert data == data[:1] * SIZE
             seen += 1
-        leftovers.sweep.cache_clear()  # what another run begins with
+        atomic.sweep.cache_clear()  # what another run begins with
         atomic.write(folder / "out-last", [b"x"], overwrite=True)
         assert [name for name in names(folder) if not name.startswith("out")] == []
         for path in folder.glob("out-*"):
@@ -96,7 +96,7 @@ def test_files_of_running_processes_are_left_alone(tmp_path: Path, monkeypatch: 
         yield b"outer"
         before = names(tmp_path)
         assert len(before) == 1
-        leftovers.sweep.cache_clear()
+        atomic.sweep.cache_clear()
         atomic.write(tmp_path / "other", [b"inner"], overwrite=False)
         assert names(tmp_path) == sorted([*before, "other"])
 
@@ -106,7 +106,7 @@ def test_files_of_running_processes_are_left_alone(tmp_path: Path, monkeypatch: 
 
 
 def test_only_files_of_dead_processes_are_removed(tmp_path: Path, unnamed: bool) -> None:
-    left = tmp_path / leftovers.PARTS.format("0123456789abcdef")
+    left = tmp_path / atomic.PARTS.format("0123456789abcdef")
     left.write_bytes(b"half a")
     kept = [tmp_path / name for name in (".sparklod-notes.txt", "a.part", ".sparklod-link.part", ".sparklod-dir.part")]
     for path in kept[:2]:
@@ -120,7 +120,7 @@ def test_only_files_of_dead_processes_are_removed(tmp_path: Path, unnamed: bool)
 
 def modes_of_parts(folder: Path) -> list[int]:
     """Permissions of all files of a folder that are not complete, with names or without."""
-    modes = [stat.S_IMODE(path.stat().st_mode) for path in folder.glob(leftovers.PARTS.format("*"))]
+    modes = [stat.S_IMODE(path.stat().st_mode) for path in folder.glob(atomic.PARTS.format("*"))]
     for number in atomic.OPEN_FILES.iterdir() if atomic.OPEN_FILES.exists() else ():
         with contextlib.suppress(OSError):
             about = number.stat()
@@ -176,13 +176,13 @@ def test_files_are_written_without_hard_links(
 
 def swept(folder: Path) -> None:
     """As another process that starts in a folder."""
-    for path in folder.glob(leftovers.PARTS.format("*")):
+    for path in folder.glob(atomic.PARTS.format("*")):
         path.unlink()
 
 
 def test_a_part_swept_before_it_is_locked_is_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(atomic, "UNNAMED", None)
-    lock: Callable[[int], None] = leftovers.lock
+    lock: Callable[[int], None] = atomic.lock
     rounds = []
 
     def late(descriptor: int) -> None:
@@ -191,7 +191,7 @@ def test_a_part_swept_before_it_is_locked_is_made_again(tmp_path: Path, monkeypa
         rounds.append(descriptor)
         lock(descriptor)
 
-    monkeypatch.setattr(leftovers, "lock", late)
+    monkeypatch.setattr(atomic, "lock", late)
     atomic.write(tmp_path / "out", [b"x"], overwrite=False)
     assert len(rounds) == 2
     assert (tmp_path / "out").read_bytes() == b"x"

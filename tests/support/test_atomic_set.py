@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from sparklod_cli.support import atomic, atomic_set, leftovers
+from sparklod_cli.support import atomic, atomic_set
 from tests.conftest import ROOT
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="POSIX only")
@@ -54,7 +54,7 @@ def held(folder: Path) -> dict[str, bytes]:
 
 @pytest.fixture(autouse=True)
 def first_run() -> None:
-    leftovers.sweep.cache_clear()
+    atomic.sweep.cache_clear()
 
 
 def test_files_appear_together(tmp_path: Path) -> None:
@@ -251,7 +251,7 @@ def test_permissions_are_those_of_what_is_replaced_or_of_the_umask(mask: int, tm
 
     def some() -> Iterator[tuple[str, Iterable[bytes]]]:
         for each in files(NEW):
-            seen.extend(stat.S_IMODE(path.stat().st_mode) for path in tmp_path.glob(leftovers.STAGES.format("*")))
+            seen.extend(stat.S_IMODE(path.stat().st_mode) for path in tmp_path.glob(atomic.STAGES.format("*")))
             yield each
 
     before = os.umask(mask)
@@ -266,7 +266,7 @@ def test_permissions_are_those_of_what_is_replaced_or_of_the_umask(mask: int, tm
 
 def stage(folder: Path, name: str = "0123456789abcdef") -> Path:
     """A hidden folder as a killed writer leaves it."""
-    left = folder / leftovers.STAGES.format(name)
+    left = folder / atomic.STAGES.format(name)
     (left / atomic_set.FORMER).mkdir(parents=True)
     put(left, NEW)
     put(left / atomic_set.FORMER, OLD)
@@ -288,7 +288,7 @@ def test_the_next_run_removes_what_killed_writers_left(one: bool, tmp_path: Path
 def test_the_folder_of_a_running_process_is_left_alone(tmp_path: Path) -> None:
     def some() -> Iterator[tuple[str, Iterable[bytes]]]:
         for each in files(NEW):
-            leftovers.sweep.cache_clear()
+            atomic.sweep.cache_clear()
             atomic.write(tmp_path / "other", [b"inner"], overwrite=True)
             yield each
 
@@ -297,7 +297,7 @@ def test_the_folder_of_a_running_process_is_left_alone(tmp_path: Path) -> None:
 
 
 def test_a_folder_swept_before_it_is_locked_is_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    lock = leftovers.lock
+    lock = atomic.lock
     rounds: list[int] = []
 
     def late(descriptor: int) -> None:
@@ -306,7 +306,7 @@ def test_a_folder_swept_before_it_is_locked_is_made_again(tmp_path: Path, monkey
         rounds.append(descriptor)
         lock(descriptor)
 
-    monkeypatch.setattr(leftovers, "lock", late)
+    monkeypatch.setattr(atomic, "lock", late)
     atomic_set.write(tmp_path, files(NEW), overwrite=False)
     assert len(rounds) == 2
     assert held(tmp_path) == NEW
@@ -335,7 +335,7 @@ def test_a_killed_writer_never_leaves_two_sets_under_one_header(tmp_path: Path) 
         if (tmp_path / "a").exists():
             whole += 1
             assert len({(tmp_path / name).read_bytes() for name in ("a-0", "a-1", "a-2", "a")}) == 1
-        leftovers.sweep.cache_clear()
-        leftovers.sweep(tmp_path)
+        atomic.sweep.cache_clear()
+        atomic.sweep(tmp_path)
         assert {path.name for path in tmp_path.iterdir()} <= {"a-0", "a-1", "a-2", "a"}
     assert whole

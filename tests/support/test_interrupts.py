@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from sparklod_cli.support.jit_cache import INNER, is_whole
+from sparklod_cli.support.kernel_cache import SUFFIX, is_whole
 from tests.conftest import FIXTURES, ROOT
 from tests.signals import heed_signals
 
@@ -36,7 +36,7 @@ def test_a_signal_ends_a_compilation_at_once_and_leaves_a_whole_cache(
     )
     assert process.stderr is not None
     assert "Compiling" in process.stderr.readline()
-    while not list(cache.rglob(f"*{INNER}")):  # until the first of many is compiled
+    while not list(cache.rglob(f"*{SUFFIX}")):  # until the first of many is compiled
         assert process.poll() is None
         time.sleep(0.02)
     process.send_signal(how)
@@ -48,7 +48,7 @@ def test_a_signal_ends_a_compilation_at_once_and_leaves_a_whole_cache(
     assert again or rest.endswith("interrupted\n")
     assert "->" not in rest  # as of a bake that is done
     assert not (tmp_path / "tree.spz").exists()
-    kept = list(cache.rglob(f"*{INNER}"))
+    kept = list(cache.rglob(f"*{SUFFIX}"))
     assert len(kept) < 9  # it did not go on to the end: a bake has several times as many
     assert all(is_whole(path.read_bytes()) for path in kept)
 

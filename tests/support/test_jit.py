@@ -9,7 +9,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -17,8 +17,9 @@ import pytest
 
 from sparklod_cli.support import jit
 from sparklod_cli.support.jit import prefetch as jit_prefetch
-from sparklod_cli.support.jit_types import f4, out
-from sparklod_cli.support.kernel_sources import sources_of
+from sparklod_cli.support.jit_types import Type, as_declared, b1, example, f4, fields, i8, out, u2, u4
+from sparklod_cli.support.kernel_cache import cache_folder, sources_of
+from sparklod_cli.warmup import Unit
 from tests.conftest import ROOT
 
 PACKAGE = ROOT / "sparklod_cli"
@@ -35,11 +36,11 @@ def test_a_kernel_works_where_no_cache_can_be_written(monkeypatch: pytest.Monkey
 
 def test_the_cache_is_where_the_environment_says(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "given"))
-    given = jit._cache_folder()
+    given = cache_folder(Path(jit.__file__))
     assert given is not None
     assert given.parent == tmp_path / "given"
     monkeypatch.setenv("NUMBA_CACHE_DIR", "/dev/null/no/folder")
-    assert jit._cache_folder() is None
+    assert cache_folder(Path(jit.__file__)) is None
 
 
 def imported(path: Path) -> set[Path]:
@@ -67,7 +68,7 @@ def test_a_change_of_a_kernel_or_constant_changes_the_names_of_those_that_depend
     copy = tmp_path / "sparklod_cli"
     shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
     names = ("geometry", "sort", "node_rows", "prune")
-    code = "from sparklod_cli.support.kernel_sources import *; " + "".join(
+    code = "from sparklod_cli.support.kernel_cache import *; " + "".join(
         f"print(digest_of(sources_of(PACKAGE / 'lod/kernels/{name}.py'))); " for name in names
     )
     digests = []
@@ -81,6 +82,41 @@ def test_a_change_of_a_kernel_or_constant_changes_the_names_of_those_that_depend
     assert changes == [{"prune"}, {"geometry", "node_rows"}, set(names)]
 
 
+@fields(f4[:, :], out(i8[:]), b1)
+class Columns(NamedTuple):
+    first: Any
+    second: Any
+    third: Any
+
+
+RECORD = np.dtype([("a", "<f4"), ("b", "<i8", (3,))])
+
+
+def readonly(values: Any) -> Any:
+    values.flags.writeable = False
+    return values
+
+
+def test_arguments_are_passed_as_the_declared_types() -> None:
+    declared = [u4, f4[:], f4[:, :, :], out(u2[:]), Columns, out(Columns), Type(RECORD)[:]]
+    writeable = np.zeros((1, 1), "f4")
+    arguments = [
+        *(np.uint32(1), np.zeros(3, "f4"), np.zeros((1, 2, 3), "f4"), np.zeros(2, "u2")),
+        *(Columns(writeable, np.zeros(1, "i8"), True), Columns(writeable, np.zeros(1, "i8"), False)),
+        np.zeros(2, RECORD),
+    ]
+    passed = list(map(as_declared, declared, arguments))
+    frozen = Columns(readonly(np.zeros((2, 2), "f4")), np.zeros(1, "i8"), True)
+    expected = [
+        *(np.uint32(1), readonly(np.zeros(3, "f4")), readonly(np.zeros((1, 2, 3), "f4")), np.zeros(2, "u2"), frozen),
+        *(arguments[5], readonly(np.zeros(2, RECORD))),
+    ]
+    types = list(map(numba.typeof, expected))
+    assert list(map(numba.typeof, passed)) == list(map(numba.typeof, map(example, declared))) == types
+    assert writeable.flags.writeable
+    assert np.shares_memory(passed[4].first, writeable)
+
+
 @jit.kernel(f4[:], out(f4[:]))
 def double(values: Any, doubled: Any) -> None:
     for index in range(len(values)):
@@ -89,7 +125,7 @@ def double(values: Any, doubled: Any) -> None:
 
 def test_read_only_arrays_are_read_by_the_same_code(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(jit, "CACHE_FOLDER", tmp_path)
-    kernel = jit.Kernel(double.py_func, double.options, double.signatures)
+    kernel = jit.Kernel(double.py_func, double.options, double.declared)
     values, doubled = np.arange(5, dtype=np.float32), np.empty(5, np.float32)
     np.save(tmp_path / "values.npy", values)
     frozen = values.copy()
@@ -102,11 +138,9 @@ def test_read_only_arrays_are_read_by_the_same_code(monkeypatch: pytest.MonkeyPa
         assert np.array_equal(doubled, values * 2)
     stop()
     assert begun == ["test_jit.double"]
-    (signature,) = kernel.examples
-    assert kernel.is_cached(signature)
-    assert kernel.declared((frozen, doubled)) == kernel.declared((values, doubled)) == signature
-    for wrong in ((values, frozen), (values.astype(np.float64), doubled), (values[::2], doubled[::2]), (values,)):
-        assert kernel.declared(wrong) is None
+    (signature,) = kernel.signatures
+    assert Unit(kernel, 0).is_cached
+    assert kernel.dispatcher.signatures == [signature]
     with pytest.raises(numba.TypingError, match="readonly array"):
         kernel(values, frozen)
     assert np.array_equal(frozen, values)
@@ -136,7 +170,7 @@ def test_malformed_settings_of_numba_are_an_error_that_names_them(content: bytes
     (tmp_path / ".numba_config.yaml").write_bytes(content)
     code = (
         "import sys; sys.path.insert(0, sys.argv[1]); from sparklod_cli.support import errors, jit\n"
-        "try: jit.load_compiler()\n"
+        "try: jit.load_numba()\n"
         "except errors.SparklodError as error: print(error)"
     )
     command = [sys.executable, "-c", code, str(ROOT)]
@@ -183,7 +217,7 @@ def test_prefetch_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
 
     rows = np.zeros(100, [("count", np.int64), ("share", np.float32)])
     rows["count"] = np.arange(100)
-    assert total(rows) == total.py_func(rows) == 4950
+    assert total(rows) == total.py_func(rows) == 4950  # as machine code, and as Python
     assert np.array_equal(rows["count"], np.arange(100))
 
 

@@ -1,4 +1,4 @@
-"""What is said where an optional package is missing."""
+"""What is said where an optional package is missing, and what is required, by the metadata of what is installed."""
 
 from __future__ import annotations
 
@@ -11,10 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from sparklod_cli.support import optional, requirements
+from sparklod_cli.support import optional
 from sparklod_cli.support.errors import CameraPathError, SparklodError
-from sparklod_cli.support.optional import install_hint, optional_import, pip_install
-from sparklod_cli.support.requirements import Required
+from sparklod_cli.support.optional import Required, install_hint, optional_import, pip_install, required_by
 from tests.conftest import ROOT
 
 
@@ -35,7 +34,7 @@ def install(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> object:
     monkeypatch.setattr(optional, "_HOME", tmp_path / "site-packages")
     monkeypatch.setenv("VIRTUAL_ENV", sys.prefix)
     required = [Required("numpy", "1.26", "2.0"), Required("pyvista", "0.45", None), Required("pandas", "", None)]
-    monkeypatch.setattr(requirements, "required_by", lambda name, extra="": iter(required))
+    monkeypatch.setattr(optional, "required_by", lambda name, extra="": iter(required))
     return lambda origin: monkeypatch.setattr(metadata, "distribution", lambda name: Installed(origin))
 
 
@@ -64,7 +63,7 @@ def test_elsewhere_the_missing_packages_are_named(install, origin: object) -> No
 
 def test_where_no_package_is_missing_all_are_named(install, monkeypatch: pytest.MonkeyPatch) -> None:
     install(None)
-    monkeypatch.setattr(requirements, "required_by", lambda name, extra="": iter([Required("numpy", "1.26", "2.0")]))
+    monkeypatch.setattr(optional, "required_by", lambda name, extra="": iter([Required("numpy", "1.26", "2.0")]))
     assert install_hint("", "--force-reinstall") == "pip install --force-reinstall 'numpy>=1.26'"
 
 
@@ -73,7 +72,7 @@ def test_a_copy_that_is_not_installed_names_the_extra(install, monkeypatch: pyte
         raise metadata.PackageNotFoundError(name)
 
     monkeypatch.setattr(metadata, "distribution", absent)
-    monkeypatch.setattr(requirements, "required_by", absent)
+    monkeypatch.setattr(optional, "required_by", absent)
     assert "the extra render of sparklod" in install_hint("render")
 
 
@@ -121,3 +120,59 @@ def test_what_is_installed_is_imported_and_other_errors_pass() -> None:
         raise ZeroDivisionError
     with pytest.raises(SparklodError), optional_import("nothing", "nothing"):
         raise ModuleNotFoundError("nothing")
+
+
+LINES = {
+    "sparklod": [
+        "numpy>=1.26",
+        "any-version",
+        "old-python>=1.0; python_version < '3.0'",
+        f"this-python>=1.0; python_version < '3.{sys.version_info[1] + 1}'",
+        'films[ffmpeg,other]>=2.31; extra == "video"',
+        'tests>=1; extra == "test"',
+    ],
+    "films": ["base", "encoder>=3 ; extra == 'ffmpeg'", "numpy; extra == 'all-plugins'"],
+}
+VERSIONS = {"numpy": "1.25.9", "any-version": "0", "this-python": "1.1.dev2", "films": "10.0"}
+
+
+@pytest.fixture
+def installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    def version(name: str) -> str:
+        if name not in VERSIONS:
+            raise metadata.PackageNotFoundError(name)
+        return VERSIONS[name]
+
+    monkeypatch.setattr(metadata, "requires", LINES.get)
+    monkeypatch.setattr(metadata, "version", version)
+
+
+@pytest.mark.usefixtures("installed")
+def test_markers_decide_what_is_required() -> None:
+    assert list(required_by("sparklod")) == [
+        Required("numpy", "1.26", "1.25.9"),
+        Required("any-version", "", "0"),
+        Required("this-python", "1.0", "1.1.dev2"),
+    ]
+
+
+@pytest.mark.usefixtures("installed")
+def test_an_extra_requires_its_own_and_the_extras_of_those() -> None:
+    assert list(required_by("sparklod", "video")) == [Required("films", "2.31", "10.0"), Required("encoder", "3", None)]
+
+
+@pytest.mark.parametrize(
+    ("least", "version", "found"),
+    [
+        ("1.26", "1.26", "1.26"),
+        ("1.26", "1.26.4", "1.26.4"),
+        ("", "0", "0"),
+        ("2.9", "2.10", "2.10"),
+        ("1.26", "1.25.9", "1.25.9, older than 1.26"),
+        ("1.26", None, "is missing"),
+    ],
+)
+def test_versions_compare_as_numbers(least: str, version: str | None, found: str) -> None:
+    required = Required("numpy", least, version)
+    assert required.found == found
+    assert required.missing == (found != version)

@@ -18,9 +18,8 @@ from ...lod.builders import BUILDERS
 from ...lod.stage_records import NO_FAMILY, Families, Pending
 from ...model.selection import Tally
 from ...model.splats import Splats
-from ...support.parallel import blocks_of
+from ...support.parallel import blocks_of, on_threads
 from ...support.progress import Progress
-from ...support.threads import on_threads
 from ..output import Output
 from ..records import BuiltTree, Clock
 from .blocks import Stage, cut_into_blocks

@@ -15,9 +15,8 @@ from ...lod.stage_records import Survey
 from ...model.selection import REASONS, Tally
 from ...model.splats import FloatArray, Splats
 from ...model.streams import SceneStream
-from ...support.parallel import blocks_of
+from ...support.parallel import blocks_of, on_threads
 from ...support.progress import Progress
-from ...support.threads import on_threads
 from ..selecting import check_transformed, select, transform
 from ..settings import BakeSettings
 from .job import Job

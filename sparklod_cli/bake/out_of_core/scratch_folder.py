@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...support import folders, leftovers
+from ...support import atomic
 from ...support.addresses import Place
 from ...support.errors import FormatError, InvalidSplatsError, ScratchError, UnreadableError
 from ...support.parallel import ordered_map
@@ -212,7 +212,7 @@ def locked(folder: Path) -> Iterator[None]:
     path = folder / LOCK
     with contextlib.ExitStack() as stack:
         try:
-            stack.enter_context(folders.created(folder.parent))
+            stack.enter_context(atomic.created(folder.parent))
             descriptor = _opened_lock(path)
         except OSError as error:
             raise ScratchError(
@@ -222,10 +222,10 @@ def locked(folder: Path) -> Iterator[None]:
         try:
             yield
         finally:
-            if leftovers.HAS_LOCKS:
+            if atomic.HAS_LOCKS:
                 _remove_empty(path)
             os.close(descriptor)
-            if not leftovers.HAS_LOCKS:  # Windows cannot remove a file that is open
+            if not atomic.HAS_LOCKS:  # Windows cannot remove a file that is open
                 _remove_empty(path)
 
 
@@ -238,7 +238,7 @@ def _opened_lock(path: Path) -> int:
     while True:
         folder.mkdir(parents=True, exist_ok=True)
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_CLOEXEC", 0), 0o666)
-        is_free = leftovers.try_lock(descriptor)
+        is_free = atomic.try_lock(descriptor)
         with contextlib.suppress(FileNotFoundError):  # the run that had it was done, and removed it
             if os.path.samestat(os.fstat(descriptor), path.stat()):
                 if is_free:

@@ -13,10 +13,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...model.coding import PLAIN, FileCoding, ScaleCoding
 from ...model.gaussian import size_factor
 from ...model.lod_tree import LodTree
 from ...model.nodes import Nodes
+from ...model.scene import PLAIN, FileCoding, ScaleCoding
 from ...model.splats import FloatArray, Splats
 from ...support.parallel import for_blocks
 from .. import quantize, spark_codings, splat_encoding

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...model.coding import ScaleCoding
 from ...model.lod_tree import LodTree
+from ...model.scene import ScaleCoding
 from ...model.sh import COEFFICIENTS
 from ...model.splats import FloatArray, Splats
 from ...support.errors import FormatError, TooLongError, TruncatedError

@@ -11,8 +11,8 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from ...model.coding import FileCoding, ScaleCoding
 from ...model.lod_tree import LodTree
+from ...model.scene import FileCoding, ScaleCoding
 from ...model.sh import COEFFICIENTS
 from ...model.splats import COLUMNS, FloatArray, Splats
 from ...support.defaults import MAX_SH_DEGREE

@@ -11,7 +11,7 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from ...model.detail import Bounds, Counts, DetailScene
+from ...model.scene import Bounds, Counts, DetailScene
 from ...model.sh import COEFFICIENTS
 from ...model.splats import COLUMNS, Splats
 from ...support.errors import FormatError

@@ -9,8 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from ...model import morton
-from ...model.detail import Bounds, DetailScene
-from ...model.scene import Scene
+from ...model.scene import Bounds, DetailScene, Scene
 from ...model.splats import Splats
 from ...support.errors import FormatError
 from ...support.parallel import ordered_map

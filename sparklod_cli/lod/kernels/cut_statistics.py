@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ...model.falloff import DRAWN_AREA
 from ...support.jit import kernel, prefetch
 from ...support.jit_types import f4, f8, fields, i4, i8, out, u2, u4
 from .cut_arrays import BUCKET_BITS, BUCKETS, LEAF, CutNodes
@@ -17,9 +18,6 @@ COUNTS = 10
 
 #: Areas are summed as whole numbers of 1/1024 square pixel, so that the sum does not depend on the order.
 AREA_PARTS = 1024
-
-#: Radius of a drawn splat in standard deviations, squared: Spark's `maxStdDev` is sqrt(8).
-EXTENT_SQUARED = 8
 
 #: Nodes that are measured together: few enough for a block of them to stay in the processor's cache.
 BLOCK_NODES = 512
@@ -145,7 +143,7 @@ def measure_block(x, y, z, size, count, view, screen):
         distance = max(np.sqrt(dx * dx + dy * dy + dz * dz), NEAREST)
         pixels = size[at] / distance / pixel_limit
         size[at] = pixels if seen else -ONE
-        covered = np.float64(np.pi / 4 * EXTENT_SQUARED) * pixels * pixels
+        covered = DRAWN_AREA * pixels * pixels
         covered = covered if covered < most_area else most_area
         area += np.int64(covered * AREA_PARTS) if seen else 0
         inside += seen

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...model import gaussian
+from ...model.falloff import harmonic
 from ...model.gaussian import MIN_OPACITY, SIZE_PER_D, linear_opacity
 from ...support.jit import kernel
 
@@ -33,19 +34,7 @@ NEEDLE, NEEDLE_D = 0.25, 1.5
 #: Entries of the table of profiles by density, between which it is interpolated linearly. Chosen.
 ENTRIES = 256
 
-#: Terms of the harmonic sums that are added one by one; the rest is an integral. With 64 the sums are exact to 1e-7.
-TERMS = 64
-
 lod_opacity_above_1 = kernel(inline=True)(gaussian.lod_opacity_above_1)
-
-
-def harmonic(a: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return H(a) and H2(a) of real numbers a >= 1, to 1e-7: the sums of 1/k - 1/(k + a) and of 1/k^2 - 1/(k + a)^2."""
-    k = np.arange(1, TERMS + 1, dtype=np.float64)[:, None]
-    start = TERMS + 0.5  # midpoint rule for the remaining terms
-    first = (1 / k - 1 / (k + a)).sum(axis=0) + np.log((start + a) / start)
-    second = (1 / k**2 - 1 / (k + a) ** 2).sum(axis=0) + 1 / start - 1 / (start + a)
-    return first, second
 
 
 def _profiles(lod_opacity: NDArray[np.float32]) -> tuple[NDArray[np.float64], ...]:

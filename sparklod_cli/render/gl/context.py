@@ -62,11 +62,11 @@ class OSMesa:
             raise NoContextError("libOSMesa does not make its context current")
 
     def load_opengl_function(self, name: str) -> int:
-        """The address of an OpenGL function; 0 if there is none of that name."""
+        """Return the address of an OpenGL function; 0 if there is none of that name."""
         return self._library.OSMesaGetProcAddress(name.encode()) or 0
 
     def release(self) -> None:
-        """Frees the context, which must be current."""
+        """Free the context, which must be current."""
         self._library.OSMesaMakeCurrent(None, None, _UNSIGNED_BYTE, 0, 0)
         self._library.OSMesaDestroyContext(self._context)
 
@@ -102,7 +102,7 @@ _MAKE: dict[str, Callable[[], Any]] = {"osmesa": _osmesa, "egl": _egl}
 
 
 def create(kind: str) -> Any:
-    """A moderngl.Context over one of `PACKAGES`, current on this thread.
+    """Return a moderngl.Context over one of `PACKAGES`, current on this thread.
 
     Raises:
         NoContextError: it cannot be created; a broken driver may end the process instead, see `probe`.
@@ -120,7 +120,7 @@ def create(kind: str) -> Any:
 
 @functools.cache
 def probe(kind: str) -> str:
-    """Why a context over one of `PACKAGES` does not work here, tested in a separate process; empty if it works."""
+    """Test a context in a separate process; return why it does not work here, empty if it does."""
     command = module_command(__name__, kind)
     try:
         child = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
@@ -147,7 +147,7 @@ void main() { color = vec4(0.25, 0.5, 2.0, 1.0); }
 
 
 def _try(kind: str) -> None:
-    """Draws a triangle to a float texture and checks the result."""
+    """Draw a triangle to a float texture and check the result."""
     import struct
 
     import moderngl

@@ -6,9 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...cameras.camera import Camera
+from ...model.falloff import MIN_ALPHA
 from ...model.splats import FloatArray
 from ..rasterizer import world_to_camera
-from ..settings import CLIP, MIN_ALPHA, RasterSettings
+from ..settings import CLIP, RasterSettings
 from ..shading import ShadedSplats
 
 Indices = NDArray[np.uint32]
@@ -30,11 +31,11 @@ class Order:
         self._sorted: tuple[Camera, RasterSettings, float] | None = None
 
     def forget(self) -> None:
-        """Discards the last order, because the splats have changed."""
+        """Discard the last order, because the splats have changed."""
         self._sorted = None
 
     def update(self, splats: ShadedSplats, camera: Camera, raster: RasterSettings) -> Indices | None:
-        """Indices of the splats that may be visible, in order; None while the last order is still valid."""
+        """Return indices of the splats that may be visible, in order; None while the last order is still valid."""
         if self._sorted is not None and self._close(camera, raster, *self._sorted):
             return None
         with np.errstate(over="ignore", invalid="ignore"):  # splats that far away are not drawn
@@ -62,7 +63,7 @@ class Order:
 
 
 def _into_camera(center: FloatArray, camera: Camera) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Camera coordinates right, down and forward, (N,) float32 each, rounded as in the rasterizer's kernel."""
+    """Return camera coordinates right, down and forward, (N,) float32 each, rounded as in the rasterizer's kernel."""
     m = world_to_camera(camera)
     x, y, z = center.T
     u, v, w = (row[0] * x + row[1] * y + row[2] * z + row[3] for row in m)
@@ -72,7 +73,7 @@ def _into_camera(center: FloatArray, camera: Camera) -> tuple[FloatArray, FloatA
 def _in_sight(
     splats: ShadedSplats, u: FloatArray, v: FloatArray, depth: FloatArray, camera: Camera, raster: RasterSettings
 ) -> Indices:
-    """Indices of the splats whose centres the vertex shader does not cull, with a small margin."""
+    """Return indices of the splats whose centres the vertex shader does not cull, with a small margin."""
     seen = (depth > raster.near) & (depth < raster.far) & (splats.lod_opacity >= np.float32(MIN_ALPHA))
     for across, focal, principal, pixels in zip(
         (u, v), camera.focal, camera.principal, (camera.width, camera.height), strict=True
@@ -84,7 +85,7 @@ def _in_sight(
 
 
 def sort_exact(key: FloatArray) -> NDArray[np.int64]:
-    """(N,) indices sorted by (N,) float32 keys, equal keys by descending index, as in the rasterizer and in Spark.
+    """Return (N,) indices sorted by (N,) float32 keys, equal keys by descending index, as in Spark.
 
     Sorts 64-bit numbers of key and index, which is several times faster than sorting indices.
     """
@@ -97,7 +98,7 @@ def sort_exact(key: FloatArray) -> NDArray[np.int64]:
 
 
 def sort_counting16(key: FloatArray) -> NDArray[np.int64]:
-    """(N,) indices sorted by (N,) float32 keys quantized to 65,536 steps; within a step by descending index."""
+    """Return (N,) indices sorted by (N,) float32 keys quantized to 65,536 steps; within a step by descending index."""
     if not len(key):
         return np.zeros(0, np.int64)
     above = key.astype(np.float64) - float(key.min())

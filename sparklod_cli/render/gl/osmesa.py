@@ -40,7 +40,7 @@ def draw(
     sorting: str = "exact",
     throttle: float = 0.0,
 ) -> Image:
-    """The picture of a camera: (height, width, 4) float32 red, green, blue (premultiplied) and alpha, 0..1.
+    """Draw the picture of a camera: (height, width, 4) float32 red, green, blue (premultiplied) and alpha, 0..1.
 
     OpenGL objects are reused from frame to frame.
 
@@ -69,7 +69,7 @@ class Renderer:
     """
 
     def __init__(self, *, precision: str = "float", sorting: str = "exact", throttle: float = 0.0) -> None:
-        """Prepares OpenGL; see `draw` for the arguments.
+        """Prepare OpenGL; see `draw` for the arguments.
 
         Raises:
             BackendError: OpenGL is not available.
@@ -84,7 +84,7 @@ class Renderer:
         on_gl_thread(self._compile, precision)
 
     def draw(self, splats: ShadedSplats, camera: Camera, raster: RasterSettings) -> Image:
-        """See the function `draw`."""
+        """Draw a frame; see the function `draw`."""
         return on_gl_thread(self._draw, splats, camera, raster)
 
     def _compile(self, precision: str) -> None:
@@ -174,7 +174,7 @@ class Renderer:
 
 
 def on_gl_thread(work: Callable[..., _T], *arguments: Any) -> _T:
-    """Runs a function on the thread that makes all calls to OpenGL.
+    """Run a function on the thread that makes all calls to OpenGL.
 
     A thread has one current context. On its own thread, our context cannot interfere with that of VTK, for example:
     drivers rely on a context staying current, and otherwise draw nothing, or into another context.
@@ -187,7 +187,7 @@ def on_gl_thread(work: Callable[..., _T], *arguments: Any) -> _T:
 
 @functools.cache
 def _thread() -> tuple[ThreadPoolExecutor, int]:
-    """The thread, and the id of its process."""
+    """Return the thread, and the id of its process."""
     return ThreadPoolExecutor(1, "sparklod-gl"), os.getpid()
 
 
@@ -203,7 +203,7 @@ def _translated(work: Callable[..., _T], *arguments: Any) -> _T:
 
 @functools.cache
 def open_context() -> Any:
-    """The moderngl.Context of this process, created on the first call; call and use it `on_gl_thread` only.
+    """Return the moderngl.Context of this process, created on the first call; call and use it `on_gl_thread` only.
 
     Raises:
         BackendError: OpenGL is not available; names the packages to install.

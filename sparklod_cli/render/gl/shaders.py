@@ -1,4 +1,4 @@
-"""The shaders, in GLSL 4.2: kernels/ellipse.py, kernels/falloff.py and kernels/raster.py, step by step, for OpenGL.
+"""The shaders, in GLSL 4.2: kernels/ellipse.py and kernels/raster.py, step by step, for OpenGL.
 
 `precise` keeps compilers from reordering what they could: what is left of the covariances of thin splats are small
 differences of large numbers, which come out visibly different when rounded in another order.
@@ -8,33 +8,17 @@ from __future__ import annotations
 
 import numpy as np
 
+from ...model.falloff import GLSL, glsl_constants
 from ..kernels.ellipse import LEAST_COVARIANCE, MAX_D, MAX_VARIANCE
-from ..kernels.falloff import HALF_LOG2E, LEAST_EXPONENT, LEAST_REST
-from ..settings import BLUR, CLIP, MAX_STD_DEV, MIN_ALPHA, STD_DEV_PER_D
+from ..settings import BLUR, CLIP
 
-
-def _literal(value: float) -> str:
-    """A float32 in all its digits."""
-    text = f"{np.float32(value):.9g}"
-    return text if "." in text or "e" in text else f"{text}.0"
-
-
-_CONSTANTS = "\n".join(
-    f"const float {name} = {_literal(value)};"
-    for name, value in {
-        "BLUR": BLUR,
-        "CLIP": CLIP,
-        "E": np.e,
-        "LEAST_COVARIANCE": float(LEAST_COVARIANCE),
-        "LEAST_EXPONENT": float(LEAST_EXPONENT),
-        "LEAST_REST": float(LEAST_REST),
-        "MAX_D": float(MAX_D),
-        "MAX_STD_DEV": MAX_STD_DEV,
-        "MAX_VARIANCE": float(MAX_VARIANCE),
-        "MINUS_HALF_LOG2E": -float(HALF_LOG2E),
-        "MIN_ALPHA": MIN_ALPHA,
-        "STD_DEV_PER_D": STD_DEV_PER_D,
-    }.items()
+_CONSTANTS = glsl_constants(
+    BLUR=BLUR,
+    CLIP=CLIP,
+    E=np.e,
+    LEAST_COVARIANCE=float(LEAST_COVARIANCE),
+    MAX_D=float(MAX_D),
+    MAX_VARIANCE=float(MAX_VARIANCE),
 )
 
 #: Gets a splat out of the texels of `texture.Floats`, and its covariance on the screen.
@@ -132,7 +116,7 @@ void main() {
     precise float before = c.w, det = before + BLUR * (c.x + c.z) + BLUR * BLUR;
     precise float xx = c.x + BLUR, yy = c.z + BLUR, xy = c.y;
     if (!(det > 0.0 && xx < MAX_VARIANCE && yy < MAX_VARIANCE)) return;
-    float deviations = MAX_STD_DEV + STD_DEV_PER_D * max(d - 1.0, 0.0);
+    float deviations = deviations_of(d);
     d *= sqrt(before / det);
     if (!(d >= MIN_ALPHA)) return;
 
@@ -164,7 +148,7 @@ void main() {
     vec2 along = xx >= yy ? vec2(half_difference + reach, xy) : vec2(xy, reach - half_difference);
     along = reach > 0.0 ? normalize(along) : vec2(1.0, 0.0);
     // It ends where the splat gets too faint to be drawn, if that is nearer than its end.
-    float edge = d <= 1.0 ? min(deviations, sqrt(2.0 * log(d / MIN_ALPHA))) : deviations;
+    float edge = edge_of(d, deviations);
     vec2 sides = 0.5 * (edge * sqrt(vec2(greatest, det / greatest)) * 1.001 + 0.02);
     vec2 at = middle + corner.x * sides.x * along + corner.y * sides.y * vec2(-along.y, along.x);
     gl_Position = vec4(2.0 * at / size - 1.0, 0.0, 1.0);  // y down: the first row read back is the picture's uppermost
@@ -181,34 +165,11 @@ flat in vec4 rgb_power;
 
 out vec4 color;
 
-const int ROOT_HALF = 0x3F3504F3;  // the bits of sqrt(1 / 2)
-
-// The rasterizer's: to 4e-7 of itself near 1 as well, which logarithms of drivers need not be.
-float log2_exactly(float v) {
-    int bits = floatBitsToInt(v), whole = (bits - ROOT_HALF) >> 23;
-    float m = intBitsToFloat(bits - (whole << 23));  // from sqrt(1 / 2) to sqrt(2)
-    precise float s = (m - 1.0) / (m + 1.0), q = s * s;
-    float p = 0.41219858;
-    p = p * q + 0.57707802;
-    p = p * q + 0.96179669;
-    p = p * q + 2.8853901;
-    return float(whole) + s * p;
-}
-
 void main() {
     vec2 off = gl_FragCoord.xy - middle;
     float z2 = (conic.x * off.x + 2.0 * conic.y * off.y) * off.x + conic.z * off.y * off.y;
-    float d = end_opacity.y, alpha;
     if (z2 > end_opacity.x) discard;
-    if (d <= 1.0) {
-        alpha = d * exp2(MINUS_HALF_LOG2E * z2);
-    } else if (shifted) {
-        float beyond = max(sqrt(max(z2, 0.0)) - (d - 1.0), 0.0);
-        alpha = exp2(MINUS_HALF_LOG2E * d * beyond * beyond);
-    } else {
-        float rest = max(1.0 - exp2(MINUS_HALF_LOG2E * z2), LEAST_REST);
-        alpha = 1.0 - exp2(max(rgb_power.w * log2_exactly(rest), LEAST_EXPONENT));
-    }
+    float alpha = alpha_at(z2, end_opacity.y, rgb_power.w, shifted);
     if (alpha < MIN_ALPHA) discard;
     color = vec4(min(alpha * rgb_power.rgb, 1.0), alpha);
 }
@@ -218,8 +179,8 @@ _FETCH = {"float": _FLOATS, "half": _HALVES}
 
 
 def sources(precision: str) -> dict[str, str]:
-    """What moderngl makes a program of, for a data texture of one of `texture.PRECISIONS`."""
-    head = f"#version 420 core\n{_CONSTANTS}\n"
+    """Return the sources of the shaders for a data texture of one of `texture.PRECISIONS`."""
+    head = f"#version 420 core\n{_CONSTANTS}{GLSL}\n"
     declarations, main = _VERTEX.split("void main()")
     vertex = head + declarations + _FETCH[precision] + "void main()" + main
     return {"vertex_shader": vertex, "fragment_shader": head + _FRAGMENT}

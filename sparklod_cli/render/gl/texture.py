@@ -40,7 +40,7 @@ class DataTexture(ABC):
         self._last: ShadedSplats | None = None
 
     def update(self, shaded: ShadedSplats) -> tuple[bool, bool]:
-        """Updates the texture to these splats.
+        """Update the texture to these splats.
 
         Compares values, not array identity: every frame has new arrays, mostly with the same values.
 
@@ -60,16 +60,16 @@ class DataTexture(ABC):
         return recolored, moved
 
     def _rows(self, kind: np.dtype[Any], count: int) -> NDArray[Any]:
-        """(count,) records of the texture."""
+        """Return (count,) records of the texture."""
         return self.texture.reshape(-1, 4 * self.texels_a_splat).view(kind)[:count, 0]
 
     @abstractmethod
     def _geometry(self, shaded: ShadedSplats) -> None:
-        """Writes all but the colours."""
+        """Write all but the colours."""
 
     @abstractmethod
     def _colors(self, shaded: ShadedSplats) -> None:
-        """Writes the colours."""
+        """Write the colours."""
 
 
 class Floats(DataTexture):
@@ -129,18 +129,18 @@ class Halves(DataTexture):
         self._extra(shaded)[:, 1] = gain
 
     def _extra(self, shaded: ShadedSplats) -> NDArray[np.float16]:
-        """(N, 2) the two halves of the word that the viewer leaves unused."""
+        """Return (N, 2) the two halves of the word that the viewer leaves unused."""
         words: NDArray[np.float16] = self.texture.reshape(-1, 8).view(np.float16)[: len(shaded), 6:8]
         return words
 
 
 def data_texture_of(precision: str) -> DataTexture:
-    """An empty data texture of one of `PRECISIONS`."""
+    """Return an empty data texture of one of `PRECISIONS`."""
     return {"float": Floats, "half": Halves}[precision]()
 
 
 def _clamped_colors(shaded: ShadedSplats) -> FloatArray:
-    """(N, 3) colours clamped to the range of the rasterizer; NaN becomes 0."""
+    """Return (N, 3) colours clamped to the range of the rasterizer; NaN becomes 0."""
     rgb: FloatArray = np.where(shaded.rgb > 0, np.minimum(shaded.rgb, MAX_COLOR), np.float32(0))
     return rgb
 

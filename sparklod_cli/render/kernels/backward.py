@@ -1,23 +1,45 @@
-"""The way back through the tiles: what a loss changes by with each splat on the screen.
+"""The way back from a picture to its splats: what a loss changes by with each splat on the screen, and in the world.
 
 The loss is any function of a picture; its derivatives by the picture's values are given. A tile passes its splats from
 near to far, as the forward pass does, and for each it writes a row of sums over the tile's pixels, so that no two tiles
 write to the same place and the order of all sums is that of the splats and tiles, whatever the number of threads.
+
+The way through the projection is in float64, because elements of a long splat's covariance are small differences of
+large numbers.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from ...model.falloff import HALF_LOG2E, deviations_of, merged_slopes, plain_slopes
 from ...support.jit import kernel, prange
 from ...support.jit_types import f4, fields, i2, i4, i8, out
-from .falloff import merged_parts, plain
-from .project import ACROSS, ALONG, BLUE, COLUMNS, GREEN, LEAST, LOG, OPACITY, POWER, RED, SHEAR, TILE, X, Y
+from .ellipse import MAX_D, Lens, Limits, in_camera, jacobian, per_world_unit, rotation_matrix, turned
+from .project import (
+    ACROSS,
+    ALONG,
+    BLUE,
+    COLUMNS,
+    GREEN,
+    LEAST,
+    LOG,
+    MAX_COLOR,
+    OPACITY,
+    POWER,
+    RED,
+    SHEAR,
+    TILE,
+    ShadedColumns,
+    X,
+    Y,
+)
 from .raster import BLOCKS, LANES, measure
 
-f32 = np.float32
+f32, f64 = np.float32, np.float64
 
 #: Columns of a row of sums over pixels, float32: derivatives by z^2, times v, dy, v^2, v dy and dy^2, where v is the
 #: distance along a row of `project.exponent`; by D, of merged splats by the power; by red, green and blue.
@@ -38,7 +60,9 @@ RECORD = FIELDS * LANES
 #: is behind to 1e-3.
 LEAST_THROUGH = f32(1e-4)
 
-LN2 = f32(np.log(2))
+#: Columns of a splat's gradient, float32, three of each but D: by centre, ln(scale), rotation vector, D and colour.
+CENTER, LOG_SCALE, TURN, LOD_OPACITY, RGB = 0, 3, 6, 9, 10
+GRADIENT_COLUMNS = 13
 
 
 @fields(f4[:, :], i2[:, :], i8[:], i4[:], i8[:], i8)
@@ -61,7 +85,7 @@ class Drawn(NamedTuple):
 
 @kernel(i2[:, :])
 def first_rows(boxes):
-    """(N + 1,) int64 where the rows of each splat begin, one for each tile that its box overlaps."""
+    """Return (N + 1,) int64 where the rows of each splat begin, one for each tile that its box overlaps."""
     first = np.empty(len(boxes) + 1, np.int64)
     total = 0
     for i in range(len(boxes)):
@@ -73,7 +97,7 @@ def first_rows(boxes):
 
 @kernel(inline=True)
 def weigh(record, i, alpha, by_z2, by_shape, is_drawn, red, green, blue, v, dy):
-    """Moves one pixel behind a splat, and writes the terms of the splat's sums; branch-free, as `raster.blend`.
+    """Move one pixel behind a splat, and write the terms of the splat's sums; branch-free, as `raster.blend`.
 
     Args:
         record: (RECORD + SUMS * LANES,) float32 of the pixels and the beginning of the next.
@@ -119,7 +143,7 @@ def weigh(record, i, alpha, by_z2, by_shape, is_drawn, red, green, blue, v, dy):
 
 @kernel(inline=True)
 def weigh_lanes(record, row, x, dy, least):
-    """Moves adjacent pixels of a row behind a splat; see `weigh` and `raster.blend_column`."""
+    """Move adjacent pixels of a row behind a splat; see `weigh` and `raster.blend_column`."""
     along, d, power, end = row[ALONG], row[OPACITY], row[POWER], row[LEAST]
     red, green, blue = row[RED], row[GREEN], row[BLUE]
     middle, most = along * (x + row[SHEAR] * dy), row[LOG] - row[ACROSS] * dy * dy
@@ -128,22 +152,19 @@ def weigh_lanes(record, row, x, dy, least):
         for i in range(LANES):
             v = along * f32(i) - middle
             t = most - v * v
-            alpha = plain(t)
-            weigh(record, i, alpha, f32(-0.5) * alpha, alpha * inverse, t >= end, red, green, blue, v, dy)
+            alpha, by_z2, by_d = plain_slopes(t, inverse)
+            weigh(record, i, alpha, by_z2, by_d, t >= end, red, green, blue, v, dy)
     else:
         for i in range(LANES):
             v = along * f32(i) - middle
             t = most - v * v
-            fall, rest, log, through = merged_parts(t, power)
-            alpha = f32(1) - through
-            is_drawn = (t >= end) & (alpha >= least)
-            by_z2 = f32(-0.5) * fall * power * (through / rest)
-            weigh(record, i, alpha, by_z2, -LN2 * through * log, is_drawn, red, green, blue, v, dy)
+            alpha, by_z2, by_power = merged_slopes(t, power)
+            weigh(record, i, alpha, by_z2, by_power, (t >= end) & (alpha >= least), red, green, blue, v, dy)
 
 
 @kernel(inline=True)
 def start_pixels(records, left, top, rows, columns, image, by_image):
-    """Fills what is kept of a tile's pixels before the first splat."""
+    """Fill what is kept of a tile's pixels before the first splat."""
     records[:] = 0
     for line in range(rows):
         for i in range(columns):
@@ -156,7 +177,7 @@ def start_pixels(records, left, top, rows, columns, image, by_image):
 
 @kernel(inline=True)
 def add_lanes(lanes, out):
-    """Adds (SUMS * LANES,) sums of lanes to (SUMS,) sums."""
+    """Add (SUMS * LANES,) sums of lanes to (SUMS,) sums."""
     for k in range(SUMS):
         v = lanes[k * LANES : (k + 1) * LANES]
         out[k] += ((v[0] + v[1]) + (v[2] + v[3])) + ((v[4] + v[5]) + (v[6] + v[7]))
@@ -164,7 +185,7 @@ def add_lanes(lanes, out):
 
 @kernel(Drawn, i8[:], f4, f4[:, :, :], f4[:, :, :], out(f4[:, :]), parallel=True, contract=True)
 def weigh_tiles(drawn, first, least, image, by_image, sums):
-    """Sums of each splat over the pixels of each tile that its box overlaps.
+    """Sum for each splat over the pixels of each tile that its box overlaps.
 
     Args:
         drawn: `Drawn`.
@@ -201,3 +222,144 @@ def weigh_tiles(drawn, first, least, image, by_image, sums):
                     record = column[line * RECORD : (line + 1) * RECORD + SUMS * LANES]
                     weigh_lanes(record, row, row[X] - f32(LANES * block), f32(line) - row[Y], least)
                 add_lanes(column[bottom_line * RECORD : bottom_line * RECORD + SUMS * LANES], out)
+
+
+# From the screen to the world
+
+
+@fields(f4[:, :], i8[:], f4[:, :])
+class Rows(NamedTuple):
+    """Splats on the screen, and their sums, tile by tile.
+
+    Attributes:
+        screen: (N, COLUMNS) float32 of `project`.
+        first: (N + 1,) int64 of `first_rows`.
+        sums: (first[-1], SUMS) float32 of `weigh_tiles`.
+    """
+
+    screen: Any
+    first: Any
+    sums: Any
+
+
+@kernel(inline=True)
+def cross(a, b):
+    """Return the cross product of two triples."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@kernel(inline=True)
+def dot(a, b):
+    """Return the dot product of two triples."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@kernel(inline=True)
+def weighed(a, u, b, v, c, w):
+    """Return a u + b v + c w of triples u, v and w."""
+    return a * u[0] + b * v[0] + c * w[0], a * u[1] + b * v[1] + c * w[1], a * u[2] + b * v[2] + c * w[2]
+
+
+@kernel(ShadedColumns, f4[:, :], Lens, Limits, Rows, out(f4[:, :]), parallel=True)
+def carry_back(splats, world_to_camera, lens, limits, rows, gradients):
+    """Compute the derivatives by the properties of splats; see `SplatGradients`.
+
+    The box of a splat and where it ends are held constant, and so is the shape of one whose axes are shortened to the
+    largest radius.
+
+    Args:
+        splats, world_to_camera, lens, limits: of `project.project_splat`.
+        rows: `Rows`.
+        gradients: (N, GRADIENT_COLUMNS) float32, filled for the splats that are drawn.
+    """
+    for i in prange(len(rows.screen)):
+        if rows.first[i] == rows.first[i + 1]:
+            continue
+        total = np.zeros(SUMS)
+        for entry in range(rows.first[i], rows.first[i + 1]):
+            for column in range(SUMS):
+                total[column] += rows.sums[entry, column]
+        carry_splat_back(splats, i, world_to_camera, lens, limits, rows.screen[i], total, gradients[i])
+
+
+@kernel(inline=True)
+def carry_splat_back(splats, i, m, lens, limits, seen, total, row):
+    """Fill a row of gradients from splat `i` on the screen and its sums; see `carry_back`."""
+    one, two, half = f64(1), f64(2), f64(0.5)
+    center, scale, quat = splats.center, splats.scale, splats.quat_xyzw
+    for channel in range(3):
+        is_held = splats.rgb[i, channel] > MAX_COLOR
+        row[RGB + channel] = f64(0) if is_held else total[BY_RED + channel]
+    # The projection again, with its names.
+    u, v, w = in_camera(m, f64(center[i, 0]), f64(center[i, 1]), f64(center[i, 2]))
+    inverse = one / w
+    dx, dy = lens.focal_x * u * inverse, lens.focal_y * v * inverse
+    jx, jy, kx, ky = jacobian(lens, inverse, dx, dy)
+    across, down = per_world_unit(m, 0, jx, kx), per_world_unit(m, 1, jy, ky)
+    rotation = rotation_matrix(f64(quat[i, 0]), f64(quat[i, 1]), f64(quat[i, 2]), f64(quat[i, 3]), one)
+    s = (f64(scale[i, 0]), f64(scale[i, 1]), f64(scale[i, 2]))
+    p_unit, q_unit = turned(across, rotation), turned(down, rotation)
+    p = (p_unit[0] * s[0], p_unit[1] * s[1], p_unit[2] * s[2])
+    q = (q_unit[0] * s[0], q_unit[1] * s[1], q_unit[2] * s[2])
+    a, c = dot(p, p), dot(q, q)
+    normal = cross(p, q)
+    before = dot(normal, normal)
+    det = before + limits.blur * (a + c) + limits.blur * limits.blur
+    a += limits.blur
+    c += limits.blur
+    # D: compensated for the blur by sqrt(before / det), and the exponent of a merged splat.
+    kept, d = math.sqrt(before / det), f64(seen[OPACITY])
+    by_d = total[BY_SHAPE]
+    if d > one:
+        by_d *= math.exp((d * d - one) / math.e) * two * d / math.e
+    row[LOD_OPACITY] = by_d * kept if splats.lod_opacity[i] <= MAX_D else f64(0)
+    by_before = half * by_d * d * (one / before - one / det)
+    by_blurred = -half * by_d * d / det * limits.blur  # by a and by c through det
+    # The shape: z^2 = (dx - (b / c) dy)^2 c / det + dy^2 / c, so that v^2 is the first term times HALF_LOG2E.
+    along, shear = f64(seen[ALONG]), f64(seen[SHEAR])
+    mean = half * (a + c)
+    lod_opacity = f64(min(splats.lod_opacity[i], MAX_D))
+    deviations = deviations_of(lod_opacity, limits.std_devs, limits.std_devs_per_d)
+    longest = deviations * math.sqrt(mean + math.sqrt(max(mean * mean - det, f64(0))))
+    by_a, by_b, by_c = f64(0), f64(0), f64(0)
+    if not longest > limits.max_radius:
+        by_width = -total[BY_XX] / HALF_LOG2E * c / det  # by a - b^2 / c, the variance along a row of pixels
+        by_shear = -two * total[BY_XY] * along / HALF_LOG2E  # by b / c
+        by_a = by_width
+        by_b = -shear * by_width + half * by_shear / c  # half of it, since b stands twice in the covariance
+        by_c = shear * shear * by_width - shear * by_shear / c - total[BY_YY] / (c * c)
+    by_a += by_blurred
+    by_c += by_blurred
+    by_p = weighed(two * by_a, p, two * by_b, q, two * by_before, cross(q, normal))
+    by_q = weighed(two * by_b, p, two * by_c, q, two * by_before, cross(normal, p))
+    # p and q: rows of T R S.
+    for axis in range(3):
+        row[LOG_SCALE + axis] = by_p[axis] * p[axis] + by_q[axis] * q[axis]
+    by_p = (by_p[0] * s[0], by_p[1] * s[1], by_p[2] * s[2])
+    by_q = (by_q[0] * s[0], by_q[1] * s[1], by_q[2] * s[2])
+    turn_p, turn_q = cross(by_p, p_unit), cross(by_q, q_unit)
+    for axis in range(3):
+        row[TURN + axis] = turn_p[axis] + turn_q[axis]
+    r = rotation
+    by_across = (
+        dot(by_p, (r[0], r[1], r[2])),
+        dot(by_p, (r[3], r[4], r[5])),
+        dot(by_p, (r[6], r[7], r[8])),
+    )
+    by_down = (
+        dot(by_q, (r[0], r[1], r[2])),
+        dot(by_q, (r[3], r[4], r[5])),
+        dot(by_q, (r[6], r[7], r[8])),
+    )
+    # T: rows of the Jacobian times the rotation into the camera.
+    right, below, ahead = (m[0, 0], m[0, 1], m[0, 2]), (m[1, 0], m[1, 1], m[1, 2]), (m[2, 0], m[2, 1], m[2, 2])
+    by_jx, by_kx = dot(by_across, right), dot(by_across, ahead)
+    by_jy, by_ky = dot(by_down, below), dot(by_down, ahead)
+    by_x = -two * along / HALF_LOG2E * total[BY_X]
+    by_y = -shear * by_x - two * f64(seen[ACROSS]) / HALF_LOG2E * total[BY_Y]
+    by_u = by_x * jx - by_kx * jx * inverse
+    by_v = by_y * jy - by_ky * jy * inverse
+    by_w = by_x * kx + by_y * ky - (by_jx * jx + by_jy * jy) * inverse - two * (by_kx * kx + by_ky * ky) * inverse
+    by_center = weighed(by_u, right, by_v, below, by_w, ahead)
+    for axis in range(3):
+        row[CENTER + axis] = by_center[axis]

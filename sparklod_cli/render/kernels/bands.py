@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
+from ...model.falloff import alpha_at
 from ...support.jit import kernel, prange
 from ...support.jit_types import b1, f4, i4, out, u8
-from .falloff import alpha_at
 from .project import HALF_HEIGHT, HALF_WIDTH, LEAST, OPACITY, POWER, X, Y, exponent, index_of
 
 f32 = np.float32
@@ -19,7 +19,7 @@ ROWS = 8
 
 @kernel(f4[:], f4[:], f4[:], f4[:, :], f4, out(f4[:, :, :]), parallel=True)
 def draw_discs(x, y, radius, rgb, alpha, image):
-    """Blends discs in their order, each over those before it.
+    """Blend discs in their order, each over those before it.
 
     Args:
         x, y: (N,) float32 centres, pixels from the upper left corner.
@@ -52,7 +52,7 @@ def draw_discs(x, y, radius, rgb, alpha, image):
 
 @kernel(f4[:, :], u8[:], b1, f4, out(i4[:, :]), parallel=True)
 def count_fragments(screen, keys, design, least, counts):
-    """Counts the splats that cover each pixel, hidden ones included.
+    """Count the splats that cover each pixel, hidden ones included.
 
     Args:
         screen: (N, COLUMNS) of `project`.

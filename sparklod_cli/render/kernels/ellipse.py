@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...model import gaussian
+from ...model.falloff import HALF_LOG2E, deviations_of, end_of
 from ...support.fast_math import log2
 from ...support.jit import kernel
 from ...support.jit_types import f4, fields
-from .falloff import HALF_LOG2E
 
 f32, f64 = np.float32, np.float64
 
@@ -97,7 +97,7 @@ class OnScreen(NamedTuple):
 
 @kernel(inline=True)
 def in_camera(m, x, y, z):
-    """A point in the axes of a camera: right, down and forward; `m` is its (3, 4) world to camera."""
+    """Return a point in the axes of a camera: right, down and forward; `m` is its (3, 4) world to camera."""
     return (
         m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3],
         m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3],
@@ -107,7 +107,7 @@ def in_camera(m, x, y, z):
 
 @kernel(inline=True)
 def jacobian(lens, inverse, dx, dy):
-    """Pixels per unit of a camera's axes at a point: x by right, y by down, x and y by forward.
+    """Return pixels per unit of a camera's axes at a point: x by right, y by down, x and y by forward.
 
     Args:
         lens: `Lens`.
@@ -119,7 +119,7 @@ def jacobian(lens, inverse, dx, dy):
 
 @kernel(inline=True)
 def per_world_unit(m, row, sideways, forward):
-    """Pixels per unit of the world's axes, of pixels per unit of axis `row` of a camera and of its forward axis."""
+    """Return pixels per unit of the world's axes, of those per unit of axis `row` of a camera and its forward axis."""
     return (
         sideways * m[row, 0] + forward * m[2, 0],
         sideways * m[row, 1] + forward * m[2, 1],
@@ -129,7 +129,7 @@ def per_world_unit(m, row, sideways, forward):
 
 @kernel(inline=True)
 def turned(t, r):
-    """Three pixels per world unit t along the axes of a splat of rotation r, 9 elements row by row."""
+    """Return three pixels per world unit t along the axes of a splat of rotation r, 9 elements row by row."""
     return (
         t[0] * r[0] + t[1] * r[3] + t[2] * r[6],
         t[0] * r[1] + t[1] * r[4] + t[2] * r[7],
@@ -139,7 +139,7 @@ def turned(t, r):
 
 @kernel(inline=True)
 def on_screen(center, scale, quat, lod_opacity, world_to_camera, lens, limits):
-    """The covariance of a splat on the screen, as Spark's vertex shader has it.
+    """Return the covariance of a splat on the screen, as Spark's vertex shader has it.
 
     Args:
         center, scale, quat: three, three and four float32.
@@ -181,7 +181,7 @@ def on_screen(center, scale, quat, lod_opacity, world_to_camera, lens, limits):
     before, a, b, c = f32(area), f32(xx + limits.blur), f32(xy), f32(yy + limits.blur)
     det = f32(area + limits.blur * (xx + yy) + limits.blur * limits.blur)
     is_shaped = (det > 0) & (a < MAX_VARIANCE) & (c < MAX_VARIANCE)
-    deviations = limits.std_devs + limits.std_devs_per_d * max(d - f32(1), f32(0))
+    deviations = deviations_of(d, limits.std_devs, limits.std_devs_per_d)
     d *= np.sqrt(before / det)
     mean = f32(0.5) * (a + c)
     spread = np.sqrt(max(mean * mean - det, f32(0)))
@@ -193,7 +193,7 @@ def on_screen(center, scale, quat, lod_opacity, world_to_camera, lens, limits):
 
 @kernel(inline=True)
 def shortened(a, b, c, det, deviations, max_radius):
-    """The covariance of a splat whose axes are shortened, each by itself, to `max_radius` pixels; and its determinant.
+    """Return the covariance of a splat, its axes shortened each by itself to `max_radius` pixels, and its determinant.
 
     Args:
         a, b, c, det, deviations: of `OnScreen`.
@@ -219,7 +219,7 @@ def shortened(a, b, c, det, deviations, max_radius):
 
 @kernel(inline=True)
 def ellipse(a, b, c, det, d, deviations, min_alpha):
-    """The columns that tell where a splat is drawn.
+    """Return the columns that tell where a splat is drawn.
 
     Args:
         a, b, c, det, d, deviations: of `OnScreen`, after `shortened`.
@@ -228,11 +228,8 @@ def ellipse(a, b, c, det, d, deviations, min_alpha):
     Returns:
         ALONG, SHEAR, ACROSS, LOG, LEAST, HALF_WIDTH, HALF_HEIGHT, SLOPE and TALL.
     """
-    is_plain = d <= f32(1)
     log = log2(d)
-    # Where alpha is least: a faint splat ends there.
-    faint = min(deviations * deviations, (log - log2(min_alpha)) / HALF_LOG2E)
-    end = max(faint if is_plain else deviations * deviations, f32(0))
-    log = log if is_plain else f32(0)
+    end = end_of(d, log, deviations, min_alpha)
+    log = log if d <= f32(1) else f32(0)
     falloff = np.sqrt(HALF_LOG2E * c / det), b / c, HALF_LOG2E / c, log, log - HALF_LOG2E * end
     return *falloff, np.sqrt(end * a), np.sqrt(end * c), b / a, np.sqrt(end * det / a)

@@ -72,19 +72,19 @@ class ShadedColumns(NamedTuple):
 
 @kernel(inline=True)
 def power_of(d):
-    """POWER of a splat of D."""
+    """Return POWER of a splat of D."""
     return linear_opacity_above_1(d, f32(1), f32(np.e)) if d > 1 else f32(1)
 
 
 @kernel(inline=True)
 def shown_color(value):
-    """A colour value as it is drawn; NaN is 0."""
+    """Return a colour value as it is drawn; NaN is 0."""
     return min(value, MAX_COLOR) if value > 0 else f32(0)
 
 
 @kernel(inline=True)
 def is_in_picture(x, y, half_width, half_height, lens):
-    """Whether a box overlaps the picture, or has a side that is not a number."""
+    """Return whether a box overlaps the picture, or has a side that is not a number."""
     return not (
         (x + half_width < 0) | (x - half_width > lens.width) | (y + half_height < 0) | (y - half_height > lens.height)
     )
@@ -92,7 +92,7 @@ def is_in_picture(x, y, half_width, half_height, lens):
 
 @kernel(inline=True)
 def project_splat(splats, i, world_to_camera, lens, limits, radial, row):
-    """A splat on the screen, as Spark's vertex shader projects it.
+    """Project a splat onto the screen, as Spark's vertex shader does.
 
     Args:
         splats: `ShadedColumns`.
@@ -129,14 +129,14 @@ def project_splat(splats, i, world_to_camera, lens, limits, radial, row):
 
 @kernel(inline=True)
 def exponent(row, dx, dy):
-    """t of the falloff 2 ** t of a splat on the screen, from its centre to a pixel; see `COLUMNS`."""
+    """Return t of the falloff 2 ** t of a splat on the screen, from its centre to a pixel; see `COLUMNS`."""
     along = row[ALONG] * (dx - row[SHEAR] * dy)
     return row[LOG] - along * along - row[ACROSS] * dy * dy
 
 
 @kernel(inline=True)
 def tiles_of(row, across, down):
-    """First and last tile on each axis that overlap the box of a splat on the screen."""
+    """Return first and last tile on each axis that overlap the box of a splat on the screen."""
     left = max(0, math.floor((row[X] - row[HALF_WIDTH]) / TILE))
     right = min(across - 1, math.floor((row[X] + row[HALF_WIDTH]) / TILE))
     top = max(0, math.floor((row[Y] - row[HALF_HEIGHT]) / TILE))
@@ -146,13 +146,13 @@ def tiles_of(row, across, down):
 
 @kernel(inline=True)
 def index_of(key):
-    """Which splat a key is of."""
+    """Return which splat a key is of."""
     return MAX_INDEX - np.int64(key & np.uint64(MAX_INDEX))
 
 
 @kernel(ShadedColumns, f4[:, :], Lens, Limits, b1, out(f4[:, :]), out(u8[:]), out(i2[:, :]), parallel=True)
 def project(splats, world_to_camera, lens, limits, radial, screen, keys, boxes):
-    """Splats on the screen; see `project_splat`, of which this is the same for many splats at once.
+    """Project splats onto the screen; see `project_splat`, of which this is the same for many splats at once.
 
     Args:
         splats, world_to_camera, lens, limits, radial: of `project_splat`.
@@ -171,7 +171,7 @@ def project(splats, world_to_camera, lens, limits, radial, screen, keys, boxes):
 
 @kernel(inline=True)
 def project_group(splats, start, count, world_to_camera, lens, limits, fields):
-    """Fills the fields of `count` splats from `start` on, but POWER and colours.
+    """Fill the fields of `count` splats from `start` on, but POWER and colours.
 
     Loops over fields, not over splats: LLVM vectorizes those without branches.
     """
@@ -212,7 +212,7 @@ def project_group(splats, start, count, world_to_camera, lens, limits, fields):
 
 @kernel(inline=True)
 def finish_group(splats, start, count, lens, radial, fields, screen, keys, boxes):
-    """Fills `screen`, `keys` and `boxes` of `project` of the fields of `count` splats from `start` on."""
+    """Fill `screen`, `keys` and `boxes` of `project` of the fields of `count` splats from `start` on."""
     across, down = -(-np.int64(lens.width) // TILE), -(-np.int64(lens.height) // TILE)
     for k in range(count):
         i = start + k

@@ -1,12 +1,12 @@
-"""Draws the tiles of a picture."""
+"""Lists the splats of each tile of a picture, and draws the tiles."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from ...model.falloff import merged, plain, shifted
 from ...support.jit import kernel, prange, prefetch
-from ...support.jit_types import b1, f4, i4, i8, out
-from .falloff import merged, plain, shifted
+from ...support.jit_types import b1, f4, i2, i4, i8, out, u8
 from .project import (
     ACROSS,
     ALONG,
@@ -26,6 +26,7 @@ from .project import (
     TILE,
     X,
     Y,
+    index_of,
 )
 
 f32 = np.float32
@@ -57,10 +58,67 @@ ROWS = (BATCH * BLOCKS + 1) * TILE
 PLACE, SPLAT = range(2)
 MIDDLE, MOST = range(2)
 
+#: Splats ahead whose boxes are fetched: with some notice, waits for memory overlap. Chosen.
+AHEAD = 16
+
+
+@kernel(u8[:], i2[:, :], i8, i8, i8, parallel=True)
+def sort_into_tiles(keys, boxes, across, down, blocks):
+    """List the splats of each tile, in their order.
+
+    Args:
+        keys: (M,) uint64 of `project`, sorted, without NOT_DRAWN.
+        boxes: (N, 4) int16 of it.
+        across, down: numbers of tiles.
+        blocks: ranges of splats to process in parallel; the result does not depend on it.
+
+    Returns:
+        start: (tiles + 1,) int64, where the splats of each tile begin.
+        splats: (total,) int32 splats, from near to far.
+    """
+    tiles = across * down
+    count = np.zeros((blocks, tiles), np.int32)
+    n = len(keys)
+    sorted_boxes, words = np.empty((n, 4), np.int16), boxes.reshape(-1)
+    for block in prange(blocks):
+        last = n * (block + 1) // blocks
+        for k in range(n * block // blocks, last):
+            if k + AHEAD < last:
+                prefetch(words, 4 * index_of(keys[k + AHEAD]))
+            box = boxes[np.uint64(index_of(keys[k]))]
+            left, right, top, bottom = np.int64(box[0]), np.int64(box[1]), np.int64(box[2]), np.int64(box[3])
+            near = sorted_boxes[np.uint64(k)]
+            near[0], near[1], near[2], near[3] = left, right, top, bottom
+            for y in range(top, bottom + 1):
+                for x in range(left, right + 1):
+                    count[block, np.uint64(y * across + x)] += 1
+    start = np.empty(tiles + 1, np.int64)
+    at = np.empty((blocks, tiles), np.int64)
+    total = 0
+    for tile in range(tiles):
+        start[tile] = total
+        for block in range(blocks):
+            at[block, tile] = total
+            total += count[block, tile]
+    start[tiles] = total
+    splats = np.empty(total, np.int32)
+    for block in prange(blocks):
+        for k in range(n * block // blocks, n * (block + 1) // blocks):
+            i = np.int32(index_of(keys[k]))
+            box = sorted_boxes[np.uint64(k)]
+            left, right, top, bottom = np.int64(box[0]), np.int64(box[1]), np.int64(box[2]), np.int64(box[3])
+            for y in range(top, bottom + 1):
+                for x in range(left, right + 1):
+                    tile = np.uint64(y * across + x)
+                    to = at[block, tile]
+                    at[block, tile] = to + 1
+                    splats[np.uint64(to)] = i
+    return start, splats
+
 
 @kernel(inline=True)
 def blend(lanes, i, alpha, is_drawn, red, green, blue):
-    """Blends a splat behind what a pixel has so far; branch-free, so that LLVM vectorizes over the pixels of a row.
+    """Blend a splat behind what a pixel has so far; branch-free, so that LLVM vectorizes over the pixels of a row.
 
     Colours are clamped to 1 after they are multiplied by alpha, as in an 8-bit picture.
     """
@@ -74,7 +132,7 @@ def blend(lanes, i, alpha, is_drawn, red, green, blue):
 
 @kernel(inline=True)
 def list_rows(splats, k, lines, rows, terms, end):
-    """Lists the rows of pixels in which a splat may be drawn; branch-free, as their number cannot be foreseen.
+    """List the rows of pixels in which a splat may be drawn; branch-free, as their number cannot be foreseen.
 
     Args:
         splats: (COLUMNS, BATCH) float32 splats of a batch, after `measure`.
@@ -105,7 +163,7 @@ def list_rows(splats, k, lines, rows, terms, end):
 
 @kernel(inline=True)
 def listed(splats, rows, terms, j):
-    """Of row j of a list: SPLAT, MIDDLE and MOST, and that splat's ALONG, LEAST, RED, GREEN and BLUE."""
+    """Return SPLAT, MIDDLE and MOST of row j of a list, and that splat's ALONG, LEAST, RED, GREEN and BLUE."""
     k = rows[SPLAT, j]
     shape = terms[MIDDLE, j], terms[MOST, j], splats[ALONG, k], splats[LEAST, k]
     return k, *shape, splats[RED, k], splats[GREEN, k], splats[BLUE, k]
@@ -113,7 +171,7 @@ def listed(splats, rows, terms, j):
 
 @kernel(inline=True)
 def blend_rows(pixels, splats, rows, terms, first, last, design, least):
-    """Blends splats into the rows of a list; they are all merged ones, or all others.
+    """Blend splats into the rows of a list; they are all merged ones, or all others.
 
     Args:
         pixels: (BLOCKS * TILE, 4, LANES) float32: transmittance, red, green and blue.
@@ -152,7 +210,7 @@ def blend_rows(pixels, splats, rows, terms, first, last, design, least):
 
 @kernel(inline=True)
 def blend_batch(pixels, splats, count, lines, rows, terms, design, least):
-    """Blends a batch of `count` splats, after `measure`, from near to far; for the arguments see `blend_rows`.
+    """Blend a batch of `count` splats, after `measure`, from near to far; for the arguments see `blend_rows`.
 
     Rows of several splats are blended in one loop, as loops over those of each would end where no processor foresees.
     """
@@ -169,7 +227,7 @@ def blend_batch(pixels, splats, count, lines, rows, terms, design, least):
 
 @kernel(inline=True)
 def measure(row, left, top, rows, columns, lines):
-    """Rows of pixels in which a splat may be drawn, in each column of blocks of a tile; branch-free.
+    """Return rows of pixels in which a splat may be drawn, in each column of blocks of a tile; branch-free.
 
     The ellipse of an elongated splat fills half its box or less. Its side is lowest in the column at its lowest point,
     or else at the column's nearer edge.
@@ -197,7 +255,7 @@ def measure(row, left, top, rows, columns, lines):
 
 @kernel(inline=True)
 def draw_tile(screen, start, splats, tile, across, design, least, image):
-    """Blends the splats of a tile, from near to far, see `draw_tiles`; returns where in `splats` it stopped."""
+    """Blend the splats of a tile, from near to far, see `draw_tiles`; return where in `splats` it stopped."""
     height, width = image.shape[:2]
     left, top = tile % across * TILE, tile // across * TILE
     down, right = min(TILE, height - top), min(TILE, width - left)
@@ -238,11 +296,11 @@ def draw_tile(screen, start, splats, tile, across, design, least, image):
 
 @kernel(f4[:, :], i8[:], i4[:], i8, b1, f4, out(f4[:, :, :]), out(i8[:]), parallel=True, contract=True)
 def draw_tiles(screen, start, splats, across, design, least, image, stop):
-    """Blends the splats of each tile, from near to far.
+    """Blend the splats of each tile, from near to far.
 
     Args:
         screen: (N, COLUMNS) of `project`.
-        start, splats: of `tiles.sort_into_tiles`.
+        start, splats: of `sort_into_tiles`.
         across: number of tiles in a row of them.
         design: merged splats have the falloff `shifted`, that of Spark's LoD design.
         least: float32, least alpha that is drawn.

@@ -52,7 +52,7 @@ class View(NamedTuple):
     contract=True,
 )
 def compare_levels(splats, sh, runs, poses, basis, sizes, focal, limits, differences):
-    """Squared differences between pictures of regions at their detail levels and at the first.
+    """Sum squared differences between pictures of regions at their detail levels and at the first.
 
     Args:
         splats: `ShadedColumns` of all levels, with colours that lack the spherical harmonics of degree 1 and above.
@@ -87,7 +87,7 @@ def compare_levels(splats, sh, runs, poses, basis, sizes, focal, limits, differe
 
 @kernel()
 def project_run(splats, sh, start, count, view, screen):
-    """Fills the rows of `screen` with the splats of a run that are drawn, from near to far; returns their number."""
+    """Fill the rows of `screen` with the splats of a run that are drawn, from near to far; return their number."""
     stop = start + count
     rgb = splats.rgb[start:stop].copy()
     for i in range(count):
@@ -110,7 +110,7 @@ def project_run(splats, sh, start, count, view, screen):
 
 @kernel()
 def by_depth(center, world_to_camera):
-    """(n,) int32 rows of (n, 3) centres in front of a camera, from near to far; of equal depths, the last first."""
+    """Return (n,) int32 rows of (n, 3) centres in front of a camera, from near to far; of equal depths the last."""
     m, n = world_to_camera, len(center)
     keys, order = np.empty(n, np.uint32), np.empty(n, np.int32)
     low, high = np.uint32(0xFFFFFFFF), np.uint32(0)
@@ -131,7 +131,7 @@ def by_depth(center, world_to_camera):
 
 @kernel()
 def digit_sorted(keys, values, shift):
-    """Keys and values, sorted stably by DIGIT_BITS bits of the keys, from bit `shift` on."""
+    """Sort keys and values stably by DIGIT_BITS bits of the keys, from bit `shift` on."""
     at = np.zeros((1 << DIGIT_BITS) + 1, np.int64)
     mask = np.uint32((1 << DIGIT_BITS) - 1)
     shift = np.uint32(shift)
@@ -149,7 +149,7 @@ def digit_sorted(keys, values, shift):
 
 @kernel(inline=True)
 def draw_run(screen, tiles, least, picture):
-    """Draws splats on the screen, from near to far, into a square picture of `tiles` tiles along each side."""
+    """Draw splats on the screen, from near to far, into a square picture of `tiles` tiles along each side."""
     start = np.zeros(tiles * tiles + 1, np.int64)
     for i in range(len(screen)):
         left, right, top, bottom = tiles_of(screen[i], tiles, tiles)
@@ -171,7 +171,7 @@ def draw_run(screen, tiles, least, picture):
 
 @kernel()
 def squared_difference(picture, other):
-    """Sum of the squared differences of two pictures, over pixels and channels, in float64."""
+    """Return the sum of the squared differences of two pictures, over pixels and channels, in float64."""
     a, b = picture.reshape(-1, LANES), other.reshape(-1, LANES)
     sums = np.zeros(LANES)
     for i in range(len(a)):

@@ -15,7 +15,7 @@ C1, C2, C3 = f32(SH_C1), tuple(map(f32, SH_C2)), tuple(map(f32, SH_C3))
 
 @kernel(inline=True)
 def second(x, y, z):
-    """The spherical harmonics of degree 2 in a unit direction."""
+    """Return the spherical harmonics of degree 2 in a unit direction."""
     return (
         C2[0] * x * y,
         C2[1] * y * z,
@@ -27,7 +27,7 @@ def second(x, y, z):
 
 @kernel(inline=True)
 def third(x, y, z):
-    """The spherical harmonics of degree 3 in a unit direction."""
+    """Return the spherical harmonics of degree 3 in a unit direction."""
     return (
         C3[0] * y * (f32(3) * x * x - y * y),
         C3[1] * x * y * z,
@@ -41,7 +41,7 @@ def third(x, y, z):
 
 @kernel(f4[:, :], f4[:, :, :], f4[:], i8, out(f4[:, :]), parallel=True)
 def add_sh(center, sh, eye, degree, rgb):
-    """Adds the terms of degree 1 and above to colours.
+    """Add the terms of degree 1 and above to colours.
 
     Args:
         center: (N, 3) float32.
@@ -77,7 +77,7 @@ def add_sh(center, sh, eye, degree, rgb):
 
 @kernel(f4[:, :], f4[:], f4[:, :], out(f4[:, :, :]), parallel=True)
 def sh_gradients(center, eye, by_rgb, by_sh):
-    """Derivatives by coefficients of degree 1 and above: the basis in a splat's direction, times those by its colour.
+    """Compute derivatives by SH coefficients: the basis in a splat's direction, times the derivatives by its colour.
 
     Args:
         center, eye: of `add_sh`.

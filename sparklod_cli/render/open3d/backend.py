@@ -24,10 +24,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...cameras.camera import Camera
+from ...model.falloff import MAX_STD_DEV, MIN_ALPHA
 from ...model.gaussian import linear_opacity
 from ...model.sh import SH_C0
 from ..rasterizer import Image
-from ..settings import BLUR, CLIP, MAX_STD_DEV, MIN_ALPHA, RasterSettings
+from ..settings import BLUR, CLIP, RasterSettings
 from ..shading import ShadedSplats
 from .child import COLUMNS, PIECE, TILE, Array
 from .process import Child
@@ -47,7 +48,7 @@ ASKEW = 1e-5
 
 
 def draw(shaded: ShadedSplats, camera: Camera, raster: RasterSettings) -> Image:
-    """The picture of a camera: (height, width, 4) float32 red, green, blue (premultiplied) and alpha, 0..1.
+    """Draw the picture of a camera: (height, width, 4) float32 red, green, blue (premultiplied) and alpha, 0..1.
 
     Raises:
         BackendError: Open3D is not installed, cannot draw here, or has crashed.
@@ -69,7 +70,7 @@ def draw(shaded: ShadedSplats, camera: Camera, raster: RasterSettings) -> Image:
 def pieces(
     shaded: ShadedSplats, camera: Camera, raster: RasterSettings, most_entries: int
 ) -> Iterator[tuple[tuple[int, int], dict[str, Any], Array]]:
-    """The pieces that Open3D draws: left and top of each, the request, and the splats that touch it.
+    """Return the pieces that Open3D draws: left and top of each, the request, and the splats that touch it.
 
     The splats are those that Spark would draw, relative to the camera.
     """
@@ -119,7 +120,7 @@ def pieces(
 
 
 def _split(camera: Camera, low: Array, high: Array, most: int) -> Iterator[tuple[Square, NDArray[np.intp], int]]:
-    """Squares that cover the splats of a picture: each with its splats, and the number of pairs of splat and tile.
+    """Yield squares that cover the splats of a picture: each with its splats, and its pairs of splat and tile.
 
     Args:
         low, high: (N, 2) the corners of boxes around splats, pixels.

@@ -52,7 +52,7 @@ Array = NDArray[Any]
 
 
 def send(file: IO[bytes], message: dict[str, Any], array: Array | None = None) -> None:
-    """Writes a message and, optionally, an array."""
+    """Write a message and, optionally, an array."""
     # Not as .npy, which requires a seekable file.
     about = None if array is None else {"type": array.dtype.str, "shape": array.shape}
     file.write(json.dumps({**message, "array": about}).encode() + b"\n")
@@ -62,7 +62,7 @@ def send(file: IO[bytes], message: dict[str, Any], array: Array | None = None) -
 
 
 def receive(file: IO[bytes]) -> tuple[dict[str, Any], Array | None]:
-    """Reads a message and its array.
+    """Read a message and its array.
 
     Raises:
         EOFError: the other process has ended.
@@ -123,7 +123,7 @@ class Painter:
         self._material.gaussian_splat_antialias = True
 
     def probe(self) -> None:
-        """Draws a splat to check that Open3D works: without a Vulkan device it draws nothing, and raises nothing.
+        """Draw a splat to check that Open3D works: without a Vulkan device it draws nothing, and raises nothing.
 
         Raises:
             RuntimeError: the splat is not in the picture.
@@ -144,7 +144,7 @@ class Painter:
             )
 
     def draw(self, request: dict[str, Any], splats: Array) -> Array:
-        """(2, side, side, 3) uint8: the picture on black, and on white.
+        """Return (2, side, side, 3) uint8: the picture on black, and on white.
 
         Args:
             request: "side" of the picture; "intrinsic", (3, 3); "rotation", (3, 3) world to camera, with y down,
@@ -195,7 +195,7 @@ class Painter:
 
 
 def main() -> None:
-    """Answers requests until standard input is closed."""
+    """Answer requests until standard input is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # handled by the parent, which then closes the input
     answers, requests = os.fdopen(os.dup(1), "wb"), sys.stdin.buffer
     os.dup2(2, 1)  # libraries print to descriptor 1

@@ -53,11 +53,11 @@ class Child:
         self.most_entries = MOST_ENTRIES_OF_OLD_MESA if mesa and int(mesa[1]) < NEW_MESA else MOST_ENTRIES
 
     def alive(self) -> bool:
-        """Whether the process is running."""
+        """Return whether the process is running."""
         return self._process.poll() is None
 
     def ask(self, request: dict[str, Any], splats: Array) -> Array:
-        """Draws pictures; see `Painter.draw`.
+        """Draw pictures; see `Painter.draw`.
 
         Raises:
             BackendError: Open3D has crashed, takes too long, or reports an error.
@@ -110,7 +110,7 @@ class Child:
         return lines[-1] if lines else f"exit code {self._process.returncode}"
 
     def close(self) -> None:
-        """Ends the process, which exits when its input is closed."""
+        """End the process, which exits when its input is closed."""
         atexit.unregister(self.close)
         assert self._process.stdin is not None and self._process.stdout is not None
         with contextlib.suppress(OSError):

@@ -16,8 +16,7 @@ from fixtures import by_hand_sog, by_hand_streamed_sog
 from sparklod_cli.codecs.streamed_sog import codec
 from sparklod_cli.io import open_stream, read_levels, read_scene
 from sparklod_cli.model import streams
-from sparklod_cli.model.detail import DetailScene
-from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.scene import DetailScene, Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.support.errors import FormatError, UnknownFormatError
 from tests.codecs.test_round_trip import assert_close

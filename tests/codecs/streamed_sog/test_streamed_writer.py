@@ -17,8 +17,7 @@ from sparklod_cli.codecs.streamed_sog.manifest import parse
 from sparklod_cli.io import read_levels, read_scene
 from sparklod_cli.io.details import detail_sink
 from sparklod_cli.model import morton
-from sparklod_cli.model.detail import DetailScene
-from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.scene import DetailScene, Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.support.errors import FormatError
 

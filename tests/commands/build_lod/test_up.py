@@ -14,7 +14,7 @@ from sparklod_cli.api.viewing import ViewSettings, prepare
 from sparklod_cli.cli import run
 from sparklod_cli.images.metrics import psnr
 from sparklod_cli.io import read_levels, read_scene
-from sparklod_cli.model.up_axis import AXES
+from sparklod_cli.model.transforms import AXES
 from tests.commands.build_lod.runs import SMALL, build
 
 pytestmark = pytest.mark.slow

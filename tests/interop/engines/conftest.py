@@ -22,7 +22,7 @@ from sparklod_cli.io import read_scene
 from sparklod_cli.io.details import detail_sink
 from sparklod_cli.lod import detail_levels, quality
 from sparklod_cli.lod.detail_rule import DetailSettings
-from sparklod_cli.model.detail import DetailScene
+from sparklod_cli.model.scene import DetailScene
 from sparklod_cli.model.splats import Splats
 from tests.conftest import FIXTURES
 from tests.interop import npm

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sparklod_cli.lod.kernels import profile
+from sparklod_cli.model import falloff
 from sparklod_cli.model.gaussian import MIN_OPACITY, lod_opacity, spark_size
 from tests.references import quality as twin
 from tests.scenes import random_splats
@@ -17,7 +18,7 @@ from tests.scenes import random_splats
 
 @pytest.mark.parametrize("a", [1, 2, 3, 10, 100, 5000])
 def test_harmonic_numbers_of_integers_are_sums(a: int) -> None:
-    first, second = profile.harmonic(np.array([float(a)]))
+    first, second = falloff.harmonic(np.array([float(a)]))
     assert first[0] == pytest.approx(math.fsum(1 / k for k in range(1, a + 1)), rel=1e-5)
     assert second[0] == pytest.approx(math.fsum(1 / k**2 for k in range(1, a + 1)), rel=1e-5)
 

@@ -1,15 +1,45 @@
-"""Tiles leave out no pixel at which a splat is drawn."""
+"""Splats are projected alone, tiles list those that overlap them, and leave out no pixel at which one is drawn."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from sparklod_cli.render.kernels.project import HALF_HEIGHT, HALF_WIDTH, LEAST, TILE, X, Y, exponent, index_of
-from sparklod_cli.render.kernels.raster import BLOCKS, LANES, measure
-from sparklod_cli.render.rasterizer import project_splats
-from sparklod_cli.render.settings import RasterSettings
-from tests.render.test_rasterizer import camera_at, shown
+from sparklod_cli.render import rasterizer
+from sparklod_cli.render.kernels.project import GROUP, HALF_HEIGHT, HALF_WIDTH, LEAST, TILE, X, Y, exponent, index_of
+from sparklod_cli.render.kernels.raster import BLOCKS, LANES, measure, sort_into_tiles
+from sparklod_cli.render.rasterizer import project_splats, tiles_across
+from sparklod_cli.render.settings import SORTS, RasterSettings
+from tests.render.test_rasterizer import camera_at, joined, one, shown
+from tests.render.test_rasterizer import rows as rows_of
+
+
+@pytest.mark.parametrize("blocks", [1, 3])
+def test_a_tile_lists_the_splats_whose_boxes_overlap_it_from_near_to_far(blocks: int) -> None:
+    """Those that are not drawn have empty boxes, and no key."""
+    camera = camera_at(size=(200, 150), focal=(100.0, 100.0))
+    seen = project_splats(shown(500, spread=2.0, most=3.0), camera, RasterSettings())
+    across, down = tiles_across(camera)
+    start, splats = sort_into_tiles(seen.keys, seen.boxes, across, down, blocks)
+    order = [index_of(key) for key in seen.keys]
+    assert 0 < len(order) < 500
+    for tile in range(across * down):
+        y, x = divmod(tile, across)
+        left, right, top, bottom = seen.boxes[order].T
+        overlap = (left <= x) & (x <= right) & (top <= y) & (y <= bottom)
+        assert splats[start[tile] : start[tile + 1]].tolist() == np.array(order)[overlap].tolist()
+    hidden = np.setdiff1d(np.arange(500), order)
+    assert (seen.boxes[hidden, 1] < seen.boxes[hidden, 0]).all()
+
+
+def test_a_picture_with_more_tiles_than_their_numbers_hold_is_refused() -> None:
+    camera = camera_at(size=(rasterizer.MAX_SIDE + 1, 1))
+    with pytest.raises(ValueError, match="524,272 along a side"):
+        rasterizer.draw(shown(1), camera, RasterSettings())
+    widest = camera_at((0, 0, 5), size=(rasterizer.MAX_SIDE, 1), focal=(1e5, 1e5))
+    ends = joined(*(one((x, 0, 0), 0.01, 1.0, (1, 1, 1)) for x in (-13.1, 13.1)))
+    image = rasterizer.draw(ends, widest, RasterSettings())
+    assert image[0, :700].any() and image[0, -700:].any() and not image[0, 700:-700].any()
 
 
 @pytest.mark.parametrize("scale", [(0.08, 0.08, 0.08), (0.5, 0.0005, 0.0005), (8.0, 0.01, 0.01), (6.0, 3.0, 0.001)])
@@ -41,3 +71,22 @@ def test_rows_beside_an_ellipse_are_those_without_a_pixel_of_it(scale: tuple[flo
                     if first - row[HALF_WIDTH] <= row[X] <= first + LANES + row[HALF_WIDTH]:
                         kept, boxed = kept + max(0, below - above), boxed + rows.sum()
     assert kept < 0.95 * boxed
+
+
+@pytest.mark.parametrize("sort", SORTS)
+@pytest.mark.parametrize("scale", [0.08, 8.0])
+def test_a_splat_is_projected_alike_among_any_others(scale: float, sort: str) -> None:
+    """Small ones, and ones whose axes are shortened; D from 0 to 5; some beside the picture."""
+    camera, look, count = camera_at(), RasterSettings(sort=sort), 2 * GROUP + 7
+    scene = shown(count, scale=scale, spread=2.0, most=5.0)
+    whole = project_splats(scene, camera, look)
+    drawn = sorted(index_of(key) for key in whole.keys)
+    found = whole.screen[drawn].copy(), whole.boxes.copy()
+    assert 0 < len(drawn) < count
+    for size in (1, GROUP - 1, GROUP, GROUP + 1):
+        first = count - size
+        part = project_splats(rows_of(scene, slice(first, None)), camera, look)
+        kept = sorted(index_of(key) for key in part.keys)
+        assert [first + i for i in kept] == [i for i in drawn if i >= first]
+        np.testing.assert_array_equal(part.screen[kept], found[0][len(drawn) - len(kept) :])
+        np.testing.assert_array_equal(part.boxes, found[1][first:])

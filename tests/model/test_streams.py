@@ -11,10 +11,9 @@ import pytest
 from sparklod_cli.model import streams
 from sparklod_cli.model.gaussian import placed
 from sparklod_cli.model.instances import Instance
-from sparklod_cli.model.merged import Placed, merged
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
-from sparklod_cli.model.streams import collected, stream_of
+from sparklod_cli.model.streams import Placed, collected, merged, stream_of
 from sparklod_cli.model.transforms import Transform
 from sparklod_cli.support.errors import FormatError
 from tests.scenes import random_splats

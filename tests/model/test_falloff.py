@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from sparklod_cli.render.kernels import falloff
+from sparklod_cli.model import falloff
 
 DISTANCES = np.linspace(0, 5, 101, dtype=np.float32)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sparklod_cli.support.ticks import nice_step, ticks
+from sparklod_cli.render.color_scales import nice_step, ticks
 
 
 @given(st.floats(1e-12, 1e12))
