@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..tables.table import Table
+from ..tables.columns import Table
 from .arguments import file_path
 
 if TYPE_CHECKING:

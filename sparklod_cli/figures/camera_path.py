@@ -9,15 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras.camera import Camera
-from ..images.text import BACKGROUND
+from ..images.pixels import BACKGROUND
 from ..model.splats import Splats
 from ..render.color_scales import range_of, whole_numbers
 from ..support.errors import SparklodError
 from ..support.units import count_of
-from .ellipsoids import Points, box_lines, evenly
-from .labels import write_png
-from .pyvista_scene import Stage
-from .viewpoint import Viewpoint, bounds, is_drawable, viewpoint
+from .geometry import Points, Viewpoint, bounds, box_lines, evenly, is_drawable, viewpoint
+from .pyvista_scene import Stage, write_png
 
 #: Most splats that are drawn; of more, an even sample.
 MOST_POINTS = 600_000

@@ -1,23 +1,65 @@
-"""Charts of a traversal: its columns over time, as small multiples. The only module that imports matplotlib."""
+"""What charts of tables share: series over time, colours, the figure of matplotlib. The only module that imports it."""
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator, Mapping, Sequence
+import io
+from collections.abc import Callable, Sequence
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image, ImageDraw
 
-from ..images.text import BACKGROUND, FAINT, INK, LINE
+from ..images.pixels import BACKGROUND, FAINT, INK, LINE, write_title
 from ..support.optional import optional_import
 from ..tables.columns import Row
-from .panels import PANELS
-from .series import PINK, Frames
+from ..tables.statistics import numbers
 
-#: Resolution in pixels an inch; width of the figure and height of a row of two charts, in pixels.
-DPI, WIDTH, ROW = 100, 1600, 255
+#: Colours of the series: stops of the colour scales of `render.color_scales`, and pink for marks.
+GREEN, BLUE, INDIGO, ORANGE, YELLOW, PINK = "#44bf70", "#2a788e", "#414487", "#ed7953", "#fde725", "#ff5c8a"
+
+#: (N,) numbers, one for each row.
+Series = NDArray[np.float64]
+
+
+class Frames:
+    """Columns of rows as arrays, along an axis of time or of frame numbers.
+
+    Attributes:
+        x: (N,) seconds; frame numbers where the rows have no times.
+    """
+
+    def __init__(self, rows: Sequence[Row]) -> None:
+        times = numbers(rows, "time_s")
+        timed = len(times) == len(rows) and len(set(times)) > 1
+        self.rows, self._timed = rows, timed
+        self.x = np.array(times if timed else numbers(rows, "frame"), np.float64)
+        if len(rows) == 1:  # two points, one frame apart, so that a line can be seen
+            self.rows, self.x = [rows[0], rows[0]], self.x + np.array([-0.5, 0.5])
+
+    def tick(self, value: float, place: int) -> str:
+        """The label of a tick of the axis."""
+        if self._timed:
+            return f"{value:g} s"
+        return f"frame {value:,.0f}" if value == round(value) else ""
+
+    def has(self, *names: str) -> bool:
+        """Whether each of these columns has a number in some row."""
+        return all(numbers(self.rows, name) for name in names)
+
+    def column(self, name: str) -> Series:
+        """(N,) values of a column; NaN for empty cells."""
+        return np.array([np.nan if row[name] is None else row[name] for row in self.rows], np.float64)
+
+    def ratio(self, name: str, of: str) -> Series:
+        """(N,) one column over another; NaN where a cell is empty, or the other is 0."""
+        above, below = self.column(name), self.column(of)
+        return np.divide(above, below, out=np.full(len(above), np.nan), where=below != 0)
+
+
+#: Resolution in pixels an inch, and width of a figure in pixels.
+DPI, WIDTH = 100, 1600
 
 #: Ground of a chart.
 PANEL = "#141b24"
@@ -39,30 +81,6 @@ def load_matplotlib() -> ModuleType:
     return matplotlib
 
 
-def draw(rows: Sequence[Row], marked: Mapping[str, int]) -> NDArray[np.uint8]:
-    """(H, WIDTH, 3) the charts of a path; a column without a number has none.
-
-    Args:
-        rows: one for each frame, at least one.
-        marked: numbers of frames worth a look, by the reason (`Panel.marks`).
-
-    Raises:
-        SparklodError: matplotlib is not installed.
-    """
-    matplotlib = load_matplotlib()
-    with styled(matplotlib):
-        return _draw(matplotlib, rows, marked)
-
-
-@contextlib.contextmanager
-def styled(matplotlib: ModuleType) -> Iterator[None]:
-    """Applies `style` inside the context, whatever a matplotlibrc says."""
-    with matplotlib.rc_context():
-        matplotlib.rcdefaults()
-        matplotlib.rcParams.update(style())
-        yield
-
-
 def style() -> dict[str, Any]:
     """matplotlib's parameters for charts in the colours of the rendered figures."""
     return {
@@ -76,45 +94,39 @@ def style() -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _draw(matplotlib: ModuleType, rows: Sequence[Row], marked: Mapping[str, int]) -> NDArray[np.uint8]:
-    frames = Frames(rows)
-    panels = [panel for panel in PANELS if frames.has(*panel.columns)]
-    lines = max(1, -(-len(panels) // 2))
-    figure = matplotlib.figure.Figure((WIDTH / DPI, ROW * lines / DPI), DPI, layout="constrained")
-    canvas = matplotlib.backends.backend_agg.FigureCanvasAgg(figure)
-    figure.get_layout_engine().set(rect=(0.012, 0.008, 0.976, 0.992), wspace=0.05, hspace=0.05)
-    grid = figure.subplots(lines, 2, squeeze=False).ravel()
-    for axes in grid[len(panels) :]:
-        axes.remove()
-    places = {row["frame"]: at for at, row in enumerate(rows)}
-    for panel, axes in zip(panels, grid, strict=False):
-        axes.set_title(panel.title)
-        heights = panel.draw(axes, frames, matplotlib)
-        margin = 0.004 * (frames.x[-1] - frames.x[0])  # so that markers at either end are not cut
-        axes.set_xlim(frames.x[0] - margin, frames.x[-1] + margin)
-        axes.xaxis.set_major_formatter(frames.tick)
-        if axes.get_legend_handles_labels()[0]:
-            axes.legend(loc="lower right", bbox_to_anchor=(1.0, 0.98), ncols=4, borderpad=0, handlelength=1.4)
-        for reason, number in marked.items():
-            at = places[number]
-            axes.axvline(frames.x[at], color=PINK, alpha=0.28, linewidth=0.9)
-            if reason in panel.marks:
-                _mark(axes, number, frames.x[at], heights[at], at > 0.85 * len(rows))
-    canvas.draw()
-    pixels: NDArray[np.uint8] = np.asarray(canvas.buffer_rgba())[..., :3].copy()
+def draw(lines: int, height: int, fill: Callable[[ModuleType, NDArray[Any]], None]) -> NDArray[np.uint8]:
+    """(H, WIDTH, 3) a figure in the style of this package, whatever a matplotlibrc says.
+
+    Args:
+        lines: rows of two charts, each
+        height: pixels high.
+        fill: draws into the axes of the charts, (2 lines,), given matplotlib and these.
+
+    Raises:
+        SparklodError: matplotlib is not installed.
+    """
+    matplotlib = load_matplotlib()
+    with matplotlib.rc_context():
+        matplotlib.rcdefaults()
+        matplotlib.rcParams.update(style())
+        figure = matplotlib.figure.Figure((WIDTH / DPI, height * lines / DPI), DPI, layout="constrained")
+        canvas = matplotlib.backends.backend_agg.FigureCanvasAgg(figure)
+        figure.get_layout_engine().set(rect=(0.012, 0.008, 0.976, 0.992), wspace=0.05, hspace=0.05)
+        fill(matplotlib, figure.subplots(lines, 2, squeeze=False).ravel())
+        canvas.draw()
+        pixels: NDArray[np.uint8] = np.asarray(canvas.buffer_rgba())[..., :3].copy()
     return pixels
 
 
-def _mark(axes: Axes, number: int, x: float, y: float, left: bool) -> None:
-    axes.plot([x], [y], "o", color=PINK, markersize=6, zorder=5, clip_on=False)
-    axes.annotate(
-        f"frame {number:,}",
-        (x, y),
-        (-8 if left else 8, 3),
-        textcoords="offset points",
-        color=INK,
-        fontsize=9.5,
-        ha="right" if left else "left",
-        va="bottom",
-        annotation_clip=False,
-    )
+def head(title: str, lines: Sequence[tuple[str, str]], height: int) -> Image.Image:
+    """Title of a figure and lines below it, each a text and a colour."""
+    image = Image.new("RGB", (WIDTH, height), BACKGROUND)
+    write_title(ImageDraw.Draw(image), 1.0, title, lines)
+    return image
+
+
+def stacked(*images: Image.Image | NDArray[np.uint8]) -> bytes:
+    """The PNG of images of the same width, stacked from top to bottom."""
+    out = io.BytesIO()
+    Image.fromarray(np.concatenate([np.asarray(image) for image in images])).save(out, "PNG", optimize=True)
+    return out.getvalue()

@@ -2,28 +2,23 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageDraw
 
-from ..images.text import BACKGROUND, FAINT, write_title
+from ..images.pixels import FAINT
 from ..tables.columns import Row
 from ..tables.statistics import numbers
-from .charts import DPI, WIDTH, load_matplotlib, styled
-from .series import BLUE, GREEN, INDIGO, ORANGE, PINK, YELLOW, Frames
+from .charts import BLUE, GREEN, INDIGO, ORANGE, PINK, YELLOW, Axes, Frames, draw, head, stacked
 
 #: Heights of a row of charts and of the title above them, in pixels.
 ROW, HEAD = 420, 122
 
 #: Colours of the budgets, in their order; with more budgets than colours they repeat.
 COLORS = (INDIGO, BLUE, GREEN, YELLOW, ORANGE, PINK)
-
-Axes = Any
 
 #: The rows of a budget, one for each frame, and the budget as it was given ("5%").
 Series = tuple[str, Sequence[Row]]
@@ -41,33 +36,18 @@ def plot(series: Sequence[Series], title: str) -> bytes:
     Raises:
         SparklodError: matplotlib is not installed.
     """
-    matplotlib = load_matplotlib()
-    with styled(matplotlib):
-        charts = _charts(matplotlib, series)
-    head = Image.new("RGB", (WIDTH, HEAD), BACKGROUND)
-    frames = len(series[0][1])
+    groups, frames = [rows for _, rows in series], len(series[0][1])
+
+    def fill(matplotlib: ModuleType, grid: NDArray[Any]) -> None:
+        _by_budget(matplotlib, grid[0], groups, "psnr", "PSNR by budget", "dB")
+        _by_budget(matplotlib, grid[1], groups, "ssim", "SSIM by budget", "")
+        _by_budget(matplotlib, grid[2], groups, "edge_psnr", "PSNR of edges by budget", "dB")
+        _by_frame(grid[3], series, "psnr", "PSNR along the path", "dB")
+        _by_frame(grid[4], series, "worst_tile_psnr", "PSNR of the worst tile", "dB")
+        _by_frame(grid[5], series, "popping", "Popping along the path", "steps of 8 bits")
+
     about = f"against full detail, {frames:,} frame{'s' * (frames > 1)}, on black and on white"
-    write_title(ImageDraw.Draw(head), 1.0, title, [(about, FAINT)])
-    out = io.BytesIO()
-    Image.fromarray(np.concatenate([np.asarray(head), charts])).save(out, "PNG", optimize=True)
-    return out.getvalue()
-
-
-def _charts(matplotlib: ModuleType, series: Sequence[Series]) -> NDArray[np.uint8]:
-    groups = [rows for _, rows in series]
-    figure = matplotlib.figure.Figure((WIDTH / DPI, 3 * ROW / DPI), DPI, layout="constrained")
-    canvas = matplotlib.backends.backend_agg.FigureCanvasAgg(figure)
-    figure.get_layout_engine().set(rect=(0.012, 0.008, 0.976, 0.992), wspace=0.05, hspace=0.05)
-    grid = figure.subplots(3, 2)
-    _by_budget(matplotlib, grid[0, 0], groups, "psnr", "PSNR by budget", "dB")
-    _by_budget(matplotlib, grid[0, 1], groups, "ssim", "SSIM by budget", "")
-    _by_budget(matplotlib, grid[1, 0], groups, "edge_psnr", "PSNR of edges by budget", "dB")
-    _by_frame(grid[1, 1], series, "psnr", "PSNR along the path", "dB")
-    _by_frame(grid[2, 0], series, "worst_tile_psnr", "PSNR of the worst tile", "dB")
-    _by_frame(grid[2, 1], series, "popping", "Popping along the path", "steps of 8 bits")
-    canvas.draw()
-    pixels: NDArray[np.uint8] = np.asarray(canvas.buffer_rgba())[..., :3].copy()
-    return pixels
+    return stacked(head(title, [(about, FAINT)], HEAD), draw(3, ROW, fill))
 
 
 def _by_budget(

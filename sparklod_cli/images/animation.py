@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import io
-import itertools
-from collections.abc import Iterable, Iterator
+import struct
+from collections.abc import Iterable
 from types import ModuleType
 
 import numpy as np
@@ -12,14 +12,19 @@ from PIL import Image
 
 from ..support.errors import SparklodError
 from ..support.optional import optional_import
-from . import animated_webp, gif
 from .pixels import Pixels
 
+#: Durations of the frames of a GIF: steps in ms, and the fewest steps that players do not slow down.
+GIF_STEP, LEAST_STEPS = 10, 2
+
 #: Longest duration of a frame, ms: 16 bits of hundredths in GIF, 24 bits of ms in WebP, ffmpeg's limit for videos.
-LONGEST = {"gif": gif.STEP * gif.MOST_STEPS, "webp": animated_webp.LONGEST, "mp4": 1_000_000, "webm": 1_000_000}
+LONGEST = {"gif": GIF_STEP * 0xFFFF, "webp": 0xFFFFFF, "mp4": 1_000_000, "webm": 1_000_000}
 
 #: Quality of WebP (0 to 100), rate factors of H.264 (51 to 0) and VP9 (63 to 0): losses are hardly visible.
 WEBP_QUALITY, H264_QUALITY, VP9_QUALITY = 90, 16, 24
+
+#: Flag of a WebP that it has alpha. libwebp leaves it out where only what is cut off at the edges is transparent.
+WEBP_ALPHA = 0x10
 
 #: Codec and options of ffmpeg for each kind of video. VP9 obeys its rate factor only with a bit rate of 0, and uses
 #: several processors only with -row-mt.
@@ -59,38 +64,63 @@ def load_imageio(form: str) -> ModuleType:
     return module
 
 
-def animate(frames: Iterable[Pixels], form: str, fps: float) -> Iterator[bytes]:
-    """The bytes of an animation in an endless loop ("gif", "webp") or of a video ("mp4", "webm"), piece by piece.
+def animate(frames: Iterable[Pixels], count: int, form: str, fps: float) -> bytes:
+    """Return the bytes of an animation in an endless loop ("gif", "webp") or of a video ("mp4", "webm").
 
-    Frames are encoded as they come; the memory that takes does not depend on their number, but for the bytes of videos.
+    Frames are taken as they are encoded; a GIF's are held, a byte a pixel, until the last.
 
     Args:
         frames: at least one, all of one size; with alpha for "webp" only.
+        count: number of frames.
         form: one of `defaults.MOVING`.
         fps: frames per second.
 
     Raises:
         SparklodError: videos cannot be written here, or the animation is too large for its format.
     """
+    out = io.BytesIO()
     if form in VIDEOS:
-        out = io.BytesIO()
         _write_video(out, frames, form, fps)
-        yield out.getvalue()
-    elif form == "gif":
-        pictures = (Image.fromarray(frame).convert("P", palette=Image.Palette.ADAPTIVE, colors=256) for frame in frames)
-        yield from gif.written(pictures, _times(fps, gif.STEP, gif.LEAST_STEPS))
-    else:
-        pictures = (Image.fromarray(frame) for frame in frames)
-        yield from animated_webp.written(pictures, _times(fps, 1, 1), quality=WEBP_QUALITY, method=4)
+        return out.getvalue()
+    step, least = (GIF_STEP, LEAST_STEPS) if form == "gif" else (1, 1)
+    times = _times(fps, count, step, least)
+    try:
+        if form == "gif":
+            palette = Image.Palette.ADAPTIVE
+            pictures = (Image.fromarray(frame).convert("P", palette=palette, colors=256) for frame in frames)
+            next(pictures).save(out, "GIF", save_all=True, append_images=pictures, duration=times, loop=0)
+        else:
+            film = _film(frames, count)
+            film.save(out, "WEBP", save_all=True, duration=times, loop=0, quality=WEBP_QUALITY, method=4)
+    except (OSError, OverflowError, struct.error) as error:
+        raise SparklodError(f"the .{form} cannot be written, write .mp4 or fewer frames: {error}") from None
+    data = bytearray(out.getvalue())
+    if form == "webp" and data[12:16] == b"VP8X" and film.mode == "RGBA":
+        data[20] |= WEBP_ALPHA
+    return bytes(data)
 
 
-def _times(fps: float, step: int, least: int) -> Iterator[int]:
+def _film(frames: Iterable[Pixels], count: int) -> Image.Image:
+    """A picture with several frames, which are drawn as Pillow seeks them; it would hold all of a list of pictures."""
+    pictures = (Image.fromarray(frame) for frame in frames)
+    film = next(pictures).copy()
+
+    def seek(frame: int) -> None:
+        if frame:
+            film.paste(next(pictures))
+
+    vars(film).update(n_frames=count, seek=seek)
+    return film
+
+
+def _times(fps: float, count: int, step: int, least: int) -> list[int]:
     """Durations of the frames in ms, in whole steps whose sum does not drift from the true time."""
-    elapsed = 0
-    for number in itertools.count(1):
+    times, elapsed = [], 0
+    for number in range(1, count + 1):
         end = max(round(1000 * number / (fps * step)), elapsed + least)
-        yield (end - elapsed) * step
+        times.append((end - elapsed) * step)
         elapsed = end
+    return times
 
 
 def _write_video(out: io.BytesIO, frames: Iterable[Pixels], form: str, fps: float) -> None:

@@ -9,8 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from .pixels import Pixels
-from .text import BACKGROUND, FAINT, Font
+from .pixels import BACKGROUND, FAINT, Font, Pixels
 
 #: Pixels between and around the pictures; height of a caption and of its letters below a picture 720 pixels high.
 GAP, CAPTION, LETTERS = 8, 34, 20

@@ -165,7 +165,8 @@ class _Writer:
             self._write(output.name, [frame.data])
         elif output.kind == "animation":
             pictures = (_pixels(frame) for frame in drawn())
-            self._write(output.name, animate(pictures, output.form, frame_rate(self._path)))
+            count = len(self._path.cameras)
+            self._write(output.name, [animate(pictures, count, output.form, frame_rate(self._path))])
         else:
             whole = sheet([_pixels(frame) for frame in drawn()], self._captions())
             self._write(output.name, [self._encode(whole)])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,21 +23,8 @@ if TYPE_CHECKING:
 NO_CHILDREN = "its splats are the nodes of a tree, but it has no child indices, so leaves cannot be told apart"
 
 
-@dataclasses.dataclass(frozen=True)
-class Facts:
-    """The facts that arrays provide, under the names of `report.Report`."""
-
-    format: str
-    splats: int
-    sh_degree: int
-    notes: list[str]
-    tree: tree.TreeFacts | None = None
-    values: values.ValueFacts | None = None
-    findings: list[Finding] = dataclasses.field(default_factory=list)
-
-
-def examine(arrays: Arrays, settings: ReportSettings, *, threads: int = 1) -> tuple[Facts, Scene | None]:
-    """Examines the arrays of one of `codecs.formats.ENCODINGS`; returns the facts, and the splats if they are complete.
+def examine(arrays: Arrays, settings: ReportSettings, *, threads: int = 1) -> tuple[dict[str, Any], Scene | None]:
+    """Return the fields of a report on the arrays of one of `gpu.table.ENCODINGS`, and the splats if they are complete.
 
     Args:
         arrays: by name; the names identify the encoding.
@@ -57,24 +43,25 @@ def examine(arrays: Arrays, settings: ReportSettings, *, threads: int = 1) -> tu
     if "lod_tree" in arrays:
         return _of_tree(arrays, settings), None
     if "texture" in arrays:
-        return _of_texture(arrays), None
+        return _of_texture(arrays, settings), None
     raise FormatError(f"its arrays ({', '.join(arrays)}) match no encoding that build-lod writes")
 
 
-def _of_splats(name: str, splats: Splats, settings: ReportSettings) -> tuple[Facts, Scene]:
+def _of_splats(name: str, splats: Splats, settings: ReportSettings) -> tuple[dict[str, Any], Scene]:
     scene = Scene(splats, format=f"NPZ of {name}")
     opaque = dataclasses.replace(splats, opacity=np.minimum(splats.opacity, np.float32(1)))  # merged splats exceed 1
-    return Facts(
-        format=scene.format,
-        splats=len(splats),
+    return _fields(
+        scene.format,
+        len(splats),
+        NO_CHILDREN,
+        settings,
         sh_degree=splats.sh_degree,
-        notes=[NO_CHILDREN],
         values=values.examine(splats, all_quantities=settings.all_quantities) if settings.values else None,
         findings=value_checks.check(Scene(opaque)) if settings.check else [],
     ), scene
 
 
-def _of_tree(arrays: Arrays, settings: ReportSettings) -> Facts:
+def _of_tree(arrays: Arrays, settings: ReportSettings) -> dict[str, Any]:
     nodes = lod_tree.unpack(arrays)
     count = len(nodes.tree)
     facts: tree.TreeFacts | None = None
@@ -89,24 +76,18 @@ def _of_tree(arrays: Arrays, settings: ReportSettings) -> Facts:
     elif settings.check:
         findings = [Finding("values.empty", "there are no splats")]
     note = "it has centres, sizes and children of nodes, but no opacities, colours and shapes"
-    return Facts("NPZ of LodTree", count, 0, [note], tree=facts, findings=findings)
+    return _fields("NPZ of LodTree", count, note, settings, tree=facts, findings=findings)
 
 
-def _of_texture(arrays: Arrays) -> Facts:
+def _of_texture(arrays: Arrays, settings: ReportSettings) -> dict[str, Any]:
     capacity = data_texture.SPLATS_A_ROW * len(arrays["texture"]) if arrays["texture"].ndim else 0
     data_texture.unpack(arrays, capacity)  # raises if the shape is wrong
     used = np.flatnonzero(np.ascontiguousarray(arrays["texture"]).reshape(capacity, 8).any(axis=1))
     note = "it has centres, covariances and colours of nodes, but no opacities above 1, SH and children"
-    return Facts("NPZ of a data texture", int(used[-1]) + 1 if len(used) else 0, 0, [note])
+    return _fields("NPZ of a data texture", int(used[-1]) + 1 if len(used) else 0, note, settings)
 
 
-def as_report_fields(facts: Facts, path: Path, size: int | None, settings: ReportSettings) -> dict[str, Any]:
-    """The arguments of a `report.Report`."""
-    plain = {field.name: getattr(facts, field.name) for field in dataclasses.fields(facts)}
-    return plain | {
-        "file": str(path),
-        "bytes": size,
-        "antialiased": False,
-        "bytes_per_splat": round(size / facts.splats, 3) if size and facts.splats else None,
-        "findings": facts.findings if settings.check else None,
-    }
+def _fields(form: str, splats: int, note: str, settings: ReportSettings, **more: Any) -> dict[str, Any]:
+    """The fields of a report; of spherical harmonics and findings there are none unless they are among `more`."""
+    fields = {"format": form, "splats": splats, "sh_degree": 0, "antialiased": False, "notes": [note], "findings": []}
+    return fields | more | ({} if settings.check else {"findings": None})

@@ -1,16 +1,15 @@
-"""`Blocks`: what a report reads, in memory or in a file, block by block and as often as it takes."""
+"""Splats as a report reads them, block by block and as often as it takes, and tallies of what some of them have."""
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any, TypeVar
+from collections.abc import Callable, Collection, Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..codecs.spz_coded import CodedSpz
 from ..io.rad_file import RadFile
 from ..model.lod_tree import LodTree
 from ..model.nodes import CHUNK_NODES
@@ -21,58 +20,50 @@ from ..support.progress import Progress, silent
 from .findings import Finding
 
 Mask = NDArray[np.bool_]
-Result = TypeVar("Result")
 
 
 def largest(rows: FloatArray) -> FloatArray:
     """(n,) the largest number of each of (n, 3) rows, NaN if one is; ten times as fast as `rows.max(axis=1)`."""
     x, y, z = rows.T
-    found: FloatArray = np.maximum(np.maximum(x, y), z)
-    return found
+    numbers: FloatArray = np.maximum(np.maximum(x, y), z)
+    return numbers
 
 
 def smallest(rows: FloatArray) -> FloatArray:
     """(n,) the smallest, as `largest`."""
     x, y, z = rows.T
-    found: FloatArray = np.minimum(np.minimum(x, y), z)
-    return found
+    numbers: FloatArray = np.minimum(np.minimum(x, y), z)
+    return numbers
 
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Some splats in a row.
+    """Consecutive splats.
 
     Attributes:
         start: index of the first.
-        splats: n of them; columns that were not asked for may be 0.
-        tree: (n,) of them where they are nodes of a tree, with children as the whole tree numbers them.
-        sound: no splat can be invalid, whatever its codes are.
-        coded: the codes of a sound file, see `Blocks`.
+        splats: n of them.
+        tree: (n,) nodes with children as the whole tree numbers them; None without a tree.
     """
 
     start: int
     splats: Splats
     tree: LodTree | None
-    sound: bool = False
-    coded: CodedSpz | None = None
 
     @property
     def part(self) -> slice:
-        """Of all splats."""
+        """Place among all splats."""
         return slice(self.start, self.start + len(self.splats))
 
     @functools.cached_property
     def invalid(self) -> dict[str, Mask]:
-        """As `Splats.invalid`; all columns must be there, unless it is sound."""
-        return {} if self.sound else self.splats.invalid()
+        """As `Splats.invalid`."""
+        return self.splats.invalid()
 
     @functools.cached_property
     def valid(self) -> Mask:
         """(n,) bool, true for splats that are in no mask of `invalid`."""
-        valid = np.ones(len(self.splats), np.bool_)
-        for mask in self.invalid.values():
-            valid &= ~mask
-        return valid
+        return ~np.logical_or.reduce([*self.invalid.values(), np.zeros(len(self.splats), np.bool_)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,144 +71,105 @@ class Blocks:
     """A scene, block by block.
 
     Attributes:
+        about: scene with the header of the file, and with the splats and the tree if they are in memory.
         count: N splats.
-        sh_degree: of the splats.
         is_tree: whether they are the nodes of a tree.
-        read: called with columns of `Splats`, gives the blocks in order; may be called again.
-        at: called with the index of the first splat of a block, and columns, gives the block, on any thread; None where
-            blocks are not in memory.
-        starts: the indices of the first splats.
-        tree: of all splats, where it is in memory.
-        sound: no splat can be invalid, so that whoever looks for those needs no more columns.
-        antialiased, up, format, notes, header, chunk_bytes: as in `Scene`.
-        coded: the codes of a sound file, which tell more in less time than what they are decoded to.
+        map: called with a function of a block, columns of `Splats` and a number of threads, returns the results in
+            order; may be called again. Blocks in memory have all columns and are processed on that many threads.
+        in_memory: whether several threads may call `map`.
     """
 
+    about: Scene
     count: int
-    sh_degree: int
     is_tree: bool
-    read: Callable[[Collection[str]], Iterator[Block]]
-    at: Callable[[int, Collection[str]], Block] | None = None
-    starts: Sequence[int] = ()
-    tree: LodTree | None = None
-    sound: bool = False
-    antialiased: bool = False
-    up: str | None = None
-    format: str = ""
-    notes: tuple[str, ...] = ()
-    header: Mapping[str, int] = field(default_factory=dict)
-    chunk_bytes: tuple[int, ...] | None = None
-    coded: CodedSpz | None = None
+    map: Callable[[Callable[[Block], Any], Collection[str], int], Iterator[Any]]
+    in_memory: bool = True
 
     @classmethod
-    def of(cls, scene: Scene) -> Blocks:
-        """Those of a scene in memory, as long as its chunks are, or `CHUNK_NODES`."""
-        count, step = len(scene.splats), scene.header.get("chunk_size") or CHUNK_NODES
+    def of(cls, scene: Scene, unread: Collection[str] = ()) -> Blocks:
+        """Blocks of an in-memory scene, as long as the chunks of its file, or `CHUNK_NODES`.
 
-        def at(start: int, columns: Collection[str]) -> Block:
-            part, tree = slice(start, start + step), scene.tree
-            rows = Splats(**{name: getattr(scene.splats, name)[part] for name in COLUMNS})
-            return Block(start, rows, None if tree is None else LodTree(tree.child_count[part], tree.child_start[part]))
+        Args:
+            scene: as it was read.
+            unread: columns that were not read and count as valid.
+        """
+        step, tree = scene.header.get("chunk_size") or CHUNK_NODES, scene.tree
+        blank = Splats.zeros(step if unread else 0, 0)
+        blank.quat_xyzw[:, 3] = 1
 
-        about = scene.antialiased, scene.up, scene.format, scene.notes, scene.header, scene.chunk_bytes
-        return cls._in_memory(count, scene.splats.sh_degree, at, step, scene.tree, False, *about)
+        def at(start: int) -> Block:
+            part = slice(start, start + step)
+            count = len(scene.splats.center[part])
+            rows = {
+                name: getattr(blank, name)[:count] if name in unread else getattr(scene.splats, name)[part]
+                for name in COLUMNS
+            }
+            nodes = None if tree is None else LodTree(tree.child_count[part], tree.child_start[part])
+            return Block(start, Splats(**rows), nodes)
 
-    @classmethod
-    def of_codes(cls, coded: CodedSpz) -> Blocks:
-        """Those of an SPZ file, whose codes are decoded whenever they are read."""
-        known = coded if coded.sound and coded.count else None
+        def mapped(work: Callable[[Block], Any], columns: Collection[str], threads: int) -> Iterator[Any]:
+            return ordered_map(lambda start: work(at(start)), range(0, len(scene.splats), step), threads)
 
-        def at(start: int, columns: Collection[str]) -> Block:
-            rows = coded.decode(slice(start, start + CHUNK_NODES), columns)
-            return Block(start, *rows, coded.sound, known)
-
-        about = coded.antialiased, coded.up, coded.format, coded.notes, coded.header
-        found = cls._in_memory(coded.count, coded.sh_degree, at, CHUNK_NODES, coded.tree, coded.sound, *about)
-        return replace(found, coded=known)
-
-    @classmethod
-    def _in_memory(
-        cls,
-        count: int,
-        sh_degree: int,
-        at: Callable[[int, Collection[str]], Block],
-        step: int,
-        tree: LodTree | None,
-        *about: Any,
-    ) -> Blocks:
-        starts = range(0, count, step)
-
-        def read(columns: Collection[str]) -> Iterator[Block]:
-            return (at(start, columns) for start in starts)
-
-        return cls(count, sh_degree, tree is not None, read, at, starts, tree, *about)
-
-    def map(self, work: Callable[[Block], Result], columns: Collection[str], threads: int) -> Iterator[Result]:
-        """What `work` returns of each block with these columns, in order; on several threads, if they are in memory."""
-        if self.at is None:
-            return map(work, self.read(columns))
-        at = self.at
-        return ordered_map(lambda start: work(at(start, columns)), self.starts, threads)
+        return cls(scene, len(scene.splats), tree is not None, mapped)
 
     @classmethod
     def of_file(cls, file: RadFile, *, threads: int = 1, progress: Progress = silent) -> Blocks:
-        """The chunks of a file. The first time they are read, all of their columns are unpacked, to find damage."""
-        header, again = file.header, False
+        """Chunks of a file. The first time they are read, all of their columns are unpacked, to find damage."""
+        header, noted, again = file.header, file.header.noted, False
 
-        def read(columns: Collection[str]) -> Iterator[Block]:
+        def mapped(work: Callable[[Block], Any], columns: Collection[str], _: int) -> Iterator[Any]:
             nonlocal again
             thorough, again = not again, True
             for start, splats, tree in file.chunks(columns, thorough=thorough, threads=threads):
-                yield Block(start, splats, tree)
+                yield work(Block(start, splats, tree))
                 progress("reading", start + len(splats), header.count, "splat")
 
-        return cls(
-            header.count,
-            header.max_sh,
-            header.lod_tree,
-            read,
-            None,
-            (),
-            None,
-            False,
-            header.noted.antialiased,
-            header.noted.up,
-            file.format,
-            header.noted.problems,
-            file.about,
-            file.chunk_bytes,
+        about = Scene(
+            Splats.zeros(0, header.max_sh),
+            antialiased=noted.antialiased,
+            format=file.format,
+            notes=noted.problems,
+            header=file.about,
+            chunk_bytes=file.chunk_bytes,
+            up=noted.up,
         )
+        return cls(about, header.count, header.lod_tree, mapped, in_memory=False)
 
 
-@dataclass
+@dataclass(frozen=True)
 class Tally:
-    """How many splats or nodes have something, and the first of them."""
+    """Number of splats or nodes that have something, and the index of the first."""
 
     count: int = 0
     first: int = -1
 
     @classmethod
     def of(cls, mask: Mask, start: int) -> Tally:
-        """Those of a block that begins at `start`."""
-        found = cls()
-        found.add(mask, start)
-        return found
-
-    def add(self, mask: Mask, start: int) -> None:
-        """Counts those of a block that begins at `start`."""
+        """Tally of a block that begins at `start`."""
         count = int(np.count_nonzero(mask))
-        if count and not self.count:
-            self.first = start + int(np.argmax(mask))
-        self.count += count
+        return cls(count, start + int(np.argmax(mask))) if count else cls()
 
-    def merge(self, other: Tally) -> None:
-        """Adds what was counted of what follows."""
-        self.first = self.first if self.count else other.first
-        self.count += other.count
+    def __add__(self, following: Tally) -> Tally:
+        """Tally of two parts, in order."""
+        return Tally(self.count + following.count, self.first if self.count else following.first)
 
     def finding(self, code: str, text: str) -> list[Finding]:
-        """A finding about them, if there are any; in its text, {first} is the first and {more} how many others."""
+        """Return a finding if there are any; in its text, {first} is the first and {more} how many others."""
         if not self.count:
             return []
-        more = f"{self.count - 1:,}"
-        return [Finding(code, text.format(first=f"{self.first:,}", more=more), self.first, self.count)]
+        message = text.format(first=f"{self.first:,}", more=f"{self.count - 1:,}")
+        return [Finding(code, message, self.first, self.count)]
+
+
+def tallies(masks: dict[str, Mask], start: int) -> dict[str, Tally]:
+    """Tallies of the masks of a block that begins at `start`, by their names."""
+    return {name: Tally.of(mask, start) for name, mask in masks.items()}
+
+
+def merged(parts: Iterable[dict[str, Tally]]) -> dict[str, Tally]:
+    """Tallies of all blocks, in order; a name that a block lacks counts as none there."""
+    total: dict[str, Tally] = {}
+    for part in parts:
+        for name, tally in part.items():
+            total[name] = total.get(name, Tally()) + tally
+    return total

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from ..model.gaussian import spark_size
 from ..model.scene import Scene
 from ..tables.columns import Cell, Column, Row
 from . import tree
-from .blocks import Block, Blocks
+from .blocks import Block, Blocks, merged
 
 COLUMNS = (
     Column("chunk", int, "", "", "number of the chunk, from 0"),
@@ -33,9 +33,6 @@ COLUMNS = (
     Column("parent_chunks", int, "", "", "other chunks that hold parents of its nodes; empty without a tree"),
 )
 
-#: Columns of `Splats` that rows are computed from.
-USED = ("center", "scale", "opacity")
-
 #: The columns of a table that a person reads, and their widths.
 SHOWN = {
     "chunk": 6,
@@ -52,70 +49,58 @@ SHOWN = {
 }
 
 
-class Rows:
-    """A row for each chunk of splats that pass once, block by block.
+def row_of(block: Block) -> dict[str, Any]:
+    """The row of the chunk of a block with the columns center, scale and opacity, but for its number and its bytes."""
+    center, size = block.splats.center, spark_size(block.splats)
+    low, high = center.min(axis=0), center.max(axis=0)
+    with np.errstate(invalid="ignore", over="ignore"):
+        extent = np.linalg.norm(high.astype(np.float64) - low)
+    numbers = {"extent": extent, "size_min": size.min(), "size_max": size.max()}
+    numbers |= {f"min_{axis}": low[at] for at, axis in enumerate("xyz")}
+    numbers |= {f"max_{axis}": high[at] for at, axis in enumerate("xyz")}
+    row: dict[str, Any] = dict.fromkeys(column.name for column in COLUMNS)
+    row |= {"base": block.start, "splats": len(center)}
+    row["leaves"] = None if block.tree is None else int(np.count_nonzero(block.tree.is_leaf))
+    return row | {name: float(value) for name, value in numbers.items() if np.isfinite(value)}
+
+
+def table_of(
+    rows: Sequence[dict[str, Any]], chunk_bytes: Sequence[int] | None, nodes: tree.Columns | None
+) -> list[Row]:
+    """The rows with a cell for each of `COLUMNS`.
 
     Args:
-        blocks: of which each is a chunk of its file, or of `CHUNK_NODES` splats where its format has none.
+        rows: of all chunks in order, see `row_of`.
+        chunk_bytes: of the chunks in the file; None where its format has no chunks.
+        nodes: of the tree; None without one.
     """
+    for chunk, row in enumerate(rows):
+        row["chunk"], row["bytes"] = chunk, None if chunk_bytes is None else chunk_bytes[chunk]
+    if nodes is not None:
+        _add_links(rows, nodes)
+    return [{column.name: column.rounded(row[column.name]) for column in COLUMNS} for row in rows]
 
-    def __init__(self, blocks: Blocks) -> None:
-        self._blocks = blocks
-        self._rows: list[dict[str, Any]] = []
 
-    def part_of(self, block: Block) -> dict[str, Any]:
-        """The row of the chunk of a block, with the columns `USED`, but for its number."""
-        center, size = block.splats.center, spark_size(block.splats)
-        low, high = center.min(axis=0), center.max(axis=0)
-        with np.errstate(invalid="ignore", over="ignore"):
-            extent = np.linalg.norm(high.astype(np.float64) - low)
-        numbers = {"extent": extent, "size_min": size.min(), "size_max": size.max()}
-        numbers |= {f"min_{axis}": low[at] for at, axis in enumerate("xyz")}
-        numbers |= {f"max_{axis}": high[at] for at, axis in enumerate("xyz")}
-        row: dict[str, Any] = dict.fromkeys(column.name for column in COLUMNS)
-        row |= {"base": block.start, "splats": len(center)}
-        row["leaves"] = None if block.tree is None else int(np.count_nonzero(block.tree.is_leaf))
-        row |= {name: float(value) for name, value in numbers.items() if np.isfinite(value)}
-        return row
-
-    def merge(self, row: dict[str, Any]) -> None:
-        """Adds the row of the next chunk."""
-        row["chunk"] = chunk = len(self._rows)
-        row["bytes"] = None if self._blocks.chunk_bytes is None else self._blocks.chunk_bytes[chunk]
-        self._rows.append(row)
-
-    def rows(self, columns: tree.Columns | None) -> list[Row]:
-        """The rows, with a cell for each of `COLUMNS`, after the last block.
-
-        Args:
-            columns: of the tree; None without one.
-        """
-        if columns is not None:
-            self._add_links(columns)
-        return [{column.name: column.rounded(row[column.name]) for column in COLUMNS} for row in self._rows]
-
-    def _add_links(self, columns: tree.Columns) -> None:
-        links = columns.tree
-        depth, _ = find_depths(links.child_count, links.child_start, columns.size)
-        parent, _ = find_parents(links.child_count, links.child_start)
-        step = self._rows[0]["splats"]
-        for number, row in enumerate(self._rows):
-            part = slice(row["base"], row["base"] + row["splats"])
-            above = parent[part]
-            elsewhere = np.unique(above[above >= 0] // step)
-            row["parent_chunks"] = int(np.count_nonzero(elsewhere != number))
-            row["depth_min"], row["depth_max"] = (int(max(end, 0)) for end in (depth[part].min(), depth[part].max()))
+def _add_links(rows: Sequence[dict[str, Any]], nodes: tree.Columns) -> None:
+    links = nodes.tree
+    depth, _ = find_depths(links.child_count, links.child_start, nodes.size)
+    parent, _ = find_parents(links.child_count, links.child_start)
+    step = rows[0]["splats"]
+    for number, row in enumerate(rows):
+        part = slice(row["base"], row["base"] + row["splats"])
+        above = parent[part]
+        elsewhere = np.unique(above[above >= 0] // step)
+        row["parent_chunks"] = int(np.count_nonzero(elsewhere != number))
+        row["depth_min"], row["depth_max"] = (int(max(end, 0)) for end in (depth[part].min(), depth[part].max()))
 
 
 def rows_of(scene: Scene) -> list[Row]:
-    """The rows of a scene in memory, see `Rows`."""
+    """The rows of a scene in memory."""
     blocks = Blocks.of(scene)
-    found, columns = Rows(blocks), tree.Columns.of(blocks) if blocks.is_tree else None
-    for block in blocks.read(USED):
-        found.merge(found.part_of(block))
-        if columns is not None:
-            columns.merge(columns.part_of(block))
-    return found.rows(columns if blocks.count else None)
+    nodes = tree.Columns.of(blocks) if blocks.is_tree and blocks.count else None
+    if nodes is not None:
+        merged(blocks.map(nodes.add, (), 1))
+    return table_of(list(blocks.map(row_of, (), 1)), scene.chunk_bytes, nodes)
 
 
 def lines(rows: list[dict[str, Any]]) -> Iterator[str]:

@@ -14,7 +14,7 @@ from ..support.errors import SparklodError
 from ..support.printable import printable
 from ..support.similar import near
 from ..support.untrusted import QUOTED, parse_json, parse_toml, quoted, quoted_value
-from ..tables.conditions import BadAssertionError, Condition, is_number, number_text, parse
+from ..tables.assertions import BadAssertionError, Condition, is_number, number_text, parse_condition
 from .findings import Finding
 from .report import NoFieldError, Report, value_at
 
@@ -65,7 +65,7 @@ KEYS = {
 
 @dataclass(frozen=True)
 class Expectations:
-    """What a file should be; None means anything. Each is a condition, see `conditions`.
+    """What a file should be; None means anything. Each is a condition, see `assertions.Condition`.
 
     Attributes:
         max_bytes: of the file.
@@ -105,7 +105,7 @@ def parse_assertion(text: str) -> Condition:
     Raises:
         BadAssertionError: it cannot be understood, or is about nothing that a report has.
     """
-    condition = parse(text, example="nodes<=5M")
+    condition = parse_condition(text, example="nodes<=5M")
     known = [*NAMES, *(each.name for each in fields(Report))]
     if condition.name.partition(".")[0] not in known:
         name = printable(condition.name, QUOTED)

@@ -1,9 +1,11 @@
-"""`Finding`, one fault of a file, and the table of all kinds of findings."""
+"""`Finding`, one fault of a file, the table of all kinds of findings, and `Survey`, findings about headers."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import statistics
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from ..codecs.rad.rad_rules import ERRORS as RAD_ERRORS
 from ..codecs.rad.rad_rules import WARNINGS as RAD_WARNINGS
@@ -106,3 +108,55 @@ def findings_of(violations: Iterable[RuleViolation]) -> list[Finding]:
         Finding(code, texts[0] + (f" (and {len(texts) - 1:,} more like it)" if len(texts) > 1 else ""))
         for code, texts in by_code.items()
     ]
+
+
+@dataclass(frozen=True)
+class Head:
+    """What a report begins with, known from headers before any splat is read.
+
+    Attributes:
+        format: name for display.
+        bytes: of all files together.
+        splats: as reading gives them; nodes of a tree.
+        sh_degree, antialiased, up: of the splats.
+    """
+
+    format: str
+    bytes: int
+    splats: int
+    sh_degree: int
+    antialiased: bool
+    up: str | None
+
+
+@dataclass(frozen=True)
+class ChunkBytes:
+    """Sizes of chunks, bytes."""
+
+    min: int
+    median: int
+    max: int
+
+    @classmethod
+    def of(cls, sizes: Sequence[int]) -> ChunkBytes | None:
+        """Those of chunks of some sizes; None without any."""
+        return cls(min(sizes), round(statistics.median(sizes)), max(sizes)) if sizes else None
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What the headers of a file, and of the files that it names, hold and break.
+
+    Attributes:
+        field: of the report that has the facts, "rad" or "streamed_sog".
+        head: what a report begins with; None where `facts` is.
+        facts: `RadFacts` or `StreamedSogFacts`; None where a rule is broken without which the rest cannot be trusted.
+        findings: broken rules, one for each code.
+        fatal: findings because of which the file cannot be read.
+    """
+
+    field: str
+    head: Head | None
+    facts: Any
+    findings: list[Finding]
+    fatal: list[Finding]

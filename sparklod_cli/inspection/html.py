@@ -9,36 +9,75 @@ from importlib.resources import files
 from typing import Any
 
 from .. import __version__
-from ..figures.svg import bar, children_groups, histogram_chart, text_of
 from ..figures.tree_plot import Picture
 from ..model.scene import Scene
 from ..tables.histograms import Histogram
 from . import values
 from .findings import CODES, ERROR, NOTE, WARNING
-from .html_parts import NONE, figure_of, number_text, panel, size_text, table_of
-from .html_streamed_sog import streamed_sog_panels
+from .html_parts import (
+    NONE,
+    bar,
+    children_groups,
+    figure_of,
+    histogram_chart,
+    number_text,
+    panel,
+    size_text,
+    table_of,
+    text_of,
+)
 from .report import Report
+
+
+def streamed_sog_panels(streamed: Mapping[str, Any]) -> str:
+    """The panels, from `streamed_sog` of a report as JSON."""
+    levels = panel("Detail levels", _levels(streamed["levels"]))
+    return f'{levels}\n<div class="two">{panel("Container", _container(streamed))}{_regions(streamed)}</div>'
+
+
+def _levels(levels: list[Mapping[str, Any]]) -> str:
+    most = max(level["splats"] for level in levels) or 1
+    rows = []
+    for number, level in enumerate(levels):
+        share = NONE if level["share"] is None else f"{100 * level['share']:.1f} %"
+        errors = level["errors"] or {}
+        cells = [number_text(level["splats"]), share, number_text(level["regions"]), number_text(level["files"])]
+        cells += [size_text(level["bytes"]), *(number_text(errors.get(name)) for name in ("p25", "p50", "p75"))]
+        rows.append([f"{number}", *cells, bar(level["splats"] / most)])
+    head = ("Level", "Splats", "Share", "Regions", "Files", "Size", "Error, 25 %", "Median", "75 %", "")
+    caption = "Level 0 is full detail. Errors of regions, each weighted by its splats at level 0."
+    return table_of(head, rows, caption)
+
+
+def _container(streamed: Mapping[str, Any]) -> str:
+    facts = [
+        ["Manifest", size_text(streamed["manifest_bytes"])],
+        ["Manifest, coarsest level and environment", size_text(streamed["first_bytes"])],
+        ["Chunk files", number_text(streamed["files"])],
+    ]
+    if streamed["file_bytes"]:
+        sizes = [size_text(streamed["file_bytes"][name]) for name in ("min", "median", "max")]
+        facts.append(["Smallest, median and largest chunk file", ", ".join(sizes)])
+    if streamed["environment"]:
+        around = streamed["environment"]
+        facts.append(["Environment", f"{number_text(around['splats'])} splats, {size_text(around['bytes'])}"])
+    if streamed["generator"]:
+        facts.append(["Written by", text_of(streamed["generator"])])
+    return table_of(("Streamed SOG", ""), facts, "As its manifest says.")
+
+
+def _regions(streamed: Mapping[str, Any]) -> str:
+    names = ("min", "p25", "p50", "p75", "max", "mean")
+    rows = [
+        [what, *(number_text(streamed[field][name]) for name in names)]
+        for what, field in (("Splats at level 0", "region_splats"), ("Longest edge, world units", "region_edge"))
+    ]
+    caption = f"{number_text(streamed['regions'])} regions; depth of their tree: {number_text(streamed['depth'])}."
+    return panel("Regions", table_of(("", *names), rows, caption))
+
 
 #: Content security policy: only the style and the pictures inside the page, whatever the name of a file contains.
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
-
-#: Meaning of the quantities of `values.QUANTITIES` and `values.SH_QUANTITIES`.
-QUANTITIES = {
-    "x": "centres, world units",
-    "y": "centres, world units",
-    "z": "centres, world units",
-    "scale": "the largest standard deviation, world units",
-    "scale_min": "the smallest standard deviation, world units",
-    "anisotropy": "the largest standard deviation over the smallest",
-    "opacity": "linear opacity; above 1 for merged splats",
-    "size": "the feature size by which Spark chooses nodes, world units",
-    "red": "display-referred colour",
-    "green": "display-referred colour",
-    "blue": "display-referred colour",
-    "sh1": "root mean square of the coefficients of degree 1",
-    "sh2": "root mean square of the coefficients of degree 2",
-    "sh3": "root mean square of the coefficients of degree 3",
-}
 
 #: Fields of a header that the page shows, by name, and their titles.
 HEADER = {"version": "Version", "fractional_bits": "Fractional bits"}
@@ -289,7 +328,8 @@ def _histograms(histograms: Mapping[str, Histogram]) -> str:
         chart = histogram_chart(counted, name)
         beyond = ((counted.below, "below"), (counted.above, "above"), (counted.not_finite, "not finite"))
         remarks = ["bins of equal ratios"] * counted.log + [f"{count:,} {where}" for count, where in beyond if count]
-        said = "; ".join(filter(None, [QUANTITIES.get(name, ""), *remarks]))
+        meaning = values.QUANTITIES[name].meaning if name in values.QUANTITIES else ""
+        said = "; ".join(filter(None, [meaning, *remarks]))
         head = f'<h4>{text_of(name)}</h4><p class="faint">{text_of(said)}</p>'
         parts.append(f"<div>{head}{chart or '<p>no numbers</p>'}</div>")
     return panel("Histograms", f'<div class="charts">{"".join(parts)}</div>' if parts else "")

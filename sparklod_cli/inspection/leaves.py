@@ -2,16 +2,218 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
+from ..codecs import coverage
+from ..codecs.spark_codings import STEPS_8_8_8, encode_axis_angle, encode_lod_alpha
+from ..codecs.rad.rad_encoder import rounded
+from ..codecs.rad.property_codings import CODINGS
+from ..codecs.rad.rad_layout import PROPERTIES, Row
+from ..codecs.statistics import ALL_BITS, ShBytes, enough
+from ..codecs.spz_layout import LOD, Layout
+from ..codecs.spz_encoder import to_code
+from ..codecs.statistics import Statistics
+from ..codecs.statistics import fine_bits
 from ..model.scene import Scene
 from ..model.selection import Selection
+from ..model.sh import COEFFICIENTS
+from ..model.splats import FloatArray, Splats
 from ..support.errors import InvalidSplatsError
 from ..support.units import count_of
 from .findings import Finding
-from .leaf_codes import Coded, Coding, codings_of
-from .rad import RadFacts
+from .rad import PropertyFacts, RadFacts
+
+#: Largest differences of the codes of one splat: writers round, truncate or go through float16. SPZ's codes of SH keep
+#: upper bits only, so that a step of theirs is a bucket of 16; logarithms of scales as float32 differ in last bits.
+STEPS, SH_STEPS, F32_STEPS = 1, 16, 64
+
+#: Largest angle in degrees between two codes of one rotation: by the bytes of an SPZ code, and by RAD's encoding.
+DEGREES = {3: 14.0, 4: 0.8}
+#: As f16 and f32 it has no w, which is the less exact the nearer it is to 0.
+RAD_DEGREES = {"oct88r8": 4.0, "f16": 4.0, "f32": 0.2}
+
+#: The columns of SPZ whose codes may differ by a step, in the order in which `Coded.numbers` has them.
+COLUMNS = ("center", "opacity", "rgb", "scale", "sh")
+
+#: Most bits after the binary point of centres that were rounded: those of SPZ.
+MOST_BITS = 24
+
+#: Encodings of RAD that only order the bytes of another one in a way that compresses better.
+PLAIN = {"f32_lebytes": "f32", "f16_lebytes": "f16", "r8_delta": "r8", "s8_delta": "s8"}
+
+
+@dataclass(frozen=True)
+class Coded:
+    """N splats as codes.
+
+    Attributes:
+        rows: (N,) all bytes of a splat as one value, to compare whole splats.
+        numbers: (N, n) int32 codes; the first three are those of the centre.
+        quat_xyzw: (N, 4) rotations.
+    """
+
+    rows: NDArray[np.void]
+    numbers: NDArray[np.int32]
+    quat_xyzw: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Coding:
+    """How the splats of a file are compared.
+
+    Attributes:
+        encode: N splats to codes.
+        steps: (n,) int64 largest differences of `Coded.numbers` between two codes of one splat.
+        degrees: largest angle between two codes of one rotation.
+    """
+
+    encode: Callable[[Splats], Coded]
+    steps: NDArray[np.int64]
+    degrees: float
+
+
+def codings_of(scene: Scene, leaves: Splats, original: Splats, facts: RadFacts | None) -> Iterator[Coding | str]:
+    """Yield the codings in which a writer may have put leaves, the most likely first; or why there is none.
+
+    Args:
+        scene: the tree.
+        leaves: of the tree.
+        original: the splats that may have become the leaves.
+        facts: of the RAD file that the tree is from; None for SPZ.
+    """
+    if facts is None:
+        yield from (of_spz(scene, leaves, covering=covering) for covering in (True, False))
+        return
+    # RAD does not store to how many bits centres were rounded. By default the scales decide; else the leaves tell.
+    scales, bits = Statistics.of_leaves(original, {"leaf_scale"}).leaf_scale, _fractional_bits(leaves.center)
+    assert scales is not None
+    for guess, covering in ((fine_bits(scales), True), (bits, True), (bits, False)):
+        yield of_rad(facts, leaves, guess, covering=covering)
+
+
+def of_spz(scene: Scene, leaves: Splats, *, covering: bool) -> Coding:
+    """The coding of an SPZ file that a scene was read from.
+
+    Args:
+        scene: with a tree.
+        leaves: of the tree.
+        covering: opacities make up for the rounding of scales, see `coverage`; only sparklod writes so.
+    """
+    version, bits = max(2, int(scene.header["version"])), int(scene.header["fractional_bits"])
+    degree = scene.splats.sh_degree
+    steps = np.full(3 + 1 + 3 + 3 + 3 * COEFFICIENTS[degree], STEPS)
+    steps[10:] = SH_STEPS
+    sh_bits = enough(ShBytes.of(leaves.sh)) if degree else ALL_BITS
+
+    def encode(splats: Splats) -> Coded:
+        parts, numbers = [], {}
+        splats = to_code(splats, None, bits, sh_bits, covering=covering)
+        for stream in Layout(version, len(splats), degree, bits, LOD).streams():
+            if not hasattr(splats, stream.column):
+                continue  # the columns of the tree
+            values = np.ascontiguousarray(stream.encode(getattr(splats, stream.column)))
+            codes = values.view(np.uint8).reshape(len(splats), stream.size)
+            parts.append(codes)
+            numbers[stream.column] = codes.astype(np.int32)
+        center = numbers["center"].reshape(-1, 3, 3) @ np.array([1, 1 << 8, 1 << 16], np.int32)
+        numbers["center"] = np.where(center >= 1 << 23, center - (1 << 24), center)
+        columns = [numbers[name] for name in COLUMNS if name in numbers]
+        return Coded(_rows(parts), np.concatenate(columns, axis=1), splats.quat_xyzw)
+
+    return Coding(encode, steps, DEGREES[3 if version == 2 else 4])
+
+
+def of_rad(facts: RadFacts, leaves: Splats, rounded_to: int | None, *, covering: bool) -> Coding | str:
+    """The coding of a RAD file; or why there is none. A palette of SH, whose entries stand for many, is left out.
+
+    Args:
+        facts: of the file.
+        leaves: its leaves.
+        rounded_to: bits after the binary point to which its writer rounded centres; None for not at all.
+        covering: as for SPZ.
+    """
+    mixed = [name for name, found in facts.properties.items() if "," in found.encoding]
+    if mixed:
+        return f"its chunks have {mixed[0]} in several encodings, in which leaves cannot be compared"
+    compared = [
+        (row, facts.properties[row.name], PLAIN.get(facts.properties[row.name].encoding))
+        for row in PROPERTIES
+        if row.name in facts.properties and row.option and not row.codes and row.name != "orientation"
+    ]
+    properties = [(row, found, plain or found.encoding) for row, found, plain in compared]
+    bits = _fractional_bits(leaves.center)
+    steps = [np.full(row.numbers, F32_STEPS if name == "f32" else STEPS) for row, _, name in properties]
+    if bits is not None and properties[0][0].name == "center":
+        steps[0][:] = STEPS
+    rotation = facts.properties["orientation"].encoding if "orientation" in facts.properties else "oct88r8"
+
+    def numbers_of(splats: Splats) -> Iterator[NDArray[Any]]:
+        for row, found, name in properties:
+            if row.name == "center" and name == "f32" and bits is not None:
+                yield np.round(splats.center.astype(np.float64) * 2.0**bits).astype(np.int32)
+            else:
+                yield _rad_codes(splats, row, found, name)
+
+    def encode(splats: Splats) -> Coded:
+        splats = _covering(splats, facts, rounded_to) if covering else splats
+        if rounded_to is not None:
+            splats = dataclasses.replace(splats, center=rounded(splats.center, rounded_to))
+        numbers = np.concatenate(list(numbers_of(splats)), axis=1)
+        axis = np.stack(encode_axis_angle(splats.quat_xyzw, STEPS_8_8_8), axis=1)
+        parts = [np.ascontiguousarray(each).view(np.uint8).reshape(len(splats), -1) for each in (numbers, axis)]
+        return Coded(_rows(parts), numbers, splats.quat_xyzw)
+
+    return Coding(encode, np.concatenate(steps), RAD_DEGREES[rotation])
+
+
+def _fractional_bits(center: FloatArray) -> int | None:
+    """Bits after the binary point that all coordinates do with; None where they are not rounded, or need too many."""
+    most = float(np.abs(center).max(initial=0))
+    for bits in range(MOST_BITS + 1):
+        scaled = center * np.float32(2.0**bits)
+        if not most * 2.0**bits < 1 << 30:
+            return None
+        if (scaled == np.round(scaled)).all():
+            return bits
+    return None
+
+
+def _covering(splats: Splats, facts: RadFacts, bits: int | None) -> Splats:
+    """Splats whose opacities make up for how a RAD file rounds their scales."""
+    found = facts.properties.get("scales")
+    if found is None:
+        return splats
+    scale = CODINGS[found.encoding].rounded(splats.scale, found.min or 0.0, found.max or 0.0)
+    blur = 0.0 if bits is None else 2.0**-bits
+    return dataclasses.replace(splats, opacity=coverage.kept(splats.opacity, splats.scale, scale, blur))
+
+
+def _rad_codes(splats: Splats, row: Row, found: PropertyFacts, encoding: str) -> NDArray[np.int32]:
+    """(N, numbers) codes of a property, in the order of their values."""
+    values = getattr(splats, row.column)
+    if row.column == "sh":
+        values = values[:, COEFFICIENTS[row.degree - 1] : COEFFICIENTS[row.degree]]
+    elif row.column == "opacity":
+        values = encode_lod_alpha(values)
+    codes = CODINGS[encoding].encode(values.reshape(len(splats), -1), found.min or 0.0, found.max or 0.0).T
+    if codes.dtype.kind != "f":
+        return (codes.astype(np.uint8).view(np.int8) if encoding == "s8" else codes).astype(np.int32)
+    bits = np.ascontiguousarray(codes).view(f"<i{codes.dtype.itemsize}").astype(np.int64)
+    lowest = -(1 << (8 * codes.dtype.itemsize - 1))
+    # Magnitudes with a sign, to numbers that grow with the value.
+    return np.where(bits < 0, lowest - bits, bits).astype(np.int32)
+
+
+def _rows(parts: list[NDArray[np.uint8]]) -> NDArray[np.void]:
+    together = np.ascontiguousarray(np.concatenate(parts, axis=1))
+    return together.view(np.dtype((np.void, together.shape[1])))[:, 0]
+
 
 #: Most leaves, without an equal splat or one at the same place of the order, that are searched for nearby: searching
 #: takes time that grows with their number.

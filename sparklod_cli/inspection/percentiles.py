@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -84,7 +83,8 @@ class Percentiles:
             if not self.count:
                 self.passes = 0
                 return
-            self._ranks = _ranks(self._shares, self.count)
+            low = np.floor((self.count - 1) * self._shares).astype(np.int64)
+            self._ranks = np.unique(np.concatenate([low, np.minimum(low + 1, self.count - 1)]))
             self._places, self._found = self._ranks.copy(), np.zeros(len(self._ranks), self._key)
         if self._kept is not None:
             self._found = np.sort(_keys(np.concatenate(self._kept), self._key))[self._ranks]
@@ -106,83 +106,23 @@ class Percentiles:
 
     def values(self) -> NDArray[np.float64]:
         """The percentiles, after the last pass; there must be numbers."""
+        places = (self.count - 1) * self._shares
+        low = np.floor(places).astype(np.int64)
+        share = places - low
         numbers = _floats(self._found, self._float).astype(np.float64)
-        return interpolated(self._shares, self.count, lambda ranks: numbers[np.searchsorted(self._ranks, ranks)])
+        below, above = (
+            numbers[np.searchsorted(self._ranks, ranks)] for ranks in (low, np.minimum(low + 1, self.count - 1))
+        )
+        # From the nearer end, as numpy does.
+        found: NDArray[np.float64] = np.where(
+            share >= 0.5, above - (above - below) * (1 - share), below + (above - below) * share
+        )
+        return found
 
     @property
     def mean(self) -> float:
         """Mean of the numbers; there must be some."""
         return self._sum / self.count
-
-
-@dataclass(frozen=True, eq=False)
-class Known:
-    """Percentiles and a mean that have been found, as those of `Percentiles`.
-
-    Attributes:
-        count: of numbers.
-        found: the percentiles; empty if there are no numbers.
-        mean: of the numbers; NaN if there are none.
-    """
-
-    count: int
-    found: NDArray[np.float64]
-    mean: float
-
-    @classmethod
-    def of_counts(cls, levels: Sequence[float], values: FloatArray, counts: NDArray[np.int64]) -> Known:
-        """Those of numbers of which there are (n,) different ones, given how often each occurs.
-
-        Args:
-            levels: percentiles, 0 to 100.
-            values, counts: (n,) the numbers in any order; those that are not finite are left out.
-        """
-        kept = np.flatnonzero((counts > 0) & np.isfinite(values))
-        kept = kept[np.argsort(values[kept], kind="stable")]
-        numbers, ends = values[kept].astype(np.float64), np.cumsum(counts[kept])
-        if not len(kept):
-            return cls(0, np.empty(0), np.nan)
-        count = int(ends[-1])
-        found = interpolated(
-            np.asarray(levels, np.float64) / 100, count, lambda ranks: numbers[np.searchsorted(ends, ranks, "right")]
-        )
-        return cls(count, found, float((numbers * counts[kept]).sum()) / count)
-
-    def values(self) -> NDArray[np.float64]:
-        """The percentiles; there must be numbers."""
-        return self.found
-
-
-def ranks_of(levels: Sequence[float], count: int) -> NDArray[np.int64]:
-    """The places of the numbers, among `count` in ascending order, that percentiles lie between; ascending."""
-    return _ranks(np.asarray(levels, np.float64) / 100, count)
-
-
-def _ranks(shares: NDArray[np.float64], count: int) -> NDArray[np.int64]:
-    low = np.floor((count - 1) * shares).astype(np.int64)
-    found: NDArray[np.int64] = np.unique(np.concatenate([low, np.minimum(low + 1, count - 1)]))
-    return found
-
-
-def interpolated(
-    shares: NDArray[np.float64], count: int, number_at: Callable[[NDArray[np.int64]], NDArray[np.float64]]
-) -> NDArray[np.float64]:
-    """Percentiles of numbers, linear between two of them.
-
-    Args:
-        shares: of the percentiles, 0 to 1.
-        count: of the numbers, at least 1.
-        number_at: the numbers at some places of their ascending order.
-    """
-    virtual = (count - 1) * shares
-    low = np.floor(virtual).astype(np.int64)
-    share = virtual - low
-    below, above = number_at(low), number_at(np.minimum(low + 1, count - 1))
-    # From the nearer end, as numpy does.
-    found: NDArray[np.float64] = np.where(
-        share >= 0.5, above - (above - below) * (1 - share), below + (above - below) * share
-    )
-    return found
 
 
 def _keys(values: FloatArray, kind: np.dtype[np.unsignedinteger]) -> NDArray[np.unsignedinteger]:

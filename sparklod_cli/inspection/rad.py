@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import statistics
 from collections import Counter
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from ..codecs.rad.property_codings import LARGEST_F16
-from ..codecs.rad.rad_header import ENCODING_KEYS, RadChunkHeader, RadHeader
+from ..codecs.rad.rad_header import ENCODING_KEYS
 from ..codecs.rad.rad_layout import BY_NAME, PROPERTIES, SIZES
+from ..codecs.rad.rad_header import RadChunkHeader, RadHeader
 from ..codecs.rad.rad_reader import scan_chunks, scan_header
 from ..codecs.splat_encoding import log_scale_table
 from ..io import opened
 from ..support.printable import MOST, printable
-from .findings import Finding, findings_of
-from .surveys import Head
+from .findings import ChunkBytes, Head, Survey, findings_of
 from .value_checks import Ends
 
 #: Name of the format in `codecs.formats`.
@@ -38,15 +37,6 @@ class PropertyFacts:
     share: float
     min: float | None
     max: float | None
-
-
-@dataclass(frozen=True)
-class ChunkBytes:
-    """Sizes of chunks, bytes."""
-
-    min: int
-    median: int
-    max: int
 
 
 @dataclass(frozen=True)
@@ -78,23 +68,6 @@ class RadFacts:
     properties: dict[str, PropertyFacts]
 
 
-@dataclass(frozen=True)
-class Survey:
-    """What the headers of a file tell and break.
-
-    Attributes:
-        head: what a report begins with; None where `facts` is.
-        facts: what they tell; None where a promise is broken without which the rest cannot be trusted.
-        findings: broken promises, one for each code.
-        fatal: findings because of which the file cannot be read.
-    """
-
-    head: Head | None
-    facts: RadFacts | None
-    findings: list[Finding]
-    fatal: list[Finding]
-
-
 def survey(path: Path, *, check: bool) -> Survey | None:
     """Reads the headers of a RAD file and of its chunks; None for a file of another format.
 
@@ -117,11 +90,11 @@ def survey(path: Path, *, check: bool) -> Survey | None:
                     gathered.add(chunk.header)
     fatal = findings_of(each for each in violations if each.fatal)
     if fatal:
-        return Survey(None, None, findings_of(violations), fatal)
+        return Survey("rad", None, None, findings_of(violations), fatal)
     facts = _facts(header, gathered)
     noted = header.noted
     head = Head(header.format, facts.bytes, header.count, header.max_sh, noted.antialiased, noted.up)
-    return Survey(head, facts, findings_of(violations), [])
+    return Survey("rad", head, facts, findings_of(violations), [])
 
 
 @dataclass
@@ -148,7 +121,6 @@ class _Gathered:
 def _facts(header: RadHeader, gathered: _Gathered) -> RadFacts:
     sizes = [entry.bytes for entry in header.chunks]
     total = header.bytes + sum(sizes)
-    chunk_bytes = ChunkBytes(min(sizes), round(statistics.median(sizes)), max(sizes)) if sizes else None
     ranges = None
     if header.encoding is not None:
         ranges = {key: getattr(header.encoding, name) for key, name in ENCODING_KEYS.items()}
@@ -160,7 +132,7 @@ def _facts(header: RadHeader, gathered: _Gathered) -> RadFacts:
         header_bytes=header.bytes,
         first_bytes=header.bytes + (sizes[0] if sizes else 0),
         chunk_size=header.chunk_size,
-        chunk_bytes=chunk_bytes,
+        chunk_bytes=ChunkBytes.of(sizes),
         palette=header.sh_code_count or 0,
         ranges=ranges,
         comment=comment,

@@ -6,10 +6,10 @@ import dataclasses
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from ..codecs.spz_layout import KNOWN_FLAGS
-from ..io import examine_scene, read_arrays, read_coded, size_of_input
+from ..io import examine_scene, read_arrays, size_of_input
 from ..io.rad_file import RadFile
 from ..model.scene import Scene
 from ..model.sh import COEFFICIENTS
@@ -19,33 +19,22 @@ from ..support.printable import printable
 from ..support.progress import Progress, silent
 from ..support.untrusted import QUOTED
 from ..tables.columns import Row
-from . import arrays, chunks, code_values, rad, streamed_sog, tree, tree_findings, value_checks, values
-from .blocks import Block, Blocks
-from .findings import Finding
+from . import arrays, chunks, rad, streamed_sog, tree, value_checks, values
+from .blocks import Block, Blocks, merged
+from .findings import Finding, Head, Survey
+from .value_checks import ValueTally
 
 #: Version of the report: counts up when a field changes its meaning or is removed. schema.json describes this one.
 SCHEMA_VERSION = 1
 
-#: Columns that the facts of a tree are computed from.
-TREE_COLUMNS = tree_findings.USED
-
+#: Columns of `Splats` that a report without statistics, findings and chunks is computed from, those that all others
+#: need of a file whose codes cannot be invalid, and what --stats needs besides.
+OF_TREE, OF_VALUES, OF_STATISTICS = {"scale", "opacity"}, {"center", "scale", "opacity"}, {"rgb", "sh"}
 
 #: Fields for which the headers of a RAD file, or of the files of a Streamed SOG, are enough.
 HEADER_FIELDS = (
-    "file",
-    "bytes",
-    "format",
-    "splats",
-    "sh_degree",
-    "bytes_per_splat",
-    "compression_ratio",
-    "rad",
-    "streamed_sog",
+    *("file", "bytes", "format", "splats", "sh_degree", "bytes_per_splat", "compression_ratio", "rad", "streamed_sog"),
 )
-
-
-#: What the headers of a file tell, of the formats that have much to tell there.
-Surveyed = rad.Survey | streamed_sog.Survey
 
 
 class NoFieldError(SparklodError):
@@ -62,8 +51,8 @@ class ReportSettings:
         check: findings.
         chunks: a row for each chunk.
         headers_only: read no more than headers where a format has those; tree and values are left out.
-        at_once: have the whole scene in memory, as those need who look at it besides; False reads RAD files chunk by
-            chunk; None does so with large ones, see `RadFile.fits`. SPZ files are decoded as a whole for True only.
+        at_once: have the whole scene in memory, with all columns, for callers that draw it; False reads RAD files chunk
+            by chunk; None does so with large ones, see `RadFile.fits`.
     """
 
     chunks: bool = False
@@ -151,8 +140,8 @@ def inspect(
 ) -> tuple[Report, Scene | None]:
     """The report on a file, and its scene as far as it was read.
 
-    A file that cannot be read gives a finding, not an error, and None for the scene. Unless the scene is wanted, a
-    large RAD file is read chunk by chunk, and an SPZ file stays codes, which gives the same report, but no scene.
+    A file that cannot be read gives a finding, not an error, and None for the scene. Unless the scene is wanted as a
+    whole (`ReportSettings.at_once`), it is None of RAD files that are read chunk by chunk and of SPZ files.
 
     Args:
         path: of the file, or of the folder of an unpacked SOG.
@@ -160,168 +149,118 @@ def inspect(
         threads: to read with.
         progress: called while the file is read.
     """
-    columns = COLUMNS if settings.values or settings.check or settings.chunks else TREE_COLUMNS
-    size = size_of_input(path)
-    surveyed = None
+    columns = set(COLUMNS) if settings.values or settings.check or settings.chunks else OF_TREE
+    size, unread, surveyed = size_of_input(path), set[str](), None
     try:
         held = read_arrays(path)
         if held is not None:
-            facts_of_arrays, scene_of_arrays = arrays.examine(held, settings, threads=threads)
-            return Report(**arrays.as_report_fields(facts_of_arrays, path, size, settings)), scene_of_arrays
+            fields, scene_of_arrays = arrays.examine(held, settings, threads=threads)
+            each = round(size / fields["splats"], 3) if size and fields["splats"] else None
+            return Report(str(path), size, bytes_per_splat=each, **fields), scene_of_arrays
         surveyed = rad.survey(path, check=settings.check) or streamed_sog.survey(
             path, check=settings.check, threads=threads, progress=progress
         )
         if surveyed is not None and surveyed.facts is None:
             return Report(str(path), size, findings=surveyed.findings if settings.check else surveyed.fatal), None
         if surveyed is not None and settings.headers_only:
-            return _of_headers(path, surveyed), None
-        if isinstance(surveyed, rad.Survey) and settings.at_once is not True:
+            return _report(path, surveyed.head, surveyed), None
+        if surveyed is not None and surveyed.field == "rad" and settings.at_once is not True:
             file = RadFile.open(path)
             if file is not None and not (settings.at_once is None and file.fits):
                 blocks = Blocks.of_file(file, threads=threads, progress=progress)
-                return _of_blocks(path, blocks, size, settings, surveyed, threads), None
-        if settings.at_once is not True:
-            kept, watched = _columns_of(settings), code_values.Watched(all_quantities=settings.all_quantities)
-            watch = watched.watch if settings.values else None
-            coded = read_coded(path, columns=kept, watch=watch, threads=threads, progress=progress)
-            if coded is not None:
-                return _of_blocks(path, Blocks.of_codes(coded), size, settings, surveyed, threads, watched), None
+                return _of_blocks(path, blocks, columns, size, settings, surveyed, threads), None
+        if surveyed is None and settings.at_once is not True:
+            # Only SPZ files are read by columns. None of their codes is invalid but positions of version 1.
+            needed = OF_VALUES | (OF_STATISTICS if settings.values and settings.all_quantities else set())
+            unread, columns = columns - needed, columns & needed
         scene = examine_scene(path, columns=columns, threads=threads, progress=progress)
     except FormatError as error:
         found = surveyed.findings if surveyed is not None and settings.check else []
         known = any(each.code == error.code for each in found)
         return Report(str(path), size, findings=[*found, *([] if known else [Finding(error.code, str(error))])]), None
-    return _of_blocks(path, Blocks.of(scene), size, settings, surveyed, threads), scene
-
-
-def _columns_of(settings: ReportSettings) -> set[str]:
-    """Columns of `Splats` whose codes a report on sound splats keeps."""
-    return {
-        *TREE_COLUMNS,
-        *(value_checks.USED if settings.check else ()),
-        *(chunks.USED if settings.chunks else ()),
-        *(values.USED if settings.values else ()),
-    }
-
-
-def _of_headers(path: Path, surveyed: Surveyed) -> Report:
-    """The report on a file of which only the headers were read."""
-    head = surveyed.head
-    assert head is not None
-    return Report(
-        str(path),
-        head.bytes,
-        head.format,
-        head.splats,
-        head.sh_degree,
-        head.antialiased,
-        head.up,
-        bytes_per_splat=_bytes_per_splat(head.bytes, head.splats),
-        compression_ratio=_compression_ratio(head.bytes, head.splats, head.sh_degree),
-        **_facts_of(surveyed),
-    )
-
-
-def _facts_of(surveyed: Surveyed | None) -> dict[str, Any]:
-    """The field of a report that has what the headers of a format tell."""
-    if surveyed is None:
-        return {}
-    return {"rad" if isinstance(surveyed, rad.Survey) else "streamed_sog": surveyed.facts}
-
-
-class _Passed(Protocol):
-    """What blocks pass through: parts are made on several threads, and merged in order."""
-
-    def part_of(self, block: Block, /) -> Any: ...
-
-    def merge(self, part: Any, /) -> None: ...
+    partial = surveyed is None and settings.at_once is not True and "fractional_bits" in scene.header
+    blocks = Blocks.of(scene, unread if partial else ())
+    return _of_blocks(path, blocks, columns, size, settings, surveyed, threads), None if partial else scene
 
 
 def _of_blocks(
     path: Path,
     blocks: Blocks,
+    columns: Collection[str],
     size: int | None,
     settings: ReportSettings,
-    surveyed: Surveyed | None,
+    surveyed: Survey | None,
     threads: int,
-    watched: code_values.Watched | None = None,
 ) -> Report:
     """The report on a file that can be read, block by block."""
-    size = blocks.header.get("bytes", size)
-    ends = value_checks.ends_of(blocks.header)
-    findings = _container_findings(blocks)
-    if surveyed is not None and surveyed.facts is not None:
-        size = surveyed.facts.bytes
-        findings += surveyed.findings
-    if isinstance(surveyed, rad.Survey) and surveyed.facts is not None:
+    about = blocks.about
+    ends, size = value_checks.ends_of(about.header), about.header.get("bytes", size)
+    findings = _container_findings(about)
+    if surveyed is not None:
+        size, findings = surveyed.facts.bytes, findings + surveyed.findings
+    if surveyed is not None and surveyed.field == "rad":
         ends = rad.ends_of(surveyed.facts)
-    columns = tree.Columns.of(blocks) if blocks.is_tree and blocks.count else None
-    coded = blocks.coded
-    statistics = values.Statistics(blocks.sh_degree, all_quantities=settings.all_quantities)
-    checks = value_checks.ValueChecks(ends, is_tree=blocks.is_tree)
-    rows = chunks.Rows(blocks)
-    wanted: list[tuple[_Passed, Collection[str]]] = [
-        *([] if columns is None else [(columns, TREE_COLUMNS if coded is None else ())]),
-        *([(statistics, values.USED if blocks.sound else COLUMNS)] if settings.values and coded is None else []),
-        *([(checks, () if coded else value_checks.USED if blocks.sound else COLUMNS)] if settings.check else []),
-        *([(rows, chunks.USED)] if settings.chunks else []),
-    ]
-    used = {name for _, names in wanted for name in names}
-    for parts in blocks.map(lambda block: [each.part_of(block) for each, _ in wanted], used, threads):
-        for (each, _), part in zip(wanted, parts, strict=True):
-            each.merge(part)
-    told = None
-    if settings.values and coded is not None and watched is not None:
-        sizes = None if columns is None else columns.size
-        told = code_values.examine(coded, sizes, watched, threads=threads)
-    elif settings.values:
-        statistics.finish(blocks, threads=threads)
-        told = statistics.facts()
-    facts = None
-    in_order = rows.rows(columns) if settings.chunks else None
-    if columns is not None:
+    nodes = tree.Columns.of(blocks) if blocks.is_tree and blocks.count else None
+
+    def examined(block: Block) -> tuple[Any, Any, Any]:
+        return (
+            None if nodes is None else nodes.add(block),
+            ValueTally.of(block, ends) if settings.values or settings.check else None,
+            chunks.row_of(block) if settings.chunks else None,
+        )
+
+    opaque, tallies, rows = zip(*blocks.map(examined, columns, threads), strict=True) if blocks.count else ((), (), ())
+    statistics = facts = table = None
+    if settings.values:
+        total = ValueTally.total(tallies)
+        statistics = values.statistics_of(blocks, total, all_quantities=settings.all_quantities, threads=threads)
+    if settings.chunks:
+        table = chunks.table_of(rows, about.chunk_bytes, nodes)
+    if nodes is not None:
         facts, found = tree.examine_blocks(
             blocks,
-            columns,
+            nodes,
+            merged(opaque),
             check=settings.check,
             scale_ends=ends.scale,
-            in_chunks=isinstance(surveyed, rad.Survey),
+            in_chunks=surveyed is not None and surveyed.field == "rad",
             threads=threads,
         )
         findings += found
     if settings.check:
-        findings += checks.findings()
-    return Report(
-        file=str(path),
+        findings += value_checks.findings_about(ValueTally.total(tallies), ends, is_tree=blocks.is_tree)
+    degree = about.splats.sh_degree
+    head = Head(about.format, size or 0, blocks.count, degree, about.antialiased, about.up)
+    report = _report(path, head, surveyed)
+    return dataclasses.replace(
+        report,
         bytes=size,
-        format=blocks.format,
-        splats=blocks.count,
-        sh_degree=blocks.sh_degree,
-        antialiased=blocks.antialiased,
-        up=blocks.up,
-        header=dict(blocks.header),
-        bytes_per_splat=_bytes_per_splat(size, blocks.count),
-        compression_ratio=_compression_ratio(size, blocks.count, blocks.sh_degree),
-        notes=list(blocks.notes),
+        header=dict(about.header),
+        notes=list(about.notes),
         tree=facts,
-        values=told,
-        chunks=in_order,
+        values=statistics,
+        chunks=table,
         findings=findings if settings.check else None,
-        **_facts_of(surveyed),
     )
 
 
-def _bytes_per_splat(size: int | None, count: int) -> float | None:
-    return round(size / count, 3) if size and count else None
+def _report(path: Path, head: Head | None, surveyed: Survey | None) -> Report:
+    """The report that headers alone give."""
+    assert head is not None
+    size, count = head.bytes, head.splats
+    decoded = 4 * count * (14 + 3 * COEFFICIENTS[head.sh_degree])
+    return Report(
+        str(path),
+        **dataclasses.asdict(head),
+        bytes_per_splat=round(size / count, 3) if size and count else None,
+        compression_ratio=round(decoded / size, 3) if size else None,
+        **({} if surveyed is None else {surveyed.field: surveyed.facts}),
+    )
 
 
-def _compression_ratio(size: int | None, count: int, sh_degree: int) -> float | None:
-    return round(4 * count * (14 + 3 * COEFFICIENTS[sh_degree]) / size, 3) if size else None
-
-
-def _container_findings(blocks: Blocks) -> list[Finding]:
-    header = blocks.header
-    findings = [Finding("container.left-out", note) for note in blocks.notes]
+def _container_findings(scene: Scene) -> list[Finding]:
+    header = scene.header
+    findings = [Finding("container.left-out", note) for note in scene.notes]
     unknown = header.get("flags", 0) & ~KNOWN_FLAGS
     if unknown:
         findings.append(Finding("container.flags", f"the header sets flags {unknown:#04x}, which have no meaning"))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,9 +16,7 @@ from ..io import opened
 from ..support.printable import MOST, printable
 from ..support.progress import Progress, silent
 from ..support.untrusted import LARGEST
-from .findings import Finding, findings_of
-from .rad import ChunkBytes
-from .surveys import Head
+from .findings import ChunkBytes, Head, Survey, findings_of
 from .values import Box
 
 #: Name of the format in `codecs.formats`.
@@ -97,23 +94,6 @@ class StreamedSogFacts:
     environment: EnvironmentFacts | None
 
 
-@dataclass(frozen=True)
-class Survey:
-    """What the manifest and the files that it names tell and break.
-
-    Attributes:
-        head: what a report begins with; None where `facts` is.
-        facts: None where a promise is broken without which the rest cannot be trusted.
-        findings: broken promises, one for each code.
-        fatal: findings because of which the file cannot be read.
-    """
-
-    head: Head | None
-    facts: StreamedSogFacts | None
-    findings: list[Finding]
-    fatal: list[Finding]
-
-
 def survey(path: Path, *, check: bool, threads: int = 1, progress: Progress = silent) -> Survey | None:
     """Reads a manifest and the headers of its chunk files; None for a file of another format.
 
@@ -133,13 +113,13 @@ def survey(path: Path, *, check: bool, threads: int = 1, progress: Progress = si
         manifest, files, violations = scan_files(file, more["beside"])
         fatal = [each for each in violations if each.fatal]
         if fatal:
-            return Survey(None, None, findings_of(violations), findings_of(fatal))
+            return Survey("streamed_sog", None, None, findings_of(violations), findings_of(fatal))
         if check:
             found = scan_splats(more["beside"], manifest, files, threads=threads, progress=progress)
             violations = [*violations, *found]
     chunks = {name: chunk for name, chunk in files.items() if isinstance(chunk, Chunk)}
     facts = _facts(manifest, chunks, size)
-    return Survey(_head(manifest, chunks, facts), facts, findings_of(violations), [])
+    return Survey("streamed_sog", _head(manifest, chunks, facts), facts, findings_of(violations), [])
 
 
 def _head(manifest: Manifest, chunks: Mapping[str, Chunk], facts: StreamedSogFacts) -> Head:
@@ -189,7 +169,7 @@ def _facts(manifest: Manifest, chunks: Mapping[str, Chunk], size: int) -> Stream
         region_edge=_quantiles(edges),
         bound=Box(list(bound[0]), list(bound[1])),
         files=len(sizes),
-        file_bytes=ChunkBytes(min(sizes), round(statistics.median(sizes)), max(sizes)) if sizes else None,
+        file_bytes=ChunkBytes.of(sizes),
         environment=environment,
     )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,9 +14,13 @@ from numpy.typing import NDArray
 
 from ..lod.kernels.tree_links import (
     LIMIT_BITS,
+    add_weighted,
     count_limits,
+    fill_weights,
+    find_cycles,
     find_depths,
     find_parents,
+    mark_small,
     sum_by_depth,
 )
 from ..model.gaussian import spark_size
@@ -24,10 +28,171 @@ from ..model.lod_tree import LodTree
 from ..model.nodes import CHUNK_BITS, CHUNK_NODES
 from ..model.scene import Scene
 from ..model.splats import FloatArray, Splats
-from ..support.parallel import ordered_map
-from .blocks import Block, Blocks, Tally
+from ..support.parallel import blocks_of, ordered_map
+from .blocks import Block, Blocks, Mask, Tally, largest, merged, tallies
 from .findings import Finding
-from .tree_findings import USED, link_findings, order_findings, parts_of, size_findings, told
+
+#: Smallest feature size of a node over the mean of its children's, weighted by area. A merged splat has at least their
+#: variance, so nodes of a good tree reach 0.5; a much smaller one is drawn in their place for too long. A single faint
+#: child may be far larger than its parent, which is no fault: docs/decisions/2026-11-21-sizes-of-parents.md.
+MIN_SIZE_RATIO = 1 / 3
+#: More than rounding adds to a mean, as a factor.
+ROUNDING = 1 + 1e-6
+
+#: A file is ordered coarse before fine if the median limit of its nodes' parents, at which the traversal refines them,
+#: does not rise by more than a factor `MAX_RISE` from one of `PARTS` equal parts to a later one. Trees with fewer than
+#: `MIN_NODES` children are not checked: chance decides there.
+PARTS, MAX_RISE, MIN_NODES = 16, 1.6, 1024
+
+#: Columns of `Splats` that the facts of a tree, and findings about it, are computed from.
+USED = ("scale", "opacity")
+
+
+def parts_of(tree: LodTree) -> list[slice]:
+    """Nodes that are looked at together, so that what is computed of them is small."""
+    return blocks_of(len(tree), CHUNK_NODES)
+
+
+def node_text(tally: Tally, what: str) -> str:
+    """The text of a finding about nodes."""
+    return f"node {{first}} {what}{' (and {more} more)' if tally.count > 1 else ''}"
+
+
+def link_findings(
+    tree: LodTree, parent: NDArray[np.int32], references: NDArray[np.int32], depth: NDArray[np.int32], threads: int
+) -> list[Finding]:
+    """Findings about the links of a tree of N nodes.
+
+    Args:
+        tree: of them.
+        parent, references: (N,) of `find_parents`.
+        depth: (N,) of `find_depths`.
+        threads: to work on.
+    """
+    faults = {
+        "tree.root": "is the root but the child of another node",
+        "tree.range": f"has children beyond the last node, {len(tree) - 1:,}",
+        "tree.order": "comes after one of its children, or is its own child",
+        "tree.shared": "is the child of more than one node",
+        "tree.orphan": "has no parent",
+        "tree.unreachable": "has a parent, but the root does not lead to it",
+        "tree.leaf-start": "is a leaf with a child_start other than 0",
+        "tree.single-child": "has a single child",
+    }
+    cycles = find_cycles(parent, depth)
+
+    def tallied(part: slice) -> dict[str, Tally]:
+        count, start, held = tree.child_count[part], tree.child_start[part].astype(np.int64), references[part]
+        node = np.arange(part.start, part.stop)
+        inner = count > 0
+        masks = {
+            "tree.range": inner & (start + count > len(tree)),
+            "tree.order": inner & (start <= node),
+            "tree.shared": held > 1,
+            "tree.orphan": (held == 0) & (node > 0),
+            "tree.unreachable": cycles[part],
+            "tree.leaf-start": ~inner & (start != 0),
+            "tree.single-child": count == 1,
+        }
+        return tallies(masks, part.start)
+
+    roots = tallies({"tree.root": references[:1] > 0}, 0)
+    total = merged([roots, *ordered_map(tallied, parts_of(tree), threads)])
+    return [found for code, what in faults.items() for found in total[code].finding(code, node_text(total[code], what))]
+
+
+def size_findings(
+    blocks: Blocks,
+    tree: LodTree,
+    parent: NDArray[np.int32],
+    size: FloatArray,
+    scale_ends: tuple[float, float],
+    threads: int,
+) -> list[Finding]:
+    """Findings about nodes that are much smaller than their children, N nodes in all.
+
+    Args:
+        blocks: of the nodes; read if a node may be too small.
+        tree: of them.
+        parent: (N,) of `find_parents`.
+        size: (N,) feature sizes, world units.
+        scale_ends: as for `tree.examine_blocks`.
+        threads: to work on.
+    """
+    # No mean is larger than the largest child, but for rounding. In a good tree, that tells of nearly all nodes that
+    # they are large enough.
+    marks = np.zeros(len(parent), np.bool_)
+    if not mark_small(tree.child_count, tree.child_start, size, MIN_SIZE_RATIO * ROUNDING, marks):
+        return []
+    sums, weights, excused = np.zeros(len(parent)), np.zeros(len(parent)), np.zeros(len(parent), np.bool_)
+    low, high = scale_ends
+
+    def sized(block: Block) -> tuple[slice, NDArray[np.int32], NDArray[np.float64], Mask, Mask] | None:
+        """Return what the comparison needs of a block; None if nothing.
+
+        That are its place, the parents that its nodes are compared with, -1 for none, their weights in the mean size of
+        those parents' children, whether each is a line whose width, and so its area, the format cannot hold, and
+        whether it has a scale as large as the format holds.
+        """
+        part, scale = block.part, block.splats.scale
+        above = np.where(marks[parent[part]], parent[part], -1)
+        above[parent[part] < 0] = -1
+        if not (marks[part].any() or (above >= 0).any()):
+            return None
+        weight = np.empty(len(scale), np.float64)
+        fill_weights(above, size[part], scale, block.splats.opacity, weight)
+        x, y, z = scale.T
+        line = (x <= low) & (y <= low) | (x <= low) & (z <= low) | (y <= low) & (z <= low)
+        return part, above, weight, line, ~(largest(scale) < high)
+
+    for found in blocks.map(sized, USED, threads):
+        if found is None:
+            continue
+        part, above, weight, line, clamped = found
+        add_weighted(above, size[part], weight, sums, weights)
+        excused[above[line & (above >= 0)]] = True
+        excused[part] |= clamped
+    small = Tally()
+    for part in parts_of(tree):
+        if not marks[part].any():
+            continue
+        weight = weights[part]
+        mean = np.divide(sums[part], weight, out=np.zeros(len(weight)), where=weight > 0)
+        small += Tally.of((size[part] < MIN_SIZE_RATIO * mean) & ~excused[part], part.start)
+    return small.finding("tree.size", node_text(small, "is less than a third as large as the mean of its children"))
+
+
+def order_findings(parent: NDArray[np.int32], limit: FloatArray, threads: int) -> list[Finding]:
+    """A finding if a tree of N nodes is not in the order coarse before fine.
+
+    Args:
+        parent: (N,) of `find_parents`.
+        limit: (N,) of `find_depths`.
+        threads: to work on.
+    """
+    held = parent >= 0
+    count = int(np.count_nonzero(held))
+    if count < MIN_NODES:
+        return []
+    # In a good tree all nodes but the first, which need not be listed.
+    children = range(1, len(parent)) if count == len(parent) - 1 and not held[0] else np.flatnonzero(held)
+    del held
+    ends = [count // PARTS * end + min(count % PARTS, end) for end in range(PARTS + 1)]
+
+    def median(part: int) -> np.float32:
+        some = children[ends[part] : ends[part + 1]]
+        above = parent[some.start : some.stop] if isinstance(some, range) else parent[some]
+        found: np.float32 = np.median(limit[above])
+        return found
+
+    limits = np.array(list(ordered_map(median, range(PARTS), threads)))
+    rises = np.flatnonzero(limits[1:] > MAX_RISE * np.minimum.accumulate(limits)[:-1])
+    if not rises.size:
+        return []
+    at = int(children[ends[rises[0] + 1]])
+    what = f"nodes from {at:,} on are refined before some of the nodes before them"
+    return [Finding("tree.coarse-first", what, at, len(parent) - at)]
+
 
 #: Most depths that a report lists, from the root on. Good trees have some twenty; a chain could have one a node.
 MAX_DEPTHS = 1000
@@ -86,48 +251,34 @@ class Columns:
         tree: children, (N,); as far as the blocks have come, unless all are in memory.
         is_whole: the tree is in memory.
         size: (N,) float32 feature sizes, world units.
-        tallies: merged nodes of D > 1, and leaves of D > 1.
     """
 
     tree: LodTree
     is_whole: bool
     size: FloatArray
-    opaque: Tally
-    opaque_leaves: Tally
 
     @classmethod
     def of(cls, blocks: Blocks) -> Columns:
         """For the nodes of some blocks, none of which has been added."""
-        count, tree = blocks.count, blocks.tree
+        count, tree = blocks.count, blocks.about.tree
+        size = np.empty(count, np.float32)
         if tree is None:
-            tree = LodTree(np.empty(count, np.uint16), np.empty(count, np.uint32))
-        return cls(tree, blocks.tree is not None, np.empty(count, np.float32), Tally(), Tally())
+            return cls(LodTree(np.empty(count, np.uint16), np.empty(count, np.uint32)), False, size)
+        return cls(tree, True, size)
 
-    def part_of(self, block: Block) -> tuple[Tally, Tally]:
-        """Sets what is here of the nodes of a block; the tallies are to be merged in order.
+    def add(self, block: Block) -> dict[str, Tally]:
+        """Set what is here of the nodes of a block; return the tallies of its nodes and of its leaves of D > 1.
 
         Args:
-            block: with the columns `USED`, or with codes.
+            block: with the columns `USED`.
         """
         assert block.tree is not None
         part = block.part
         if not self.is_whole:
             self.tree.child_count[part], self.tree.child_start[part] = block.tree.child_count, block.tree.child_start
-        if block.coded is None:
-            self.size[part] = spark_size(block.splats)
-            more = block.splats.opacity > 1
-        else:
-            block.coded.fill_sizes(part, self.size[part])
-            more = (block.coded.table("opacity") > 1)[block.coded.codes["alphas"][part, 0]]
-        found = (Tally(), Tally())
-        found[0].add(more, block.start)
-        found[1].add(more & block.tree.is_leaf, block.start)
-        return found
-
-    def merge(self, part: tuple[Tally, Tally]) -> None:
-        """Adds the tallies of the next block."""
-        self.opaque.merge(part[0])
-        self.opaque_leaves.merge(part[1])
+        self.size[part] = spark_size(block.splats)
+        more = block.splats.opacity > 1
+        return tallies({"opaque": more, "opaque leaves": more & block.tree.is_leaf}, block.start)
 
 
 def examine(
@@ -143,14 +294,14 @@ def examine(
     """
     blocks = Blocks.of(Scene(splats, tree))
     columns = Columns.of(blocks)
-    for block in blocks.read(USED):
-        columns.merge(columns.part_of(block))
-    return examine_blocks(blocks, columns, check=check, scale_ends=scale_ends)
+    opaque = merged(blocks.map(columns.add, USED, 1))
+    return examine_blocks(blocks, columns, opaque, check=check, scale_ends=scale_ends)
 
 
 def examine_blocks(
     blocks: Blocks,
     columns: Columns,
+    opaque: Mapping[str, Tally],
     *,
     check: bool,
     scale_ends: tuple[float, float] = (0.0, math.inf),
@@ -163,7 +314,8 @@ def examine_blocks(
 
     Args:
         blocks: read once more to compare nodes with their children, where faults are looked for.
-        columns: of all blocks.
+        columns: of all blocks, and
+        opaque: what `Columns.add` returned of them.
         check: look for faults.
         scale_ends: smallest and largest scale that the format holds, world units. A scale at one of them may have been
             clamped.
@@ -193,7 +345,7 @@ def examine_blocks(
         ],
         levels_left_out=max(0, len(nodes) - MAX_DEPTHS),
         children={str(number): int(children[number]) for number in np.flatnonzero(children) if number},
-        more_than_opaque=round(float(columns.opaque.count) / len(tree), 4),
+        more_than_opaque=round(opaque["opaque"].count / len(tree), 4),
         chunks=-(-len(tree) // CHUNK_NODES),
         chunks_of_coarse_cut=len(np.unique(coarse // CHUNK_NODES)),
         split_siblings=split,
@@ -205,7 +357,8 @@ def examine_blocks(
     parent, references = parents
     found = link_findings(tree, parent, references, depth, threads)
     del references, depth, parents
-    found += columns.opaque_leaves.finding("tree.leaf-opacity", told(columns.opaque_leaves, "is a leaf with D > 1"))
+    leaves_of_d = opaque["opaque leaves"]
+    found += leaves_of_d.finding("tree.leaf-opacity", node_text(leaves_of_d, "is a leaf with D > 1"))
     found += size_findings(blocks, tree, parent, size, scale_ends, threads)
     return facts, found if in_chunks else [*found, *order_findings(parent, limit, threads)]
 

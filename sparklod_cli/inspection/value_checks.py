@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..codecs import clamps, quantize
 from ..model.scene import Scene
-from ..model.splats import COLUMNS
-from .blocks import Block, Blocks, Tally, largest
+from ..model.splats import COLUMNS, FloatArray
+from .blocks import Block, Blocks, Mask, Tally, largest, merged, tallies
 from .findings import Finding
 
 #: Code and message of each reason that makes a splat invalid (`splats.INVALID`).
@@ -22,9 +21,6 @@ OF_INVALID = {
     "negative_scale": ("values.negative-scale", "a scale is below 0"),
     "negative_opacity": ("values.opacity", "the opacity is below 0"),
 }
-
-#: Columns of `Splats` that are looked at besides those that make a splat invalid.
-USED = ("center", "scale", "opacity")
 
 #: Share of splats above which invisible ones are a finding: a few are the rounding of good files.
 MANY_INVISIBLE = 0.1
@@ -55,106 +51,119 @@ def ends_of(header: Mapping[str, int]) -> Ends:
     return Ends((low, high), quantize.FIXED24_MAX * 2.0 ** -int(header["fractional_bits"]) if fixed else math.inf)
 
 
-def check(scene: Scene, ends: Ends | None = None) -> list[Finding]:
-    """Findings about the values of a scene in memory.
-
-    Args:
-        scene: as it was read.
-        ends: of its codes; None for those of its header.
-    """
-    found = ValueChecks(ends_of(scene.header) if ends is None else ends, is_tree=scene.tree is not None)
-    for block in Blocks.of(scene).read(COLUMNS):
-        found.merge(found.part_of(block))
-    return found.findings()
-
-
-@dataclass
-class ValueChecks:
-    """Looks for faults in splats that pass once, block by block: with all columns, `USED` of sound ones, or codes.
+@dataclass(frozen=True, eq=False)
+class ValueTally:
+    """Tallies of splats by their values.
 
     Attributes:
-        ends: of the codes of their file.
-        is_tree: they are the nodes of a tree.
-        count: splats so far.
+        count: splats.
         checked: of them, those of which few may be invisible or clamped: the leaves of a tree, or all.
         invisible: of these, valid or not.
-        tallies: by what is wrong.
+        by_name: tallies of valid splats that are "opaque", "invisible", "transparent", ..., and of the kinds of
+            `splats.INVALID`.
+        valid: masks of valid splats, by the start of each block in which some are not.
+        low, high: (3,) corners of the box of the centres of valid splats; infinite without any.
     """
 
-    ends: Ends
-    is_tree: bool
-    count: int = 0
-    checked: int = 0
-    invisible: int = 0
-    tallies: dict[str, Tally] = field(default_factory=dict)
+    count: int
+    checked: int
+    invisible: int
+    by_name: dict[str, Tally]
+    valid: dict[int, Mask]
+    low: FloatArray
+    high: FloatArray
 
-    def _add(self, what: str, mask: NDArray[np.bool_], block: Block) -> None:
-        self.tallies.setdefault(what, Tally()).add(mask, block.start)
-
-    def part_of(self, block: Block) -> ValueChecks:
-        """What is wrong in a block, to be merged."""
-        part = ValueChecks(self.ends, is_tree=self.is_tree)
-        part.add(block)
-        return part
-
-    def merge(self, part: ValueChecks) -> None:
-        """Adds what was found in the next block."""
-        self.count += part.count
-        self.checked += part.checked
-        self.invisible += part.invisible
-        for what, tally in part.tallies.items():
-            self.tallies.setdefault(what, Tally()).merge(tally)
-
-    def add(self, block: Block) -> None:
-        """Looks at a block."""
-        splats, valid = block.splats, block.valid
-        some = np.ones(len(splats), np.bool_) if block.tree is None else block.tree.is_leaf
-        self.count += len(splats)
-        self.checked += int(np.count_nonzero(some))
-        for kind, mask in block.invalid.items():
-            self._add(kind, mask, block)
-        if block.coded is None:
-            opacity, most, furthest = splats.opacity, largest(splats.scale), largest(np.abs(splats.center))
-        else:
-            opacity, most, furthest = block.coded.extremes(block.part)
-        if not self.is_tree:
-            self._add("opaque", valid & (opacity > 1), block)
+    @classmethod
+    def of(cls, block: Block, ends: Ends) -> ValueTally:
+        """Tallies of a block with the columns center, scale and opacity, and others that may be invalid."""
+        opacity, most = block.splats.opacity, largest(block.splats.scale)
+        furthest, valid = largest(np.abs(block.splats.center)), block.valid
+        checked = np.ones(len(opacity), np.bool_) if block.tree is None else block.tree.is_leaf
         # Merged splats of thin leaves far apart may be fainter than any code, or larger.
-        invisible = some & ((opacity == 0) | (most == 0))
-        self.invisible += int(np.count_nonzero(invisible))
-        self._add("invisible", valid & invisible, block)
-        self._add("center", valid & (furthest >= self.ends.center), block)
-        low, high = self.ends.scale
+        invisible = checked & ((opacity == 0) | (most == 0))
+        masks = {
+            **block.invalid,
+            "opaque": valid & (opacity > 1),
+            "transparent": valid & (opacity == 0),
+            "without scale": valid & (most == 0),
+            "invisible": valid & invisible,
+            "center": valid & (furthest >= ends.center),
+            "far": valid & (furthest >= FLOAT16_END),
+        }
+        low, high = ends.scale
         if high < math.inf:  # see `clamps.tally` for what of it can be seen
-            self._add("small", some & valid & (most > 0) & (most <= low), block)
-            self._add("large", some & valid & (most >= high), block)
-        self._add("far", valid & (furthest >= FLOAT16_END), block)
+            masks["small"] = checked & valid & (most > 0) & (most <= low)
+            masks["large"] = checked & valid & (most >= high)
+        center = block.splats.center[valid] if block.invalid else block.splats.center
+        return cls(
+            len(opacity),
+            int(np.count_nonzero(checked)),
+            int(np.count_nonzero(invisible)),
+            tallies(masks, block.start),
+            {block.start: valid} if block.invalid else {},
+            np.array([axis.min(initial=np.inf) for axis in center.T]),
+            np.array([axis.max(initial=-np.inf) for axis in center.T]),
+        )
 
-    def findings(self) -> list[Finding]:
-        """What was found."""
-        if not self.count:
-            return [Finding("values.empty", "there are no splats")]
-        found: list[Finding] = []
+    @classmethod
+    def total(cls, parts: Iterable[ValueTally]) -> ValueTally:
+        """Tallies of all blocks, in order."""
+        every = list(parts)
+        valid = {start: mask for part in every for start, mask in part.valid.items()}
+        low, high = np.full(3, np.inf, np.float32), np.full(3, -np.inf, np.float32)
+        for part in every:
+            low, high = np.minimum(low, part.low), np.maximum(high, part.high)
+        return cls(
+            sum(part.count for part in every),
+            sum(part.checked for part in every),
+            sum(part.invisible for part in every),
+            merged(part.by_name for part in every),
+            valid,
+            low,
+            high,
+        )
 
-        def report(code: str, what: str, text: str) -> None:
-            tally = self.tallies.get(what, Tally())
-            more = " and {more} more" if tally.count > 1 else ""
-            found.extend(tally.finding(code, f"splat {{first}}{more}: {text}"))
+    def number(self, name: str) -> int:
+        """Number of splats in a tally."""
+        return self.by_name.get(name, Tally()).count
 
-        for kind, (code, text) in OF_INVALID.items():
-            report(code, kind, text)
+
+def check(scene: Scene) -> list[Finding]:
+    """Findings about the values of a scene in memory."""
+    ends, blocks = ends_of(scene.header), Blocks.of(scene)
+    parts = blocks.map(lambda block: ValueTally.of(block, ends), COLUMNS, 1)
+    return findings_about(ValueTally.total(parts), ends, is_tree=blocks.is_tree)
+
+
+def findings_about(values: ValueTally, ends: Ends, *, is_tree: bool) -> list[Finding]:
+    """Findings about the values of all splats of a file.
+
+    Args:
+        values: of all blocks.
+        ends: of the codes of the file.
+        is_tree: they are the nodes of a tree.
+    """
+    if not values.count:
+        return [Finding("values.empty", "there are no splats")]
+    findings: list[Finding] = []
+
+    def report(code: str, name: str, text: str) -> None:
+        tally = values.by_name.get(name, Tally())
+        more = " and {more} more" if tally.count > 1 else ""
+        findings.extend(tally.finding(code, f"splat {{first}}{more}: {text}"))
+
+    for kind, (code, text) in OF_INVALID.items():
+        report(code, kind, text)
+    if not is_tree:
         report("values.opacity", "opaque", "the opacity is above 1")
-        if self.invisible > MANY_INVISIBLE * self.checked:
-            report("values.invisible", "invisible", "cannot be drawn, as its opacity or scale is 0")
-        if self.ends.center < math.inf:
-            text = f"a coordinate is {self.ends.center:g}, the end of the range of its code"
-            report("values.center-clamped", "center", text)
-        for what, end in zip(("small", "large"), self.ends.scale, strict=True):
-            visible = self.tallies.get(what, Tally()).count
-            if clamps.matters("scale", above=what == "large", visible=visible, leaves=self.checked):
-                text = (
-                    f"a scale is {end:.2g}, the end of the range of its code; RAD with --rad-scales ln_f16 keeps such"
-                )
-                report("values.scale-clamped", what, text)
-        report("values.center-far", "far", f"a coordinate is {FLOAT16_END:,} or more, which float16 cannot hold")
-        return found
+    if values.invisible > MANY_INVISIBLE * values.checked:
+        report("values.invisible", "invisible", "cannot be drawn, as its opacity or scale is 0")
+    if ends.center < math.inf:
+        text = f"a coordinate is {ends.center:g}, the end of the range of its code"
+        report("values.center-clamped", "center", text)
+    for name, end in zip(("small", "large"), ends.scale, strict=True):
+        if clamps.matters("scale", above=name == "large", visible=values.number(name), leaves=values.checked):
+            text = f"a scale is {end:.2g}, the end of the range of its code; RAD with --rad-scales ln_f16 keeps such"
+            report("values.scale-clamped", name, text)
+    report("values.center-far", "far", f"a coordinate is {FLOAT16_END:,} or more, which float16 cannot hold")
+    return findings

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -17,42 +17,62 @@ from ..model.splats import COLUMNS, FloatArray, Splats
 from ..support.parallel import ordered_map
 from ..tables.histograms import Histogram, histogram
 from .blocks import Block, Blocks, largest, smallest
-from .percentiles import Known, Percentiles
-
-#: The quantities of a splat by name, as functions of N splats to (N,) numbers. Splats with SH have `SH_QUANTITIES` too.
-QUANTITIES: dict[str, Callable[[Splats], FloatArray]] = {
-    "x": lambda splats: splats.center[:, 0],
-    "y": lambda splats: splats.center[:, 1],
-    "z": lambda splats: splats.center[:, 2],
-    "scale": lambda splats: largest(splats.scale),
-    "scale_min": lambda splats: smallest(splats.scale),
-    "anisotropy": lambda splats: np.divide(largest(splats.scale), smallest(splats.scale), dtype=np.float64),
-    "opacity": lambda splats: splats.opacity,
-    "size": spark_size,
-    "red": lambda splats: splats.rgb[:, 0],
-    "green": lambda splats: splats.rgb[:, 1],
-    "blue": lambda splats: splats.rgb[:, 2],
-}
-#: Columns of `Splats` that each of them is computed from.
-COLUMNS_OF = {
-    **dict.fromkeys(("x", "y", "z"), ("center",)),
-    **dict.fromkeys(("scale", "scale_min", "anisotropy"), ("scale",)),
-    "opacity": ("opacity",),
-    "size": ("scale", "opacity"),
-    **dict.fromkeys(("red", "green", "blue"), ("rgb",)),
-}
-#: Root mean square of a splat's SH coefficients of degree 1, 2 and 3.
-SH_QUANTITIES = ("sh1", "sh2", "sh3")
-
-#: Quantities whose histograms have bins of equal width, however many decades the numbers span.
-LINEAR = ("x", "y", "z", "opacity", "red", "green", "blue")
+from .percentiles import Percentiles
+from .value_checks import Ends, ValueTally
 
 #: Coordinates, whose percentiles are those of the box.
 AXES = ("x", "y", "z")
-#: Columns of `Splats` that are counted in; sound splats need no other.
-USED = ("center", "scale", "opacity")
-#: What is counted, by name.
-COUNTED = ("good", "non_finite", "negative_scale", "zero_opacity", "zero_scale", "more_than_opaque")
+
+
+class Quantity(NamedTuple):
+    """A number of each splat.
+
+    Attributes:
+        meaning: for display.
+        columns: of `Splats` that it is computed from.
+        of: function of N splats to (N,) numbers, some of which may not be finite.
+        linear: its histogram has bins of equal width, however many decades the numbers span.
+        sh_degree: least SH degree of splats that have it.
+    """
+
+    meaning: str
+    columns: tuple[str, ...]
+    of: Callable[[Splats], FloatArray]
+    linear: bool = False
+    sh_degree: int = 0
+
+
+def _component(meaning: str, column: str, at: int) -> Quantity:
+    return Quantity(meaning, (column,), lambda splats: getattr(splats, column)[:, at], linear=True)
+
+
+def _anisotropy(splats: Splats) -> FloatArray:
+    return np.divide(largest(splats.scale), smallest(splats.scale), dtype=np.float64)
+
+
+def _sh(degree: int) -> Quantity:
+    def of(splats: Splats) -> FloatArray:
+        lengths = np.empty(len(splats), np.float64)
+        sh_lengths(splats.sh, COEFFICIENTS[degree - 1], COEFFICIENTS[degree], lengths)
+        return lengths
+
+    return Quantity(f"root mean square of the coefficients of degree {degree}", ("sh",), of, sh_degree=degree)
+
+
+QUANTITIES = {
+    **{axis: _component("centres, world units", "center", at) for at, axis in enumerate(AXES)},
+    "scale": Quantity("the largest standard deviation, world units", ("scale",), lambda splats: largest(splats.scale)),
+    "scale_min": Quantity(
+        "the smallest standard deviation, world units", ("scale",), lambda splats: smallest(splats.scale)
+    ),
+    "anisotropy": Quantity("the largest standard deviation over the smallest", ("scale",), _anisotropy),
+    "opacity": Quantity(
+        "linear opacity; above 1 for merged splats", ("opacity",), lambda splats: splats.opacity, linear=True
+    ),
+    "size": Quantity("the feature size by which Spark chooses nodes, world units", ("scale", "opacity"), spark_size),
+    **{name: _component("display-referred colour", "rgb", at) for at, name in enumerate(("red", "green", "blue"))},
+    **{f"sh{degree}": _sh(degree) for degree in (1, 2, 3)},
+}
 
 #: The quantities of a report without --stats.
 MAIN = ("scale", "opacity", "anisotropy")
@@ -96,168 +116,75 @@ class ValueFacts:
 
 def names_of(splats: Splats) -> list[str]:
     """The names of the quantities of these splats: those of SH by their degree."""
-    return [*QUANTITIES, *SH_QUANTITIES[: splats.sh_degree]]
-
-
-def needed(sh_degree: int, *, all_quantities: bool) -> list[str]:
-    """The names of the quantities whose percentiles a report needs: those of the box first."""
-    names = [*QUANTITIES, *SH_QUANTITIES[:sh_degree]] if all_quantities else MAIN
-    return list(dict.fromkeys((*AXES, *names)))
+    return [name for name, row in QUANTITIES.items() if row.sh_degree <= splats.sh_degree]
 
 
 def quantity(splats: Splats, name: str) -> FloatArray:
     """(N,) a quantity by its name; some numbers may not be finite."""
     with np.errstate(all="ignore"):
-        if name in QUANTITIES:
-            return QUANTITIES[name](splats)
-        degree, lengths = SH_QUANTITIES.index(name), np.empty(len(splats), np.float64)
-        sh_lengths(splats.sh, COEFFICIENTS[degree], COEFFICIENTS[degree + 1], lengths)
-        return lengths
-
-
-def columns_of(name: str) -> tuple[str, ...]:
-    """The columns of `Splats` that a quantity is computed from."""
-    return COLUMNS_OF.get(name, ("sh",))
+        return QUANTITIES[name].of(splats)
 
 
 def histogram_of(splats: Splats, name: str, *, bins: int = 40) -> Histogram:
     """The histogram of one of `names_of(splats)`, by its name."""
-    return histogram(quantity(splats, name), bins=bins, log=False if name in LINEAR else None)
+    return histogram(quantity(splats, name), bins=bins, log=False if QUANTITIES[name].linear else None)
 
 
 def examine(splats: Splats, *, all_quantities: bool = False) -> ValueFacts:
-    """Statistics of N splats in memory, see `Statistics`."""
-    blocks, found = Blocks.of(Scene(splats)), Statistics(splats.sh_degree, all_quantities=all_quantities)
-    for block in blocks.read(COLUMNS):
-        found.merge(found.part_of(block))
-    found.finish(blocks, threads=1)
-    return found.facts()
+    """Statistics of N splats in memory."""
+    blocks = Blocks.of(Scene(splats))
+    tally = ValueTally.total(blocks.map(lambda block: ValueTally.of(block, Ends()), COLUMNS, 1))
+    return statistics_of(blocks, tally, all_quantities=all_quantities, threads=1)
 
 
-class Part(NamedTuple):
-    """What is counted of a block.
-
-    Attributes:
-        start: of the block.
-        valid: (n,) bool; None where all splats are valid.
-        good: valid splats.
-        non_finite, negative_scale: invalid splats.
-        zero_opacity, zero_scale, more_than_opaque: among the valid.
-        low, high: (3,) box of their centres.
-    """
-
-    start: int
-    valid: NDArray[np.bool_] | None
-    good: int
-    non_finite: int
-    negative_scale: int
-    zero_opacity: int
-    zero_scale: int
-    more_than_opaque: int
-    low: FloatArray
-    high: FloatArray
-
-
-class Statistics:
-    """Statistics of splats: parts of all blocks are added in order, then `finish` makes further passes.
+def statistics_of(blocks: Blocks, tally: ValueTally, *, all_quantities: bool, threads: int) -> ValueFacts:
+    """Statistics of splats, which pass as often as percentiles need.
 
     Args:
-        sh_degree: of the splats.
+        blocks: of the splats.
+        tally: of all blocks.
         all_quantities: compute all quantities, not only those of `MAIN`.
+        threads: to work on, each on quantities of some columns, where blocks are in memory.
     """
+    none = blocks.about.splats.take(slice(0))
+    shown = names_of(none) if all_quantities else MAIN
+    numbers = {name: Percentiles(LEVELS, quantity(none, name).dtype) for name in dict.fromkeys((*AXES, *shown))}
+    groups: dict[tuple[str, ...], list[str]] = {}
+    for name in numbers:
+        groups.setdefault(QUANTITIES[name].columns if blocks.in_memory else (), []).append(name)
 
-    def __init__(self, sh_degree: int, *, all_quantities: bool = False) -> None:
-        none = Splats.empty(0, sh_degree)
-        self._numbers = {
-            name: Percentiles(LEVELS, quantity(none, name).dtype)
-            for name in needed(sh_degree, all_quantities=all_quantities)
-        }
-        self._shown = [name for name in self._numbers if all_quantities or name in MAIN]
-        self._low, self._high = np.full(3, np.inf, np.float32), np.full(3, -np.inf, np.float32)
-        self._counts = dict.fromkeys(COUNTED, 0)
-        self._valid: dict[int, NDArray[np.bool_]] = {}  # by the start of each block in which some are not
+    def valid_splats(block: Block) -> Splats:
+        valid = tally.valid.get(block.start)
+        return block.splats if valid is None else block.splats.take(valid)
 
-    @staticmethod
-    def part_of(block: Block) -> Part:
-        """What is counted of a block with all columns, or with those `USED` where it is sound."""
-        invalid = {kind: int(np.count_nonzero(mask)) for kind, mask in block.invalid.items()}
-        valid = block.valid if invalid else None
-        good = block.splats if valid is None else block.splats.take(valid)
-        return Part(
-            block.start,
-            valid,
-            len(good),
-            invalid.get("non_finite", 0),
-            invalid.get("negative_scale", 0),
-            int(np.count_nonzero(good.opacity == 0)),
-            int(np.count_nonzero(largest(good.scale) == 0)),
-            int(np.count_nonzero(good.opacity > 1)),
-            np.array([axis.min(initial=np.inf) for axis in good.center.T]),
-            np.array([axis.max(initial=-np.inf) for axis in good.center.T]),
-        )
-
-    def merge(self, part: Part) -> None:
-        """Adds what was counted of the next block."""
-        if part.valid is not None:
-            self._valid[part.start] = part.valid
-        for name in COUNTED:
-            self._counts[name] += getattr(part, name)
-        self._low, self._high = np.minimum(self._low, part.low), np.maximum(self._high, part.high)
-
-    def finish(self, blocks: Blocks, *, threads: int) -> None:
-        """Passes all blocks as often as percentiles need.
-
-        Args:
-            blocks: those whose parts were added.
-            threads: to work on, each on quantities of some columns, where blocks are in memory.
-        """
-        groups: dict[tuple[str, ...], list[str]] = {}
-        for name in self._numbers:
-            groups.setdefault(columns_of(name) if blocks.at is not None else (), []).append(name)
-        for _ in ordered_map(lambda names: self._pass_all(blocks, names), groups.values(), threads):
-            pass
-
-    def _pass_all(self, blocks: Blocks, names: list[str]) -> None:
-        while left := [name for name in names if self._numbers[name].passes]:
-            for block in blocks.read({column for name in left for column in columns_of(name)}):
-                valid = self._valid.get(block.start)
-                good = block.splats if valid is None else block.splats.take(valid)
+    def count(names: list[str]) -> None:
+        while left := [name for name in names if numbers[name].passes]:
+            for splats in blocks.map(valid_splats, {column for name in left for column in QUANTITIES[name].columns}, 1):
                 for name in left:
-                    self._numbers[name].add(quantity(good, name))
+                    numbers[name].add(quantity(splats, name))
             for name in left:
-                self._numbers[name].end_pass()
+                numbers[name].end_pass()
 
-    def facts(self) -> ValueFacts:
-        """What was found."""
-        return facts_of(self._counts, self._low, self._high, self._numbers, self._shown)
-
-
-def facts_of(
-    counts: Mapping[str, int],
-    low: FloatArray,
-    high: FloatArray,
-    numbers: Mapping[str, Percentiles | Known],
-    shown: Iterable[str],
-) -> ValueFacts:
-    """What is reported of splats.
-
-    Args:
-        counts: of `COUNTED`.
-        low, high: (3,) box of the centres of valid splats.
-        numbers: of `LEVELS`, of all quantities that are shown and of `AXES`.
-        shown: quantities.
-    """
+    for _ in ordered_map(count, groups.values(), threads):
+        pass
     box = box_98 = None
-    if counts["good"]:
-        box = Box(_numbers(low), _numbers(high))
-        places = [LEVELS.index(level) for level in (1, 99)]
-        inner_low, inner_high = np.stack([numbers[axis].values()[places] for axis in AXES], axis=1)
-        box_98 = Box(_numbers(inner_low), _numbers(inner_high))
-    told = {name: counts[name] for name in COUNTED if name != "good"}
-    return ValueFacts(box=box, box_98=box_98, quantities={name: _summary(numbers[name]) for name in shown}, **told)
+    if numbers["x"].count:
+        box = Box(_numbers(tally.low), _numbers(tally.high))
+        ends = np.array([numbers[axis].values() for axis in AXES])
+        box_98 = Box(*(_numbers(ends[:, LEVELS.index(level)]) for level in (1, 99)))
+    return ValueFacts(
+        box,
+        box_98,
+        tally.number("non_finite"),
+        tally.number("negative_scale"),
+        tally.number("transparent"),
+        tally.number("without scale"),
+        tally.number("opaque"),
+        {name: _summary(numbers[name]) for name in shown},
+    )
 
 
-def _summary(numbers: Percentiles | Known) -> dict[str, float | None]:
+def _summary(numbers: Percentiles) -> dict[str, float | None]:
     if not numbers.count:
         return dict.fromkeys(("min", *PERCENTILES, "max", "mean"))
     levels: dict[str, float | None] = dict(zip(("min", *PERCENTILES, "max"), _numbers(numbers.values()), strict=True))

@@ -99,41 +99,25 @@ def summarize(rows: Iterable[Row], budgets: Sequence[str]) -> list[BudgetSummary
 
 
 def _summary(text: str, rows: Sequence[Row]) -> BudgetSummary:
-    def of(name: str, which: str = "mean") -> float:
-        return float(f"{statistic(which, numbers(rows, name)):.9g}")
+    def of(name: str, which: str = "mean") -> Any:
+        cells = numbers(rows, name)
+        return float(f"{statistic(which, cells):.9g}") if cells else None
 
-    def of_some(name: str, which: str = "mean") -> float | None:
-        return of(name, which) if numbers(rows, name) else None
-
+    first = rows[0]
+    worst = min(rows, key=lambda row: numbers([row], "worst_tile_psnr")[0])
     popped = [row for row in rows if row["popping"] is not None]
     most = max(popped, key=lambda row: numbers([row], "popping")[0], default=None)
-    worst = min(rows, key=lambda row: numbers([row], "worst_tile_psnr")[0])
-    first = rows[0]
+    places = {"worst_frame": "frame", "worst_tile_x": "worst_tile_x", "worst_tile_y": "worst_tile_y"}
+    means = ("selected", "psnr", "psnr_black", "psnr_white", "ssim", "edge_psnr", "popping")
     return BudgetSummary(
         text=text,
         budget=int(numbers([first], "budget")[0]),
         share=float(numbers([first], "share")[0]),
         frames=len(rows),
-        selected=of("selected"),
-        psnr=of("psnr"),
-        psnr_min=of("psnr", "min"),
-        psnr_max=of("psnr", "max"),
-        psnr_black=of("psnr_black"),
-        psnr_white=of("psnr_white"),
-        ssim=of("ssim"),
-        ssim_min=of("ssim", "min"),
-        edge_psnr=of_some("edge_psnr"),
-        edge_psnr_min=of_some("edge_psnr", "min"),
         worst_tile_psnr=of("worst_tile_psnr", "min"),
-        popping=of_some("popping"),
-        popping_max=of_some("popping", "max"),
         popping_frame=None if most is None else int(numbers([most], "frame")[0]),
-        **{
-            name: int(numbers([worst], column)[0])
-            for name, column in (
-                ("worst_frame", "frame"),
-                ("worst_tile_x", "worst_tile_x"),
-                ("worst_tile_y", "worst_tile_y"),
-            )
-        },
+        **{name: of(name) for name in means},
+        **{f"{name}_min": of(name, "min") for name in ("psnr", "ssim", "edge_psnr")},
+        **{f"{name}_max": of(name, "max") for name in ("psnr", "popping")},
+        **{name: int(numbers([worst], column)[0]) for name, column in places.items()},
     )

@@ -8,10 +8,12 @@ import errno
 import ipaddress
 import json
 import os
+import re
 import socket
 import socketserver
 import sys
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -21,10 +23,8 @@ from urllib.parse import unquote_to_bytes
 from .. import __version__
 from ..io.paths import open_plain
 from ..support.errors import SparklodError
-from .drops import MAX_BYTES, parse_drop
 from .files import media_type
-from .ranges import DIGITS, span_of
-from .site import CAMERAS, INDEX, Site
+from .site import CAMERAS, INDEX, MAX_BYTES, Site, parse_drop
 
 #: Where a server listens unless told otherwise: only programs of this machine can connect.
 LOOPBACK = "127.0.0.1"
@@ -52,6 +52,12 @@ PREFLIGHT = {
     "Access-Control-Allow-Headers": "Range, If-Range",
     "Access-Control-Max-Age": "600",
 }
+
+#: A Range header (RFC 9110, section 14) of one range: from a first byte to a last one, from a first on, or the last.
+RANGE = re.compile(r"bytes\s*=\s*([0-9]*)\s*-\s*([0-9]*)\s*", re.IGNORECASE | re.ASCII)
+
+#: Digits of a number of bytes in a request; any number of more digits is beyond every file.
+DIGITS = 18
 
 #: Says one line about a request.
 Log = Callable[[str], None]
@@ -271,3 +277,47 @@ class Handler(BaseHTTPRequestHandler):
     def log_message(self, format: str, *arguments: Any) -> None:
         """Tells of a request, as far as anybody listens."""
         self.server.log(f"{self.address_string()} {format % arguments}")
+
+
+@dataclass(frozen=True)
+class Span:
+    """Bytes of a file.
+
+    Attributes:
+        first: of them, from 0.
+        count: how many; 0 where the file has none of those that are asked for.
+    """
+
+    first: int
+    count: int
+
+
+def span_of(text: str | None, size: int) -> Span | None:
+    """The bytes that a Range header asks for; None where the whole file is sent.
+
+    That is where there is no header, or where it is one that a server may ignore: of another unit, with several
+    ranges, or broken.
+
+    Args:
+        text: of the header.
+        size: of the file.
+    """
+    found = RANGE.fullmatch(text.strip()) if text is not None else None
+    if found is None:
+        return None
+    first, last = found.groups()
+    if first:
+        begin = _number(first)
+        end = _number(last) if last else max(begin, size)
+        if end < begin:
+            return None
+        return Span(begin, max(0, min(end, size - 1) - begin + 1))
+    if last:
+        count = min(_number(last), size)
+        return Span(size - count, count)
+    return None
+
+
+def _number(digits: str) -> int:
+    digits = digits.lstrip("0")
+    return int(digits or "0") if len(digits) <= DIGITS else 10**DIGITS

@@ -2,18 +2,42 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 
 import numpy as np
 import pytest
 
-from sparklod_cli.figures import charts, panels, series
+from sparklod_cli.figures import charts, traversal_chart
+from sparklod_cli.support.errors import SparklodError
+from sparklod_cli.support.optional import install_hint
 from sparklod_cli.tables.columns import Row
-from tests.figures.flights import count_of, marked, pixels, plotted
+from tests.figures.flights import count_of, marked, path_scene, pixels, plotted
 from tests.tables.rows import flight, row
 
 pytestmark = pytest.mark.slow
+
+
+def test_a_chart_of_no_frames_is_an_error() -> None:
+    with pytest.raises(SparklodError, match="nothing to draw"):
+        plotted([])
+
+
+def test_a_missing_matplotlib_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    with pytest.raises(SparklodError, match=re.escape(install_hint("render"))) as caught:
+        plotted(flight(3))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.usefixtures("charting", "fresh")
+def test_without_pyvista_there_are_charts_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pyvista", None)
+    both = plotted(flight(5), path_scene=path_scene())
+    assert both.note is not None
+    assert install_hint("render") in both.note
+    assert both.png == plotted(flight(5)).png
 
 
 @pytest.mark.parametrize("most", [0, 1, 2, 3, 7, 999, 12_345, 2_500_000])
@@ -23,7 +47,7 @@ def test_ticks_of_counts_are_integers(most: int, charting: None) -> None:
     matplotlib.backends.backend_agg.FigureCanvasAgg(figure)
     axes = figure.subplots()
     axes.set_ylim(0, 1.22 * most or 1)
-    panels._counted(axes, matplotlib)
+    traversal_chart._counted(axes, matplotlib)
     figure.canvas.draw()
     texts = [text.get_text() for text in axes.get_yticklabels()]
     assert len(texts) >= 2
@@ -38,31 +62,33 @@ class TestCharts:
     def test_a_chart_has_its_width(self) -> None:
         image = pixels(plotted(flight(60)).png)
         assert image.shape[1] == charts.WIDTH
-        assert image.shape[0] > charts.ROW * len(panels.PANELS) / 2
+        assert image.shape[0] > traversal_chart.ROW * len(traversal_chart.PANELS) / 2
 
     def test_frames_to_look_at_are_marked(self) -> None:
         quiet = flight(60)
         for each in quiet:
             each |= dict.fromkeys(("churn", "bytes_new", "missing", "complete_in_s", "overdraw_estimate"), 0)
             each["pixel_scale_min"] = each["pixel_scale_limit"]
-        assert count_of(pixels(plotted(flight(60)).png), series.PINK) > 500
-        assert count_of(pixels(plotted(quiet).png), series.PINK) == 0
+        assert count_of(pixels(plotted(flight(60)).png), charts.PINK) > 500
+        assert count_of(pixels(plotted(quiet).png), charts.PINK) == 0
 
     def test_empty_columns_leave_their_panel_out(self) -> None:
         rows = flight(60)
-        every = charts.draw(rows, marked(rows)).shape[0]
-        assert every == charts.ROW * 5
-        fewer = charts.draw([each | dict.fromkeys(("traverse_ms", "complete_in_s"), None) for each in rows], {})
-        assert fewer.shape[0] == charts.ROW * 4
+        every = traversal_chart.draw_charts(rows, marked(rows)).shape[0]
+        assert every == traversal_chart.ROW * 5
+        fewer = traversal_chart.draw_charts(
+            [each | dict.fromkeys(("traverse_ms", "complete_in_s"), None) for each in rows], {}
+        )
+        assert fewer.shape[0] == traversal_chart.ROW * 4
 
-    @pytest.mark.parametrize("panel", panels.PANELS, ids=lambda panel: panel.title)
-    def test_each_panel_shows_its_columns(self, panel: panels.Panel, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(charts, "PANELS", (panel,))
+    @pytest.mark.parametrize("panel", traversal_chart.PANELS, ids=lambda panel: panel.title)
+    def test_each_panel_shows_its_columns(self, panel: traversal_chart.Panel, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(traversal_chart, "PANELS", (panel,))
         rows = flight(60)
-        before = charts.draw(rows, marked(rows))
+        before = traversal_chart.draw_charts(rows, marked(rows))
         for name in panel.columns:
             other = [each | {name: (each[name] or 0) * (1.1 + at % 7)} for at, each in enumerate(rows)]  # type: ignore[operator]
-            assert not np.array_equal(charts.draw(other, marked(other)), before), name
+            assert not np.array_equal(traversal_chart.draw_charts(other, marked(other)), before), name
 
     @pytest.mark.parametrize("count", [1, 2, 3])
     def test_a_path_of_few_frames_has_a_chart_of_full_width(self, count: int) -> None:
@@ -90,9 +116,9 @@ class TestCharts:
     @pytest.mark.parametrize(("limit", "said"), [(0.001, "edges from the root"), (None, "level")])
     def test_levels_without_pixel_scales_are_detail_levels(self, limit: float | None, said: str) -> None:
         matplotlib = charts.load_matplotlib()
-        (panel,) = (each for each in panels.PANELS if "level_mean" in each.columns)
+        (panel,) = (each for each in traversal_chart.PANELS if "level_mean" in each.columns)
         axes = matplotlib.figure.Figure().subplots()
-        panel.draw(axes, series.Frames([each | {"pixel_scale_limit": limit} for each in flight(4)]), matplotlib)
+        panel.draw(axes, charts.Frames([each | {"pixel_scale_limit": limit} for each in flight(4)]), matplotlib)
         assert axes.get_ylabel() == said
 
     def test_a_chart_leaves_single_instances_out(self) -> None:
@@ -102,14 +128,14 @@ class TestCharts:
     def test_a_matplotlibrc_changes_nothing(self) -> None:
         import matplotlib
 
-        before = charts.draw(flight(5), {})
+        before = traversal_chart.draw_charts(flight(5), {})
         with matplotlib.rc_context({"lines.linewidth": 9, "font.size": 30, "axes.grid": False}):
-            assert np.array_equal(charts.draw(flight(5), {}), before)
+            assert np.array_equal(traversal_chart.draw_charts(flight(5), {}), before)
 
     def test_pyplot_is_left_alone(self) -> None:
         """It would keep every figure, and ask for a display."""
         program = (
-            "import sys; from tests.tables.rows import flight; from sparklod_cli.figures import charts\n"
-            "charts.draw(flight(3), {}); assert 'matplotlib.pyplot' not in sys.modules"
+            "import sys; from tests.tables.rows import flight; from sparklod_cli.figures import traversal_chart\n"
+            "traversal_chart.draw_charts(flight(3), {}); assert 'matplotlib.pyplot' not in sys.modules"
         )
         subprocess.run([sys.executable, "-c", program], check=True)

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sparklod_cli.figures.svg import children_groups
 from sparklod_cli.figures.tree_plot import Picture
 from sparklod_cli.inspection.html import Section, page
+from sparklod_cli.inspection.html_parts import children_groups
 from sparklod_cli.inspection.report import ReportSettings, inspect
 from sparklod_cli.inspection.values import histogram_of, names_of
 from sparklod_cli.tables.histograms import histogram

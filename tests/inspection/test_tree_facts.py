@@ -12,7 +12,6 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from sparklod_cli.inspection import tree as facts_of
-from sparklod_cli.inspection import tree_findings
 from sparklod_cli.inspection.findings import Finding
 from sparklod_cli.inspection.tree import TreeFacts, examine
 from sparklod_cli.lod import quick
@@ -186,7 +185,7 @@ def test_without_a_check_nothing_is_looked_for() -> None:
 
 @pytest.mark.parametrize(("size", "found"), [(0.99, True), (1.01, False), (3.0, False), (0.0, True)])
 def test_a_node_smaller_than_a_share_of_its_children_is_a_finding(size: float, found: bool) -> None:
-    child = 1 / tree_findings.MIN_SIZE_RATIO
+    child = 1 / facts_of.MIN_SIZE_RATIO
     splats = sized([100.0, size, child, child, 1000.0])
     splats.opacity[4] = 1e-10  # a large one that covers nearly nothing
     _, findings = examine(splats, tree_of([(2, 1), (2, 3), (0, 0), (0, 0), (0, 0)]))
@@ -194,18 +193,18 @@ def test_a_node_smaller_than_a_share_of_its_children_is_a_finding(size: float, f
 
 
 @pytest.mark.parametrize("rise", [0.9, 1.1])
-@pytest.mark.parametrize("nodes", [tree_findings.MIN_NODES, tree_findings.MIN_NODES + 3, 3000])
+@pytest.mark.parametrize("nodes", [facts_of.MIN_NODES, facts_of.MIN_NODES + 3, 3000])
 def test_a_rise_of_size_in_a_large_tree_is_a_finding(nodes: int, rise: float) -> None:
     """Half of the leaves below a small node, and half below one that is larger by a factor, which comes behind them."""
     half = (nodes - 3) // 2
     sizes = np.ones(nodes)
-    sizes[:3] = 100, 10, 10 * tree_findings.MAX_RISE * rise
+    sizes[:3] = 100, 10, 10 * facts_of.MAX_RISE * rise
     links = [(2, 1), (half, 3), (nodes - 3 - half, 3 + half), *[(0, 0)] * (nodes - 3)]
     _, findings = examine(sized(sizes.tolist()), tree_of(links))
-    if rise > 1 and nodes > tree_findings.MIN_NODES:  # the root is not counted
+    if rise > 1 and nodes > facts_of.MIN_NODES:  # the root is not counted
         (found,) = findings
         assert (found.code, found.severity) == ("tree.coarse-first", "note")
-        assert found.index == pytest.approx(nodes / 2, abs=nodes / tree_findings.PARTS)
+        assert found.index == pytest.approx(nodes / 2, abs=nodes / facts_of.PARTS)
         assert found.count == nodes - found.index
     else:
         assert findings == []
@@ -213,12 +212,12 @@ def test_a_rise_of_size_in_a_large_tree_is_a_finding(nodes: int, rise: float) ->
 
 def test_a_rise_is_found_although_a_node_has_no_parent() -> None:
     sizes = np.ones(3000)
-    sizes[:3] = 100, 10, 20 * tree_findings.MAX_RISE
+    sizes[:3] = 100, 10, 20 * facts_of.MAX_RISE
     links = [(2, 1), (1498, 3), (1498, 1501), *[(0, 0)] * 2997]
     _, findings = examine(sized(sizes.tolist()), tree_of(links))
     assert codes(findings) == {"tree.orphan", "tree.coarse-first"}
     (found,) = (each for each in findings if each.code == "tree.coarse-first")
-    assert found.index == pytest.approx(1500, abs=3000 / tree_findings.PARTS)
+    assert found.index == pytest.approx(1500, abs=3000 / facts_of.PARTS)
 
 
 @pytest.mark.parametrize("seed", range(30))
@@ -239,8 +238,8 @@ def test_good_trees_are_far_from_the_bounds() -> None:
             worst = min(worst, float(size[node] / size[start : start + int(tree.child_count[node])].max()))
         _, limit = find_depths(tree.child_count, tree.child_start, size)
         parent, _ = find_parents(tree.child_count, tree.child_start)
-        wanted = [np.median(part) for part in np.array_split(limit[parent[1:]], tree_findings.PARTS)]
+        wanted = [np.median(part) for part in np.array_split(limit[parent[1:]], facts_of.PARTS)]
         rise = max(rise, float((wanted[1:] / np.minimum.accumulate(wanted)[:-1]).max()))
         assert (design_size(nodes) > 0).all()
-    assert worst > 1.2 * tree_findings.MIN_SIZE_RATIO
-    assert rise < tree_findings.MAX_RISE / 1.2
+    assert worst > 1.2 * facts_of.MIN_SIZE_RATIO
+    assert rise < facts_of.MAX_RISE / 1.2

@@ -98,7 +98,7 @@ def assert_option(text: str, heading: str = COMMON) -> Callable[[Command], Comma
 @contextlib.contextmanager
 def assert_errors() -> Iterator[None]:
     """Turns the error that an assertion cannot be understood into a usage error that names the option."""
-    from ...tables.conditions import BadAssertionError
+    from ...tables.assertions import BadAssertionError
 
     try:
         yield

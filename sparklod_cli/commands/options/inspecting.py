@@ -300,8 +300,8 @@ def check_usage(ctx: click.Context, count: int, checks: Checks, output: Output, 
     if output.plot is None and output.html is None:
         refuse(ctx, ("plot_level", "plot_by"), "needs --plot or --html")
     for name in output.histogram:
-        from ...inspection.values import QUANTITIES, SH_QUANTITIES
+        from ...inspection.values import QUANTITIES
 
-        if name not in (*QUANTITIES, *SH_QUANTITIES):
-            known = ", ".join((*QUANTITIES, *SH_QUANTITIES))
+        if name not in QUANTITIES:
+            known = ", ".join(QUANTITIES)
             raise click.UsageError(f"--histogram: there is no quantity {name}; choose one of {known}")
