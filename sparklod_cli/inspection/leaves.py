@@ -11,15 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..codecs import coverage
-from ..codecs.spark_codings import STEPS_8_8_8, encode_axis_angle, encode_lod_alpha
-from ..codecs.rad.rad_encoder import rounded
 from ..codecs.rad.property_codings import CODINGS
+from ..codecs.rad.rad_encoder import rounded
 from ..codecs.rad.rad_layout import PROPERTIES, Row
-from ..codecs.statistics import ALL_BITS, ShBytes, enough
-from ..codecs.spz_layout import LOD, Layout
+from ..codecs.spark_codings import STEPS_8_8_8, encode_axis_angle, encode_lod_alpha
 from ..codecs.spz_encoder import to_code
-from ..codecs.statistics import Statistics
-from ..codecs.statistics import fine_bits
+from ..codecs.spz_layout import LOD, Layout
+from ..codecs.statistics import ALL_BITS, ShBytes, Statistics, enough, fine_bits
 from ..model.scene import Scene
 from ..model.selection import Selection
 from ..model.sh import COEFFICIENTS

@@ -7,9 +7,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from ..codecs.rad.property_codings import LARGEST_F16
-from ..codecs.rad.rad_header import ENCODING_KEYS
+from ..codecs.rad.rad_header import ENCODING_KEYS, RadChunkHeader, RadHeader
 from ..codecs.rad.rad_layout import BY_NAME, PROPERTIES, SIZES
-from ..codecs.rad.rad_header import RadChunkHeader, RadHeader
 from ..codecs.rad.rad_reader import scan_chunks, scan_header
 from ..codecs.splat_encoding import log_scale_table
 from ..io import opened
