@@ -15,7 +15,8 @@ import pytest
 from PIL import Image
 
 import sparklod_cli as sparklod
-from sparklod_cli import bake
+from sparklod_cli.bake.flow import bake
+from sparklod_cli.bake.settings import BakeSettings
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.cameras.path import CameraPath
 from sparklod_cli.cameras.pose import look_at
@@ -45,7 +46,7 @@ RENDER = RenderSettings()
 def twice(tmp_path_factory: pytest.TempPathFactory) -> Scenes:
     """A few hundred splats with SH, as a tree, twice."""
     baked = tmp_path_factory.mktemp("compare") / "sh3.spz"
-    bake.bake(FIXTURES / "sh3.ply", baked, bake.BakeSettings())
+    bake(FIXTURES / "sh3.ply", baked, BakeSettings())
     there = np.eye(4)
     there[:3, 3] = 3, 0, 1
     return read_scenes([Instance(baked, "here"), Instance(baked, "there", there)])

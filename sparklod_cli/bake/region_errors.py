@@ -3,7 +3,7 @@
 As splat-transform 3.7 measures them, so that its numbers and ours mean the same: each region is drawn alone from six
 directions, from so far away that the pictures have next to no perspective. An error is the squared difference to the
 pictures of the first level, of colours premultiplied by alpha and of alpha, divided by the squares of those; the same
-for a region of any size and place. See docs/decisions/2026-11-22-errors-of-regions.md.
+for a region of any size and place. See benchmarks/notes/rounding-and-levels.md.
 """
 
 from __future__ import annotations

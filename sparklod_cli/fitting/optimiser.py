@@ -20,13 +20,13 @@ USUAL_ERROR = 0.03
 
 #: How far the feature size of a node may go from its first value: by a factor of `MOST_REACH` of those that cuts of up
 #: to `FREE_SHARE` of the leaves refine, and the logarithm of that falls with the root of the share. Which nodes a fine
-#: cut refines matters more than how large they are; measured (docs/decisions/2026-11-22-refine.md).
+#: cut refines matters more than how large they are; measured (benchmarks/notes/refining.md).
 MOST_REACH, FREE_SHARE = 1.5, 0.03
 
 #: Stages, after each of which held-out cameras decide.
 STAGES = 6
 
-#: Rates of the first steps, and those of the last ones over these. Measured (docs/decisions/2026-11-22-refine.md).
+#: Rates of the first steps, and those of the last ones over these. Measured (benchmarks/notes/refining.md).
 RATES, LAST = Rates(0.015, 0.03, 0.008, 0.015, 0.015, 0.003), 0.02
 
 #: Steps unless given: the most, the least, and their number times that of the leaves: 2,400 for 500,000. Chosen.

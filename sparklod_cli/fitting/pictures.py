@@ -100,7 +100,7 @@ def keep_sizes(nodes: FittedNodes) -> bool:
     """Restore nodes that became too small for their children, unless they were so at first; return True if any were.
 
     A parent is refined before its children if it is larger; a small one is drawn in their place for too long
-    (docs/decisions/2026-11-21-sizes-of-parents.md).
+    (docs/decisions/11-quality-builder.md).
     """
     parent, _ = find_parents(nodes.tree.child_count, nodes.tree.child_start)
     at_first = _ratios(nodes.old, nodes, parent)

@@ -31,7 +31,7 @@ from .kernels.tree_links import find_limits
 from .traversal import set_foveation
 
 #: Viewpoints: half outside of the scene looking at it, a quarter anywhere inside, a quarter near a node. Chosen: 16
-#: are as good for large trees, not for those of four chunks (docs/decisions/2026-11-22-chunk-order.md).
+#: are as good for large trees, not for those of four chunks (benchmarks/notes/cuts-and-chunks.md).
 VIEWPOINTS = 64
 
 #: Distances of viewpoints from the middle of the scene, or from a node, in radii of the scene: log-uniform. Chosen.

@@ -207,8 +207,8 @@ def faded(opacity: FloatArray, weight: Shares) -> FloatArray:
     """Return the (N,) linear opacities of splats drawn with a weight: those of D times the weight.
 
     A parent and children of half the weight each let more through than either alone: a quarter, if both are opaque.
-    Ways to compensate for that were tried, and pop no less; see docs/decisions. Linear opacity times the weight pops as
-    little, but a splat of linear opacity 1000 would still be opaque at a weight of a thousandth.
+    Ways to compensate for that were tried, and pop no less; see benchmarks/notes/rasterizer.md. Linear opacity times
+    the weight pops as little, but a splat of linear opacity 1000 would still be opaque at a weight of a thousandth.
     """
     fading: FloatArray = np.where(weight < 1, linear_opacity(lod_opacity(opacity) * weight), opacity)
     return fading.astype(np.float32)

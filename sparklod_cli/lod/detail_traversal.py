@@ -125,6 +125,7 @@ class DetailTraversal:
             reason="missing" if missing else choice.reason,
             missing=missing,
             least=np.inf,
+            stop=None,
             wanted=wanted,
             seconds=time.perf_counter() - start,
         )

@@ -3,7 +3,7 @@
 That order goes from coarse to fine in few bands, each of them along the tree. Neighbours in a file compress together if
 they are neighbours in space. A builder's order goes through the scene once for each step of size; this one goes through
 it once a band, from subtree to subtree. At the end of each band the nodes up to there are an even, coarser scene.
-docs/decisions/2026-11-22-size.md has what that saves.
+benchmarks/notes/file-sizes.md has what that saves.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from .kernels.tree_links import find_limits, find_parents
 
 #: Nodes of the first band, and how many times more there are at the end of each band than at that of the one before.
 #: Measured: with 8 instead of 4 files are up to 0.5 % smaller, and in no bands up to 0.9 %, but fewer prefixes are even
-#: scenes then (docs/decisions/2026-11-22-size.md).
+#: scenes then (benchmarks/notes/file-sizes.md).
 FIRST_BAND, BAND_GROWTH = 4096, 4
 Index = NDArray[np.int32]
 

@@ -35,15 +35,15 @@ FARTHEST = 1e15
 BASE = 2.0
 
 #: Largest distance on the curve of two nodes that merge. Measured: 8 loses 0.1 to 0.2 dB to 16; 16 and 24 gain nothing
-#: over 12 (docs/decisions/2026-11-21-fidelity.md).
+#: over 12 (benchmarks/notes/quality-builder.md).
 WINDOW = 12
 
 #: Width of the strip along a border, as a multiple of the size of a level, in which nodes wait. Measured: with 0.5 cuts
-#: lose 0.1 to 0.2 dB more, with 0 up to 1 dB (docs/decisions/2026-11-22-quality-in-blocks.md).
+#: lose 0.1 to 0.2 dB more, with 0 up to 1 dB (benchmarks/notes/quality-builder.md).
 MARGIN = 1.0
 
 #: Quantile of the costs of pairs up to which pairs merge in a round, which comes close to merging the cheapest first.
-#: Measured: gains up to 0.6 dB over merging all (docs/decisions/2026-11-21-fidelity.md).
+#: Measured: gains up to 0.6 dB over merging all (benchmarks/notes/quality-builder.md).
 CHEAP = 0.5
 
 #: With no more costs than this in the sample, all pairs merge. Chosen.

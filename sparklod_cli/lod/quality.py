@@ -7,7 +7,7 @@
    has this coverage (`kernels/profile.py`).
 3. The binary tree's least useful nodes are dropped (`kernels/prune.py`).
 
-docs/decisions/2026-11-21-fidelity.md has the reasons, and the alternatives that were tried.
+benchmarks/notes/quality-builder.md has the reasons, and the alternatives that were tried.
 
 In stages, the nodes of a region merge level by level, too. Before each level those nodes are set aside that are so
 close to the region's border that their best partner may be beyond it; they are handed on, and merge at that level in

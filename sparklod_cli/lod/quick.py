@@ -4,7 +4,7 @@ The levels are those of Spark's method ("Quick LoD algorithm"): a splat of size 
 ceil(log_base(s)), and from the finest level up, the splats of a level join the survivors of the level below. There, all
 nodes that share a cell become one. Here, cells are wider, and in each the cheapest pairs of neighbours merge for a few
 rounds, up to a size that grows with the level; what became one node is a family (`kernels/cell_pairs.py`).
-docs/decisions/2026-11-22-quick-again.md has the reasons, and the alternatives that were tried.
+benchmarks/notes/quick-builder.md has the reasons, and the alternatives that were tried.
 
 For speed, leaves are sorted once, by level and Morton code, into rows with all data that a merge reads, so that each
 level reads neighbouring memory. A level is a radix sort of its cells and one parallel merge. As the nodes of a level

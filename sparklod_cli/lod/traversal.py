@@ -133,6 +133,7 @@ class TreeCut:
         reason: why the cut is not finer, a value of `REASONS`.
         missing: number of nodes that would be refined if their children were resident, and of roots that are not.
         least: the least limit of a refined node; infinite if none was refined.
+        stop: (pixel scale, instance, index) of the node that would have exceeded the budget, or None.
         wanted: (chunks,) float32, for each chunk of all trees the largest limit of the nodes that are, or should be,
             refined and have children in it; 0 if there is none.
         seconds: that it took to find, once its chunks were in memory.
@@ -145,6 +146,7 @@ class TreeCut:
     reason: str
     missing: int
     least: float
+    stop: tuple[float, int, int] | None
     wanted: NDArray[np.float32]
     seconds: float = 0.0
 
@@ -215,7 +217,7 @@ class Traversal:
             if memory.slots is None or len(memory.slots.node) <= size:
                 memory.slots = _slots(size)
             slots, guess = memory.slots, np.float32(memory.guess)
-            selected, reason, missing, least, _ = find_cut(trees, stop, guess, slots, wanted, nodes)
+            selected, reason, missing, least, last = find_cut(trees, stop, guess, slots, wanted, nodes)
             if reason != cut_arrays.FULL:
                 break
             size = 2 * len(slots.node)
@@ -229,6 +231,7 @@ class Traversal:
             reason=REASONS[reason],
             missing=missing,
             least=float(least),
+            stop=None if last < 0 else _node_at(slots, last),
             wanted=wanted,
             seconds=time.perf_counter() - start,
         )
@@ -254,6 +257,11 @@ def _slots(size: int) -> cut_arrays.Slots:
         tally=np.empty(cut_arrays.TALLIES, np.int64),
         **{name: np.empty(size + 1, np.int32) for name in ("limit", "first", "queue", "pending", "heap")},
     )
+
+
+def _node_at(slots: cut_arrays.Slots, at: int) -> tuple[float, int, int]:
+    """Return the pixel scale, instance and index of the node in a slot."""
+    return float(slots.limit.view(np.float32)[at]), int(slots.instance[at]), int(slots.node[at])
 
 
 def views_of(forest: Forest, instances: Sequence[TreeInstance], view: View) -> NDArray[np.void]:

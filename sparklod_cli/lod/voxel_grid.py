@@ -23,7 +23,7 @@ from .kernels.sort import PART_BITS, Keys, Nodes, Parts, level_keys, split_box
 #: differences. No level is finer than this allows.
 MAX_STEPS = 2.0**59
 
-#: Edge of a cell in steps of its level. Chosen; 8 is no better (docs/decisions/2026-11-22-quick-again.md).
+#: Edge of a cell in steps of its level. Chosen; 8 is no better (benchmarks/notes/quick-builder.md).
 CELL = 4
 
 #: Parts of a cell on an axis.

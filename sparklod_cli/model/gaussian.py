@@ -149,7 +149,7 @@ def size_factor(lod_opacity: FloatArray, out: FloatArray | None = None) -> Float
 def spark_size(splats: Splats) -> FloatArray:
     """(N,) feature size, 2 * mean(scale) * (1 + 0.7 * max(0, D - 1)): what Spark 2.2.0 writes into its nodes.
 
-    Inferred from its output, see docs/decisions/2026-11-20-what-spark-does.md; its `encode_lod_tree` computes the same.
+    Inferred from its output, see docs/decisions/14-cuts.md; its `encode_lod_tree` computes the same.
     """
     x, y, z = splats.scale.T
     mean = x + y

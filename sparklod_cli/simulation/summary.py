@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, cast
 
 from ..tables.columns import Row
 from ..tables.statistics import Number, numbers, statistic, totals
@@ -184,12 +184,14 @@ class Lookout:
 
     def moments(self) -> list[Moment]:
         """Return the extreme frames so far, in the order of `MOMENTS`."""
-        return [
-            _moment(what, row, _rounded(value), unit)
-            for what, (_, _, unit) in MOMENTS.items()
-            for value, row in [self._most.get(what, (None, {}))]
-            if value is not None
-        ]
+        moments = []
+        for what, (_, _, unit) in MOMENTS.items():
+            if what in self._most:
+                value, row = self._most[what]
+                frame, name = cast("int", row["frame"]), cast("str | None", row["name"])
+                time = cast("float | None", row["time_s"])
+                moments.append(Moment(what, frame, time, name or None, _rounded(value), unit))
+        return moments
 
 
 def look_at(frames: Sequence[Row]) -> list[Moment]:
@@ -198,15 +200,3 @@ def look_at(frames: Sequence[Row]) -> list[Moment]:
     for row in frames:
         lookout.add(row)
     return lookout.moments()
-
-
-def _moment(what: str, row: Row, value: Number, unit: str) -> Moment:
-    frame, time, name = row["frame"], row["time_s"], row["name"]
-    return Moment(
-        what,
-        frame if isinstance(frame, int) else 0,
-        time if isinstance(time, float) else None,
-        str(name) if name else None,
-        value,
-        unit,
-    )

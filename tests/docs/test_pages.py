@@ -14,6 +14,9 @@ from tests.conftest import FIXTURES, ROOT
 #: The README is a front page; what is longer belongs into docs/.
 MAX_README = 8192
 
+#: Words of a decision, of a note on measurements, and of CONTRIBUTING.md.
+MAX_RECORD, MAX_NOTE, MAX_CONTRIBUTING = 300, 600, 1500
+
 PAGES = sorted(path for path in [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 
 
@@ -29,6 +32,39 @@ def test_every_page_of_the_documentation_is_in_its_navigation_once() -> None:
     listed = re.findall(r"^ *- (?:[^:\n]+: )?(\S+\.md)$", navigation, re.MULTILINE)
     docs = ROOT / "docs"
     assert sorted(listed) == sorted(path.relative_to(docs).as_posix() for path in docs.rglob("*.md"))
+
+
+def words(path: Path) -> int:
+    """Count the words of a page, without the marks of its tables."""
+    return len(re.sub(r"\||-{3,}", " ", path.read_text(encoding="utf-8")).split())
+
+
+def test_contributing_names_files_that_exist() -> None:
+    page = ROOT / "CONTRIBUTING.md"
+    names = re.findall(r"`([\w./]+/[\w.]*|\w+\.py)`", page.read_text(encoding="utf-8"))
+    assert len(names) > 40
+    missing = [name for name in names if not any((ROOT / top / name).exists() for top in ("", "sparklod_cli"))]
+    assert set(missing) <= {"kernels/"}
+    assert words(page) <= MAX_CONTRIBUTING
+
+
+def test_every_package_is_on_the_map() -> None:
+    page = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    packages = [path.parent.name for path in (ROOT / "sparklod_cli").glob("*/__init__.py")]
+    assert [name for name in packages if f"| `{name}/` |" not in page] == []
+
+
+def test_decisions_are_short_dated_and_in_the_index() -> None:
+    folder = ROOT / "docs" / "decisions"
+    index = (folder / "README.md").read_text(encoding="utf-8")
+    for record in folder.glob("[0-9]*.md"):
+        text = record.read_text(encoding="utf-8")
+        (date,) = re.findall(r"^Status: accepted.* Date: ([\d-]{10})\.", text, re.MULTILINE)
+        assert re.search(rf"\]\({record.name}\) \| accepted.* \| {date} \|", index), record.name
+        assert words(record) <= MAX_RECORD, record.name
+    notes = list((ROOT / "benchmarks" / "notes").glob("*.md"))
+    assert notes
+    assert [note.name for note in notes if words(note) > MAX_NOTE] == []
 
 
 def test_the_readme_is_a_front_page() -> None:

@@ -95,7 +95,7 @@ def build_in_stages(
     """Builds a tree, with a block for each of the smallest regions.
 
     Args:
-        builder: a module of `lod.stages`.
+        builder: module of a builder.
         splats: valid and visible ones.
         setting: of the builder.
         splits: of the scene; none for a single stage.

@@ -75,6 +75,7 @@ def check(case: Case, cut: TreeCut, resident: np.ndarray | None = None, bits: in
     assert cut.reason == expected.reason
     assert cut.missing == expected.missing
     assert cut.least == expected.least
+    np.testing.assert_equal(cut.stop, expected.stop)
     np.testing.assert_array_equal(np.abs(cut.limit), np.array([expected.limit[node] for node in nodes]))
     waits = (cut.limit.view(np.int32) >= 0).tolist()
     assert {node for node, wait in zip(nodes, waits, strict=True) if wait} == expected.waiting

@@ -31,7 +31,7 @@ SPAN = 512
 PADDING = 16
 
 #: Rounds of merging at a level, and the largest distance of a partner on the curve. Measured, as the next three
-#: (docs/decisions/2026-11-22-quick-again.md): fewer rounds give more nodes, a larger window takes longer.
+#: (benchmarks/notes/quick-builder.md): fewer rounds give more nodes, a larger window takes longer.
 ROUNDS, WINDOW = 6, 3
 
 #: A family has at least this many children, or waits for the next level, where it may get more.

@@ -32,7 +32,7 @@ BLOCK = 512
 SIDE_BY_SIDE = 16
 
 #: Cost of a squared colour difference of 1 (channels are 0..1), in nats of shape. Between 3 and 10 it matters little
-#: (docs/decisions/2026-11-21-fidelity.md).
+#: (benchmarks/notes/quality-builder.md).
 COLOR_COST = f32(4)
 
 #: Least variance along an axis in the cost, as a share of the trace: flatter splats are not cheaper to merge. Chosen.

@@ -31,7 +31,7 @@ SPHERICAL = 1e-12
 RIDGE, LEAST_RIDGE = 1e-6, 1e-30
 
 #: Least trace of a union's covariance, as a share of that of its two nodes without the overlap's part; with less, the
-#: product in space is not where they overlap (docs/decisions/2026-11-21-sizes-of-parents.md).
+#: product in space is not where they overlap (docs/decisions/11-quality-builder.md).
 LEAST_UNION = 0.5
 
 #: Pairs that a thread merges one after the other; results do not depend on it. Chosen.

@@ -20,14 +20,14 @@ from ...model import gaussian
 from ...model.gaussian import MIN_OPACITY, SIZE_PER_D, linear_opacity
 from ...support.jit import kernel
 
-#: The largest D of a merged splat; a sharper profile gains nothing (docs/decisions/2026-11-21-fidelity.md). A splat
+#: The largest D of a merged splat; a sharper profile gains nothing (benchmarks/notes/quality-builder.md). A splat
 #: whose density is higher than that of this profile is drawn larger instead.
 MAX_D = 2.5
 
 #: The same for needles, whose second axis is shorter than this share of the longest. They may be thinner than a pixel,
 #: where the blur of the rasterizer takes more from a sharp profile than from the splats that it replaces: wires would
 #: fade. Measured; between 0.25 and 0.4, and between 1.5 and 1.75, little changes
-#: (docs/decisions/2026-11-22-quality-at-2-percent.md).
+#: (benchmarks/notes/quality-builder.md).
 NEEDLE, NEEDLE_D = 0.25, 1.5
 
 #: Entries of the table of profiles by density, between which it is interpolated linearly. Chosen.

@@ -23,7 +23,7 @@ LEAST_SIZE = np.float32(1e-37)
 
 #: Error cost, in splats, of a node whose error is the mean at its size; it grows with the square root of the error.
 #: Measured: 0.4 gains up to 0.7 dB at large budgets over 0, 1.0 loses up to 6 dB at small ones
-#: (docs/decisions/2026-11-21-fidelity.md).
+#: (benchmarks/notes/quality-builder.md).
 ERROR_COST = np.float32(0.4)
 
 #: In cuts of less than this share of the leaves the error cost falls in proportion, as such cuts have no node to spare.
@@ -38,7 +38,7 @@ ROUNDS = 8
 
 #: The most children of a node as long as any node can be dropped without exceeding it; then it doubles. A node that is
 #: smaller than its children has no use by the rule above, and biker's root got 2,575 children, which left nothing to
-#: draw with budgets between 1 and 2,575 (docs/decisions/2026-11-21-fidelity.md).
+#: draw with budgets between 1 and 2,575 (benchmarks/notes/quality-builder.md).
 MOST_CHILDREN = 16
 
 #: ln(size) of a root whose own size is not known yet: larger than any. Chosen.

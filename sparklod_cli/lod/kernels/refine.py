@@ -26,7 +26,7 @@ from .cut_arrays import (
 from .pixel_scale import INFINITE
 
 #: Nodes ahead of the one being refined whose own record, and whose children, are fetched into the processor's cache.
-#: Chosen among 8 to 24 and 6 to 12, which differ little (docs/decisions/2026-11-22-first-frame.md).
+#: Chosen among 8 to 24 and 6 to 12, which differ little (benchmarks/notes/cuts-and-chunks.md).
 OWN_AHEAD, CHILDREN_AHEAD = 16, 6
 
 #: Nodes of 24 bytes in a cache line of 64, rounded up.

@@ -9,12 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sparklod_cli import io
 from sparklod_cli.codecs.formats import sniff
 from sparklod_cli.codecs.options import DEFAULTS
 from sparklod_cli.codecs.sog import codec as sog
 from sparklod_cli.codecs.streamed_sog import codec
 from sparklod_cli.codecs.streamed_sog.manifest import parse
+from sparklod_cli.io import read_levels, read_scene
+from sparklod_cli.io.details import detail_sink
 from sparklod_cli.model import morton
 from sparklod_cli.model.detail import DetailScene
 from sparklod_cli.model.scene import Scene
@@ -154,10 +155,10 @@ def test_progress_ends_with_all_splats() -> None:
 def test_an_output_is_read_by_its_folder_and_by_its_manifest(tmp_path: Path) -> None:
     scene = detail_scene()
     files = codec.encode_files(scene, DEFAULTS, SETTINGS)
-    assert io.detail_sink(tmp_path / "lod-meta.json", overwrite=False)(files) == sum(
+    assert detail_sink(tmp_path / "lod-meta.json", overwrite=False)(files) == sum(
         path.stat().st_size for path in tmp_path.rglob("*") if path.is_file()
     )
-    whole, levels = io.read_scene(tmp_path), io.read_levels(tmp_path / "lod-meta.json", threads=2)
+    whole, levels = read_scene(tmp_path), read_levels(tmp_path / "lod-meta.json", threads=2)
     for column in COLUMNS:
         np.testing.assert_array_equal(getattr(levels.scene().splats, column), getattr(whole.splats, column), column)
     assert len(whole) == 96 + 6
