@@ -1,7 +1,7 @@
 """Keeps what a splat covers when its scales are rounded: its opacity makes up for them.
 
 A code of a scale is off by 3 % and more, so that a splat gets up to 7 % larger or smaller, and with it what it adds to
-a picture. See docs/decisions/2026-11-22-rounding.md.
+a picture. See docs/decisions/08-rounding.md.
 """
 
 from __future__ import annotations

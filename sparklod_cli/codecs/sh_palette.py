@@ -10,7 +10,7 @@ depends more on where k-means starts than on its passes, which take their time t
 3. Passes of k-means that look for the code of a row among the neighbours of the code that it has.
 
 There are no random numbers, and no sum depends on the number of threads: the same rows always give the same palette.
-docs/decisions/2026-11-22-sh-palette.md has what it was measured against.
+docs/decisions/09-palettes-and-sog.md has what it was measured against.
 """
 
 from __future__ import annotations

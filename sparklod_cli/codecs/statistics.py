@@ -162,7 +162,7 @@ class Binades:
 ALL_BITS = 8
 
 #: Largest root mean square, over splats and directions, of what dropping bits changes of a splat's colour: with
-#: it, SH alone cost what 58 dB and more are, see docs/decisions/2026-11-22-rounding.md.
+#: it, SH alone cost what 58 dB and more are, see docs/decisions/08-rounding.md.
 LARGEST_ERROR = 0.009
 
 #: Splats that are counted at a time: they and their codes stay in the processor's cache.
