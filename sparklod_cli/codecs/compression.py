@@ -19,7 +19,7 @@ from ..support.progress import Progress
 from .inflate import COMMENTED_HEAD, PLAIN_HEAD
 
 #: Bytes of a block that one thread deflates, or inflates, by itself, and bytes that are read at a time. That blocks of
-#: this size refer to none before them costs 0.05 to 0.2 % of a file (docs/decisions/04-reading.md).
+#: this size refer to none before them costs 0.05 to 0.2 % of a file (docs/decisions/05-spz.md).
 BLOCK, PIECE = 1 << 19, 1 << 17
 
 #: Bytes at the beginning of a block on which the ways to deflate it are compared.

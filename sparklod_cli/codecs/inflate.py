@@ -1,7 +1,7 @@
 """Inflating: gzip members on several threads where their blocks allow it, without buffering more than a few blocks.
 
 The one place that chooses the library: ISA-L (package isal) where it is installed, zlib-ng elsewhere. What they inflate
-is the same; docs/decisions/04-reading.md has their speeds.
+is the same; docs/decisions/05-spz.md has their speeds.
 """
 
 from __future__ import annotations
