@@ -200,7 +200,7 @@ def test_a_command_heals_a_cache_in_which_every_file_is_damaged(tmp_path: Path) 
     copy = tmp_path / "cache" / jit.CACHE_FOLDER.name
     copy.mkdir(parents=True)
     for unit in units():
-        if unit.name.partition(".")[0] in ("digits", "spz_codes", "tree_links"):  # those of inspect
+        if unit.name.partition(".")[0] in ("digits", "tree_links"):  # those of inspect
             for suffix in SUFFIXES:
                 for path in jit.CACHE_FOLDER.glob(f"{start_of(unit.kernel.py_func)}-*{suffix}"):
                     shutil.copy(path, copy)
