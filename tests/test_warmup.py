@@ -18,7 +18,7 @@ import pytest
 
 from sparklod_cli import warmup
 from sparklod_cli.cli import run
-from sparklod_cli.codecs.kernels import drawable, spz_codes
+from sparklod_cli.codecs.kernels import drawable, texels
 from sparklod_cli.commands.console import Console
 from sparklod_cli.lod.kernels import sort
 from sparklod_cli.support import jit
@@ -82,11 +82,11 @@ def test_a_call_with_types_that_are_not_declared_fails_in_tests() -> None:
     """Thus no run of the tests calls what a warm-up does not compile; see `tests.conftest`."""
     package: dict[str, Any] = {"__name__": "sparklod_cli.somewhere"}
     exec("def call(kernel, *arguments): return kernel(*arguments)", package)
-    codes, counts = np.zeros((3, 3), np.uint8), np.zeros((3, 256), np.int64)
-    package["call"](spz_codes.count_bytes, codes, counts)
-    for wrong in (codes.astype(np.int8), codes.T[:2], codes[0]):
+    words, rest = np.zeros((3, 3), np.uint32), (np.zeros((3, 1 << 16), np.float32), np.zeros((3, 3), np.float32))
+    package["call"](texels.look_up_words, words, *rest)
+    for wrong in (words.astype(np.int32), words.T[:2], words[0]):
         with pytest.raises(AssertionError, match="types that it does not declare"):
-            package["call"](spz_codes.count_bytes, wrong, counts)
+            package["call"](texels.look_up_words, wrong, *rest)
 
 
 def test_commands_that_combine_much_find_all_kernels_compiled(tmp_path: Path) -> None:
@@ -111,7 +111,7 @@ def few(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Unit]:
     folder = tmp_path / jit.CACHE_FOLDER.name
     folder.mkdir()
     monkeypatch.setattr(jit, "CACHE_FOLDER", folder)
-    kernels = [spz_codes.count_bytes, spz_codes.look_up, drawable.count_doubtful]
+    kernels = [texels.look_up_words, texels.look_up, drawable.count_doubtful]
     units = [Unit(kernel, number) for kernel in kernels for number in range(len(kernel.declared))]
     monkeypatch.setattr(warmup, "units", lambda: units)
     return units
@@ -179,9 +179,9 @@ def test_the_children_import_nothing_from_the_working_directory(
 
 def test_the_tests_say_that_they_compile(tmp_path: Path) -> None:
     assert jit.CACHE_FOLDER is not None
-    ignore = shutil.ignore_patterns(f"{start_of(spz_codes.count_bytes.py_func)}*")
+    ignore = shutil.ignore_patterns(f"{start_of(texels.look_up_words.py_func)}*")
     shutil.copytree(jit.CACHE_FOLDER, tmp_path / jit.CACHE_FOLDER.name, ignore=ignore)
-    line = [sys.executable, "-m", "pytest", "tests/support/test_ticks.py", "-q", "-p", "no:cacheprovider"]
+    line = [sys.executable, "-m", "pytest", "tests/support/test_units.py", "-q", "-p", "no:cacheprovider"]
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
     how: dict[str, Any] = {"cwd": ROOT, "capture_output": True, "text": True, "check": True, "env": environment}
     said = subprocess.run([*line, "-n1"], **how).stdout

@@ -26,7 +26,6 @@ from .content import Source, decoder
 from .encoder import Kept, results
 from .options import DEFAULTS, WriteOptions
 from .quantize import Bytes
-from .spz_coded import read_coded as read_coded
 from .spz_encoder import SpzEncoder, like
 from .spz_encoder import encoder as encoder
 from .spz_encoder import needed as needed
@@ -115,4 +114,4 @@ class StoredSpz:
 
 def stored(file: BinaryIO) -> StoredSpz:
     """Read the codes of a file; raises `FormatError` as `open_content`."""
-    return StoredSpz(*read_codes(Source(file))[1:])
+    return StoredSpz(*read_codes(Source(file)))

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Iterator
 from typing import BinaryIO
 
 import numpy as np
 
 from ..model.scene import FileCoding, ScaleCoding
 from ..model.sh import notes_on_degree
-from ..model.splats import COLUMNS
 from ..support.defaults import MAX_SH_DEGREE
 from ..support.errors import FormatError, MembersError, NotSplatsError, TruncatedError, VersionError
 from ..support.parallel import ordered_map
@@ -20,7 +19,7 @@ from .content import Content, Source, Target
 from .file_notes import FileNote, read_comment
 from .inflate import GZIP_MAGIC, Inflate
 from .quantize import Bytes
-from .spz_layout import ANTIALIASED, EXTENSIONS, HEADER, MAGIC, Layout, Stream, StreamRows, column_of
+from .spz_layout import ANTIALIASED, EXTENSIONS, HEADER, LINKS, MAGIC, Layout, Stream, StreamRows, column_of
 from .stream import Positioned, Read, rows_between, rows_of, size_of
 
 HEADER_V4 = struct.Struct("<IIIBBBBI12s")  # ..., streams, offset of the table of streams, reserved
@@ -31,8 +30,6 @@ READABLE = (1, 2, 3, 4)
 
 #: How all versions hold scales.
 CODING = FileCoding((ScaleCoding("spz"),), 1)
-
-_TREE = ("child_count", "child_start")
 
 
 def open_content(source: Source) -> Content:
@@ -47,29 +44,13 @@ def open_content(source: Source) -> Content:
     return _open(source)[0]
 
 
-def read_codes(
-    source: Source, columns: Collection[str] = COLUMNS, see: Callable[[StreamRows], None] = lambda rows: None
-) -> tuple[Content, Layout, dict[str, Bytes]]:
-    """Read the codes of a file: (N, bytes) of the streams of columns and of the tree, by name.
-
-    Args:
-        source: the file.
-        columns: of `Splats`; all of a file of version 1.
-        see: called with the rows of all streams.
-
-    Raises:
-        FormatError: as `open_content`.
-    """
-    content, layout, rows = _open(source)
-    columns = {*(columns if layout.version > 1 else COLUMNS), *_TREE}
-    codes = {
-        each.name: np.empty((layout.count, each.size), np.uint8) for each in layout.streams() if each.column in columns
-    }
+def read_codes(source: Source) -> tuple[Layout, dict[str, Bytes]]:
+    """Read the layout of a file, and (N, bytes) codes of each of its streams, by name; raises as `open_content`."""
+    _, layout, rows = _open(source)
+    codes = {each.name: np.empty((layout.count, each.size), np.uint8) for each in layout.streams()}
     for each, part, some in rows:
-        if each.name in codes:
-            codes[each.name][part] = some
-        see((each, part, some))
-    return content, layout, codes
+        codes[each.name][part] = some
+    return layout, codes
 
 
 def _open(source: Source) -> tuple[Content, Layout, Iterator[StreamRows]]:
@@ -108,7 +89,7 @@ def _open(source: Source) -> tuple[Content, Layout, Iterator[StreamRows]]:
     def fill(target: Target, threads: int, progress: Progress) -> None:
         def decode(item: StreamRows) -> int:
             stream, part, codes = item
-            if stream.column in target.columns or stream.column in _TREE:
+            if stream.column in target.columns or stream.name in LINKS:
                 column = column_of(target.splats, target.tree, stream)
                 out = column[part.start - target.start : part.stop - target.start]
                 out[...] = stream.decode(codes).reshape(out.shape)

@@ -10,7 +10,6 @@ from .reading import (
     examine_scene,
     opened,
     read_arrays,
-    read_coded,
     read_levels,
     read_rgba,
     read_scene,

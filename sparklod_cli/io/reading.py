@@ -24,7 +24,6 @@ from .paths import reason_unreadable
 
 if TYPE_CHECKING:
     from ..codecs.gpu import dump
-    from ..codecs.spz_coded import CodedSpz, Watch
 
 
 #: How a .npz begins, which is a zip.
@@ -91,31 +90,6 @@ def examine_scene(
     with opened(path) as (file, form, more):
         content: Content = form.codec().open_content(Source(file, threads=threads, **more))
         return content.scene(columns=columns, threads=threads, progress=progress, validate=False)
-
-
-def read_coded(
-    path: Place,
-    *,
-    columns: Collection[str] = COLUMNS,
-    watch: Watch | None = None,
-    threads: int = 1,
-    progress: Progress = silent,
-) -> CodedSpz | None:
-    """Return the codes of an SPZ file, for a report on it; None where a file is of another format.
-
-    Args:
-        watch: sees the codes of some columns, which need not be kept.
-
-    Raises:
-        FormatError: as `examine_scene`.
-    """
-    with opened(path) as (file, form, _):
-        if form.name != "SPZ":
-            return None
-        coded: CodedSpz = form.codec().read_coded(
-            file, columns=columns, watch=watch, threads=threads, progress=progress
-        )
-    return coded
 
 
 @contextlib.contextmanager
