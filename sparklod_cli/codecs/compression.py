@@ -1,6 +1,6 @@
 """Compression: writes one gzip member on several threads, and reads zstd without buffering more than requested.
 
-docs/decisions explains why the library's own threaded gzip is not used. `inflate` reads gzip.
+benchmarks/notes/file-sizes.md explains why the library's own threaded gzip is not used. `inflate` reads gzip.
 """
 
 from __future__ import annotations

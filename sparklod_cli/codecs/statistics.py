@@ -221,7 +221,7 @@ def enough(found: ShBytes) -> int:
 
 
 #: A step of the positions is at most a 16th of the standard deviation of a small splat, so that rounding shifts it by
-#: at most a 32nd; small are the splats at this quantile of the largest scales. See docs/decisions.
+#: at most a 32nd; small are the splats at this quantile of the largest scales. See docs/decisions/05-spz.md.
 STEPS_A_SPLAT, SMALL_QUANTILE = 16, 0.01
 
 

@@ -34,7 +34,7 @@ from .findings import Finding
 
 #: Smallest feature size of a node over the mean of its children's, weighted by area. A merged splat has at least their
 #: variance, so nodes of a good tree reach 0.5; a much smaller one is drawn in their place for too long. A single faint
-#: child may be far larger than its parent, which is no fault: docs/decisions/2026-11-21-sizes-of-parents.md.
+#: child may be far larger than its parent, which is no fault: docs/decisions/11-quality-builder.md.
 MIN_SIZE_RATIO = 1 / 3
 #: More than rounding adds to a mean, as a factor.
 ROUNDING = 1 + 1e-6

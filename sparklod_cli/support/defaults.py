@@ -12,13 +12,13 @@ MAX_SH_DEGREE = 3
 #: Largest accepted number of threads.
 MAX_THREADS = 256
 
-#: SPZ versions that can be written, and the default; measured in docs/decisions.
+#: SPZ versions that can be written, and the default; measured in docs/decisions/05-spz.md.
 SPZ_VERSIONS, DEFAULT_SPZ_VERSION = (2, 3), 3
 
 #: Largest number of fractional bits of an SPZ position.
 MAX_FRACTIONAL_BITS = 24
 
-#: Deflate levels, and the default; measured in docs/decisions.
+#: Deflate levels, and the default; measured in docs/decisions/05-spz.md.
 MIN_COMPRESSION, MAX_COMPRESSION, DEFAULT_COMPRESSION = 1, 9, 5
 
 #: Entries of a palette of spherical harmonics: Spark's labels have 16 bits.

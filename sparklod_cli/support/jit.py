@@ -18,7 +18,7 @@ from .kernel_cache import SETTINGS, Trouble, cache_folder
 
 #: How long OpenMP's threads spin while they wait for one another at the end of a parallel loop. By default they
 #: spin for milliseconds, which on a busy machine takes the processor from the thread they wait for: four concurrent
-#: bakes then take 1.5 times as long as four in sequence (docs/decisions/2026-11-21-kernels.md). The variables are read
+#: bakes then take 1.5 times as long as four in sequence (benchmarks/notes/kernels.md). The variables are read
 #: when the threads start; variables that are already set are left unchanged.
 WAIT_SETTINGS = {
     "GOMP_SPINCOUNT": "1000",  # GNU: iterations, about 20 microseconds
@@ -33,7 +33,7 @@ Begun = Callable[[str], None]
 Done = Callable[[float], None]
 
 #: Least number of rows for which several threads are used: with fewer, one thread finishes before another wakes up.
-#: Chosen; no difference was measured up to 65,536 (docs/decisions/2026-11-21-kernels.md).
+#: Chosen; no difference was measured up to 65,536 (benchmarks/notes/kernels.md).
 PARALLEL_ROWS = 4096
 
 #: The folder for compiled code; None if kernels have to be compiled in every process.

@@ -1,4 +1,4 @@
-"""Which encodings and ranges a RAD file is written with, and which values those clamp; docs/decisions has why."""
+"""Encodings and ranges of RAD files, and the values that those clamp (docs/decisions/07-rad.md)."""
 
 from __future__ import annotations
 

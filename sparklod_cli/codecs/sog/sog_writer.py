@@ -33,7 +33,7 @@ from .texel_codings import codebook, nearest
 from .webp_images import MAX_SIDE, Texels, encode_webp, image_of, size_for
 
 #: Power of the weights of splats in the palette of SH. With 1, pictures are better still, but the error of coefficients
-#: is larger than that of splat-transform's; docs/decisions has the measurements.
+#: is larger than that of splat-transform's; benchmarks/notes/file-sizes.md has the measurements.
 SEEN = 0.5
 
 #: The tilt of the book of scales: large splats, which are few, make most of a picture. Measured: 34,902 merged splats

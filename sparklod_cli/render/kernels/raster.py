@@ -46,7 +46,7 @@ LEAST_SQUARE = f32(1e-6)
 
 #: Splats of a tile that are fetched and measured together before they are drawn; between two batches is a check for
 #: OPAQUE. The rows of a tile's splats lie anywhere in memory: a processor fetches several at once where nothing that
-#: has to be guessed stands between them. Measured: docs/decisions/2026-11-22-render-speed.md.
+#: has to be guessed stands between them. Measured: benchmarks/notes/rasterizer.md.
 BATCH = 16
 
 #: Rows of LANES pixels that a batch may have to be blended into, and one column that is written beyond the last.
