@@ -50,7 +50,7 @@ def brute_force(rows: Rows, count: int, rounds: int) -> Rows:
 
 
 def by_faiss(rows: Rows, count: int, rounds: int) -> Rows:
-    """faiss's k-means of all rows; returns the code of each row."""
+    """Faiss's k-means of all rows; returns the code of each row."""
     import faiss
 
     faiss.omp_set_num_threads(processors())

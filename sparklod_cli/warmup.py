@@ -38,7 +38,7 @@ class Unit(NamedTuple):
 
     @property
     def name(self) -> str:
-        """ "module.function", for display."""
+        """Return "module.function", for display."""
         return stem_of(self.kernel.py_func)
 
     @property

@@ -30,7 +30,7 @@ class Verbosity:
 
 
 def size_of(size: int) -> str:
-    """ "2.9 MB"."""
+    """Return an amount of bytes for display, such as "2.9 MB"."""
     return f"{size / 1e6:.1f} MB" if size >= 1e5 else f"{size / 1e3:.1f} kB"
 
 

@@ -284,7 +284,7 @@ def _report(console: Console, drawn: Drawn, seconds: float, *, as_json: bool) ->
 
 
 def _describe(written: Pictures) -> str:
-    """ "60 frames, 1280 x 720, 499,102 to 500,000 splats"."""
+    """Return what was drawn, such as "60 frames, 1280 x 720, 499,102 to 500,000 splats"."""
     frames = written.frames
     sizes = dict.fromkeys(f"{frame['width']} x {frame['height']}" for frame in frames)
     splats = sorted({frame["splats"] for frame in frames})

@@ -45,7 +45,7 @@ def picture_of_path(
     frame: int | None = None,
     size: tuple[int, int] = (1600, 1000),
 ) -> bytes:
-    """The PNG of a path, its frusta and a cut.
+    """Return the PNG of a path, its frusta and a cut.
 
     Args:
         cameras: of the path; at least one.
@@ -94,7 +94,7 @@ def _called(camera: Camera, frame: int) -> str:
 
 
 def _above(cameras: Sequence[Camera], low: Points, high: Points, size: tuple[int, int]) -> Viewpoint:
-    """A viewpoint above a corner of the box, with the mean up axis of the cameras upwards."""
+    """Return a viewpoint above a corner of the box, with the mean up axis of the cameras upwards."""
     mean = np.sum([camera.camera_to_world[:3, 1] for camera in cameras], axis=0)
     axis = int(np.abs(mean).argmax())
     up = np.zeros(3)
@@ -104,7 +104,7 @@ def _above(cameras: Sequence[Camera], low: Points, high: Points, size: tuple[int
 
 
 def _path_lines(cameras: Sequence[Camera], way: Points, frame: int | None, extent: float) -> list[tuple[Points, str]]:
-    """Ends of the lines of the path and of its frusta, and their colours."""
+    """Return the ends of the lines of the path and of its frusta, and their colours."""
     steps = np.unique([*evenly(len(way), MOST_STEPS), len(way) - 1])
     path = np.repeat(way[steps], 2, axis=0)[1:-1]
     frusta = [frustum_lines(cameras[at], LENGTH * extent) for at in evenly(len(cameras), MOST_FRUSTA)]

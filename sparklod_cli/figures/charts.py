@@ -39,7 +39,7 @@ class Frames:
             self.rows, self.x = [rows[0], rows[0]], self.x + np.array([-0.5, 0.5])
 
     def tick(self, value: float, place: int) -> str:
-        """The label of a tick of the axis."""
+        """Return the label of a tick of the axis."""
         if self._timed:
             return f"{value:g} s"
         return f"frame {value:,.0f}" if value == round(value) else ""
@@ -68,7 +68,7 @@ Axes = Any
 
 
 def load_matplotlib() -> ModuleType:
-    """Imports matplotlib without pyplot, whose global state belongs to the calling program.
+    """Import matplotlib without pyplot, whose global state belongs to the calling program.
 
     Raises:
         SparklodError: it is not installed.
@@ -82,7 +82,7 @@ def load_matplotlib() -> ModuleType:
 
 
 def style() -> dict[str, Any]:
-    """matplotlib's parameters for charts in the colours of the rendered figures."""
+    """Matplotlib's parameters for charts in the colours of the rendered figures."""
     return {
         "axes.edgecolor": LINE, "axes.facecolor": PANEL, "axes.labelcolor": FAINT, "axes.titlecolor": INK,
         "axes.labelsize": 10, "axes.titlesize": 12, "axes.titlelocation": "left", "axes.titlepad": 8,
@@ -126,7 +126,7 @@ def head(title: str, lines: Sequence[tuple[str, str]], height: int) -> Image.Ima
 
 
 def stacked(*images: Image.Image | NDArray[np.uint8]) -> bytes:
-    """The PNG of images of the same width, stacked from top to bottom."""
+    """Return the PNG of images of the same width, stacked from top to bottom."""
     out = io.BytesIO()
     Image.fromarray(np.concatenate([np.asarray(image) for image in images])).save(out, "PNG", optimize=True)
     return out.getvalue()

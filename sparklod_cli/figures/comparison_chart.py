@@ -25,7 +25,7 @@ Series = tuple[str, Sequence[Row]]
 
 
 def plot(series: Sequence[Series], title: str) -> bytes:
-    """The PNG of charts: PSNR, SSIM and PSNR of edges by budget, PSNR, worst tile and popping along the path.
+    """Return the PNG of charts: PSNR, SSIM and PSNR of edges by budget, PSNR, worst tile and popping along the path.
 
     A chart of which no frame has a value, such as popping of single views, stays away.
 

@@ -32,7 +32,7 @@ class Mesh:
 
 
 def sphere(rounds: int) -> Mesh:
-    """The unit sphere: an icosahedron, each of whose triangles is split into four `rounds` times."""
+    """Return the unit sphere: an icosahedron, each of whose triangles is split into four `rounds` times."""
     golden = (1 + math.sqrt(5)) / 2
     one = np.array([[-1, golden, 0], [1, golden, 0], [-1, -golden, 0], [1, -golden, 0]])
     points = np.concatenate([one, np.roll(one, 1, axis=1), np.roll(one, 2, axis=1)])
@@ -61,7 +61,7 @@ def rotation(quat_xyzw: FloatArray) -> FloatArray:
 
 
 def ellipsoids(splats: Splats, deviations: float, of: Mesh, thinnest: float) -> Mesh:
-    """The surfaces of N splats at some number of standard deviations, in their order.
+    """Return the surfaces of N splats at some number of standard deviations, in their order.
 
     Points of the sphere are multiplied by the radii, its normals divided by them.
 
@@ -86,7 +86,7 @@ def evenly(count: int, most: int) -> NDArray[np.int64]:
 
 
 def level_of_step(size: float, base: float = DEFAULT_BASE) -> int:
-    """The voxel level of Quick-LoD for a design size, 2 * max(scale); its cells have edges of base ** level."""
+    """Return the voxel level of Quick-LoD for a design size, 2 * max(scale); its cells have edges of base ** level."""
     return math.ceil(math.log(size, base) - 1e-9)
 
 
@@ -102,7 +102,7 @@ def box_lines(low: Points, high: Points) -> Points:
 
 
 def wall_lines(low: Points, high: Points, far: Points, spacing: float) -> Points:
-    """Ends of the lines at multiples of `spacing` on the three walls of a box that meet in its corner `far`."""
+    """Return the ends of lines at multiples of `spacing` on the three walls of a box that meet in its corner `far`."""
     lines: list[Points] = []
     for axis in range(3):
         at = spacing * np.arange(math.ceil(low[axis] / spacing - 1e-9), math.floor(high[axis] / spacing + 1e-9) + 1)
@@ -147,7 +147,7 @@ class Viewpoint:
 def viewpoint(
     points: Points, direction: Points, up: Points, *, aspect: float, frame: tuple[float, float, float, float]
 ) -> Viewpoint:
-    """The viewpoint that looks along a direction and just fits all points into a frame.
+    """Return the viewpoint that looks along a direction and just fits all points into a frame.
 
     Args:
         points: (N, 3) points to show.

@@ -37,7 +37,7 @@ def write_png(
     low: Points,
     high: Points,
 ) -> bytes:
-    """The PNG of a picture with title, colour scale and axes.
+    """Return the PNG of a picture with title, colour scale and axes.
 
     Args:
         pixels: (H, W, 3) of the scene.
@@ -132,7 +132,7 @@ window.Render()
 
 @functools.cache
 def load_pyvista() -> ModuleType:
-    """Imports pyvista, after a check that it can draw here.
+    """Import pyvista, after a check that it can draw here.
 
     Raises:
         SparklodError: pyvista is not installed, or OpenGL is missing.
@@ -172,7 +172,7 @@ class Stage:
         self._plotter.close()
 
     def splats(self, splats: Splats, rgb: NDArray[np.uint8], eye: Viewpoint) -> str:
-        """Adds N splats in (N, 3) colours, as ellipsoids or, if they are too many, as points; returns a description."""
+        """Add N splats in (N, 3) colours, as ellipsoids or, if they are too many, as points; return a description."""
         away = (splats.center - eye.position) @ eye.axes[2]
         half = math.tan(math.radians(eye.angle) / 2)
         pixels = splats.scale.mean(axis=1) / np.maximum(away, 1e-3 * self._unit) * self._size[1] / half
@@ -207,12 +207,12 @@ class Stage:
         actor.prop.interpolation = "gouraud"
 
     def dots(self, points: Points, color: str) -> None:
-        """Adds small points of one colour."""
+        """Add small points of one colour."""
         mesh = self._pyvista.PolyData(self._local(points))
         self._plotter.add_mesh(mesh, color=color, point_size=1.5 * OVERSAMPLING, lighting=False)
 
     def lines(self, ends: Points, color: str, opacity: float, *, width: float = 1) -> None:
-        """Adds lines between pairs of points, `width` pixels wide."""
+        """Add lines between pairs of points, `width` pixels wide."""
         if len(ends):
             pairs = np.insert(np.arange(len(ends)).reshape(-1, 2), 0, 2, axis=1)
             mesh = self._pyvista.PolyData(self._local(ends), lines=pairs.ravel())

@@ -78,13 +78,13 @@ def _from_zero(axes: Axes, values: Series) -> None:
 
 
 def _counted(axes: Axes, matplotlib: ModuleType, unit: str = "") -> None:
-    """Gives the vertical axis ticks at whole numbers, with k and M for thousands and millions."""
+    """Give the vertical axis ticks at whole numbers, with k and M for thousands and millions."""
     axes.yaxis.set_major_locator(matplotlib.ticker.MaxNLocator(6, steps=[1, 2, 5, 10], integer=True, min_n_ticks=1))
     axes.yaxis.set_major_formatter(matplotlib.ticker.EngFormatter(unit, sep=" " if unit else ""))
 
 
 def _beside(axes: Axes) -> Axes:
-    """A second vertical axis, on the right."""
+    """Return a second vertical axis, on the right."""
     other = axes.twinx()
     other.grid(False)
     return other

@@ -40,7 +40,7 @@ APART = 0.04
 
 
 def color_by(by: str, splats: Splats, index: NDArray[np.int64], depth: NDArray[np.int32] | None) -> Coloring:
-    """The colours of M of N splats, and the scale that explains them.
+    """Return the colours of M of N splats, and the scale that explains them.
 
     Args:
         by: one of `PLOT_BY`: "level", the depth of a node, needs `depth`; else "opacity", "size" or "chunk".

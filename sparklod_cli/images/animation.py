@@ -38,7 +38,7 @@ VIDEOS = {
 
 
 def check(form: str, fps: float) -> None:
-    """Raises a `SparklodError` if an animation cannot be written; called before any frame is drawn."""
+    """Raise a `SparklodError` if an animation cannot be written; called before any frame is drawn."""
     if form in VIDEOS:
         load_imageio(form)
     longest = LONGEST[form] / 1000
@@ -47,7 +47,7 @@ def check(form: str, fps: float) -> None:
 
 
 def load_imageio(form: str) -> ModuleType:
-    """Imports imageio with its ffmpeg, which writes videos of a form.
+    """Import imageio with its ffmpeg, which writes videos of a form.
 
     Raises:
         SparklodError: it is not installed.
@@ -101,7 +101,7 @@ def animate(frames: Iterable[Pixels], count: int, form: str, fps: float) -> byte
 
 
 def _film(frames: Iterable[Pixels], count: int) -> Image.Image:
-    """A picture with several frames, which are drawn as Pillow seeks them; it would hold all of a list of pictures."""
+    """Return a picture whose frames are drawn as Pillow seeks them, so that they are not all in memory."""
     pictures = (Image.fromarray(frame) for frame in frames)
     film = next(pictures).copy()
 

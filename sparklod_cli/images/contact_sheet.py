@@ -25,7 +25,7 @@ def grid(count: int, size: tuple[int, int]) -> tuple[int, int]:
 
 
 def cells(count: int, size: tuple[int, int]) -> list[tuple[int, int]]:
-    """The upper left pixel of each picture of a sheet."""
+    """Return the upper left pixel of each picture of a sheet."""
     columns, _ = grid(count, size)
     width, height = size[0] + GAP, size[1] + GAP + _caption_height(size)
     return [(GAP + number % columns * width, GAP + number // columns * height) for number in range(count)]

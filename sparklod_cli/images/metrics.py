@@ -61,7 +61,7 @@ class Tile:
 
 
 def check_covered(reference: Image, what: str) -> None:
-    """Raises a `SparklodError` if the reference of a comparison is empty: its figures would mean nothing.
+    """Raise a `SparklodError` if the reference of a comparison is empty: its figures would mean nothing.
 
     Args:
         reference: (H, W, 4), the last channel alpha.
@@ -139,7 +139,7 @@ def popping(a: Image, b: Image, a_before: Image, b_before: Image) -> float:
 
 
 def worst_tile(a: Image, b: Image, size: int = TILE) -> Tile:
-    """The tile with the lowest PSNR, the first of several. Tiles at the right and lower edge may be smaller.
+    """Return the tile with the lowest PSNR, the first of several. Tiles at the right and lower edge may be smaller.
 
     Args:
         a, b: (H, W, C) of the same shape, 0..1.

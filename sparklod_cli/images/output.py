@@ -32,26 +32,26 @@ class Output:
     kind: str
 
     def path(self, number: int = 0) -> Path:
-        """The path of the file, or of the file of a frame."""
+        """Return the path of the file, or of the file of a frame."""
         assert self.name is not None
         if self.kind != "frames":
             return self.name
         return self.name.with_name(NUMBER.sub(lambda match: match[0] % number, self.name.name))
 
     def paths(self, numbers: Sequence[int]) -> list[Path]:
-        """The paths of all files that will be written."""
+        """Return the paths of all files that will be written."""
         if self.name is None:
             return []
         return [self.path(number) for number in (numbers if self.kind == "frames" else [0])]
 
     def check(self, numbers: Sequence[int], *, overwrite: bool) -> None:
-        """Raises an `OutputError` if a file cannot be written; called before any work is done."""
+        """Raise an `OutputError` if a file cannot be written; called before any work is done."""
         for path in self.paths(numbers):
             check_writable(path, overwrite=overwrite)
 
 
 def output_for(name: Path | None, default: Path, cameras: int, *, sheet: bool) -> Output:
-    """The destination of the pictures of a number of cameras.
+    """Return the destination of the pictures of a number of cameras.
 
     Args:
         name: the requested path; "-" for standard output; None for a path derived from `default`.

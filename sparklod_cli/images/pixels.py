@@ -36,7 +36,7 @@ def font(unit: float, size: float) -> Font:
 
 
 def write_title(draw: ImageDraw.ImageDraw, unit: float, title: str, lines: Sequence[tuple[str, str]]) -> None:
-    """Writes a title, and lines below it, at the upper left of a picture.
+    """Write a title, and lines below it, at the upper left of a picture.
 
     Args:
         draw: draws on the picture.
@@ -137,7 +137,7 @@ def _unit(width: int, height: int) -> float:
 
 
 def with_scale(pixels: Pixels, bar: Coloring) -> Pixels:
-    """A picture with a colour scale on its right; a picture that is too small for one is returned unchanged."""
+    """Return a picture with a colour scale on its right; a picture that is too small for one is returned unchanged."""
     height, width = pixels.shape[:2]
     wider = scale_width(width, height)
     if not wider:
@@ -155,7 +155,7 @@ def apart(a: Image, b: Image) -> Image:
 
 
 def gain_for(differences: Sequence[Image]) -> float:
-    """The amplification with which differences are visible and few of them are clipped.
+    """Return the amplification with which differences are visible and few of them are clipped.
 
     Args:
         differences: (H, W, 3) each, see `apart`.
@@ -172,13 +172,13 @@ def gain_for(differences: Sequence[Image]) -> float:
 
 
 def difference_bar(gain: float) -> Coloring:
-    """The colour scale of `difference`: absolute difference of a channel, 0..1."""
+    """Return the colour scale of `difference`: absolute difference of a channel, 0..1."""
     marks = [(0.0, "0"), (0.5, f"{0.5 / gain:.3g}"), (1.0, f"{1 / gain:.3g}" + " or more" * (gain > 1))]
     return smooth("difference", np.empty(0), GRAYS, marks)
 
 
 def encode(pixels: Pixels, form: str, jpeg_quality: int = JPEG_QUALITY) -> bytes:
-    """The bytes of a "png", of a "webp" without loss, or of a "jpg".
+    """Return the bytes of a "png", of a "webp" without loss, or of a "jpg".
 
     Args:
         pixels: with alpha for "png" and "webp" only.
@@ -197,7 +197,7 @@ def encode(pixels: Pixels, form: str, jpeg_quality: int = JPEG_QUALITY) -> bytes
 
 
 def encode_floats(values: NDArray[np.float32]) -> bytes:
-    """The bytes of a .npy file."""
+    """Return the bytes of a .npy file."""
     out = io.BytesIO()
     np.save(out, values)
     return out.getvalue()

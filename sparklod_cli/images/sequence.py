@@ -97,7 +97,7 @@ def write_pictures(
     overwrite: bool = False,
     progress: Progress = silent,
 ) -> Pictures:
-    """Renders and writes the pictures of a camera path.
+    """Render and write the pictures of a camera path.
 
     Args:
         source: the cuts to render.
@@ -176,7 +176,7 @@ class _Writer:
         return [camera.name or f"frame {number}" for number, camera in cameras]
 
     def _frames(self) -> Iterator[_Frame]:
-        """The pictures, in order."""
+        """Yield the pictures, in order."""
         count = len(self._path.cameras)
         for done, frame in enumerate(ordered_map(self._frame, range(count), min(self._settings.jobs, count)), 1):
             self._progress("drawing", done, count, "frame")
@@ -206,14 +206,14 @@ class _Writer:
         return _Frame(facts, pixels, b"", empty)
 
     def _draw(self, at: int) -> tuple[Drawn, Drawn | None]:
-        """The picture of a camera, and the picture of the reference."""
+        """Return the picture of a camera, and the picture of the reference."""
         if at in self._drawn:
             return self._drawn.pop(at)
         camera = self._path.cameras[at]
         return self._renderer.draw(camera), None if self._reference is None else self._reference.draw(camera)
 
     def _bar(self) -> Coloring | None:
-        """The colour bar; None if the pictures get none."""
+        """Return the colour bar; None if the pictures get none."""
         if not self._settings.bar:
             return None
         if self._reference is not None:
@@ -221,7 +221,7 @@ class _Writer:
         return self._renderer.scale.bar if self._renderer.scale is not None else None
 
     def _fitting_gain(self, reference: Renderer) -> float:
-        """The gain for all pictures, chosen from the first, the middle and the last one."""
+        """Return the gain for all pictures, chosen from the first, the middle and the last one."""
         cameras, background = self._path.cameras, self._settings.background
         some = sorted({0, len(cameras) // 2, len(cameras) - 1}, reverse=True)
         keep = 2 * sum(cameras[at].width * cameras[at].height for at in some) <= CACHED_PIXELS
@@ -242,7 +242,7 @@ class _Writer:
         return facts
 
     def _floats(self, drawn: Drawn, image: NDArray[np.float32]) -> NDArray[np.float32]:
-        """The content of a .npy file: the values behind the colours if they are per pixel, else the colours."""
+        """Return the content of a .npy file: the values behind the colours if they are per pixel, else the colours."""
         by = self._renderer.settings.color_by
         return drawn.values if by in OF_PIXELS and drawn.values is not None else image
 

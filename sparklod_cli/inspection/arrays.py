@@ -88,6 +88,6 @@ def _of_texture(arrays: Arrays, settings: ReportSettings) -> dict[str, Any]:
 
 
 def _fields(form: str, splats: int, note: str, settings: ReportSettings, **more: Any) -> dict[str, Any]:
-    """The fields of a report; of spherical harmonics and findings there are none unless they are among `more`."""
+    """Return the fields of a report; spherical harmonics and findings are left out unless they are among `more`."""
     fields = {"format": form, "splats": splats, "sh_degree": 0, "antialiased": False, "notes": [note], "findings": []}
     return fields | more | ({} if settings.check else {"findings": None})

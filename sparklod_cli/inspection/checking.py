@@ -41,7 +41,7 @@ class CheckSettings:
 def inspect(
     path: Path, settings: CheckSettings, *, threads: int = 1, progress: Progress = silent
 ) -> tuple[Report, Scene | None]:
-    """The report on a file, whose findings include unmet expectations, and the scene as far as it was read.
+    """Return the report on a file, whose findings include unmet expectations, and the scene as far as it was read.
 
     Args:
         path: path of the file, see `report.inspect`.
@@ -62,7 +62,7 @@ def inspect(
 
 
 def read_original(path: Path, *, threads: int = 1, progress: Progress = silent) -> Scene:
-    """Reads the scene whose splats the leaves must equal.
+    """Read the scene whose splats the leaves must equal.
 
     Raises:
         FormatError: the file cannot be read; names it.

@@ -50,7 +50,7 @@ SHOWN = {
 
 
 def row_of(block: Block) -> dict[str, Any]:
-    """The row of the chunk of a block with the columns center, scale and opacity, but for its number and its bytes."""
+    """Return the row of a chunk, a block with center, scale and opacity, without its number and its bytes."""
     center, size = block.splats.center, spark_size(block.splats)
     low, high = center.min(axis=0), center.max(axis=0)
     with np.errstate(invalid="ignore", over="ignore"):
@@ -67,7 +67,7 @@ def row_of(block: Block) -> dict[str, Any]:
 def table_of(
     rows: Sequence[dict[str, Any]], chunk_bytes: Sequence[int] | None, nodes: tree.Columns | None
 ) -> list[Row]:
-    """The rows with a cell for each of `COLUMNS`.
+    """Return the rows with a cell for each of `COLUMNS`.
 
     Args:
         rows: of all chunks in order, see `row_of`.
@@ -95,7 +95,7 @@ def _add_links(rows: Sequence[dict[str, Any]], nodes: tree.Columns) -> None:
 
 
 def rows_of(scene: Scene) -> list[Row]:
-    """The rows of a scene in memory."""
+    """Return the rows of a scene in memory."""
     blocks = Blocks.of(scene)
     nodes = tree.Columns.of(blocks) if blocks.is_tree and blocks.count else None
     if nodes is not None:
@@ -104,7 +104,7 @@ def rows_of(scene: Scene) -> list[Row]:
 
 
 def lines(rows: list[dict[str, Any]]) -> Iterator[str]:
-    """The table as a person reads it; its rows may come from JSON."""
+    """Yield the table as a person reads it; its rows may come from JSON."""
     shown = {name: width for name, width in SHOWN.items() if any(row[name] is not None for row in rows)}
     yield "".join(f"{name:>{width}}" for name, width in shown.items())
     for row in rows:

@@ -99,7 +99,7 @@ class Expectations:
 
 
 def parse_assertion(text: str) -> Condition:
-    """A condition on a report.
+    """Return a condition on a report.
 
     Raises:
         BadAssertionError: it cannot be understood, or is about nothing that a report has.
@@ -117,7 +117,7 @@ def _is_range(wanted: Any, end: str) -> bool:
 
 
 def read(path: Path) -> Expectations:
-    """The expectations in a .json or .toml file: keys that are attributes of `Expectations`, and `assert`.
+    """Return the expectations in a .json or .toml file: keys that are attributes of `Expectations`, and `assert`.
 
     Raises:
         ExpectationError: it cannot be read, or says something that is not an expectation.
@@ -151,7 +151,7 @@ def read(path: Path) -> Expectations:
 
 
 def _flat(table: dict[str, Any], path: str, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Expectations by the full names of their fields; in TOML `tree.depth = 2` is a table in a table."""
+    """Return expectations by the full names of their fields; in TOML `tree.depth = 2` is a table in a table."""
     for key, wanted in table.items():
         name = prefix + key
         if isinstance(wanted, dict) and wanted and not wanted.keys() & {"min", "max"}:

@@ -100,7 +100,7 @@ class Finding:
 
 
 def findings_of(violations: Iterable[RuleViolation]) -> list[Finding]:
-    """A finding for each code: the text of its first violation, and how many more there are."""
+    """Return a finding for each code: the text of its first violation, and how many more there are."""
     by_code: dict[str, list[str]] = {}
     for each in violations:
         by_code.setdefault(each.code, []).append(each.text)

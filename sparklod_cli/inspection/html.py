@@ -30,7 +30,7 @@ from .report import Report
 
 
 def streamed_sog_panels(streamed: Mapping[str, Any]) -> str:
-    """The panels, from `streamed_sog` of a report as JSON."""
+    """Return the panels, from `streamed_sog` of a report as JSON."""
     levels = panel("Detail levels", _levels(streamed["levels"]))
     return f'{levels}\n<div class="two">{panel("Container", _container(streamed))}{_regions(streamed)}</div>'
 
@@ -109,7 +109,7 @@ class Section:
 def section_of(
     report: Report, scene: Scene | None, picture: Picture | None, thumbnail: Picture | None = None
 ) -> Section:
-    """The section about a file: its report, its pictures, and histograms of what was read of it."""
+    """Return the section about a file: its report, its pictures, and histograms of what was read of it."""
     drawn = {}
     if scene is not None and len(scene.splats):
         drawn = {name: values.histogram_of(scene.splats, name) for name in values.names_of(scene.splats)}
@@ -117,7 +117,7 @@ def section_of(
 
 
 def page(sections: Sequence[Section]) -> str:
-    """The page about one or more files, as HTML to be written in UTF-8."""
+    """Return the page about one or more files, as HTML to be written in UTF-8."""
     one = len(sections) == 1
     title = f"{text_of(sections[0].report.get('file', ''))} \u2013 sparklod inspect" if one else "sparklod inspect"
     style = files(__package__).joinpath("page.css").read_text("utf-8")
@@ -146,7 +146,7 @@ def page(sections: Sequence[Section]) -> str:
 
 
 def _verdict(report: Mapping[str, Any]) -> str:
-    """The worst severity of the findings, as a badge."""
+    """Return the worst severity of the findings, as a badge."""
     findings = report.get("findings")
     if findings is None:
         return '<span class="badge plain">not checked</span>'
@@ -200,7 +200,7 @@ def _section(section: Section, anchor: str) -> str:
 
 
 def _figures(report: Mapping[str, Any]) -> str:
-    """The key figures, as cards."""
+    """Return the key figures, as cards."""
     tree, header = report.get("tree") or {}, report.get("header") or {}
     noun = "node" if tree else "splat"
     cards: list[tuple[str, str, str]] = []

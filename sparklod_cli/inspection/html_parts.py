@@ -29,7 +29,7 @@ def text_of(value: object) -> str:
 
 
 def chart(counts: Sequence[int], tooltips: Sequence[str], labels: Iterable[tuple[float, str]], summary: str) -> str:
-    """A bar chart.
+    """Return a bar chart.
 
     Args:
         counts: one for each bar.
@@ -62,7 +62,7 @@ def chart(counts: Sequence[int], tooltips: Sequence[str], labels: Iterable[tuple
 
 
 def histogram_chart(histogram: Histogram, name: str) -> str:
-    """A histogram as a chart; an empty text if it has no numbers."""
+    """Return a histogram as a chart; an empty text if it has no numbers."""
     counts = [int(count) for count in histogram.counts]
     if not counts:
         return ""
@@ -110,14 +110,14 @@ NONE = "\u2013"
 
 
 def number_text(value: float | None) -> str:
-    """A number with separators; an integer exactly."""
+    """Return a number with separators; an integer exactly."""
     if value is None:
         return NONE
     return f"{value:,}" if isinstance(value, int) else f"{value:,.4g}" if abs(value) < 1e6 else f"{value:.4g}"
 
 
 def size_text(size: int) -> str:
-    """An amount of bytes."""
+    """Return an amount of bytes."""
     for unit, power in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
         if size >= power:
             return f"{size / power:.1f} {unit}"
@@ -125,12 +125,12 @@ def size_text(size: int) -> str:
 
 
 def panel(title: str, content: str) -> str:
-    """A box with a heading; nothing where its content is empty."""
+    """Return a box with a heading; nothing where its content is empty."""
     return f'<section class="panel"><h3>{title}</h3>\n{content}\n</section>' if content else ""
 
 
 def table_of(head: Sequence[str], rows: Iterable[Sequence[str]], caption: str) -> str:
-    """A table of cells of HTML; the first cell of each row is its heading."""
+    """Return a table of cells of HTML; the first cell of each row is its heading."""
     columns = "".join(f'<th scope="col">{cell}</th>' for cell in head)
     lines = (f'<tr><th scope="row">{row[0]}</th>{"".join(_cell(cell) for cell in row[1:])}</tr>' for row in rows)
     body = "\n".join(lines)
@@ -145,7 +145,7 @@ def _cell(content: str) -> str:
 
 
 def figure_of(picture: Picture | None, *, small: bool = False) -> str:
-    """A picture with its description; nothing where there is none."""
+    """Return a picture with its description; nothing where there is none."""
     if picture is None:
         return ""
     data, words = base64.b64encode(picture.png).decode("ascii"), picture.description

@@ -96,7 +96,7 @@ def codings_of(scene: Scene, leaves: Splats, original: Splats, facts: RadFacts |
 
 
 def of_spz(scene: Scene, leaves: Splats, *, covering: bool) -> Coding:
-    """The coding of an SPZ file that a scene was read from.
+    """Return the coding of an SPZ file that a scene was read from.
 
     Args:
         scene: with a tree.
@@ -128,7 +128,7 @@ def of_spz(scene: Scene, leaves: Splats, *, covering: bool) -> Coding:
 
 
 def of_rad(facts: RadFacts, leaves: Splats, rounded_to: int | None, *, covering: bool) -> Coding | str:
-    """The coding of a RAD file; or why there is none. A palette of SH, whose entries stand for many, is left out.
+    """Yield the coding of a RAD file; or why there is none. A palette of SH, whose entries stand for many, is left out.
 
     Args:
         facts: of the file.
@@ -219,7 +219,7 @@ MAX_SEARCHED = 20_000
 
 
 def check(scene: Scene, original: Scene, facts: RadFacts | None = None) -> list[Finding]:
-    """A finding if the leaves of `scene`, a tree, are not exactly the splats of `original` that can be drawn.
+    """Return a finding if the leaves of `scene`, a tree, are not exactly the splats of `original` that can be drawn.
 
     Both are compared as codes of the tree's file, as sparklod makes them or as others do: most are equal, and each of
     the others must pair with one whose codes all lie within a step.

@@ -52,7 +52,7 @@ class Percentiles:
         self._seen, self._mixed = np.zeros(shape, self._key), np.zeros(shape, np.bool_)
 
     def add(self, values: FloatArray) -> None:
-        """Adds (n,) numbers, the same in every pass; those that are not finite are left out."""
+        """Add (n,) numbers, the same in every pass; those that are not finite are left out."""
         if not self.passes:
             return
         values = np.ascontiguousarray(values)
@@ -75,7 +75,7 @@ class Percentiles:
                 self._kept = None
 
     def end_pass(self) -> None:
-        """Ends a pass over all numbers."""
+        """End a pass over all numbers."""
         if not self.passes:
             return
         if self._first:
@@ -105,7 +105,7 @@ class Percentiles:
         self._look_for(np.unique(self._found) if self.passes else self._prefixes[:0])
 
     def values(self) -> NDArray[np.float64]:
-        """The percentiles, after the last pass; there must be numbers."""
+        """Return the percentiles, after the last pass; there must be numbers."""
         places = (self.count - 1) * self._shares
         low = np.floor(places).astype(np.int64)
         share = places - low
@@ -133,6 +133,6 @@ def _keys(values: FloatArray, kind: np.dtype[np.unsignedinteger]) -> NDArray[np.
 
 
 def _floats(keys: NDArray[np.unsignedinteger], kind: np.dtype[np.floating]) -> FloatArray:
-    """The floats of `_keys`."""
+    """Return the floats of `_keys`."""
     sign = keys.dtype.type(1 << (8 * keys.dtype.itemsize - 1))
     return np.where(keys & sign, keys ^ sign, ~keys).view(kind)

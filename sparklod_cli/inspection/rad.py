@@ -68,7 +68,7 @@ class RadFacts:
 
 
 def survey(path: Path, *, check: bool) -> Survey | None:
-    """Reads the headers of a RAD file and of its chunks; None for a file of another format.
+    """Read the headers of a RAD file and of its chunks; None for a file of another format.
 
     Args:
         path: of the file; - is standard input.
@@ -149,7 +149,7 @@ def _facts(header: RadHeader, gathered: _Gathered) -> RadFacts:
 
 
 def ends_of(facts: RadFacts) -> Ends:
-    """The ends of the codes of a file; there are none where chunks have several encodings."""
+    """Return the ends of the codes of a file; there are none where chunks have several encodings."""
     center, scales = facts.properties.get("center"), facts.properties.get("scales")
     ends = Ends()
     if center is not None and center.encoding in ("f16", "f16_lebytes"):

@@ -109,11 +109,11 @@ class Report:
         return any(found.severity in ("error", severity) for found in self.findings or [])
 
     def value_at(self, name: str) -> Any:
-        """The value of a field, see `value_at`."""
+        """Return the value of a field, see `value_at`."""
         return value_at(self.as_dict(), name)
 
     def as_dict(self) -> dict[str, Any]:
-        """The report as plain values, for JSON."""
+        """Return the report as plain values, for JSON."""
         plain = {"schema_version": SCHEMA_VERSION} | dataclasses.asdict(self)
         if self.findings is not None:
             plain["findings"] = [{"severity": found.severity} | dataclasses.asdict(found) for found in self.findings]
@@ -121,7 +121,7 @@ class Report:
 
 
 def value_at(plain: dict[str, Any], name: str) -> Any:
-    """The value of a field of a report as JSON: keys and indices with dots between ("tree.levels.0.nodes").
+    """Return the value of a field of a report as JSON: keys and indices with dots between ("tree.levels.0.nodes").
 
     Raises:
         NoFieldError: there is no such field.
@@ -138,7 +138,7 @@ def value_at(plain: dict[str, Any], name: str) -> Any:
 def inspect(
     path: Path, settings: ReportSettings, *, threads: int = 1, progress: Progress = silent
 ) -> tuple[Report, Scene | None]:
-    """The report on a file, and its scene as far as it was read.
+    """Return the report on a file, and its scene as far as it was read.
 
     A file that cannot be read gives a finding, not an error, and None for the scene. Unless the scene is wanted as a
     whole (`ReportSettings.at_once`), it is None of RAD files that are read chunk by chunk and of SPZ files.
@@ -192,7 +192,7 @@ def _of_blocks(
     surveyed: Survey | None,
     threads: int,
 ) -> Report:
-    """The report on a file that can be read, block by block."""
+    """Return the report on a file that can be read, block by block."""
     about = blocks.about
     ends, size = value_checks.ends_of(about.header), about.header.get("bytes", size)
     findings = _container_findings(about)
@@ -245,7 +245,7 @@ def _of_blocks(
 
 
 def _report(path: Path, head: Head | None, surveyed: Survey | None) -> Report:
-    """The report that headers alone give."""
+    """Return the report that headers alone give."""
     assert head is not None
     size, count = head.bytes, head.splats
     decoded = 4 * count * (14 + 3 * COEFFICIENTS[head.sh_degree])

@@ -95,7 +95,7 @@ class StreamedSogFacts:
 
 
 def survey(path: Path, *, check: bool, threads: int = 1, progress: Progress = silent) -> Survey | None:
-    """Reads a manifest and the headers of its chunk files; None for a file of another format.
+    """Read a manifest and the headers of its chunk files; None for a file of another format.
 
     Args:
         path: of the manifest, or of its folder; - is standard input.
@@ -135,7 +135,7 @@ def _head(manifest: Manifest, chunks: Mapping[str, Chunk], facts: StreamedSogFac
 
 
 def _names_of(manifest: Manifest, level: int) -> list[str]:
-    """The chunk files with splats of a level."""
+    """Return the chunk files with splats of a level."""
     held = {node.runs[level].file for _, node in manifest.regions() if node.runs and _count(node, level)}
     return [manifest.filenames[number] for number in sorted(held)]
 
@@ -191,7 +191,7 @@ def _level(manifest: Manifest, chunks: Mapping[str, Chunk], level: int, counts: 
 
 
 def _count(node: ManifestNode, level: int) -> int:
-    """The splats of a region at a level."""
+    """Return the splats of a region at a level."""
     return node.runs[level].count if node.runs and level in node.runs else 0
 
 
@@ -204,12 +204,12 @@ def _depth(manifest: Manifest) -> int:
 
 
 def _edge(low: float, high: float) -> float:
-    """The length between two numbers, which are finite but may be as large as numbers are."""
+    """Return the length between two numbers, which are finite but may be as large as numbers are."""
     return min(max(high - low, -LARGEST), LARGEST)
 
 
 def _quantiles(values: Sequence[float], weights: Sequence[float] | None = None) -> dict[str, float]:
-    """The quantiles of values, each of them one of these, and their mean.
+    """Return the quantiles of values, each of them one of these, and their mean.
 
     Args:
         values: one or more.

@@ -54,14 +54,14 @@ def parts_of(tree: LodTree) -> list[slice]:
 
 
 def node_text(tally: Tally, what: str) -> str:
-    """The text of a finding about nodes."""
+    """Return the text of a finding about nodes."""
     return f"node {{first}} {what}{' (and {more} more)' if tally.count > 1 else ''}"
 
 
 def link_findings(
     tree: LodTree, parent: NDArray[np.int32], references: NDArray[np.int32], depth: NDArray[np.int32], threads: int
 ) -> list[Finding]:
-    """Findings about the links of a tree of N nodes.
+    """Return findings about the links of a tree of N nodes.
 
     Args:
         tree: of them.
@@ -109,7 +109,7 @@ def size_findings(
     scale_ends: tuple[float, float],
     threads: int,
 ) -> list[Finding]:
-    """Findings about nodes that are much smaller than their children, N nodes in all.
+    """Return findings about nodes that are much smaller than their children, N nodes in all.
 
     Args:
         blocks: of the nodes; read if a node may be too small.
@@ -163,7 +163,7 @@ def size_findings(
 
 
 def order_findings(parent: NDArray[np.int32], limit: FloatArray, threads: int) -> list[Finding]:
-    """A finding if a tree of N nodes is not in the order coarse before fine.
+    """Return a finding if a tree of N nodes is not in the order coarse before fine.
 
     Args:
         parent: (N,) of `find_parents`.
@@ -284,7 +284,7 @@ class Columns:
 def examine(
     splats: Splats, tree: LodTree, *, check: bool = True, scale_ends: tuple[float, float] = (0.0, math.inf)
 ) -> tuple[TreeFacts, list[Finding]]:
-    """The facts of a tree in memory and findings about it, see `examine_blocks`.
+    """Return the facts of a tree in memory and findings about it, see `examine_blocks`.
 
     Args:
         splats: N nodes, of which scale and opacity are used.
@@ -308,7 +308,7 @@ def examine_blocks(
     in_chunks: bool = False,
     threads: int = 1,
 ) -> tuple[TreeFacts, list[Finding]]:
-    """The facts of a tree and findings about it; of a broken tree, the facts of the nodes that its root leads to.
+    """Return the facts of a tree and findings about it; of a broken tree, those of the nodes that its root leads to.
 
     At most 31 bytes a node are in memory, those of `columns` among them; 18 where nothing is checked.
 
@@ -364,12 +364,12 @@ def examine_blocks(
 
 
 def _at_once(threads: int, *work: Callable[[], Any]) -> Iterator[Any]:
-    """What each of these returns."""
+    """Return the results of the functions."""
     return ordered_map(lambda each: each(), work, threads)
 
 
 def _coarse_cut(tree: LodTree, limit: FloatArray) -> tuple[NDArray[np.int64], int]:
-    """The nodes of the cut that refines the largest nodes first, until it would have more than `CHUNK_NODES`.
+    """Return the nodes of the cut that refines the largest nodes first, until it would have more than `CHUNK_NODES`.
 
     Also the number of inner nodes whose children lie in more than one chunk.
     """
@@ -395,6 +395,6 @@ def _coarse_cut(tree: LodTree, limit: FloatArray) -> tuple[NDArray[np.int64], in
 
 
 def _large(tree: LodTree, limit: FloatArray, least: float, part: slice) -> NDArray[np.intp]:
-    """The places in a part of the inner nodes whose limits are above 0 and `least` or more."""
+    """Return the places in a part of the inner nodes whose limits are above 0 and `least` or more."""
     some = limit[part]
     return np.flatnonzero((tree.child_count[part] > 0) & (some > 0) & (some >= least))

@@ -43,7 +43,7 @@ class Ends:
 
 
 def ends_of(header: Mapping[str, int]) -> Ends:
-    """The ends of the codes of an SPZ file by its header, and none for other formats, whose numbers are floats."""
+    """Return the ends of the codes of an SPZ file by its header; none for other formats, whose numbers are floats."""
     if "fractional_bits" not in header:
         return Ends()
     low, high = quantize.decode_log_scale(np.array([0, 255], np.uint8))
@@ -124,19 +124,19 @@ class ValueTally:
         )
 
     def number(self, name: str) -> int:
-        """Number of splats in a tally."""
+        """Return the number of splats in a tally."""
         return self.by_name.get(name, Tally()).count
 
 
 def check(scene: Scene) -> list[Finding]:
-    """Findings about the values of a scene in memory."""
+    """Return findings about the values of a scene in memory."""
     ends, blocks = ends_of(scene.header), Blocks.of(scene)
     parts = blocks.map(lambda block: ValueTally.of(block, ends), COLUMNS, 1)
     return findings_about(ValueTally.total(parts), ends, is_tree=blocks.is_tree)
 
 
 def findings_about(values: ValueTally, ends: Ends, *, is_tree: bool) -> list[Finding]:
-    """Findings about the values of all splats of a file.
+    """Return findings about the values of all splats of a file.
 
     Args:
         values: of all blocks.

@@ -115,7 +115,7 @@ class ValueFacts:
 
 
 def names_of(splats: Splats) -> list[str]:
-    """The names of the quantities of these splats: those of SH by their degree."""
+    """Return the names of the quantities of these splats: those of SH by their degree."""
     return [name for name, row in QUANTITIES.items() if row.sh_degree <= splats.sh_degree]
 
 
@@ -126,7 +126,7 @@ def quantity(splats: Splats, name: str) -> FloatArray:
 
 
 def histogram_of(splats: Splats, name: str, *, bins: int = 40) -> Histogram:
-    """The histogram of one of `names_of(splats)`, by its name."""
+    """Return the histogram of one of `names_of(splats)`, by its name."""
     return histogram(quantity(splats, name), bins=bins, log=False if QUANTITIES[name].linear else None)
 
 

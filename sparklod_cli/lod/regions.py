@@ -1,5 +1,6 @@
-"""Regions of a scene at several detail levels, a binary kd partition of the nodes of the coarsest level; and what is
-far outside of it, its environment, such as a sky, which is drawn whatever the levels are.
+"""Regions of a scene at several detail levels: a binary kd partition of the nodes of the coarsest level.
+
+What is far outside, such as a sky, is the environment, which is drawn whatever the levels are.
 """
 
 from __future__ import annotations

@@ -45,7 +45,7 @@ class Tally:
         return self.count - sum(self.dropped.values())
 
     def then(self, after: Tally) -> Tally:
-        """That of these splats and those that come after them."""
+        """Return the result for these splats and those that come after them."""
         first = self.first_invalid
         if first is None and after.first_invalid is not None:
             first = self.count + after.first_invalid
@@ -71,7 +71,7 @@ class Selection:
     within: tuple[Vector, float] | None = None
 
     def apply(self, splats: Splats, *, threads: int = 1) -> tuple[Splats, dict[str, int]]:
-        """The splats that are kept, in their order, and the number dropped for each of `REASONS` that occurred.
+        """Return the splats that are kept, in their order, and the number dropped for each of `REASONS` that occurred.
 
         Raises:
             InvalidSplatsError: there are no splats, some are invalid without `drop_invalid`, or none is left.
@@ -111,7 +111,7 @@ class Selection:
         return keep, Tally(len(splats), {reason: count for reason, count in dropped.items() if count}, first)
 
     def check(self, tally: Tally) -> None:
-        """Checks that a tree can be made of what is kept of a whole scene.
+        """Check that a tree can be made of what is kept of a whole scene.
 
         Raises:
             InvalidSplatsError: see `apply`.
@@ -139,5 +139,5 @@ class Selection:
 
 
 def describe(dropped: dict[str, int]) -> str:
-    """ "12 not finite, 3 cropped", for display."""
+    """Return the dropped splats for display, such as "12 not finite, 3 cropped"."""
     return ", ".join(f"{count:,} {REASONS[reason]}" for reason, count in dropped.items())

@@ -98,12 +98,12 @@ class Kernel:
 
     @property
     def dispatcher(self) -> Any:
-        """numba's function, which may be called with arguments of any types that it can be compiled for."""
+        """Numba's function, which may be called with arguments of any types that it can be compiled for."""
         return self.built or load_numba().dispatcher_of(self)
 
     @functools.cached_property
     def signatures(self) -> list[tuple[Any, ...]]:
-        """numba's types of the arguments of each declared signature."""
+        """Numba's types of the arguments of each declared signature."""
         import numba
 
         return [tuple(numba.typeof(example(each)) for each in types) for types in self.declared]

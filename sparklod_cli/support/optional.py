@@ -119,7 +119,7 @@ class Required:
 
     @property
     def found(self) -> str:
-        """ "2.4.6", "is missing", or "1.20, older than 1.26"."""
+        """Return the state for display: "2.4.6", "is missing", or "1.20, older than 1.26"."""
         if self.version is None:
             return "is missing"
         return f"{self.version}, older than {self.least}" if self.missing else self.version

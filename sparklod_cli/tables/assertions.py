@@ -58,7 +58,7 @@ class Condition:
 
     @classmethod
     def of(cls, name: str, sign: str, bound: Any) -> Condition:
-        """A condition that nobody typed."""
+        """Return a condition that nobody typed."""
         return cls(f"{name}{sign}{json.dumps(bound)}", name, sign, bound)
 
     def holds(self, value: Any) -> bool:
@@ -76,7 +76,7 @@ def is_number(value: Any) -> bool:
 
 
 def parse_condition(text: str, *, example: str) -> Condition:
-    """A condition from `NAME SIGN VALUE`.
+    """Return a condition from `NAME SIGN VALUE`.
 
     VALUE is a number, which may end in k, M, G, % or a unit of bytes (3MB, 3MiB); or true, false, null or a text in
     double quotes.
@@ -122,7 +122,7 @@ def _number(text: str, right: str) -> Number:
 
 
 def number_text(value: Number) -> str:
-    """A number as exact as a comparison needs it: "1,234,567", "0.2", "0.123457"."""
+    """Return a number as exact as a comparison needs it: "1,234,567", "0.2", "0.123457"."""
     return f"{int(value):,}" if float(value).is_integer() and abs(value) < 1e15 else f"{value:.9g}"
 
 
@@ -169,7 +169,7 @@ class Outcome:
     worst: Row | None
 
     def message(self) -> str:
-        """The outcome, in a line."""
+        """Return the outcome, in a line."""
         asked = self.assertion
         where = self.worst and place_text(self.worst)
         if not asked.statistic:
@@ -185,7 +185,7 @@ class Outcome:
 
 
 def parse(text: str, columns: Sequence[Column]) -> Assertion:
-    """An assertion from `NAME[_STATISTIC] SIGN NUMBER`.
+    """Return an assertion from `NAME[_STATISTIC] SIGN NUMBER`.
 
     NAME is that of a numeric column, the longest one that fits: `pixel_scale_min<1` is about every cell of the column
     pixel_scale_min, `pixel_scale_min_max<1` about the largest of them. NUMBER may end in k, M, G or %.
@@ -205,7 +205,7 @@ def parse(text: str, columns: Sequence[Column]) -> Assertion:
 
 
 def _column(text: str, left: str, columns: Sequence[Column]) -> tuple[Column, str]:
-    """The column and the statistic on the left side; the statistic may be empty."""
+    """Return the column and the statistic on the left side; the statistic may be empty."""
     every = {column.name: column for column in columns}
     fitting = [
         name for name in every if left == name or (left.startswith(f"{name}_") and is_statistic(left[len(name) + 1 :]))
@@ -219,7 +219,7 @@ def _column(text: str, left: str, columns: Sequence[Column]) -> tuple[Column, st
 
 
 def _unknown(left: str, columns: Sequence[Column]) -> str:
-    """The error about a name that is neither a column nor a column with a statistic."""
+    """Return the error about a name that is neither a column nor a column with a statistic."""
     numeric = [column.name for column in columns if column.kind is not str]
     stem, _, last = left.rpartition("_")
     name = stem if stem and is_statistic(last) else left
@@ -234,7 +234,7 @@ def _unknown(left: str, columns: Sequence[Column]) -> str:
 def check(
     assertions: Sequence[Assertion], rows: Iterable[Row], *, empty: Mapping[str, str] = MappingProxyType({})
 ) -> list[Outcome]:
-    """The outcomes of assertions, in their order.
+    """Return the outcomes of assertions, in their order.
 
     Args:
         assertions: to check.
@@ -280,7 +280,7 @@ def _badness(assertion: Assertion, value: Number) -> Number:
 
 
 def place_text(row: Row) -> str:
-    """The frame of a row, for display: "frame 12 at 0.400 s (door)"."""
+    """Return the frame of a row, for display: "frame 12 at 0.400 s (door)"."""
     at = "" if row["time_s"] is None else f" at {row['time_s']:.3f} s"
     name = "" if row["name"] is None else str(row["name"]).replace("\r", "\\r").replace("\n", "\\n")
     return f"frame {row['frame']}{at}" + (f" ({name})" if name else "")

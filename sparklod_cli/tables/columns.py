@@ -33,7 +33,7 @@ class Column:
     meaning: str
 
     def rounded(self, value: Cell) -> Cell:
-        """A value rounded to the digits of this column. Rows hold rounded values, so that all file formats agree.
+        """Return a value rounded to the digits of this column.
 
         A number that is not finite, of splats that are not, is an empty cell.
         """
@@ -44,7 +44,7 @@ class Column:
         return float(format(value, self.digits)) + 0.0  # adding 0 turns -0 into 0
 
     def text(self, value: Cell) -> str:
-        """The text of a cell in a CSV file."""
+        """Return the text of a cell in a CSV file."""
         if value is None:
             return ""
         return format(value, self.digits) if self.digits else str(value)
@@ -96,7 +96,7 @@ class Table(Sequence[Row]):
         return f"{type(self).__name__}({len(self.rows):,} rows of {len(self.columns)} columns)"
 
     def column(self, name: str) -> list[Cell]:
-        """The cells of a column, None where one is empty.
+        """Return the cells of a column, None where one is empty.
 
         Raises:
             KeyError: there is no such column; the text names those that there are.
@@ -107,7 +107,7 @@ class Table(Sequence[Row]):
         return [row[name] for row in self.rows]
 
     def to_pandas(self) -> Any:
-        """A pandas DataFrame with the same columns; empty cells are missing values.
+        """Return a pandas DataFrame with the same columns; empty cells are missing values.
 
         Raises:
             SparklodError: pandas is not installed.

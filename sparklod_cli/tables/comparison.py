@@ -88,13 +88,13 @@ class BudgetSummary:
 
 
 def rows_by_budget(rows: Iterable[Row], budgets: int) -> list[list[Row]]:
-    """The rows of each of some budgets, in the order of the frames."""
+    """Return the rows of each of some budgets, in the order of the frames."""
     every = list(rows)
     return [every[at::budgets] for at in range(budgets)]
 
 
 def summarize(rows: Iterable[Row], budgets: Sequence[str]) -> list[BudgetSummary]:
-    """What the rows of a comparison come to, for each budget, named as it was given."""
+    """Return the summary of the rows of a comparison for each budget, named as it was given."""
     return [_summary(budget, mine) for budget, mine in zip(budgets, rows_by_budget(rows, len(budgets)), strict=True)]
 
 

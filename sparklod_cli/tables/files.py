@@ -26,7 +26,7 @@ FORMULAS = ("=", "+", "-", "@", "\t", "\r", "\n")
 
 
 def encode(rows: Iterable[Row], columns: Sequence[Column], form: str) -> Iterator[bytes]:
-    """The pieces of a file of rows. CSV and JSON are made row by row, so that long paths take no memory.
+    """Return the pieces of a file of rows. CSV and JSON are made row by row, so that long paths take no memory.
 
     An empty text is written as an empty cell, since CSV cannot tell them apart; what UTF-8 cannot hold becomes "?". In
     CSV a ' is put before a text that a spreadsheet would take for a formula.
@@ -46,7 +46,7 @@ def encode(rows: Iterable[Row], columns: Sequence[Column], form: str) -> Iterato
 
 
 def load_pyarrow() -> ModuleType:
-    """Imports pyarrow.
+    """Import pyarrow.
 
     Raises:
         SparklodError: it is not installed.
@@ -58,7 +58,7 @@ def load_pyarrow() -> ModuleType:
 
 
 def _cell(column: Column, row: Row) -> Cell:
-    """The value of a cell in every format."""
+    """Return the value of a cell in every format."""
     value = row[column.name]
     if isinstance(value, str):
         return value.encode("utf-8", "replace").decode("utf-8") or None
@@ -74,13 +74,13 @@ def _csv(rows: Iterable[Row], columns: Sequence[Column]) -> Iterator[bytes]:
 
 
 def _field(column: Column, row: Row) -> str:
-    """A field of CSV; a ' before a formula makes it a text."""
+    """Return a field of CSV; a ' before a formula makes it a text."""
     text = column.text(_cell(column, row))
     return _quoted("'" + text if column.kind is str and text.startswith(FORMULAS) else text)
 
 
 def _quoted(text: str) -> str:
-    """A quoted field of CSV. The module csv quotes carriage returns in some versions of Python only."""
+    """Return a quoted field of CSV. The module csv quotes carriage returns in some versions of Python only."""
     return '"' + text.replace('"', '""') + '"' if any(mark in text for mark in QUOTED) else text
 
 

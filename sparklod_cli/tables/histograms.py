@@ -41,7 +41,7 @@ class Histogram:
 
 
 def histogram(values: FloatArray, *, bins: int = 40, log: bool | None = None) -> Histogram:
-    """The histogram of some numbers.
+    """Return the histogram of some numbers.
 
     Args:
         values: (N,) numbers, finite or not.
@@ -86,7 +86,7 @@ def _range(values: NDArray[np.float64]) -> tuple[float, float]:
 
 
 def as_text(histogram: Histogram, *, width: int = 60, rows: int = 20) -> str:
-    """A line for each bin, with its lower edge, count and bar, and lines for the numbers outside the bins.
+    """Return a line for each bin, with its lower edge, count and bar, and lines for the numbers outside the bins.
 
     Args:
         histogram: whose bins are joined where there are more than `rows`.
@@ -116,13 +116,13 @@ def as_text(histogram: Histogram, *, width: int = 60, rows: int = 20) -> str:
 
 
 def bar(count: int, most: int, width: int) -> str:
-    """A bar of blocks, `width` characters long for `most`; any count above 0 is visible."""
+    """Return a bar of blocks, `width` characters long for `most`; any count above 0 is visible."""
     eighths = 0 if not count else max(1, round(8 * width * count / most))
     return "█" * (eighths // 8) + EIGHTHS[eighths % 8].strip()
 
 
 def edge_names(edges: NDArray[np.float64]) -> list[str]:
-    """The edges as text, with the fewest significant digits, from 3 on, that keep them apart."""
+    """Return the edges as text, with the fewest significant digits, from 3 on, that keep them apart."""
     gap = float(np.diff(edges).min())
     if gap > 1e-12:  # rounds edges that are 0 but for the error of float arithmetic
         edges = np.round(edges, 2 - math.floor(math.log10(gap))) + 0.0

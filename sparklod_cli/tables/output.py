@@ -36,14 +36,14 @@ class TableOutput:
         return self.path is None and self.form is not None
 
     def check(self) -> None:
-        """Raises a `SparklodError` where the table cannot be written, before work goes into it."""
+        """Raise a `SparklodError` where the table cannot be written, before work goes into it."""
         if self.path is not None:
             check_writable(self.path, overwrite=self.overwrite)
         if self.form == "parquet":
             load_pyarrow()
 
     def write(self, rows: Iterable[Row], *, passed: Filter | None = None) -> None:
-        """Makes all rows and writes them, as they come.
+        """Make all rows and write them, as they come.
 
         Args:
             rows: of the table.
@@ -64,7 +64,7 @@ class TableOutput:
 
 
 def kept(rows: Iterable[Row], into: list[Row]) -> Iterator[Row]:
-    """The rows, each put into a list on its way."""
+    """Yield the rows, each put into a list on its way."""
     for row in rows:
         into.append(row)
         yield row

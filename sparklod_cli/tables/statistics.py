@@ -33,7 +33,7 @@ def is_statistic(name: str) -> bool:
 
 
 def statistic(name: str, values: Sequence[Number]) -> Number:
-    """A statistic of the numbers of a column.
+    """Return a statistic of the numbers of a column.
 
     Args:
         name: one of `STATISTICS`, or a percentile such as p95, interpolated linearly.
@@ -45,10 +45,10 @@ def statistic(name: str, values: Sequence[Number]) -> Number:
 
 
 def totals(rows: Iterable[Row]) -> list[Row]:
-    """The rows of all instances together, one a frame; all rows of a table without a column for instances."""
+    """Return the rows of all instances together, one a frame; all rows of a table without a column for instances."""
     return [row for row in rows if row.get("instance", TOTAL) == TOTAL]
 
 
 def numbers(rows: Iterable[Row], name: str) -> list[Number]:
-    """The cells of a numeric column that are not empty, in order."""
+    """Return the cells of a numeric column that are not empty, in order."""
     return [cell for row in rows if isinstance(cell := row[name], (int, float))]

@@ -26,7 +26,7 @@ FOLDERS, SUFFIXES = ("data", "lib"), (".html", ".css", ".js", ".json")
 
 
 def check_folder(folder: Path, site: Site | None = None, *, overwrite: bool) -> None:
-    """Raises an `OutputError` where a site cannot be written into a folder.
+    """Raise an `OutputError` where a site cannot be written into a folder.
 
     A folder that exists is replaced only if it is empty or a site that was exported before: what else somebody keeps
     in a folder, such as the .git of the pages that it is published from, is not ours to remove.
@@ -68,7 +68,7 @@ def _is_foreign(path: Path) -> bool:
 
 
 def export(site: Site, folder: Path, *, overwrite: bool, progress: Progress = silent) -> int:
-    """Writes a site and returns its bytes.
+    """Write a site and return its bytes.
 
     Args:
         site: that is written.
@@ -110,7 +110,7 @@ def _pieces(path: Path) -> Iterator[bytes]:
 
 
 def _replace(folder: Path, part: Path) -> None:
-    """Gives a complete folder its name; what had it before is put aside, and back where that fails."""
+    """Give a complete folder its name; what had it before is put aside, and back where that fails."""
     if not folder.exists():
         part.rename(folder)
         return

@@ -97,17 +97,17 @@ class ShownFile:
 
 
 def media_type(name: str) -> str:
-    """The media type of a resource, by its suffix."""
+    """Return the media type of a resource, by its suffix."""
     return MEDIA_TYPES.get(Path(name).suffix.lower(), BYTES)
 
 
 def url_of(name: str) -> str:
-    """A resource's name as a relative address."""
+    """Return a resource's name as a relative address."""
     return quote(os.fsencode(name))
 
 
 def shown_files(paths: Sequence[Path]) -> list[ShownFile]:
-    """The files that a page shows, each with those that it refers to.
+    """Return the files that a page shows, each with those that it refers to.
 
     Raises:
         FormatError: a file cannot be read, is of no known format, or refers to one that is missing or elsewhere; or
@@ -173,7 +173,7 @@ def _note(name: str, head: bytes, header: RadHeader | None) -> str | None:
 
 
 def _chunk_files(path: Path, header: RadHeader) -> Iterator[tuple[str, Path]]:
-    """The chunk files that the header of a RAD file names."""
+    """Yield the chunk files that the header of a RAD file names."""
     for name in header.filenames:
         beside = path_beside(path, name)
         if not beside.is_file():
@@ -191,7 +191,7 @@ def _manifest_files(path: Path) -> list[str]:
 
 
 def _inside(path: Path, beside: Path) -> Path:
-    """The real path of a file that another one names; `FormatError` where a link leads out of its folder."""
+    """Return the real path of a file that another one names; `FormatError` where a link leads out of its folder."""
     real = beside.resolve()
     if real.parent != path.parent.resolve() / beside.relative_to(path.parent).parent:
         raise FormatError(f"{quoted_value(beside.name)}, which it names, is a link to another folder; copy it there")

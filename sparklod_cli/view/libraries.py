@@ -63,7 +63,7 @@ class Libraries:
     files: Mapping[str, Path]
 
     def import_map(self) -> dict[str, dict[str, str]]:
-        """What `<script type="importmap">` holds."""
+        """Return the content of `<script type="importmap">`."""
         imports = {
             name: self._url(package, path) for name, (package, path) in NAMES.items() if package in self.versions
         }
@@ -73,7 +73,7 @@ class Libraries:
         return _url(self.base, package, self.versions[package] if self.integrity else None, path)
 
     def notes(self) -> list[str]:
-        """What a person should know of the versions."""
+        """Return notes on the versions for display."""
         return [
             f"{self.source} has {package} {version}; the page was tested with {VERSIONS[package]}"
             for package, version in self.versions.items()
@@ -86,7 +86,7 @@ def _url(base: str, package: str, version: str | None, path: str) -> str:
 
 
 def from_cdn(engine: str = "spark") -> Libraries:
-    """The libraries of the CDN for an engine."""
+    """Return the libraries of the CDN for an engine."""
     versions = {package: VERSIONS[package] for package in PACKAGES[engine]}
     integrity = {
         _url(CDN, package, versions[package], path): f"sha384-{digest}"
@@ -97,7 +97,7 @@ def from_cdn(engine: str = "spark") -> Libraries:
 
 
 def from_folder(folder: Path, engine: str = "spark") -> Libraries:
-    """The libraries for an engine of a folder that has a node_modules, or is one.
+    """Return the libraries for an engine of a folder that has a node_modules, or is one.
 
     Raises:
         SparklodError: a package, or a module of it, is missing; the text says how to install it.
@@ -123,7 +123,7 @@ def from_folder(folder: Path, engine: str = "spark") -> Libraries:
 
 
 def _version(package: Path) -> str:
-    """The version of an installed package."""
+    """Return the version of an installed package."""
     try:
         value = parse_json(read_text(package / "package.json"))
         return printable(str(value["version"]), 40)

@@ -131,12 +131,12 @@ class Handler(BaseHTTPRequestHandler):
     timeout = IDLE
 
     def do_GET(self) -> None:
-        """Sends a resource, or a range of it."""
+        """Send a resource, or a range of it."""
         if self._is_ours():
             self._send_resource(body=True)
 
     def do_HEAD(self) -> None:
-        """Sends the headers of a resource."""
+        """Send the headers of a resource."""
         if self._is_ours():
             self._send_resource(body=False)
 
@@ -146,7 +146,7 @@ class Handler(BaseHTTPRequestHandler):
             self._answer(HTTPStatus.NO_CONTENT, {"Allow": "GET, HEAD", **(PREFLIGHT if self.server.cors else {})})
 
     def do_POST(self) -> None:
-        """Parses a camera path that was dropped onto our page."""
+        """Parse a camera path that was dropped onto our page."""
         if not self._is_ours():
             return
         if self.path != f"/{CAMERAS}":
@@ -168,7 +168,7 @@ class Handler(BaseHTTPRequestHandler):
         self._answer(status, {"Content-Type": "application/json"}, data)
 
     def _body(self) -> bytes | None:
-        """The body of a request; None where it was refused."""
+        """Return the body of a request; None where it was refused."""
         length = self.headers.get("Content-Length", "")
         if not (length.isascii() and length.isdigit()) or "Transfer-Encoding" in self.headers:
             self._refuse(HTTPStatus.LENGTH_REQUIRED, "the request has no Content-Length")
@@ -253,7 +253,7 @@ class Handler(BaseHTTPRequestHandler):
             self.close_connection = True
 
     def _refuse(self, status: HTTPStatus, text: str, headers: Mapping[str, str] | None = None) -> None:
-        """Sends an error; its body may be unread, so the connection ends."""
+        """Send an error; its body may be unread, so the connection ends."""
         self.close_connection = True
         more = {"Content-Type": "text/plain; charset=utf-8", "Connection": "close", **(headers or {})}
         self._answer(status, more, f"{text}\n".encode(), body=self.command != "HEAD")
@@ -293,7 +293,7 @@ class Span:
 
 
 def span_of(text: str | None, size: int) -> Span | None:
-    """The bytes that a Range header asks for; None where the whole file is sent.
+    """Return the bytes that a Range header asks for; None where the whole file is sent.
 
     That is where there is no header, or where it is one that a server may ignore: of another unit, with several
     ranges, or broken.

@@ -44,7 +44,7 @@ MAX_CAMERAS = 20_000
 
 
 def parse_drop(body: bytes, settings: CameraSettings) -> dict[str, Any]:
-    """The path of some dropped files, as `frames_of` has it.
+    """Return the path of some dropped files, as `frames_of` has it.
 
     Args:
         body: JSON, {"files": [{"name": text, "data": base64}]}.
@@ -66,7 +66,7 @@ def parse_drop(body: bytes, settings: CameraSettings) -> dict[str, Any]:
 
 
 def _read(path: Path, settings: CameraSettings) -> CameraPath:
-    """The cameras of a file; those that have up axes of their own keep them."""
+    """Return the cameras of a file; those that have up axes of their own keep them."""
     if settings.up is not None:
         with contextlib.suppress(CameraPathError):
             return read_path(path, settings=settings)
@@ -74,7 +74,7 @@ def _read(path: Path, settings: CameraSettings) -> CameraPath:
 
 
 def _contents(body: bytes) -> Mapping[str, bytes]:
-    """The dropped files by their names, at least one."""
+    """Return the dropped files by their names, at least one."""
     try:
         files = parse_json(body)["files"]
         contents = {file["name"]: b64decode(file["data"], validate=True) for file in files[:MAX_FILES]}
@@ -89,7 +89,7 @@ def _contents(body: bytes) -> Mapping[str, bytes]:
 
 
 def frames_of(path: CameraPath) -> dict[str, Any]:
-    """A camera path as the page plays it: matrices from camera to world, column by column, degrees and seconds."""
+    """Return a camera path as the page plays it: camera-to-world matrices by columns, degrees and seconds."""
     every = -(-len(path) // MAX_CAMERAS)
     notes = [*path.notes]
     if every > 1:
@@ -166,7 +166,7 @@ def site_of(
     cameras: CameraSettings,
     served: bool,
 ) -> Site:
-    """The site of some files.
+    """Return the site of some files.
 
     Args:
         shown: the files, and
@@ -221,7 +221,7 @@ def _file(shown: ShownFile, extent: Extent) -> dict[str, Any]:
 
 
 def _index(template: str, title: str, libraries: Libraries) -> str:
-    """The page with the addresses of its libraries, and a policy that lets it load nothing else."""
+    """Return the page with the addresses of its libraries, and a policy that lets it load nothing else."""
     import_map = json.dumps(libraries.import_map(), indent=1).replace("<", "\\u003c")
     digest = base64.b64encode(hashlib.sha256(import_map.encode()).digest()).decode()
     scripts = ["'self'", f"'sha256-{digest}'", "'wasm-unsafe-eval'", *libraries.integrity]

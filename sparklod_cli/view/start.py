@@ -44,7 +44,7 @@ BELOW = 8
 
 @dataclass(frozen=True)
 class Extent:
-    """What a file holds.
+    """Return the extent of a file, for the first view.
 
     Attributes:
         splats: how many, nodes where it is a tree.
@@ -86,7 +86,7 @@ class Start:
 
 
 def extent_of(shown: ShownFile, *, threads: int = 1, progress: Progress = silent) -> Extent:
-    """What a file holds.
+    """Return the extent of a file, for the first view.
 
     Raises:
         SparklodError: it is broken; the text names it.
@@ -108,7 +108,7 @@ def extent_of(shown: ShownFile, *, threads: int = 1, progress: Progress = silent
 
 
 def _coarse_extent(shown: ShownFile, header: RadHeader) -> Extent:
-    """That of a RAD tree by its first chunk, as a viewer first has it, and its leaves: a file may have gigabytes.
+    """Return the extent of a RAD tree by its first chunk and its leaves, since a file may have gigabytes.
 
     A cut through the chunk, its nodes that have no children in it, covers the whole scene.
     """
@@ -139,7 +139,7 @@ def _detail_extent(path: Path, threads: int, progress: Progress) -> Extent:
 
 
 def _sizes(splats: Splats) -> tuple[float, float]:
-    """The range of the feature sizes of some splats, as if none had a D above 1; both ends are above 0."""
+    """Return the range of the feature sizes of some splats, as if none had a D above 1; both ends are above 0."""
     sizes = 2 * splats.scale[:: max(len(splats) // framing.SAMPLE, 1)].mean(axis=1, dtype=np.float64)
     sizes = sizes[np.isfinite(sizes) & (sizes > 0)]
     if not len(sizes):
@@ -149,7 +149,7 @@ def _sizes(splats: Splats) -> tuple[float, float]:
 
 
 def start_of(extents: Sequence[Extent], view: tuple[Point, Point] | None, up: Point, fov: float) -> Start:
-    """The first look at some files together.
+    """Return the extent of some files together.
 
     Args:
         extents: of the files.
@@ -174,7 +174,7 @@ def start_of(extents: Sequence[Extent], view: tuple[Point, Point] | None, up: Po
 
 
 def _ahead(camera: Camera, middle: Matrix) -> Matrix:
-    """The point on the axis of a camera that is nearest to the middle of the scene."""
+    """Return the point on the axis of a camera that is nearest to the middle of the scene."""
     away = float((middle - camera.position) @ camera.forward)
     point: Matrix = camera.position + camera.forward * (away if away > 0 else 1.0)
     return point

@@ -13,7 +13,7 @@ _8, _16, _24 = np.uint32(8), np.uint32(16), np.uint32(24)
 
 @kernel(u4[:], out(u1[:, :]), i8, nogil=True)
 def place_bytes(pixels, out, place):
-    """Puts red, green and blue into one byte of each of three words.
+    """Put red, green and blue into one byte of each of three words.
 
     Args:
         pixels: (N,) uint32.
@@ -29,7 +29,7 @@ def place_bytes(pixels, out, place):
 
 @kernel(u4[:, :], f4[:, :], out(f4[:, :]), nogil=True)
 def look_up_words(words, tables, out):
-    """Fills (N, 3) float32 by (3, 65536) tables and the lower halves of (N, 3) uint32, which may be the same memory."""
+    """Fill (N, 3) float32 by (3, 65536) tables and the lower halves of (N, 3) uint32, which may be the same memory."""
     for i in range(len(words)):
         for axis in range(3):
             out[i, axis] = tables[axis, words[i, axis] & np.uint32(0xFFFF)]
@@ -37,7 +37,7 @@ def look_up_words(words, tables, out):
 
 @kernel(u4[:], u4[:], f4[:, :], out(f4[:, :]), nogil=True)
 def look_up(pixels, shifts, tables, out):
-    """Fills (N, C) float32 by (C, 256) tables and the bytes that stand at (C,) uint32 `shifts` of (N,) pixels."""
+    """Fill (N, C) float32 by (C, 256) tables and the bytes that stand at (C,) uint32 `shifts` of (N,) pixels."""
     for i in range(len(pixels)):
         for k in range(len(shifts)):
             out[i, k] = tables[k, pixels[i] >> shifts[k] & _BYTE]
@@ -45,7 +45,7 @@ def look_up(pixels, shifts, tables, out):
 
 @kernel(u4[:], f4[:], out(f4[:, :]), nogil=True)
 def fill_quats(pixels, components, out):
-    """Fills (N, 4) quaternions x y z w.
+    """Fill (N, 4) quaternions x y z w.
 
     Red, green and blue are the codes of all components but the largest, in the order w x y z; alpha minus 252 is the
     index of that, and anything below gives NaN.
@@ -82,7 +82,7 @@ def fill_quats(pixels, components, out):
 
 @kernel(u4[:], f4[:, :], out(f4[:, :]), nogil=True)
 def gather_rows(pixels, rows, out):
-    """Fills rows by their labels, red + 256 * green, unless one is beyond the last.
+    """Fill rows by their labels, red + 256 * green, unless one is beyond the last.
 
     Args:
         pixels: (N,) uint32.

@@ -65,7 +65,6 @@ def open_chunk(beside: Beside | None, name: str, pieces: Sequence[Piece] | None,
     Raises:
         FormatError: it is no SOG; names it.
     """
-
     with _opened(beside, name) as source:
         content = sog.open_content(source)
     return Chunk(
