@@ -1,4 +1,4 @@
-"""How far cuts are from full detail, as pictures: along a camera path, for one budget after another."""
+"""Image errors of cuts against full detail, along a camera path, for one budget after another."""
 
 from __future__ import annotations
 

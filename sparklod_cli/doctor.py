@@ -1,7 +1,7 @@
-"""What sparklod needs, and whether it is here: what `sparklod doctor` calls, and a program can call.
+"""Checks of the installation, for `sparklod doctor` and for programs.
 
-It must work where nothing else does: packages are looked up by their metadata and tried in processes of their own, as a
-broken one may end its process instead of raising.
+They must work where nothing else does: packages are looked up by their metadata and tried in processes of their own, as
+a broken one may end its process instead of raising.
 """
 
 from __future__ import annotations

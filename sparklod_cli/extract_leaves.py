@@ -22,7 +22,7 @@ from .support.progress import Progress, silent
 
 @dataclass(frozen=True)
 class Extracted:
-    """What was written.
+    """Result of extracting the leaves of a tree.
 
     Attributes:
         format: of the input, for display.

@@ -29,7 +29,7 @@ THUMBNAIL, THUMBNAIL_BUDGET, MOST_SPLATS = (512, 384), 200_000, 3_000_000
 
 @dataclass(frozen=True)
 class DrawSettings:
-    """What is drawn of a file that is inspected.
+    """Outputs of an inspection besides the report: histograms, a picture, a section of the page, a table of chunks.
 
     Attributes:
         histograms: quantities that are drawn as text.
@@ -64,7 +64,7 @@ class DrawSettings:
 
 @dataclass(frozen=True)
 class Inspected:
-    """What came of a file.
+    """Result of an inspection.
 
     Attributes:
         report: on it.

@@ -106,12 +106,12 @@ COLORS_OF_CUTS = ("level", "chunk", "overdraw")
 
 
 class UnfitError(ValueError):
-    """What is asked for does not fit the scenes: a budget, or a chunk cache, too small for their roots."""
+    """Error for settings that do not fit the scenes: a budget, or a chunk cache, too small for their roots."""
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """What was drawn.
+    """Result of rendering a camera path.
 
     Attributes:
         pictures: what was written.
@@ -198,7 +198,7 @@ def _source(
 
 @dataclass(frozen=True)
 class Compared:
-    """What a comparison found.
+    """Result of a comparison.
 
     Attributes:
         pictures: how many were compared.
@@ -217,7 +217,7 @@ class Compared:
 
 @dataclass(frozen=True)
 class Traversed:
-    """What a traversal found.
+    """Result of a traversal.
 
     Attributes:
         frames: what was written of them.

@@ -1,4 +1,4 @@
-"""What traversals, comparisons and pictures come to: tables, and a picture that notebooks show."""
+"""Results of traversals, comparisons and renderings: tables, and a picture that notebooks show."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ from ..view.start import FOV, Point, extent_of, start_of
 
 @dataclass(frozen=True)
 class ViewSettings:
-    """What a page shows at first, and what it is made of.
+    """Initial view of a page, and the sources of its camera path and scripts.
 
     Attributes:
         look_at: eye and target of the camera; None for one that sees the whole scene.

@@ -1,4 +1,4 @@
-"""What viewers draw of trees and scenes: cuts, pictures, camera paths, and comparisons with full detail."""
+"""Views of trees and scenes: cuts, pictures, camera paths, and comparisons with full detail."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ PROGRAM = "sparklod"
 
 @dataclass(frozen=True)
 class Fingerprint:
-    """All that determines the bytes of an output.
+    """Fingerprint of inputs and settings, which determine the bytes of an output.
 
     Attributes:
         inputs: what tells the content of each file, in the order in which they are read.

@@ -20,7 +20,7 @@ from .sources import Source
 
 
 class Workspace(Protocol):
-    """Where a tree is built: in memory, which is one block, or block by block in a scratch folder."""
+    """Place in which a tree is built: in memory, as one block, or block by block in a scratch folder."""
 
     def build(self) -> BuiltTree:
         """Read the input, select and transform its splats, and build their tree, or keep the one that it has."""

@@ -31,7 +31,7 @@ Encode = Callable[[BuiltTree, Encoder], Get]
 
 
 class Output(Protocol):
-    """Where a tree goes."""
+    """Destination of a tree."""
 
     @property
     def in_chunks(self) -> bool:

@@ -1,4 +1,4 @@
-"""What the steps of a bake hand on and report: the tree that is built, and the result."""
+"""Records that the steps of a bake exchange and report: the built tree, and the result."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ from .settings import BakeSettings
 
 @dataclass(frozen=True, kw_only=True)
 class Refined(FitReport):
-    """What fitting the merged splats brought, as `--json` has it.
+    """Result of fitting the merged splats, as `--json` has it.
 
     Attributes:
         seed: of the cameras and budgets that were drawn at random.

@@ -1,4 +1,4 @@
-"""What is baked: a file, or several that are merged into one scene."""
+"""Inputs of a bake: a file, or several that are merged into one scene."""
 
 from __future__ import annotations
 

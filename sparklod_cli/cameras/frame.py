@@ -46,7 +46,7 @@ def direction_of(up: str | None) -> Point:
 
 @dataclass(frozen=True)
 class Lens:
-    """What a file says about a camera's image; None where it says nothing.
+    """Intrinsics of a camera in a file; None for those that the file does not have.
 
     Attributes:
         size: width and height, pixels.
@@ -134,7 +134,7 @@ def sampled(count: float, at: Callable[[NDArray[np.int64]], list[Frame]]) -> Sam
 
 @dataclass(frozen=True)
 class Settings:
-    """What a user says about a path; it overrides the file, and None leaves it to the file.
+    """User settings of a camera path; they override the file, and None leaves a value to the file.
 
     Attributes:
         axes: of the file's matrices.

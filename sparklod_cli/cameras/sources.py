@@ -1,4 +1,4 @@
-"""Where cameras come from: a file, an orbit around a scene, a dolly towards it, single views, or keyframes."""
+"""Sources of cameras: a file, an orbit around a scene, a dolly towards it, single views, or keyframes."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ TRIED = 1 << 16
 
 
 class Way(NamedTuple):
-    """How a block is deflated: the level, None for the one that was chosen, and the strategy of zlib."""
+    """Deflate settings of a block: the level, None for the one that was chosen, and the strategy of zlib."""
 
     level: int | None = None
     strategy: int = zlib_ng.Z_DEFAULT_STRATEGY

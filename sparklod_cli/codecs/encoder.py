@@ -1,4 +1,4 @@
-"""What writing a file in windows has in common, whether its splats are in memory or not.
+"""Interfaces and helpers for writing a file in windows, whether its splats are in memory or not.
 
 A window is encoded by itself, on any thread or machine, and its result kept, in memory, in a file, or in a store that
 machines share; then the pieces of the file are made of the results.
@@ -48,7 +48,7 @@ class Encoder(Protocol):
 
     @property
     def sh_degree(self) -> int:
-        """Of all splats."""
+        """SH degree of all splats."""
 
     @property
     def options(self) -> WriteOptions:

@@ -60,7 +60,7 @@ class Format:
 
     @property
     def endings(self) -> tuple[str, ...]:
-        """How the name of a file ends that is written in this format: in a suffix, or it is that of `unbundled`."""
+        """Endings of the names of files in this format: suffixes, or the name in `unbundled`."""
         if self.unbundled is None:
             return self.suffixes
         return *(suffix for suffix in self.suffixes if not self.unbundled.endswith(suffix)), self.unbundled

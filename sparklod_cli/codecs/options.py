@@ -41,7 +41,7 @@ def _encoding(option: str, plural: str) -> Any:
 
 @dataclass(frozen=True)
 class RadOptions(CheckedSettings):
-    """How to write RAD; encodings are explained in `rad_options`.
+    """Options of RAD files; encodings are explained in `rad_options`.
 
     Attributes:
         chunked: write each chunk into a file of its own.
@@ -75,7 +75,7 @@ class RadOptions(CheckedSettings):
 
 @dataclass(frozen=True)
 class SogOptions:
-    """How to write SOG.
+    """Options of SOG files.
 
     Attributes:
         sh_codes: the most entries of the palette of spherical harmonics, which a label for each splat points into; None
@@ -91,7 +91,7 @@ class SogOptions:
 
 @dataclass(frozen=True)
 class WriteOptions(CheckedSettings):
-    """How to write a splat file. PLY and .splat leave no such choice, and ignore all of them.
+    """Options of splat files. PLY and .splat have none of these choices, and ignore all of them.
 
     Attributes:
         rad: of RAD.

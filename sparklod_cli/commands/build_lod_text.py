@@ -1,4 +1,4 @@
-"""What `sparklod build-lod` says of a file that it wrote."""
+"""Messages of `sparklod build-lod` about the files that it wrote."""
 
 from __future__ import annotations
 

@@ -132,7 +132,7 @@ def _report_settings(
 
 @dataclass
 class _Job:
-    """What is done with every file, and the page that grows meanwhile."""
+    """Inspection of all files with the same settings, and the sections of the page so far."""
 
     console: Console
     general: General

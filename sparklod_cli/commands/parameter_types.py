@@ -178,7 +178,7 @@ class Background(_Shown):
 
 
 class View(_Shown):
-    """Where a camera is and what it looks at, as (eye, target), two tuples of three numbers."""
+    """Camera position and target, as (eye, target), two tuples of three numbers."""
 
     name = "EYE:TARGET"
 

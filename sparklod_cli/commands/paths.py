@@ -224,7 +224,7 @@ def _keep_apart(outputs: Iterable[Place], inputs: Iterable[Place]) -> None:
 
 
 def _all_read(paths: Iterable[Place]) -> Iterator[Place]:
-    """Each path and its companion files."""
+    """Yield each path and its companion files."""
     from ..cameras.formats.table import NAMES
     from ..io import companions
 

@@ -1,4 +1,4 @@
-"""What `sparklod render --compare` does: measures how far cuts of several budgets are from full detail."""
+"""Command `sparklod render --compare`: errors of cuts of several budgets against full detail."""
 
 from __future__ import annotations
 

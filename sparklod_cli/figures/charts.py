@@ -1,4 +1,4 @@
-"""What charts of tables share: series over time, colours, the figure of matplotlib. The only module that imports it."""
+"""Helpers for charts of tables: time series, colours, matplotlib figures. No other module imports matplotlib."""
 
 from __future__ import annotations
 

@@ -202,7 +202,7 @@ CALLED = {
 
 @dataclass(frozen=True)
 class PathScene:
-    """What the picture of the path shows.
+    """Content of the picture of a camera path.
 
     Attributes:
         cameras: of the path.

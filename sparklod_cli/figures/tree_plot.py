@@ -107,7 +107,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class _Subject:
-    """What is drawn.
+    """Splats that a tree plot shows.
 
     Attributes:
         index: (M,) splats that are drawn in colour.

@@ -41,7 +41,7 @@ HALVES = 12
 
 @dataclass(frozen=True)
 class Picture:
-    """What a camera sees of full detail.
+    """Picture of full detail from one camera.
 
     Attributes:
         camera: that sees it.

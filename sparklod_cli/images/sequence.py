@@ -39,7 +39,7 @@ CACHED_PIXELS = 1 << 26
 
 @dataclass(frozen=True)
 class PictureSettings:
-    """How pictures become files.
+    """Settings for writing pictures to files.
 
     Attributes:
         background: red, green and blue, 0..1, behind the splats; None keeps alpha.

@@ -18,7 +18,7 @@ from .report import Report, ReportSettings
 
 @dataclass(frozen=True)
 class CheckSettings:
-    """What to check in a file.
+    """Settings of the checks of a file.
 
     Attributes:
         report: contents of the report.

@@ -1,4 +1,4 @@
-"""What a file should be, as options, assertions and files of expectations say it, and where a report falls short."""
+"""Expectations of a file, from options, assertions and files of expectations, and their check against a report."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ KEYS = {
 
 @dataclass(frozen=True)
 class Expectations:
-    """What a file should be; None means anything. Each is a condition, see `assertions.Condition`.
+    """Expectations of a file; None means anything. Each is a condition, see `assertions.Condition`.
 
     Attributes:
         max_bytes: of the file.
@@ -188,7 +188,7 @@ def _chunked(report: dict[str, Any]) -> Any:
 
 
 def check(report: Report, expected: Expectations) -> list[Finding]:
-    """Where a report falls short of expectations; of a file that could not be read nothing is expected."""
+    """Return findings for the expectations that a report does not meet; none for a file that could not be read."""
     if report.format is None:
         return []
     plain = report.as_dict()

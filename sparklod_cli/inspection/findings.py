@@ -112,7 +112,7 @@ def findings_of(violations: Iterable[RuleViolation]) -> list[Finding]:
 
 @dataclass(frozen=True)
 class Head:
-    """What a report begins with, known from headers before any splat is read.
+    """Head of a report, known from headers before any splat is read.
 
     Attributes:
         format: name for display.
@@ -139,13 +139,13 @@ class ChunkBytes:
 
     @classmethod
     def of(cls, sizes: Sequence[int]) -> ChunkBytes | None:
-        """Those of chunks of some sizes; None without any."""
+        """Return the least, median and greatest of the sizes of chunks; None without any."""
         return cls(min(sizes), round(statistics.median(sizes)), max(sizes)) if sizes else None
 
 
 @dataclass(frozen=True)
 class Survey:
-    """What the headers of a file, and of the files that it names, hold and break.
+    """Facts and broken rules from the headers of a file and of the files that it names.
 
     Attributes:
         field: of the report that has the facts, "rad" or "streamed_sog".

@@ -63,7 +63,7 @@ class Coded:
 
 @dataclass(frozen=True)
 class Coding:
-    """How the splats of a file are compared.
+    """Coding of splats as integers, for comparing the splats of a file, and its tolerances.
 
     Attributes:
         encode: N splats to codes.

@@ -40,7 +40,7 @@ class PropertyFacts:
 
 @dataclass(frozen=True)
 class RadFacts:
-    """What the headers tell.
+    """Facts from the headers of a RAD file.
 
     Attributes:
         chunked: whether the chunks are files of their own.

@@ -43,7 +43,7 @@ class NoFieldError(SparklodError):
 
 @dataclass(frozen=True)
 class ReportSettings:
-    """What to report besides the header and the tree.
+    """Contents of a report besides the header and the tree.
 
     Attributes:
         values: statistics of the splats.

@@ -58,7 +58,7 @@ class EnvironmentFacts:
 
 @dataclass(frozen=True)
 class StreamedSogFacts:
-    """What the manifest and the headers of the chunk files tell.
+    """Facts from the manifest and the headers of the chunk files of Streamed SOG.
 
     Attributes:
         generator: the program that wrote it, on one line and shortened; None where the manifest does not say.

@@ -245,7 +245,7 @@ class TreeFacts:
 
 @dataclass(frozen=True, eq=False)
 class Columns:
-    """What the facts of a tree of N nodes need of each of them, 10 bytes.
+    """Columns of a tree of N nodes that its facts are computed from; 10 bytes a node.
 
     Attributes:
         tree: children, (N,); as far as the blocks have come, unless all are in memory.

@@ -1,4 +1,4 @@
-"""What tells one content of a file from another: for work that goes on later, and for work that need not be done."""
+"""Fingerprints of file contents, by which a bake resumes or is skipped."""
 
 from __future__ import annotations
 

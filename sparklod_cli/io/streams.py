@@ -125,7 +125,7 @@ def _read_once(
 
 
 class _Store(Protocol):
-    """Where the one file is that is unpacked.
+    """Storage of one unpacked file.
 
     Attributes:
         name: tells it from others.
@@ -217,7 +217,7 @@ def _room(folder: Path | None) -> Iterator[None]:
 
 
 class _Key(NamedTuple):
-    """What tells an opened file from others, see `idle.borrowed`."""
+    """Key that identifies an opened file, see `idle.borrowed`."""
 
     store: Hashable
     path: Place

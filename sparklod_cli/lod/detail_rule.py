@@ -1,4 +1,4 @@
-"""How a scene is divided into regions and detail levels, and how a viewer of Streamed SOG chooses a level for each."""
+"""Settings of the regions and detail levels of a scene, and of a viewer's choice of levels in Streamed SOG."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MOST_LEVELS = 15
 
 @dataclass(frozen=True)
 class DetailRule(CheckedSettings):
-    """How a viewer chooses detail levels: names, defaults and bounds are those of PlayCanvas 2.23.
+    """Rule by which a viewer chooses detail levels: names, defaults and bounds are those of PlayCanvas 2.23.
 
     They are its `splatBudgetMode`, `lodBaseDistance` (seen by a camera with a field of view of 45 degrees),
     `lodMultiplier`, `lodBehindPenalty`, `lodDistanceShrink`, `lodRangeMin`, `lodRangeMax` and `lodUnderfillLimit`.
@@ -105,7 +105,7 @@ def _are_levels(levels: tuple[float, ...]) -> bool:
 
 @dataclass(frozen=True)
 class DetailSettings(CheckedSettings):
-    """How regions and detail levels are made; the defaults are those of the tools of the makers of Streamed SOG.
+    """Settings of regions and detail levels; the defaults are those of the tools of the makers of Streamed SOG.
 
     A region has no more splats of all levels together than a chunk file.
     """

@@ -145,7 +145,7 @@ def _splats_of(scene: DetailScene, levels: Levels, *, environment: bool) -> NDAr
 
 @dataclass(frozen=True, eq=False)
 class DetailFiles:
-    """Where the splats of a scene at several detail levels are.
+    """Chunk files of a scene at several detail levels.
 
     Attributes:
         of_run: (R, L) int64 number of the chunk file of each run; -1 where there is no run.
@@ -162,7 +162,7 @@ class DetailFiles:
 
 @dataclass(frozen=True, eq=False)
 class Loading:
-    """What is drawn of regions, and what is asked for, while files load.
+    """Drawn levels of R regions, and priorities of F chunk files, while files load.
 
     Attributes:
         drawn: (R,) the level of each; -1 where nothing is.

@@ -91,7 +91,7 @@ def _levels(size: FloatArray) -> Levels:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """What all stages of a build share.
+    """Parameters that all stages of a build share.
 
     Attributes:
         growth: maximum ratio of nodes to leaves of the whole tree.
@@ -106,7 +106,7 @@ class Plan:
 
 @dataclass(frozen=True, eq=False)
 class _Nodes:
-    """What the builder knows of pending nodes besides how they are drawn: the other columns of `Pending`.
+    """Columns of `Pending` besides the splats: sizes, levels and families of pending nodes.
 
     Attributes:
         rows: (n, WIDTH) float32 node rows.
@@ -127,7 +127,7 @@ class _Nodes:
 
     @classmethod
     def of(cls, pending: Pending, index: NDArray[np.unsignedinteger], plan: Plan) -> _Nodes:
-        """Of some of the pending nodes; if they are fresh from `leaves`, the columns are those of leaves."""
+        """Return the columns of pending nodes; if these are fresh from `leaves`, the columns are those of leaves."""
         columns = pending.columns
         if "rows" in columns:
             return cls(**{field.name: columns[field.name][index] for field in fields(cls)})
@@ -204,7 +204,7 @@ def _families(final: FinalTree, numbers: NDArray[np.int64]) -> Families:
 
 
 def _no_families(splats: Splats) -> Families:
-    """Of a stage without a merge."""
+    """Return the empty families of a stage without a merge."""
     none = splats.take(slice(0, 0))
     empty = np.empty(0, np.int32), np.empty((0, 1), np.uint64), np.empty(0, np.uint16)
     return Families(*empty, none, np.empty(0, np.int64), none.center, none.opacity)

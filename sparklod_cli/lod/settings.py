@@ -16,7 +16,7 @@ FACTOR = Range(0, 10**12)
 
 @dataclass(frozen=True)
 class LodSettings(CheckedSettings):
-    """How a viewer finds its cuts.
+    """Settings of the cuts that a viewer draws.
 
     Attributes:
         budget: maximum number of splats, all instances together; by default that of Spark 2 on a desktop.

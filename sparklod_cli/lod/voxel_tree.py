@@ -39,7 +39,7 @@ FillRows = Callable[[Nodes, FloatArray], None]
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """What is known of n nodes without a parent.
+    """Columns of n nodes without a parent.
 
     Attributes:
         node: (n, WIDTH) float32 node rows of `kernels/pair_cost.py`.

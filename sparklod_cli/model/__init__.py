@@ -1,1 +1,1 @@
-"""What splats, scenes and Level-of-Detail trees are, whatever file they come from."""
+"""Data model: splats, scenes and Level-of-Detail trees, independent of file formats."""

@@ -23,7 +23,7 @@ USED = ("center", "scale", "opacity")
 
 @dataclass(frozen=True)
 class Balls:
-    """What splats cover; N of them.
+    """N bounding spheres of splats.
 
     Attributes:
         center: (N, 3) float64 world units.

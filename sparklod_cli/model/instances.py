@@ -97,7 +97,7 @@ class Instance:
 
     @property
     def transform(self) -> Transform:
-        """What `object_to_world` does, with the rotation that is nearest where the axes of a matrix are a bit askew."""
+        """Similarity in `object_to_world`, with the nearest rotation if the axes are slightly skewed."""
         axes = self.object_to_world[:3, :3]
         scale = min(max(float(np.cbrt(np.linalg.det(axes))), 1 / LARGEST), LARGEST)
         rotation = axes / scale

@@ -15,7 +15,7 @@ CHUNK_NODES = 1 << CHUNK_BITS
 
 @dataclass(frozen=True)
 class Nodes:
-    """What the traversal needs of N nodes.
+    """Node data that the traversal reads, N nodes.
 
     Attributes:
         center: (N, 3) float32 world units.

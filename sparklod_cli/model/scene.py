@@ -1,4 +1,4 @@
-"""What one splat file holds: `Scene`, splats and their tree if they have one, and what belongs to the file as a whole.
+"""Contents of one splat file: `Scene`, splats with their tree if they have one, and metadata of the file.
 
 `DetailScene` is one whose regions each exist at several detail levels, as Streamed SOG holds it. `FileCoding` tells how
 a file holds its scales: what it takes to know the numbers that another reader has of them.
@@ -36,7 +36,7 @@ class ScaleCoding:
 
 @dataclass(frozen=True)
 class FileCoding:
-    """What a file says of its codes.
+    """Codings of the scales in a file.
 
     Attributes:
         scales: of each run of splats, in order.
@@ -235,12 +235,12 @@ class DetailScene:
 
     @property
     def regions(self) -> int:
-        """How many regions there are."""
+        """Number of regions."""
         return len(self.counts)
 
     @property
     def levels(self) -> int:
-        """How many detail levels there are."""
+        """Number of detail levels."""
         return self.counts.shape[1]
 
     @functools.cached_property

@@ -27,7 +27,7 @@ EXAMINED = 1 << 15
 
 @dataclass(frozen=True)
 class Tally:
-    """What becomes of the splats of a scene, or of a part of it.
+    """Counts of the splats of a scene, or of a part of it, that a selection keeps and drops.
 
     Attributes:
         count: N splats.
@@ -41,7 +41,7 @@ class Tally:
 
     @property
     def kept(self) -> int:
-        """How many are kept."""
+        """Number of splats that are kept."""
         return self.count - sum(self.dropped.values())
 
     def then(self, after: Tally) -> Tally:

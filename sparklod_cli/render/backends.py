@@ -20,7 +20,7 @@ class BackendError(SparklodError):
 
 
 class Draw(Protocol):
-    """What draws.
+    """Drawing function of a backend.
 
     Returns:
         (height, width, 4) float32: red, green and blue, multiplied by alpha, and alpha, all 0..1.

@@ -44,7 +44,7 @@ APART = 0.05
 
 @dataclass(frozen=True)
 class Scale:
-    """Which numbers have which colours; the same for all pictures of a run.
+    """Colour scale for numbers, the same for all pictures of a run.
 
     Attributes:
         bar: the colours, with their meaning.

@@ -27,7 +27,7 @@ LEAST_DECADES = 0.1
 
 @dataclass(frozen=True)
 class Coloring:
-    """What the colours of N splats mean.
+    """Colours of N splats, with the scale that explains them.
 
     Attributes:
         title: the quantity, for display.

@@ -47,7 +47,7 @@ class Projected:
 
 @dataclass(frozen=True)
 class Tiles:
-    """Which splats tiles were drawn with.
+    """Splats that each of T tiles was drawn with.
 
     Attributes:
         start: (T + 1,) int64 where in `splats` each tile begins.

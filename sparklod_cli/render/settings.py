@@ -1,4 +1,4 @@
-"""How splats become pixels, and how pictures are drawn; the defaults are Spark 2's. Imports nothing heavy."""
+"""Settings of rasterization and rendering; the defaults are Spark 2's. Imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ DISTANCE = Range(above=0, most=FARTHEST, unit="D")
 
 @dataclass(frozen=True)
 class RasterSettings(CheckedSettings):
-    """How splats become pixels.
+    """Settings of rasterization.
 
     Both profiles are exp(-z^2 / 2) up to D = 1. Above, Spark's is 1 - (1 - exp(-z^2 / 2)) ** exp((D^2 - 1) / e), and
     that of its LoD design exp(-D / 2 * (z - (D - 1))^2).
@@ -76,7 +76,7 @@ class RasterSettings(CheckedSettings):
 
 @dataclass(frozen=True)
 class RenderSettings(CheckedSettings):
-    """How pictures are drawn.
+    """Settings of rendering.
 
     Attributes:
         raster: how splats become pixels.

@@ -15,7 +15,7 @@ from .loaded import Cut, Part, Scenes
 
 
 class CutSource(Protocol):
-    """What pictures are of: a `CutFinder`, or a `FixedCut`."""
+    """Source of the cuts that pictures show: a `CutFinder`, or a `FixedCut`."""
 
     def cut(self, camera: Camera) -> Cut:
         """Return what a camera sees."""

@@ -35,7 +35,7 @@ MAX_INSTANCES = 65_535
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """What is drawn of one instance.
+    """Splats of one instance in a cut.
 
     Attributes:
         scene: that it is of.
@@ -65,7 +65,7 @@ class Part:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Cut:
-    """What is drawn of some instances.
+    """Splats of some instances that a camera's picture is drawn from.
 
     Attributes:
         parts: one for each instance.

@@ -88,7 +88,7 @@ class LoadedScene:
 
     @property
     def chunks(self) -> int:
-        """How many chunks it has, of 65,536 splats each."""
+        """Number of chunks, of 65,536 splats each."""
         return -(-self.count // CHUNK_NODES)
 
     def rows(self, index: Index) -> Splats:
@@ -156,7 +156,7 @@ class LoadedDetail(LoadedScene):
 
     @property
     def chunks(self) -> int:
-        """How many chunk files it has."""
+        """Number of chunk files."""
         return len(self.files.sizes)
 
     def chunk_of(self, index: Index) -> NDArray[np.int64]:

@@ -171,7 +171,7 @@ class Pages:
             raise type(error)(f"{self._name}: {error}") from None
 
     def leaf_count(self) -> int:
-        """How many nodes are leaves, for which the children of all are read."""
+        """Return the number of leaves; reads the children of all nodes."""
         return sum(int(np.count_nonzero(tree.is_leaf)) for _, tree in self.blocks(()))
 
     def leaves(self) -> NDArray[np.int64]:

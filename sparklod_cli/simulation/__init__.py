@@ -1,1 +1,1 @@
-"""What a viewer would draw along a camera path: budgeted cuts, frame by frame, and what they cost."""
+"""Simulation of a viewer along a camera path: budgeted cuts, frame by frame, and their costs."""

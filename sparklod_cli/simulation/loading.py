@@ -1,4 +1,4 @@
-"""What a visitor sees who opens a page with trees or Streamed SOG and waits, arrival by arrival."""
+"""Simulation of loading a page with trees or Streamed SOG, arrival by arrival."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ class Loader(Viewer):
 
 
 class LoadingCuts(Loader):
-    """What visitors see who opened the page some time ago, each in front of a camera of their own; a `CutSource`.
+    """Cuts of visitors some time after they opened the page, one visitor for each camera; a `CutSource`.
 
     Args:
         scenes, settings, streaming: as of `Loader`.

@@ -1,1 +1,1 @@
-"""What everything else stands on: errors, defaults, units, compiled kernels, threads, progress."""
+"""Foundations of all other packages: errors, defaults, units, compiled kernels, threads, progress."""

@@ -57,7 +57,7 @@ def prefetch(array: Any, index: int) -> None:
 
 @dataclass(frozen=True)
 class Options:
-    """How a kernel is compiled; see `kernel`."""
+    """Compilation options of a kernel; see `kernel`."""
 
     parallel: bool
     nogil: bool

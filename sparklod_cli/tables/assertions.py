@@ -42,7 +42,7 @@ class BadAssertionError(SparklodError):
 
 @dataclass(frozen=True)
 class Condition:
-    """What must hold of something that has a name.
+    """Condition on a named value.
 
     Attributes:
         text: as it was given, without spaces at its ends.

@@ -44,7 +44,7 @@ EMPTY = {
 
 @dataclass(frozen=True)
 class BudgetSummary:
-    """What the frames of a budget come to.
+    """Summary of the frames of a budget.
 
     Attributes:
         text: the budget, as it was given.

@@ -1,4 +1,4 @@
-"""Where the table of a command goes: a file, standard output, or nowhere but into a summary."""
+"""Destination of the table of a command: a file, standard output, or none but a summary."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Filter = Callable[[Iterable[bytes]], Iterable[bytes]]
 
 @dataclass(frozen=True)
 class TableOutput:
-    """Where a table goes.
+    """Destination of a table.
 
     Attributes:
         path: of its file; None for standard output, or for nowhere.

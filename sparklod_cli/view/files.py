@@ -1,4 +1,4 @@
-"""Which files a viewer shows, and under which names it gets them.
+"""Files that a viewer shows, and the names under which they are served.
 
 A site is a closed table of names: whatever is not in it is not served, so no name can lead out of it.
 """
@@ -92,7 +92,7 @@ class ShownFile:
 
     @property
     def bytes(self) -> int:
-        """Of all its files."""
+        """Size of all files together, bytes."""
         return sum(path.stat().st_size for path in self.files.values())
 
 

@@ -106,7 +106,7 @@ class Server(ThreadingHTTPServer):
         return f"http://{f'[{host}]' if ':' in host else host}:{self.port}/"
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Whatever nobody foresaw ends a connection, not the server."""
+        """Log an unexpected error; it ends the connection, not the server."""
         self.log(f"a connection failed: {type(sys.exc_info()[1]).__name__}: {sys.exc_info()[1]}")
 
 

@@ -129,7 +129,7 @@ GENERATOR = "sparklod view"
 
 @dataclass(frozen=True)
 class Look:
-    """How the page shows the files at first.
+    """Initial view of the page.
 
     Attributes:
         start: the camera.

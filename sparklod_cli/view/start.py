@@ -1,4 +1,4 @@
-"""Where the camera of a page starts, and how large the scene is."""
+"""Initial camera of a page, and the extent of the scene."""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ class Stage:
 
 @dataclass(frozen=True)
 class Blocks:
-    """How a scene is cut.
+    """Division of a scene into blocks.
 
     Attributes:
         splits: (axis, value, low, high) of each split: centres below the value are on the low side. A side is the
@@ -52,7 +52,7 @@ class Blocks:
 
     @property
     def count(self) -> int:
-        """How many blocks there are."""
+        """Number of blocks."""
         return self.stages[-1].blocks
 
     @property

@@ -62,7 +62,7 @@ CERTIFICATES = "DASK_DISTRIBUTED__COMM__TLS__CA_FILE, ..__CLIENT__CERT and ..__C
 
 @dataclass(frozen=True)
 class ClusterSettings:
-    """Which cluster.
+    """Cluster that runs the tasks of a bake.
 
     Attributes:
         scheduler: address of one that runs, as tcp://host:8786; None starts one on this machine.

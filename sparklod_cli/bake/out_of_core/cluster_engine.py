@@ -171,7 +171,7 @@ PROBE = "probe"
 
 @dataclass(frozen=True)
 class Probed:
-    """What a worker says of itself.
+    """Result of probing a worker.
 
     Attributes:
         version: of sparklod.

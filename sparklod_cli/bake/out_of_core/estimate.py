@@ -1,4 +1,4 @@
-"""How much memory and room on a disk a bake takes, before it begins.
+"""Estimates of the memory and disk space that a bake takes.
 
 Coefficients are measured as those of `lod.builders.SplatBytes`.
 """

@@ -20,7 +20,7 @@ NO_BLOCKS = Blocks((), ())
 
 @dataclass(frozen=True)
 class Job:
-    """What the tasks of a bake share; small, so it can be pickled.
+    """Data that all tasks of a bake share; small, so it can be pickled.
 
     Attributes:
         store: of the results.
@@ -52,7 +52,7 @@ class Job:
 
     @property
     def sh_degree(self) -> int:
-        """Of the splats that are kept."""
+        """SH degree of the splats that are kept."""
         return min(self.stream.sh_degree, self.settings.max_sh)
 
     def builder(self) -> StagedBuilder:

@@ -36,7 +36,7 @@ Run = tuple[int, int, int]
 
 @dataclass(frozen=True, eq=False)
 class _Links:
-    """What is known of F families, which are numbered stage by stage.
+    """Links between F families, which are numbered stage by stage.
 
     Attributes:
         begin: (stages + 1,) number of the first family of each stage, and F.

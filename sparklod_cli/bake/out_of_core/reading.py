@@ -80,7 +80,7 @@ def first_look(stream: SceneStream, settings: BakeSettings, blocks: int) -> tupl
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """What is known of splats that were read.
+    """Counts, bounds, sample and statistics of splats that were read.
 
     Attributes:
         tally: what became of them.

@@ -70,7 +70,7 @@ def _digest(text: str) -> str:
 
 @dataclass(frozen=True)
 class _Manifest:
-    """Whose results a store has.
+    """Manifest that identifies the bake a store belongs to.
 
     Attributes:
         fingerprint: of the output.

@@ -61,12 +61,12 @@ class Entry:
 
     @property
     def bytes(self) -> int:
-        """Of all its numbers."""
+        """Size of the array, bytes."""
         return math.prod(self.shape) * self.dtype.itemsize
 
     @property
     def row_bytes(self) -> int:
-        """Of one row."""
+        """Size of one row, bytes."""
         return math.prod(self.shape[1:]) * self.dtype.itemsize
 
 

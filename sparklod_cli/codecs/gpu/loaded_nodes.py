@@ -35,7 +35,7 @@ _SAME = np.float32(2**-20)
 
 
 class LoadedPrecision(NamedTuple):
-    """What splats in memory keep of numbers: of alphas, 0..2, and of linear scales."""
+    """Rounding of splats loaded into a viewer's memory: of alphas, 0..2, and of linear scales."""
 
     alpha: Recode
     scale: Recode

@@ -81,7 +81,7 @@ class Gradients(NamedTuple):
 
 @fields(out(f4[:, :]), out(f4[:, :, :]), out(f4[:, :]), out(i4[:]), f4[:])
 class Moments(NamedTuple):
-    """What Adam remembers of each merged splat.
+    """State of Adam for each merged splat.
 
     Attributes:
         first: (S, FIRST) float32. first_sh: (S, K, 3) float32. second: (S, SECOND) float32. count: (S,) int32 steps.
@@ -97,7 +97,7 @@ class Moments(NamedTuple):
 
 @fields(f4, f4, f4, f4, f4, f4)
 class Rates(NamedTuple):
-    """How far a step goes, float32.
+    """Step sizes, float32.
 
     Attributes:
         center: in scales. log_scale: ln. turn: radians. lod_opacity: D. rgb: 0..1. sh: of rgb.

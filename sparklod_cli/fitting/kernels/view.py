@@ -1,4 +1,4 @@
-"""Which nodes a camera may see, and how far a picture is from another."""
+"""Kernels for visible nodes, and for the differences of pictures and their derivatives."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the kernels that find a cut share: their arrays, limits as bits, and chunks."""
+"""Data that the cut kernels share: their arrays, limits as bits, and chunks."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Trees(NamedTuple):
 
 @fields(i4, i8)
 class Stop(NamedTuple):
-    """Where refinement stops.
+    """Limits of refinement.
 
     Attributes:
         smallest: int32 bits of a pixel scale; nodes up to it are not refined.

@@ -23,7 +23,7 @@ DIGIT_BITS = 9
 
 
 class View(NamedTuple):
-    """How a region is seen.
+    """View of a region.
 
     Attributes:
         world_to_camera: (3, 4) float32, which also scales.
