@@ -100,14 +100,14 @@ def judged(goal: Goal, figures: Figures) -> Verdict:
     if goal.across:
         found = {"": goal.across([value for _, value in values])} if values else {}
     else:
-        found = {", ".join(_told(name, row) for name in goal.name): value for row, value in values}
+        found = {", ".join(_label_text(name, row) for name in goal.name): value for row, value in values}
         if len(found) < len(values):
             raise ValueError(f"{goal.text}: {goal.name} does not tell the rows of {goal.section} apart")
     return Verdict(goal, all(_keeps(goal, value) for value in found.values()) if found else None, found)
 
 
-def _told(name: str, row: Row) -> str:
-    """A label, with its name where it is a number."""
+def _label_text(name: str, row: Row) -> str:
+    """Return a label, with its name if it is a number."""
     value = row.labels[name]
     return f"{name} {value:,}" if isinstance(value, int) else str(value)
 

@@ -77,7 +77,7 @@ class DetailOutput(WholeOutput):
         files = encode_files(made, self.options, self.settings, threads=threads, progress=progress)
         size = self.sink(_noted(files, names))
         clock.end("write")
-        return WrittenTree(output_format="streamed-sog", bytes=size, detail=_told(made, names))
+        return WrittenTree(output_format="streamed-sog", bytes=size, detail=_written_detail(made, names))
 
 
 def _noted(files: Files, names: list[str]) -> Iterator[tuple[str, Iterable[bytes]]]:
@@ -87,8 +87,8 @@ def _noted(files: Files, names: list[str]) -> Iterator[tuple[str, Iterable[bytes
         yield name, pieces
 
 
-def _told(made: DetailScene, names: list[str]) -> WrittenDetail:
-    """Return what is said of a scene that was written to files of these names."""
+def _written_detail(made: DetailScene, names: list[str]) -> WrittenDetail:
+    """Return the statistics of a scene that was written to files of these names."""
     assert made.errors is not None
     splats, errors = made.counts.sum(axis=0).tolist(), made.errors.max(axis=0).tolist()
     return WrittenDetail(

@@ -51,11 +51,11 @@ def bake_side_by_side(
     engine.check(None, [place for source, _ in whole for place in places_of(source)])
     with engine.each("baking", _bake_small, calls, progress, "scene") as outcomes:
         for pair, is_small in zip(pairs, small, strict=True):
-            yield _found(next(outcomes), pair[1]) if is_small else bake_large(*pair)
+            yield _checked_outcome(next(outcomes), pair[1]) if is_small else bake_large(*pair)
 
 
-def _found(outcome: Any, target: Place) -> Any:
-    """Return what came of a scene; a `SparklodError` where its output is on a machine that this one does not see."""
+def _checked_outcome(outcome: Any, target: Place) -> Any:
+    """Return the outcome of a bake, or a `SparklodError` if this machine does not see the output."""
     if isinstance(outcome, Baked) and isinstance(target, Path) and not target.exists():
         return SparklodError(
             f"a worker wrote {target} into a folder that is not seen here: give --output-dir a folder that all machines"

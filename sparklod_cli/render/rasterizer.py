@@ -18,7 +18,7 @@ from .shading import ShadedSplats
 
 Image = NDArray[np.float32]
 
-_kept = threading.local()
+_working_memory = threading.local()
 
 #: Bytes that processors fetch from memory at once.
 CACHE_LINE = 64
@@ -111,10 +111,10 @@ def arguments(
 
 def _buffers(count: int) -> tuple[NDArray[np.float32], NDArray[np.int16], NDArray[np.uint64]]:
     """Return working memory for projected splats, kept by each thread, as the first access to new memory is slow."""
-    if len(getattr(_kept, "keys", ())) < count:
-        _kept.screen, _kept.boxes = _aligned(count), np.empty((count, 4), np.int16)
-        _kept.keys = np.empty(count, np.uint64)
-    return _kept.screen[:count], _kept.boxes[:count], _kept.keys[:count]
+    if len(getattr(_working_memory, "keys", ())) < count:
+        _working_memory.screen, _working_memory.boxes = _aligned(count), np.empty((count, 4), np.int16)
+        _working_memory.keys = np.empty(count, np.uint64)
+    return _working_memory.screen[:count], _working_memory.boxes[:count], _working_memory.keys[:count]
 
 
 def _aligned(count: int) -> NDArray[np.float32]:
