@@ -143,7 +143,7 @@ def find_partners(rows, nodes, window, largest):
 
 @kernel()
 def keep_cheaper(cost, count, best, at, here, there):
-    """Where cost[i] is less than best[i], sets best[i] to it, and at[i], the partner of here + i, to there + i.
+    """Set best[i] to cost[i] and at[i], the partner of here + i, to there + i, where that cost is less.
 
     Among equal costs, that partner wins whose index differs from the node's in the lowest bits. That relation is
     symmetric, so among many equal splats half choose each other.
