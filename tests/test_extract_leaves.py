@@ -151,7 +151,7 @@ def test_a_file_without_a_tree_is_refused(tmp_path: Path, capsys: pytest.Capture
         (["-o", "x.ksplat"], "--unlod writes .ply, .spz, .rad, .sog, meta.json, .splat, not .ksplat"),
         (["-o", "x.json"], "--unlod writes .ply, .spz, .rad, .sog, meta.json, .splat, not .json"),
         (["-o", "x.ply", "--cluster-sh"], "--cluster-sh is an option of RAD and SOG, not of PLY"),
-        (["-o", "x.ply", "--spz-version", "2"], "--spz-version is an option of SPZ, not of .ply"),
+        (["-o", "x.ply", "--spz-version", "2"], "--spz-version is an option of SPZ, not of PLY"),
     ],
 )
 def test_options_that_do_not_suit_unlod_are_refused(

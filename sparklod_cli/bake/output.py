@@ -162,13 +162,13 @@ class RepackedOutput(WholeOutput):
         """Copy the chunks."""
         with opened(self.source) as (file, form, more):
             chunks = form.codec().RadReader.open(file, **more)
-            size = self.sink.repack(chunks)
+            size, encodings = self.sink.repack(chunks), chunks.encodings
         clock.end("write")
         return WrittenTree(
             output_format="rad" if chunks.header.chunked else "rad-chunked",
             bytes=size,
             chunks=len(chunks.header.chunks),
-            encodings=chunks.encodings,
+            encodings=encodings,
             sh_codes=chunks.header.sh_code_count,
         )
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import tokenize
+import warnings
 from dataclasses import dataclass
 from typing import Any, BinaryIO
 
@@ -19,7 +20,11 @@ from ..support.units import count_of
 #: Largest header of a .npy file, bytes; that of a two-dimensional array has 118.
 MAX_HEADER = 1 << 12
 
-_READERS = {(1, 0): npy_format.read_array_header_1_0, (2, 0): npy_format.read_array_header_2_0}
+_READERS = {
+    (1, 0): npy_format.read_array_header_1_0,
+    (2, 0): npy_format.read_array_header_2_0,
+    (3, 0): npy_format.read_array_header_2_0,  # differs in the names of records only, of which there are none
+}
 
 
 @dataclass(frozen=True)
@@ -46,8 +51,10 @@ def read_layout(file: BinaryIO) -> ArrayLayout | None:
         version = npy_format.read_magic(file)
         if version not in _READERS:
             raise FormatError("is a .npy file of an unknown version")
-        shape, fortran_order, dtype = _READERS[version](file, max_header_size=MAX_HEADER)
-    except (ValueError, TypeError, SyntaxError, RecursionError, MemoryError, tokenize.TokenError):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # of types by their former names
+            shape, fortran_order, dtype = _READERS[version](file, max_header_size=MAX_HEADER)
+    except (Warning, ValueError, TypeError, SyntaxError, RecursionError, MemoryError, tokenize.TokenError):
         raise FormatError("is not a .npy file of plain numbers: its header is malformed") from None
     if dtype.kind not in "biufc" or min(shape, default=0) < 0:
         raise FormatError(f"is not a .npy file of plain numbers: its header says {dtype} {shape}")

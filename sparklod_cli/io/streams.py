@@ -255,12 +255,14 @@ class _Source:
                 unpacked.append(closing.enter_context(self.store.file(self.path, readable_pieces)))
             return unpacked[0]
 
-        with contextlib.ExitStack() as stack:
-            file, form, more = stack.enter_context(opened(self.path))
+        closing = contextlib.ExitStack()
+        with contextlib.ExitStack() as after_an_error:
+            after_an_error.enter_context(closing)
+            file, form, more = closing.enter_context(opened(self.path))
             source = Source(file, scratch=scratch, threads=self.threads, progress=self.progress, **more)
             content: Content = form.codec().open_content(source)
             stream = content.stream(self.threads)
-            closing = stack.pop_all()
+            after_an_error.pop_all()
         return closing, stream
 
 

@@ -15,8 +15,8 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from ..model.foveation import SPARK
 from ..model.gaussian import spark_size
-from ..model.instances import SPARK
 from ..model.lod_tree import LodTree
 from ..model.nodes import CHUNK_NODES
 from ..model.splats import FloatArray, Splats

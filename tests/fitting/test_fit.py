@@ -130,13 +130,6 @@ def test_an_interruption_before_the_first_step_changes_nothing() -> None:
     assert (report.steps, report.kept, report.is_complete) == (0, 0.0, False)
 
 
-def test_no_steps_change_nothing() -> None:
-    result, report = fit(*demo(), FitSettings(steps=0))
-    assert same(result, demo()[0])
-    assert report.psnr_after == report.psnr_before
-    assert report.is_complete
-
-
 @pytest.mark.parametrize(("count", "degree"), [(1, 0), (2, 0), (3, 1), (40, 0), (40, 1), (40, 3)])
 @pytest.mark.parametrize("builder", [quick, quality])
 def test_small_trees_of_both_builders_and_of_any_sh_degree_can_be_fitted(builder: Any, count: int, degree: int) -> None:

@@ -291,11 +291,11 @@ def test_a_stream_refuses_to_go_back_in_time() -> None:
 @pytest.mark.parametrize(
     ("bandwidth", "latency", "fetchers", "message"),
     [
-        (0.0, 0.0, 3, "bandwidth of 0"),
-        (math.nan, 0.0, 3, "bandwidth of nan"),
-        (1.0, -1.0, 3, "latency of -1"),
-        (1.0, math.inf, 3, "latency of inf"),
-        (1.0, 0.0, 0, "0 fetchers"),
+        (0.0, 0.0, 3, "bandwidth is 0"),
+        (math.nan, 0.0, 3, "bandwidth is nan"),
+        (1.0, -1.0, 3, "latency is -1"),
+        (1.0, math.inf, 3, "latency is inf"),
+        (1.0, 0.0, 0, "fetchers is 0"),
     ],
 )
 def test_impossible_networks_are_refused(bandwidth: float, latency: float, fetchers: int, message: str) -> None:

@@ -101,7 +101,7 @@ def test_a_browser_is_opened_with_the_address(
         ([TREE, "--host", "192.0.2.1"], 1, "error: '192.0.2.1' is no address of this machine; give --host 127.0.0.1"),
         ([TREE, "--overwrite"], 2, "error: --overwrite can only be used with --export"),
         ([TREE, "--export", "site", "--cors"], 2, "error: --cors cannot be used with --export"),
-        ([TREE, "--budget", "0"], 2, "leaves nothing to draw"),
+        ([TREE, "--budget", "0"], 2, "'0' is out of range; give 1 or more"),
         ([TREE, "--camera-path", "missing.json"], 1, "error: missing.json cannot be read"),
         ([TREE, "--look-at", "1,2,3"], 2, "is not EYE:TARGET"),
         (["-"], 2, "standard input is not read here"),

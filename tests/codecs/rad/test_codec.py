@@ -294,7 +294,7 @@ def test_without_sh_there_is_no_palette() -> None:
 
 @pytest.mark.parametrize("codes", [0, -1, 65537])
 def test_a_palette_of_an_impossible_size_is_refused(codes: int) -> None:
-    with pytest.raises(ValueError, match=f"sh_codes is {codes}, not 1 to 65,536"):
+    with pytest.raises(ValueError, match=f"sh_codes is {codes}; give 2 to 65536"):
         chosen(random_splats(1), sh_codes=codes)
 
 
