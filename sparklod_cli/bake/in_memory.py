@@ -13,7 +13,6 @@ from ..lod.builders import BUILDERS
 from ..model.lod_tree import LodTree
 from ..model.scene import Scene
 from ..model.splats import Splats
-from ..support.jit import load_numba
 from ..support.parallel import on_threads
 from ..support.progress import Progress
 from .output import FileOutput, Output, output_of_kept
@@ -44,7 +43,6 @@ class InMemory:
     def build(self) -> BuiltTree:
         """Read the input and build its tree, or keep the one that it has."""
         settings, threads, progress = self.settings, self.threads, self.progress
-        load_numba()  # before the scene is: where memory runs out, LLVM ends the process instead of raising an error
         scene = read_source(self.source, threads=threads, progress=progress)
         tree = BuiltTree(
             nodes=None,
