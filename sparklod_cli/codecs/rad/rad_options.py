@@ -15,7 +15,7 @@ from ...support.errors import FormatError
 from ..clamps import Range
 from ..options import RadOptions, WriteOptions
 from ..splat_encoding import LARGEST_END, SCALE_ZERO, SplatEncoding
-from ..statistics import LOWER, SMALL_QUANTILE, UPPER, Magnitudes, Statistics, fine_bits, tops
+from ..statistics import EXACT_BITS, LOWER, SMALL_QUANTILE, UPPER, Magnitudes, Statistics, fine_bits, tops
 from .property_codings import LARGEST_F16
 from .rad_layout import AUTO, OPTIONS, PROPERTIES, RANGES, Row
 
@@ -106,7 +106,7 @@ def settled(scene: Scene | Statistics, options: WriteOptions) -> WriteOptions:
     if _rounds(rad):
         # The lowest bytes of rounded float32 are mostly zeros, which take no room.
         assert found.leaf_scale is not None
-        bits = fine_bits(found.leaf_scale)
+        bits = min(fine_bits(found.leaf_scale), EXACT_BITS)
     return dataclasses.replace(options, rad=dataclasses.replace(rad, **chosen, center_bits=bits, ranges=ranges))
 
 
