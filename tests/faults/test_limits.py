@@ -63,9 +63,6 @@ print("peak", re.search(r"VmPeak:\\s*(\\d+) kB", text)[1], code)
 """
 
 
-#: Memory that a bake lacks while LLVM links a kernel ends the process: that code cannot raise an error.
-LINKING = pytest.mark.xfail(reason="LLVM ends a process that has no memory left", strict=False)
-
 #: Threads that allocate reserve an arena of up to 128 MB of address space each, of which they use little.
 ONE_ARENA = {**ENVIRONMENT, "MALLOC_ARENA_MAX": "1"}
 
@@ -96,9 +93,7 @@ def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="this system does not tell what a process takes")
-@pytest.mark.parametrize(
-    "name", [pytest.param("build-lod", marks=LINKING), "inspect", "render a scene", "render a picture"]
-)
+@pytest.mark.parametrize("name", ["build-lod", "inspect", "render a scene", "render a picture"])
 def test_too_little_memory_is_one_error_in_every_command(name: str, large: Path, tmp_path: Path) -> None:
     small = tmp_path / "small.splat"
     small.write_bytes(large.read_bytes()[: 32 * 100])
@@ -112,7 +107,9 @@ def test_too_little_memory_is_one_error_in_every_command(name: str, large: Path,
     def line(scene: Path, size: str) -> list[object]:
         return [{"SCENE": scene, "SIZE": size}.get(str(word), word) for word in [*lines[name], "--threads", "1"]]
 
-    most = address_space(*line(small, "16x12")) + 40_000
+    # Less than any column of the large scene takes, so that an array is what fails: neither LLVM nor Python itself can
+    # report that a few bytes are lacking.
+    most = address_space(*line(small, "16x12")) + 3_000
     for path in tmp_path.glob("out.*"):
         path.unlink()
     subject = small if name == "render a picture" else large
