@@ -13,8 +13,7 @@ from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.lod.budget import Budget, parse_budget
 from sparklod_cli.lod.detail_rule import BUDGET, DetailRule
 from sparklod_cli.lod.settings import LodSettings
-from sparklod_cli.model.foveation import Cones
-from sparklod_cli.model.instances import Instance
+from sparklod_cli.model.instances import Cones, Instance
 from sparklod_cli.model.scene import DetailScene, Scene
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.render.color_by import numbers_of, scale_of_splats
@@ -99,7 +98,7 @@ def test_instances_share_a_budget_by_where_they_stand_and_by_their_lod_scale(row
     def sizes(*, lod_scale: float = 1.0) -> list[int]:
         scenes = scenes_of(Instance(row, "near"), Instance(row, "far", away, lod_scale=lod_scale))
         cut = CutFinder(scenes, LodSettings(500)).cut(AT)
-        assert len(scenes.loaded) == 1
+        assert len(scenes.finder) == 1
         return [len(part.index) for part in cut.parts]
 
     near, far = sizes()

@@ -17,8 +17,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..model.lod_tree import LodTree
-from ..model.nodes import CHUNK_NODES
+from ..model.lod_tree import CHUNK_NODES, LodTree
 from ..model.scene import Scene
 from ..model.splats import COLUMNS, Splats
 from ..model.streams import NodeStream

@@ -1,6 +1,6 @@
 """SPZ, Niantic's compressed splats, and Spark's extension of it for Level-of-Detail trees.
 
-Reads versions 1 to 4, see `spz_reader`; writes versions 2 and 3. `docs/formats.md` lays the extension out byte by
+Reads versions 1 to 4, see `spz_streams`; writes versions 2 and 3. `docs/formats.md` lays the extension out byte by
 byte.
 """
 
@@ -8,31 +8,257 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..model.lod_tree import LodTree
 from ..model.scene import Scene
-from ..model.splats import COLUMNS
+from ..model.splats import COLUMNS, FloatArray, Splats
 from ..model.streams import NodeStream
-from ..support.defaults import MAX_FRACTIONAL_BITS
+from ..support.defaults import DEFAULT_SPZ_VERSION, MAX_FRACTIONAL_BITS, SPZ_VERSIONS
+from ..support.errors import FormatError
+from ..support.parallel import blocks_of
 from ..support.progress import Progress, silent
-from . import clamps
+from . import clamps, compression, coverage, quantize
 from .clamps import Range
+from .compression import DataRun
 from .content import Source, decoder
-from .encoder import Kept, results
+from .encoder import CLAMPED, Encoded, Get, Kept, results, rows_of, windows_of
+from .file_notes import comment_of
 from .options import DEFAULTS, WriteOptions
 from .quantize import Bytes
-from .spz_encoder import SpzEncoder, like
-from .spz_encoder import encoder as encoder
-from .spz_encoder import needed as needed
-from .spz_encoder import settled as settled
-from .spz_layout import Layout, Stream
-from .spz_reader import open_content as open_content
-from .spz_reader import read_codes
+from .spz_streams import ANTIALIASED, HEADER, LOD, MAGIC, Layout, Stream, column_of, read_codes
+from .spz_streams import open_content as open_content
+from .statistics import ALL_BITS, Statistics, enough, fine_bits
+
+#: The largest code that a coordinate is given, 2 ** 23 - 2. Writers clamp what does not fit to the code after it, of
+#: either sign, so `inspect` takes a coordinate that has that one for clamped.
+LAST_CODE = quantize.FIXED24_MAX - 1
+
+
+def largest_fractional_bits(largest: float) -> int:
+    """Return the most fractional bits, 0 to 24, with which 24-bit fixed point holds this magnitude of a coordinate.
+
+    Raises:
+        FormatError: not even whole units fit.
+    """
+    if np.rint(largest) > LAST_CODE:
+        reach = f"{largest:.0f}" if largest < 1e7 else f"{largest:.3g}"
+        raise FormatError(f"coordinates reach {reach}, SPZ holds at most {LAST_CODE}: scale the scene down")
+    bits = MAX_FRACTIONAL_BITS
+    while bits and np.rint(largest * 2.0**bits) > LAST_CODE:
+        bits -= 1
+    return bits
+
+
+def needed(options: WriteOptions) -> frozenset[str]:
+    """Return the statistics by which `settled` settles these options."""
+    needed = {"reach"}
+    if options.fractional_bits is None:
+        needed.add("leaf_scale")
+    if options.sh_bits is None:
+        needed.add("leaf_sh")
+    return frozenset(needed)
+
+
+def settled(scene: Scene | Statistics, options: WriteOptions) -> WriteOptions:
+    """Return the options with nothing left open: `encode` writes the scene with them.
+
+    Positions get as many fractional bits as all nodes allow, up to where a step is far below the smallest splats of
+    full detail (`statistics.STEPS_A_SPLAT`): merged splats are larger. SH get as many bits as colours need (`enough`).
+
+    Args:
+        scene: or the statistics of one that are `needed`.
+        options: that may leave choices open.
+
+    Raises:
+        FormatError: a coordinate does not fit the fractional bits; the text names the most that would.
+        ValueError: there are no such bits.
+    """
+    version = DEFAULT_SPZ_VERSION if options.spz_version is None else options.spz_version
+    found = scene if isinstance(scene, Statistics) else Statistics.of_scene(scene, needed(options))
+    assert found.reach is not None
+    bits, most = options.fractional_bits, largest_fractional_bits(found.reach)
+    if bits is None:
+        assert found.leaf_scale is not None
+        bits = max(0, min(most, fine_bits(found.leaf_scale)))
+    if bits > most:
+        raise FormatError(f"a coordinate does not fit {bits} fractional bits; use at most {most}")
+    sh_bits = options.sh_bits
+    if sh_bits is None:
+        sh_bits = quantize.LEAST_SH_BITS if found.leaf_sh is None else enough(found.leaf_sh)
+    if not quantize.LEAST_SH_BITS <= sh_bits <= ALL_BITS:
+        raise ValueError(f"sh_bits is {sh_bits}, not {quantize.LEAST_SH_BITS} to {ALL_BITS}")
+    return dataclasses.replace(options, spz_version=version, fractional_bits=bits, sh_bits=sh_bits)
+
+
+def like(header: Mapping[str, int], options: WriteOptions) -> WriteOptions:
+    """Return the options, and where they leave a choice open, that of the SPZ file which a scene was read from.
+
+    Its values then stay as they are. A version that is not written becomes the newest one that is; a scene from
+    another format, by its `Scene.header`, leaves the choice open.
+    """
+    version, bits = options.spz_version, options.fractional_bits
+    if "fractional_bits" not in header:
+        return options
+    if version is None:
+        version = int(header["version"])
+        version = version if version in SPZ_VERSIONS else max(SPZ_VERSIONS)
+    bits = int(header["fractional_bits"]) if bits is None else bits
+    return dataclasses.replace(options, spz_version=version, fractional_bits=bits)
+
+
+#: How streams are deflated; the others have repetitions of all kinds.
+WAYS = {
+    **dict.fromkeys(("alphas", "scales", "rotations"), compression.NOISE),
+    "colors": compression.TRIPLES,
+    "child_counts": compression.RUNS,
+    "child_starts": compression.LINKS,
+}
+
+
+@dataclass(frozen=True)
+class SpzEncoder:
+    """Encoder of a file, see `encoder.Encoder`: the result of a window has its part of each stream, by its name.
+
+    Attributes:
+        layout: of the file.
+        options: with nothing left open.
+        ranges: beyond which values are counted; none unless somebody wants to know.
+        up: as in `Scene`.
+        stored: (N, bytes or more) codes of streams by name, see `kept`. Of SH, there may be more coefficients than are
+            written.
+        kept: (N,) nodes that get their codes of `stored`; None for none.
+    """
+
+    layout: Layout
+    options: WriteOptions
+    ranges: tuple[Range, ...] = ()
+    up: str | None = None
+    stored: Mapping[str, Bytes] = field(default_factory=dict)
+    kept: NDArray[np.bool_] | None = None
+
+    @property
+    def count(self) -> int:
+        """Splats of the file."""
+        return self.layout.count
+
+    @property
+    def sh_degree(self) -> int:
+        """SH degree of the file."""
+        return self.layout.sh_degree
+
+    def encode(self, splats: Splats, tree: LodTree | None, start: int) -> Encoded:
+        """Encode a window, wherever it begins."""
+        streams = self.layout.streams()
+        codes = {stream.name: np.empty((len(splats), stream.size), np.uint8) for stream in streams}
+        bits, sh_bits = self.layout.fractional_bits, self.options.sh_bits
+        assert sh_bits is not None
+        for part in blocks_of(len(splats)):
+            some, links = rows_of(splats, tree, part)
+            is_leaf = None if links is None else links.is_leaf
+            some = dataclasses.replace(some, opacity=opacities(some, bits, covering=self.options.covering))
+            for stream in streams:
+                if stream.name == "sh":
+                    values = sh_codes(some.sh, is_leaf, sh_bits)
+                else:
+                    values = np.ascontiguousarray(stream.encode(column_of(some, links, stream)))
+                codes[stream.name][part] = values.view(np.uint8).reshape(-1, stream.size)
+        if self.kept is not None:
+            here = slice(start, start + len(splats))
+            kept = self.kept[here]
+            for name, stored in self.stored.items():
+                codes[name][kept] = stored[here][kept, : codes[name].shape[1]]
+        return codes | (
+            {CLAMPED: clamps.tally(splats, self.ranges, None if tree is None else tree.is_leaf)} if self.ranges else {}
+        )
+
+    def pieces(self, get: Get, *, threads: int, progress: Progress) -> Iterator[bytes]:
+        """Return the header and all streams, as one gzip member, piece by piece."""
+        layout = self.layout
+        fields = layout.version, layout.count, layout.sh_degree, layout.fractional_bits, layout.flags, 0
+
+        def data() -> Iterator[bytes | NDArray[Any]]:
+            yield HEADER.pack(MAGIC, *fields)
+            for stream in layout.streams():
+                for number in range(len(windows_of(layout.count))):
+                    yield get(number, stream.name)
+
+        runs = [
+            DataRun(stream.size * layout.count, WAYS.get(stream.name, compression.MIXED)) for stream in layout.streams()
+        ]
+        runs[0] = runs[0]._replace(size=runs[0].size + HEADER.size)
+        comment = "" if self.up is None else comment_of(up=self.up)
+        level = self.options.compression_level
+        yield from compression.gzip_member(data(), runs, level, threads, progress, comment=comment.encode())
+
+
+def encoder(
+    scene: Scene | NodeStream,
+    options: WriteOptions,
+    ranges: tuple[Range, ...] = (),
+    *,
+    threads: int = 1,
+    progress: Progress = silent,
+) -> SpzEncoder:
+    """Return the encoder of a scene, of which nothing is read; `threads` and `progress` are not needed.
+
+    Args:
+        scene: to write.
+        options: settled.
+        ranges: beyond which the results count values, see `clamps.tally`.
+
+    Raises:
+        ValueError: the options are not settled.
+    """
+    if options.spz_version is None or options.fractional_bits is None or options.sh_bits is None:
+        raise ValueError("the options leave choices open; `settled` makes them")
+    if isinstance(scene, NodeStream):
+        count, sh_degree, tree = scene.count, scene.sh_degree, True
+    else:
+        count, sh_degree, tree = len(scene), scene.splats.sh_degree, scene.tree is not None
+    flags = (ANTIALIASED if scene.antialiased else 0) | (LOD if tree else 0)
+    layout = Layout(options.spz_version, count, sh_degree, options.fractional_bits, flags)
+    return SpzEncoder(layout, options, ranges, scene.up)
+
+
+def to_code(
+    splats: Splats, is_leaf: NDArray[np.bool_] | None, fractional_bits: int, sh_bits: int, *, covering: bool
+) -> Splats:
+    """Return the values that the streams of a file are coded from; those of a file stay as they are.
+
+    Args:
+        splats: N splats or nodes.
+        is_leaf: (N,) which of them are leaves; None for splats without a tree.
+        fractional_bits: of the positions, a step of which is too thin to matter.
+        sh_bits: bits kept of the SH bytes of leaves; merged splats keep `quantize.LEAST_SH_BITS`.
+        covering: opacities make up for the rounding of scales.
+    """
+    sh = splats.sh
+    if sh.shape[1] and len(sh):
+        sh = quantize.decode_sh(sh_codes(sh, is_leaf, sh_bits))
+    return dataclasses.replace(splats, opacity=opacities(splats, fractional_bits, covering=covering), sh=sh)
+
+
+def opacities(splats: Splats, fractional_bits: int, *, covering: bool) -> FloatArray:
+    """Return (N,) linear opacities that make up for the rounding of scales, if `covering`."""
+    if not covering:
+        return splats.opacity
+    rounded = quantize.decode_log_scale(quantize.encode_log_scale(splats.scale))
+    return coverage.kept(splats.opacity, splats.scale, rounded, 2.0**-fractional_bits)
+
+
+def sh_codes(sh: FloatArray, is_leaf: NDArray[np.bool_] | None, sh_bits: int) -> Bytes:
+    """Return (N, K, 3) bytes of SH, of which merged splats keep fewer bits."""
+    codes = quantize.encode_sh(sh, sh_bits)
+    if is_leaf is not None and sh_bits > quantize.LEAST_SH_BITS:
+        codes[~is_leaf] = quantize.encode_sh(sh[~is_leaf], quantize.LEAST_SH_BITS)
+    return codes
+
 
 decode = decoder(open_content)
 

@@ -16,8 +16,7 @@ from ..support import atomic, atomic_set
 from ..support.addresses import Address, Place
 from ..support.errors import FormatError, OutputError
 from ..support.stdin import DASH
-from .beside import companions, in_folder
-from .paths import reason_of
+from .beside import companions, in_folder, reason_of
 from .reading import opened
 from .writing import Files, SinkTogether, check_header, send_together
 

@@ -19,8 +19,7 @@ from ..model.scene import FileCoding
 from ..model.splats import FloatArray, Splats
 from ..support.errors import UnreadableError
 from ..support.machine import available_memory
-from .beside import open_beside
-from .paths import reason_of
+from .beside import open_beside, reason_of
 from .reading import opened
 
 #: Name of the format in `codecs.formats`.

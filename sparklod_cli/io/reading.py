@@ -19,8 +19,7 @@ from ..support.addresses import Place, size_of
 from ..support.errors import FormatError, UnknownFormatError, UnreadableError
 from ..support.progress import Progress, silent
 from ..support.stdin import DASH, spooled
-from .beside import in_folder, open_beside
-from .paths import reason_unreadable
+from .beside import in_folder, open_beside, reason_unreadable
 
 if TYPE_CHECKING:
     from ..codecs.gpu import dump

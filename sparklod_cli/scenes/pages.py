@@ -18,8 +18,7 @@ from ..lod.kernels.pixel_scale import NODE
 from ..lod.traversal import Forest, fill_nodes
 from ..model.balls import USED, Balls, balls_of
 from ..model.instances import Instance
-from ..model.lod_tree import LodTree
-from ..model.nodes import CHUNK_BITS, CHUNK_NODES, Nodes
+from ..model.lod_tree import CHUNK_BITS, CHUNK_NODES, LodTree, Nodes
 from ..model.scene import FileCoding, Scene
 from ..model.splats import COLUMNS, Splats
 from ..support.errors import SparklodError, TreeError

@@ -13,7 +13,7 @@ from ..io import examine_scene, read_levels, size_of_input
 from ..io.details import has_levels, read_level_files
 from ..io.rad_file import RadFile
 from ..model.instances import Instance
-from ..model.nodes import CHUNK_NODES
+from ..model.lod_tree import CHUNK_NODES
 from ..model.scene import DetailScene, Scene
 from ..model.selection import Selection, describe
 from ..model.splats import COLUMNS

@@ -14,7 +14,7 @@ from sparklod_cli.codecs.encoder import Kept, results
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import codec as rad
 from sparklod_cli.codecs.rad.rad_layout import OPTIONS, choices
-from sparklod_cli.codecs.spz_encoder import like
+from sparklod_cli.codecs.spz import like
 from sparklod_cli.lod import quick
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats, same_rows

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...model.gaussian import size_factor
-from ...model.lod_tree import LodTree
-from ...model.nodes import Nodes
+from ...model.lod_tree import LodTree, Nodes
 from ...model.scene import PLAIN, FileCoding, ScaleCoding
 from ...model.splats import FloatArray, Splats
 from ...support.parallel import for_blocks

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from zlib_ng import zlib_ng
 
-from ...model.lod_tree import LodTree
-from ...model.nodes import CHUNK_NODES
+from ...model.lod_tree import CHUNK_NODES, LodTree
 from ...model.scene import Scene
 from ...model.sh import COEFFICIENTS
 from ...model.splats import COLUMNS, FloatArray, Splats

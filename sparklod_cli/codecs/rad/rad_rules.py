@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
 
-from ...model.nodes import CHUNK_NODES
+from ...model.lod_tree import CHUNK_NODES
 from ...support.defaults import MAX_SH_DEGREE
 from ...support.untrusted import quoted_value
 from ..quantize import LARGEST

@@ -28,9 +28,8 @@ from ..file_notes import note_of
 from ..options import DEFAULTS, WriteOptions
 from ..validation import check_valid
 from . import texel_codings as codings
-from .sog_container import zipped
+from .sog_container import MAX_SIDE, Texels, encode_webp, image_of, size_for, zipped
 from .texel_codings import codebook, nearest
-from .webp_images import MAX_SIDE, Texels, encode_webp, image_of, size_for
 
 #: Power of the weights of splats in the palette of SH. With 1, pictures are better still, but the error of coefficients
 #: is larger than that of splat-transform's; benchmarks/notes/file-sizes.md has the measurements.
