@@ -55,8 +55,8 @@ def test_a_cut_is_that_of_the_traversal() -> None:
     assert len(cut) == len(found) + len(plain.index) == len(cut.splats)
     assert np.array_equal(town.index, expected[0])
     assert np.array_equal(tree.index, expected[1])
-    assert len(plain.index) == len(scenes.finder[1].splats)
-    assert np.array_equal(town.splats.center, scenes.finder[0].splats.center[town.index])
+    assert len(plain.index) == len(scenes.loaded[1].splats)
+    assert np.array_equal(town.splats.center, scenes.loaded[0].splats.center[town.index])
     assert len(town.index) + len(tree.index) <= 3000
 
 
@@ -77,7 +77,7 @@ def test_colours_of_whole_numbers_span_what_the_cuts_have(by: str, budget: int) 
 def test_full_detail_is_the_leaves() -> None:
     scenes = read_scenes(at(TOWN, PLAIN))
     town, plain = CutFinder(scenes, None).cut(seen(scenes)).parts
-    loaded = scenes.finder[0]
+    loaded = scenes.loaded[0]
     assert loaded.depth is not None
     assert np.array_equal(town.index, loaded.leaves)
     assert len(scenes.balls().center) == len(town.index) + len(plain.index)
@@ -114,7 +114,7 @@ def test_continuous_cuts_fade_what_the_weights_say() -> None:
     assert part.weight is not None
     whole = part.weight == 1
     assert 0 < whole.sum() < len(whole)
-    opacity = scenes.finder[0].splats.opacity[part.index]
+    opacity = scenes.loaded[0].splats.opacity[part.index]
     assert np.array_equal(part.splats.opacity[whole], opacity[whole])
     assert (part.splats.opacity[~whole] < opacity[~whole]).all()
     assert part.weight.sum() == pytest.approx(3000, rel=1e-3)
@@ -162,7 +162,7 @@ def test_an_encoding_says_what_spz_cannot_hold(tmp_path: Path) -> None:
 def test_splats_that_cannot_be_drawn_are_left_out() -> None:
     file = FIXTURES / "faults" / "nan.ply"
     scenes = read_scenes(at(file))
-    assert scenes.finder[0].splats.is_valid().all()
+    assert scenes.loaded[0].splats.is_valid().all()
     assert any(note.startswith(f"{file}: left out ") and "not finite" in note for note in scenes.notes)
     with pytest.raises(InvalidSplatsError, match=r"no-splats.ply: it has no splats"):
         read_scenes(at(FIXTURES / "faults" / "no-splats.ply"))

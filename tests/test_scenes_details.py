@@ -98,7 +98,7 @@ def test_instances_share_a_budget_by_where_they_stand_and_by_their_lod_scale(row
     def sizes(*, lod_scale: float = 1.0) -> list[int]:
         scenes = scenes_of(Instance(row, "near"), Instance(row, "far", away, lod_scale=lod_scale))
         cut = CutFinder(scenes, LodSettings(500)).cut(AT)
-        assert len(scenes.finder) == 1
+        assert len(scenes.loaded) == 1
         return [len(part.index) for part in cut.parts]
 
     near, far = sizes()

@@ -265,7 +265,7 @@ def _named(instances: Sequence[Instance]) -> list[Instance]:
 
 def _trees(viewed: Viewed, threads: int, precision: str) -> Scenes:
     scenes = scenes_of(viewed, threads, precision)
-    plain = next((loaded.name for loaded in scenes.finder if not loaded.has_cuts), None)
+    plain = next((loaded.name for loaded in scenes.loaded if not loaded.has_cuts), None)
     if plain is not None:
         raise FormatError(f"{plain}: it is not a Level-of-Detail tree; build_lod makes one of it")
     return scenes

@@ -12,7 +12,6 @@ from ..model.lod_tree import LodTree
 from ..model.splats import FloatArray, Splats
 from ..support.parallel import blocks_of, ordered_map
 from . import quantize
-from .encoder import rows_of
 
 
 @dataclass(frozen=True)
@@ -174,8 +173,7 @@ def find(splats: Splats, threads: int = 1, ranges: Sequence[Range] = SPZ, tree: 
         return Clamps()
 
     def counted(part: slice) -> Tally:
-        some, links = rows_of(splats, tree, part)
-        return tally(some, ranges, None if links is None else links.is_leaf)
+        return tally(splats.rows(part), ranges, None if tree is None else tree.rows(part).is_leaf)
 
     return clamps_of(merged(list(ordered_map(counted, blocks_of(len(splats)), threads))), ranges)
 

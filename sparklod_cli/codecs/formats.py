@@ -30,10 +30,10 @@ class Format:
         unbundled: the name of the first of the files as which a scene can also be written, all in one folder; None if
             there is no such way. Its module then has `encode_files(scene, options, *, threads, progress)`, too, which
             yields the name and the bytes of each, this one last.
-        trees: it can be written with a Level-of-Detail tree. Its `encode` then takes a `NodeStream`, too, and
-            `scratch`, a folder; its `settled` takes `Statistics`, too, those that `needed(options)` names; and
-            `encoder(scene, options, ranges, *, threads, progress)` gives its `encoder.Encoder`, and `stored(file)`,
-            with `beside` where it has companions, the `encoder.Stored` of a file.
+        trees: it can be written with a Level-of-Detail tree. Its `settled` then takes `Statistics`, too,
+            those that `needed(options)` names; `encoder(scene, options, ranges, *, threads, progress)` gives its
+            `encoder.Encoder`, and `stored(file)`, with `beside` where it has companions, the `encoder.Stored` of a
+            file.
         suffixes: lower case, with the dot.
         beginning: a regular expression that the first bytes of its files match; None if any bytes are possible, so that
             only the suffix decides.

@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -27,7 +26,7 @@ from . import clamps, compression, coverage, quantize
 from .clamps import Range
 from .compression import DataRun
 from .content import Source, decoder
-from .encoder import CLAMPED, Encoded, Get, Kept, results, rows_of, windows_of
+from .encoder import Encoded, Encoder, Get, results, windows_of
 from .file_notes import comment_of
 from .options import DEFAULTS, WriteOptions
 from .quantize import Bytes
@@ -121,45 +120,35 @@ WAYS = {
 }
 
 
-@dataclass(frozen=True)
-class SpzEncoder:
-    """Encoder of a file, see `encoder.Encoder`: the result of a window has its part of each stream, by its name.
+@dataclass(frozen=True, eq=False)
+class SpzEncoder(Encoder):
+    """Encoder of a file: the result of a window has its part of each stream, by its name.
 
     Attributes:
-        layout: of the file.
-        options: with nothing left open.
-        ranges: beyond which values are counted; none unless somebody wants to know.
-        up: as in `Scene`.
         stored: (N, bytes or more) codes of streams by name, see `kept`. Of SH, there may be more coefficients than are
             written.
         kept: (N,) nodes that get their codes of `stored`; None for none.
     """
 
-    layout: Layout
-    options: WriteOptions
-    ranges: tuple[Range, ...] = ()
-    up: str | None = None
     stored: Mapping[str, Bytes] = field(default_factory=dict)
     kept: NDArray[np.bool_] | None = None
 
     @property
-    def count(self) -> int:
-        """Splats of the file."""
-        return self.layout.count
+    def layout(self) -> Layout:
+        """Layout of the file."""
+        version, bits = self.options.spz_version, self.options.fractional_bits
+        assert version is not None and bits is not None
+        flags = ANTIALIASED * self.antialiased | LOD * self.tree
+        return Layout(version, self.count, self.sh_degree, bits, flags)
 
-    @property
-    def sh_degree(self) -> int:
-        """SH degree of the file."""
-        return self.layout.sh_degree
-
-    def encode(self, splats: Splats, tree: LodTree | None, start: int) -> Encoded:
+    def codes(self, splats: Splats, tree: LodTree | None, start: int) -> Encoded:
         """Encode a window, wherever it begins."""
-        streams = self.layout.streams()
+        layout, sh_bits = self.layout, self.options.sh_bits
+        streams, bits = layout.streams(), layout.fractional_bits
         codes = {stream.name: np.empty((len(splats), stream.size), np.uint8) for stream in streams}
-        bits, sh_bits = self.layout.fractional_bits, self.options.sh_bits
         assert sh_bits is not None
         for part in blocks_of(len(splats)):
-            some, links = rows_of(splats, tree, part)
+            some, links = splats.rows(part), None if tree is None else tree.rows(part)
             is_leaf = None if links is None else links.is_leaf
             some = dataclasses.replace(some, opacity=opacities(some, bits, covering=self.options.covering))
             for stream in streams:
@@ -173,9 +162,7 @@ class SpzEncoder:
             kept = self.kept[here]
             for name, stored in self.stored.items():
                 codes[name][kept] = stored[here][kept, : codes[name].shape[1]]
-        return codes | (
-            {CLAMPED: clamps.tally(splats, self.ranges, None if tree is None else tree.is_leaf)} if self.ranges else {}
-        )
+        return codes
 
     def pieces(self, get: Get, *, threads: int, progress: Progress) -> Iterator[bytes]:
         """Return the header and all streams, as one gzip member, piece by piece."""
@@ -217,13 +204,7 @@ def encoder(
     """
     if options.spz_version is None or options.fractional_bits is None or options.sh_bits is None:
         raise ValueError("the options leave choices open; `settled` makes them")
-    if isinstance(scene, NodeStream):
-        count, sh_degree, tree = scene.count, scene.sh_degree, True
-    else:
-        count, sh_degree, tree = len(scene), scene.splats.sh_degree, scene.tree is not None
-    flags = (ANTIALIASED if scene.antialiased else 0) | (LOD if tree else 0)
-    layout = Layout(options.spz_version, count, sh_degree, options.fractional_bits, flags)
-    return SpzEncoder(layout, options, ranges, scene.up)
+    return SpzEncoder.of(scene, options, ranges)
 
 
 def to_code(
@@ -269,37 +250,18 @@ def held(options: WriteOptions, sh_degree: int) -> Sequence[Range]:
 
 
 def encode(
-    scene: Scene | NodeStream,
-    options: WriteOptions = DEFAULTS,
-    *,
-    threads: int = 1,
-    progress: Progress = silent,
-    scratch: Path | None = None,
+    scene: Scene, options: WriteOptions = DEFAULTS, *, threads: int = 1, progress: Progress = silent
 ) -> Iterator[bytes]:
     """Return the bytes of a file, piece by piece: an LoD file if the scene has a tree, otherwise a plain one.
 
-    The same scene and options give the same bytes for any number of threads, and for a stream of the same nodes.
-
-    Args:
-        scene: to write.
-        options: settled where the scene is a stream; otherwise they may leave choices open.
-        threads: to encode on.
-        progress: called with the splats, and then the bytes.
-        scratch: folder for a temporary file of the bytes before they are compressed; None to keep them in memory.
+    The same scene and options give the same bytes for any number of threads.
 
     Raises:
         FormatError: a coordinate does not fit the fractional bits; the text names the most that would.
     """
-    made = encoder(scene, settled(scene, options) if isinstance(scene, Scene) else options)
-    windows = results(made, scene, threads, progress, "encoding")
-    if scratch is None:
-        in_memory = list(windows)
-        yield from made.pieces(lambda number, name: in_memory[number][name], threads=threads, progress=progress)
-        return
-    with Kept(scratch) as spilled:
-        for window in windows:
-            spilled.put(window)
-        yield from made.pieces(spilled.get, threads=threads, progress=progress)
+    of_scene = encoder(scene, settled(scene, options))
+    windows = list(results(of_scene, scene, threads, progress, "encoding"))
+    yield from of_scene.pieces(lambda number, name: windows[number][name], threads=threads, progress=progress)
 
 
 @dataclass(frozen=True, eq=False)

@@ -195,7 +195,7 @@ def _upside_down(options: RenderOptions, scenes: Scenes) -> list[str]:
     """
     if scenes.up is not None or options.cameras.up is not None or options.cameras.camera_path is not None:
         return []
-    plain = (loaded for loaded in scenes.finder if loaded.scene.format.startswith("SPZ") and not loaded.is_tree)
+    plain = (loaded for loaded in scenes.loaded if loaded.scene.format.startswith("SPZ") and not loaded.is_tree)
     return [
         f"{loaded.name}: SPZ has y up by its specification, but cameras assume y down, as in trained scenes; give"
         " --up y if the scene is upside down"

@@ -9,9 +9,9 @@ import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from ..codecs.encoder import Encoder, Get
+from ..codecs.encoder import Get
 from ..codecs.formats import Format
 from ..codecs.options import WriteOptions
 from ..model.scene import Scene
@@ -297,11 +297,11 @@ class SceneSink:
         assert self.together is not None
         return self.together(chunks.in_files(self.stem))
 
-    def assemble(self, encoder: Encoder, get: Get, *, threads: int = 1, progress: Progress = silent) -> int:
+    def assemble(self, encoder: Any, get: Get, *, threads: int = 1, progress: Progress = silent) -> int:
         """Write a tree whose windows are encoded, and return how many bytes it wrote.
 
         Args:
-            encoder: of the tree, in the format of this sink.
+            encoder: an `Encoder` of the tree, in the format of this sink.
             get: reads the results of the windows.
 
         Raises:
@@ -310,7 +310,7 @@ class SceneSink:
         if self.whole is not None:
             return self.whole(encoder.pieces(get, threads=threads, progress=progress))
         assert self.together is not None
-        return self.together(self.form.codec().assemble_chunked(encoder, get, self.stem, progress=progress))
+        return self.together(encoder.files(get, self.stem, progress=progress))
 
 
 def scene_sink(path: Place, form: Format, *, chunked: bool = False, overwrite: bool) -> SceneSink:

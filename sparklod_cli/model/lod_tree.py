@@ -43,6 +43,10 @@ class LodTree:
         count, start = read_only(self.child_count), read_only(self.child_start)
         return self if count is self.child_count and start is self.child_start else LodTree(count, start)
 
+    def rows(self, part: slice) -> LodTree:
+        """Return views of some consecutive nodes."""
+        return LodTree(self.child_count[part], self.child_start[part])
+
     @property
     def is_leaf(self) -> NDArray[np.bool_]:
         """(M,) bool, true for nodes without children."""

@@ -106,6 +106,10 @@ class Splats:
         """Return the splats of an index array, a mask or a slice: the one way to filter, permute and truncate."""
         return Splats(**{name: np.ascontiguousarray(getattr(self, name)[index]) for name in COLUMNS})
 
+    def rows(self, part: slice) -> Splats:
+        """Return views of some consecutive splats."""
+        return Splats(**{name: getattr(self, name)[part] for name in COLUMNS})
+
     def invalid(self) -> dict[str, NDArray[np.bool_]]:
         """Return (N,) masks of invalid splats, by the kinds of `INVALID` that occur; a splat is in at most one mask.
 

@@ -6,9 +6,9 @@ A file is a header and its chunks, or a header that names a file for each chunk;
 from __future__ import annotations
 
 import dataclasses
+import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 from ...model.lod_tree import LodTree
 from ...model.scene import Scene
 from ...model.splats import COLUMNS, Splats
-from ...model.streams import NodeStream
 from ...support.progress import Progress, silent
 from ..content import Beside, decoder
-from ..encoder import Get, Kept, results, windows_of
+from ..encoder import results
 from ..options import DEFAULTS, WriteOptions
 from ..quantize import Bytes
 from ..splat_encoding import SplatEncoding
@@ -45,66 +44,34 @@ decode = decoder(open_content)
 
 
 def encode(
-    scene: Scene | NodeStream,
-    options: WriteOptions = DEFAULTS,
-    *,
-    threads: int = 1,
-    progress: Progress = silent,
-    scratch: Path | None = None,
+    scene: Scene, options: WriteOptions = DEFAULTS, *, threads: int = 1, progress: Progress = silent
 ) -> Iterator[bytes]:
     """Return the bytes of one file, piece by piece; chunks wait in a temporary file for the header, which has sizes.
 
-    The same scene and options give the same bytes for any number of threads, and for a stream of the same nodes. Nodes
-    keep their order; that of `lod.chunk_order` is for streaming.
-
-    Args:
-        scene: to write.
-        options: settled where the scene is a stream; otherwise they may leave choices open.
-        threads: to encode on.
-        progress: called with the splats.
-        scratch: folder for the temporary file; None for that of the system.
+    The same scene and options give the same bytes for any number of threads. Nodes keep their order; that of
+    `lod.chunk_order` is for streaming.
 
     Raises:
         FormatError, ValueError: see `rad_options.settled`.
     """
-    made = _encoder(scene, options, threads, progress)
-    with Kept(scratch, SPOOLED) as kept:
-        for result in results(made, scene, threads, progress, "encoding"):
-            kept.put(result)
-        yield from made.pieces(kept.get, threads=threads, progress=progress)
+    of_scene = encoder(scene, settled(scene, options), threads=threads, progress=progress)
+    with tempfile.SpooledTemporaryFile(SPOOLED) as file:
+        sizes = [file.write(window[CHUNK].data) for window in results(of_scene, scene, threads, progress, "encoding")]
+        file.seek(0)
+        yield from of_scene.one_file(sizes, map(file.read, sizes), progress)
 
 
 def encode_chunked(
-    scene: Scene | NodeStream, options: WriteOptions, stem: str, *, threads: int = 1, progress: Progress = silent
+    scene: Scene, options: WriteOptions, stem: str, *, threads: int = 1, progress: Progress = silent
 ) -> Files:
-    """Return the name and the bytes of each file of a scene with a file a chunk; the header is last.
-
-    Args:
-        scene, options, threads, progress: as for `encode`.
-        stem: of the names: the header's is "stem.rad", and those of the chunks are "stem-0.radc" and so on.
+    """Return the name and the bytes of each file of a scene with a file a chunk, see `RadEncoder.files`.
 
     Raises:
         FormatError, ValueError: see `rad_options.settled`.
     """
-    made = _encoder(scene, options, threads, progress)
-    windows = results(made, scene, threads, progress, "writing")
-    yield from made.files((window[CHUNK] for window in windows), stem)
-
-
-def assemble_chunked(made: RadEncoder, get: Get, stem: str, *, progress: Progress = silent) -> Files:
-    """Return the files of a tree whose windows are encoded, as `encode_chunked`; `get` reads their results."""
-
-    def chunks() -> Iterator[NDArray[np.uint8]]:
-        for number, part in enumerate(windows_of(made.count)):
-            yield get(number, CHUNK)
-            progress("writing", part.stop, made.count, "splat")
-
-    yield from made.files(chunks(), stem)
-
-
-def _encoder(scene: Scene | NodeStream, options: WriteOptions, threads: int, progress: Progress) -> RadEncoder:
-    options = settled(scene, options) if isinstance(scene, Scene) else options
-    return encoder(scene, options, threads=threads, progress=progress)
+    of_scene = encoder(scene, settled(scene, options), threads=threads, progress=progress)
+    windows = results(of_scene, scene, threads, progress, "writing")
+    yield from of_scene.files(lambda number, name: next(windows)[name], stem)
 
 
 @dataclass(frozen=True, eq=False)
