@@ -89,12 +89,6 @@ def matters(column: str, *, above: bool, visible: int, leaves: int) -> bool:
     """Return whether a person should know of clamped values.
 
     Splats that move or shrink may be large in a picture, so that one is enough; of others, a share of `MANY`.
-
-    Args:
-        column: of `Splats`.
-        above: whether the values lie above the upper end.
-        visible: number of leaves whose loss can be seen.
-        leaves: number of all of them.
     """
     return visible > (0 if column == "center" or (column == "scale" and above) else MANY[column] * leaves)
 
@@ -107,7 +101,6 @@ def tally(splats: Splats, ranges: Sequence[Range], leaf: NDArray[np.bool_] | Non
     thicker than a number that small cannot be seen.
 
     Args:
-        splats: n of them.
         ranges: those of one column are side by side.
         leaf: (n,) which of them are leaves; None for all.
 

@@ -126,8 +126,6 @@ class Content:
 
         Args:
             columns: of `Splats` to read; the others may be 0.
-            threads: to decode on.
-            progress: called while splats are read.
             validate: refuse a broken tree.
 
         Raises:

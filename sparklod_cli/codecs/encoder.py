@@ -73,7 +73,6 @@ class Encoder(ABC):
         """Encode a window, and count what that clamps.
 
         Args:
-            splats: of the window, all columns.
             tree: of the window, whose children have the numbers of the file; None where the file has no tree.
             start: number of the first splat; the start of one of `windows_of`.
         """

@@ -70,10 +70,6 @@ def settled(scene: Scene | Statistics, options: WriteOptions) -> WriteOptions:
     Positions get as many fractional bits as all nodes allow, up to where a step is far below the smallest splats of
     full detail (`statistics.STEPS_A_SPLAT`): merged splats are larger. SH get as many bits as colours need (`enough`).
 
-    Args:
-        scene: or the statistics of one that are `needed`.
-        options: that may leave choices open.
-
     Raises:
         FormatError: a coordinate does not fit the fractional bits; the text names the most that would.
         ValueError: there are no such bits.
@@ -193,11 +189,6 @@ def encoder(
     progress: Progress = silent,
 ) -> SpzEncoder:
     """Return the encoder of a scene, of which nothing is read; `threads` and `progress` are not needed.
-
-    Args:
-        scene: to write.
-        options: settled.
-        ranges: beyond which the results count values, see `clamps.tally`.
 
     Raises:
         ValueError: the options are not settled.

@@ -88,11 +88,7 @@ IN_FOLDERS = (MANIFEST, META)
 
 
 def companions(path: Path, sets: Collection[Collection[str]]) -> list[Path]:
-    """Return the files that are read together with one, as far as can be told; nothing is raised.
-
-    Args:
-        path: of a file, or of a folder.
-    """
+    """Return the files that are read together with one, as far as can be told; nothing is raised."""
     try:
         folder = path if path.is_dir() else path.parent
         first: Path | None = path

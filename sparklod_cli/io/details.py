@@ -34,7 +34,6 @@ def detail_sink(path: Place, *, overwrite: bool) -> SinkTogether:
 
     Args:
         path: of the manifest; where it is a symbolic link, all files go to where that leads.
-        overwrite: replace a former output.
 
     Raises:
         OutputError: it is no place for several files, a folder is in the way, or see `check_writable`.
@@ -48,11 +47,7 @@ def detail_sink(path: Place, *, overwrite: bool) -> SinkTogether:
 
 
 def detail_files(path: Path) -> list[Path]:
-    """Return the files beside a manifest that are called as those of an output there, whether it names them or not.
-
-    Args:
-        path: of the manifest, which need not exist.
-    """
+    """Return the files beside a manifest that are called as those of an output there, whether it names them or not."""
     target = Path(os.path.realpath(path))
     return [target.parent / name for name in _standing(target)]
 

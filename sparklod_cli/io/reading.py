@@ -80,9 +80,6 @@ def examine_scene(
 ) -> Scene:
     """Read a splat file for a report on it: its tree may be broken, and columns that are not asked for may be 0.
 
-    Args:
-        columns: of `Splats`.
-
     Raises:
         FormatError: as `read_scene`, but for the tree.
     """
@@ -188,7 +185,6 @@ def read_together(path: Path, sets: Collection[Collection[str]], limit: int) -> 
     Args:
         path: of a file, or of a folder that holds one of the sets.
         sets: names of files that belong together; where `path` is one of a set, the others beside it are read, too.
-        limit: bytes that a file may have.
 
     Raises:
         UnreadableError: there is no such file or set, or one is too large; the text names it.

@@ -96,9 +96,6 @@ def open_streams(
 
     Nothing is kept open between reads, and the header of a file that is named twice is read once.
 
-    Args:
-        files: at least one.
-
     Raises:
         HasTreeError, FormatError, ValueError: as `open_stream`; names the file.
     """
@@ -295,12 +292,7 @@ _IDLE: list[tuple[Hashable, Opened]] = []
 
 @contextlib.contextmanager
 def borrowed(key: Hashable, opened: Callable[[], Opened]) -> Iterator[SceneStream]:
-    """Yield a stream that nobody else reads meanwhile: one that waits, or else a new one. It waits afterwards.
-
-    Args:
-        key: tells a file, its version and how it is read from others.
-        opened: makes a new one.
-    """
+    """Yield a stream that nobody else reads meanwhile: one that waits, or else a new one. It waits afterwards."""
     found = _taken(key) or opened()
     sound = False
     try:

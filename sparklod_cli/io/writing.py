@@ -47,10 +47,6 @@ def check_writable(path: Place, *, overwrite: bool) -> None:
     """Raise `OutputError` where an output cannot be written, as far as that can be told before work goes into it.
 
     Folders on the way to it that do not exist are no error: `write_whole` makes them.
-
-    Args:
-        path: of the output.
-        overwrite: an existing file may be replaced.
     """
     try:
         if isinstance(path, Address):
@@ -120,11 +116,7 @@ def write_stdout(pieces: Iterable[bytes]) -> int:
 
 
 def chunk_files(path: Path) -> list[Path]:
-    """Return the existing files beside a header whose names match its pattern, in the order of their numbers.
-
-    Args:
-        path: of a header, which need not exist: the meta.json of a SOG, or a RAD.
-    """
+    """Return the existing files beside a header whose names match its pattern, in the order of their numbers."""
     target = Path(os.path.realpath(path))
     try:
         return _numbered(target, (each.name for each in target.parent.iterdir()))
@@ -227,7 +219,6 @@ def send_together(address: Address, files: Files, *, former: Sequence[Address], 
     replaced, the old header is removed first for the same reason: services replace one object at a time.
 
     Args:
-        address: of the file that names the others.
         files: names, with the folders that they are in there, and contents; the last is that of `address`.
         former: files of a former output, which are removed where no new one has their name.
 
@@ -300,10 +291,6 @@ class SceneSink:
     def assemble(self, encoder: Any, get: Get, *, threads: int = 1, progress: Progress = silent) -> int:
         """Write a tree whose windows are encoded, and return how many bytes it wrote.
 
-        Args:
-            encoder: an `Encoder` of the tree, in the format of this sink.
-            get: reads the results of the windows.
-
         Raises:
             OutputError: see `scene_sink`.
         """
@@ -319,7 +306,6 @@ def scene_sink(path: Place, form: Format, *, chunked: bool = False, overwrite: b
     Args:
         path: of the file, or of the header where `chunked`; - is standard output, for one file. One that is called as
             the `unbundled` of the format has the other files beside it.
-        form: that is written.
         chunked: with each chunk in a file of its own, beside the header; of RAD.
 
     Raises:

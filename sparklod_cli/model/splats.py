@@ -173,11 +173,7 @@ def same_rows(one: Splats, other: Splats) -> NDArray[np.bool_]:
 
 
 def describe_invalid(invalid: dict[str, NDArray[np.bool_]]) -> str:
-    """Return a message such as "3 of 50 splats are invalid (3 a scale below 0; the first is splat 7)".
-
-    Args:
-        invalid: the masks of `Splats.invalid`, not empty.
-    """
+    """Return a message such as "3 of 50 splats are invalid (3 a scale below 0; the first is splat 7)"."""
     counts = {kind: int(np.count_nonzero(mask)) for kind, mask in invalid.items()}
     total = len(next(iter(invalid.values())))
     return describe_counts(counts, total, min(int(np.argmax(mask)) for mask in invalid.values()))

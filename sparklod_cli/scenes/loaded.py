@@ -209,7 +209,6 @@ class Scenes:
         """Find the cuts of the instances of trees, or of scenes at several detail levels.
 
         Args:
-            settings: of the viewer.
             remembers: of `DetailTraversal`: cuts are found one after the other, along a path.
 
         Raises:

@@ -292,12 +292,7 @@ def empty_scene(file: RadFile) -> Scene:
 
 
 def sampled_balls(instances: Sequence[Instance], scenes: Sequence[LoadedScene]) -> Balls:
-    """Return what the splats of instances cover, as many as cameras look at: those that they take of all.
-
-    Args:
-        instances: at least one.
-        scenes: that each is of.
-    """
+    """Return what the splats of instances cover, as many as cameras look at: those that they take of all."""
     counts = [loaded.leaf_count for loaded in scenes]
     while True:
         every = max(sum(counts) // SAMPLE, 1)

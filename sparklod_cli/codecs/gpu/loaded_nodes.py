@@ -45,11 +45,9 @@ def nodes(splats: Splats, tree: LodTree, layout: str, coding: FileCoding = PLAIN
 
     Args:
         splats: N, as they were decoded; their centres, scales and opacities matter.
-        tree: of them.
         layout: one of `formats.LOADED`.
         coding: of the file that they were read from. Scales that do not come from its codes, or of splats that were not
             read from a file, are taken to be those that Spark has.
-        threads: to work on.
     """
     held = _layout(layout, coding.packed_range)
     found = Nodes(np.empty((len(splats), 3), np.float32), np.empty(len(splats), np.float32), tree)

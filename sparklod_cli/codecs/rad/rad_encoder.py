@@ -243,9 +243,6 @@ def encoder(
 
     Args:
         scene: of which nothing is read but what the palette is made of.
-        options: settled.
-        ranges: beyond which the results count values, see `clamps.tally`.
-        threads, progress: for the palette.
 
     Raises:
         ValueError: the options are not settled.

@@ -77,10 +77,6 @@ def _rounds(rad: RadOptions) -> bool:
 def settled(scene: Scene | Statistics, options: WriteOptions) -> WriteOptions:
     """Return the options with nothing left open: `encode` writes the scene with them.
 
-    Args:
-        scene: or the statistics of one that are `needed`.
-        options: that may leave choices open.
-
     Raises:
         FormatError: there are more splats than the format can number, or centres as float16 do not reach far enough.
     """
@@ -145,11 +141,7 @@ def held(options: WriteOptions, sh_degree: int) -> list[Range]:
 
 
 def fitted(found: Statistics) -> SplatEncoding:
-    """Return the ranges that suit splats in any order: what clamping and rounding cost together is least.
-
-    Args:
-        found: of `NEEDED`.
-    """
+    """Return the ranges that suit splats in any order: what clamping and rounding cost together is least."""
     rgb_min, rgb_max = _linear_range(found.magnitudes["rgb"])
     low, high = _log_range(found.magnitudes["scale"])
     sh_max = dict.fromkeys(("sh1_max", "sh2_max", "sh3_max"), 1.0)

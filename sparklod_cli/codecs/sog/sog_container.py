@@ -175,8 +175,6 @@ class Meta:
         """Return (count,) finite numbers.
 
         Args:
-            count: required length of the list.
-            way: keys that lead to the list.
             first_may_be_null: the first number may be null, as an old writer left it in codebooks; it is extrapolated
                 by the mean step.
         """
@@ -337,11 +335,7 @@ class _Archive:
 
 
 def zipped(files: Iterable[tuple[str, bytes]]) -> Iterator[bytes]:
-    """Return the bytes of a zip, piece by piece: the same for the same files, as its members have no dates.
-
-    Args:
-        files: names and contents, in the order of the archive.
-    """
+    """Return the bytes of a zip, piece by piece: the same for the same files, as its members have no dates."""
     # A buffer that is emptied member by member could not be sought, and sizes would follow the members' contents
     # instead of standing before them.
     buffer, done = io.BytesIO(), 0

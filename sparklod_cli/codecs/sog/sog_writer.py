@@ -112,12 +112,6 @@ def encode(
 
     Splats are in Morton order.
 
-    Args:
-        scene: what is written.
-        options: that may leave choices open.
-        threads: to encode on.
-        progress: told of the palette of SH, and of the images.
-
     Raises:
         FormatError, ValueError: see `settled`.
     """
