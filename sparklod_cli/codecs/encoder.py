@@ -52,12 +52,10 @@ class Encoder(ABC):
     antialiased: bool
     up: str | None
     options: WriteOptions
-    ranges: tuple[clamps.Range, ...] = ()
+    ranges: tuple[clamps.CodeRange, ...] = ()
 
     @classmethod
-    def of(
-        cls, scene: Scene | NodeStream, options: WriteOptions, ranges: tuple[clamps.Range, ...], **more: Any
-    ) -> Self:
+    def of(cls, scene: Scene | NodeStream, options: WriteOptions, ranges: tuple[clamps.CodeRange, ...]) -> Self:
         """Return the encoder of a scene, of which nothing is read."""
         if isinstance(scene, NodeStream):
             count, sh_degree, tree = scene.count, scene.sh_degree, True

@@ -23,14 +23,14 @@ from ..support.errors import FormatError
 from ..support.parallel import blocks_of
 from ..support.progress import Progress, silent
 from . import clamps, compression, coverage, quantize
-from .clamps import Range
+from .clamps import CodeRange
 from .compression import DataRun
 from .content import Source, decoder
 from .encoder import Encoded, Encoder, Get, results, windows_of
 from .file_notes import comment_of
 from .options import DEFAULTS, WriteOptions
 from .quantize import Bytes
-from .spz_streams import ANTIALIASED, HEADER, LOD, MAGIC, Layout, Stream, column_of, read_codes
+from .spz_streams import ANTIALIASED, HEADER, LOD, MAGIC, Layout, SpzStream, column_of, read_codes
 from .spz_streams import open_content as open_content
 from .statistics import ALL_BITS, Statistics, enough, fine_bits
 
@@ -183,7 +183,7 @@ class SpzEncoder(Encoder):
 def encoder(
     scene: Scene | NodeStream,
     options: WriteOptions,
-    ranges: tuple[Range, ...] = (),
+    ranges: tuple[CodeRange, ...] = (),
     *,
     threads: int = 1,
     progress: Progress = silent,
@@ -235,7 +235,7 @@ def sh_codes(sh: FloatArray, is_leaf: NDArray[np.bool_] | None, sh_bits: int) ->
 decode = decoder(open_content)
 
 
-def held(options: WriteOptions, sh_degree: int) -> Sequence[Range]:
+def held(options: WriteOptions, sh_degree: int) -> Sequence[CodeRange]:
     """Return the values that SPZ holds without clamping them."""
     return clamps.SPZ
 
@@ -279,7 +279,7 @@ class StoredSpz:
         codes = {each.name: self.codes[each.name] for each in streams if self._is_alike(each, encoder.layout)}
         return dataclasses.replace(encoder, stored=codes, kept=kept)
 
-    def _is_alike(self, stream: Stream, other: Layout) -> bool:
+    def _is_alike(self, stream: SpzStream, other: Layout) -> bool:
         """Return True if a layout has a stream of splats in the coding of the file."""
         own = self.layout
         if stream.column not in COLUMNS:

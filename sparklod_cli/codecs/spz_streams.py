@@ -42,7 +42,7 @@ KNOWN_FLAGS = ANTIALIASED | EXTENSIONS | LOD
 LINKS = {"child_counts": ("child_count", "<u2"), "child_starts": ("child_start", "<u4")}
 
 
-class Stream(NamedTuple):
+class SpzStream(NamedTuple):
     """One stream of a file: one column of all splats in order.
 
     Attributes:
@@ -66,10 +66,10 @@ class Stream(NamedTuple):
 
 
 #: Some rows of a stream: the stream, which rows, and (n, size) bytes.
-StreamRows = tuple[Stream, slice, quantize.Bytes]
+StreamRows = tuple[SpzStream, slice, quantize.Bytes]
 
 
-def column_of(splats: Splats, tree: LodTree | None, stream: Stream) -> NDArray[Any]:
+def column_of(splats: Splats, tree: LodTree | None, stream: SpzStream) -> NDArray[Any]:
     """Return the column that a stream holds."""
     column: NDArray[Any] = getattr(splats if hasattr(splats, stream.column) else tree, stream.column)
     return column
@@ -85,20 +85,20 @@ class Layout:
     fractional_bits: int
     flags: int
 
-    def streams(self) -> list[Stream]:
+    def streams(self) -> list[SpzStream]:
         """Return the streams in file order."""
         q, bits, coefficients = quantize, self.fractional_bits, COEFFICIENTS[self.sh_degree]
         table = [
-            Stream("positions", 6, "center", lambda codes: codes.view("<f2"), lambda center: center.astype("<f2"))
+            SpzStream("positions", 6, "center", lambda codes: codes.view("<f2"), lambda center: center.astype("<f2"))
             if self.version == 1
-            else Stream(
+            else SpzStream(
                 "positions",
                 9,
                 "center",
                 lambda codes: q.decode_fixed24(codes.reshape(-1, 3, 3), bits),
                 lambda center: q.encode_fixed24(center, bits),
             ),
-            Stream(
+            SpzStream(
                 "alphas",
                 1,
                 "opacity",
@@ -106,13 +106,13 @@ class Layout:
                 lambda opacity: q.encode_lod_opacity(lod_opacity(opacity)),
             )
             if self.flags & LOD
-            else Stream("alphas", 1, "opacity", q.decode_unorm8, q.encode_unorm8),
-            Stream("colors", 3, "rgb", q.decode_color, q.encode_color),
-            Stream("scales", 3, "scale", q.decode_log_scale, q.encode_log_scale),
-            Stream("rotations", 4, "quat_xyzw", q.decode_quat_smallest_three, q.encode_quat_smallest_three)
+            else SpzStream("alphas", 1, "opacity", q.decode_unorm8, q.encode_unorm8),
+            SpzStream("colors", 3, "rgb", q.decode_color, q.encode_color),
+            SpzStream("scales", 3, "scale", q.decode_log_scale, q.encode_log_scale),
+            SpzStream("rotations", 4, "quat_xyzw", q.decode_quat_smallest_three, q.encode_quat_smallest_three)
             if self.version >= 3
-            else Stream("rotations", 3, "quat_xyzw", q.decode_quat_first_three, q.encode_quat_first_three),
-            Stream(
+            else SpzStream("rotations", 3, "quat_xyzw", q.decode_quat_first_three, q.encode_quat_first_three),
+            SpzStream(
                 "sh",
                 3 * coefficients,  # coefficient-major, r g b innermost
                 "sh",
@@ -135,9 +135,9 @@ class Layout:
         return self.count * sum(stream.size for stream in self.streams())
 
 
-def _integers(name: str, column: str, code: str) -> Stream:
+def _integers(name: str, column: str, code: str) -> SpzStream:
     size = np.dtype(code).itemsize
-    return Stream(name, size, column, lambda codes: codes.view(code), lambda values: values.astype(code))
+    return SpzStream(name, size, column, lambda codes: codes.view(code), lambda values: values.astype(code))
 
 
 HEADER_V4 = struct.Struct("<IIIBBBBI12s")  # ..., streams, offset of the table of streams, reserved
@@ -249,7 +249,7 @@ def _checked(layout: Layout, file_size: int, header: dict[str, int]) -> Layout:
     return layout
 
 
-def _rows(layout: Layout, read: Read, stream: Stream) -> Iterator[StreamRows]:
+def _rows(layout: Layout, read: Read, stream: SpzStream) -> Iterator[StreamRows]:
     for part, codes in rows_of(read, stream.row_type, layout.count, stream.name):
         yield stream, part, codes
 

@@ -64,7 +64,7 @@ def open_stream(
         source = _Source(path, store, threads, progress)
         with source.borrowed() as stream:
             found = stream
-        yield dataclasses.replace(found, read=_Read(source, found.count, found.sh_degree))
+        yield dataclasses.replace(found, read=_ReadAnew(source, found.count, found.sh_degree))
     finally:
         close_idle(lambda key: isinstance(key, _Key) and (key.store, key.path) == (store.name, path))
         store.close()
@@ -264,7 +264,7 @@ class _Source:
 
 
 @dataclass(frozen=True)
-class _Read:
+class _ReadAnew:
     """`SceneStream.read` of a file that is opened anew."""
 
     source: _Source

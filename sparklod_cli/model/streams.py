@@ -112,7 +112,7 @@ def merged(parts: Sequence[Placed]) -> SceneStream:
     return SceneStream(
         firsts[-1],
         degree,
-        _Read(tuple(parts), firsts, degree),
+        _ReadMerged(tuple(parts), firsts, degree),
         antialiased,
         " and ".join(sorted({part.stream.format for part in parts})),
         tuple(dict.fromkeys(notes)),
@@ -133,7 +133,7 @@ def _antialiased(parts: Sequence[Placed]) -> tuple[bool, tuple[str, ...]]:
 
 
 @dataclass(frozen=True, eq=False)
-class _Read:
+class _ReadMerged:
     """`SceneStream.read` of several scenes; can be pickled if their streams can."""
 
     parts: tuple[Placed, ...]

@@ -24,7 +24,7 @@ from ..options import DEFAULTS, WriteOptions
 from ..quantize import Bytes
 from ..splat_encoding import SplatEncoding
 from .property_codings import CODINGS
-from .rad_encoder import CHUNK, Coded, RadEncoder
+from .rad_encoder import CHUNK, CodedProperty, RadEncoder
 from .rad_encoder import encoder as encoder
 from .rad_header import Files, Property, RadHeader
 from .rad_layout import AUTO, OPTIONS, PROPERTIES, RANGES, SIZES, Row, encodings_of
@@ -164,7 +164,7 @@ class KeepingEncoder(RadEncoder):
 
     def coded(
         self, row: Row, splats: Splats, tree: LodTree | None, labels: NDArray[np.uint32] | None, start: int
-    ) -> Coded:
+    ) -> CodedProperty:
         """Encode a property of a chunk in the range that it had."""
         made, stop = super().coded(row, splats, tree, labels, start), start + len(splats)
         found = None if self.stored is None else self.stored.codes(row.name, start, stop)
@@ -175,7 +175,7 @@ class KeepingEncoder(RadEncoder):
         codes = CODINGS[made.encoding].encode(self.values(row, made.encoding, splats, tree, labels), low, high)
         flat, kept = _flat(codes, made.encoding, len(splats)), self.kept[start:stop]
         _by_splat(flat, row, made.encoding)[kept] = before[kept]
-        return Coded(made.encoding, _stored(flat, made.encoding, len(splats)), each.min, each.max)
+        return CodedProperty(made.encoding, _stored(flat, made.encoding, len(splats)), each.min, each.max)
 
 
 def _flat(codes: NDArray[Any], encoding: str, count: int) -> Bytes:

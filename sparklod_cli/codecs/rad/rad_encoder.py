@@ -19,7 +19,7 @@ from ...model.streams import NodeStream
 from ...support.parallel import blocks_of
 from ...support.progress import Progress, silent
 from .. import coverage, sh_palette, spark_codings
-from ..clamps import Range
+from ..clamps import CodeRange
 from ..encoder import Encoded, Encoder, Get, windows_of
 from ..file_notes import comment_of
 from ..options import WriteOptions
@@ -56,7 +56,7 @@ SAMPLE = 1 << 20
 RUN = 1 << 8
 
 
-class Coded(NamedTuple):
+class CodedProperty(NamedTuple):
     """Property of a chunk: encoding, codes of any shape that are not compressed, and ends of their range, if any."""
 
     encoding: str
@@ -166,12 +166,12 @@ class RadEncoder(Encoder):
 
     def coded(
         self, row: Row, splats: Splats, tree: LodTree | None, labels: NDArray[np.uint32] | None, start: int
-    ) -> Coded:
+    ) -> CodedProperty:
         """Encode a property of the chunk that begins with node `start`."""
         encoding = getattr(self.options.rad, row.option) if row.option else row.encodings[0]
         low, high = code_range(row, self._codes)
         codes = CODINGS[encoding].encode(self.values(row, encoding, splats, tree, labels), low, high)
-        return Coded(encoding, codes, *((low, high) if RANGES.get(encoding) else (None, None)))
+        return CodedProperty(encoding, codes, *((low, high) if RANGES.get(encoding) else (None, None)))
 
     def _rows(self, *, first: bool) -> Iterator[Row]:
         """Yield the properties of a chunk."""
@@ -234,7 +234,7 @@ class RadEncoder(Encoder):
 def encoder(
     scene: Scene | NodeStream,
     options: WriteOptions,
-    ranges: tuple[Range, ...] = (),
+    ranges: tuple[CodeRange, ...] = (),
     *,
     threads: int = 1,
     progress: Progress = silent,

@@ -22,7 +22,7 @@ from ...support.parallel import blocks_of, ordered_map
 from ...support.progress import Progress, silent
 from ...support.units import count_of
 from .. import quantize, sh_palette
-from ..clamps import Range
+from ..clamps import CodeRange
 from ..file_names import META, SOG_IMAGES
 from ..file_notes import note_of
 from ..options import DEFAULTS, WriteOptions
@@ -88,7 +88,7 @@ def settled(scene: Scene, options: WriteOptions) -> WriteOptions:
     return dataclasses.replace(options, sog=sog)
 
 
-def held(options: WriteOptions, sh_degree: int) -> tuple[Range, ...]:
+def held(options: WriteOptions, sh_degree: int) -> tuple[CodeRange, ...]:
     """Return the values that SOG holds without clamping them: its codebooks suit any."""
     return ()
 
