@@ -18,4 +18,4 @@ def node_stream(scene: Scene) -> NodeStream:
         part = slice(start, stop)
         return scene.splats.take(part), LodTree(tree.child_count[part].copy(), tree.child_start[part].copy())
 
-    return NodeStream(len(scene), int(tree.is_leaf.sum()), scene.splats.sh_degree, scene.antialiased, read)
+    return NodeStream(len(scene), scene.splats.sh_degree, scene.antialiased, read)

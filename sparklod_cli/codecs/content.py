@@ -77,11 +77,7 @@ class Target:
 
 
 class Fill(Protocol):
-    """Reads and decodes rows.
-
-    Raises:
-        FormatError: the file is cut short or corrupt.
-    """
+    """Reads and decodes rows; raises `FormatError` if the file is cut short or corrupt."""
 
     def __call__(self, target: Target, threads: int, progress: Progress) -> None: ...
 

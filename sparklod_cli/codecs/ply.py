@@ -176,11 +176,7 @@ def _text_rows(file: BinaryIO, header: PlyHeader) -> Iterator[Rows]:
 
 
 def settled(scene: Scene, options: WriteOptions) -> WriteOptions:
-    """Return the options: PLY has no choices.
-
-    Raises:
-        FormatError: the scene is a tree, which PLY cannot hold.
-    """
+    """Return the options: PLY has no choices; raises `FormatError` if the scene is a tree, which PLY cannot hold."""
     if scene.tree is not None:
         raise FormatError("PLY holds no Level-of-Detail tree")
     return options

@@ -250,7 +250,7 @@ def _checked(layout: Layout, file_size: int, header: dict[str, int]) -> Layout:
 
 
 def _rows(layout: Layout, read: Read, stream: SpzStream) -> Iterator[StreamRows]:
-    for part, codes in rows_of(read, stream.row_type, layout.count, stream.name):
+    for part, codes in rows_of(read, stream.row_type, 0, layout.count, layout.count, stream.name):
         yield stream, part, codes
 
 

@@ -72,15 +72,6 @@ class Positioned:
         return read
 
 
-def rows_of(read: Read, row_type: np.dtype[Any], count: int, what: str = "splats") -> Iterator[Rows]:
-    """Read `count` rows in blocks of at least `BLOCK_ROWS` rows and `BLOCK_BYTES` bytes, when they are asked for.
-
-    Raises:
-        TruncatedError: the data ends early.
-    """
-    yield from _rows(read, row_type, 0, count, count, what)
-
-
 def rows_between(
     file: Positioned,
     offset: int,
@@ -92,10 +83,17 @@ def rows_between(
 ) -> Iterator[Rows]:
     """Read rows from `start` to `stop`, of `count` that begin at `offset` in a file; blocks and errors as `rows_of`."""
     read = file.reader(offset + start * row_type.itemsize)
-    yield from _rows(read, row_type, start, stop, count, what)
+    return rows_of(read, row_type, start, stop, count, what)
 
 
-def _rows(read: Read, row_type: np.dtype[Any], start: int, stop: int, count: int, what: str) -> Iterator[Rows]:
+def rows_of(
+    read: Read, row_type: np.dtype[Any], start: int, stop: int, count: int, what: str = "splats"
+) -> Iterator[Rows]:
+    """Read rows from `start` to `stop`, of `count`, in blocks of at least `BLOCK_ROWS` rows and `BLOCK_BYTES` bytes.
+
+    Raises:
+        TruncatedError: the data ends early.
+    """
     step = max(BLOCK_ROWS, BLOCK_BYTES // row_type.itemsize)
     for first in range(start, stop, step):
         part = slice(first, min(first + step, stop))

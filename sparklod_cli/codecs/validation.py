@@ -78,11 +78,7 @@ def is_valid_and_visible(splats: Splats, threads: int) -> tuple[bool, bool]:
 
 
 def check_valid(splats: Splats, threads: int) -> None:
-    """Check that splats can be written.
-
-    Raises:
-        InvalidSplatsError: one is invalid.
-    """
+    """Check that splats can be written; raises `InvalidSplatsError` if one is invalid."""
     if not is_valid_and_visible(splats, threads)[0] and (invalid := splats.invalid()):
         raise InvalidSplatsError(f"{describe_invalid(invalid)}; such splats are not written, leave them out")
 

@@ -113,11 +113,7 @@ class Selection:
         return keep, SelectionTally(len(splats), {reason: count for reason, count in dropped.items() if count}, first)
 
     def check(self, tally: SelectionTally) -> None:
-        """Check that a tree can be made of what is kept of a whole scene.
-
-        Raises:
-            InvalidSplatsError: see `apply`.
-        """
+        """Check that a tree can be made of what is kept of a whole scene; raises `InvalidSplatsError`, see `apply`."""
         if tally.count == 0:
             raise InvalidSplatsError("it has no splats")
         if tally.first_invalid is not None and not self.drop_invalid:

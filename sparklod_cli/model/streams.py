@@ -55,7 +55,6 @@ class NodeStream:
 
     Attributes:
         count: M nodes.
-        leaves: how many of them are leaves.
         sh_degree: of all windows.
         antialiased, up: as in `Scene`.
         read: called with a range of nodes, returns them and their tree columns, whose `child_start` counts from the
@@ -63,7 +62,6 @@ class NodeStream:
     """
 
     count: int
-    leaves: int
     sh_degree: int
     antialiased: bool
     read: Callable[[int, int], tuple[Splats, LodTree]]

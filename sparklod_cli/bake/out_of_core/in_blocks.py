@@ -92,7 +92,7 @@ class InBlocks:
         self.clock.end("order")
         count, tree.levels = job.store.get(ORDER, ["counts"])["counts"].tolist()
         tree.statistics = Statistics.merged([Statistics.from_array(stage["statistics"]) for stage in stages])
-        tree.nodes = node_stream(job, count, tree.splats)
+        tree.nodes = node_stream(job, count)
 
     def encode(self, tree: BuiltTree, encoder: Encoder) -> Get:
         """Encode the windows of the tree; whatever interrupts the rest finds its output published, or a part of it."""

@@ -58,11 +58,7 @@ def pack(
 
 
 def dump(scene: Scene, *, threads: int = 1) -> dict[str, Words]:
-    """Return the words of a scene that is a tree.
-
-    Raises:
-        ValueError: it is none.
-    """
+    """Return the words of a scene that is a tree; raises `ValueError` if it is none."""
     if scene.tree is None:
         raise ValueError("the scene has no tree")
     return pack(scene.splats, scene.tree, threads=threads)

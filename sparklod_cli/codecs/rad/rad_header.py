@@ -276,11 +276,7 @@ def read_header(file: BinaryIO) -> RadHeader:
 
 
 def read_chunk_header(file: BinaryIO) -> RadChunkHeader:
-    """Read the header of a chunk; the file is left at its payload.
-
-    Raises:
-        FormatError: as for `read_header`.
-    """
+    """Read the header of a chunk; the file is left at its payload; raises `FormatError` as for `read_header`."""
     fields, size, zeros = _read_json(file, CHUNK_MAGIC, MAX_CHUNK_JSON, "header of a RAD chunk")
     stored = file.read(PAYLOAD.size)
     if len(stored) < PAYLOAD.size:

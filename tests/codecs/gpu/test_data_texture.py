@@ -71,19 +71,6 @@ def test_every_byte_is_that_of_the_slow_twin() -> None:
     assert not texture.reshape(-1, 8)[len(splats) :].any()
 
 
-def test_a_splat_is_two_texels_of_these_bytes() -> None:
-    """A quarter turn about z takes the local x axis to the world's y axis."""
-    half = 0.5**0.5
-    splats = splats_with(
-        1, center=[1, 2, 3], scale=[0.5, 0.25, 2], quat_xyzw=[0, 0, half, half], rgb=[0, 0.2, 1], opacity=0.6
-    )
-    texel_0, texel_1 = data_texture.pack(splats)["texture"][0, :2]
-    assert texel_0.tobytes() == struct.pack("<3fI", 1, 2, 3, 0)
-    covariance = np.frombuffer(texel_1[:3].tobytes(), "<f2")
-    np.testing.assert_allclose(covariance, [0.25, 0, 0, 1, 0, 16], atol=1e-6)
-    assert texel_1[3] == 153 << 24 | 255 << 16 | 51 << 8
-
-
 @pytest.mark.parametrize(("count", "height"), [(0, 1), (1, 1), (1024, 1), (1025, 2), (2048, 2)])
 def test_a_texture_has_as_many_rows_as_its_splats_need(count: int, height: int) -> None:
     packed = data_texture.pack(random_splats(2048).take(slice(count)))

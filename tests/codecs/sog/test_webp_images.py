@@ -44,24 +44,14 @@ def extended(flags: int, width: int, height: int, *chunks: bytes) -> bytes:
     return b"RIFF" + struct.pack("<I", len(body)) + body
 
 
-def pictures() -> dict[str, Texels]:
-    rng = np.random.default_rng(7)
-    y, x = np.mgrid[:40, :52]
-    smooth = np.stack([x * 4 + y, y * 5, 255 - x * 3], axis=-1)
-    few = {f"{n} colours": rng.integers(0, 256, (n, 4), np.uint8)[rng.integers(0, n, (37, 41))] for n in (2, 3, 9, 200)}
-    return few | {
-        "smooth": (smooth % 256).astype(np.uint8),
-        "smooth with noise": np.clip(smooth + rng.normal(0, 3, smooth.shape), 0, 255).astype(np.uint8),
-        "noise": rng.integers(0, 256, (33, 29, 4), np.uint8),
-        "dark noise": np.clip(rng.geometric(0.05, (80, 90, 3)), 0, 255).astype(np.uint8),
-        "repeated": np.tile(rng.integers(0, 256, (8, 8, 3), np.uint8), (6, 7, 1)),
-        "one pixel": np.full((1, 1, 4), 77, np.uint8),
-        "a row": rng.integers(0, 9, (1, 500, 3), np.uint8),
-        "a column": rng.integers(0, 9, (500, 1, 3), np.uint8),
-    }
-
-
-PICTURES = pictures()
+RNG = np.random.default_rng(7)
+PICTURES = {
+    "noise": RNG.integers(0, 256, (33, 29, 4), np.uint8),
+    "opaque": np.tile(RNG.integers(0, 256, (8, 8, 3), np.uint8), (6, 7, 1)),
+    "3 colours": RNG.integers(0, 256, (3, 4), np.uint8)[RNG.integers(0, 3, (37, 41))],
+    "one pixel": np.full((1, 1, 4), 77, np.uint8),
+    "a row": RNG.integers(0, 9, (1, 500, 3), np.uint8),
+}
 
 
 @pytest.mark.parametrize("name", PICTURES)
@@ -76,7 +66,7 @@ def test_pixels_are_those_that_were_written(name: str) -> None:
 
 
 def test_an_extended_header_is_read() -> None:
-    texels = PICTURES["9 colours"]
+    texels = PICTURES["3 colours"]
     height, width = texels.shape[:2]
     data = extended(0x10, width, height, encoded(texels)[12:])
     np.testing.assert_array_equal(decoded(data), texels)
@@ -96,27 +86,23 @@ def is_refused(data: bytes) -> bool:
 
 
 def test_images_that_are_cut_are_refused() -> None:
-    for name in ("smooth with noise", "3 colours", "one pixel"):
+    for name in ("noise", "3 colours", "one pixel"):
         data = encoded(PICTURES[name])
         assert not is_refused(data)
         assert all(is_refused(data[:end]) for end in range(len(data)))
 
 
 def broken_containers() -> Iterator[tuple[str, bytes]]:
-    texels = PICTURES["9 colours"]
+    texels = PICTURES["3 colours"]
     height, width = texels.shape[:2]
     data = encoded(texels)
     image, size = data[12:], len(data)
-    for wrong in (0, 3, size - 40, size + 2, 1 << 31, (1 << 32) - 1):
+    for wrong in (0, size - 40, 1 << 31):
         yield f"RIFF of {wrong} bytes", data[:4] + struct.pack("<I", wrong) + data[8:]
         yield f"chunk of {wrong} bytes", data[:16] + struct.pack("<I", wrong) + data[20:]
     yield "a larger canvas", extended(0x10, width + 4, height, image)
-    yield "a smaller canvas", extended(0x10, width, height - 1, image)
     yield "no image", extended(0x10, width, height)
     yield "an animation", extended(0x12, width, height, image)
-    yield "an animation without its flag", extended(0x10, width, height, chunk(b"ANMF", bytes(16) + image))
-    yield "another signature", data[:20] + b"\x2e" + data[21:]
-    yield "another version", data[:24] + bytes([data[24] | 0xE0]) + data[25:]
     yield "another kind", data[:12] + b"VP8Z" + data[16:]
     yield "no RIFF", b"RIFX" + data[4:]
 
@@ -124,21 +110,6 @@ def broken_containers() -> Iterator[tuple[str, bytes]]:
 @pytest.mark.parametrize(("name", "data"), [pytest.param(*each, id=each[0]) for each in broken_containers()])
 def test_containers_that_do_not_fit_together_are_refused(name: str, data: bytes) -> None:
     assert is_refused(data)
-
-
-def test_damaged_images_are_refused_or_have_their_size() -> None:
-    rng, refused, tried = np.random.default_rng(9), 0, 0
-    for texels in PICTURES.values():
-        data = encoded(texels, 100, 6)
-        for _ in range(40):
-            changed = bytearray(data)
-            for place in rng.integers(0, len(data), rng.integers(1, 4)):
-                changed[place] ^= 1 << rng.integers(8)
-            header = struct.unpack_from("<I", changed, 21)[0]
-            if (1 + (header & 0x3FFF)) * (1 + (header >> 14 & 0x3FFF)) < 1 << 22:  # SOG bounds it before it is decoded
-                refused += is_refused(bytes(changed))
-                tried += 1
-    assert 0.3 * tried < refused < tried
 
 
 def test_an_image_of_one_colour_is_decoded() -> None:
