@@ -38,7 +38,7 @@ def faces(scale: FloatArray, blur: float) -> NDArray[np.float64]:
     return found
 
 
-def kept(opacity: FloatArray, scale: FloatArray, rounded: FloatArray, blur: float) -> FloatArray:
+def compensated(opacity: FloatArray, scale: FloatArray, rounded: FloatArray, blur: float) -> FloatArray:
     """Return (N,) linear opacities with which splats of rounded scales cover as much as before.
 
     A splat of opacity A up to 1 covers A times its area, and keeps an opacity up to 1. A merged one of A above 1 covers

@@ -221,7 +221,7 @@ def opacities(splats: Splats, fractional_bits: int, *, covering: bool) -> FloatA
     if not covering:
         return splats.opacity
     rounded = quantize.decode_log_scale(quantize.encode_log_scale(splats.scale))
-    return coverage.kept(splats.opacity, splats.scale, rounded, 2.0**-fractional_bits)
+    return coverage.compensated(splats.opacity, splats.scale, rounded, 2.0**-fractional_bits)
 
 
 def sh_codes(sh: FloatArray, is_leaf: NDArray[np.bool_] | None, sh_bits: int) -> Bytes:

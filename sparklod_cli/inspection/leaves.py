@@ -189,7 +189,7 @@ def _covering(splats: Splats, facts: RadFacts, bits: int | None) -> Splats:
         return splats
     scale = CODINGS[found.encoding].rounded(splats.scale, found.min or 0.0, found.max or 0.0)
     blur = 0.0 if bits is None else 2.0**-bits
-    return dataclasses.replace(splats, opacity=coverage.kept(splats.opacity, splats.scale, scale, blur))
+    return dataclasses.replace(splats, opacity=coverage.compensated(splats.opacity, splats.scale, scale, blur))
 
 
 def _rad_codes(splats: Splats, row: Row, found: PropertyFacts, encoding: str) -> NDArray[np.int32]:

@@ -24,7 +24,7 @@ class Precision:
     log_scale: float | Array = 2e-6
     degrees: float = 1e-3
     opacity: float = 1e-6
-    blur: float | None = None  # of `coverage.kept`, where the opacity makes up for the rounding of scales
+    blur: float | None = None  # of `coverage.compensated`, where the opacity makes up for the rounding of scales
     merged: float = 1e-6  # of an LoD opacity D above 1
     rgb: float | Array = 1e-6
     sh: tuple[float, float] = (0.0, 0.0)  # degree 1, degrees above

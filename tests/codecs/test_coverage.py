@@ -39,7 +39,7 @@ def test_a_splat_covers_what_it_did(seed: int) -> None:
     held = rounded(splats.scale)
     before = splats.opacity * coverage.faces(splats.scale, 0)
     area = coverage.faces(held, 0)
-    kept = coverage.kept(splats.opacity, splats.scale, held, 0.0)
+    kept = coverage.compensated(splats.opacity, splats.scale, held, 0.0)
     off = np.abs(kept * area / before - 1)
     assert (off[kept < 1] < 1e-5).all()
     assert (off <= np.abs(splats.opacity * area / before - 1) + 1e-6).all()  # saturated ones gain as much as they can
@@ -65,13 +65,13 @@ def test_merged_splats_cover_what_they_did() -> None:
     splats = random_splats(400, seed=3)
     opacity = np.geomspace(1.2, 1000, 400).astype(np.float32)
     held = rounded(splats.scale)
-    kept = coverage.kept(opacity, splats.scale, held, 0.0)
+    kept = coverage.compensated(opacity, splats.scale, held, 0.0)
     expected, area = integral(opacity) * coverage.faces(splats.scale, 0), coverage.faces(held, 0)
     off = np.abs(integral(kept) * area / expected - 1)
     assert off.max() < 0.012  # of 0.06
     assert (np.abs(kept - opacity) > 0).all()
     barely = np.full(400, 1.001, np.float32)
-    assert (coverage.kept(barely, splats.scale, held, 0.0) > 1).all()  # they keep their falloff
+    assert (coverage.compensated(barely, splats.scale, held, 0.0) > 1).all()  # they keep their falloff
 
 
 @pytest.mark.parametrize("opacity", [0.0, 0.5, 1.0, 1.5, 1000.0])
@@ -79,7 +79,7 @@ def test_merged_splats_cover_what_they_did() -> None:
 def test_what_is_not_rounded_stays_bit_for_bit(opacity: float, blur: float) -> None:
     scale = np.concatenate([random_splats(50).scale, np.zeros((1, 3), np.float32)])
     column = np.full(len(scale), opacity, np.float32)
-    assert coverage.kept(column, scale, scale.copy(), blur).tobytes() == column.tobytes()
+    assert coverage.compensated(column, scale, scale.copy(), blur).tobytes() == column.tobytes()
 
 
 def test_what_is_thinner_than_a_step_of_positions_makes_no_splat_fainter() -> None:
@@ -87,19 +87,19 @@ def test_what_is_thinner_than_a_step_of_positions_makes_no_splat_fainter() -> No
     opacity, least = np.full(2, 0.8, np.float32), np.float32(np.exp(-10))
     scale = np.array([[1e-9, 1e-9, 1e-9], [0.5, 1e-8, 1e-7]], np.float32)
     held = np.maximum(scale, least)
-    assert (coverage.kept(opacity, scale, held, 1e-3) > 0.79).all()
+    assert (coverage.compensated(opacity, scale, held, 1e-3) > 0.79).all()
     # In a scene of such splats a pixel is as small, up to what cannot be told from a speck.
-    np.testing.assert_allclose(coverage.kept(opacity, scale, held, 0.0), [0.8 * coverage.LEAST_GROWTH] * 2)
+    np.testing.assert_allclose(coverage.compensated(opacity, scale, held, 0.0), [0.8 * coverage.LEAST_GROWTH] * 2)
 
 
 @pytest.mark.filterwarnings("error")
 def test_what_shrinks_to_the_largest_code_does_not_get_dense() -> None:
     opacity = np.array([0.5, 2, 1000], np.float32)
     scale = np.full((3, 3), 1e9, np.float32)
-    kept = coverage.kept(opacity, scale, rounded(scale), 1.0)
+    kept = coverage.compensated(opacity, scale, rounded(scale), 1.0)
     assert kept[0] == pytest.approx(0.5 * coverage.MOST_GROWTH)
     assert np.isfinite(kept).all()
-    assert np.isfinite(coverage.kept(opacity, np.zeros_like(scale), np.zeros_like(scale), 0.0)).all()
+    assert np.isfinite(coverage.compensated(opacity, np.zeros_like(scale), np.zeros_like(scale), 0.0)).all()
 
 
 def again(codec: ModuleType, scene: Scene, options: WriteOptions) -> Scene:

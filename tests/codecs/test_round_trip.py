@@ -83,7 +83,7 @@ def assert_close(back: Splats, source: Splats, allowed: Precision) -> None:
     assert rotation_degrees(back.quat_xyzw, source.quat_xyzw).max() <= allowed.degrees
     opacity = source.opacity
     if allowed.blur is not None:
-        opacity = coverage.kept(opacity, source.scale, back.scale, allowed.blur)
+        opacity = coverage.compensated(opacity, source.scale, back.scale, allowed.blur)
     off = np.abs(lod_opacity(back.opacity) - lod_opacity(opacity))
     assert (off <= np.where(opacity > 1, allowed.merged, allowed.opacity)).all()
     assert (np.abs(back.rgb - np.clip(source.rgb, *allowed.rgb_range)) <= allowed.rgb).all()

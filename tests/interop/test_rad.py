@@ -215,7 +215,9 @@ def check_close(spark: Spark, path: Path, scene: Scene, options: RadOptions) -> 
     within(got.center, center, step + (0 if chosen.center_bits is None else 2.0**-chosen.center_bits / 2))
     held = rad.decode(io.BytesIO(path.read_bytes())).splats.scale
     blur = 0.0 if chosen.center_bits is None else 2.0**-chosen.center_bits
-    opacity = coverage.kept(splats.opacity, splats.scale, held, blur)  # which makes up for the rounding of scales
+    opacity = coverage.compensated(
+        splats.opacity, splats.scale, held, blur
+    )  # which makes up for the rounding of scales
     alpha = encode_lod_alpha(opacity) if scene.tree else opacity
     step = width_of(path, "alpha") / 510 if chosen.alpha == "r8" else HALF * alpha
     within(got.alpha, alpha.astype(np.float64), step + HALF * alpha + TINY)

@@ -216,7 +216,7 @@ class RadEncoder(Encoder):
         for part in blocks_of(len(splats), BLOCK):
             scale = splats.scale[part]
             rounded = CODINGS[self.options.rad.scales].rounded(scale, *ends)
-            kept[part] = coverage.kept(splats.opacity[part], scale, rounded, blur)
+            kept[part] = coverage.compensated(splats.opacity[part], scale, rounded, blur)
         return kept
 
     def _deflated(self, codes: NDArray[Any], encoding: str) -> bytes:
