@@ -13,6 +13,7 @@ from typing import Any, TextIO
 
 import click
 
+from ..support import interrupts
 from ..support.printable import MOST, printable
 from ..support.stdout import silence
 from ..support.units import count_of as count_of
@@ -199,6 +200,7 @@ class _CompilingReporter:
             self._console.say(trouble)
 
     def _begin(self, _name: str) -> None:
+        interrupts.leave_if_lost()
         if not self._begun:
             self._announce()
         self._begun += 1
