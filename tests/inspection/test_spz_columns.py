@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sparklod_cli.codecs.spz_layout import ANTIALIASED, HEADER, LOD, MAGIC, Layout
+from sparklod_cli.codecs.spz_streams import ANTIALIASED, HEADER, LOD, MAGIC, Layout
 from sparklod_cli.inspection import percentiles
 from sparklod_cli.inspection.report import ReportSettings, inspect
 from sparklod_cli.io import examine_scene
