@@ -61,8 +61,6 @@ class Comparison:
     Args:
         scenes: trees alone, read with all columns of their splats.
         lod: settings of the cuts but for the budget.
-        budgets: at least one.
-        render: how the pictures are drawn.
         full: what full detail is; the leaves of the trees unless given.
 
     Attributes:

@@ -88,10 +88,6 @@ def inspect_file(
 
     Args:
         path: of a file that is read, or of a .npz of arrays; - is standard input.
-        settings: what to look for.
-        drawn: what to draw.
-        threads: to work on.
-        progress: is told how much is done.
 
     Raises:
         OutOfMemoryError: it does not fit into memory.

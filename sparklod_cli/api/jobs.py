@@ -143,18 +143,13 @@ def draw_files(
     """Draw files and write the pictures.
 
     Args:
-        files: splat files, and the cameras that look at them.
         budget: of the cuts; None draws full detail.
-        lod: settings of the cuts, but for the budget.
-        render: how pictures are drawn.
         place: tells where the pictures of some cameras go and how they become files; is asked before a file is read,
             if the cameras do not depend on one.
-        fit_planes: move the near and the far plane apart where cameras are chosen for the scenes.
         through: one of `rounding.ROUND_TRIPS`, after which splats are drawn.
         loading: how chunks get to the viewer, and how many seconds after a page was opened pictures are of, each of a
             visitor who opened it in front of that camera; None where every chunk is there.
         reference: the file whose pictures are compared with these: the difference is written.
-        overwrite: replace files that exist.
         ready: called with the cameras and the scenes before the first picture is drawn.
 
     Raises:
@@ -249,16 +244,8 @@ def compare_files(
     """Measure how far cuts of files are from full detail, and write the table and the charts.
 
     Args:
-        files: splat files, and the cameras that look at them.
-        budgets: at least one.
-        lod: settings of the cuts, but for the budget.
-        render: how pictures are drawn.
         table: where the rows go, at once when all are known.
-        fit_planes: move the near and the far plane apart where cameras are chosen for the scenes.
         asserts: assertions, each with the index of its budget; None for all budgets.
-        plot: file of the charts; None for none.
-        overwrite: replace files that exist.
-        ready: called with the cameras and the scenes before the first picture is drawn.
         passed: what the bytes of the table are passed through on their way to standard output.
 
     Raises:
@@ -314,15 +301,7 @@ def traverse_files(
     """Simulate what a viewer draws of files along a path, and write what is made of the frames.
 
     Args:
-        files: splat files, and the cameras that look at them.
-        budget: of the cuts.
-        lod: settings of the cuts, but for the budget.
-        streaming: how chunks get to the viewer.
-        outputs: where the frames go.
         by_instance: make rows of single instances, too.
-        asserts: assertions on the table.
-        ready: called with the cameras and the scenes before the first frame.
-        passed: what the bytes of the table are passed through on their way to standard output.
         bar: tell how many frames are done.
 
     Raises:

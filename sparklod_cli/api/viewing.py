@@ -65,10 +65,7 @@ def prepare(
 
     Args:
         paths: of the files, at least one.
-        settings: what the page shows at first.
         served: by a `Server`; otherwise it is written.
-        threads: to decode on.
-        progress: called with how much is done.
 
     Raises:
         SparklodError: a file or a library is missing or broken, or the camera makes no sense.

@@ -167,11 +167,7 @@ class Console:
 
 
 class _CompilingReporter:
-    """Announces the first kernel that is compiled, shows a bar, and prints at the end how long all of them took.
-
-    Args:
-        console: prints it.
-    """
+    """Announces the first kernel that is compiled, shows a bar, and prints at the end how long all of them took."""
 
     def __init__(self, console: Console) -> None:
         self._console = console

@@ -135,13 +135,7 @@ class Ball(Numbers):
 
 
 class OptionalNumber(click.IntRange):
-    """A number that may be left out, so that an input after its option is taken for it; says what to do then.
-
-    Args:
-        range: of the number.
-        placeholder: in `--help`.
-        example: a number for that message.
-    """
+    """A number that may be left out, so that an input after its option is taken for it; says what to do then."""
 
     def __init__(self, range: Range, *, placeholder: str = "N", example: int) -> None:
         super().__init__(range.least, range.most)  # type: ignore[arg-type]  # whole numbers

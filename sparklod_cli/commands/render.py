@@ -249,14 +249,7 @@ def files_read(options: RenderOptions, instances: list[Instance]) -> dict[str, l
 
 
 def _report(console: Console, drawn: Drawn, seconds: float, *, as_json: bool) -> None:
-    """Print a line on the pictures, with `as_json` an object too, and a warning if nothing is visible.
-
-    Args:
-        console: prints the line.
-        drawn: the pictures.
-        seconds: duration of the whole command.
-        as_json: print one JSON object on standard output.
-    """
+    """Print a line on the pictures, with `as_json` an object too, and a warning if nothing is visible."""
     written, output, settings = drawn.pictures, drawn.output, drawn.render
     if not any(frame["splats"] for frame in written.frames):
         console.say("warning: the picture is empty, for the first chunk has not arrived yet (--after)")

@@ -102,9 +102,6 @@ def _report(console: Console, options: RenderOptions, compared: Compared, about:
     """Print the results of a comparison; return the exit status.
 
     Args:
-        console: prints them.
-        options: values of the options.
-        compared: the results.
         about: for each assertion the index of its budget; None for all budgets.
     """
     summary, outcomes = compared.summary, compared.outcomes

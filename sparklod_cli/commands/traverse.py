@@ -237,10 +237,7 @@ def _report(console: Console, traversed: Traversed, summary: bool | None, *, as_
     """Print the results of a traversal; return the exit status.
 
     Args:
-        console: prints them on standard error.
-        traversed: the results.
         summary: print the summary; None prints it if standard error is a terminal.
-        as_json: print it as JSON on standard output.
         on_stdout: print it on standard output, instead of the table.
     """
     from .traverse_text import lines

@@ -53,7 +53,6 @@ def picture_of_path(
         depth: (N,) edges from the root to each node of the cut, or the detail level of each splat.
         title: which of both it is, for display.
         frame: index of the camera whose cut it is; that camera is marked.
-        size: width and height in pixels.
 
     Raises:
         SparklodError: pyvista is not installed or cannot draw here, or there is nothing to draw.

@@ -98,8 +98,6 @@ def draw(lines: int, height: int, fill: Callable[[ModuleType, NDArray[Any]], Non
     """(H, WIDTH, 3) a figure in the style of this package, whatever a matplotlibrc says.
 
     Args:
-        lines: rows of two charts, each
-        height: pixels high.
         fill: draws into the axes of the charts, (2 lines,), given matplotlib and these.
 
     Raises:

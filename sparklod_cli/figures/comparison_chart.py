@@ -31,7 +31,6 @@ def plot(series: Sequence[Series], title: str) -> bytes:
 
     Args:
         series: one for each budget, all of the same frames.
-        title: the name of the scene.
 
     Raises:
         SparklodError: matplotlib is not installed.

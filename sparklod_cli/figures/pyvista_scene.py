@@ -42,8 +42,6 @@ def write_png(
     Args:
         pixels: (H, W, 3) of the scene.
         title, lines: texts for the upper left corner, which must fit into the width.
-        coloring: the colour scale.
-        eye: viewpoint of the picture.
         low, high: (3,) corners of the box along whose edges the axes run, world units.
     """
     image = Image.fromarray(pixels)

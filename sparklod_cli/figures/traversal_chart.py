@@ -233,8 +233,6 @@ def plot(rows: Iterable[Row], marked: Mapping[str, int], title: str, scene: Path
     Args:
         rows: of all frames; those of single instances are left out.
         marked: numbers of frames worth a look, by the reason, a key of `CALLED`.
-        title: the name of the scene.
-        scene: what the picture of the path shows; None for charts alone.
 
     Raises:
         SparklodError: matplotlib is not installed, or there is no frame.

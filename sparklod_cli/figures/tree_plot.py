@@ -44,7 +44,6 @@ def color_by(by: str, splats: Splats, index: NDArray[np.int64], depth: NDArray[n
 
     Args:
         by: one of `PLOT_BY`: "level", the depth of a node, needs `depth`; else "opacity", "size" or "chunk".
-        splats: all N splats.
         index: (M,) indices of the splats that are coloured; at least one.
         depth: (N,) edges from the root; None for a scene without a tree.
     """
@@ -132,7 +131,6 @@ def plot(scene: Scene, *, by: str = "level", depth: int | None = None, size: tup
         scene: N splats; invalid ones are left out. Its tree may be broken.
         by: one of `PLOT_BY`; for a scene without a tree, "level" means "size".
         depth: edges from the root to the nodes that are drawn; None for all leaves, or all splats.
-        size: width and height in pixels.
 
     Raises:
         SparklodError: pyvista is not installed or cannot draw here, no node has this depth, or there is

@@ -56,8 +56,6 @@ def output_for(name: Path | None, default: Path, cameras: int, *, sheet: bool) -
     Args:
         name: the requested path; "-" for standard output; None for a path derived from `default`.
         default: a path without suffix.
-        cameras: number of cameras.
-        sheet: put all pictures on one contact sheet.
 
     Raises:
         ValueError: this destination cannot hold that many pictures, or its format is unknown.

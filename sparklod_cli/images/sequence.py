@@ -100,13 +100,8 @@ def write_pictures(
     """Render and write the pictures of a camera path.
 
     Args:
-        source: the cuts to render.
         path: the cameras; all of one size for an animation or a contact sheet.
-        output: the destination of the pictures.
-        render: settings of the renderer.
-        settings: settings of the files.
         reference: cuts to compare with; the pictures are then differences from it.
-        overwrite: replace existing files.
         progress: called with the number of frames scanned for the colour scale, compared and drawn.
 
     Raises:

@@ -90,7 +90,6 @@ class Blocks:
         """Blocks of an in-memory scene, as long as the chunks of its file, or `CHUNK_NODES`.
 
         Args:
-            scene: as it was read.
             unread: columns that were not read and count as valid.
         """
         step, tree = scene.header.get("chunk_size") or CHUNK_NODES, scene.tree

@@ -45,9 +45,6 @@ def inspect(
 
     Args:
         path: path of the file, see `report.inspect`.
-        settings: what to check.
-        threads: number of threads to decode on.
-        progress: called while the file is read.
     """
     found, scene = report.inspect(path, settings.report, threads=threads, progress=progress)
     if not settings.holds or found.format is None:

@@ -32,8 +32,6 @@ def chart(counts: Sequence[int], tooltips: Sequence[str], labels: Iterable[tuple
     """Return a bar chart.
 
     Args:
-        counts: one for each bar.
-        tooltips: one for each bar.
         labels: positions along the axis, in bars, and their texts.
         summary: description for screen readers.
     """
@@ -78,11 +76,7 @@ def histogram_chart(histogram: Histogram, name: str) -> str:
 
 
 def children_groups(children: Mapping[str, int]) -> list[tuple[str, int]]:
-    """Numbers of nodes by their number of children: first single numbers, then ranges that double.
-
-    Args:
-        children: counts of nodes, by number of children as text.
-    """
+    """Numbers of nodes by their number of children: first single numbers, then ranges that double."""
     if not children:
         return []
     most = max(int(number) for number in children)

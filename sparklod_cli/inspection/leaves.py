@@ -80,8 +80,6 @@ def codings_of(scene: Scene, leaves: Splats, original: Splats, facts: RadFacts |
     """Yield the codings in which a writer may have put leaves, the most likely first; or why there is none.
 
     Args:
-        scene: the tree.
-        leaves: of the tree.
         original: the splats that may have become the leaves.
         facts: of the RAD file that the tree is from; None for SPZ.
     """
@@ -131,10 +129,7 @@ def of_rad(facts: RadFacts, leaves: Splats, rounded_to: int | None, *, covering:
     """Yield the coding of a RAD file; or why there is none. A palette of SH, whose entries stand for many, is left out.
 
     Args:
-        facts: of the file.
-        leaves: its leaves.
         rounded_to: bits after the binary point to which its writer rounded centres; None for not at all.
-        covering: as for SPZ.
     """
     mixed = [name for name, found in facts.properties.items() if "," in found.encoding]
     if mixed:
@@ -226,7 +221,6 @@ def check(scene: Scene, original: Scene, facts: RadFacts | None = None) -> list[
 
     Args:
         scene: of an SPZ or RAD file.
-        original: of any file.
         facts: of the RAD file that the tree is from; None for SPZ.
     """
     if scene.tree is None:

@@ -145,9 +145,6 @@ def inspect(
 
     Args:
         path: of the file, or of the folder of an unpacked SOG.
-        settings: what to report.
-        threads: to read with.
-        progress: called while the file is read.
     """
     columns = set(COLUMNS) if settings.values or settings.check or settings.chunks else OF_TREE
     size, unread, surveyed = size_of_input(path), set[str](), None

@@ -100,8 +100,6 @@ def survey(path: Path, *, check: bool, threads: int = 1, progress: Progress = si
     Args:
         path: of the manifest, or of its folder; - is standard input.
         check: decode the chunk files and look at their splats, too.
-        threads: to decode with.
-        progress: called while they are decoded.
 
     Raises:
         FormatError: the manifest cannot be parsed, or the path is no splat file.

@@ -64,10 +64,8 @@ def link_findings(
     """Return findings about the links of a tree of N nodes.
 
     Args:
-        tree: of them.
         parent, references: (N,) of `find_parents`.
         depth: (N,) of `find_depths`.
-        threads: to work on.
     """
     faults = {
         "tree.root": "is the root but the child of another node",
@@ -113,11 +111,9 @@ def size_findings(
 
     Args:
         blocks: of the nodes; read if a node may be too small.
-        tree: of them.
         parent: (N,) of `find_parents`.
         size: (N,) feature sizes, world units.
         scale_ends: as for `tree.examine_blocks`.
-        threads: to work on.
     """
     # No mean is larger than the largest child, but for rounding. In a good tree, that tells of nearly all nodes that
     # they are large enough.
@@ -168,7 +164,6 @@ def order_findings(parent: NDArray[np.int32], limit: FloatArray, threads: int) -
     Args:
         parent: (N,) of `find_parents`.
         limit: (N,) of `find_depths`.
-        threads: to work on.
     """
     held = parent >= 0
     count = int(np.count_nonzero(held))
@@ -289,7 +284,6 @@ def examine(
     Args:
         splats: N nodes, of which scale and opacity are used.
         tree: of N nodes, at least one.
-        check: look for faults.
         scale_ends: smallest and largest scale that the format holds, world units.
     """
     blocks = Blocks.of(Scene(splats, tree))
@@ -316,11 +310,9 @@ def examine_blocks(
         blocks: read once more to compare nodes with their children, where faults are looked for.
         columns: of all blocks, and
         opaque: what `Columns.add` returned of them.
-        check: look for faults.
         scale_ends: smallest and largest scale that the format holds, world units. A scale at one of them may have been
             clamped.
         in_chunks: the format orders nodes by chunks, so that they need not be coarse before fine.
-        threads: to work on.
     """
     tree, size = columns.tree, columns.size
     depth, limit = find_depths(tree.child_count, tree.child_start, size)

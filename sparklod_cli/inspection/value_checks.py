@@ -136,13 +136,7 @@ def check(scene: Scene) -> list[Finding]:
 
 
 def findings_about(values: ValueTally, ends: Ends, *, is_tree: bool) -> list[Finding]:
-    """Return findings about the values of all splats of a file.
-
-    Args:
-        values: of all blocks.
-        ends: of the codes of the file.
-        is_tree: they are the nodes of a tree.
-    """
+    """Return findings about the values of all splats of a file."""
     if not values.count:
         return [Finding("values.empty", "there are no splats")]
     findings: list[Finding] = []

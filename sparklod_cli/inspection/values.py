@@ -141,9 +141,6 @@ def statistics_of(blocks: Blocks, tally: ValueTally, *, all_quantities: bool, th
     """Statistics of splats, which pass as often as percentiles need.
 
     Args:
-        blocks: of the splats.
-        tally: of all blocks.
-        all_quantities: compute all quantities, not only those of `MAIN`.
         threads: to work on, each on quantities of some columns, where blocks are in memory.
     """
     none = blocks.about.splats.take(slice(0))

@@ -171,8 +171,6 @@ def site_of(
     Args:
         shown: the files, and
         extents: what they hold.
-        look: how the page shows them at first.
-        libraries: that it draws with.
         cameras: settings of camera paths that are dropped onto the page.
         served: by `server`, which parses camera paths; otherwise the page can read those of sparklod itself.
     """

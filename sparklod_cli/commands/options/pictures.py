@@ -227,10 +227,7 @@ class PictureFiles:
         """Return the output of the pictures of some cameras.
 
         Args:
-            ctx: of the command.
             scene: the file beside which an output goes that has no name, and whose name it has.
-            cameras: how many there are.
-            sheet: they are put on a contact sheet.
 
         Raises:
             click.UsageError: the cameras do not fit into the output.
@@ -252,14 +249,7 @@ class PictureFiles:
 
 
 def check_sizes(output: Output, cameras: Sequence[Camera], supersample: int, *, bar: bool) -> None:
-    """Raise a `click.UsageError` where a picture is larger than can be drawn, or than its file can be.
-
-    Args:
-        output: where the pictures go.
-        cameras: that they are of.
-        supersample: samples along each side of a pixel.
-        bar: a colour bar stands beside each.
-    """
+    """Raise a `click.UsageError` where a picture is larger than can be drawn, or than its file can be."""
     from ...images.pixels import scale_width
 
     for camera in cameras:
