@@ -16,7 +16,7 @@ from ...render.settings import OF_PIXELS, SORTINGS, RenderSettings
 from ...support import defaults
 from ...support.setting_fields import Range, whole
 from ..option_groups import COMMON, exclude, flag, is_set, option, require
-from ..parameter_types import Background
+from ..parameter_types import COLOR
 from ..paths import Folder, InputPath, require_suffix, stem_of
 from .common import assert_errors, assert_option, output_option, overwrite_flag, plot_option
 
@@ -62,7 +62,7 @@ class Appearance:
     HEADING: ClassVar[str] = "Appearance"
 
     background: Color | None = option(
-        "Colour behind the splats: '#rrggbb', black, white or transparent.", Background(), "black", heading=COMMON
+        "Colour behind the splats: '#rrggbb', black, white or transparent.", COLOR, "black", heading=COMMON
     )
     alpha: bool = flag("Keep alpha, as --background transparent does.")
     render: RenderSettings = field(default_factory=RenderSettings)

@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 import sparklod_cli as api
-from sparklod_cli.api.viewing import ViewSettings, prepare
+from sparklod_cli.api.viewing import prepare
 from sparklod_cli.cli import run
 from sparklod_cli.images.metrics import psnr
 from sparklod_cli.io import read_levels, read_scene
@@ -74,13 +75,12 @@ def test_inspect_and_view_say_which_axis_is_up(name: str, turned: Path, tmp_path
     if name.endswith(".json"):
         assert read_levels(turned / name).up == "y"
         return
-    settings = ViewSettings(None, None, None, None, None, None)
-    assert shown_up(turned / name, settings) == [0, 1, 0]
-    assert shown_up(turned / name, ViewSettings(None, None, (0.0, -1.0, 0.0), None, None, None)) == [0, -1, 0]
+    assert shown_up(turned / name) == [0, 1, 0]
+    assert shown_up(turned / name, up=(0.0, -1.0, 0.0)) == [0, -1, 0]
 
 
-def shown_up(path: Path, settings: ViewSettings) -> list[float]:
-    page = prepare([path], settings, served=True, threads=1).site.resources["view.json"]
+def shown_up(path: Path, **options: Any) -> list[float]:
+    page = prepare([path], served=True, threads=1, **options).resources["view.json"]
     assert isinstance(page, bytes)
     found: list[float] = json.loads(page)["up"]
     return found
