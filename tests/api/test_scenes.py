@@ -12,6 +12,7 @@ import pytest
 
 import sparklod_cli as sparklod
 from tests.api.runs import DEMO, EYE, command
+from tests.conftest import Capture
 from tests.scenes import random_splats
 
 
@@ -142,7 +143,7 @@ def test_errors_are_those_that_are_documented(scene: sparklod.Scene, tree: spark
         sparklod.read(DEMO, columns=["colour"])
 
 
-def test_a_report_is_what_inspect_prints(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_report_is_what_inspect_prints(file: Path, capsys: Capture) -> None:
     command("inspect", file, "--json", "--check", "--stats")
     theirs = json.loads(capsys.readouterr().out)
     ours = sparklod.inspect(file, all_quantities=True, check=True).as_dict()

@@ -9,10 +9,9 @@ import pytest
 
 from sparklod_cli.cli import run
 from sparklod_cli.io import reading
-from tests.conftest import FIXTURES
+from tests.conftest import FIXTURES, Capture
 
 SCENE = FIXTURES / "one.ply"
-Said = pytest.CaptureFixture[str]
 Break = Callable[[BaseException], None]
 
 
@@ -35,7 +34,7 @@ def broken(monkeypatch: pytest.MonkeyPatch) -> Break:
     [ZeroDivisionError("division\nby zero"), EOFError("cut"), AssertionError(), KeyError("x"), StopIteration(1)],
 )
 def test_a_bug_is_one_line_that_asks_for_a_report(
-    command: str, error: Exception, broken: Break, tmp_path: Path, capsys: Said
+    command: str, error: Exception, broken: Break, tmp_path: Path, capsys: Capture
 ) -> None:
     broken(error)
     out = [] if command.startswith("inspect") else ["-o", str(tmp_path / "out.spz" if "build" in command else "a.png")]
@@ -48,7 +47,7 @@ def test_a_bug_is_one_line_that_asks_for_a_report(
     assert not list(tmp_path.iterdir())
 
 
-def test_verbose_shows_the_traceback_before_the_error(broken: Break, capsys: Said) -> None:
+def test_verbose_shows_the_traceback_before_the_error(broken: Break, capsys: Capture) -> None:
     broken(ZeroDivisionError("division by zero"))
     assert run(["inspect", str(SCENE), "-v"]) == 1
     lines = capsys.readouterr().err.splitlines()
@@ -60,7 +59,7 @@ def test_verbose_shows_the_traceback_before_the_error(broken: Break, capsys: Sai
     assert "Traceback" not in capsys.readouterr().err
 
 
-def test_the_line_of_a_bug_is_short_and_printable(broken: Break, capsys: Said) -> None:
+def test_the_line_of_a_bug_is_short_and_printable(broken: Break, capsys: Capture) -> None:
     broken(RuntimeError("\x1b[31m" + "x" * 100_000))
     assert run(["inspect", str(SCENE)]) == 1
     (line,) = capsys.readouterr().err.splitlines()
@@ -68,7 +67,7 @@ def test_the_line_of_a_bug_is_short_and_printable(broken: Break, capsys: Said) -
     assert len(line) < 400
 
 
-def test_an_interruption_is_not_reported_as_a_bug(broken: Break, capsys: Said) -> None:
+def test_an_interruption_is_not_reported_as_a_bug(broken: Break, capsys: Capture) -> None:
     broken(KeyboardInterrupt())
     assert run(["inspect", str(SCENE)]) == 130
     assert capsys.readouterr().err.strip() == "interrupted"

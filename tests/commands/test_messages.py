@@ -15,11 +15,10 @@ from sparklod_cli.codecs import ply
 from sparklod_cli.commands.build_lod_text import CLAMPED_BY_SPZ
 from sparklod_cli.io import read_scene
 from sparklod_cli.model.scene import Scene
-from tests.conftest import FIXTURES
+from tests.conftest import FIXTURES, Capture
 from tests.scenes import random_splats
 
 TREE, PLAIN = FIXTURES / "golden" / "tree-v3.spz", FIXTURES / "one.ply"
-Said = pytest.CaptureFixture[str]
 
 #: A plural of one.
 ONES = re.compile(r"(?<![\d.,])1 (?:\w+ )?(splats|nodes|levels|leaves|frames|cameras|chunks|texels|rows|instances)\b")
@@ -38,7 +37,7 @@ ONES = re.compile(r"(?<![\d.,])1 (?:\w+ )?(splats|nodes|levels|leaves|frames|cam
         ("8x²", "is not a width and a height"),
     ],
 )
-def test_a_wrong_picture_size_is_quoted(size: str, said: str, capsys: Said) -> None:
+def test_a_wrong_picture_size_is_quoted(size: str, said: str, capsys: Capture) -> None:
     assert run(["render", str(TREE), "--size", size]) == 2
     err = capsys.readouterr().err
     assert said in err
@@ -51,7 +50,7 @@ def test_max_bytes_takes_units(size: str, status: int) -> None:
 
 
 @pytest.mark.parametrize("size", ["-1", "3Mbit", "3 apples", "1.5", "3iB"])
-def test_a_text_that_is_not_a_size_is_wrong_usage(size: str, capsys: Said) -> None:
+def test_a_text_that_is_not_a_size_is_wrong_usage(size: str, capsys: Capture) -> None:
     assert run(["inspect", str(TREE), f"--max-bytes={size}"]) == 2
     assert f"{size!r} is not a size: whole bytes, such as 3000000, 3MB or 3MiB" in capsys.readouterr().err
 
@@ -65,7 +64,7 @@ def test_a_text_that_is_not_a_size_is_wrong_usage(size: str, capsys: Said) -> No
         ("frame,position,rotation", "lacks x, y, z, target_x, target_y, target_z"),
     ],
 )
-def test_a_camera_csv_is_told_its_columns(first: str, said: str, tmp_path: Path, capsys: Said) -> None:
+def test_a_camera_csv_is_told_its_columns(first: str, said: str, tmp_path: Path, capsys: Capture) -> None:
     path = tmp_path / "cameras.csv"
     path.write_text(f"{first}\n0,0,0,0,0\n")
     for arguments in ([], ["--camera-format", "csv"]):
@@ -99,7 +98,7 @@ def clamped_scene(tmp_path: Path, **values: float) -> Path:
     ],
 )
 def test_what_is_clamped_is_said_in_a_line_and_with_verbose_in_detail(
-    name: str, value: float, detail: str, consequence: str, tmp_path: Path, capsys: Said
+    name: str, value: float, detail: str, consequence: str, tmp_path: Path, capsys: Capture
 ) -> None:
     source = clamped_scene(tmp_path, **{name: value, "opacity": 0.5})
     assert run(["build-lod", str(source)]) == 0
@@ -117,7 +116,7 @@ def test_what_is_clamped_is_said_in_a_line_and_with_verbose_in_detail(
 
 @pytest.mark.parametrize("column", [slice(0, 1), slice(0, 3)])
 @pytest.mark.parametrize("count", [0, 1, 2, 300])
-def test_the_note_and_inspect_go_by_one_rule(count: int, column: slice, tmp_path: Path, capsys: Said) -> None:
+def test_the_note_and_inspect_go_by_one_rule(count: int, column: slice, tmp_path: Path, capsys: Capture) -> None:
     """That flat splats get thicker cannot be seen; that whole splats grow can, if they are more than 0.1 %."""
     splats = random_splats(1_000)
     splats.scale[:count, column] = 1e-6
@@ -131,7 +130,7 @@ def test_the_note_and_inspect_go_by_one_rule(count: int, column: slice, tmp_path
     assert ("values.scale-clamped" in codes) == (count > 1 and column.stop == 3)
 
 
-def test_counts_of_one_have_a_singular_noun(tmp_path: Path, capsys: Said) -> None:
+def test_counts_of_one_have_a_singular_noun(tmp_path: Path, capsys: Capture) -> None:
     look = ("--look-at", "0,-1,4:0,0,0", "--size", "8x8")
     lod = tmp_path / "one-lod.spz"
     for arguments in (

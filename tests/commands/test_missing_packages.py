@@ -9,6 +9,7 @@ import pytest
 
 from sparklod_cli.cli import run
 from sparklod_cli.figures.pyvista_scene import load_pyvista
+from tests.conftest import Capture
 
 
 @pytest.mark.parametrize(
@@ -27,7 +28,7 @@ def test_a_missing_package_is_reported_before_the_work(
     command: list[str],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    capsys: Capture,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(sys.modules, package, None)

@@ -15,11 +15,10 @@ from sparklod_cli.inspection import chunks
 from sparklod_cli.io import examine_scene
 from sparklod_cli.model.gaussian import spark_size
 from sparklod_cli.model.scene import Scene
-from tests.conftest import FIXTURES
+from tests.conftest import FIXTURES, Capture
 from tests.inspection.rad_files import CHUNK, tree
 from tests.scenes import random_splats
 
-Said = pytest.CaptureFixture[str]
 GOLDEN = FIXTURES / "golden" / "sh1-tree.rad"
 
 
@@ -72,7 +71,7 @@ def test_what_is_not_finite_is_empty() -> None:
     assert row["min_y"] is not None
 
 
-def test_the_table_is_printed_and_written(tmp_path: Path, capsys: Said) -> None:
+def test_the_table_is_printed_and_written(tmp_path: Path, capsys: Capture) -> None:
     path = tree(CHUNK + 8).write(tmp_path / "a.rad")
     output = tmp_path / "chunks.csv"
     assert run(["inspect", str(path), "--chunks", "--chunks-out", str(output), "-q"]) == 0
@@ -88,7 +87,7 @@ def test_the_table_is_printed_and_written(tmp_path: Path, capsys: Said) -> None:
     assert [str(row["extent"]) for row in plain["chunks"]] == [row["extent"] for row in rows]
 
 
-def test_the_table_without_a_tree_has_no_empty_columns(capsys: Said) -> None:
+def test_the_table_without_a_tree_has_no_empty_columns(capsys: Capture) -> None:
     assert run(["inspect", str(FIXTURES / "sh0.ply"), "--chunks", "-q"]) == 0
     head, row = capsys.readouterr().out.splitlines()
     assert head.split() == ["chunk", "base", "splats", "extent", "size_min", "size_max"]
@@ -101,7 +100,7 @@ def test_the_table_of_a_chunked_file_is_that_of_the_whole_one(tmp_path: Path) ->
     assert chunks.rows_of(one) == chunks.rows_of(other)
 
 
-def test_the_table_of_what_has_no_splats_is_refused(tmp_path: Path, capsys: Said) -> None:
+def test_the_table_of_what_has_no_splats_is_refused(tmp_path: Path, capsys: Capture) -> None:
     source = FIXTURES / "sh0.ply"
     assert run(["build-lod", str(source), "--encoding", "lodtree", "-o", str(tmp_path / "a.npz"), "-q"]) == 0
     assert run(["inspect", str(tmp_path / "a.npz"), "--chunks", "-q"]) == 1
@@ -116,6 +115,6 @@ def test_the_table_of_what_has_no_splats_is_refused(tmp_path: Path, capsys: Said
         ([str(GOLDEN), "--chunks-out", "a.csv"], "--chunks-out takes one file, not 2"),
     ],
 )
-def test_options_that_exclude_each_other_are_usage_errors(options: list[str], message: str, capsys: Said) -> None:
+def test_options_that_exclude_each_other_are_usage_errors(options: list[str], message: str, capsys: Capture) -> None:
     assert run(["inspect", str(GOLDEN), *options]) == 2
     assert message in capsys.readouterr().err

@@ -12,6 +12,7 @@ from sparklod_cli.cli import run
 from sparklod_cli.inspection.expectations import ExpectationError, Expectations, check, read
 from sparklod_cli.inspection.report import Report
 from sparklod_cli.support.errors import SparklodError
+from tests.conftest import Capture
 from tests.inspection.expected import TREE, written
 
 EVERY = Expectations(
@@ -137,7 +138,7 @@ def test_bad_toml_is_an_error(tmp_path: Path) -> None:
         f"max_growth = {'9' * 4000}.5",
     ],
 )
-def test_hostile_toml_is_an_error_of_one_line(text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_hostile_toml_is_an_error_of_one_line(text: str, tmp_path: Path, capsys: Capture) -> None:
     path = written(tmp_path, text, "expect.toml")
     assert run(["inspect", str(TREE), "--expect", str(path)]) == 1
     (line,) = capsys.readouterr().err.splitlines()
@@ -148,7 +149,7 @@ def test_hostile_toml_is_an_error_of_one_line(text: str, tmp_path: Path, capsys:
 @pytest.mark.parametrize(
     "wanted", ["9" * 5000, "1" + "0" * 4000, "1e999", "NaN", '"\\ud800"', '["' + "x" * 10**5 + '"]']
 )
-def test_odd_values_are_not_met_and_no_error(wanted: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_odd_values_are_not_met_and_no_error(wanted: str, tmp_path: Path, capsys: Capture) -> None:
     for text in (f'{{"values": {{"splats": {wanted}}}}}', f'{{"values": {{"tree.levels": {wanted}}}}}'):
         assert run(["inspect", str(TREE), "--expect", str(written(tmp_path, text)), "-q"]) == 3
         (line,) = capsys.readouterr().out.splitlines()
@@ -157,7 +158,7 @@ def test_odd_values_are_not_met_and_no_error(wanted: str, tmp_path: Path, capsys
 
 
 @pytest.mark.parametrize("source", ["/dev/zero", "/dev/null", "/proc/kcore", "."])
-def test_expectations_must_be_a_regular_file_below_a_size(source: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_expectations_must_be_a_regular_file_below_a_size(source: str, capsys: Capture) -> None:
     if not Path(source).exists():
         pytest.skip(f"there is no {source}")
     assert run(["inspect", str(TREE), "--expect", source]) == 1
@@ -174,9 +175,7 @@ def test_a_date_equals_no_value(tmp_path: Path, tree: Report) -> None:
 
 
 @pytest.mark.parametrize("text", ['{"max_byte": 1}', "{"])
-def test_a_bad_file_of_expectations_fails_before_anything_is_read(
-    text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_bad_file_of_expectations_fails_before_anything_is_read(text: str, tmp_path: Path, capsys: Capture) -> None:
     path = written(tmp_path, text)
     assert run(["inspect", str(TREE), "--expect", str(path)]) == 1
     out, err = capsys.readouterr()

@@ -11,7 +11,7 @@ import pytest
 from sparklod_cli.cli import run
 from sparklod_cli.inspection.expectations import Expectations, check
 from sparklod_cli.inspection.report import NoFieldError, Report, ReportSettings, inspect
-from tests.conftest import FIXTURES
+from tests.conftest import FIXTURES, Capture
 from tests.inspection.expected import DEPTH, LEAVES, NODES, PLAIN, TREE, written
 
 
@@ -124,7 +124,7 @@ OPTIONS = [
 
 @pytest.mark.parametrize(("holds", "fails", "code"), OPTIONS, ids=[option[0][0] for option in OPTIONS])
 def test_every_option_passes_and_fails_with_its_code(
-    holds: list[Any], fails: list[Any], code: str, capsys: pytest.CaptureFixture[str]
+    holds: list[Any], fails: list[Any], code: str, capsys: Capture
 ) -> None:
     assert run(["inspect", str(TREE), *map(str, holds)]) == 0
     out, err = capsys.readouterr()
@@ -135,7 +135,7 @@ def test_every_option_passes_and_fails_with_its_code(
     assert (out.count("\n"), err) == (1, "")
 
 
-def test_leaves_can_be_those_of_another_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_leaves_can_be_those_of_another_file(tmp_path: Path, capsys: Capture) -> None:
     splats = tmp_path / "splats.spz"
     assert run(["build-lod", "--unlod", str(TREE), "-o", str(splats), "-q"]) == 0
     assert run(["inspect", str(TREE), "--leaves-of", str(splats)]) == 0
@@ -148,20 +148,20 @@ def test_leaves_can_be_those_of_another_file(tmp_path: Path, capsys: pytest.Capt
 
 
 @pytest.mark.parametrize("original", ["missing.ply", FIXTURES / "points.ply"])
-def test_an_original_that_cannot_be_read_is_named(original: object, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_original_that_cannot_be_read_is_named(original: object, capsys: Capture) -> None:
     assert run(["inspect", str(TREE), "--leaves-of", str(original)]) == 1
     out, err = capsys.readouterr()
     assert out == ""
     assert err.startswith(f"error: {original}: ")
 
 
-def test_a_tree_can_be_required(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_tree_can_be_required(capsys: Capture) -> None:
     assert run(["inspect", str(TREE), "--require-lod"]) == 0
     assert run(["inspect", str(TREE), str(PLAIN), "--require-lod"]) == 3
     assert capsys.readouterr().out == f"{PLAIN}: error: expect.lod: lod==true: lod is false\n"
 
 
-def test_options_win_over_the_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_options_win_over_the_file(tmp_path: Path, capsys: Capture) -> None:
     path = written(tmp_path, '{"max_splats": 1, "sh": 0, "values": {"tree.depth": 2}}')
     assert run(["inspect", str(TREE), "--expect", str(path)]) == 3
     assert run(["inspect", str(TREE), "--expect", str(path), "--max-splats", "6"]) == 0
@@ -169,7 +169,7 @@ def test_options_win_over_the_file(tmp_path: Path, capsys: pytest.CaptureFixture
     assert "expect.sh" in capsys.readouterr().out
 
 
-def test_an_expectation_is_that_there_are_no_errors_either(capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_expectation_is_that_there_are_no_errors_either(capsys: Capture) -> None:
     broken, warned = (FIXTURES / "faults" / f"{name}.spz" for name in ("tree-orphan", "tree-single-child"))
     assert run(["inspect", str(broken), "--require-lod"]) == 3
     assert capsys.readouterr().out == f"{broken}: error: tree.orphan: node 9 has no parent\n"
@@ -179,16 +179,14 @@ def test_an_expectation_is_that_there_are_no_errors_either(capsys: pytest.Captur
     assert "tree.single-child" in capsys.readouterr().out
 
 
-def test_expected_values_are_computed_without_stats(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_expected_values_are_computed_without_stats(tmp_path: Path, capsys: Capture) -> None:
     path = written(tmp_path, '{"values": {"values.quantities.sh1.max": {"max": 9}, "values.box.min.0": {"min": 99}}}')
     assert run(["inspect", str(PLAIN), "--expect", str(path)]) == 3
     said = "values.box.min.0>=99: values.box.min.0 is -"
     assert capsys.readouterr().out.startswith(f"{PLAIN}: error: expect.value: {said}")
 
 
-def test_a_path_missing_in_one_file_does_not_stop_the_others(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_path_missing_in_one_file_does_not_stop_the_others(tmp_path: Path, capsys: Capture) -> None:
     path = written(tmp_path, '{"values": {"tree.depth": 2}}')
     assert run(["inspect", str(PLAIN), str(TREE), "--expect", str(path)]) == 3
     out, err = capsys.readouterr()

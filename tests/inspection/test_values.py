@@ -28,6 +28,7 @@ from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.sh import COEFFICIENTS
 from sparklod_cli.model.splats import COLUMNS, Splats
+from tests.conftest import Capture
 from tests.scenes import random_splats
 
 NAN, INF = math.nan, math.inf
@@ -282,7 +283,7 @@ def test_values_of_files_are_those_of_what_was_written(count: int, tmp_path: Pat
     assert (report.bytes_per_splat, report.compression_ratio) == (32.0, 1.75)
 
 
-def test_every_quantity_is_a_field_of_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_quantity_is_a_field_of_the_command_line(tmp_path: Path, capsys: Capture) -> None:
     path = tmp_path / "scene.ply"
     path.write_bytes(b"".join(ply.encode(Scene(random_splats(10, sh_degree=2)))))
     for name in values.names_of(random_splats(1, sh_degree=2)):

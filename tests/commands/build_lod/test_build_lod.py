@@ -19,10 +19,10 @@ from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.support.progress import Progress
 from tests.commands.build_lod.runs import ONE, SMALL, build
-from tests.conftest import FIXTURES
+from tests.conftest import FIXTURES, Capture
 
 
-def test_an_input_is_baked_beside_itself(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_input_is_baked_beside_itself(scene: Path, capsys: Capture) -> None:
     assert build(scene) == 0
     out, err = capsys.readouterr()
     assert out == ""
@@ -37,7 +37,7 @@ def test_several_inputs_go_into_a_directory_that_is_made(tmp_path: Path) -> None
     assert sorted(path.name for path in (tmp_path / "new" / "web").iterdir()) == ["one-lod.spz", "sh2-lod.spz"]
 
 
-def test_a_failure_does_not_stop_the_others(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_failure_does_not_stop_the_others(tmp_path: Path, capsys: Capture) -> None:
     missing, broken = tmp_path / "missing.ply", tmp_path / "broken.ply"
     broken.write_bytes(b"ply\nnonsense\nend_header\n")
     assert build(missing, ONE, broken, SMALL, "--output-dir", tmp_path) == 1
@@ -48,7 +48,7 @@ def test_a_failure_does_not_stop_the_others(tmp_path: Path, capsys: pytest.Captu
     assert sorted(path.name for path in tmp_path.iterdir()) == ["broken.ply", "one-lod.spz", "sh2-lod.spz"]
 
 
-def test_an_existing_output_is_refused_without_overwrite(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_existing_output_is_refused_without_overwrite(scene: Path, capsys: Capture) -> None:
     output = scene.with_name("scene-lod.spz")
     output.write_bytes(b"precious")
     assert build(scene) == 1
@@ -58,7 +58,7 @@ def test_an_existing_output_is_refused_without_overwrite(scene: Path, capsys: py
     assert read_scene(output).tree is not None
 
 
-def test_json_is_an_object_a_file(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_json_is_an_object_a_file(scene: Path, tmp_path: Path, capsys: Capture) -> None:
     assert build(scene, tmp_path / "missing.ply", "--json", "-q", "--base", 2, "--max-sh", 1) == 1
     good, bad = map(json.loads, capsys.readouterr().out.splitlines())
     output = scene.with_name("scene-lod.spz")
@@ -71,7 +71,7 @@ def test_json_is_an_object_a_file(scene: Path, tmp_path: Path, capsys: pytest.Ca
 
 
 def test_merged_splats_beyond_the_leaves_lower_the_fractional_bits(
-    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
 ) -> None:
     """The quality builder may put them there: they get fewer bits where they would not fit."""
 
@@ -92,7 +92,7 @@ def test_merged_splats_beyond_the_leaves_lower_the_fractional_bits(
     assert json.loads(capsys.readouterr().out)["fractional_bits"] < most
 
 
-def test_dropped_splats_are_counted_by_reason(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_dropped_splats_are_counted_by_reason(scene: Path, capsys: Capture) -> None:
     splats = read_scene(scene).splats
     x = float(sorted(splats.center[:, 0])[len(splats) // 2])
     assert build(scene, "--max-box", f"{x},1e9,1e9", "--json") == 0
@@ -104,16 +104,14 @@ def test_dropped_splats_are_counted_by_reason(scene: Path, capsys: pytest.Captur
     assert f"left out: {cropped} cropped" in err
 
 
-def test_quiet_says_nothing_and_verbose_more(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_quiet_says_nothing_and_verbose_more(scene: Path, capsys: Capture) -> None:
     assert build(scene, "-q") == 0
     assert capsys.readouterr() == ("", "")
     assert build(scene, "-v", "--overwrite") == 0
     assert "fractional bits; read" in capsys.readouterr().err
 
 
-def test_properties_of_the_file_are_kept_or_their_loss_is_said(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_properties_of_the_file_are_kept_or_their_loss_is_said(tmp_path: Path, capsys: Capture) -> None:
     golden = FIXTURES / "golden"
     assert build(golden / "hand-v4.spz", golden / "hand-v4-sh4.spz", "--output-dir", tmp_path) == 0
     assert "SH degree 4 is cut to 3" in capsys.readouterr().err
@@ -123,14 +121,14 @@ def test_properties_of_the_file_are_kept_or_their_loss_is_said(
     assert read_scene(golden / "hand-v4.spz").antialiased
 
 
-def test_a_tree_is_not_baked_again(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_tree_is_not_baked_again(scene: Path, capsys: Capture) -> None:
     assert build(scene) == 0
     assert build(scene.with_name("scene-lod.spz")) == 1
     assert "it is a Level-of-Detail file already" in capsys.readouterr().err
 
 
 def test_a_file_too_large_for_memory_does_not_stop_the_others(
-    scene: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    scene: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
 ) -> None:
     def full(*args: object, **kwargs: object) -> None:
         raise MemoryError
@@ -142,7 +140,7 @@ def test_a_file_too_large_for_memory_does_not_stop_the_others(
 
 
 def test_a_file_that_may_not_be_read_does_not_stop_the_others(
-    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
 ) -> None:
     closed = tmp_path / "closed.ply"
     closed.write_bytes(SMALL.read_bytes())
@@ -164,7 +162,7 @@ def test_a_file_that_may_not_be_read_does_not_stop_the_others(
     assert run(["inspect", str(ONE), str(closed)]) == 1
 
 
-def test_build_lod_never_writes_over_its_input(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_build_lod_never_writes_over_its_input(scene: Path, capsys: Capture) -> None:
     before = scene.read_bytes()
     assert build(scene, "-o", scene, "--overwrite") == 2
     assert "is an input" in capsys.readouterr().err

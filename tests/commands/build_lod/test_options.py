@@ -11,10 +11,10 @@ import pytest
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod.builders import METHODS
 from tests.commands.build_lod.runs import build
-from tests.conftest import FIXTURES
+from tests.conftest import FIXTURES, Capture
 
 
-def test_options_of_spz_reach_the_file(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_options_of_spz_reach_the_file(scene: Path, tmp_path: Path, capsys: Capture) -> None:
     assert build(scene, "-o", tmp_path / "a.spz", "--json", "--spz-version", 2, "--fractional-bits", 9) == 0
     record = json.loads(capsys.readouterr().out)
     assert (record["version"], record["fractional_bits"]) == (2, 9)
@@ -26,7 +26,7 @@ def test_options_of_spz_reach_the_file(scene: Path, tmp_path: Path, capsys: pyte
     assert sizes[1.1] > sizes[2.0]
 
 
-def test_quality_builds_a_tree_of_all_splats(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_quality_builds_a_tree_of_all_splats(scene: Path, tmp_path: Path, capsys: Capture) -> None:
     total = len(read_scene(scene).splats)
     sizes = {}
     for growth in (1.05, 1.2, 2.0):
@@ -44,7 +44,7 @@ def test_quality_builds_a_tree_of_all_splats(scene: Path, tmp_path: Path, capsys
     assert sizes[1.05] < sizes[1.2] < sizes[2.0]
 
 
-def test_the_default_method_is_quick(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_default_method_is_quick(scene: Path, tmp_path: Path, capsys: Capture) -> None:
     for name, arguments in {"a": [], "b": ["--method", "quick"], "c": ["--method", "quality"]}.items():
         assert build(scene, "-o", tmp_path / f"{name}.spz", "--json", *arguments) == 0
     records = map(json.loads, capsys.readouterr().out.splitlines())
@@ -61,7 +61,7 @@ def test_threads_do_not_change_the_file(method: str, tmp_path: Path) -> None:
     assert (tmp_path / "1.spz").read_bytes() == (tmp_path / "2.spz").read_bytes()
 
 
-def test_options_reach_the_tree(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_options_reach_the_tree(scene: Path, tmp_path: Path, capsys: Capture) -> None:
     splats = read_scene(scene).splats
     x, y, z = splats.center[0].tolist()
     distance = np.sqrt(((splats.center - splats.center[0]) ** 2).sum(axis=1, dtype=np.float64))
@@ -121,8 +121,6 @@ def test_more_processors_than_the_most_threads_are_no_error(scene: Path, monkeyp
         (["a.ply", "--overwritten"], "--overwrite"),
     ],
 )
-def test_wrong_usage_of_build_lod_is_exit_code_2(
-    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_wrong_usage_of_build_lod_is_exit_code_2(arguments: list[str], message: str, capsys: Capture) -> None:
     assert build(*arguments) == 2
     assert message in capsys.readouterr().err

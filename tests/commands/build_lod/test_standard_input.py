@@ -11,7 +11,7 @@ import pytest
 
 from sparklod_cli.support.stdin import spooled
 from tests.commands.build_lod.runs import SMALL, build, sparklod
-from tests.conftest import FIXTURES
+from tests.conftest import FIXTURES, Capture
 
 FILES = ("sh2.ply", "sh1-ascii.ply", "golden/sh3-v2.sog", "golden/sh2-level1.ksplat", "golden/hand-v4.spz")
 
@@ -27,7 +27,7 @@ def pipe(monkeypatch: pytest.MonkeyPatch, data: bytes) -> None:
 
 @pytest.mark.parametrize("name", FILES)
 def test_the_bytes_of_a_file_give_the_same_tree_as_the_file(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
 ) -> None:
     source = FIXTURES / name
     pipe(monkeypatch, source.read_bytes())
@@ -66,7 +66,7 @@ def test_the_leaves_of_a_piped_tree_can_be_written(tmp_path: Path, monkeypatch: 
     ],
 )
 def test_errors_name_standard_input(
-    data: bytes, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    data: bytes, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
 ) -> None:
     pipe(monkeypatch, data)
     assert build("-", "-o", tmp_path / "out.spz") == 1
@@ -74,14 +74,14 @@ def test_errors_name_standard_input(
     assert not list(tmp_path.iterdir())
 
 
-def test_standard_input_without_an_output_is_wrong_usage(capsys: pytest.CaptureFixture[str]) -> None:
+def test_standard_input_without_an_output_is_wrong_usage(capsys: Capture) -> None:
     for arguments in (["-"], ["-", "--output-dir", "web"], ["-", SMALL]):
         assert build(*arguments) == 2
         assert "standard input has no name to derive one from; name the output file" in capsys.readouterr().err
 
 
 def test_a_terminal_as_standard_input_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
 ) -> None:
     pipe(monkeypatch, b"")
     monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)

@@ -14,7 +14,7 @@ from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.model.transforms import Transform
 from tests.commands.build_lod.runs import build
-from tests.conftest import FIXTURES
+from tests.conftest import FIXTURES, Capture
 from tests.scenes import random_splats
 
 SCENE = FIXTURES / "sh3.ply"
@@ -103,7 +103,7 @@ def test_selection_goes_by_the_coordinates_of_the_input(tmp_path: Path) -> None:
     ],
 )
 def test_transforms_that_cannot_be_done_are_refused(
-    arguments: list[str], status: int, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    arguments: list[str], status: int, message: str, tmp_path: Path, capsys: Capture
 ) -> None:
     assert build(SCENE, "-o", tmp_path / "out.spz", *arguments) == status
     assert message in capsys.readouterr().err

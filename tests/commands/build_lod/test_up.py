@@ -17,6 +17,7 @@ from sparklod_cli.images.metrics import psnr
 from sparklod_cli.io import read_levels, read_scene
 from sparklod_cli.model.transforms import AXES
 from tests.commands.build_lod.runs import SMALL, build
+from tests.conftest import Capture
 
 pytestmark = pytest.mark.slow
 
@@ -30,8 +31,6 @@ OUTPUTS = {
     "web/lod-meta.json": ("--method", "quick", "--levels", "30%"),
 }
 
-Said = pytest.CaptureFixture[str]
-
 
 def render(path: Path, output: Path, *options: object) -> np.ndarray:
     command = ["render", path, "-o", output, "--size", "120x90", "--full", "-q", "--overwrite", *options]
@@ -40,7 +39,7 @@ def render(path: Path, output: Path, *options: object) -> np.ndarray:
     return image
 
 
-def inspected(path: Path, capsys: Said) -> dict[str, object]:
+def inspected(path: Path, capsys: Capture) -> dict[str, object]:
     capsys.readouterr()
     assert run(["inspect", str(path), "--json"]) == 0
     report: dict[str, object] = json.loads(capsys.readouterr().out)
@@ -68,7 +67,7 @@ def test_a_picture_of_the_turned_scene_is_that_of_the_scene(name: str, turned: P
 
 
 @pytest.mark.parametrize("name", OUTPUTS)
-def test_inspect_and_view_say_which_axis_is_up(name: str, turned: Path, tmp_path: Path, capsys: Said) -> None:
+def test_inspect_and_view_say_which_axis_is_up(name: str, turned: Path, tmp_path: Path, capsys: Capture) -> None:
     assert inspected(turned / name, capsys)["up"] == "y"
     assert run(["inspect", str(turned / name)]) == 0
     assert "y is up" in capsys.readouterr().out
@@ -86,7 +85,7 @@ def shown_up(path: Path, **options: Any) -> list[float]:
     return found
 
 
-def test_traverse_and_the_api_go_around_the_axis_that_is_up(turned: Path, capsys: Said) -> None:
+def test_traverse_and_the_api_go_around_the_axis_that_is_up(turned: Path, capsys: Capture) -> None:
     command = ["traverse", str(turned / "x.spz"), "--orbit", "3", "--elevation", "40", "--budget", "500", "--json"]
     summaries = []
     for up in ([], ["--up=y"], ["--up=-y"]):
@@ -105,7 +104,7 @@ def test_traverse_and_the_api_go_around_the_axis_that_is_up(turned: Path, capsys
 
 @pytest.mark.parametrize("options", [(), ("--rotate", "90,0,0"), ("--translate", "1,2,3")])
 @pytest.mark.parametrize("suffix", [".spz", ".rad"])
-def test_without_up_nothing_is_said(suffix: str, options: tuple[str, ...], tmp_path: Path, capsys: Said) -> None:
+def test_without_up_nothing_is_said(suffix: str, options: tuple[str, ...], tmp_path: Path, capsys: Capture) -> None:
     path = tmp_path / f"x{suffix}"
     assert build(SMALL, "-o", path, *options) == 0
     assert b'"up"' not in path.read_bytes()[:4096]
@@ -127,7 +126,7 @@ def test_the_axis_turns_with_the_scene(options: tuple[str, ...], up: str, tmp_pa
     assert read_scene(tmp_path / "x.rad").up == up
 
 
-def test_whatever_is_made_of_a_file_has_its_axis(turned: Path, tmp_path: Path, capsys: Said) -> None:
+def test_whatever_is_made_of_a_file_has_its_axis(turned: Path, tmp_path: Path, capsys: Capture) -> None:
     source = turned / "x.spz"
     for name, options in {"a.rad": (), "b.rad": ("--format", "rad-chunked"), "c.rad": ("--refine", 2)}.items():
         assert build(source, "-o", tmp_path / name, *options) == 0
@@ -145,7 +144,7 @@ def test_whatever_is_made_of_a_file_has_its_axis(turned: Path, tmp_path: Path, c
     assert read_scene(tmp_path / "folder").up == "y"
 
 
-def test_a_format_that_cannot_note_it_is_told(turned: Path, tmp_path: Path, capsys: Said) -> None:
+def test_a_format_that_cannot_note_it_is_told(turned: Path, tmp_path: Path, capsys: Capture) -> None:
     assert build(turned / "x.rad", "--unlod", "-o", tmp_path / "x.splat") == 0
     (option,) = re.findall(r"y is up, which this format cannot note; give (--up=y) to render", capsys.readouterr().err)
     output = tmp_path / "x.npy"
@@ -189,7 +188,7 @@ def test_every_axis_can_be_noted(name: str, tmp_path: Path) -> None:
         )
 
 
-def test_a_wrong_axis_is_a_finding_and_ignored(turned: Path, tmp_path: Path, capsys: Said) -> None:
+def test_a_wrong_axis_is_a_finding_and_ignored(turned: Path, tmp_path: Path, capsys: Capture) -> None:
     for name in ("x.spz", "x.rad"):
         data = (turned / name).read_bytes()
         assert data.count(b'"up": "y"' if name == "x.spz" else b'\\"up\\": \\"y\\"') == 1

@@ -8,10 +8,11 @@ from pathlib import Path
 import pytest
 
 from sparklod_cli.inspection.findings import CODES, Finding
-from tests.commands.inspect.runs import BROKEN, CORRUPT, NOTED, TREE, WARNED, Said, inspect
+from tests.commands.inspect.runs import BROKEN, CORRUPT, NOTED, TREE, WARNED, inspect
+from tests.conftest import Capture
 
 
-def test_every_finding_is_an_annotation_for_github(capsys: Said) -> None:
+def test_every_finding_is_an_annotation_for_github(capsys: Capture) -> None:
     assert inspect("--check", "--format", "github", CORRUPT, BROKEN, WARNED, NOTED, TREE) == 3
     out, err = capsys.readouterr()
     lines = out.splitlines()
@@ -21,7 +22,7 @@ def test_every_finding_is_an_annotation_for_github(capsys: Said) -> None:
 
 
 def test_no_name_ends_an_annotation_or_begins_a_command(
-    tmp_path: Path, capsys: Said, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A name could end the annotation, or begin another command."""
     path = tmp_path / "50%, a:b\n::stop.spz"
@@ -37,7 +38,7 @@ def test_no_name_ends_an_annotation_or_begins_a_command(
     assert capsys.readouterr().out == f"::error file={name},title=tree.orphan::100%25 of it%0D%0Ais: lost, all\n"
 
 
-def test_a_line_is_a_finding_whatever_the_name_is(tmp_path: Path, capsys: Said) -> None:
+def test_a_line_is_a_finding_whatever_the_name_is(tmp_path: Path, capsys: Capture) -> None:
     path = tmp_path / "two\nlines.spz"
     shutil.copy(BROKEN, path)
     assert inspect("--check", path) == 3

@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from sparklod_cli.inspection.expectations import FORMATS, NAMES
-from tests.commands.inspect.runs import PLAIN, RAD, STREAMED, TREE, Said, inspect, records
+from tests.commands.inspect.runs import PLAIN, RAD, STREAMED, TREE, inspect, records
+from tests.conftest import Capture
 
 #: Of a tree of nine nodes, of which six are leaves.
 HOLD = (
@@ -24,20 +25,20 @@ FAIL = (
 
 
 @pytest.mark.parametrize("text", HOLD)
-def test_an_assertion_that_holds_is_exit_code_0(text: str, capsys: Said) -> None:
+def test_an_assertion_that_holds_is_exit_code_0(text: str, capsys: Capture) -> None:
     assert inspect(TREE, "--assert", text) == 0
     assert capsys.readouterr().out == ""
 
 
 @pytest.mark.parametrize("text", FAIL)
-def test_one_that_does_not_hold_is_exit_code_3_and_says_what_there_is(text: str, capsys: Said) -> None:
+def test_one_that_does_not_hold_is_exit_code_3_and_says_what_there_is(text: str, capsys: Capture) -> None:
     assert inspect(TREE, "--assert", text) == 3
     (line,) = capsys.readouterr().out.splitlines()
     assert line.startswith(f"{TREE}: error: expect.")
     assert f"{text}: " in line
 
 
-def test_the_value_is_said(capsys: Said) -> None:
+def test_the_value_is_said(capsys: Capture) -> None:
     assert inspect(TREE, "--assert", "nodes<5", "--assert", "leaves<5", "--assert", "bytes<=1") == 3
     out = capsys.readouterr().out
     assert ": error: expect.value: nodes<5: nodes is 9\n" in out
@@ -45,7 +46,7 @@ def test_the_value_is_said(capsys: Said) -> None:
     assert f": error: expect.bytes: bytes<=1: bytes is {TREE.stat().st_size}\n" in out
 
 
-def test_what_a_plain_file_does_not_have_does_not_hold(capsys: Said) -> None:
+def test_what_a_plain_file_does_not_have_does_not_hold(capsys: Capture) -> None:
     for name in ("growth", "depth"):
         assert inspect(PLAIN, "--assert", f"{name}<99") == 3
         assert f"{name}<99: the file has no tree\n" in capsys.readouterr().out
@@ -53,7 +54,7 @@ def test_what_a_plain_file_does_not_have_does_not_hold(capsys: Said) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_every_short_name_has_a_value_of_a_tree(name: str, capsys: Said) -> None:
+def test_every_short_name_has_a_value_of_a_tree(name: str, capsys: Capture) -> None:
     files = {"Streamed SOG": STREAMED, "RAD": RAD, "RAD or Streamed SOG": STREAMED}
     assert inspect(files.get(FORMATS.get(name, ""), TREE), "--assert", f"{name}==12345") == 3
     assert f"{name}==12345: {name} is " in capsys.readouterr().out
@@ -71,19 +72,19 @@ def test_every_short_name_has_a_value_of_a_tree(name: str, capsys: Said) -> None
         ("tre.leaves<5", "there is no 'tre.leaves' in a report"),
     ],
 )
-def test_what_cannot_be_understood_is_wrong_usage(text: str, message: str, capsys: Said) -> None:
+def test_what_cannot_be_understood_is_wrong_usage(text: str, message: str, capsys: Capture) -> None:
     assert inspect(TREE, "--assert", text) == 2
     assert message in capsys.readouterr().err
 
 
-def test_assertions_of_a_file_and_of_options_all_count(tmp_path: Path, capsys: Said) -> None:
+def test_assertions_of_a_file_and_of_options_all_count(tmp_path: Path, capsys: Capture) -> None:
     path = tmp_path / "expect.toml"
     path.write_text('assert = ["nodes<9"]\nmax_bytes = 1_000_000\n')
     assert inspect(TREE, "--expect", path, "--assert", "leaves<6") == 3
     assert [line.split(": ")[3] for line in capsys.readouterr().out.splitlines()] == ["nodes<9", "leaves<6"]
 
 
-def test_standard_input_is_reported_as_the_file_is(monkeypatch: pytest.MonkeyPatch, capsys: Said) -> None:
+def test_standard_input_is_reported_as_the_file_is(monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
     assert inspect(TREE, "--json", "--stats", "--check") == 0
     (named,) = records(capsys.readouterr().out)
     monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(TREE.read_bytes())))

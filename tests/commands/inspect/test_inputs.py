@@ -17,10 +17,11 @@ from sparklod_cli.inspection import report as reports
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
-from tests.commands.inspect.runs import FAULTS, FOLDER, Said, inspect, records
+from tests.commands.inspect.runs import FAULTS, FOLDER, inspect, records
+from tests.conftest import Capture
 
 
-def test_an_unpacked_sog_counts_as_one_file(tmp_path: Path, capsys: Said) -> None:
+def test_an_unpacked_sog_counts_as_one_file(tmp_path: Path, capsys: Capture) -> None:
     assert inspect(FOLDER, FOLDER / "meta.json", "--json") == 0
     folder, meta = records(capsys.readouterr().out)
     size = sum(path.stat().st_size for path in FOLDER.iterdir())
@@ -40,13 +41,13 @@ def test_an_unpacked_sog_counts_as_one_file(tmp_path: Path, capsys: Said) -> Non
     ]
 
 
-def test_inspect_does_not_read_devices(capsys: Said) -> None:
+def test_inspect_does_not_read_devices(capsys: Capture) -> None:
     assert inspect("/dev/null", "--check") == 3
     assert capsys.readouterr().out.count(": error: file.unreadable: ") == 1
 
 
 @pytest.mark.parametrize("name", ["no-splats.ply", "no-splats.spz"])
-def test_files_without_splats_have_a_report(name: str, capsys: Said) -> None:
+def test_files_without_splats_have_a_report(name: str, capsys: Capture) -> None:
     assert inspect(FAULTS / name) == 0
     assert "0 splats, SH 0" in capsys.readouterr().out
     assert inspect(FAULTS / name, "--json", "--stats") == 0
@@ -82,7 +83,7 @@ def chain(nodes: int) -> bytes:
 
 
 @pytest.mark.parametrize("nodes", [999, 1000, 1001, 50_000])
-def test_the_report_of_a_deep_chain_is_bounded(nodes: int, tmp_path: Path, capsys: Said) -> None:
+def test_the_report_of_a_deep_chain_is_bounded(nodes: int, tmp_path: Path, capsys: Capture) -> None:
     """Reports do not grow with the levels of a tree, and say how many they leave out."""
     path, page = tmp_path / "chain.spz", tmp_path / "page.html"
     path.write_bytes(chain(nodes))

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from tests.commands.inspect.runs import BROKEN, MISSING, PLAIN, TREE, Said, inspect, records
+from tests.commands.inspect.runs import BROKEN, MISSING, PLAIN, TREE, inspect, records
+from tests.conftest import Capture
 
 
-def test_json_is_one_object_and_one_line_a_file(capsys: Said) -> None:
+def test_json_is_one_object_and_one_line_a_file(capsys: Capture) -> None:
     assert inspect("--json", TREE, MISSING, PLAIN) == 1
     out, err = capsys.readouterr()
     tree, missing, plain = records(out)
@@ -22,7 +23,7 @@ def test_json_is_one_object_and_one_line_a_file(capsys: Said) -> None:
     assert tree.keys() == missing.keys() == plain.keys()
 
 
-def test_json_has_the_parts_that_options_ask_for(capsys: Said) -> None:
+def test_json_has_the_parts_that_options_ask_for(capsys: Capture) -> None:
     assert inspect("--json", "--stats", "--check", "--sh", "1", BROKEN) == 3
     out, err = capsys.readouterr()
     (record,) = records(out)
@@ -54,14 +55,14 @@ def test_json_has_the_parts_that_options_ask_for(capsys: Said) -> None:
         ("bytes", str(TREE.stat().st_size)),
     ],
 )
-def test_a_field_is_printed_as_a_script_wants_it(field: str, value: str, capsys: Said) -> None:
+def test_a_field_is_printed_as_a_script_wants_it(field: str, value: str, capsys: Capture) -> None:
     assert inspect(TREE, "--field", field) == 0
     out, err = capsys.readouterr()
     assert out.startswith(value)
     assert (out.count("\n"), err) == (1, "")
 
 
-def test_a_field_of_several_files_is_a_line_each(capsys: Said) -> None:
+def test_a_field_of_several_files_is_a_line_each(capsys: Capture) -> None:
     assert inspect(TREE, MISSING, PLAIN, "--field", "splats") == 1
     out, err = capsys.readouterr()
     assert out.splitlines() == ["9", "60"]
@@ -70,7 +71,7 @@ def test_a_field_of_several_files_is_a_line_each(capsys: Said) -> None:
     assert capsys.readouterr().out == "10\n"
 
 
-def test_a_field_missing_in_one_file_does_not_stop_the_others(capsys: Said) -> None:
+def test_a_field_missing_in_one_file_does_not_stop_the_others(capsys: Capture) -> None:
     assert inspect(PLAIN, TREE, "--field", "tree.leaves") == 1
     out, err = capsys.readouterr()
     assert out == "6\n"
@@ -78,7 +79,7 @@ def test_a_field_missing_in_one_file_does_not_stop_the_others(capsys: Said) -> N
     assert "the report has no tree.leaves" in err
 
 
-def test_an_unknown_field_is_an_error(capsys: Said) -> None:
+def test_an_unknown_field_is_an_error(capsys: Capture) -> None:
     assert inspect(TREE, "--field", "tree.leafs") == 1
     out, err = capsys.readouterr()
     assert out == ""

@@ -10,11 +10,11 @@ import pytest
 
 from sparklod_cli.cli import run
 from sparklod_cli.figures import pyvista_scene, tree_plot
-from tests.commands.inspect.runs import BROKEN, CORRUPT, MISSING, NOTED, PLAIN, TREE, WARNED, Said, inspect, records
-from tests.conftest import FIXTURES, ROOT
+from tests.commands.inspect.runs import BROKEN, CORRUPT, MISSING, NOTED, PLAIN, TREE, WARNED, inspect, records
+from tests.conftest import FIXTURES, ROOT, Capture
 
 
-def test_a_person_gets_a_report_on_standard_output(capsys: Said) -> None:
+def test_a_person_gets_a_report_on_standard_output(capsys: Capture) -> None:
     assert inspect(TREE, PLAIN) == 0
     out, err = capsys.readouterr()
     assert err == ""
@@ -32,7 +32,7 @@ def test_a_person_gets_a_report_on_standard_output(capsys: Said) -> None:
     assert "depth" not in plain
 
 
-def test_stats_adds_quantities(capsys: Said) -> None:
+def test_stats_adds_quantities(capsys: Capture) -> None:
     assert inspect(PLAIN, "--stats") == 0
     out = capsys.readouterr().out
     rows = [line.split()[0] for line in out.splitlines()]
@@ -41,7 +41,7 @@ def test_stats_adds_quantities(capsys: Said) -> None:
     assert "sh1" not in capsys.readouterr().out
 
 
-def test_histograms_are_printed_by_name(capsys: Said) -> None:
+def test_histograms_are_printed_by_name(capsys: Capture) -> None:
     assert inspect(PLAIN, "--histogram", "sh1", "--histogram", "opacity") == 0
     lines = [line.strip() for line in capsys.readouterr().out.splitlines()]
     assert 0 < lines.index("sh1") < lines.index("opacity") < len(lines) - 1
@@ -53,7 +53,7 @@ def test_histograms_are_printed_by_name(capsys: Said) -> None:
     ids=lambda value: getattr(value, "name", None),
 )
 def test_the_exit_code_says_whether_a_file_was_read_and_checked(
-    file: Path, without: int, with_check: int, capsys: Said
+    file: Path, without: int, with_check: int, capsys: Capture
 ) -> None:
     assert inspect(file) == without
     assert inspect(file, "--json") == without
@@ -96,12 +96,12 @@ def test_the_exit_code_says_whether_a_file_was_read_and_checked(
         ([TREE, "--histogram", "beauty"], "--histogram: there is no quantity"),
     ],
 )
-def test_wrong_usage_of_inspect_is_exit_code_2(arguments: list[object], message: str, capsys: Said) -> None:
+def test_wrong_usage_of_inspect_is_exit_code_2(arguments: list[object], message: str, capsys: Capture) -> None:
     assert inspect(*arguments) == 2
     assert message in capsys.readouterr().err
 
 
-def test_an_unreadable_file_does_not_stop_the_others(capsys: Said) -> None:
+def test_an_unreadable_file_does_not_stop_the_others(capsys: Capture) -> None:
     assert inspect(MISSING, TREE, CORRUPT, PLAIN) == 1
     out, err = capsys.readouterr()
     assert [line for line in out.splitlines() if not line.startswith(" ")] == [
@@ -114,7 +114,7 @@ def test_an_unreadable_file_does_not_stop_the_others(capsys: Said) -> None:
     )
 
 
-def test_findings_go_to_stdout_and_good_news_to_stderr(capsys: Said) -> None:
+def test_findings_go_to_stdout_and_good_news_to_stderr(capsys: Capture) -> None:
     assert inspect("--check", MISSING, TREE, BROKEN, WARNED) == 3
     out, err = capsys.readouterr()
     assert out.splitlines() == [
@@ -125,7 +125,7 @@ def test_findings_go_to_stdout_and_good_news_to_stderr(capsys: Said) -> None:
     assert err == f"{TREE}: nothing is wrong with its 9 nodes\n"
 
 
-def test_quiet_prints_only_what_options_name(capsys: Said) -> None:
+def test_quiet_prints_only_what_options_name(capsys: Capture) -> None:
     assert inspect("--check", "-q", TREE, BROKEN) == 3
     out, err = capsys.readouterr()
     assert (out.count("\n"), err) == (1, "")
@@ -146,7 +146,7 @@ def test_quiet_prints_only_what_options_name(capsys: Said) -> None:
     assert capsys.readouterr().err.startswith(f"error: {CORRUPT}")
 
 
-def test_threads_do_not_change_a_report(capsys: Said) -> None:
+def test_threads_do_not_change_a_report(capsys: Capture) -> None:
     printed = set()
     for threads in (1, 2, 5):
         assert inspect(FIXTURES / "demo.ply", TREE, "--json", "--stats", "--check", "--threads", threads) == 0
@@ -167,7 +167,7 @@ def test_a_process_prints_findings_and_exits_3() -> None:
 
 
 def test_the_paths_of_page_and_picture_are_printed(
-    tmp_path: Path, capsys: Said, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def drawn(*args: object, **kwargs: object) -> tree_plot.Picture:
         return tree_plot.Picture(b"\x89PNG" * 100, "all leaves: 6 nodes; coloured by level")
@@ -187,7 +187,7 @@ def test_the_paths_of_page_and_picture_are_printed(
 
 @pytest.mark.parametrize(("option", "name"), [("--html", "page.spz"), ("--plot", "picture.html")])
 def test_wrong_suffixes_of_page_and_picture_are_refused(
-    option: str, name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    option: str, name: str, tmp_path: Path, capsys: Capture
 ) -> None:
     assert run(["inspect", str(FIXTURES / "one.ply"), option, str(tmp_path / name)]) == 2
     assert f"{name}' does not end in ." in capsys.readouterr().err

@@ -10,10 +10,11 @@ import pytest
 
 from sparklod_cli.codecs.rounding import ROUND_TRIPS
 from sparklod_cli.images.metrics import psnr
-from tests.commands.render.runs import AT, DEMO, PLAIN, SIZE, Said, floats, pixels, render
+from tests.commands.render.runs import AT, DEMO, PLAIN, SIZE, floats, pixels, render
+from tests.conftest import Capture
 
 
-def test_a_difference_is_drawn_and_its_psnr_said(built: Path, tmp_path: Path, capsys: Said) -> None:
+def test_a_difference_is_drawn_and_its_psnr_said(built: Path, tmp_path: Path, capsys: Capture) -> None:
     how = (*SIZE, *AT)
     assert render(DEMO, *how, "--diff", DEMO, "-o", tmp_path / "same.png", "--json", "-q") == 0
     assert json.loads(capsys.readouterr().out)["frames"][0]["psnr_db"] == 100
@@ -31,7 +32,7 @@ def test_a_difference_is_drawn_and_its_psnr_said(built: Path, tmp_path: Path, ca
     assert np.abs(pixels(tmp_path / "d.png") - expected).max() <= 1
 
 
-def test_a_difference_says_what_it_shows(built: Path, tmp_path: Path, capsys: Said) -> None:
+def test_a_difference_says_what_it_shows(built: Path, tmp_path: Path, capsys: Capture) -> None:
     how = (built, "--budget", 9_000, "--size", "400x240", *AT, "--diff", DEMO, "--json")
     assert render(*how, "-o", tmp_path / "bar.png") == 0
     out, err = capsys.readouterr()
@@ -44,7 +45,7 @@ def test_a_difference_says_what_it_shows(built: Path, tmp_path: Path, capsys: Sa
     assert bar[:, :400].max() > 90
 
 
-def test_an_encoding_is_seen_in_the_difference_to_the_file_itself(tmp_path: Path, capsys: Said) -> None:
+def test_an_encoding_is_seen_in_the_difference_to_the_file_itself(tmp_path: Path, capsys: Capture) -> None:
     values = {}
     for through in ROUND_TRIPS:
         settings = (PLAIN, *SIZE, "--through", through, "--diff", PLAIN, "--json", "-q")

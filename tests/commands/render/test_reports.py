@@ -13,11 +13,11 @@ from typing import Any
 import pytest
 
 from sparklod_cli.api import jobs
-from tests.commands.render.runs import PLAIN, SIZE, TOWN, TREE, Said, pixels, render
-from tests.conftest import ROOT
+from tests.commands.render.runs import PLAIN, SIZE, TOWN, TREE, pixels, render
+from tests.conftest import ROOT, Capture
 
 
-def test_json_says_what_was_drawn(tmp_path: Path, capsys: Said) -> None:
+def test_json_says_what_was_drawn(tmp_path: Path, capsys: Capture) -> None:
     output = tmp_path / "out.%04d.png"
     assert render(TOWN, *SIZE, "--budget", "3k", "--orbit", 3, "--json", "-q", "-o", output) == 0
     out, err = capsys.readouterr()
@@ -30,7 +30,9 @@ def test_json_says_what_was_drawn(tmp_path: Path, capsys: Said) -> None:
     assert report["bytes"] == sum(path.stat().st_size for path in tmp_path.iterdir())
 
 
-def test_the_time_that_is_said_is_the_whole_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Said) -> None:
+def test_the_time_that_is_said_is_the_whole_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
+) -> None:
     whole = jobs.read_scenes
 
     def slow(*arguments: Any, **named: Any) -> Any:
@@ -44,7 +46,7 @@ def test_the_time_that_is_said_is_the_whole_time(tmp_path: Path, monkeypatch: py
     assert float(err.rsplit(" ", 2)[1]) >= 0.5
 
 
-def test_help_of_render_has_examples(capsys: Said) -> None:
+def test_help_of_render_has_examples(capsys: Capture) -> None:
     assert render("--help") == 0
     out = capsys.readouterr().out
     assert "Examples:" in out

@@ -12,11 +12,12 @@ from PIL import Image
 
 from sparklod_cli.cli import run
 from sparklod_cli.images.defaults import THUMBNAIL_SIZE, THUMBNAIL_SUPERSAMPLE
-from tests.commands.render.runs import AT, DEMO, FIXTURES, PLAIN, SIZE, TOWN, Said, pixels, render
+from tests.commands.render.runs import AT, DEMO, FIXTURES, PLAIN, SIZE, TOWN, pixels, render
+from tests.conftest import Capture
 
 
 def test_a_thumbnail_is_the_whole_scene_made_small(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Said
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
 ) -> None:
     monkeypatch.chdir(tmp_path)
     shutil.copy(DEMO, tmp_path)
@@ -60,7 +61,7 @@ def test_frames_and_sheets_can_be_jpegs(tmp_path: Path) -> None:
     assert height * width > 2 * 160 * 90
 
 
-def test_a_budget_can_be_a_share_of_the_leaves(tmp_path: Path, capsys: Said) -> None:
+def test_a_budget_can_be_a_share_of_the_leaves(tmp_path: Path, capsys: Capture) -> None:
     how = (TOWN, *SIZE, *AT)
     assert run(["traverse", *map(str, how), "--budget", "5%", "--no-timing"]) == 0
     header, row = (line.split(",") for line in capsys.readouterr().out.splitlines())
@@ -76,7 +77,7 @@ def test_a_budget_can_be_a_share_of_the_leaves(tmp_path: Path, capsys: Said) -> 
     assert 0.9 * budget / 2 < drawn <= budget / 2
 
 
-def test_a_plain_spz_may_stand_on_its_head(tmp_path: Path, capsys: Said) -> None:
+def test_a_plain_spz_may_stand_on_its_head(tmp_path: Path, capsys: Capture) -> None:
     file = FIXTURES / "golden" / "hand-v4.spz"
     for number, (arguments, noted) in enumerate(
         (((), True), (("--up", "0,1,0"), False), (("--look-at", "0,0,3:0,0,0"), True), (("-q",), False))
@@ -87,7 +88,7 @@ def test_a_plain_spz_may_stand_on_its_head(tmp_path: Path, capsys: Said) -> None
     assert "upside down" not in capsys.readouterr().err
 
 
-def test_a_comparison_shows_a_terminal_its_summary(monkeypatch: pytest.MonkeyPatch, capsys: Said) -> None:
+def test_a_comparison_shows_a_terminal_its_summary(monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
     how = (TOWN, "--size", "64x48", *AT, "--compare", "--budget", "5%", "-q")
     assert render(*how) == 0
     assert capsys.readouterr().out.startswith("frame,time_s,")

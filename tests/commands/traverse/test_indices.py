@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.commands.traverse.runs import ORBIT, OTHER, TOWN, TREE, Said, table, traverse
+from tests.commands.traverse.runs import ORBIT, OTHER, TOWN, TREE, table, traverse
+from tests.conftest import Capture
 
 
 def cut_of(path: Path) -> np.ndarray:
@@ -15,7 +16,7 @@ def cut_of(path: Path) -> np.ndarray:
     return nodes
 
 
-def test_indices_out_writes_the_nodes_of_every_cut(tmp_path: Path, capsys: Said) -> None:
+def test_indices_out_writes_the_nodes_of_every_cut(tmp_path: Path, capsys: Capture) -> None:
     folder = tmp_path / "new" / "cuts"
     assert traverse(TOWN, *ORBIT, "--budget", "20k", "--indices-out", folder) == 0
     rows = table(capsys.readouterr().out)
@@ -38,7 +39,7 @@ def test_indices_out_writes_the_nodes_of_every_cut(tmp_path: Path, capsys: Said)
     assert len(cut_of(folder / "000000.npy")) <= 100
 
 
-def test_indices_out_names_instances_and_frames(tmp_path: Path, capsys: Said) -> None:
+def test_indices_out_names_instances_and_frames(tmp_path: Path, capsys: Capture) -> None:
     cuts = tmp_path / "cuts"
     assert traverse(TREE, OTHER, *ORBIT, "--every", 2, "--indices-out", cuts, "--per-instance") == 0
     rows = table(capsys.readouterr().out)
@@ -52,7 +53,7 @@ def test_indices_out_names_instances_and_frames(tmp_path: Path, capsys: Said) ->
             assert len(cut_of(cuts / f"00000{row['frame']}.{at}.npy")) == int(row["selected"])
 
 
-def test_indices_out_refuses_a_path_that_is_a_file(tmp_path: Path, capsys: Said) -> None:
+def test_indices_out_refuses_a_path_that_is_a_file(tmp_path: Path, capsys: Capture) -> None:
     (tmp_path / "cuts").touch()
     assert traverse(TREE, *ORBIT, "--indices-out", tmp_path / "cuts") == 2
     assert "cuts" in capsys.readouterr().err

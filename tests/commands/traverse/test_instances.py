@@ -6,10 +6,11 @@ import json
 import shutil
 from pathlib import Path
 
-from tests.commands.traverse.runs import ORBIT, TOWN, TREE, Said, scene_file, table, traverse
+from tests.commands.traverse.runs import ORBIT, TOWN, TREE, scene_file, table, traverse
+from tests.conftest import Capture
 
 
-def test_files_of_one_name_get_numbers(tmp_path: Path, capsys: Said) -> None:
+def test_files_of_one_name_get_numbers(tmp_path: Path, capsys: Capture) -> None:
     for folder in ("a", "b"):
         (tmp_path / folder).mkdir()
         shutil.copy(TREE, tmp_path / folder / "door.spz")
@@ -19,7 +20,7 @@ def test_files_of_one_name_get_numbers(tmp_path: Path, capsys: Said) -> None:
     assert names[:4] == ["total", "door", "door 2", "door 3"]
 
 
-def test_an_instance_farther_away_has_fewer_nodes(tmp_path: Path, capsys: Said) -> None:
+def test_an_instance_farther_away_has_fewer_nodes(tmp_path: Path, capsys: Capture) -> None:
     shutil.copy(TREE, tmp_path / "tree.spz")
     scene = scene_file(tmp_path, {"file": "tree.spz", "name": "near"}, {"file": "tree.spz", "translation": [0, 0, 500]})
     assert traverse("--scene", scene, "--look-at", "0,0,-9:0,0,0", "--per-instance") == 0
@@ -29,7 +30,7 @@ def test_an_instance_farther_away_has_fewer_nodes(tmp_path: Path, capsys: Said) 
     assert int(total["selected"]) == int(near["selected"]) + int(far["selected"])
 
 
-def test_a_scene_names_what_is_missing_beside_it(tmp_path: Path, capsys: Said) -> None:
+def test_a_scene_names_what_is_missing_beside_it(tmp_path: Path, capsys: Capture) -> None:
     assert traverse("--scene", scene_file(tmp_path, {"file": "gone.spz"})) == 1
     assert capsys.readouterr().err == f"error: {tmp_path / 'gone.spz'}: cannot be read: no such file or directory\n"
     assert traverse("--scene", scene_file(tmp_path, {"file": "a"}, {"file": "b", "scale": "big"})) == 1
@@ -37,7 +38,7 @@ def test_a_scene_names_what_is_missing_beside_it(tmp_path: Path, capsys: Said) -
 
 
 def test_a_walk_through_a_city_has_a_row_for_every_instance_and_frame(
-    built: Path, tmp_path: Path, capsys: Said
+    built: Path, tmp_path: Path, capsys: Capture
 ) -> None:
     """Three trees, five instances, ten seconds on foot, over a network."""
     for name in ("demo-lod.spz", "sh3-lod.spz"):

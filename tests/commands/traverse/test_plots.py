@@ -8,12 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from tests.commands.traverse.runs import ORBIT, TOWN, Said, traverse
+from tests.commands.traverse.runs import ORBIT, TOWN, traverse
+from tests.conftest import Capture
 
 pytestmark = pytest.mark.slow
 
 
-def test_a_plot_is_a_picture(tmp_path: Path, capsys: Said) -> None:
+def test_a_plot_is_a_picture(tmp_path: Path, capsys: Capture) -> None:
     pytest.importorskip("matplotlib")
     image = pytest.importorskip("PIL.Image")
     assert traverse(TOWN, *ORBIT, "--budget", "4k", "--plot", tmp_path / "path.png", "-o", tmp_path / "out.csv") == 0

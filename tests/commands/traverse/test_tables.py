@@ -10,13 +10,13 @@ from pathlib import Path
 import pytest
 
 from sparklod_cli.simulation.columns import COLUMNS
-from tests.commands.traverse.runs import NAMES, ORBIT, TOWN, TREE, Said, table, traverse
-from tests.conftest import ROOT
+from tests.commands.traverse.runs import NAMES, ORBIT, TOWN, TREE, table, traverse
+from tests.conftest import ROOT, Capture
 
 pytestmark = pytest.mark.slow
 
 
-def test_a_table_comes_on_standard_output_and_nothing_else_is_said(capsys: Said) -> None:
+def test_a_table_comes_on_standard_output_and_nothing_else_is_said(capsys: Capture) -> None:
     assert traverse(TOWN) == 0
     out, err = capsys.readouterr()
     rows = table(out)
@@ -27,7 +27,7 @@ def test_a_table_comes_on_standard_output_and_nothing_else_is_said(capsys: Said)
     assert err == ""
 
 
-def test_two_traversals_give_the_same_bytes(capsys: Said) -> None:
+def test_two_traversals_give_the_same_bytes(capsys: Capture) -> None:
     outs = set()
     for threads in (1, 2, 5):
         assert traverse(TOWN, *ORBIT, "--budget", "4k", "--no-timing", "--threads", threads, "--per-instance") == 0
@@ -36,7 +36,7 @@ def test_two_traversals_give_the_same_bytes(capsys: Said) -> None:
     assert list(table(out)[0]) == [name for name in NAMES if name != "traverse_ms"]
 
 
-def test_an_output_is_a_file(tmp_path: Path, capsys: Said) -> None:
+def test_an_output_is_a_file(tmp_path: Path, capsys: Capture) -> None:
     output = tmp_path / "frames.csv"
     assert traverse(TREE, *ORBIT, "-o", output, "--no-timing") == 0
     assert capsys.readouterr() == ("", "")
@@ -51,7 +51,7 @@ def test_an_output_is_a_file(tmp_path: Path, capsys: Said) -> None:
     assert capsys.readouterr().out.encode() == before
 
 
-def test_json_has_the_same_cells(tmp_path: Path, capsys: Said) -> None:
+def test_json_has_the_same_cells(tmp_path: Path, capsys: Capture) -> None:
     settings = (TOWN, *ORBIT, "--budget", "4k", "--no-timing", "--per-instance")
     assert traverse(*settings) == 0
     rows = table(capsys.readouterr().out)
@@ -63,7 +63,7 @@ def test_json_has_the_same_cells(tmp_path: Path, capsys: Said) -> None:
     assert texts == rows
 
 
-def test_parquet_has_the_same_cells(tmp_path: Path, capsys: Said) -> None:
+def test_parquet_has_the_same_cells(tmp_path: Path, capsys: Capture) -> None:
     parquet = pytest.importorskip("pyarrow.parquet")
     settings = (TOWN, *ORBIT, "--budget", "4k", "--no-timing")
     assert traverse(*settings, "-o", tmp_path / "frames.parquet") == 0
@@ -82,7 +82,7 @@ def test_the_suffix_decides_the_format_unless_an_option_does(tmp_path: Path) -> 
     assert begins == {"a.csv": b"f", "a.JSON": b"{", "a.txt": b"f", "a": b"{"}
 
 
-def test_a_summary_is_said_when_it_is_asked_for(tmp_path: Path, capsys: Said) -> None:
+def test_a_summary_is_said_when_it_is_asked_for(tmp_path: Path, capsys: Capture) -> None:
     output = tmp_path / "out.csv"
     assert traverse(TOWN, *ORBIT, "--budget", "4k", "--summary", "-o", output) == 0
     out, err = capsys.readouterr()
@@ -94,7 +94,7 @@ def test_a_summary_is_said_when_it_is_asked_for(tmp_path: Path, capsys: Said) ->
         assert capsys.readouterr() == ("", "")
 
 
-def test_json_is_the_summary_and_the_table_goes_to_its_file(tmp_path: Path, capsys: Said) -> None:
+def test_json_is_the_summary_and_the_table_goes_to_its_file(tmp_path: Path, capsys: Capture) -> None:
     output = tmp_path / "out.csv"
     assert traverse(TOWN, *ORBIT, "--budget", "4k", "--json", "-o", output, "--assert", "selected<=4k") == 0
     out, err = capsys.readouterr()
@@ -107,7 +107,7 @@ def test_json_is_the_summary_and_the_table_goes_to_its_file(tmp_path: Path, caps
     assert json.loads(capsys.readouterr().out)["frames"] == 3
 
 
-def test_an_assertion_that_does_not_hold_is_exit_code_3(tmp_path: Path, capsys: Said) -> None:
+def test_an_assertion_that_does_not_hold_is_exit_code_3(tmp_path: Path, capsys: Capture) -> None:
     output = tmp_path / "out.csv"
     settings = (TOWN, *ORBIT, "--budget", "4k", "-o", output, "--overwrite")
     assert traverse(*settings, "--assert", "selected<=4k", "--assert", "missing==0") == 0
@@ -128,7 +128,7 @@ def test_an_assertion_that_does_not_hold_is_exit_code_3(tmp_path: Path, capsys: 
     assert json.loads(capsys.readouterr().out)["asserts"][0]["held"] is False
 
 
-def test_help_of_traverse_has_examples(capsys: Said) -> None:
+def test_help_of_traverse_has_examples(capsys: Capture) -> None:
     assert traverse("--help") == 0
     out = capsys.readouterr().out
     assert "Examples:" in out
@@ -137,7 +137,7 @@ def test_help_of_traverse_has_examples(capsys: Said) -> None:
         assert option in out
 
 
-def test_verbose_says_how_long_it_took(capsys: Said) -> None:
+def test_verbose_says_how_long_it_took(capsys: Capture) -> None:
     assert traverse(TREE, *ORBIT, "-v", "--assert", "selected>0") == 0
     err = capsys.readouterr().err
     assert "3 frames of an orbit, " in err

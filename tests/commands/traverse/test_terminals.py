@@ -6,14 +6,15 @@ import sys
 
 import pytest
 
-from tests.commands.traverse.runs import ORBIT, TOWN, Said, table, traverse
+from tests.commands.traverse.runs import ORBIT, TOWN, table, traverse
+from tests.conftest import Capture
 
 
 def at_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True, raising=False)
 
 
-def test_a_terminal_gets_the_summary(monkeypatch: pytest.MonkeyPatch, capsys: Said) -> None:
+def test_a_terminal_gets_the_summary(monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
     at_a_terminal(monkeypatch)
     for quiet in ((), ("-q",)):
         assert traverse(TOWN, *ORBIT, *quiet) == 0
@@ -25,7 +26,7 @@ def test_a_terminal_gets_the_summary(monkeypatch: pytest.MonkeyPatch, capsys: Sa
 
 @pytest.mark.parametrize("option", [("--format", "csv"), ("--per-instance",), ("--no-timing",)], ids=str)
 def test_a_terminal_gets_the_table_by_output_alone(
-    option: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: Said
+    option: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: Capture
 ) -> None:
     at_a_terminal(monkeypatch)
     assert traverse(TOWN, *ORBIT, *option) == 2
@@ -34,20 +35,20 @@ def test_a_terminal_gets_the_table_by_output_alone(
     assert len({row["frame"] for row in table(capsys.readouterr().out)}) == 3
 
 
-def test_a_terminal_gets_no_summary_that_nobody_wants(monkeypatch: pytest.MonkeyPatch, capsys: Said) -> None:
+def test_a_terminal_gets_no_summary_that_nobody_wants(monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
     at_a_terminal(monkeypatch)
     assert traverse(TOWN, *ORBIT, "--no-summary") == 0
     assert capsys.readouterr() == ("", "")
 
 
-def test_a_pipe_gets_the_table(capsys: Said) -> None:
+def test_a_pipe_gets_the_table(capsys: Capture) -> None:
     assert traverse(TOWN, *ORBIT) == 0
     out, err = capsys.readouterr()
     assert len(table(out)) == 3
     assert err == ""
 
 
-def test_what_must_hold_is_checked_without_a_table(monkeypatch: pytest.MonkeyPatch, capsys: Said) -> None:
+def test_what_must_hold_is_checked_without_a_table(monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
     at_a_terminal(monkeypatch)
     assert traverse(TOWN, *ORBIT, "--assert", "selected<0") == 3
     out, err = capsys.readouterr()
