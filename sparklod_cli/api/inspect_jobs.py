@@ -20,8 +20,8 @@ from ..support.progress import Progress
 from ..tables.output import TableOutput
 
 if TYPE_CHECKING:
-    from ..figures.tree_plot import Picture
-    from ..inspection.html import Section
+    from ..figures.tree_plot import DescribedPicture
+    from ..inspection.html import FileSection
 
 
 #: Width and height of the thumbnail on a page, pixels; the splats of the cut that it shows; and the most splats of a
@@ -104,7 +104,7 @@ class Inspected:
     report: Report
     histograms: dict[str, str]
     picture: tuple[str, int] | None
-    section: Section | None
+    section: FileSection | None
     problem: str | None
 
 
@@ -150,7 +150,9 @@ def _checked(report: Report, scene: Scene | None, settings: InspectSettings) -> 
     return dataclasses.replace(report, findings=findings)
 
 
-def _picture(report: Report, scene: Scene | None, settings: InspectSettings) -> tuple[Picture | None, str | None]:
+def _picture(
+    report: Report, scene: Scene | None, settings: InspectSettings
+) -> tuple[DescribedPicture | None, str | None]:
     """Return the picture that is wanted, or why there is none."""
     if (settings.plot is None and settings.html is None) or report.format is None:
         return None, None
@@ -164,9 +166,9 @@ def _picture(report: Report, scene: Scene | None, settings: InspectSettings) -> 
         return None, str(error)
 
 
-def _thumbnail(report: Report, scene: Scene, threads: int) -> Picture | None:
+def _thumbnail(report: Report, scene: Scene, threads: int) -> DescribedPicture | None:
     """Return the scene as a viewer draws it; None where it is broken, or too large to be drawn at once."""
-    from ..figures.tree_plot import Picture
+    from ..figures.tree_plot import DescribedPicture
     from ..inspection.arrays import NO_CHILDREN
     from .cameras import orbit
     from .files import as_tree
@@ -188,7 +190,7 @@ def _thumbnail(report: Report, scene: Scene, threads: int) -> Picture | None:
     except SparklodError:
         return None
     what = "all splats" if scene.tree is None else f"a cut of at most {THUMBNAIL_BUDGET:,} splats"
-    return Picture(show(image).png, f"The scene from its front; {what}")
+    return DescribedPicture(show(image).png, f"The scene from its front; {what}")
 
 
 def _histograms(scene: Scene | None, names: Sequence[str]) -> dict[str, str]:
@@ -201,7 +203,7 @@ def _histograms(scene: Scene | None, names: Sequence[str]) -> dict[str, str]:
     return {name: as_text(values.histogram_of(scene.splats, name)) for name in names if name in held}
 
 
-def write_page(path: Path, sections: Sequence[Section], *, overwrite: bool) -> int:
+def write_page(path: Path, sections: Sequence[FileSection], *, overwrite: bool) -> int:
     """Write the page of some files, and return its bytes."""
     from ..inspection.html import page
 

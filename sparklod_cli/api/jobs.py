@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from ..cameras.frame import Settings
     from ..cameras.path import CameraPath
     from ..cameras.sources import CameraSource
-    from ..images.output import Output
-    from ..images.sequence import Pictures, PictureSettings
+    from ..images.output import PictureOutput
+    from ..images.sequence import PictureSettings, WrittenPictures
     from ..lod.budget import Budget
     from ..lod.settings import LodSettings
     from ..model.instances import Instance
@@ -110,7 +110,7 @@ class UnfitError(ValueError):
 
 
 @dataclass(frozen=True)
-class Drawn:
+class DrawnPath:
     """Result of rendering a camera path.
 
     Attributes:
@@ -120,9 +120,9 @@ class Drawn:
         render: how they were drawn.
     """
 
-    pictures: Pictures
+    pictures: WrittenPictures
     path: CameraPath
-    output: Output
+    output: PictureOutput
     render: RenderSettings
 
 
@@ -131,7 +131,7 @@ def draw_files(
     budget: Budget | None,
     lod: LodSettings,
     render: RenderSettings,
-    place: Callable[[CameraPath], tuple[Output, PictureSettings]],
+    place: Callable[[CameraPath], tuple[PictureOutput, PictureSettings]],
     *,
     fit_planes: bool,
     through: str | None = None,
@@ -139,7 +139,7 @@ def draw_files(
     reference: Path | None = None,
     overwrite: bool = False,
     ready: Callable[[CameraPath, Scenes], None] = lambda path, scenes: None,
-) -> Drawn:
+) -> DrawnPath:
     """Draw files and write the pictures.
 
     Args:
@@ -174,7 +174,7 @@ def draw_files(
     pictures = write_pictures(
         source, path, output, render, settings, reference=other, overwrite=overwrite, progress=files.progress
     )
-    return Drawn(pictures, path, output, render)
+    return DrawnPath(pictures, path, output, render)
 
 
 def _source(

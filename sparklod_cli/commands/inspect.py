@@ -25,7 +25,7 @@ from .paths import InputPath, keep_apart, name_outputs
 if TYPE_CHECKING:
     from ..api.inspect_jobs import Inspected, InspectSettings
     from ..inspection.expectations import Expectations
-    from ..inspection.html import Section
+    from ..inspection.html import FileSection
     from ..inspection.report import Report, ReportSettings
 
 EXAMPLES = """
@@ -42,7 +42,7 @@ Examples:
 
 
 @dataclass(frozen=True)
-class _General(General):
+class _InspectGeneral(General):
     quiet: bool = quiet_flag("Print only what other options ask for, and errors.")
 
 
@@ -53,7 +53,7 @@ class InspectOptions:
     files: tuple[Path, ...] = argument(InputPath(stdin=True), metavar="FILE...", required=True)
     checks: Checks = dataclasses.field(default_factory=Checks)
     output: InspectOutput = dataclasses.field(default_factory=InspectOutput)
-    general: _General = dataclasses.field(default_factory=_General)
+    general: _InspectGeneral = dataclasses.field(default_factory=_InspectGeneral)
 
 
 @click.command("inspect", cls=Command, epilog=EXAMPLES, context_settings={"show_default": True})
@@ -139,7 +139,7 @@ class _Job:
     console: Console
     options: InspectOptions
     settings: InspectSettings
-    sections: list[Section] = dataclasses.field(default_factory=list)
+    sections: list[FileSection] = dataclasses.field(default_factory=list)
 
     def inspect(self, file: Path) -> int:
         """Print the report of a file and return its exit status; one too large for memory does not stop the others."""

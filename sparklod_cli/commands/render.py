@@ -20,14 +20,14 @@ from .option_groups import COMMON, check_declared, exclude, flags_set, values_of
 from .options.cameras import PictureCameras
 from .options.common import General, json_flag
 from .options.cut import Inputs, PictureCut, PictureStreaming, check_scenes
-from .options.pictures import Appearance, Comparison, PictureFiles, check_sizes
+from .options.pictures import Appearance, ComparisonOptions, PictureFiles, check_sizes
 from .paths import claim_stdout, keep_apart, name_outputs
 
 if TYPE_CHECKING:
-    from ..api.jobs import Drawn, ViewedFiles
+    from ..api.jobs import DrawnPath, ViewedFiles
     from ..cameras.path import CameraPath
-    from ..images.output import Output
-    from ..images.sequence import Pictures, PictureSettings
+    from ..images.output import PictureOutput
+    from ..images.sequence import PictureSettings, WrittenPictures
     from ..model.instances import Instance
     from ..scenes.loaded import Scenes
 
@@ -53,7 +53,7 @@ HEADINGS = (
 
 
 @dataclass(frozen=True)
-class _General(General):
+class _RenderGeneral(General):
     as_json: bool = json_flag("Print what was drawn as one JSON object on standard output.")
 
 
@@ -67,8 +67,8 @@ class RenderOptions:
     cut: PictureCut = field(default_factory=PictureCut)
     streaming: PictureStreaming = field(default_factory=PictureStreaming)
     appearance: Appearance = field(default_factory=Appearance)
-    comparison: Comparison = field(default_factory=Comparison)
-    general: _General = field(default_factory=_General)
+    comparison: ComparisonOptions = field(default_factory=ComparisonOptions)
+    general: _RenderGeneral = field(default_factory=_RenderGeneral)
 
     @classmethod
     def of(cls, ctx: click.Context) -> RenderOptions:
@@ -130,7 +130,7 @@ def _draw(ctx: click.Context, options: RenderOptions) -> None:
 
         console.announce_compiling()
 
-        def place(path: CameraPath) -> tuple[Output, PictureSettings]:
+        def place(path: CameraPath) -> tuple[PictureOutput, PictureSettings]:
             return _place(ctx, options, instances, path)
 
         def ready(path: CameraPath, scenes: Scenes) -> None:
@@ -203,7 +203,7 @@ def _upside_down(options: RenderOptions, scenes: Scenes) -> list[str]:
     ]
 
 
-def _output(ctx: click.Context, options: RenderOptions, cameras: int) -> Output:
+def _output(ctx: click.Context, options: RenderOptions, cameras: int) -> PictureOutput:
     """Return the output of the pictures of some cameras."""
     assert options.inputs.first is not None  # or there would be no instances
     return options.pictures.place(
@@ -213,7 +213,7 @@ def _output(ctx: click.Context, options: RenderOptions, cameras: int) -> Output:
 
 def _place(
     ctx: click.Context, options: RenderOptions, instances: list[Instance], path: CameraPath
-) -> tuple[Output, PictureSettings]:
+) -> tuple[PictureOutput, PictureSettings]:
     """Return the output of the pictures of a path, and how they become files.
 
     Raises:
@@ -248,7 +248,7 @@ def files_read(options: RenderOptions, instances: list[Instance]) -> dict[str, l
     return {"scene": options.inputs.read(instances), "world_transform": options.cameras.files()}
 
 
-def _report(console: Console, drawn: Drawn, seconds: float, *, as_json: bool) -> None:
+def _report(console: Console, drawn: DrawnPath, seconds: float, *, as_json: bool) -> None:
     """Print a line on the pictures, with `as_json` an object too, and a warning if nothing is visible."""
     written, output, settings = drawn.pictures, drawn.output, drawn.render
     if not any(frame["splats"] for frame in written.frames):
@@ -276,7 +276,7 @@ def _report(console: Console, drawn: Drawn, seconds: float, *, as_json: bool) ->
     )
 
 
-def _describe(written: Pictures) -> str:
+def _describe(written: WrittenPictures) -> str:
     """Return what was drawn, such as "60 frames, 1280 x 720, 499,102 to 500,000 splats"."""
     frames = written.frames
     sizes = dict.fromkeys(f"{frame['width']} x {frame['height']}" for frame in frames)

@@ -28,7 +28,7 @@ from .options.common import (
     plot_option,
     table_form,
 )
-from .options.cut import Cut, Inputs, check_scenes
+from .options.cut import CutOptions, Inputs, check_scenes
 from .paths import OutputPath, claim_stdout, keep_apart, name_outputs
 
 if TYPE_CHECKING:
@@ -138,7 +138,7 @@ HEADINGS = (COMMON, "Inputs", "Cameras", "Cut", "Streamed SOG", "Streaming", "Ou
 
 
 @dataclass(frozen=True)
-class _General(General):
+class _TraverseGeneral(General):
     as_json: bool = json_flag(
         "Print the summary as one JSON object on standard output; write a table only to --output."
     )
@@ -151,9 +151,9 @@ class TraverseOptions:
     table: FrameTable = field(default_factory=FrameTable)
     inputs: Inputs = field(default_factory=Inputs)
     cameras: Cameras = field(default_factory=Cameras)
-    cut: Cut = field(default_factory=Cut)
+    cut: CutOptions = field(default_factory=CutOptions)
     streaming: StreamingSettings = field(default_factory=StreamingSettings)
-    general: _General = field(default_factory=_General)
+    general: _TraverseGeneral = field(default_factory=_TraverseGeneral)
 
 
 @click.command("traverse", cls=Command, headings=HEADINGS, epilog=EXAMPLES, context_settings={"show_default": True})

@@ -99,7 +99,7 @@ class _Place:
 
 
 @dataclass(frozen=True)
-class _General(General):
+class _ViewGeneral(General):
     as_json: bool = json_flag("Print the address and the files as one JSON object on standard output.")
     quiet: bool = quiet_flag("Print nothing but the address, and errors.")
     verbose: bool = verbose_flag("Print each request.")
@@ -112,7 +112,7 @@ class _ViewOptions:
     files: tuple[Path, ...] = argument(InputPath(), metavar="FILE...", required=True)
     page: _Page = field(default_factory=_Page)
     place: _Place = field(default_factory=_Place)
-    general: _General = field(default_factory=_General)
+    general: _ViewGeneral = field(default_factory=_ViewGeneral)
 
 
 HEADINGS = (COMMON, "Page", "Server")

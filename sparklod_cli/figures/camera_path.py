@@ -15,7 +15,7 @@ from ..render.color_scales import range_of, whole_numbers
 from ..support.errors import SparklodError
 from ..support.units import count_of
 from .geometry import Points, Viewpoint, bounds, box_lines, evenly, is_drawable, viewpoint
-from .pyvista_scene import Stage, write_png
+from .pyvista_scene import PyvistaStage, write_png
 
 #: Most splats that are drawn; of more, an even sample.
 MOST_POINTS = 600_000
@@ -69,12 +69,12 @@ def picture_of_path(
     low, high = np.minimum(low, way.min(axis=0)), np.maximum(high, way.max(axis=0))
     eye = _above(cameras, low, high, size)
     parts = _path_lines(cameras, way, frame, float((high - low).max()))
-    with Stage(low, high, size, BACKGROUND) as stage:
+    with PyvistaStage(low, high, size, BACKGROUND) as stage:
         drawn = stage.splats(shown, coloring.rgb, eye)
         for ends, color in parts:
             stage.lines(ends, color, 1.0, width=1.5)
         pixels = stage.photograph(eye)
-    with Stage(low, high, size, BACKGROUND) as stage:
+    with PyvistaStage(low, high, size, BACKGROUND) as stage:
         for ends, color in parts:
             stage.lines(ends, color, 1.0, width=1.5)
         pixels = _seen_through(pixels, stage.photograph(eye))

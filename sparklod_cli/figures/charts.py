@@ -23,7 +23,7 @@ GREEN, BLUE, INDIGO, ORANGE, YELLOW, PINK = "#44bf70", "#2a788e", "#414487", "#e
 Series = NDArray[np.float64]
 
 
-class Frames:
+class FrameColumns:
     """Columns of rows as arrays, along an axis of time or of frame numbers.
 
     Attributes:

@@ -150,7 +150,7 @@ def load_pyvista() -> ModuleType:
     return pyvista
 
 
-class Stage:
+class PyvistaStage:
     """A scene to render, in units of its extent and around its middle, so that float32 suffices wherever it lies.
 
     A context manager: it frees pyvista's memory at the end.
@@ -163,7 +163,7 @@ class Stage:
         self._plotter = self._pyvista.Plotter(off_screen=True, window_size=window, lighting="light kit")
         self._plotter.set_background(background)
 
-    def __enter__(self) -> Stage:
+    def __enter__(self) -> PyvistaStage:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:

@@ -33,7 +33,7 @@ from ..render.color_scales import (
 from ..support.defaults import DEFAULT_BASE, PLOT_BY
 from ..support.errors import SparklodError
 from .geometry import Points, bounds, box_lines, cells, evenly, is_drawable, level_of_step, viewpoint, wall_lines
-from .pyvista_scene import Stage, write_png
+from .pyvista_scene import PyvistaStage, write_png
 
 #: Marks closer to an end of a scale than this share of it are left out: they would touch the mark of the end.
 APART = 0.04
@@ -97,7 +97,7 @@ GREY, VOXELS, BOXES = "#5b6673", "#6ea8fe", "#dfe7ef"
 
 
 @dataclass(frozen=True)
-class Picture:
+class DescribedPicture:
     """The bytes of a PNG, and a description of what it shows."""
 
     png: bytes
@@ -124,7 +124,9 @@ class _Subject:
 
 
 @np.errstate(over="ignore", invalid="ignore")  # of numbers that are out of range in the file
-def plot(scene: Scene, *, by: str = "level", depth: int | None = None, size: tuple[int, int] = (1600, 1000)) -> Picture:
+def plot(
+    scene: Scene, *, by: str = "level", depth: int | None = None, size: tuple[int, int] = (1600, 1000)
+) -> DescribedPicture:
     """Draws a scene. All depths of a tree are seen from the same viewpoint.
 
     Args:
@@ -149,7 +151,7 @@ def plot(scene: Scene, *, by: str = "level", depth: int | None = None, size: tup
     low, high = bounds(splats.take(drawable))
     up = np.array(direction_of(scene.up))
     eye = viewpoint(box_lines(low[None], high[None]), _direction(up), up, aspect=size[0] / size[1], frame=FRAME)
-    with Stage(low, high, size, BACKGROUND) as stage:
+    with PyvistaStage(low, high, size, BACKGROUND) as stage:
         drawn = stage.splats(chosen, coloring.rgb, eye)
         if len(subject.index) < subject.total:
             drawn += f", an even sample of {len(subject.index):,}"
@@ -161,7 +163,7 @@ def plot(scene: Scene, *, by: str = "level", depth: int | None = None, size: tup
         pixels = stage.photograph(eye)
     lines = [line for line in (drawn, voxels, boxes) if line]
     png = write_png(pixels, subject.title, lines, coloring, eye, low, high)
-    return Picture(png, "; ".join([subject.title, f"coloured by {coloring.title}", *lines]))
+    return DescribedPicture(png, "; ".join([subject.title, f"coloured by {coloring.title}", *lines]))
 
 
 def _direction(up: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -197,7 +199,7 @@ def _counted(count: int, one: str, many: str = "") -> str:
     return f"{count:,} {one if count == 1 else many or one + 's'}"
 
 
-def _voxels(stage: Stage, splats: Splats, low: Points, high: Points, eye: Points) -> str:
+def _voxels(stage: PyvistaStage, splats: Splats, low: Points, high: Points, eye: Points) -> str:
     """Draws the voxel grid in which Quick-LoD would merge splats of this size; returns a description.
 
     A file says neither the base of its grids nor to which of them a node belongs, so the grid is the one of the default
@@ -217,7 +219,7 @@ def _voxels(stage: Stage, splats: Splats, low: Points, high: Points, eye: Points
     return f"blue: on the walls, the grid of voxels {said}{line}"
 
 
-def _boxes(stage: Stage, scene: Scene, index: NDArray[np.int64], drawable: NDArray[np.bool_], by: str) -> str:
+def _boxes(stage: PyvistaStage, scene: Scene, index: NDArray[np.int64], drawable: NDArray[np.bool_], by: str) -> str:
     """Draws boxes around the chunks that hold some nodes; returns a description."""
     count = -(-len(drawable) // CHUNK_NODES)
     chunks = np.unique(index // CHUNK_NODES)

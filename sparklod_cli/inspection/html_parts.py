@@ -9,7 +9,7 @@ from html import escape
 
 import numpy as np
 
-from ..figures.tree_plot import Picture
+from ..figures.tree_plot import DescribedPicture
 from ..tables.histograms import Histogram, edge_names
 
 #: Width and height of a chart, and what the labels below and the figure above take of it, in units of its view box.
@@ -138,7 +138,7 @@ def _cell(content: str) -> str:
     return f'<td class="wide">{content}</td>' if content.startswith('<div class="track"') else f"<td>{content}</td>"
 
 
-def figure_of(picture: Picture | None, *, small: bool = False) -> str:
+def figure_of(picture: DescribedPicture | None, *, small: bool = False) -> str:
     """Return a picture with its description; nothing where there is none."""
     if picture is None:
         return ""

@@ -16,7 +16,7 @@ from sparklod_cli.cli import run
 from sparklod_cli.codecs.rad import codec as codec
 from sparklod_cli.codecs.rad import rad_reader
 from sparklod_cli.inspection import leaves, rad
-from sparklod_cli.inspection.html import Section, page
+from sparklod_cli.inspection.html import FileSection, page
 from sparklod_cli.inspection.rad import PropertyFacts
 from sparklod_cli.inspection.report import ReportSettings, inspect
 from sparklod_cli.io import examine_scene, read_scene
@@ -92,7 +92,7 @@ def test_a_person_reads_what_is_stored_how(tmp_path: Path, capsys: Capture) -> N
 
 def test_the_page_has_the_properties(tmp_path: Path) -> None:
     report, _ = inspect(PALETTE.write(tmp_path / "a.rad"), ReportSettings())
-    text = page([Section(report.as_dict())])
+    text = page([FileSection(report.as_dict())])
     for part in ("Properties", "ln_0r8", "sh2_code", "Palette of SH", "24 entries", "Header and first chunk"):
         assert part in text
 

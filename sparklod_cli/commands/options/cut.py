@@ -101,7 +101,7 @@ def _budget_option(unit: str, several: str = "") -> Any:
 
 
 @dataclass(frozen=True)
-class Cut:
+class CutOptions:
     """Options of the cuts of trees, and of how detail levels of Streamed SOG are chosen."""
 
     HEADING: ClassVar[str] = "Cut"
@@ -176,7 +176,7 @@ class Cut:
 
 
 @dataclass(frozen=True)
-class PictureCut(Cut):
+class PictureCut(CutOptions):
     """Options of the cuts that pictures show."""
 
     budget: tuple[Budget, ...] | None = _budget_option("N|P%,...", "; with --compare several, such as 5%,500k")

@@ -22,7 +22,7 @@ from .common import assert_errors, assert_option, output_option, overwrite_flag,
 
 if TYPE_CHECKING:
     from ...cameras.camera import Camera
-    from ...images.output import Output
+    from ...images.output import PictureOutput
     from ...images.pixels import Color
     from ...lod.budget import Budget
     from ...tables.assertions import Assertion
@@ -128,7 +128,7 @@ class Appearance:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class ComparisonOptions:
     """Options of comparisons: of cuts with full detail (`--compare`), and of one file with another (`--diff`)."""
 
     HEADING: ClassVar[str] = "Comparison"
@@ -223,7 +223,7 @@ class PictureFiles:
     )
     jpeg_quality: int = option("Quality of a .jpg, from 1 to 100.", whole(1, 100), JPEG_QUALITY)
 
-    def place(self, ctx: click.Context, scene: Path, cameras: int, *, sheet: bool) -> Output:
+    def place(self, ctx: click.Context, scene: Path, cameras: int, *, sheet: bool) -> PictureOutput:
         """Return the output of the pictures of some cameras.
 
         Args:
@@ -248,7 +248,7 @@ class PictureFiles:
         return output
 
 
-def check_sizes(output: Output, cameras: Sequence[Camera], supersample: int, *, bar: bool) -> None:
+def check_sizes(output: PictureOutput, cameras: Sequence[Camera], supersample: int, *, bar: bool) -> None:
     """Raise a `click.UsageError` where a picture is larger than can be drawn, or than its file can be."""
     from ...images.pixels import scale_width
 

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sparklod_cli.api import inspect_jobs
 from sparklod_cli.codecs import spz
 from sparklod_cli.codecs.options import WriteOptions
-from sparklod_cli.inspection import report as reports
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
@@ -58,7 +58,7 @@ def test_files_without_splats_have_a_report(name: str, capsys: Capture) -> None:
 
 
 def test_a_scene_is_freed_before_the_next_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
-    read = reports.inspect
+    read = inspect_jobs.inspect
     seen: list[weakref.ref[object]] = []
 
     def look(*arguments: Any, **settings: Any) -> Any:
@@ -67,7 +67,7 @@ def test_a_scene_is_freed_before_the_next_is_read(monkeypatch: pytest.MonkeyPatc
         seen.append(weakref.ref(scene))
         return report, scene
 
-    monkeypatch.setattr(reports, "inspect", look)
+    monkeypatch.setattr(inspect_jobs, "inspect", look)
     assert inspect(*[FOLDER] * 4, "--json") == 0
     assert len(seen) == 4
 

@@ -169,8 +169,8 @@ def test_a_process_prints_findings_and_exits_3() -> None:
 def test_the_paths_of_page_and_picture_are_printed(
     tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def drawn(*args: object, **kwargs: object) -> tree_plot.Picture:
-        return tree_plot.Picture(b"\x89PNG" * 100, "all leaves: 6 nodes; coloured by level")
+    def drawn(*args: object, **kwargs: object) -> tree_plot.DescribedPicture:
+        return tree_plot.DescribedPicture(b"\x89PNG" * 100, "all leaves: 6 nodes; coloured by level")
 
     monkeypatch.setattr(tree_plot, "plot", drawn)
     monkeypatch.setattr(pyvista_scene, "load_pyvista", lambda: None)  # which may be missing
