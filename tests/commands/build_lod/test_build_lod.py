@@ -1,11 +1,18 @@
-"""`sparklod build-lod` as a shell sees it: inputs, outputs, messages and exit codes."""
+"""`sparklod build-lod` as a shell sees it: inputs, outputs, standard streams, signals, messages and exit codes."""
 
 from __future__ import annotations
 
 import dataclasses
+import io
 import json
 import os
+import re
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,8 +25,10 @@ from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.support.progress import Progress
-from tests.commands.build_lod.runs import ONE, SMALL, build
-from tests.conftest import FIXTURES, Capture
+from sparklod_cli.support.stdin import spooled
+from tests.commands.build_lod.runs import ONE, SMALL, build, sparklod
+from tests.conftest import FIXTURES, ROOT, Capture
+from tests.signals import heed_signals
 
 
 def test_an_input_is_baked_beside_itself(scene: Path, capsys: Capture) -> None:
@@ -170,3 +179,146 @@ def test_build_lod_never_writes_over_its_input(scene: Path, capsys: Capture) -> 
     link.symlink_to(scene)
     assert build(link, "-o", scene, "--overwrite") == 2
     assert scene.read_bytes() == before
+
+
+FILES = ("sh2.ply", "sh1-ascii.ply", "golden/sh3-v2.sog", "golden/sh2-level1.ksplat", "golden/hand-v4.spz")
+
+
+class Piped(io.TextIOWrapper):
+    def __init__(self, data: bytes) -> None:
+        super().__init__(io.BytesIO(data))
+
+
+def pipe(monkeypatch: pytest.MonkeyPatch, data: bytes) -> None:
+    monkeypatch.setattr("sys.stdin", Piped(data))
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_the_bytes_of_a_file_give_the_same_tree_as_the_file(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
+) -> None:
+    source = FIXTURES / name
+    pipe(monkeypatch, source.read_bytes())
+    assert build("-", "-o", tmp_path / "piped.spz", "--json") == 0
+    record = json.loads(capsys.readouterr().out)
+    assert build(source, "-o", tmp_path / "named.spz") == 0
+    assert (tmp_path / "piped.spz").read_bytes() == (tmp_path / "named.spz").read_bytes()
+    assert record["input"] == "-"
+
+
+def test_a_process_reads_and_writes_pipes(tmp_path: Path) -> None:
+    done = sparklod("build-lod", "-", "-o", "-", input=SMALL.read_bytes())
+    assert done.returncode == 0, done.stderr
+    assert build(SMALL, "-o", tmp_path / "named.spz") == 0
+    assert done.stdout == (tmp_path / "named.spz").read_bytes()
+    assert b"standard input  " in done.stderr
+    assert b"->  standard output" in done.stderr
+
+
+def test_the_leaves_of_a_piped_tree_can_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert build(SMALL, "-o", tmp_path / "tree.spz") == 0
+    pipe(monkeypatch, (tmp_path / "tree.spz").read_bytes())
+    assert build("-", "--unlod", "-o", tmp_path / "piped.ply") == 0
+    assert build(tmp_path / "tree.spz", "--unlod", "-o", tmp_path / "named.ply") == 0
+    assert (tmp_path / "piped.ply").read_bytes() == (tmp_path / "named.ply").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (b"", "error: standard input: the file is empty"),
+        (b"hello", "error: standard input: not a splat file that sparklod reads"),
+        ((FIXTURES / "golden/sh0.splat").read_bytes(), "a .splat file is not recognised by its content"),
+        (SMALL.read_bytes()[:-9], "error: standard input: "),
+        (b'{"version": 2, "means": {"files": ["means_l.webp", "means_u.webp"]}}', "error: standard input: "),
+    ],
+)
+def test_errors_name_standard_input(
+    data: bytes, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
+) -> None:
+    pipe(monkeypatch, data)
+    assert build("-", "-o", tmp_path / "out.spz") == 1
+    assert message in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_standard_input_without_an_output_is_wrong_usage(capsys: Capture) -> None:
+    for arguments in (["-"], ["-", "--output-dir", "web"], ["-", SMALL]):
+        assert build(*arguments) == 2
+        assert "standard input has no name to derive one from; name the output file" in capsys.readouterr().err
+
+
+def test_a_terminal_as_standard_input_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
+) -> None:
+    pipe(monkeypatch, b"")
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
+    assert build("-", "-o", tmp_path / "out.spz") == 1
+    assert "standard input is a terminal; pipe a file into it" in capsys.readouterr().err
+    monkeypatch.setattr("sys.stdin", None)
+    assert build("-", "-o", tmp_path / "out.spz") == 1
+    assert "standard input is closed" in capsys.readouterr().err
+
+
+def test_standard_input_can_be_read_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+    for data in (b"first", b"second"):
+        pipe(monkeypatch, data)
+        files: list[Any] = [spooled().read() for _ in range(2)]
+        assert files == [data, data]
+
+
+def test_a_closed_standard_output_is_an_error_and_a_closed_standard_error_is_none(tmp_path: Path) -> None:
+    command = f"{sys.executable} -m sparklod_cli build-lod {SMALL}"
+    done = subprocess.run(["bash", "-c", f"{command} -o - >&-"], capture_output=True, text=True, check=False, cwd=ROOT)
+    assert (done.returncode, done.stderr) == (1, f"error: {SMALL}: standard output is closed\n")
+    done = subprocess.run(["bash", "-c", f"{command} -o {tmp_path}/out.spz 2>&-"], check=False, cwd=ROOT)
+    assert done.returncode == 0
+    assert read_scene(tmp_path / "out.spz").tree is not None
+
+
+def test_standard_output_takes_the_file(tmp_path: Path) -> None:
+    result = sparklod("build-lod", SMALL, "-o", "-")
+    assert result.returncode == 0
+    (tmp_path / "out.spz").write_bytes(result.stdout)
+    assert read_scene(tmp_path / "out.spz").tree is not None
+
+
+def test_a_reader_that_goes_away_is_a_failure_without_a_traceback() -> None:
+    command = f"{sys.executable} -m sparklod_cli build-lod {FIXTURES / 'demo.ply'} -o - | head -c 10 > {os.devnull}"
+    result = subprocess.run(["bash", "-c", f"set -o pipefail; {command}"], capture_output=True, check=False, cwd=ROOT)
+    assert result.returncode == 1
+    assert b"Traceback" not in result.stderr
+    assert b"broken pipe" in result.stderr
+
+
+def handles(process: int, how: signal.Signals) -> bool:
+    """Whether a process has its own handler for SIGTERM and a signal; Python itself has one for SIGINT."""
+    status = Path(f"/proc/{process}/status")
+    if not status.exists():
+        time.sleep(0.4)
+        return True
+    caught = int(re.search(r"SigCgt:\s*(\w+)", status.read_text())[1], 16)  # type: ignore[index]
+    return all(caught >> number - 1 & 1 for number in (how, signal.SIGTERM))
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_an_interruption_leaves_nothing_behind(tmp_path: Path, how: signal.Signals) -> None:
+    source = FIXTURES / "demo.ply"
+    command = [sys.executable, "-m", "sparklod_cli", "build-lod", str(source), "--output-dir", str(tmp_path), "-q"]
+    # Wherever it is caught: while it imports, reads, compiles, builds or writes. Before that it is Python's to handle.
+    for delay in (0.05, 0.3, 0.6):
+        process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, preexec_fn=heed_signals)
+        while process.poll() is None and not handles(process.pid, how):
+            time.sleep(0.01)
+        time.sleep(delay)
+        process.send_signal(how)
+        _, err = process.communicate()
+        assert process.returncode in (0, 130, -how), err  # -how: while Python left
+        left = list(tmp_path.iterdir())
+        if left:  # it was done before, or all but done
+            assert [path.name for path in left] == ["demo-lod.spz"]
+            assert read_scene(left[0]).tree is not None
+            left[0].unlink()
+        else:
+            assert process.returncode != 0
+        assert b"Exception ignored" not in err

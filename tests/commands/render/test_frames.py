@@ -1,4 +1,4 @@
-"""`sparklod render` of several views: frames, contact sheets and animations."""
+"""Frames, thumbnails, and pictures while chunks are loading, of `sparklod render`."""
 
 from __future__ import annotations
 

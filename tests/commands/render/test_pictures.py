@@ -1,4 +1,4 @@
-"""`sparklod render` as a shell sees it: pictures of trees and files, styles, colours and backends."""
+"""Pictures, differences and reports of `sparklod render`."""
 
 from __future__ import annotations
 

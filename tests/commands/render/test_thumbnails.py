@@ -1,19 +1,27 @@
-"""Small pictures of whole scenes, and JPEG."""
+"""Thumbnails, differences and reports of `sparklod render`."""
 
 from __future__ import annotations
 
+import io
+import json
 import shutil
+import subprocess
 import sys
+import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from sparklod_cli.api import jobs
 from sparklod_cli.cli import run
+from sparklod_cli.codecs.rounding import ROUND_TRIPS
 from sparklod_cli.images.defaults import THUMBNAIL_SIZE, THUMBNAIL_SUPERSAMPLE
-from tests.commands.render.runs import AT, DEMO, FIXTURES, PLAIN, SIZE, TOWN, pixels, render
-from tests.conftest import Capture
+from sparklod_cli.images.metrics import psnr
+from tests.commands.render.runs import AT, DEMO, FIXTURES, PLAIN, SIZE, TOWN, TREE, floats, pixels, render
+from tests.conftest import ROOT, Capture
 
 
 def test_a_thumbnail_is_the_whole_scene_made_small(
@@ -97,3 +105,90 @@ def test_a_comparison_shows_a_terminal_its_summary(monkeypatch: pytest.MonkeyPat
     out = capsys.readouterr().out
     assert "psnr_black" not in out
     assert "worst tile" in out
+
+
+def test_json_says_what_was_drawn(tmp_path: Path, capsys: Capture) -> None:
+    output = tmp_path / "out.%04d.png"
+    assert render(TOWN, *SIZE, "--budget", "3k", "--orbit", 3, "--json", "-q", "-o", output) == 0
+    out, err = capsys.readouterr()
+    report = json.loads(out)
+    assert err == ""
+    assert (report["output"], report["format"], report["kind"]) == (str(output), "png", "frames")
+    assert [frame["frame"] for frame in report["frames"]] == [0, 1, 2]
+    assert all(0 < frame["splats"] <= 3000 for frame in report["frames"])
+    assert [frame["file"] for frame in report["frames"]] == [str(tmp_path / f"out.000{n}.png") for n in range(3)]
+    assert report["bytes"] == sum(path.stat().st_size for path in tmp_path.iterdir())
+
+
+def test_the_time_that_is_said_is_the_whole_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
+) -> None:
+    whole = jobs.read_scenes
+
+    def slow(*arguments: Any, **named: Any) -> Any:
+        time.sleep(0.5)
+        return whole(*arguments, **named)
+
+    monkeypatch.setattr(jobs, "read_scenes", slow)
+    assert render(PLAIN, *SIZE, "--json", "-o", tmp_path / "x.png") == 0
+    out, err = capsys.readouterr()
+    assert json.loads(out)["seconds"] >= 0.5
+    assert float(err.rsplit(" ", 2)[1]) >= 0.5
+
+
+def test_help_of_render_has_examples(capsys: Capture) -> None:
+    assert render("--help") == 0
+    out = capsys.readouterr().out
+    assert "Examples:" in out
+    assert out.count("  sparklod render ") >= 6
+    for option in ("--camera-path", "--view", "--style", "--color-by", "--through", "--diff", "--supersample"):
+        assert option in out
+
+
+def test_a_process_writes_a_png_and_says_nothing(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "sparklod_cli", "render", str(TREE), "--size", "64x48", "-o", "-", "-q"]
+    done = subprocess.run(command, capture_output=True, check=False, cwd=ROOT)
+    assert done.returncode == 0
+    assert pixels(io.BytesIO(done.stdout)).shape == (48, 64, 3)
+    assert done.stderr == b""
+
+
+def test_a_difference_is_drawn_and_its_psnr_said(built: Path, tmp_path: Path, capsys: Capture) -> None:
+    how = (*SIZE, *AT)
+    assert render(DEMO, *how, "--diff", DEMO, "-o", tmp_path / "same.png", "--json", "-q") == 0
+    assert json.loads(capsys.readouterr().out)["frames"][0]["psnr_db"] == 100
+    assert not pixels(tmp_path / "same.png").any()
+    for name, said in (("a", (built, "--budget", 300)), ("b", (DEMO,))):
+        assert render(*said, *how, "-q", "-o", tmp_path / f"{name}.npy", "--background", "white") == 0
+    a, b = (floats(tmp_path / f"{name}.npy")[..., :3] for name in "ab")
+    settings = (built, "--budget", 300, *how, "--diff", DEMO, "--background", "white", "--gain", 3, "--json")
+    assert render(*settings, "-o", tmp_path / "d.png") == 0
+    out, err = capsys.readouterr()
+    value = json.loads(out)["frames"][0]["psnr_db"]
+    assert value == pytest.approx(psnr(np.clip(a, 0, 1), np.clip(b, 0, 1)), abs=2e-3)
+    assert f"PSNR {value:.2f} dB" in err
+    expected = np.rint(255 * np.clip(3 * np.abs(np.clip(a, 0, 1) - np.clip(b, 0, 1)), 0, 1))
+    assert np.abs(pixels(tmp_path / "d.png") - expected).max() <= 1
+
+
+def test_a_difference_says_what_it_shows(built: Path, tmp_path: Path, capsys: Capture) -> None:
+    how = (built, "--budget", 9_000, "--size", "400x240", *AT, "--diff", DEMO, "--json")
+    assert render(*how, "-o", tmp_path / "bar.png") == 0
+    out, err = capsys.readouterr()
+    report = json.loads(out)
+    assert f"differences times {report['gain']:g}" in err
+    bar = pixels(tmp_path / "bar.png")
+    assert report["frames"][0]["width"] == bar.shape[1] > 400
+    assert render(*how, "-o", tmp_path / "same.png", "--gain", report["gain"], "--no-bar") == 0
+    assert np.array_equal(pixels(tmp_path / "same.png"), bar[:, :400])
+    assert bar[:, :400].max() > 90
+
+
+def test_an_encoding_is_seen_in_the_difference_to_the_file_itself(tmp_path: Path, capsys: Capture) -> None:
+    values = {}
+    for through in ROUND_TRIPS:
+        settings = (PLAIN, *SIZE, "--through", through, "--diff", PLAIN, "--json", "-q")
+        assert render(*settings, "-o", tmp_path / f"{through}.png") == 0
+        values[through] = json.loads(capsys.readouterr().out)["frames"][0]["psnr_db"]
+    assert all(25 < value < 100 for value in values.values())
+    assert len(set(values.values())) == len(values)

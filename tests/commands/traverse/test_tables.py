@@ -1,7 +1,9 @@
-"""`sparklod traverse` as a shell sees it: the table, the summary, what must hold, and what goes where."""
+"""`sparklod traverse` as a shell sees it: the table, the summary, what must hold, plots and cameras."""
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 import subprocess
 import sys
@@ -10,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from sparklod_cli.simulation.columns import COLUMNS
-from tests.commands.traverse.runs import NAMES, ORBIT, TOWN, TREE, table, traverse
+from tests.commands.traverse.runs import CAMERAS, NAMES, ORBIT, TOWN, TREE, table, traverse
 from tests.conftest import ROOT, Capture
 
 pytestmark = pytest.mark.slow
@@ -150,3 +152,73 @@ def test_a_process_writes_a_row_for_a_view() -> None:
     assert done.returncode == 0
     assert len(table(done.stdout)) == 1
     assert "Traceback" not in done.stderr
+
+
+def test_a_plot_is_a_picture(tmp_path: Path, capsys: Capture) -> None:
+    pytest.importorskip("matplotlib")
+    image = pytest.importorskip("PIL.Image")
+    assert traverse(TOWN, *ORBIT, "--budget", "4k", "--plot", tmp_path / "path.png", "-o", tmp_path / "out.csv") == 0
+    capsys.readouterr()
+    with image.open(tmp_path / "path.png") as picture:
+        assert picture.width == 1600
+    assert traverse(TOWN, *ORBIT, "--plot", tmp_path / "path.png", "-o", tmp_path / "other.csv") == 1
+    assert "path.png exists, add --overwrite" in capsys.readouterr().err
+    assert not (tmp_path / "other.csv").exists()
+
+
+def test_a_plot_shows_what_the_frame_had(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Over a slow network few chunks are there; the picture is of what was drawn with these."""
+    pytest.importorskip("matplotlib", reason="charts need the extra `render`")
+    from sparklod_cli.figures import traversal_chart
+
+    shown: list[traversal_chart.PathScene] = []
+
+    def drawn(rows: object, marked: object, title: str, scene: traversal_chart.PathScene) -> traversal_chart.Plot:
+        shown.append(scene)
+        return traversal_chart.Plot(b"a plot", None)
+
+    monkeypatch.setattr(traversal_chart, "plot", drawn)
+    slow = ("--bandwidth", "0.1Mbit", "--latency", "50ms")
+    for number, network in enumerate(((), slow)):
+        table = tmp_path / f"{number}.csv"
+        assert traverse(TOWN, *ORBIT, *network, "--plot", tmp_path / f"{number}.png", "-o", table) == 0
+        rows = list(csv.DictReader(io.StringIO(table.read_text())))
+        scene = shown[-1]
+        assert scene.frame is not None
+        assert len(scene.splats) == len(scene.depth) == int(rows[scene.frame]["selected"])
+    assert len(shown[1].splats) < len(shown[0].splats)
+
+
+AWAY = "axes (--camera-axes, --world-transform, --up)"
+
+
+def test_cameras_that_look_away_give_a_warning(capsys: Capture) -> None:
+    assert traverse(TOWN, "--look-at", "0,-1,-9:0,-1,-20", "--budget", "4k") == 0
+    err = capsys.readouterr().err
+    assert err.startswith("warning: only 0.0% of the splats lie in front of the cameras")
+    assert err.endswith(f"{AWAY}\n")
+    assert traverse(TOWN, "--look-at", "0,-1,-9:0,-1,-20", "--budget", "4k", "-q") == 0
+    assert capsys.readouterr().err == ""
+    assert traverse(TOWN, "--look-at", "0,-1,-9:0,0,0", "--budget", "4k") == 0
+    assert capsys.readouterr().err == ""
+
+
+def test_notes_on_a_camera_file_are_printed(tmp_path: Path, capsys: Capture) -> None:
+    path = json.loads((CAMERAS / "transforms.json").read_text()) | {"k1": 0.25}
+    (tmp_path / "transforms.json").write_text(json.dumps(path))
+    assert traverse(TREE, "--camera-path", tmp_path / "transforms.json") == 0
+    out, err = capsys.readouterr()
+    assert "Its lens distortion was ignored." in err.splitlines()
+    assert len(table(out)) == len(path["frames"])
+    assert traverse(TREE, "--camera-path", tmp_path / "transforms.json", "-q") == 0
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize("path", sorted(CAMERAS.iterdir()), ids=lambda path: path.name)
+def test_every_camera_format_can_be_traversed(path: Path, capsys: Capture) -> None:
+    if path.name.startswith("open3d"):
+        pytest.importorskip("open3d")
+    assert traverse(TREE, "--camera-path", path, "-q") == 0
+    out, err = capsys.readouterr()
+    assert len(table(out)) >= 3
+    assert err == ""
