@@ -138,7 +138,7 @@ def draw_files(
     loading: tuple[StreamingSettings, float] | None = None,
     reference: Path | None = None,
     overwrite: bool = False,
-    ready: Callable[[CameraPath, Scenes], None] = lambda path, scenes: None,
+    ready: Callable[[CameraPath, Scenes], None],
 ) -> DrawnPath:
     """Draw files and write the pictures.
 
@@ -238,7 +238,7 @@ def compare_files(
     asserts: Sequence[tuple[int | None, Assertion]] = (),
     plot: Path | None = None,
     overwrite: bool = False,
-    ready: Callable[[CameraPath, Scenes], None] = lambda path, scenes: None,
+    ready: Callable[[CameraPath, Scenes], None],
     passed: Filter | None = None,
 ) -> Compared:
     """Measure how far cuts of files are from full detail, and write the table and the charts.
@@ -294,7 +294,7 @@ def traverse_files(
     *,
     by_instance: bool = False,
     asserts: Sequence[Assertion] = (),
-    ready: Callable[[CameraPath, Scenes], None] = lambda path, scenes: None,
+    ready: Callable[[CameraPath, Scenes], None],
     passed: Filter | None = None,
     bar: bool = True,
 ) -> Traversed:

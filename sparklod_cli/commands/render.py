@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import json
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,12 +17,12 @@ from .console import Console, count_of, size_of
 from .option_groups import COMMON, check_declared, exclude, flags_set, values_of, with_options
 from .options.cameras import PictureCameras
 from .options.common import General, json_flag
-from .options.cut import Inputs, PictureCut, PictureStreaming, check_scenes
+from .options.cut import Inputs, PictureCut, PictureStreaming, check_scenes, viewed_files
 from .options.pictures import Appearance, ComparisonOptions, PictureFiles, check_sizes
 from .paths import claim_stdout, keep_apart, name_outputs
 
 if TYPE_CHECKING:
-    from ..api.jobs import DrawnPath, ViewedFiles
+    from ..api.jobs import DrawnPath
     from ..cameras.path import CameraPath
     from ..images.output import PictureOutput
     from ..images.sequence import PictureSettings, WrittenPictures
@@ -139,7 +137,7 @@ def _draw(ctx: click.Context, options: RenderOptions) -> None:
                 console.say(note)
             console.detail(f"  read in {time.perf_counter() - start:.2f} s")
 
-        with usage_errors(options):
+        with options.cameras.usage_errors():
             drawn = draw_files(
                 viewed_files(options, instances, console),
                 budget,
@@ -157,35 +155,9 @@ def _draw(ctx: click.Context, options: RenderOptions) -> None:
         _report(console, drawn, time.perf_counter() - start, as_json=general.as_json)
 
 
-def viewed_files(options: RenderOptions, instances: list[Instance], console: Console) -> ViewedFiles:
-    """Return the files and the cameras that look at them."""
-    from ..api.jobs import ViewedFiles
-
-    return ViewedFiles(
-        instances,
-        options.cameras.camera_source(),
-        options.cameras.settings(),
-        options.cut.precision,
-        options.general.threads,
-        console.progress,
-    )
-
-
 def fit_planes(ctx: click.Context) -> bool:
     """Return whether the near and the far plane may move apart, so that a view of the whole scene clips nothing."""
     return not flags_set(ctx, ["near", "far"])
-
-
-@contextlib.contextmanager
-def usage_errors(options: RenderOptions) -> Iterator[None]:
-    """Turn errors that the values of options cause into usage errors."""
-    from ..api.jobs import UnfitError
-
-    try:
-        with options.cameras.usage_errors():
-            yield
-    except UnfitError as error:
-        raise click.UsageError(str(error)) from None
 
 
 def _upside_down(options: RenderOptions, scenes: Scenes) -> list[str]:

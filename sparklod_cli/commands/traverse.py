@@ -26,9 +26,10 @@ from .options.common import (
     output_option,
     overwrite_flag,
     plot_option,
+    report_outcomes,
     table_form,
 )
-from .options.cut import CutOptions, Inputs, check_scenes
+from .options.cut import CutOptions, Inputs, check_scenes, viewed_files
 from .paths import OutputPath, claim_stdout, keep_apart, name_outputs
 
 if TYPE_CHECKING:
@@ -185,7 +186,7 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
     asserts = table.assertions()
     start = time.perf_counter()
     with general.console() as console:
-        from ..api.jobs import UnfitError, ViewedFiles, traverse_files
+        from ..api.jobs import traverse_files
 
         def ready(path: CameraPath, scenes: Scenes) -> None:
             for note in path.notes:
@@ -195,30 +196,19 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
 
         console.announce_compiling()
         screen = outputs.table.on_stdout and is_terminal(sys.stdout)
-        files = ViewedFiles(
-            instances,
-            options.cameras.camera_source(),
-            options.cameras.settings(),
-            options.cut.precision,
-            general.threads,
-            console.progress,
-        )
-        try:
-            with options.cameras.usage_errors():
-                traversed = traverse_files(
-                    files,
-                    budget,
-                    options.cut.settings(),
-                    options.streaming,
-                    outputs,
-                    by_instance=table.per_instance,
-                    asserts=asserts,
-                    ready=ready,
-                    passed=for_screen if screen and outputs.table.form != "parquet" else None,
-                    bar=not screen,  # a bar and a table do not go together on one screen
-                )
-        except UnfitError as error:
-            raise click.UsageError(str(error)) from None
+        with options.cameras.usage_errors():
+            traversed = traverse_files(
+                viewed_files(options, instances, console),
+                budget,
+                options.cut.settings(),
+                options.streaming,
+                outputs,
+                by_instance=table.per_instance,
+                asserts=asserts,
+                ready=ready,
+                passed=for_screen if screen and outputs.table.form != "parquet" else None,
+                bar=not screen,  # a bar and a table do not go together on one screen
+            )
         written, cameras_read = traversed.frames, len(traversed.path.cameras)
         console.clear()
         console.detail(f"  {cameras_read:,} frames of {traversed.path.format}, {time.perf_counter() - start:.2f} s")
@@ -244,16 +234,11 @@ def _report(console: Console, traversed: Traversed, summary: bool | None, *, as_
 
     whole, outcomes = traversed.summary, traversed.outcomes
     if as_json:
-        held = [{"assert": each.assertion.text, "held": each.held, "value": each.value} for each in outcomes]
-        click.echo(json.dumps(whole.as_dict() | {"asserts": held}, allow_nan=False))
+        asserts = [each.as_dict() for each in outcomes]
+        click.echo(json.dumps(whole.as_dict() | {"asserts": asserts}, allow_nan=False))
     if on_stdout and summary is not False:
         click.echo("\n".join(lines(whole)))
     elif summary or (summary is None and is_terminal(sys.stderr)):
         for line in lines(whole):
             console.say(line)
-    for outcome in outcomes:
-        if not outcome.held:
-            console.error(outcome.message())
-        else:
-            console.detail(f"  holds: {outcome.message()}")
-    return 0 if all(outcome.held for outcome in outcomes) else 3
+    return report_outcomes(console, outcomes)

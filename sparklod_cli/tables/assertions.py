@@ -164,6 +164,10 @@ class Outcome:
     frames: int
     worst: Row | None
 
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {"assert": self.assertion.text, "held": self.held, "value": self.value}
+
     def message(self) -> str:
         """Return the outcome, in a line."""
         asked = self.assertion

@@ -214,9 +214,13 @@ class Cameras:
 
     @contextlib.contextmanager
     def usage_errors(self) -> Iterator[None]:
-        """Turn the error that an option asks for too many cameras into a usage error that names the option."""
+        """Turn errors that the values of options cause into usage errors; of too many cameras one names the option."""
+        from ...api.jobs import UnfitError
+
         try:
             yield
+        except UnfitError as error:
+            raise click.UsageError(str(error)) from None
         except TooManyCamerasError as error:
             if self.camera_path is not None:
                 raise
