@@ -12,12 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from ..cameras.camera import Camera
 from ..images.pixels import FAINT, INK
-from ..model.splats import Splats
 from ..support.errors import SparklodError
 from ..tables.columns import Row
 from ..tables.statistics import numbers, totals
+from .camera_path import PathScene as PathScene
 from .camera_path import picture_of_path
 from .charts import BLUE, GREEN, INDIGO, ORANGE, PINK, YELLOW, Axes, FrameColumns, Series, draw, head, stacked
 
@@ -201,25 +200,6 @@ CALLED = {
 
 
 @dataclass(frozen=True)
-class PathScene:
-    """Content of the picture of a camera path.
-
-    Attributes:
-        cameras: of the path.
-        splats: N splats of the cut of one frame.
-        depth: (N,) edges from the root to each node of the cut, or the detail level of each splat.
-        frame: index of the camera whose cut it is; that camera is marked. None for none.
-        title: which of both the depths are, for display.
-    """
-
-    cameras: Sequence[Camera]
-    splats: Splats
-    depth: NDArray[Any]
-    frame: int | None = None
-    title: str = "tree depth"
-
-
-@dataclass(frozen=True)
 class Plot:
     """The bytes of a PNG, and why it has no picture of the path; None if it has one or none was asked for."""
 
@@ -247,7 +227,7 @@ def plot(rows: Iterable[Row], marked: Mapping[str, int], title: str, scene: Path
     note = None
     if scene is not None:
         try:
-            picture = picture_of_path(scene.cameras, scene.splats, scene.depth, title=scene.title, frame=scene.frame)
+            picture = picture_of_path(scene)
             images.append(Image.open(io.BytesIO(picture)).convert("RGB"))
         except SparklodError as error:
             note = f"drawn without the picture of the path: {error}"

@@ -104,25 +104,6 @@ class DescribedPicture:
     description: str
 
 
-@dataclass(frozen=True)
-class _Subject:
-    """Splats that a tree plot shows.
-
-    Attributes:
-        index: (M,) splats that are drawn in colour.
-        total: number of splats that they are a sample of.
-        others: (K,) leaves above the depth that is drawn; grey dots.
-        depths: (N,) depth of each node, -1 for a node that the root does not lead to; None without a tree.
-        title: what is drawn, in words.
-    """
-
-    index: NDArray[np.int64]
-    total: int
-    others: NDArray[np.int64]
-    depths: NDArray[np.int32] | None
-    title: str
-
-
 @np.errstate(over="ignore", invalid="ignore")  # of numbers that are out of range in the file
 def plot(
     scene: Scene, *, by: str = "level", depth: int | None = None, size: tuple[int, int] = (1600, 1000)
@@ -144,26 +125,27 @@ def plot(
     drawable = is_drawable(splats)
     if not drawable.any():
         raise SparklodError("there is nothing to draw: no splat is valid and has a size")
-    subject = _subject(scene, depth, drawable)
-    by = "size" if by == "level" and subject.depths is None else by
-    coloring = color_by(by, splats, subject.index, subject.depths)
-    chosen = splats.take(subject.index)
+    chosen, others, depths, title = _subject(scene, depth, drawable)
+    index, others = (of[evenly(len(of), MOST_POINTS)] for of in (chosen, others))
+    by = "size" if by == "level" and depths is None else by
+    coloring = color_by(by, splats, index, depths)
+    shown = splats.take(index)
     low, high = bounds(splats.take(drawable))
     up = np.array(direction_of(scene.up))
     eye = viewpoint(box_lines(low[None], high[None]), _direction(up), up, aspect=size[0] / size[1], frame=FRAME)
     with PyvistaStage(low, high, size, BACKGROUND) as stage:
-        drawn = stage.splats(chosen, coloring.rgb, eye)
-        if len(subject.index) < subject.total:
-            drawn += f", an even sample of {len(subject.index):,}"
-        if len(subject.others):
-            stage.dots(splats.center[subject.others], GREY)
-            drawn += f"; grey: {len(subject.others):,} leaves of smaller depth"
-        voxels = _voxels(stage, chosen, low, high, eye.position)
-        boxes = _boxes(stage, scene, subject.index, drawable, by) if scene.tree is not None or by == "chunk" else ""
+        drawn = stage.splats(shown, coloring.rgb, eye)
+        if len(index) < len(chosen):
+            drawn += f", an even sample of {len(index):,}"
+        if len(others):
+            stage.dots(splats.center[others], GREY)
+            drawn += f"; grey: {len(others):,} leaves of smaller depth"
+        voxels = _voxels(stage, shown, low, high, eye.position)
+        boxes = _boxes(stage, scene, index, drawable, by) if scene.tree is not None or by == "chunk" else ""
         pixels = stage.photograph(eye)
     lines = [line for line in (drawn, voxels, boxes) if line]
-    png = write_png(pixels, subject.title, lines, coloring, eye, low, high)
-    return DescribedPicture(png, "; ".join([subject.title, f"coloured by {coloring.title}", *lines]))
+    png = write_png(pixels, title, lines, coloring, eye, low, high)
+    return DescribedPicture(png, "; ".join([title, f"coloured by {coloring.title}", *lines]))
 
 
 def _direction(up: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -172,7 +154,13 @@ def _direction(up: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.array(DIRECTION) @ np.stack([right, up, np.cross(right, up)])
 
 
-def _subject(scene: Scene, depth: int | None, drawable: NDArray[np.bool_]) -> _Subject:
+def _subject(
+    scene: Scene, depth: int | None, drawable: NDArray[np.bool_]
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int32] | None, str]:
+    """Return the splats in colour, leaves above the depth that is drawn, the depth of each node, and a title.
+
+    Depths are (N,), -1 for a node that the root does not lead to; None without a tree.
+    """
     none = np.empty(0, np.int64)
     if scene.tree is None:
         if depth is not None:
@@ -191,8 +179,7 @@ def _subject(scene: Scene, depth: int | None, drawable: NDArray[np.bool_]) -> _S
         if not len(index):
             what = "leaf" if depth is None else f"node of depth {depth}"
             raise SparklodError(f"there is no {what} to draw: the tree has depths 0 to {depths.max()}")
-    chosen, others = (of[evenly(len(of), MOST_POINTS)] for of in (index, others))
-    return _Subject(chosen, len(index), others, depths, title)
+    return index, others, depths, title
 
 
 def _counted(count: int, one: str, many: str = "") -> str:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from sparklod_cli.figures import charts, geometry
-from sparklod_cli.figures.camera_path import FRAME, _above, frustum_lines, picture_of_path
+from sparklod_cli.figures.camera_path import FRAME, PathScene, _above, frustum_lines, picture_of_path
 from sparklod_cli.figures.geometry import viewpoint
 from sparklod_cli.model.gaussian import covariance
 from sparklod_cli.support.errors import SparklodError
@@ -121,8 +123,8 @@ def test_a_viewpoint_sees_y_downwards() -> None:
 class TestPictureOfPath:
     def test_the_figure_shows_the_scene_and_the_path(self) -> None:
         of = path_scene()
-        with_frame = pixels(picture_of_path(of.cameras, of.splats, of.depth, frame=3, size=SIZE))
-        without = pixels(picture_of_path(of.cameras, of.splats, of.depth, size=SIZE))
+        with_frame = pixels(picture_of_path(of, size=SIZE))
+        without = pixels(picture_of_path(dataclasses.replace(of, frame=None), size=SIZE))
         assert with_frame.shape == without.shape == (250, 400, 3)
         body = (slice(50, None), slice(0, 320))
         assert count_of(without[body], "#ffffff", 60) > 100
@@ -131,29 +133,29 @@ class TestPictureOfPath:
 
     def test_two_figures_have_the_same_bytes(self) -> None:
         of = path_scene()
-        assert len({picture_of_path(of.cameras, of.splats, of.depth, size=SIZE) for _ in range(2)}) == 1
+        assert len({picture_of_path(of, size=SIZE) for _ in range(2)}) == 1
 
     def test_one_camera_and_one_splat_are_drawn(self) -> None:
         splats = random_splats(1)
-        assert picture_of_path(circle(1), splats, np.array([4]), frame=0, size=SIZE)
+        assert picture_of_path(PathScene(circle(1), splats, np.array([4]), 0), size=SIZE)
 
     def test_hidden_lines_are_seen_faintly(self) -> None:
         """The path goes through a ball."""
         splats = random_splats(200).take(np.zeros(1, np.int64))
         splats.center[:], splats.scale[:] = 0, 3
         path = [looking((x, 0.01, 0.3)) for x in np.linspace(-1, 1, 9)]
-        image = picture_of_path(path, splats, np.array([0]), size=SIZE)
-        plain = picture_of_path([looking((0, 0, 0.001))], splats, np.array([0]), size=SIZE)
+        image = picture_of_path(PathScene(path, splats, np.array([0])), size=SIZE)
+        plain = picture_of_path(PathScene([looking((0, 0, 0.001))], splats, np.array([0])), size=SIZE)
         middle = (slice(100, 190), slice(120, 240))
         assert (np.abs(pixels(image)[middle] - pixels(plain)[middle]).max(axis=2) > 40).sum() > 50
 
     def test_splats_that_are_not_finite_are_left_out(self) -> None:
         of = path_scene()
         of.splats.center[0], of.splats.scale[1] = np.nan, np.inf
-        assert picture_of_path(of.cameras, of.splats, of.depth, size=SIZE)
+        assert picture_of_path(of, size=SIZE)
         of.splats.scale[:] = 0
         with pytest.raises(SparklodError, match="nothing to draw"):
-            picture_of_path(of.cameras, of.splats, of.depth, size=SIZE)
+            picture_of_path(of, size=SIZE)
 
     @pytest.mark.usefixtures("charting")
     def test_the_figure_is_below_the_charts(self) -> None:
