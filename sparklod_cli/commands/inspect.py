@@ -14,10 +14,9 @@ import click
 from ..support.errors import OutOfMemoryError, SparklodError, StdoutError
 from ..support.printable import printable
 from ..support.stdin import name_of
-from .command import Command
 from .console import Console, count_of, size_of
 from .inspect_text import finding_line, lines
-from .option_groups import argument, values_of, with_options
+from .option_groups import argument, command, values_of
 from .options.common import General, quiet_flag
 from .options.inspecting import Checks, InspectOutput, check_usage
 from .paths import InputPath, keep_apart, name_outputs
@@ -28,9 +27,7 @@ if TYPE_CHECKING:
     from ..inspection.html import FileSection
     from ..inspection.report import Report, ReportSettings
 
-EXAMPLES = """
-\b
-Examples:
+EXAMPLES = """\
   sparklod inspect scene-lod.spz
   sparklod inspect web/*.spz --check --format github      # exit status 3 if one is broken
   sparklod inspect scene-lod.spz --assert 'nodes<5M' --assert 'growth<=1.4' --assert 'bytes<40MB'
@@ -56,9 +53,7 @@ class InspectOptions:
     general: _InspectGeneral = dataclasses.field(default_factory=_InspectGeneral)
 
 
-@click.command("inspect", cls=Command, epilog=EXAMPLES, context_settings={"show_default": True})
-@with_options(InspectOptions)
-@click.pass_context
+@command("inspect", InspectOptions, examples=EXAMPLES)
 def inspect(ctx: click.Context, /, **_: Any) -> None:
     """Report on splat files and check them.
 

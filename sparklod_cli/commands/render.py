@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ..images.defaults import THUMBNAIL_SIZE, THUMBNAIL_SUPERSAMPLE
-from .command import Command
 from .console import Console, count_of, size_of
-from .option_groups import COMMON, check_declared, exclude, flags_set, values_of, with_options
+from .option_groups import COMMON, check_declared, command, exclude, flags_set, values_of
 from .options.cameras import PictureCameras
 from .options.common import General, json_flag
 from .options.cut import Inputs, PictureCut, PictureStreaming, check_scenes, viewed_files
@@ -29,9 +28,7 @@ if TYPE_CHECKING:
     from ..model.instances import Instance
     from ..scenes.loaded import Scenes
 
-EXAMPLES = """
-\b
-Examples:
+EXAMPLES = """\
   sparklod render scene-lod.spz --budget 500k --size 1280x720 -o preview.png
   sparklod render scene.ply --thumbnail
   sparklod render scene.ply --look-at 0,-1,4:0,0,0 --supersample 2 --alpha -o view.webp
@@ -92,9 +89,7 @@ class RenderOptions:
         return dataclasses.replace(options, cameras=small, appearance=look)
 
 
-@click.command("render", cls=Command, headings=HEADINGS, epilog=EXAMPLES, context_settings={"show_default": True})
-@with_options(RenderOptions)
-@click.pass_context
+@command("render", RenderOptions, examples=EXAMPLES, headings=HEADINGS)
 def render(ctx: click.Context, /, **_: Any) -> None:
     """Draw pictures of splat files as a viewer draws them.
 

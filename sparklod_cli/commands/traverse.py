@@ -14,9 +14,8 @@ import click
 from ..simulation.streaming_settings import StreamingSettings
 from ..support.stdin import DASH
 from ..tables.files import FORMS
-from .command import Command
 from .console import Console, for_screen, is_terminal
-from .option_groups import COMMON, check_declared, exclude, flag, option, refuse, values_of, with_options
+from .option_groups import COMMON, check_declared, command, exclude, flag, option, refuse, values_of
 from .options.cameras import Cameras
 from .options.common import (
     General,
@@ -42,9 +41,7 @@ if TYPE_CHECKING:
 #: Below this share of splats in front of the cameras, path and scene probably do not share their axes.
 LEAST_IN_FRONT = 0.05
 
-EXAMPLES = """
-\b
-Examples:
+EXAMPLES = """\
   sparklod traverse scene-lod.spz --budget 500k            # an orbit; the summary, or CSV into a pipe
   sparklod traverse scene-lod.spz --camera-path path.json -o frames.csv --summary
   sparklod traverse scene-lod.spz --preset quest --assert 'churn_p95<0.2'    # exit status 3
@@ -157,9 +154,7 @@ class TraverseOptions:
     general: _TraverseGeneral = field(default_factory=_TraverseGeneral)
 
 
-@click.command("traverse", cls=Command, headings=HEADINGS, epilog=EXAMPLES, context_settings={"show_default": True})
-@with_options(TraverseOptions)
-@click.pass_context
+@command("traverse", TraverseOptions, examples=EXAMPLES, headings=HEADINGS)
 def traverse(ctx: click.Context, /, **_: Any) -> None:
     """Simulate what a viewer draws of Level-of-Detail files or Streamed SOG along a camera path.
 

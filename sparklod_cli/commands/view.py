@@ -16,9 +16,8 @@ import click
 from ..support.printable import printable
 from ..support.setting_fields import Quantity, Range, whole
 from ..support.units import parse_count
-from .command import Command
 from .console import Console, count_of, size_of
-from .option_groups import COMMON, argument, check_declared, flag, option, values_of, with_options
+from .option_groups import COMMON, argument, check_declared, command, flag, option, values_of
 from .options.common import General, json_flag, overwrite_flag, quiet_flag, verbose_flag
 from .parameter_types import DIRECTION, VIEW
 from .paths import InputPath, OutputPath, keep_apart
@@ -26,9 +25,7 @@ from .paths import InputPath, OutputPath, keep_apart
 if TYPE_CHECKING:
     from ..api.viewing import Server, Site
 
-EXAMPLES = """
-\b
-Examples:
+EXAMPLES = """\
   sparklod view scene-lod.rad
   sparklod view web/lod-meta.json                         # in PlayCanvas
   sparklod view scene-lod.spz --look-at 0,-1,4:0,0,0 --budget 500k
@@ -118,9 +115,7 @@ class _ViewOptions:
 HEADINGS = (COMMON, "Page", "Server")
 
 
-@click.command("view", cls=Command, headings=HEADINGS, epilog=EXAMPLES, context_settings={"show_default": True})
-@with_options(_ViewOptions)
-@click.pass_context
+@command("view", _ViewOptions, examples=EXAMPLES, headings=HEADINGS)
 def view(ctx: click.Context, /, **_: Any) -> None:
     """Show splat files in Spark or PlayCanvas, in a browser.
 

@@ -6,6 +6,7 @@ import csv
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +16,9 @@ from hypothesis.extra import numpy as arrays
 
 from sparklod_cli.cli import run
 from sparklod_cli.inspection import chunks, percentiles
+from sparklod_cli.inspection.blocks import ReportBlocks, merged
 from sparklod_cli.inspection.report import Report, ReportSettings, inspect
+from sparklod_cli.inspection.tree import TreeColumns
 from sparklod_cli.io import examine_scene
 from sparklod_cli.io.rad_file import RadFile
 from sparklod_cli.model.gaussian import spark_size
@@ -26,6 +29,14 @@ from tests.inspection.test_rad_faults import FAULTS, column
 from tests.scenes import random_splats
 
 GOLDEN = FIXTURES / "golden" / "sh1-tree.rad"
+
+
+def rows_of(scene: Scene) -> list[dict[str, Any]]:
+    blocks = ReportBlocks.of(scene)
+    nodes = TreeColumns.of(blocks) if blocks.is_tree and blocks.count else None
+    if nodes is not None:
+        merged(blocks.map(nodes.add, (), 1))
+    return chunks.table_of(list(blocks.map(chunks.row_of, (), 1)), scene.chunk_bytes, nodes)
 
 
 def parents_of(scene: Scene) -> dict[int, int]:
@@ -44,7 +55,7 @@ def test_rows_are_what_can_be_counted_by_hand() -> None:
     scene = examine_scene(GOLDEN)
     assert scene.tree is not None
     step, parents, size = scene.header["chunk_size"], parents_of(scene), spark_size(scene.splats)
-    rows = chunks.rows_of(scene)
+    rows = rows_of(scene)
     assert len(rows) == scene.header["chunks"] > 1
     for number, row in enumerate(rows):
         nodes = range(number * step, min(len(scene), (number + 1) * step))
@@ -63,16 +74,16 @@ def test_rows_are_what_can_be_counted_by_hand() -> None:
 
 
 def test_other_formats_have_the_chunks_of_a_viewer() -> None:
-    rows = chunks.rows_of(Scene(random_splats(CHUNK + 3)))
+    rows = rows_of(Scene(random_splats(CHUNK + 3)))
     assert [row["splats"] for row in rows] == [CHUNK, 3]
     assert {row[name] for row in rows for name in ("bytes", "leaves", "depth_max", "parent_chunks")} == {None}
-    assert chunks.rows_of(Scene(random_splats(0))) == []
+    assert rows_of(Scene(random_splats(0))) == []
 
 
 def test_what_is_not_finite_is_empty() -> None:
     splats = random_splats(3)
     splats.center[1, 0] = np.nan
-    (row,) = chunks.rows_of(Scene(splats))
+    (row,) = rows_of(Scene(splats))
     assert (row["min_x"], row["max_x"], row["extent"]) == (None, None, None)
     assert row["min_y"] is not None
 
@@ -103,7 +114,7 @@ def test_the_table_without_a_tree_has_no_empty_columns(capsys: Capture) -> None:
 def test_the_table_of_a_chunked_file_is_that_of_the_whole_one(tmp_path: Path) -> None:
     whole, chunked = tree(CHUNK + 8), replace(tree(CHUNK + 8), stem="a")
     one, other = (examine_scene(rad.write(tmp_path / f"{name}.rad")) for rad, name in ((whole, "w"), (chunked, "c")))
-    assert chunks.rows_of(one) == chunks.rows_of(other)
+    assert rows_of(one) == rows_of(other)
 
 
 def test_the_table_of_what_has_no_splats_is_refused(tmp_path: Path, capsys: Capture) -> None:
