@@ -107,7 +107,7 @@ def from_folder(folder: Path, engine: str = "spark") -> Libraries:
     install = f"npm install --prefix {folder} " + " ".join(f"{name}@{VERSIONS[name]}" for name in PACKAGES[engine])
     versions, files = {}, {}
     for package in PACKAGES[engine]:
-        if not os.path.isdir(packages / package):  # unlike `Path.is_dir`, False for a name that is too long, too
+        if not os.path.isdir(packages / package):  # noqa: PTH112, since `Path.is_dir` fails on names that are too long
             raise SparklodError(f"{packages} has no {package}; install it with {install}")
         versions[package] = _version(packages / package)
         files[f"lib/{package}/{LICENSE}"] = packages / package / LICENSE
