@@ -76,7 +76,6 @@ def extract_leaves(
 
     Args:
         source: a Level-of-Detail file; - is standard input.
-        target: of any name; - is standard output.
         options: how to write; what is None is taken from the input, which keeps its values as they are.
         suffix: of the format, one of `WRITABLE`.
 

@@ -28,8 +28,6 @@ def examine(arrays: Arrays, settings: ReportSettings, *, threads: int = 1) -> tu
 
     Args:
         arrays: by name; the names identify the encoding.
-        settings: what to examine.
-        threads: number of threads to decode on.
 
     Raises:
         FormatError: the arrays match no encoding, or have wrong shapes.

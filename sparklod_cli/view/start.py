@@ -152,10 +152,7 @@ def start_of(extents: Sequence[Extent], view: tuple[Point, Point] | None, up: Po
     """Return the extent of some files together.
 
     Args:
-        extents: of the files.
         view: eye and target, where they are given; else the whole scene is in view, from its front.
-        up: direction that is up.
-        fov: vertical field of view, degrees.
 
     Raises:
         CameraPathError: the camera makes no sense.
