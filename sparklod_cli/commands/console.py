@@ -169,7 +169,9 @@ class Console:
         """
         from ..support import jit
 
-        begun, seconds, troubles = [], [], set[str]()
+        begun: list[str] = []
+        seconds: list[float] = []
+        troubles: set[str] = set()
 
         def show() -> None:
             self.progress("compiling", len(seconds), 0, "kernel")  # how many a command needs is not known
