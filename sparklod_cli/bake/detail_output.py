@@ -30,10 +30,7 @@ def detail_levels(
     """Return regions of a tree at several detail levels, with their errors.
 
     Args:
-        scene: a tree.
         environment: splats beside it; None without.
-        settings: of levels and regions.
-        threads: to work on; the result does not depend on it.
     """
     from ..lod.detail_levels import make
     from .region_errors import measured
@@ -50,13 +47,7 @@ def detail_levels(
 
 @dataclass(frozen=True)
 class DetailOutput(WholeOutput):
-    """A Streamed SOG.
-
-    Attributes:
-        settings: of levels and regions.
-        options: how chunk files are written.
-        sink: writes it.
-    """
+    """A Streamed SOG."""
 
     settings: DetailSettings
     options: WriteOptions

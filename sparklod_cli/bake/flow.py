@@ -51,10 +51,6 @@ def bake(
     Args:
         source: a file of any format that is read, - for standard input, or several files as one scene.
         target: a file of the format that is set, or one of arrays, whatever its name; - is standard output.
-        settings: how.
-        overwrite: replace files that exist.
-        threads: to work on.
-        progress: called with how much of a stage is done.
         resources: that it may use; None for those of a machine that is otherwise idle.
         engine: runs the tasks of a bake that goes out of core because of it; None for this process.
         say: called with a line when it goes out of core, what is left after an interruption, and what fitting brought.

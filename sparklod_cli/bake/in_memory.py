@@ -28,8 +28,6 @@ class InMemory:
 
     Attributes:
         source, settings, threads, progress: as for `flow.bake`.
-        output: where the tree goes.
-        clock: of the stages.
     """
 
     source: Source
@@ -112,8 +110,6 @@ def build_tree(
     """Build the tree of splats, which are taken out of a list so that the builder can free them.
 
     Args:
-        leaves: a list of these splats.
-        settings: method and its setting.
         in_chunks: the nodes are put into the order for streaming later.
     """
     row = BUILDERS[settings.method]

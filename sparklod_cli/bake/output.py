@@ -75,8 +75,6 @@ def output_of_kept(output: Output, source: Source, scene: Scene, settings: BakeS
 
     Args:
         output: of an input without a tree.
-        source: the input.
-        scene: its content.
 
     Raises:
         FormatError: nobody asked for another format than that of the scene, or for merged splats to be fitted; or for
@@ -128,7 +126,6 @@ class ArrayOutput(WholeOutput):
     Attributes:
         encoding: of `codecs.formats.ENCODINGS`.
         raw: their words alone, rather than a .npz.
-        sink: writes them.
     """
 
     encoding: str
@@ -148,12 +145,7 @@ class ArrayOutput(WholeOutput):
 
 @dataclass(frozen=True)
 class RepackedOutput(WholeOutput):
-    """RAD file with the chunks of another one.
-
-    Attributes:
-        source: the other file.
-        sink: writes it.
-    """
+    """RAD file with the chunks of another one."""
 
     source: Place
     sink: SceneSink
@@ -178,9 +170,6 @@ class FileOutput:
     """SPZ or RAD file, written in windows.
 
     Attributes:
-        form: its format.
-        options: how it is written.
-        sink: writes it.
         in_chunks: see `Output`; RAD is.
         stored: codes that nodes keep which still have the values of `before`; None where there are none.
         before: (N,) nodes with these codes.

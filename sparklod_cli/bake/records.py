@@ -37,7 +37,6 @@ class BuiltTree:
 
     Attributes:
         nodes: of the tree, in memory or in a store; None while a step replaces them.
-        output: where they go.
         format, notes: of the input, for display.
         read: number of splats of the input, which are nodes where it has a tree.
         splats: leaves of the tree.

@@ -34,7 +34,6 @@ def bake_side_by_side(
 
     Args:
         pairs: inputs and outputs, which all workers see.
-        engine: of the cluster.
         resources: of a worker; a scene that its memory holds is one task.
         bake_large: bakes one that none can, and returns what came of it.
         make: bakes one; a function of a module.

@@ -73,7 +73,6 @@ class Frame:
 
     Attributes:
         matrix: (4, 4), in the axes of its format.
-        lens: of the camera.
         time: seconds from an arbitrary start; None if the file has no times.
         name: for display; may be empty.
         axes: of this matrix if they are certain, since it was computed from an eye and a target; otherwise None.

@@ -143,7 +143,6 @@ def fitted(camera: Camera, scene: Balls) -> Camera:
 
     Args:
         camera: whose principal point is the middle of its picture.
-        scene: of `covered`.
     """
     middle = middle_of(scene)
     reach, aside, back = _support(Balls(scene.center - middle, scene.radius), camera)
@@ -160,7 +159,6 @@ def distance(cameras: Sequence[Camera], center: Matrix, scene: Balls) -> float:
     Args:
         cameras: at least one, wherever they are; their directions count.
         center: (3,) in the middle of all pictures.
-        scene: of `covered`.
     """
     local = Balls(scene.center - center, scene.radius)
     needed = []

@@ -158,7 +158,6 @@ def along(curve: Callable[[Matrix], Matrix], at: Matrix) -> Matrix:
     """(N, K) points of a curve.
 
     Args:
-        curve: maps parameters to points.
         at: (N,) parameters.
 
     Raises:

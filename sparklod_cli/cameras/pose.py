@@ -25,7 +25,6 @@ def to_opengl(matrix: Matrix, axes: Axes) -> Matrix:
 
     Args:
         matrix: (4, 4), with 0 0 0 1 as its last row; may have a uniform scale.
-        axes: its convention.
 
     Raises:
         ValueError: it cannot be inverted; the text continues a sentence about it.

@@ -44,7 +44,6 @@ class CameraFile:
     """The cameras of a file, or of a folder that COLMAP wrote.
 
     Attributes:
-        path: of the file or folder.
         format: its name in `formats.table.FORMATS`; None tells it by the content.
     """
 
@@ -77,8 +76,6 @@ class _Aimed:
 
         Args:
             frames: makes cameras of their directions; called where something is chosen for the scene.
-            settings: that the cameras are made with.
-            scene: gives what the splats cover.
             times: the distance, where it is chosen, as a multiple of where the scene just fits the image.
         """
         if self.center is not None and self.distance is not None:
@@ -92,7 +89,6 @@ class Orbit(_Aimed):
     """Cameras once around a scene.
 
     Attributes:
-        count: how many.
         center: what they look at; None for the middle of the scene.
         distance: from there, world units; None for where the scene fits the image.
         elevation: above there, degrees.
@@ -116,7 +112,6 @@ class Dolly(_Aimed):
     """Cameras straight towards a scene, from far to near.
 
     Attributes:
-        seconds: how long it takes.
         center: what they look at; None for the middle of the scene.
         distance: of the first camera from there, world units; None for 4 times where the scene fits the image.
         elevation: above there, degrees.
@@ -282,8 +277,6 @@ def _fit(frames: Sequence[Frame], center: Point | None, scene: Balls, settings: 
     Args:
         frames: at least one.
         center: (3,) where it is known; None for the middle of the scene.
-        scene: all that the splats cover.
-        settings: that the cameras are made with.
     """
     visible = framing.covered(scene)
     middle = framing.middle_of(visible) if center is None else np.asarray(center, np.float64)

@@ -42,10 +42,7 @@ def fit(
     Args:
         nodes: N nodes in final order.
         tree: of them; it stays as it is, and so do the leaves, bit for bit.
-        settings: steps, seed and cameras.
         antialiased: of the scene; splats are drawn the same either way, as Spark draws them.
-        threads: to work on; the result does not depend on it.
-        progress: called with the number of steps done.
         say: called with a line of text after each stage.
         interrupted: asked between steps; when it returns True, what the finished stages gained is returned.
 

@@ -29,9 +29,6 @@ class FittedNodes:
 
     Args:
         nodes: N nodes, as they are at first.
-        tree: of them.
-        raster: how they are drawn.
-        threads: to prepare them on.
 
     Attributes:
         columns: of the nodes, as they are now; changed in place.

@@ -66,11 +66,7 @@ class BlendedCut:
 
 
 class ContinuousCuts:
-    """Finds continuous cuts.
-
-    Args:
-        traversal: provides the trees and instances.
-    """
+    """Finds continuous cuts."""
 
     def __init__(self, traversal: Traversal) -> None:
         self._forest, self._instances = traversal.forest, traversal.instances
@@ -81,7 +77,6 @@ class ContinuousCuts:
         """Return the continuous cut.
 
         Args:
-            view: the camera.
             budget: sum of the weights, all instances together, unless `smallest` or the leaves are reached first; at
                 least the number of instances. The number of nodes is larger, because fading nodes count in part.
             smallest: nodes of this pixel scale or less are not refined; see `settings.pixel_limit`.

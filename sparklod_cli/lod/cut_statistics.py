@@ -54,12 +54,9 @@ def measure(
     """Return the statistics of a cut as a whole and, optionally, of each instance in it.
 
     Args:
-        forest: the trees.
         level: (nodes,) int32 depths, edges from the root, of all trees.
         cut: a cut found for `view`.
-        view: the camera.
         size: width and height of the picture, pixels.
-        by_instance: compute statistics of each instance, too.
     """
     width, height = size
     counts = np.empty((len(cut.views), kernels.COUNTS), np.int64)
@@ -119,12 +116,7 @@ def _percentiles(values: NDArray[np.float32], shares: Sequence[float]) -> list[f
 
 
 class Changes:
-    """Compares each cut with the one before it.
-
-    Args:
-        forest: the trees.
-        instances: instances of them.
-    """
+    """Compares each cut with the one before it."""
 
     def __init__(self, forest: Forest, instances: Sequence[TreeInstance]) -> None:
         sizes = np.diff(forest.node_base)

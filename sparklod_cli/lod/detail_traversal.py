@@ -60,9 +60,6 @@ class DetailTraversal:
     """Finds cuts of scenes at several detail levels; several threads may ask it, unless it remembers.
 
     Args:
-        forest: the scenes.
-        instances: of them.
-        rule: how levels are chosen.
         fixed: splats that are drawn besides, and count against the budget.
         remembers: while files are missing, regions stay as the cut before had them; without, nothing was drawn before.
     """
@@ -88,7 +85,6 @@ class DetailTraversal:
         """Return the cut that a viewer draws: the splats of the levels of all regions, and the environments.
 
         Args:
-            view: the camera.
             budget: maximum number of splats, all instances together; those of environments do not count.
             smallest: has no meaning here; traversals of trees have it.
             resident: (chunks,) bool, which chunk files of all scenes are there; all are unless given.
@@ -185,8 +181,6 @@ def loading(
     """Return what is drawn of the regions of an instance, and what is asked for.
 
     Args:
-        chains: of its regions.
-        files: of its scene.
         chosen: (R,) the level that is chosen for each region; -1 for one without splats.
         squared_distance: (R,) by which it was chosen.
         resident: (F,) which files are there.

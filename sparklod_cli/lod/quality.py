@@ -57,7 +57,6 @@ def build(splats: Splats, growth: float = DEFAULT_GROWTH, *, progress: Progress 
     Args:
         splats: N splats, finite, with positive opacity and at least one positive scale each.
         growth: maximum ratio of nodes to leaves, 1.05 to 2.
-        progress: called with the number of nodes done in each of the stages building, pruning and ordering.
 
     Returns:
         M >= N splats and their tree.
@@ -95,7 +94,6 @@ class Plan:
 
     Attributes:
         growth: maximum ratio of nodes to leaves of the whole tree.
-        curve: of the whole scene.
         lowest: first level that nodes merge at.
     """
 
@@ -222,13 +220,10 @@ def _rest(
     """Return the nodes that a stage hands on: those without a parent, which come right after the first.
 
     Args:
-        final: tree of the stage.
-        pending: what it began with.
         index: (n,) places there of the tree's leaves.
         left: nodes without a parent before the tree was pruned, and the levels at which they merge next.
         numbers: (M,) of the families of the nodes of `final`.
         sums: numbers of leaves and of merged nodes under all that is handed on.
-        plan: of the build.
     """
     here = slice(1, final.first_child)
     splats, node, family = final.splats.take(here), final.order[here], numbers[here]

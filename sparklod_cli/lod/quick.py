@@ -66,7 +66,6 @@ def build(splats: Splats, base: float = DEFAULT_BASE, *, progress: Progress = si
     Args:
         splats: N splats, finite, with positive opacity and at least one positive scale each.
         base: growth of the cells from level to level, 1.1 to 2.0.
-        progress: called with the number of splats that have joined the tree.
 
     Returns:
         M >= N splats and their tree; merged ones have linear opacities up to 1000.
@@ -110,11 +109,8 @@ def grow(
     """Merge the nodes of each cell, level by level.
 
     Args:
-        tree: without nodes.
-        grid: of the scene.
         arrivals: all nodes that are given; it is emptied.
         margins: of the region that they are in, at level 0; None if they are all that there are, and get one root.
-        progress: told of the splats that have joined.
 
     Returns:
         the nodes without a parent, by the level that they wait for; only the root if there are no margins.

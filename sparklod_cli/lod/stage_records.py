@@ -42,7 +42,6 @@ class Survey:
 
     Attributes:
         count: N splats that are kept.
-        sh_degree: of them.
         low, high: corners of the box of their centres, world units.
         smallest, largest: range of their sizes, 2 * max(scale), world units.
         sample: an even sample of them, in their order.
@@ -128,10 +127,6 @@ class StagedBuilder(Protocol):
     def plan(self, survey: Survey, setting: float) -> Any:
         """Return what all stages share.
 
-        Args:
-            survey: of the whole scene.
-            setting: of the builder, base or growth.
-
         Raises:
             ValueError: the setting is out of its range.
         """
@@ -142,7 +137,6 @@ class StagedBuilder(Protocol):
         Args:
             splats: n splats, valid and visible.
             index: (n,) ascending place of each among all splats of the scene.
-            plan: of `plan`.
         """
 
     def advance(
@@ -154,6 +148,4 @@ class StagedBuilder(Protocol):
             pending: all nodes without a parent whose centres lie in the region, from blocks in ascending order.
             region: of the scene; None for all of it, after which one node is left, the root.
             stage: number of the stage, which is part of the numbers of its families.
-            plan: of `plan`.
-            progress: told of the splats or nodes.
         """

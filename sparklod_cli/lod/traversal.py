@@ -171,7 +171,6 @@ class Traversal:
     """Finds cuts. Each thread has its own buffers, which are reused from one cut to the next.
 
     Args:
-        forest: the trees.
         instances: instances of them, at most 65,535.
     """
 
@@ -187,7 +186,6 @@ class Traversal:
         """Return the cut that a viewer draws.
 
         Args:
-            view: the camera.
             budget: maximum number of splats, all instances together; at least one per instance.
             smallest: nodes of this pixel scale or less are not refined; see `settings.pixel_limit`.
             resident: (chunks,) bool, of all trees; all chunks are resident unless given.

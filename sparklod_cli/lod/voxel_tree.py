@@ -89,7 +89,6 @@ class Joining:
     Attributes:
         index: (n,) uint32 the splat of each node.
         number: of the first node; the others follow.
-        fill: fills the node rows of splats.
     """
 
     index: Nodes
@@ -146,8 +145,6 @@ class VoxelTree:
 
         Args:
             given: number of nodes that will be given.
-            leaves: see above.
-            space: coordinates of node rows.
             keys: returns the keys of a batch, by the level and the rows of the nodes made; None if nobody wants them.
         """
         self.leaves, self.batches, self.total, self._space, self._keys = leaves, list[Batch](), 0, space, keys
@@ -294,8 +291,6 @@ def sorted_leaves(
 
     Args:
         center, scale: (n, 3) of the splats.
-        grid: of the scene.
-        threads: to work on.
         order: (n,) the splats in the order of the scene; by default they are in it.
     """
     keys, levels, bits = grid.leaf_keys(center, scale)
@@ -314,7 +309,6 @@ def joining(index: Nodes, ends: Offsets, fill: FillRows) -> dict[int, Joining]:
     Args:
         index: (n,) the splat of each node; nodes are numbered in this order.
         ends: where each level ends.
-        fill: fills the node rows of splats.
     """
     found, begin = {}, 0
     for level, end in enumerate(ends.tolist()):

@@ -45,8 +45,6 @@ class Drawing:
     Attributes:
         image: (height, width, 4) float32, as `rasterizer.draw` gives it.
         splats, camera, settings: what it was drawn of. The arrays of `splats` must not have changed before `gradients`.
-        seen: the splats on the screen.
-        tiles: of the picture.
     """
 
     image: Image

@@ -43,10 +43,7 @@ class Renderer:
     """Draws pictures with the same settings; several threads may ask it.
 
     Args:
-        source: what is drawn.
-        settings: how.
         cameras: that will be drawn; a color scale is the same in the pictures of all of them.
-        progress: called with the number of cameras that were examined for that.
 
     Attributes:
         scale: the color scale; None where splats have their own colours.

@@ -55,11 +55,7 @@ def draw(
         style: one of `settings.STYLES`. "points" are opaque, a pixel each, "billboards" discs of one opacity, as wide
             as the splats; both are drawn in the order of the file. "sorted-billboards" are drawn from far to near, as
             "splats" are.
-        backend: one of `BACKENDS`, which draws splats.
-        splats: what is drawn.
-        camera: that sees it.
         settings: how splats become pixels.
-        options: of the backend.
 
     Raises:
         BackendError: the backend cannot draw here.

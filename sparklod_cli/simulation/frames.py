@@ -31,7 +31,6 @@ class Frame:
 
     Attributes:
         number: number of the frame on the path.
-        camera: its camera.
         cut: the cut that is drawn.
         resident: (chunks,) bool, of all trees, the chunks that it was found with.
         rows: the row of all instances together, then one per instance, if requested.
@@ -56,12 +55,7 @@ class _MeasuredCut:
 
 
 class Simulation(Viewer):
-    """A viewer that moves along a camera path through scenes that all have cuts.
-
-    Args:
-        scenes, settings, streaming: as of `Viewer`.
-        by_instance: make a row per instance, too.
-    """
+    """A viewer that moves along a camera path through scenes that all have cuts."""
 
     def __init__(
         self,

@@ -135,7 +135,6 @@ class LoadingCuts(Loader):
     """Cuts of visitors some time after they opened the page, one visitor for each camera; a `CutSource`.
 
     Args:
-        scenes, settings, streaming: as of `Loader`.
         seconds: since then.
 
     Raises:

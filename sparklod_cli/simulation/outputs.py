@@ -29,11 +29,9 @@ class FrameOutputs:
     """Destinations of the frames of a simulation.
 
     Attributes:
-        table: the table of the rows.
         indices: folder for the node indices of each cut; None for none.
         padded: pad the index files to whole rows of `ROW`.
         plot: file of the charts; None for none.
-        overwrite: replace existing files.
     """
 
     table: TableOutput
@@ -108,11 +106,6 @@ def write_frames(
     """Simulate a camera path and writes the outputs: table and index files frame by frame, then the charts.
 
     Args:
-        simulation: the simulation.
-        path: the camera path.
-        outputs: destinations.
-        threads: number of threads that find cuts.
-        progress: called with the number of finished frames.
         passed: a filter for the bytes of a table on standard output.
 
     Raises:

@@ -28,13 +28,11 @@ class Stream:
     The state changes at events only, so the result does not depend on the steps in which time advances.
 
     Args:
-        chunks: the chunks of all trees.
         network: the network; everything arrives at once unless given.
         capacity: maximum number of chunks in the cache; None for all.
         start: the time at the start, seconds.
 
     Attributes:
-        cache: the resident chunks.
         now: the current time, seconds.
         received: bytes that have arrived since the start, of headers too.
 

@@ -108,7 +108,6 @@ class Address:
         """Open the file for reading, wherever in it.
 
         Args:
-            mode: as of a path.
             buffering: bytes that are read at once where less is wanted.
             size: bytes of the file, where that is known.
         """

@@ -32,7 +32,6 @@ def optional_import(
     Args:
         purpose: what takes the package, and which one: "charts are drawn by matplotlib".
         extra: the extra that brings it: "render".
-        error: class of the error.
         package: what pip installs, if no extra brings it.
 
     Raises:
@@ -62,7 +61,6 @@ def install_hint(extra: str = "", *options: str) -> str:
 
     Args:
         extra: name of the extra; empty for what sparklod always requires.
-        options: of pip.
     """
     from importlib import metadata  # takes long to load
 
@@ -101,7 +99,6 @@ class Required:
     """A distribution that another one requires.
 
     Attributes:
-        name: its name for pip.
         least: the minimum version; empty for any.
         version: the installed version; None if it is not installed.
     """

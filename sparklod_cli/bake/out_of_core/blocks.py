@@ -171,7 +171,6 @@ def cut_into_blocks(sample: FloatArray, count: int, block_splats: int) -> Blocks
 
     Args:
         sample: (n, 3) centres, evenly drawn; without any, the scene is one block.
-        count: splats of the scene.
         block_splats: at least 1.
     """
     cut = _Cut(sample)

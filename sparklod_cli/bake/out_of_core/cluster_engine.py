@@ -35,7 +35,6 @@ class ClusterEngine:
     one which is lost takes no result with it: what it had put is in the store.
 
     Attributes:
-        threads: that a task works on.
         memory: bytes that a task may take; None where nobody knows.
     """
 
@@ -92,7 +91,6 @@ class ClusterEngine:
         """Call a function with each tuple of arguments, side by side, until the context ends.
 
         Args:
-            stage: word for what is done.
             call: a function of a module that takes `threads` besides, and returns something small.
             arguments: small, and can be pickled.
             unit: what a call is called.
@@ -120,7 +118,6 @@ class ClusterEngine:
         """Raise a `SparklodError` where a worker cannot do its share: another sparklod, or a folder it does not see.
 
         Args:
-            store: of the bake, if it has one.
             files: that tasks read; those that are not here are left to the tasks.
         """
         here = [file for file in files if isinstance(file, Path) and file.exists()]
@@ -174,8 +171,6 @@ class Probed:
     """Result of probing a worker.
 
     Attributes:
-        version: of sparklod.
-        host: name of its machine.
         reads: it reads the result that the client wrote.
         writes: empty, or why it cannot write one.
         missing: of the files that were asked for, those that it does not see.
@@ -192,9 +187,7 @@ def probe(store: Store | None, name: str, files: Sequence[Path]) -> Probed:
     """Try whether this worker can do its share: read what others wrote, and write what they read.
 
     Args:
-        store: of the bake, if it has one.
         name: of a result that the client wrote.
-        files: that tasks read.
     """
     reads, writes = True, ""
     if store is not None:
@@ -217,7 +210,6 @@ def run_task(packed: bytes, task: Task, threads: int) -> tuple[int, int]:
 
     Args:
         packed: the job, pickled; a copy for each task, so that each counts its own bytes.
-        task: to be run.
 
     Returns:
         bytes that it wrote to the store, and read there.

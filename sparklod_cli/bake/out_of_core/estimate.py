@@ -38,12 +38,7 @@ def default_memory() -> int | None:
 
 
 def in_memory_bytes(method: str, splats: int, sh_degree: int) -> int:
-    """Return bytes that a bake in memory takes at its peak.
-
-    Args:
-        method: of `lod.builders.BUILDERS`.
-        splats, sh_degree: of the input.
-    """
+    """Return bytes that a bake in memory takes at its peak."""
     return PROCESS + BUILDERS[method].in_memory.of(splats, sh_degree)
 
 
@@ -53,9 +48,7 @@ def out_of_core_bytes(
     """Return bytes that a bake out of core takes at its peak.
 
     Args:
-        method: of `lod.builders.BUILDERS`.
         splats, sh_degree: of the input; `sh_degree` as far as it is kept.
-        block_splats: of a block.
         in_chunks: families are put in an order for streaming at the end.
     """
     from ...lod.chunk_order import MOST_FAMILIES, family_bytes  # takes long to load, and this is asked out of core only
@@ -71,7 +64,6 @@ def scratch_bytes(method: str, splats: int, sh_degree: int) -> int:
     """Return bytes that the scratch folder takes at its peak, without what is unpacked of the input.
 
     Args:
-        method: of `lod.builders.BUILDERS`.
         splats, sh_degree: of the input; `sh_degree` as far as it is kept.
     """
     return BUILDERS[method].in_scratch.of(splats, sh_degree)

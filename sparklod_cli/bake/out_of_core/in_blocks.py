@@ -45,9 +45,6 @@ class InBlocks:
 
     Attributes:
         job: of all tasks; `build` and `order` add what they find out.
-        output: where the tree goes.
-        clock: of the stages.
-        engine: runs the tasks.
         block_splats: of a block, about.
         progress: called with how much of a stage is done.
     """

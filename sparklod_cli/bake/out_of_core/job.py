@@ -23,9 +23,7 @@ class Job:
     """Data that all tasks of a bake share; small, so it can be pickled.
 
     Attributes:
-        store: of the results.
         stream: the input; can be pickled, too.
-        settings: how to bake.
         needed: statistics by which the output is settled.
         in_chunks: the output has the order for streaming.
         parts: where each part of the input begins, and at last the count; none before that is known.

@@ -81,12 +81,7 @@ GAP = 128
 
 
 def node_stream(job: Job, count: int, leaves: int) -> NodeStream:
-    """Return the nodes of a tree that is in order.
-
-    Args:
-        count: of the nodes.
-        leaves: of these.
-    """
+    """Return the nodes of a tree that is in order."""
     read = functools.partial(_read, job.store, width_of(job.sh_degree))
     up = job.settings.up_of(job.stream.up)
     return NodeStream(count, leaves, job.sh_degree, job.stream.antialiased, read, up)

@@ -53,10 +53,6 @@ def blocks_for(
 ) -> Iterator[InBlocks | None]:
     """Open the workspace of a bake that goes out of core, if that is needed or requested; None for one in memory.
 
-    Args:
-        output: of the bake.
-        clock: of its stages.
-
     Raises:
         ScratchError: the scratch folder cannot be used, or has too little room.
         FormatError, OutOfMemoryError: as `flow.bake`.

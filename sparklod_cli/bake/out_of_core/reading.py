@@ -61,7 +61,6 @@ def first_look(stream: SceneStream, settings: BakeSettings, blocks: int) -> tupl
     """Return (n, 3) centres of selected splats, from ranges all over the input, and the share of selected splats.
 
     Args:
-        stream: the input.
         blocks: that the scene will be cut into, about; for a single one nothing is read.
     """
     if blocks == 1:
@@ -88,7 +87,6 @@ class Findings:
         box: (2, 3) float64 corners of the box of the centres that are kept, world units; infinite without any.
         sizes: (2,) float64 range of their sizes, 2 * max(scale), world units.
         sample: rows of an even sample of them.
-        statistics: of them.
     """
 
     tally: Tally

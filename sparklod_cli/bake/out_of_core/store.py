@@ -72,12 +72,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Table:
-    """The arrays of a result, by name.
-
-    Attributes:
-        entries: them.
-        bytes: of the whole file.
-    """
+    """The arrays of a result, by name."""
 
     entries: Mapping[str, Entry]
     bytes: int

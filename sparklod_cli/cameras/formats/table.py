@@ -21,7 +21,6 @@ class PathFormat:
 
     Attributes:
         name: value of `--camera-format`.
-        title: for display.
         module: in this package; has `recognises(files) -> bool` and `parse(files, settings) -> Parsed`.
         axes: of its matrices; None if it has eyes and targets instead.
         looking: its cameras have, or may have, an eye and a target, which need an up axis.

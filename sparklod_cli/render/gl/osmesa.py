@@ -61,12 +61,7 @@ def _renderer(precision: str, sorting: str, throttle: float) -> Renderer:
 
 
 class Renderer:
-    """Draws a sequence of frames; compiles once, and uploads only what has changed.
-
-    Attributes:
-        uploads: number of uploads of the data texture.
-        sorts: number of times that the splats were sorted.
-    """
+    """Draws a sequence of frames; compiles once, and uploads only what has changed."""
 
     def __init__(self, *, precision: str = "float", sorting: str = "exact", throttle: float = 0.0) -> None:
         """Prepare OpenGL; see `draw` for the arguments.
