@@ -14,7 +14,7 @@ from ..model.scene import DetailScene, Scene
 from ..model.splats import Splats
 from ..support.parallel import on_threads
 from ..support.progress import Progress
-from .output import Encode, WholeOutput
+from .output import Encode, Output
 from .records import BuiltTree, Clock, WrittenDetail, WrittenLevel, WrittenTree
 
 
@@ -46,7 +46,7 @@ def detail_levels(
 
 
 @dataclass(frozen=True)
-class DetailOutput(WholeOutput):
+class DetailOutput(Output):
     """A Streamed SOG."""
 
     settings: DetailSettings

@@ -24,7 +24,7 @@ from .sources import Source, read_source
 
 @dataclass
 class InMemory:
-    """Workspace in memory, see `flow.Workspace`.
+    """Workspace in memory; that of a bake out of core, `in_blocks.InBlocks`, has the same three steps.
 
     Attributes:
         source, settings, threads, progress: as for `flow.bake`.
@@ -39,7 +39,7 @@ class InMemory:
     _leaves: Statistics | None = None
 
     def build(self) -> BuiltTree:
-        """Read the input and build its tree, or keep the one that it has."""
+        """Read the input, select and transform its splats, and build their tree, or keep the one that it has."""
         settings, threads, progress = self.settings, self.threads, self.progress
         scene = read_source(self.source, threads=threads, progress=progress)
         tree = BuiltTree(
@@ -99,7 +99,7 @@ class InMemory:
             tree.statistics = Statistics.of_scene(scene, output.needed, threads=self.threads)
 
     def encode(self, tree: BuiltTree, encoder: Encoder) -> Get:
-        """Encode the windows of a tree."""
+        """Encode the windows of a tree that is in order; return what reads their results."""
         encoded = list(results(encoder, tree.scene, self.threads, self.progress, "encoding"))
         return lambda number, name: encoded[number][name]
 

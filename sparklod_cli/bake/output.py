@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 from ..codecs import clamps
 from ..codecs.encoder import CLAMPED, Encoder, Get, Stored, windows_of
@@ -30,22 +30,26 @@ from .sources import Merged, Source
 Encode = Callable[[BuiltTree, Encoder], Get]
 
 
-class Output(Protocol):
-    """Destination of a tree."""
+class Output:
+    """Destination of a tree; by default one that is made of all nodes at once, in memory, and holds any tree.
 
-    @property
-    def in_chunks(self) -> bool:
-        """Whether it is read in chunks, so that nodes are put in an order for that first."""
+    Attributes:
+        in_chunks: it is read in chunks, so that nodes are put in an order for that first.
+    """
+
+    in_chunks: bool = False
 
     @property
     def needed(self) -> frozenset[str]:
-        """The statistics of all nodes by which it is written, see `codecs.statistics`."""
+        """Statistics of all nodes by which it is written, see `codecs.statistics`."""
+        return frozenset()
 
     def check(self, leaves: Statistics) -> None:
         """Raise `FormatError` where a tree of leaves with these statistics cannot be written."""
 
     def write(self, tree: BuiltTree, encode: Encode, clock: Clock, threads: int, progress: Progress) -> WrittenTree:
         """Write a tree whose nodes are in order; in memory, unless this is a `FileOutput`."""
+        raise NotImplementedError
 
 
 def output_of(target: Place, settings: BakeSettings, *, overwrite: bool) -> Output:
@@ -109,18 +113,8 @@ def output_of_kept(output: Output, source: Source, scene: Scene, settings: BakeS
     return dataclasses.replace(output, options=dataclasses.replace(options, covering=False)), False
 
 
-class WholeOutput:
-    """Base of outputs that are made of a tree in memory, and hold any."""
-
-    in_chunks = False
-    needed: frozenset[str] = frozenset()
-
-    def check(self, leaves: Statistics) -> None:
-        """Accept any tree."""
-
-
 @dataclass(frozen=True)
-class ArrayOutput(WholeOutput):
+class ArrayOutput(Output):
     """Arrays in the layout of a viewer's memory.
 
     Attributes:
@@ -144,7 +138,7 @@ class ArrayOutput(WholeOutput):
 
 
 @dataclass(frozen=True)
-class RepackedOutput(WholeOutput):
+class RepackedOutput(Output):
     """RAD file with the chunks of another one."""
 
     source: Place
@@ -166,7 +160,7 @@ class RepackedOutput(WholeOutput):
 
 
 @dataclass(frozen=True)
-class FileOutput:
+class FileOutput(Output):
     """SPZ or RAD file, written in windows.
 
     Attributes:

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from ..model.transforms import AXES
 from ..support.errors import TooManyCamerasError
-from .axes import Axes
 from .camera import Camera, Matrix
+from .formats.table import Axes
 
 #: x, y and z in world units, or of a direction.
 Point = tuple[float, float, float]

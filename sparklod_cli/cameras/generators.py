@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..support.errors import CameraPathError
-from .axes import Axes
 from .camera import Matrix
+from .formats.table import Axes
 from .frame import DEFAULT_FOV_Y, DEFAULT_FPS, NO_LENS, NUMBERED, Frame, Lens, Sampled, sampled
 from .pose import look_at, normalized
 

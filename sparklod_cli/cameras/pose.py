@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..model.gaussian import rotation_matrix
-from .axes import Axes
 from .camera import Matrix
+from .formats.table import Axes
 
 #: Largest deviation of an element of R^T R from a multiple of the identity. Files that round to three decimals stay
 #: well below it.

@@ -18,10 +18,9 @@ from ..support.defaults import ELEVATION
 from ..support.errors import CameraPathError, SparklodError
 from ..support.untrusted import parse_json
 from . import framing, generators
-from .axes import Axes
 from .camera import Matrix
 from .formats.source import Files, Json, Parsed, finite
-from .formats.table import NAMES, PathFormat
+from .formats.table import NAMES, Axes, PathFormat
 from .frame import DEFAULT_FPS, Frame, Settings, camera_of
 from .path import CameraPath, cameras_of, read
 from .pose import rigid
@@ -80,8 +79,14 @@ class _Aimed:
         """
         if self.center is not None and self.distance is not None:
             return self.center, self.distance
-        center, fits = _fit(frames(), self.center, scene(), settings)
-        return center, self.distance or times * fits
+        visible = framing.covered(scene())
+        center = framing.middle_of(visible) if self.center is None else np.asarray(self.center, np.float64)
+        some = framing.sampled_cameras(frames())
+        try:
+            cameras = [camera_of(frame.matrix, frame.lens, 0, "", settings) for frame in some]
+        except ValueError as error:
+            raise CameraPathError(f"the camera {error}") from None
+        return center, self.distance or times * framing.distance(cameras, center, visible)
 
 
 @dataclass(frozen=True)
@@ -269,19 +274,3 @@ def read_world_transform(path: Path) -> Matrix:
 
 def _generated(title: str, frames: Sequence[Frame], settings: Settings) -> CameraPath:
     return cameras_of(Parsed(frames), PathFormat("", title, "", Axes.OPENGL_C2W), settings)
-
-
-def _fit(frames: Sequence[Frame], center: Point | None, scene: Balls, settings: Settings) -> tuple[Any, float]:
-    """Return the target of cameras, (3,), and the distance from there at which all of them see the whole scene.
-
-    Args:
-        frames: at least one.
-        center: (3,) where it is known; None for the middle of the scene.
-    """
-    visible = framing.covered(scene)
-    middle = framing.middle_of(visible) if center is None else np.asarray(center, np.float64)
-    try:
-        cameras = [camera_of(frame.matrix, frame.lens, 0, "", settings) for frame in framing.sampled_cameras(frames)]
-    except ValueError as error:
-        raise CameraPathError(f"the camera {error}") from None
-    return middle, framing.distance(cameras, middle, visible)

@@ -105,14 +105,14 @@ class DetailTraversal:
             tree = instance.tree
             scene, files, own = forest.scenes[tree], forest.files[tree], slice(*forest.chunk_base[tree : tree + 2])
             before = self._before[at] if self.remembers else None
-            state = loading(self._chains[tree], files, levels, distance, there[own], before, rule.underfill)
+            drawn, priority = loading(self._chains[tree], files, levels, distance, there[own], before, rule.underfill)
             if self.remembers and resident is not None:
-                self._before[at] = state.drawn
+                self._before[at] = drawn
             around = files.environment is not None and bool(there[own][files.environment])
-            nodes.append(_splats_of(scene, state.drawn, environment=around))
-            wrong = (state.drawn != levels) & (levels >= 0)
+            nodes.append(_splats_of(scene, drawn, environment=around))
+            wrong = (drawn != levels) & (levels >= 0)
             missing += int(scene.counts[wrong, levels[wrong]].sum())
-            wanted[own] = np.maximum(wanted[own], np.maximum(state.priority, np.where(state.priority > 0, 1e-30, 0)))
+            wanted[own] = np.maximum(wanted[own], np.maximum(priority, np.where(priority > 0, 1e-30, 0)))
         return TreeCut(
             views=views_of(forest, self.instances, view),
             node=np.concatenate(nodes),
@@ -156,19 +156,6 @@ class DetailFiles:
     manifest: int = 0
 
 
-@dataclass(frozen=True, eq=False)
-class Loading:
-    """Drawn levels of R regions, and priorities of F chunk files, while files load.
-
-    Attributes:
-        drawn: (R,) the level of each; -1 where nothing is.
-        priority: (F,) of the files that are in use or asked for, above 0; 0 for others.
-    """
-
-    drawn: Levels
-    priority: NDArray[np.float64]
-
-
 def loading(
     chains: Chains,
     files: DetailFiles,
@@ -177,7 +164,7 @@ def loading(
     resident: NDArray[np.bool_],
     before: Levels | None,
     underfill: int,
-) -> Loading:
+) -> tuple[Levels, NDArray[np.float64]]:
     """Return what is drawn of the regions of an instance, and what is asked for.
 
     Args:
@@ -186,6 +173,10 @@ def loading(
         resident: (F,) which files are there.
         before: (R,) what was drawn before, -1 where nothing was; None for nothing at all.
         underfill: levels by which a region may be coarser as long as a file is missing; see `DetailRule`.
+
+    Returns:
+        (R,) the drawn level of each region, -1 where nothing is; and (F,) priorities of the files that are in use or
+        asked for, above 0, and 0 for others.
     """
     levels = files.of_run.shape[1]
     before = np.full(len(chosen), -1) if before is None else before
@@ -206,7 +197,7 @@ def loading(
     ask(np.where(desired == chosen, chosen, _finer(chains, desired)), NEXT)
     if files.environment is not None:
         priority[files.environment] = ENVIRONMENT
-    return Loading(drawn, priority)
+    return drawn, priority
 
 
 def _desired(chains: Chains, files: DetailFiles, chosen: Levels, resident: NDArray[np.bool_], underfill: int) -> Levels:

@@ -34,7 +34,7 @@ from .final_tree import FinalTree, PruningGoal, in_final_order
 from .kernels import pair_cost
 from .kernels.sort import Nodes
 from .pair_tree import BinaryTree, Curve, Levels, levels_of, lowest_level, merge_levels
-from .stage_records import NO_FAMILY, STAGE_BITS, Families, Pending, Region, Survey
+from .stage_records import NO_FAMILY, STAGE_BITS, Families, Pending, Region
 
 #: For each node that a stage hands on, it leaves this many times what the growth allows for a leaf to those above it:
 #: more than once, as the pruning of a stage adds to what it hands on. Measured: once loses up to 0.3 dB.
@@ -140,12 +140,11 @@ class _Nodes:
         return Pending.of(splats, **vars(self))
 
 
-def plan(survey: Survey, setting: float) -> Plan:
+def plan(bounds: Bounds, sample: Splats, setting: float) -> Plan:
     """See `StagedBuilder`; the setting is the growth, 1.05 to 2."""
     check_setting("growth", setting, MIN_GROWTH, MAX_GROWTH)
-    bounds = Bounds(np.array(survey.low), np.array(survey.high), survey.smallest, survey.largest)
-    curve = Curve.of(survey.sample, bounds)
-    _, size = curve.leaf_rows(survey.sample, np.arange(len(survey.sample), dtype=np.uint32))
+    curve = Curve.of(sample, bounds)
+    _, size = curve.leaf_rows(sample, np.arange(len(sample), dtype=np.uint32))
     return Plan(setting, curve, lowest_level(levels_of(size)))
 
 

@@ -35,7 +35,7 @@ from ..support.progress import Progress, silent
 from .check import Bounds, check, check_setting
 from .kernels.pair_cost import WIDTH
 from .kernels.sort import PART_BITS, Keys, Nodes, cell_words, sort_by_cell, sort_by_key
-from .stage_records import NO_FAMILY, STAGE_BITS, Families, Pending, Region, Survey
+from .stage_records import NO_FAMILY, STAGE_BITS, Families, Pending, Region
 from .voxel_grid import Margins, VoxelGrid
 from .voxel_tree import (
     MERGED,
@@ -153,14 +153,14 @@ def _by_cell(
         return sort_by_cell(tree.nodes, nodes, grid.parts(level), threads, within=within)
 
 
-def plan(survey: Survey, setting: float) -> VoxelGrid:
+def plan(bounds: Bounds, sample: Splats, setting: float) -> VoxelGrid:
     """Return the grid of the scene; the setting is the base.
 
     Raises:
         ValueError: the base is out of its range.
     """
     check_setting("base", setting, MIN_BASE, MAX_BASE)
-    return VoxelGrid.of(Bounds(np.array(survey.low), np.array(survey.high), survey.smallest, survey.largest), setting)
+    return VoxelGrid.of(bounds, setting)
 
 
 def leaves(splats: Splats, index: NDArray[np.int64], plan: VoxelGrid) -> Pending:

@@ -9,13 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..model.splats import COLUMNS, FloatArray, Splats
 from ..support.progress import Progress
+
+if TYPE_CHECKING:
+    from .check import Bounds
 
 #: Number of the family of a leaf, which has no children.
 NO_FAMILY = -1
@@ -34,26 +37,6 @@ class Region:
 
     low: tuple[float, float, float]
     high: tuple[float, float, float]
-
-
-@dataclass(frozen=True, eq=False)
-class Survey:
-    """Facts about the whole scene that stages need before any of it is built.
-
-    Attributes:
-        count: N splats that are kept.
-        low, high: corners of the box of their centres, world units.
-        smallest, largest: range of their sizes, 2 * max(scale), world units.
-        sample: an even sample of them, in their order.
-    """
-
-    count: int
-    sh_degree: int
-    low: tuple[float, float, float]
-    high: tuple[float, float, float]
-    smallest: float
-    largest: float
-    sample: Splats
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,8 +107,13 @@ class StagedBuilder(Protocol):
     `plan` is a value of plain numbers and small arrays, the same for all stages, which can be pickled.
     """
 
-    def plan(self, survey: Survey, setting: float) -> Any:
+    def plan(self, bounds: Bounds, sample: Splats, setting: float) -> Any:
         """Return what all stages share.
+
+        Args:
+            bounds: of the whole scene.
+            sample: an even sample of its splats, in their order.
+            setting: of the builder, base or growth.
 
         Raises:
             ValueError: the setting is out of its range.

@@ -64,8 +64,6 @@ def install_hint(extra: str = "", *options: str) -> str:
     """
     from importlib import metadata  # takes long to load
 
-    from .optional import required_by
-
     checkout = _checkout()
     if checkout is not None:
         editable = ["-e"] if checkout == _HOME else []

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sparklod_cli.cameras.axes import Axes
 from sparklod_cli.cameras.formats.source import Parsed
-from sparklod_cli.cameras.formats.table import PathFormat
+from sparklod_cli.cameras.formats.table import Axes, PathFormat
 from sparklod_cli.cameras.frame import Frame, Lens, Settings
 from sparklod_cli.cameras.generators import (
     Key,

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from sparklod_cli.lod.check import check
-from sparklod_cli.lod.stage_records import NO_FAMILY, STAGE_BITS, Families, Pending, Region, StagedBuilder, Survey
+from sparklod_cli.lod.stage_records import NO_FAMILY, STAGE_BITS, Families, Pending, Region, StagedBuilder
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.support.progress import silent
@@ -56,14 +56,6 @@ class Stages:
         return self.advance(Pending.concat(parts), here)
 
 
-def survey_of(splats: Splats, step: int = 1) -> Survey:
-    """A survey of a whole scene whose sample is every so many splats."""
-    bounds = check(splats)
-    low, high = tuple(bounds.low.tolist()), tuple(bounds.high.tolist())
-    sample = splats.take(slice(None, None, step))
-    return Survey(len(splats), splats.sh_degree, low, high, bounds.smallest, bounds.largest, sample)
-
-
 def split(
     splats: Splats, index: np.ndarray, region: Region, parts: tuple[int, int, int]
 ) -> list[tuple[np.ndarray, Region]]:
@@ -99,7 +91,7 @@ def build_in_stages(
         splats: valid and visible ones.
         setting: of the builder.
         splits: of the scene; none for a single stage.
-        step: the survey's sample is every so many splats.
+        step: the plan's sample is every so many splats.
     """
     nodes, tree, _ = run_stages(builder, splats, setting, splits, step=step)
     return nodes, tree
@@ -109,7 +101,7 @@ def run_stages(
     builder: StagedBuilder, splats: Splats, setting: float, splits: Splits, *, step: int = 1
 ) -> tuple[Splats, LodTree, Stages]:
     """As `build_in_stages`, and the stages themselves."""
-    stages = Stages(builder, builder.plan(survey_of(splats, step), setting))
+    stages = Stages(builder, builder.plan(check(splats), splats.take(slice(None, None, step)), setting))
     left = stages.run(splats, np.arange(len(splats)), EVERYWHERE, splits, is_root=True)
     assert len(left) == 1
     return *assemble(stages.families, *left.root()), stages

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
 from concurrent.futures import ThreadPoolExecutor
 
@@ -16,7 +15,7 @@ from sparklod_cli.lod.settings import pixel_limit
 from sparklod_cli.lod.traversal import VISITS, Forest, TreeInstance, View, views_of
 from sparklod_cli.model.foveation import Cones, Frustum
 from sparklod_cli.model.nodes import CHUNK_NODES, Nodes
-from tests.lod.forests import Case, ancestors_drawn, cases, check, drawn, links, random_tree, rotation, transform, views
+from tests.lod.forests import Case, ancestors_drawn, cases, check, drawn, links, random_tree, transform, views
 from tests.references import budgeted_cuts
 
 #: Pixel scales at which nothing happens, something does, and everything does.
@@ -220,27 +219,3 @@ def test_the_pixel_limit_is_a_pixels_size_at_distance_1() -> None:
     """At distance 1 the picture is 2 * tan(fov_y / 2) high."""
     assert pixel_limit(math.radians(90), 1000) == pytest.approx(2 / 1000)
     assert pixel_limit(math.radians(60), 1080, 2.0) == pytest.approx(2 * pixel_limit(math.radians(60), 1080))
-
-
-def test_the_order_of_equals_is_that_of_instances_and_indices() -> None:
-    """The last instance first, and in it the last node."""
-    tree = links([3, 2, 2, 2])
-    nodes = Nodes(np.zeros((10, 3), np.float32), np.ones(10, np.float32), tree)
-    case = Case([nodes], [TreeInstance(), TreeInstance()], seen_from(2.0), 0, 0.0)
-    found = case.traversal()
-    divided = {2: [], 3: [], 4: [(1, 0)], 5: [(1, 0), (1, 3)], 7: [(1, 0), (1, 3), (1, 2), (1, 1)], 9: [(1, 0), (0, 0)]}
-    everything = set(itertools.product(range(2), range(10)))
-    for budget in (2, 3, 4, 5, 7):
-        got = set(drawn(dataclasses.replace(case, budget=budget).find(found)))
-        children = {(i, child) for i, node in divided[budget] for child in children_of(nodes, node)}
-        assert got == ({(0, 0), (1, 0)} | children) - set(divided[budget])
-        assert got <= everything
-
-
-def children_of(nodes: Nodes, node: int) -> range:
-    start = int(nodes.tree.child_start[node])
-    return range(start, start + int(nodes.tree.child_count[node]))
-
-
-def test_random_rotations_do_not_mirror() -> None:
-    assert np.linalg.det(rotation(np.random.default_rng(0))) == pytest.approx(1)

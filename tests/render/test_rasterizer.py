@@ -121,13 +121,6 @@ def test_an_off_centre_principal_point_shifts_the_picture(principal: tuple[float
     assert image[..., 3].mean() > 0.02
 
 
-def test_needles_are_drawn_as_the_twin_draws_them() -> None:
-    """A thousand times longer than they are thick."""
-    needles = shown(40, seed=5, most=3.0)
-    needles.scale[:] = np.float32([0.5, 0.0005, 0.0005])
-    check(needles, camera_at(size=(90, 70), focal=(90.0, 90.0)))
-
-
 @pytest.mark.parametrize("most", [1.0, 5.0])
 def test_the_longest_needles_are_exact(most: float) -> None:
     """As long as a splat may be; in float32 the terms of a quadratic form would cancel to 1e-2."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import pickle
 import shutil
@@ -100,7 +101,7 @@ class ClusterEngine:
         """
         with Pool(self._connection, stage) as pool:
             for place, each in enumerate(arguments):
-                pool.submit(str(place), place, run_call, call, each, self.threads)
+                pool.submit(str(place), place, functools.partial(call, threads=self.threads), *each)
             yield self._outcomes(pool, stage, len(arguments), progress, unit)
 
     def _outcomes(self, pool: Pool, stage: str, count: int, progress: Progress, unit: str) -> Iterator[Any]:
@@ -220,11 +221,6 @@ def run_task(packed: bytes, task: Task, threads: int) -> tuple[int, int]:
             task.run(job, *task.arguments, threads=threads, progress=silent)
         machine.release_memory()
     return job.store.traffic.written, job.store.traffic.read
-
-
-def run_call(call: Callable[..., Any], arguments: tuple[Any, ...], threads: int) -> Any:
-    """Call a function that returns something small."""
-    return call(*arguments, threads=threads)
 
 
 def dask_setup(worker: Any) -> None:

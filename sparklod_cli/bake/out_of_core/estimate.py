@@ -9,6 +9,8 @@ import functools
 
 from ...lod.builders import BUILDERS, SplatBytes
 from ...support import machine
+from ...support.errors import OutOfMemoryError
+from ...support.units import format_size
 
 #: Part of the memory available that a bake may take unless told otherwise: other programs need some, and figures for it
 #: are estimates. Chosen.
@@ -71,19 +73,22 @@ def scratch_bytes(method: str, splats: int, sh_degree: int) -> int:
 
 def block_splats_within(
     memory: int | None, method: str, splats: int, sh_degree: int, *, in_chunks: bool = False, threads: int = 1
-) -> int | None:
+) -> int:
     """Return the splats of a block, a power of two, so that nearly the same memory gives the same blocks.
 
     Args:
         memory: bytes that a bake may take; None for any number.
 
-    Returns:
-        None where the memory is too little for blocks of `LEAST_BLOCK_SPLATS`.
+    Raises:
+        OutOfMemoryError: the memory is too little for blocks of `LEAST_BLOCK_SPLATS`.
     """
     size = MOST_BLOCK_SPLATS
     needed = functools.partial(out_of_core_bytes, method, splats, sh_degree, in_chunks=in_chunks, threads=threads)
     while memory is not None and needed(size) > memory:
         size //= 2
         if size < LEAST_BLOCK_SPLATS:
-            return None
+            raise OutOfMemoryError(
+                f"{format_size(memory)} of memory is too little even out of core; give --memory"
+                f" {format_size(1.02 * needed(LEAST_BLOCK_SPLATS))} or more"
+            )
     return size

@@ -41,7 +41,7 @@ JOIN_WORK = 0.1
 
 @dataclass
 class InBlocks:
-    """Workspace in a scratch folder, see `flow.Workspace`.
+    """Workspace in a scratch folder, with the steps of `in_memory.InMemory`.
 
     Attributes:
         job: of all tasks; `build` and `order` add what they find out.
@@ -65,7 +65,8 @@ class InBlocks:
         self.clock.end("read")
         self.output.check(findings.statistics)
         setting = getattr(settings, BUILDERS[settings.method].setting)
-        self.job = job = dataclasses.replace(self.job, plan=self.job.builder().plan(findings.survey(), setting))
+        plan = self.job.builder().plan(findings.bounds, splats_of(findings.sample), setting)
+        self.job = job = dataclasses.replace(self.job, plan=plan)
         self.engine.run("building", list(_stages(job)), job, self.progress)
         self.clock.end("build")
         return BuiltTree(
@@ -211,15 +212,5 @@ def block_of(job: Job, block: int, threads: int) -> tuple[Splats, NDArray[np.int
 
 
 def _put_families(job: Job, number: int, families: Families, threads: int) -> None:
-    job.store.put(
-        families_of(number),
-        {
-            "batch": families.batch,
-            "key": families.key,
-            "count": families.count,
-            "rows": rows_of(families.nodes, threads),
-            "family": families.family,
-            "center": families.center,
-            "size": families.size,
-        },
-    )
+    columns = dict(vars(families))
+    job.store.put(families_of(number), {"rows": rows_of(columns.pop("nodes"), threads), **columns})

@@ -8,11 +8,11 @@ import math
 import numpy as np
 
 from ...support.errors import CameraPathError
-from ..axes import Axes
 from ..camera import Matrix
 from ..frame import NO_LENS, Frame, Lens, Settings
 from ..generators import Key, between, frame_looking
 from .source import Files, Json, Parsed, brief, posed, side
+from .table import Axes
 
 FORMAT, VERSION = "sparklod-camera-path", 1
 

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import click
 
-from ...cameras.axes import Axes
-from ...cameras.formats.table import FORMATS
+from ...cameras.formats.table import FORMATS, Axes
 from ...support.defaults import ELEVATION, ORBIT
 from ...support.errors import CameraPathError, TooManyCamerasError
 from ...support.setting_fields import Range, whole

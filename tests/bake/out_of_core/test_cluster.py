@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import pickle
 import threading
@@ -113,7 +114,7 @@ def test_calls_side_by_side_give_results_and_failures_in_order(engine: ClusterEn
 
 def test_a_result_that_is_lost_with_its_worker_is_waited_for(engine: ClusterEngine) -> None:
     with cluster_pool.Pool(engine._connection, "baking") as pool:
-        pool.submit("twice", 0, cluster_engine.run_call, made_up.twice, (21,), 1)
+        pool.submit("twice", 0, functools.partial(made_up.twice, threads=1), 21)
         future = pool._futures["twice"]
         future.result(timeout=60)
         loop, lost = engine._connection.client.loop, threading.Event()

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from sparklod_cli.bake.out_of_core import nodes, order
 from sparklod_cli.bake.out_of_core.in_blocks import InBlocks
 from sparklod_cli.bake.out_of_core.job import Job
-from sparklod_cli.bake.output import WholeOutput
+from sparklod_cli.bake.output import Output
 from sparklod_cli.bake.records import BuiltTree, Clock
 from sparklod_cli.bake.settings import BakeSettings
 from sparklod_cli.codecs.statistics import ALL
@@ -49,7 +49,7 @@ def _small_windows() -> Iterator[None]:
 def built(folder: str, splats: Splats, how: BakeSettings, block: int, engine: Loop, *, in_chunks: bool) -> BuiltTree:
     """A tree in a store, of blocks of about so many splats."""
     job = Job(PlainStore(Path(folder)), stream_of(Scene(splats)), how, ALL, in_chunks)
-    blocks = InBlocks(job, WholeOutput(), Clock(), engine, block, silent)
+    blocks = InBlocks(job, Output(), Clock(), engine, block, silent)
     tree = blocks.build()
     blocks.order(tree)
     return tree

@@ -206,18 +206,6 @@ def test_broken_splats_are_not_drawn() -> None:
 
 
 @needs_opengl
-@pytest.mark.parametrize("precision", texture.PRECISIONS)
-def test_the_order_of_the_input_does_not_matter(precision: str) -> None:
-    shown = SPLATS["plausible"]
-    shuffle = np.random.default_rng(1).permutation(len(shown))
-    shuffled = ShadedSplats(
-        **{field.name: getattr(shown, field.name)[shuffle] for field in dataclasses.fields(ShadedSplats)}
-    )
-    images = [osmesa.draw(each, CAMERAS["beside"], RasterSettings(), precision=precision) for each in (shown, shuffled)]
-    assert psnr(*images) >= FLOAT
-
-
-@needs_opengl
 def test_of_equally_distant_splats_the_last_is_in_front() -> None:
     both = ShadedSplats(
         *(
@@ -309,16 +297,6 @@ def test_keys_are_sorted_upwards_and_equal_ones_backwards() -> None:
     for few in ([], [3.0], [2.0, 2.0], [-0.0, 0.0]):
         for sort in order.SORT.values():
             assert sort(np.array(few, np.float32)).tolist() == list(range(len(few)))[::-1]
-
-
-@needs_opengl
-def test_sorting_by_16_bits_hardly_changes_a_picture() -> None:
-    for name in ("plausible", "merged"):
-        images = [
-            osmesa.draw(SPLATS[name], CAMERAS["beside"], RasterSettings(), sorting=sorting)
-            for sorting in settings.SORTINGS
-        ]
-        assert psnr(*images) >= 60
 
 
 def test_half_precision_has_the_texture_of_the_viewer() -> None:
