@@ -157,9 +157,6 @@ def between(
 def along(curve: Callable[[Matrix], Matrix], at: Matrix) -> Matrix:
     """(N, K) points of a curve.
 
-    Args:
-        at: (N,) parameters.
-
     Raises:
         CameraPathError: some points are not finite: keys are too far apart, or too close in time.
     """

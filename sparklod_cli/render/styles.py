@@ -55,7 +55,6 @@ def draw(
         style: one of `settings.STYLES`. "points" are opaque, a pixel each, "billboards" discs of one opacity, as wide
             as the splats; both are drawn in the order of the file. "sorted-billboards" are drawn from far to near, as
             "splats" are.
-        settings: how splats become pixels.
 
     Raises:
         BackendError: the backend cannot draw here.

@@ -100,7 +100,6 @@ class ChunkCache:
 
     Args:
         chunks: the chunks of all trees. Chunks with roots are always wanted, and come first.
-        capacity: maximum number of chunks; None for all.
 
     Attributes:
         wanted: the wanted chunks, each once, the most important first.

@@ -29,8 +29,6 @@ class Stream:
 
     Args:
         network: the network; everything arrives at once unless given.
-        capacity: maximum number of chunks in the cache; None for all.
-        start: the time at the start, seconds.
 
     Attributes:
         now: the current time, seconds.

@@ -108,7 +108,6 @@ class Address:
         """Open the file for reading, wherever in it.
 
         Args:
-            buffering: bytes that are read at once where less is wanted.
             size: bytes of the file, where that is known.
         """
         return io.BufferedReader(_Ranged(self, self.size() if size is None else size), buffering)

@@ -66,9 +66,6 @@ class Blocks:
     def sort(self, center: FloatArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Sort splats by their blocks, stably.
 
-        Args:
-            center: (N, 3).
-
         Returns:
             (N,) the splats, and (blocks + 1,) where those of each block begin.
         """
@@ -87,13 +84,7 @@ class Blocks:
 
 @dataclass(frozen=True)
 class _Part:
-    """A part of the scene: a block, or two halves.
-
-    Attributes:
-        side: as in `Blocks.splits`.
-        region: of the scene.
-        halves: without any, it is a block.
-    """
+    """A part of the scene: a block, or two halves."""
 
     side: int
     region: Region

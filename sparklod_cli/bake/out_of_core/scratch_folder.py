@@ -70,11 +70,7 @@ def _digest(text: str) -> str:
 
 @dataclass(frozen=True)
 class _Manifest:
-    """Manifest that identifies the bake a store belongs to.
-
-    Attributes:
-        block_splats: of the blocks that the scene was cut into.
-    """
+    """Manifest that identifies the bake a store belongs to."""
 
     fingerprint: Fingerprint
     block_splats: int
