@@ -108,6 +108,7 @@ def _by_table(
     return Coding(encode_planes, decode)
 
 
+@np.errstate(over="ignore")  # values may be any number of times the end of the range
 def _encode_signed(values: FloatArray, low: float, high: float) -> NDArray[Any]:
     steps = values / np.float32(high)
     steps *= np.float32(127)

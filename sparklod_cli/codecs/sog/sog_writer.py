@@ -18,7 +18,7 @@ from ...model.scene import Scene
 from ...model.splats import FloatArray, Splats
 from ...support.defaults import MAX_SH_CODES
 from ...support.errors import FormatError
-from ...support.parallel import ordered_map
+from ...support.parallel import blocks_of, ordered_map
 from ...support.progress import Progress, silent
 from ...support.units import count_of
 from .. import quantize, sh_palette
@@ -29,7 +29,7 @@ from ..options import DEFAULTS, WriteOptions
 from ..validation import check_valid
 from . import texel_codings as codings
 from .sog_container import zipped
-from .texel_codings import codebook, nearest
+from .texel_codings import codebook, even_codebook, nearest
 from .webp_images import MAX_SIDE, Texels, encode_webp, image_of, size_for
 
 #: Power of the weights of splats in the palette of SH. With 1, pictures are better still, but the error of coefficients
@@ -39,6 +39,10 @@ SEEN = 0.5
 #: The tilt of the book of scales: large splats, which are few, make most of a picture. Measured: 34,902 merged splats
 #: come 6.6 dB closer to their source with 1 than with 0, and scales are off by 1.6 % instead of 1.0 %.
 LARGE = 1.0
+
+#: By how much codes may make a scale larger: a factor, and a share of the splat's largest scale. The bounds of Streamed
+#: SOG's regions leave room for it. Scenes whose scales differ by factors of 1e30 exceed it.
+GROWTH, GROWTH_OF_LARGEST = 4 / 3, 0.01
 
 #: Fewest codes of a palette where nobody chooses, and the steps in which it grows, as PlayCanvas's writer has them.
 LEAST_CODES = 1024
@@ -182,7 +186,18 @@ def _means(words: codings.Words, low: codings.Wide, high: codings.Wide, order: O
 def _scales(scale: FloatArray, order: Order) -> Texture:
     logs = quantize.encode_log(scale)
     book = codebook(logs, LARGE)
+    if _grows(scale, logs, book):
+        book = even_codebook(logs)
     return Texture({"codebook": _numbers(book)}, [_per_splat(nearest(logs[order], book))])
+
+
+def _grows(scale: FloatArray, logs: FloatArray, book: FloatArray) -> bool:
+    """Return True if codes of a book make a splat so much larger that it may leave the bound of its region."""
+    for block in blocks_of(len(scale)):
+        largest = np.max(scale[block], axis=1, keepdims=True)
+        if np.any(np.exp(book)[nearest(logs[block], book)] > GROWTH * scale[block] + GROWTH_OF_LARGEST * largest):
+            return True
+    return False
 
 
 def _quats(quat_xyzw: FloatArray, order: Order) -> Texture:

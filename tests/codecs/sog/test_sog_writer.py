@@ -128,6 +128,15 @@ def test_a_scale_of_0_stays_0_and_the_largest_and_the_smallest_stay() -> None:
     assert ((found == 0) == (splats.scale == 0)).all()
 
 
+def test_scales_of_any_range_grow_by_a_third_at_most() -> None:
+    splats = random_splats(300)
+    splats.scale[:] = np.geomspace(1e-24, 1e37, 900).reshape(300, 3)
+    splats.scale[0, 0] = 0
+    found = back(Scene(splats)).scale
+    assert (found <= splats.scale * 1.36).all()
+    assert found[0, 0] == 0
+
+
 def test_colours_of_splats_of_opacity_0_stay() -> None:
     splats = random_splats(50)
     splats.opacity[:] = 0

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from sparklod_cli.codecs.sog import texel_codings as codings
-from sparklod_cli.codecs.sog.texel_codings import CODES, codebook, nearest
+from sparklod_cli.codecs.sog.texel_codings import CODES, codebook, even_codebook, nearest
 from sparklod_cli.model.gaussian import normalized_quat
 from tests.codecs.test_quantize import rotation_degrees, stated_degrees
 from tests.references.sog_quats import decode_quat
@@ -72,6 +72,16 @@ def test_no_other_code_is_nearer(seed: int, spread: float) -> None:
     book = codebook(values).astype(np.float64)
     off = np.abs(values - book[nearest(values, book.astype(np.float32))])
     np.testing.assert_array_equal(off, np.abs(values[:, None] - book).min(axis=1))
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(1, 150), st.floats(0, 100))
+def test_no_number_is_far_from_an_even_book(seed: int, extent: float, gap: float) -> None:
+    rng = np.random.default_rng(seed)
+    values = np.concatenate([rng.uniform(0, extent, 600), [-gap - 1]]).astype(np.float32)
+    book = even_codebook(values)
+    assert book[0] == values.min()
+    assert (np.diff(book) >= 0).all()
+    assert np.abs(values - book[nearest(values, book)]).max() <= np.ptp(values[:-1]) / 254 / 2 * 1.001 + 1e-5
 
 
 def test_codes_have_the_shape_of_their_numbers() -> None:
