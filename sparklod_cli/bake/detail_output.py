@@ -14,7 +14,7 @@ from ..model.scene import DetailScene, Scene
 from ..model.splats import Splats
 from ..support.parallel import on_threads
 from ..support.progress import Progress
-from .output import Encode, Output
+from .output import BakeOutput, Encode
 from .records import BuiltTree, Clock, WrittenDetail, WrittenLevel, WrittenTree
 
 
@@ -27,11 +27,7 @@ def detail_levels(
     threads: int,
     progress: Progress,
 ) -> DetailScene:
-    """Return regions of a tree at several detail levels, with their errors.
-
-    Args:
-        environment: splats beside it; None without.
-    """
+    """Return regions of a tree at several detail levels, with their errors, and an environment, if any."""
     from ..lod.detail_levels import make
     from .region_errors import measured
 
@@ -46,7 +42,7 @@ def detail_levels(
 
 
 @dataclass(frozen=True)
-class DetailOutput(Output):
+class DetailOutput(BakeOutput):
     """A Streamed SOG."""
 
     settings: DetailSettings

@@ -15,7 +15,7 @@ from ..model.scene import Scene
 from ..model.splats import Splats
 from ..support.parallel import on_threads
 from ..support.progress import Progress
-from .output import FileOutput, Output, output_of_kept
+from .output import BakeOutput, FileOutput, output_of_kept
 from .records import BuiltTree, Clock
 from .selecting import read_environment, select, split_environment, transformed
 from .settings import BakeSettings
@@ -32,7 +32,7 @@ class InMemory:
 
     source: Source
     settings: BakeSettings
-    output: Output
+    output: BakeOutput
     clock: Clock
     threads: int
     progress: Progress

@@ -30,7 +30,7 @@ from .sources import Merged, Source
 Encode = Callable[[BuiltTree, Encoder], Get]
 
 
-class Output:
+class BakeOutput:
     """Destination of a tree; by default one that is made of all nodes at once, in memory, and holds any tree.
 
     Attributes:
@@ -52,7 +52,7 @@ class Output:
         raise NotImplementedError
 
 
-def output_of(target: Place, settings: BakeSettings, *, overwrite: bool) -> Output:
+def output_of(target: Place, settings: BakeSettings, *, overwrite: bool) -> BakeOutput:
     """Return the output that settings ask for; fail now if it cannot be written later.
 
     Raises:
@@ -70,7 +70,7 @@ def output_of(target: Place, settings: BakeSettings, *, overwrite: bool) -> Outp
     return FileOutput(form, settings.options, write, in_chunks=settings.suffix == RAD)
 
 
-def output_of_kept(output: Output, source: Source, scene: Scene, settings: BakeSettings) -> tuple[Output, bool]:
+def output_of_kept(output: BakeOutput, source: Source, scene: Scene, settings: BakeSettings) -> tuple[BakeOutput, bool]:
     """Return the output of an input that has a tree, which is kept, and whether its nodes are in order already.
 
     Nodes keep their opacities. In the same format, what was not chosen of how to write is that of the file, and nodes
@@ -114,7 +114,7 @@ def output_of_kept(output: Output, source: Source, scene: Scene, settings: BakeS
 
 
 @dataclass(frozen=True)
-class ArrayOutput(Output):
+class ArrayOutput(BakeOutput):
     """Arrays in the layout of a viewer's memory.
 
     Attributes:
@@ -138,7 +138,7 @@ class ArrayOutput(Output):
 
 
 @dataclass(frozen=True)
-class RepackedOutput(Output):
+class RepackedOutput(BakeOutput):
     """RAD file with the chunks of another one."""
 
     source: Place
@@ -160,11 +160,11 @@ class RepackedOutput(Output):
 
 
 @dataclass(frozen=True)
-class FileOutput(Output):
+class FileOutput(BakeOutput):
     """SPZ or RAD file, written in windows.
 
     Attributes:
-        in_chunks: see `Output`; RAD is.
+        in_chunks: see `BakeOutput`; RAD is.
         stored: codes that nodes keep which still have the values of `before`; None where there are none.
         before: (N,) nodes with these codes.
     """

@@ -13,7 +13,7 @@ from ..model.splats import Splats
 from ..model.streams import NodeStream
 
 if TYPE_CHECKING:
-    from .output import Output
+    from .output import BakeOutput
     from .refining import Refined
 
 
@@ -50,7 +50,7 @@ class BuiltTree:
     """
 
     nodes: Scene | NodeStream | None
-    output: Output
+    output: BakeOutput
     format: str = ""
     notes: tuple[str, ...] = ()
     read: int = 0

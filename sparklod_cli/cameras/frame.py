@@ -45,7 +45,7 @@ def direction_of(up: str | None) -> Point:
 
 
 @dataclass(frozen=True)
-class Lens:
+class Intrinsics:
     """Intrinsics of a camera in a file; None for those that the file does not have.
 
     Attributes:
@@ -64,7 +64,7 @@ class Lens:
 
 
 #: The lens of a file that says nothing about it.
-NO_LENS = Lens()
+NO_LENS = Intrinsics()
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class Frame:
     """
 
     matrix: Matrix
-    lens: Lens = NO_LENS
+    lens: Intrinsics = NO_LENS
     time: float | None = None
     name: str = ""
     axes: Axes | None = None
@@ -161,7 +161,7 @@ class Settings:
         return self.up or self.up_of_scene()
 
 
-def camera_of(pose: Matrix, lens: Lens, time: float, name: str, settings: Settings) -> Camera:
+def camera_of(pose: Matrix, lens: Intrinsics, time: float, name: str, settings: Settings) -> Camera:
     """Return the camera of a rigid pose in OpenGL's axes, with defaults for what neither file nor user says.
 
     Raises:
@@ -193,7 +193,7 @@ def _check(focal: tuple[float, float], principal: tuple[float, float]) -> None:
         )
 
 
-def _focal_of(lens: Lens, size: tuple[int, int]) -> tuple[float, float]:
+def _focal_of(lens: Intrinsics, size: tuple[int, int]) -> tuple[float, float]:
     """fx, fy of square pixels for the field of view of a lens."""
     fov = lens.fov if lens.fov is not None else DEFAULT_FOV_Y
     if not 0 < fov < math.pi:

@@ -139,11 +139,7 @@ class Dolly(_Aimed):
 
 @dataclass(frozen=True)
 class WholeScene:
-    """One camera that has the whole scene just inside its picture.
-
-    Attributes:
-        elevation: above the middle of the scene, degrees.
-    """
+    """One camera, so many degrees above the middle of the scene, that has all of it just inside its picture."""
 
     elevation: float = ELEVATION
 
@@ -157,7 +153,7 @@ class WholeScene:
 
 
 @dataclass(frozen=True)
-class Views:
+class SingleViews:
     """A camera for each pair of an eye and the target that it looks at.
 
     Attributes:
@@ -207,7 +203,7 @@ class Keyframes:
 #: Each has `fits_scene`, whether its cameras are as far away as the scene asks for, and
 #: `cameras(settings, scene) -> CameraPath`, which raises a `CameraPathError` where a camera makes no sense, its
 #: subclass `TooManyCamerasError` where there are too many, and an `InvalidSplatsError` where there is no scene to fit.
-CameraSource = CameraFile | Orbit | Dolly | WholeScene | Views | Keyframes
+CameraSource = CameraFile | Orbit | Dolly | WholeScene | SingleViews | Keyframes
 
 
 def read_path(path: Path, format: str | None = None, settings: Settings | None = None) -> CameraPath:

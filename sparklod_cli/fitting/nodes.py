@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras.camera import Camera
-from ..lod.traversal import Forest, Traversal, TreeInstance, View
+from ..lod.traversal import CutView, Forest, Traversal, TreeInstance
 from ..model.foveation import Cones
 from ..model.gaussian import linear_opacity, lod_opacity, normalized_quat, size_factor
 from ..model.lod_tree import LodTree
@@ -50,7 +50,7 @@ class FittedNodes:
     def cut(self, camera: Camera, share: float) -> Index:
         """Return the nodes, ascending, of a cut of a share of the leaves, without pixel-scale limit or foveation."""
         budget = max(1, int(share * len(self.leaves)))
-        view = View(camera.camera_to_world, camera.fov_x, camera.fov_y)
+        view = CutView(camera.camera_to_world, camera.fov_x, camera.fov_y)
         return self._traversal.cut(view, budget=budget).indices()[0].astype(np.int64)
 
     def seen(self, index: Index, camera: Camera) -> tuple[Index, ShadedSplats]:

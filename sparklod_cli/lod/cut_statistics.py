@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from .kernels import cut_statistics as kernels
 from .kernels.cut_arrays import CutNodes
 from .settings import pixel_limit
-from .traversal import Forest, TreeCut, TreeInstance, View
+from .traversal import CutView, Forest, TreeCut, TreeInstance
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ def measure(
     forest: Forest,
     level: NDArray[np.int32],
     cut: TreeCut,
-    view: View,
+    view: CutView,
     *,
     size: tuple[int, int],
     by_instance: bool = False,

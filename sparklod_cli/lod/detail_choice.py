@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from .detail_rule import DetailRule
 
 if TYPE_CHECKING:
-    from .traversal import View
+    from .traversal import CutView
 
 Levels = NDArray[np.int64]
 
@@ -204,7 +204,7 @@ class RegionBounds:
         median = np.sort(half32, axis=0)[len(half32) // 2].astype(np.float64)
         self.excess = np.maximum(half32 - median, 0).astype(np.float32).astype(np.float64)
 
-    def squared_distances(self, view: View, object_to_world: Matrix, rule: DetailRule) -> Distances:
+    def squared_distances(self, view: CutView, object_to_world: Matrix, rule: DetailRule) -> Distances:
         """Return (R,) squared distances by which levels are chosen, world units at a field of view of 45 degrees.
 
         The distance is that from the camera to the nearest point of the bound, shrunk by `rule.shrink` of its excess;

@@ -20,7 +20,7 @@ from ..model.splats import Splats
 from .detail_choice import Chains, Distances, Distant, Levels, RegionBounds, choose
 from .detail_rule import LEAST_BASE_DISTANCE, DetailRule
 from .kernels import pixel_scale
-from .traversal import Forest, TreeCut, TreeInstance, View, views_of
+from .traversal import CutView, Forest, TreeCut, TreeInstance, views_of
 
 #: Priorities of files, whole numbers: for regions of which nothing is drawn, for those at another level, and for what
 #: comes next. The environment is asked for before all others.
@@ -80,7 +80,7 @@ class DetailTraversal:
         self._before: list[Levels | None] = [None] * len(self.instances)
 
     def cut(
-        self, view: View, *, budget: int, smallest: float = 0.0, resident: NDArray[np.bool_] | None = None
+        self, view: CutView, *, budget: int, smallest: float = 0.0, resident: NDArray[np.bool_] | None = None
     ) -> TreeCut:
         """Return the cut that a viewer draws: the splats of the levels of all regions, and the environments.
 

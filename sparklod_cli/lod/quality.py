@@ -34,7 +34,7 @@ from .final_tree import FinalTree, PruningGoal, in_final_order
 from .kernels import pair_cost
 from .kernels.sort import Nodes
 from .pair_tree import BinaryTree, Curve, Levels, levels_of, lowest_level, merge_levels
-from .stage_records import NO_FAMILY, STAGE_BITS, Families, Pending, Region
+from .stage_records import NO_FAMILY, STAGE_BITS, Pending, Region, StageFamilies
 
 #: For each node that a stage hands on, it leaves this many times what the growth allows for a leaf to those above it:
 #: more than once, as the pruning of a stage adds to what it hands on. Measured: once loses up to 0.3 dB.
@@ -155,7 +155,7 @@ def leaves(splats: Splats, index: NDArray[np.int64], plan: Plan) -> Pending:
 
 def advance(
     pending: Pending, region: Region | None, stage: int, plan: Plan, *, progress: Progress
-) -> tuple[Families, Pending]:
+) -> tuple[StageFamilies, Pending]:
     """See `StagedBuilder`."""
     splats, count = pending.splats, len(pending)
     if count <= 1:
@@ -192,19 +192,19 @@ def _pruning_goal(nodes: _Nodes, handed: int, region: Region | None, plan: Plan)
     return PruningGoal(max(most - reserve, 0), splats, False, HIGHEST, nodes.rank)
 
 
-def _families(final: FinalTree, numbers: NDArray[np.int64]) -> Families:
+def _families(final: FinalTree, numbers: NDArray[np.int64]) -> StageFamilies:
     """Return the families of the nodes that a stage kept; `numbers` are those of all nodes' families."""
     children = slice(final.first_child, None)
     nodes, parents = final.splats.take(children), final.splats.take(final.parents)
     count, size = final.tree.child_count[final.parents], spark_size(parents)
-    return Families(final.ranks, final.keys[:, None], count, nodes, numbers[children], parents.center, size)
+    return StageFamilies(final.ranks, final.keys[:, None], count, nodes, numbers[children], parents.center, size)
 
 
-def _no_families(splats: Splats) -> Families:
+def _no_families(splats: Splats) -> StageFamilies:
     """Return the empty families of a stage without a merge."""
     none = splats.take(slice(0, 0))
     empty = np.empty(0, np.int32), np.empty((0, 1), np.uint64), np.empty(0, np.uint16)
-    return Families(*empty, none, np.empty(0, np.int64), none.center, none.opacity)
+    return StageFamilies(*empty, none, np.empty(0, np.int64), none.center, none.opacity)
 
 
 def _rest(

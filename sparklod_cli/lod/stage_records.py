@@ -73,7 +73,7 @@ class Pending:
 
 
 @dataclass(frozen=True, eq=False)
-class Families:
+class StageFamilies:
     """The children that a stage gave to F nodes, in the order of the tree.
 
     In the tree the root comes first, then all families of all stages by batch and then by key: that of a node comes
@@ -129,7 +129,7 @@ class StagedBuilder(Protocol):
 
     def advance(
         self, pending: Pending, region: Region | None, stage: int, plan: Any, *, progress: Progress
-    ) -> tuple[Families, Pending]:
+    ) -> tuple[StageFamilies, Pending]:
         """Give nodes parents as far as the rest of the scene cannot matter.
 
         Args:

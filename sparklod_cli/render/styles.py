@@ -24,7 +24,7 @@ BILLBOARD_ALPHA = 0.5
 
 
 @dataclass(frozen=True)
-class OnScreen:
+class VisibleCentres:
     """Splats whose centres a camera sees; M of them.
 
     Attributes:
@@ -89,7 +89,7 @@ def draw(
     return image
 
 
-def on_screen(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> OnScreen:
+def on_screen(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> VisibleCentres:
     """Return the splats between near and far whose centres are inside the picture, or within `CLIP` of it."""
     local = (splats.center - camera.position.astype(np.float32)) @ camera.camera_to_world[:3, :3].astype(np.float32)
     depth = -local[:, 2]
@@ -98,7 +98,7 @@ def on_screen(splats: ShadedSplats, camera: Camera, settings: RasterSettings) ->
         seen = (depth > settings.near) & (depth < settings.far) & (splats.lod_opacity >= MIN_ALPHA)
         seen &= (abs(dx) <= CLIP * camera.width / 2) & (abs(dy) <= CLIP * camera.height / 2)
     index = np.flatnonzero(seen)
-    return OnScreen(
+    return VisibleCentres(
         index,
         (dx[index] + camera.principal[0]).astype(np.float32),
         (dy[index] + camera.principal[1]).astype(np.float32),

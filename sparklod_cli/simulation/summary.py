@@ -26,7 +26,7 @@ STATISTICS = ("min", "p50", "p95", "max")
 
 
 @dataclass(frozen=True)
-class Quantity:
+class FrameStatistics:
     """Statistics over the frames.
 
     Attributes:
@@ -88,7 +88,7 @@ class Summary:
     chunks_first: int
     bytes_first: int
     stop_reasons: dict[str, float]
-    quantities: tuple[Quantity, ...]
+    quantities: tuple[FrameStatistics, ...]
     moments: tuple[Moment, ...]
     loading: Row | None = None
 
@@ -120,14 +120,14 @@ def summarize(rows: Iterable[Row], loading: Row | None = None) -> Summary:
     )
 
 
-def _quantity(name: str, frames: Sequence[Row]) -> Quantity | None:
+def _quantity(name: str, frames: Sequence[Row]) -> FrameStatistics | None:
     values = [share for row in frames if (share := _share(row)) is not None]
     if name != IN_FRUSTUM:
         values = numbers(frames, name)
     if not values:
         return None
     found = {each: _rounded(statistic(each, values)) for each in STATISTICS}
-    return Quantity(name, UNITS.get(name, "share"), len(values), **found)
+    return FrameStatistics(name, UNITS.get(name, "share"), len(values), **found)
 
 
 def _share(row: Row) -> Number | None:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from sparklod_cli.lod.check import check
-from sparklod_cli.lod.stage_records import NO_FAMILY, STAGE_BITS, Families, Pending, Region, StagedBuilder
+from sparklod_cli.lod.stage_records import NO_FAMILY, STAGE_BITS, Pending, Region, StagedBuilder, StageFamilies
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.support.progress import silent
@@ -34,7 +34,7 @@ class Stages:
 
     builder: StagedBuilder
     plan: Any
-    families: list[Families] = field(default_factory=list)
+    families: list[StageFamilies] = field(default_factory=list)
     pending: list[int] = field(default_factory=list)
 
     def advance(self, pending: Pending, region: Region | None) -> Pending:
@@ -107,7 +107,7 @@ def run_stages(
     return *assemble(stages.families, *left.root()), stages
 
 
-def assemble(families: Sequence[Families], root: Splats, family: int) -> tuple[Splats, LodTree]:
+def assemble(families: Sequence[StageFamilies], root: Splats, family: int) -> tuple[Splats, LodTree]:
     """The root, then all families by batch and then by key; where both are equal, by stage and then by place.
 
     Args:
@@ -135,7 +135,7 @@ def assemble(families: Sequence[Families], root: Splats, family: int) -> tuple[S
     return nodes, tree
 
 
-def check_families(families: Families, stage: int) -> None:
+def check_families(families: StageFamilies, stage: int) -> None:
     """What holds for the families of every stage."""
     assert (np.diff(families.batch) >= 0).all()
     assert (families.count >= 1).all()

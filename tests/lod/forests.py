@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from hypothesis import strategies as st
 
-from sparklod_cli.lod.traversal import Forest, Traversal, TreeCut, TreeInstance, View
+from sparklod_cli.lod.traversal import CutView, Forest, Traversal, TreeCut, TreeInstance
 from sparklod_cli.model.foveation import Cones, Frustum
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.nodes import Nodes
@@ -36,7 +36,7 @@ class Case:
 
     trees: list[Nodes]
     instances: list[TreeInstance]
-    view: View
+    view: CutView
     budget: int
     smallest: float
 
@@ -150,7 +150,7 @@ def some_trees(draw: st.DrawFn, max_nodes: int = 40) -> Nodes:
 
 
 @st.composite
-def views(draw: st.DrawFn, trees: list[Nodes]) -> View:
+def views(draw: st.DrawFn, trees: list[Nodes]) -> CutView:
     """A camera somewhere, or at a node's centre."""
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     camera = transform(rng, spread=draw(st.sampled_from([0.0, 0.5, 3.0, 100.0])))
@@ -158,7 +158,7 @@ def views(draw: st.DrawFn, trees: list[Nodes]) -> View:
         camera[:3, :3] = np.eye(3)
     if draw(st.booleans()):
         camera[:3, 3] = rng.choice(trees[0].center)
-    return View(camera, math.radians(80), math.radians(60))
+    return CutView(camera, math.radians(80), math.radians(60))
 
 
 @st.composite

@@ -19,7 +19,7 @@ from sparklod_cli.lod.kernels.chunk_sets import fill_demand
 from sparklod_cli.lod.kernels.pixel_scale import NODE
 from sparklod_cli.lod.kernels.tree_links import find_limits, find_parents
 from sparklod_cli.lod.settings import LodSettings
-from sparklod_cli.lod.traversal import Forest, Traversal, TreeCut, TreeInstance, View
+from sparklod_cli.lod.traversal import CutView, Forest, Traversal, TreeCut, TreeInstance
 from sparklod_cli.model.gaussian import spark_size
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.nodes import CHUNK_NODES, Nodes
@@ -219,7 +219,7 @@ def cut_at(tree: tuple[Splats, LodTree], turn: float) -> TreeCut:
     pose[:3, 0], pose[:3, 1], pose[:3, 2], pose[:3, 3] = across, [0, 1, 0], -along, 9 * across
     foveation = LodSettings().foveation
     found = Traversal(Forest([Nodes.of(*tree)]), [TreeInstance(foveation=foveation)])
-    return found.cut(View(pose, 1.5, 1.0), budget=40_000)
+    return found.cut(CutView(pose, 1.5, 1.0), budget=40_000)
 
 
 def test_progress_ends_at_the_number_of_nodes(built: tuple[Splats, LodTree]) -> None:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from sparklod_cli.lod.continuous import BlendedCut, ContinuousCuts, faded, find_threshold, shares
 from sparklod_cli.lod.kernels.pixel_scale import pixel_scales
-from sparklod_cli.lod.traversal import Forest, Traversal, TreeInstance, View
+from sparklod_cli.lod.traversal import CutView, Forest, Traversal, TreeInstance
 from sparklod_cli.model.foveation import Cones
 from sparklod_cli.model.gaussian import lod_opacity
 from tests.lod.forests import Case, cases, random_tree, transform
@@ -22,10 +22,10 @@ WIDTHS = (1.05, 1.25, 2.0)
 SPARK = Cones(90, 120, 0.4, 0.2)
 
 
-def view_from(position: tuple[float, ...]) -> View:
+def view_from(position: tuple[float, ...]) -> CutView:
     camera = np.eye(4)
     camera[:3, 3] = position
-    return View(camera, math.radians(80), math.radians(60))
+    return CutView(camera, math.radians(80), math.radians(60))
 
 
 def weights_of(case: Case, cut: BlendedCut) -> list[np.ndarray]:
@@ -152,7 +152,7 @@ def test_weights_move_no_faster_than_pixel_scales(width: float, seed: int) -> No
     assert changed > 1000  # there was something to see
 
 
-def log_scales(case: Case, view: View) -> np.ndarray:
+def log_scales(case: Case, view: CutView) -> np.ndarray:
     """Logarithms of the pixel scales of the nodes with children, of all instances."""
     scales = []
     for instance in case.instances:

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sparklod_cli.lod.settings import pixel_limit
-from sparklod_cli.lod.traversal import VISITS, Forest, TreeInstance, View, views_of
+from sparklod_cli.lod.traversal import VISITS, CutView, Forest, TreeInstance, views_of
 from sparklod_cli.model.foveation import Cones, Frustum
 from sparklod_cli.model.nodes import CHUNK_NODES, Nodes
 from tests.lod.forests import Case, ancestors_drawn, cases, check, drawn, links, random_tree, transform, views
@@ -110,7 +110,7 @@ def large_case(seed: int, *, nodes: int = 150_000, instances: int = 3) -> Case:
         )
         for number in range(instances)
     ]
-    return Case(trees, placed, View(transform(rng, spread=4.0), math.radians(80), math.radians(60)), 10_000, 0.0)
+    return Case(trees, placed, CutView(transform(rng, spread=4.0), math.radians(80), math.radians(60)), 10_000, 0.0)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -128,7 +128,10 @@ def test_threads_can_share_a_traversal() -> None:
     found = case.traversal()
     asked = [
         dataclasses.replace(
-            case, view=View(transform(rng, spread=4.0), 1.4, 1.0), budget=int(rng.integers(3, 80_000)), smallest=limit
+            case,
+            view=CutView(transform(rng, spread=4.0), 1.4, 1.0),
+            budget=int(rng.integers(3, 80_000)),
+            smallest=limit,
         )
         for limit in LIMITS * 14
     ]
@@ -155,11 +158,11 @@ def test_chains_longer_than_the_buffers_are_traversed(ends: int) -> None:
         assert cut.reason == ("budget" if ends > 1 and budget == 1 else "exhausted")
 
 
-def seen_from(distance: float) -> View:
+def seen_from(distance: float) -> CutView:
     """A camera that looks at the origin."""
     camera = np.eye(4)
     camera[2, 3] = distance
-    return View(camera, 1.4, 1.0)
+    return CutView(camera, 1.4, 1.0)
 
 
 def test_a_tree_as_long_as_the_buffers_is_cut_as_by_one_queue() -> None:
@@ -191,7 +194,7 @@ def test_pixel_scales_are_those_of_the_world(seed: int, foveation: Cones | Frust
     rng = np.random.default_rng(seed)
     scale = rng.uniform(0.2, 5)
     placed = TreeInstance(0, transform(rng, scale=scale), rng.uniform(0.5, 2), foveation)
-    view = View(transform(rng, spread=3.0), 1.4, 1.0)
+    view = CutView(transform(rng, spread=3.0), 1.4, 1.0)
     tree = random_tree(rng, 50, 3)
     forest = Forest([tree])
     (sight,) = views_of(forest, [placed], view)

@@ -185,11 +185,7 @@ class Probed:
 
 
 def probe(store: Store | None, name: str, files: Sequence[Path]) -> Probed:
-    """Try whether this worker can do its share: read what others wrote, and write what they read.
-
-    Args:
-        name: of a result that the client wrote.
-    """
+    """Try whether this worker can read what the client wrote, by the name of the result, and write what it reads."""
     reads, writes = True, ""
     if store is not None:
         mine = f"{name}-{uuid.uuid4().hex}"

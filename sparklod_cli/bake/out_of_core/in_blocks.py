@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 from ...codecs.encoder import Encoder, Get
 from ...codecs.statistics import Statistics
 from ...lod.builders import BUILDERS
-from ...lod.stage_records import NO_FAMILY, Families, Pending
+from ...lod.stage_records import NO_FAMILY, Pending, StageFamilies
 from ...model.selection import Tally
 from ...model.splats import Splats
 from ...support.parallel import blocks_of, on_threads
 from ...support.progress import Progress
-from ..output import Output
+from ..output import BakeOutput
 from ..records import BuiltTree, Clock
-from .blocks import Stage, cut_into_blocks
+from .blocks import BuildStage, cut_into_blocks
 from .job import ORDER, PUBLISHED, ROOT, Job, clean_of, encoded_of, families_of, pending_of, stage_of
 from .nodes import Rows, encode, encoded_chunk, node_stream, rows_of, splats_of, width_of
 from .order import WINDOW_NODES, put_order
@@ -50,7 +50,7 @@ class InBlocks:
     """
 
     job: Job
-    output: Output
+    output: BakeOutput
     clock: Clock
     engine: Engine
     block_splats: int
@@ -181,7 +181,7 @@ def clean(job: Job, group: int, *, threads: int, progress: Progress) -> None:
     job.store.put(clean_of(group), {})
 
 
-def _begun(job: Job, stage: Stage, threads: int) -> Pending:
+def _begun(job: Job, stage: BuildStage, threads: int) -> Pending:
     """Return the nodes that a stage begins with."""
     if stage.block is None:
         return Pending.concat([Pending(job.store.get(pending_of(child))) for child in stage.children])
@@ -211,6 +211,6 @@ def block_of(job: Job, block: int, threads: int) -> tuple[Splats, NDArray[np.int
     return splats_of(rows, threads), index
 
 
-def _put_families(job: Job, number: int, families: Families, threads: int) -> None:
+def _put_families(job: Job, number: int, families: StageFamilies, threads: int) -> None:
     columns = dict(vars(families))
     job.store.put(families_of(number), {"rows": rows_of(columns.pop("nodes"), threads), **columns})

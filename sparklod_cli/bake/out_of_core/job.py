@@ -11,11 +11,11 @@ from ...lod.builders import BUILDERS
 from ...lod.stage_records import StagedBuilder
 from ...model.streams import SceneStream
 from ..settings import BakeSettings
-from .blocks import Blocks
+from .blocks import BlockDivision
 from .store import Store
 
 #: Those of a scene that is not cut yet.
-NO_BLOCKS = Blocks((), ())
+NO_BLOCKS = BlockDivision((), ())
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Job:
     needed: frozenset[str]
     in_chunks: bool
     parts: tuple[int, ...] = ()
-    blocks: Blocks = NO_BLOCKS
+    blocks: BlockDivision = NO_BLOCKS
     round: int = 0
     kept: tuple[int, ...] = ()
     plan: Any = None

@@ -19,7 +19,7 @@ from ...support.progress import Progress
 from ...support.stdin import name_of
 from ...support.units import count_of, format_size
 from ..fingerprint import files_named_in, source_fingerprint
-from ..output import Output
+from ..output import BakeOutput
 from ..records import Clock
 from ..settings import BakeSettings, Resources
 from ..sources import Merged, Source, absolute_source, opened_source
@@ -41,7 +41,7 @@ def blocks_for(
     source: Source,
     target: Place,
     settings: BakeSettings,
-    output: Output,
+    output: BakeOutput,
     clock: Clock,
     *,
     overwrite: bool,

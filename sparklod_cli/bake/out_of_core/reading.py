@@ -155,11 +155,7 @@ class Findings:
 
 
 def check_findings(findings: Findings, settings: BakeSettings) -> None:
-    """Check that a tree can be made of a whole scene.
-
-    Raises:
-        InvalidSplatsError: as `bake`.
-    """
+    """Check that a tree can be made of a whole scene; raise `InvalidSplatsError` as `bake` does."""
     settings.selection.check(findings.tally)
     check_transformed(findings.beyond)
     check_visible(float(findings.sizes[0]))

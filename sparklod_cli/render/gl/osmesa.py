@@ -56,11 +56,11 @@ def draw(
 
 
 @functools.lru_cache(maxsize=2)
-def _renderer(precision: str, sorting: str, throttle: float) -> Renderer:
-    return Renderer(precision=precision, sorting=sorting, throttle=throttle)
+def _renderer(precision: str, sorting: str, throttle: float) -> OpenGLRenderer:
+    return OpenGLRenderer(precision=precision, sorting=sorting, throttle=throttle)
 
 
-class Renderer:
+class OpenGLRenderer:
     """Draws a sequence of frames; compiles once, and uploads only what has changed."""
 
     def __init__(self, *, precision: str = "float", sorting: str = "exact", throttle: float = 0.0) -> None:

@@ -225,7 +225,7 @@ def _columns(shown: ShadedSplats) -> list[FloatArray]:
 @needs_opengl
 def test_frames_of_the_same_splats_share_an_upload() -> None:
     shown, other = SPLATS["plausible"], SPLATS["merged"]
-    renderer = osmesa.Renderer()
+    renderer = osmesa.OpenGLRenderer()
     first = renderer.draw(shown, CAMERAS["front"], RasterSettings())
     again = ShadedSplats(*(column.copy() for column in _columns(shown)))
     renderer.draw(again, CAMERAS["beside"], RasterSettings())
@@ -253,7 +253,7 @@ def turned(degrees: float, *, away: float = 0.0) -> Camera:
 @needs_opengl
 def test_a_throttle_sorts_anew_only_after_a_large_turn() -> None:
     shown = SPLATS["plausible"]
-    lazy = osmesa.Renderer(throttle=0.01)
+    lazy = osmesa.OpenGLRenderer(throttle=0.01)
     for degrees, sorts in ((0, 1), (5, 1), (8, 1), (8.2, 2), (3, 2), (0, 3)):
         image = lazy.draw(shown, turned(degrees), RasterSettings(sort="z"))
         assert lazy.sorts == sorts, degrees
@@ -278,7 +278,7 @@ def test_a_throttle_sorts_anew_only_after_a_large_turn() -> None:
     assert lazy.sorts == 5
     lazy.draw(SPLATS["merged"], turned(0, away=1), RasterSettings(sort="radial"))
     assert lazy.sorts == 6
-    eager = osmesa.Renderer()
+    eager = osmesa.OpenGLRenderer()
     for _ in range(3):
         eager.draw(shown, turned(0), RasterSettings())
     assert eager.sorts == 3
