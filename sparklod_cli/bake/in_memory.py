@@ -15,7 +15,7 @@ from ..model.scene import Scene
 from ..model.splats import Splats
 from ..support.parallel import on_threads
 from ..support.progress import Progress
-from .output import BakeOutput, FileOutput, output_of_kept
+from .output import BakeOutput, FileOutput, output_of_existing_tree
 from .records import BuiltTree, Clock
 from .selecting import read_environment, select, split_environment, transformed
 from .settings import BakeSettings
@@ -52,7 +52,7 @@ class InMemory:
         )
         antialiased, up = scene.antialiased, settings.up_of(scene.up)
         if scene.tree is not None:
-            tree.output, tree.is_ordered = output_of_kept(self.output, self.source, scene, settings)
+            tree.output, tree.is_ordered = output_of_existing_tree(self.output, self.source, scene, settings)
             tree.splats = int(np.count_nonzero(scene.tree.is_leaf))
             tree.nodes = Scene(scene.splats, scene.tree, antialiased, up=up)
             self.clock.end("read")

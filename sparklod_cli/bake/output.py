@@ -70,7 +70,9 @@ def output_of(target: Place, settings: BakeSettings, *, overwrite: bool) -> Bake
     return FileOutput(form, settings.options, write, in_chunks=settings.suffix == RAD)
 
 
-def output_of_kept(output: BakeOutput, source: Source, scene: Scene, settings: BakeSettings) -> tuple[BakeOutput, bool]:
+def output_of_existing_tree(
+    output: BakeOutput, source: Source, scene: Scene, settings: BakeSettings
+) -> tuple[BakeOutput, bool]:
     """Return the output of an input that has a tree, which is kept, and whether its nodes are in order already.
 
     Nodes keep their opacities. In the same format, what was not chosen of how to write is that of the file, and nodes

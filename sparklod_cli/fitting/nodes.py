@@ -53,7 +53,7 @@ class FittedNodes:
         view = CutView(camera.camera_to_world, camera.fov_x, camera.fov_y)
         return self._traversal.cut(view, budget=budget).indices()[0].astype(np.int64)
 
-    def seen(self, index: Index, camera: Camera) -> tuple[Index, ShadedSplats]:
+    def visible(self, index: Index, camera: Camera) -> tuple[Index, ShadedSplats]:
         """Return those of some nodes that a camera may see, and how it sees them."""
         now = self.columns
         whole = ShadedSplats(now.center, now.scale, now.quat_xyzw, now.lod_opacity, now.rgb)

@@ -52,7 +52,7 @@ class Optimiser:
     def step(self, picture: FullDetailPicture, index: Index, rates: adam.Rates) -> Index:
         """Take one step for a picture of a cut; return the nodes that it showed."""
         nodes, camera = self.nodes, picture.camera
-        seen, shaded = nodes.seen(index, camera)
+        seen, shaded = nodes.visible(index, camera)
         drawing = gradients.draw(shaded, camera, nodes.raster)
         by_image, error = picture.gradient(drawing.image)
         found = drawing.gradients(by_image)

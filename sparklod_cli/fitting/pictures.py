@@ -70,7 +70,7 @@ def pictures(cameras: Iterator[Camera], nodes: FittedNodes) -> Iterator[FullDeta
     """Yield the pictures of full detail of cameras that see enough to compare cuts by; end if hardly any does."""
     misses = 0
     for camera in cameras:
-        full = draw(nodes.seen(nodes.leaves, camera)[1], camera, nodes.raster)
+        full = draw(nodes.visible(nodes.leaves, camera)[1], camera, nodes.raster)
         if full[..., 3].mean() >= COVERED and on_background(full, 0.5).std(axis=(0, 1)).max() >= VARIED:
             misses = 0
             yield FullDetailPicture(camera, full)
@@ -85,7 +85,7 @@ def scores_of(nodes: FittedNodes, held_out: Sequence[FullDetailPicture]) -> Scor
     for share in SHARES if held_out else ():
         psnr: list[float] = []
         for picture in held_out:
-            _, shaded = nodes.seen(nodes.cut(picture.camera, share), picture.camera)
+            _, shaded = nodes.visible(nodes.cut(picture.camera, share), picture.camera)
             psnr += map(psnr_of, picture.errors(draw(shaded, picture.camera, nodes.raster)))
         scores[share] = float(np.mean(psnr))
     return scores

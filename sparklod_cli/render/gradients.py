@@ -51,7 +51,7 @@ class Drawing:
     splats: ShadedSplats
     camera: Camera
     settings: RasterSettings
-    seen: Projected
+    projected: Projected
     tiles: Tiles
 
     def gradients(self, by_image: Image) -> SplatGradients:
@@ -65,7 +65,7 @@ class Drawing:
                 multiplied by alpha, and by alpha.
         """
         across, _ = rasterizer.tiles_across(self.camera)
-        screen, boxes = self.seen.screen, self.seen.boxes
+        screen, boxes = self.projected.screen, self.projected.boxes
         first = backward.first_rows(boxes)
         sums = np.empty((first[-1], backward.SUMS), np.float32)
         drawn = backward.Drawn(screen, boxes, self.tiles.start, self.tiles.splats, self.tiles.stop, across)

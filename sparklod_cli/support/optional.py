@@ -113,7 +113,7 @@ class Required:
         return self.version is None or bool(self.least and Version(self.version) < Version(self.least))
 
     @property
-    def found(self) -> str:
+    def state(self) -> str:
         """Return the state for display: "2.4.6", "is missing", or "1.20, older than 1.26"."""
         if self.version is None:
             return "is missing"

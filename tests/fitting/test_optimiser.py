@@ -34,7 +34,7 @@ def picture_of(nodes: FittedNodes) -> FullDetailPicture:
 
 
 def error(nodes: FittedNodes, picture: FullDetailPicture) -> float:
-    _, shaded = nodes.seen(nodes.cut(picture.camera, SHARE), picture.camera)
+    _, shaded = nodes.visible(nodes.cut(picture.camera, SHARE), picture.camera)
     return sum(picture.errors(draw(shaded, picture.camera, nodes.raster)))
 
 

@@ -19,8 +19,9 @@ from sparklod_cli.render import rasterizer
 from sparklod_cli.render.gradients import SplatGradients, by_sh, draw
 from sparklod_cli.render.settings import SORTS, RasterSettings
 from sparklod_cli.render.shading import ShadedSplats, shade
+from sparklod_cli.support.parallel import on_threads
 from tests.references import spark_pictures
-from tests.render.test_rasterizer import camera_at, joined, one, rows, shown, threads
+from tests.render.test_rasterizer import camera_at, joined, one, rows, shown
 from tests.scenes import random_splats
 
 LOOK = RasterSettings()
@@ -224,7 +225,7 @@ def test_threads_do_not_change_a_bit_of_a_gradient() -> None:
     weights = np.random.default_rng(0).normal(size=(150, 200, 4)).astype(np.float32)
     found = []
     for count in (1, 2):
-        with threads(count):
+        with on_threads(count):
             gradients = draw(scene, camera, LOOK).gradients(weights)
         found.append([getattr(gradients, name).tobytes() for name in PROPERTIES])
     assert found[0] == found[1]

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -19,7 +17,7 @@ from sparklod_cli.model.splats import Splats
 from sparklod_cli.render.rasterizer import Image, draw
 from sparklod_cli.render.settings import PROFILES, SORTS, RasterSettings
 from sparklod_cli.render.shading import ShadedSplats, shade
-from sparklod_cli.support import jit
+from sparklod_cli.support.parallel import on_threads
 from tests.references import spark_pictures
 from tests.scenes import random_splats
 
@@ -88,15 +86,6 @@ def check(
     assert np.abs(difference).max(initial=0) <= most
     assert np.square(difference).mean() <= 10 ** (-LEAST_PSNR / 10)
     return image
-
-
-@contextmanager
-def threads(count: int) -> Iterator[None]:
-    jit.use_threads(count)
-    try:
-        yield
-    finally:
-        jit.use_threads(256)
 
 
 @pytest.mark.parametrize("sort", SORTS)
@@ -217,7 +206,7 @@ def test_threads_do_not_change_a_bit_of_a_picture(profile: str) -> None:
     scene = shown(5000, most=3.0, seed=11)
     pictures = []
     for count in (1, 2, 3):
-        with threads(count):
+        with on_threads(count):
             pictures.append(draw(scene, camera, RasterSettings(profile=profile)).tobytes())
     assert pictures[0] == pictures[1] == pictures[2]
 

@@ -86,7 +86,7 @@ class ClusterEngine:
                         submit(heir)
 
     @contextlib.contextmanager
-    def each(
+    def map_calls(
         self, stage: str, call: Callable[..., Any], arguments: Sequence[tuple[Any, ...]], progress: Progress, unit: str
     ) -> Iterator[Iterator[Any]]:
         """Call a function with each tuple of arguments, side by side, until the context ends.

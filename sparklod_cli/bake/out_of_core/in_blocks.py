@@ -125,8 +125,8 @@ class InBlocks:
             parts = [Findings.from_arrays(each) for each in arrays]
             findings = Findings.merged(parts)
             check_findings(findings, job.settings)
-            kept = tuple(itertools.accumulate((part.tally.kept for part in parts), initial=0))
-            self.job = job = dataclasses.replace(job, kept=kept)
+            selected = tuple(itertools.accumulate((part.tally.kept for part in parts), initial=0))
+            self.job = job = dataclasses.replace(job, selected=selected)
             largest = int(np.sum([np.diff(each["first"]) for each in arrays], axis=0).max())
             again = cut_into_blocks(findings.sample[:, :3], findings.tally.kept, block_splats)
             if largest <= SLACK * block_splats or job.round + 1 == ROUNDS or again == job.blocks:
@@ -140,7 +140,7 @@ def _stages(job: Job) -> Iterator[Task]:
     """Yield the tasks of all stages, and those that remove what they no longer need, as soon as that can be."""
     blocks = job.blocks
     ends = {group.stop - 1: number for number, group in enumerate(blocks.groups)}
-    share = job.kept[-1] // blocks.count
+    share = job.selected[-1] // blocks.count
     begun = {stage.block: stage_of(stage.number) for stage in blocks.stages}
     for stage in blocks.stages:
         needs = tuple(stage_of(child) for child in stage.children)
@@ -206,7 +206,7 @@ def block_of(job: Job, block: int, threads: int) -> tuple[Splats, NDArray[np.int
         here, name = slice(at, at + stop - start), job.splats(part, group)
         rows[here] = job.store.rows(name, "rows", start, stop)
         index[here] = job.store.rows(name, "index", start, stop)
-        index[here] += job.kept[part]
+        index[here] += job.selected[part]
         at = here.stop
     return splats_of(rows, threads), index
 

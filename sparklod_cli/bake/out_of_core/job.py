@@ -29,7 +29,7 @@ class Job:
         parts: where each part of the input begins, and at last the count; none before that is known.
         blocks: that the scene is cut into; none before that is known.
         round: how often it was cut before.
-        kept: how many splats of the parts before each part are kept; empty before that is known.
+        selected: how many splats of the parts before each part are selected; empty before that is known.
         plan: of the builder; None before it is known.
         families: how many each stage made, by its number; empty before they are known.
         encoder: of the output; None before the statistics of all nodes are known.
@@ -43,7 +43,7 @@ class Job:
     parts: tuple[int, ...] = ()
     blocks: BlockDivision = NO_BLOCKS
     round: int = 0
-    kept: tuple[int, ...] = ()
+    selected: tuple[int, ...] = ()
     plan: Any = None
     families: tuple[int, ...] = ()
     encoder: Encoder | None = None

@@ -105,7 +105,7 @@ def test_other_errors_come_through_for_those_who_mend_them(engine: ClusterEngine
 def test_calls_side_by_side_give_results_and_failures_in_order(engine: ClusterEngine) -> None:
     told: list[tuple[str, int, int, str]] = []
     arguments = [(number,) for number in range(6)]
-    with engine.each("baking", made_up.twice, arguments, lambda *args: told.append(args), "scene") as outcomes:
+    with engine.map_calls("baking", made_up.twice, arguments, lambda *args: told.append(args), "scene") as outcomes:
         found = list(outcomes)
     assert [each if isinstance(each, int) else str(each) for each in found] == [0, 2, 4, "no 3", 8, 10]
     assert isinstance(found[3], ScratchError)
@@ -126,9 +126,9 @@ def test_a_result_that_is_lost_with_its_worker_is_waited_for(engine: ClusterEngi
 
 
 def test_calls_that_nobody_waits_for_are_cancelled(engine: ClusterEngine) -> None:
-    with engine.each("baking", made_up.twice, [(0,)] * 100, silent, "scene") as outcomes:
+    with engine.map_calls("baking", made_up.twice, [(0,)] * 100, silent, "scene") as outcomes:
         assert next(outcomes) == 0
-    with engine.each("baking", made_up.twice, [(21,)], silent, "scene") as outcomes:
+    with engine.map_calls("baking", made_up.twice, [(21,)], silent, "scene") as outcomes:
         assert list(outcomes) == [42]
 
 
