@@ -37,7 +37,7 @@ MEASURERS = 4
 
 
 @dataclass(frozen=True, eq=False)
-class Pictures:
+class PicturePair:
     """A cut's picture and that of full detail, of one camera.
 
     Attributes:
@@ -52,7 +52,7 @@ class Pictures:
     image: Image
     full: Image
     edges: Mask
-    before: Pictures | None
+    before: PicturePair | None
 
 
 class Comparison:
@@ -61,8 +61,6 @@ class Comparison:
     Args:
         scenes: trees alone, read with all columns of their splats.
         lod: settings of the cuts but for the budget.
-        budgets: at least one.
-        render: how the pictures are drawn.
         full: what full detail is; the leaves of the trees unless given.
 
     Attributes:
@@ -98,7 +96,7 @@ class Comparison:
 
         Cells of `popping` are empty where a camera does not follow the one before it (`CameraPath.follows`).
 
-        Pictures are drawn one after the other, each on all the threads; meanwhile others are measured.
+        PicturePair are drawn one after the other, each on all the threads; meanwhile others are measured.
 
         Raises:
             SparklodError: full detail covers no pixel of a frame.
@@ -108,8 +106,8 @@ class Comparison:
             progress("compare", at + 1, total, "picture")
             yield row
 
-    def _pictures(self, path: CameraPath, threads: int) -> Iterator[Pictures]:
-        last: list[Pictures] = []
+    def _pictures(self, path: CameraPath, threads: int) -> Iterator[PicturePair]:
+        last: list[PicturePair] = []
         for at, (number, camera) in enumerate(zip(path.numbers, path.cameras, strict=True)):
             with on_threads(threads):
                 full = self._full.draw(camera).image
@@ -127,12 +125,12 @@ class Comparison:
                     "selected": drawn.splats,
                 }
                 before = replace(last[which], before=None) if follows else None
-                frame.append(Pictures(row, drawn.image, full, where, before))
+                frame.append(PicturePair(row, drawn.image, full, where, before))
                 yield frame[-1]
             last = frame
 
 
-def measured(pictures: Pictures) -> Row:
+def measured(pictures: PicturePair) -> Row:
     """Return the row of a comparison: what was known of the pictures, and how far they are apart."""
     row, before = pictures.row, pictures.before
     tiles = []

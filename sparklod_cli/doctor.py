@@ -71,11 +71,7 @@ class Check:
 
 
 def check_all(begun: Callable[[str], None] = lambda name: None) -> list[Check]:
-    """Look at everything, in the order in which a person would; takes some seconds.
-
-    Args:
-        begun: is told what is about to be looked at.
-    """
+    """Look at everything, in the order in which a person would; takes some seconds."""
     found: list[Check] = []
     parts: list[tuple[str, Callable[[], Iterator[Check]]]] = [
         ("versions", _versions),

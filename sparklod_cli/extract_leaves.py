@@ -11,7 +11,7 @@ import numpy as np
 from .codecs import clamps
 from .codecs.formats import WRITABLE
 from .codecs.options import WriteOptions
-from .codecs.spz_encoder import like
+from .codecs.spz import like
 from .codecs.validation import check_scene
 from .io import read_scene, scene_sink
 from .model.scene import Scene
@@ -76,7 +76,6 @@ def extract_leaves(
 
     Args:
         source: a Level-of-Detail file; - is standard input.
-        target: of any name; - is standard output.
         options: how to write; what is None is taken from the input, which keeps its values as they are.
         suffix: of the format, one of `WRITABLE`.
 

@@ -78,7 +78,6 @@ def warm_up(*, processes: int, progress: Progress = silent) -> int:
 
     Args:
         processes: number of processes to compile in, since numba compiles one kernel at a time in each.
-        progress: is called with the number of compiled kernels.
 
     Raises:
         SparklodError: no cache can be written, or a kernel cannot be compiled.
@@ -115,7 +114,6 @@ class _Child:
 
     Args:
         modules: what is left to compile, by module; children share it.
-        cache: value of NUMBA_CACHE_DIR.
 
     Attributes:
         compiled: number of kernels that it has compiled.

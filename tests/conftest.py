@@ -23,6 +23,9 @@ settings.load_profile("sparklod")
 
 ROOT = Path(__file__).resolve().parents[1]
 FIXTURES = ROOT / "fixtures"
+
+#: What a test that reads its own standard output and error takes.
+Capture = pytest.CaptureFixture[str]
 #: Real scenes, which are not part of the repository: where SPARKLOD_SCENES says, or beside the checkout.
 SCENES = Path(os.environ.get("SPARKLOD_SCENES") or ROOT.parent / "shared" / "scenes")
 #: Root may read and write everything, whatever the permissions.

@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..inspection import checking
-from ..inspection.checking import CheckSettings as CheckSettings
-from ..io import check_writable, write_whole
-from ..support.errors import SparklodError, memory_errors_translated
+from ..inspection import expectations, leaves
+from ..inspection.expectations import Expectations
+from ..inspection.findings import Finding
+from ..inspection.report import Report, ReportSettings, inspect
+from ..io import check_writable, read_scene, write_whole
+from ..model.scene import Scene
+from ..support.errors import FormatError, SparklodError, memory_errors_translated
 from ..support.parallel import on_threads
-from ..support.progress import Progress, silent
+from ..support.progress import Progress
 from ..tables.output import TableOutput
 
 if TYPE_CHECKING:
-    from ..figures.tree_plot import Picture
-    from ..inspection.html import Section
-    from ..inspection.report import Report
-    from ..model.scene import Scene
+    from ..figures.tree_plot import DescribedPicture
+    from ..inspection.html import FileSection
 
 
 #: Width and height of the thumbnail on a page, pixels; the splats of the cut that it shows; and the most splats of a
@@ -28,10 +30,14 @@ THUMBNAIL, THUMBNAIL_BUDGET, MOST_SPLATS = (512, 384), 200_000, 3_000_000
 
 
 @dataclass(frozen=True)
-class DrawSettings:
-    """Outputs of an inspection besides the report: histograms, a picture, a section of the page, a table of chunks.
+class InspectSettings:
+    """What to report on files and to check, and the outputs besides: histograms, a picture, a page, a table of chunks.
 
     Attributes:
+        report: contents of the report.
+        expected: expectations that a file must meet.
+        original: the scene whose splats the leaves must equal.
+        everything: report findings of all severities; otherwise a file with expectations has errors only.
         histograms: quantities that are drawn as text.
         plot: file of a picture.
         depth: of the nodes in the picture; None for the leaves.
@@ -39,27 +45,48 @@ class DrawSettings:
         html: file of a page, which `write_page` writes.
         overwrite: replace files that exist.
         chunks: where the table of the chunks goes; None for nowhere.
+        threads: to work on.
+        progress: called with how much is done.
     """
 
+    report: ReportSettings
+    expected: Expectations | None
+    original: Scene | None
+    everything: bool
     histograms: tuple[str, ...]
     plot: Path | None
     depth: int | None
     by: str
     html: Path | None
     overwrite: bool
-    chunks: TableOutput | None = None
+    chunks: TableOutput | None
+    threads: int
+    progress: Progress
 
-    def check(self) -> None:
-        """Raise a `SparklodError` where a file cannot be written or drawn, before anything is read."""
-        if self.chunks is not None:
-            self.chunks.check()
-        for target in (self.plot, self.html):
-            if target is not None:
-                check_writable(target, overwrite=self.overwrite)
-        if self.plot is not None:
-            from ..figures.pyvista_scene import load_pyvista
 
-            load_pyvista()
+def check_outputs(plot: Path | None, html: Path | None, chunks: TableOutput | None, *, overwrite: bool) -> None:
+    """Raise a `SparklodError` where a file cannot be written or drawn, before anything is read."""
+    if chunks is not None:
+        chunks.check()
+    for target in (plot, html):
+        if target is not None:
+            check_writable(target, overwrite=overwrite)
+    if plot is not None:
+        from ..figures.pyvista_scene import load_pyvista
+
+        load_pyvista()
+
+
+def read_original(path: Path, *, threads: int, progress: Progress) -> Scene:
+    """Read the scene whose splats the leaves must equal.
+
+    Raises:
+        FormatError: the file cannot be read; names it.
+    """
+    try:
+        return read_scene(path, threads=threads, progress=progress)
+    except FormatError as error:
+        raise FormatError(f"{path}: {error}") from None
 
 
 @dataclass(frozen=True)
@@ -77,60 +104,71 @@ class Inspected:
     report: Report
     histograms: dict[str, str]
     picture: tuple[str, int] | None
-    section: Section | None
+    section: FileSection | None
     problem: str | None
 
 
-def inspect_file(
-    path: Path, settings: CheckSettings, drawn: DrawSettings, *, threads: int = 1, progress: Progress = silent
-) -> Inspected:
+def inspect_file(path: Path, settings: InspectSettings) -> Inspected:
     """Report on a file, check it and draw it.
 
     Args:
         path: of a file that is read, or of a .npz of arrays; - is standard input.
-        settings: what to look for.
-        drawn: what to draw.
-        threads: to work on.
-        progress: is told how much is done.
 
     Raises:
         OutOfMemoryError: it does not fit into memory.
-        OutputError: `drawn.plot` cannot be written.
+        OutputError: `settings.plot` cannot be written.
     """
-    with memory_errors_translated(), on_threads(threads):
-        report, scene = checking.inspect(path, settings, threads=threads, progress=progress)
-        if drawn.chunks is not None and report.chunks is not None:
-            drawn.chunks.write(report.chunks)
-        picture, problem = _picture(report, scene, drawn)
+    with memory_errors_translated(), on_threads(settings.threads):
+        report, scene = inspect(path, settings.report, threads=settings.threads, progress=settings.progress)
+        report = _checked(report, scene, settings)
+        if settings.chunks is not None and report.chunks is not None:
+            settings.chunks.write(report.chunks)
+        picture, problem = _picture(report, scene, settings)
         size = None
-        if picture is not None and drawn.plot is not None:
-            size = picture.description, write_whole(drawn.plot, [picture.png], overwrite=drawn.overwrite)
+        if picture is not None and settings.plot is not None:
+            size = picture.description, write_whole(settings.plot, [picture.png], overwrite=settings.overwrite)
         section = None
-        if drawn.html is not None:
+        if settings.html is not None:
             from ..inspection.html import section_of
 
-            thumbnail = None if scene is None else _thumbnail(report, scene, threads)
+            thumbnail = None if scene is None else _thumbnail(report, scene, settings.threads)
             section = section_of(report, scene, picture, thumbnail)
-        return Inspected(report, _histograms(scene, drawn.histograms), size, section, problem)
+        return Inspected(report, _histograms(scene, settings.histograms), size, section, problem)
 
 
-def _picture(report: Report, scene: Scene | None, drawn: DrawSettings) -> tuple[Picture | None, str | None]:
+def _checked(report: Report, scene: Scene | None, settings: InspectSettings) -> Report:
+    """Return a report whose findings include expectations that are not met."""
+    expected, original = settings.expected, settings.original
+    if report.format is None or not (settings.everything or expected is not None or original is not None):
+        return report
+    findings = [each for each in report.findings or [] if settings.everything or each.severity == "error"]
+    if expected is not None:
+        findings += expectations.check(report, expected)
+    if original is not None:
+        nothing = [Finding("expect.leaves", "the file does not contain all of its splats, so they cannot be compared")]
+        findings += nothing if scene is None else leaves.check(scene, original, report.rad)
+    return dataclasses.replace(report, findings=findings)
+
+
+def _picture(
+    report: Report, scene: Scene | None, settings: InspectSettings
+) -> tuple[DescribedPicture | None, str | None]:
     """Return the picture that is wanted, or why there is none."""
-    if (drawn.plot is None and drawn.html is None) or report.format is None:
+    if (settings.plot is None and settings.html is None) or report.format is None:
         return None, None
     if scene is None:
         return None, "it does not hold all of its splats, so they cannot be drawn"
     from ..figures import tree_plot
 
     try:
-        return tree_plot.plot(scene, by=drawn.by, depth=drawn.depth), None
+        return tree_plot.plot(scene, by=settings.by, depth=settings.depth), None
     except SparklodError as error:
         return None, str(error)
 
 
-def _thumbnail(report: Report, scene: Scene, threads: int) -> Picture | None:
+def _thumbnail(report: Report, scene: Scene, threads: int) -> DescribedPicture | None:
     """Return the scene as a viewer draws it; None where it is broken, or too large to be drawn at once."""
-    from ..figures.tree_plot import Picture
+    from ..figures.tree_plot import DescribedPicture
     from ..inspection.arrays import NO_CHILDREN
     from .cameras import orbit
     from .files import as_tree
@@ -152,7 +190,7 @@ def _thumbnail(report: Report, scene: Scene, threads: int) -> Picture | None:
     except SparklodError:
         return None
     what = "all splats" if scene.tree is None else f"a cut of at most {THUMBNAIL_BUDGET:,} splats"
-    return Picture(show(image).png, f"The scene from its front; {what}")
+    return DescribedPicture(show(image).png, f"The scene from its front; {what}")
 
 
 def _histograms(scene: Scene | None, names: Sequence[str]) -> dict[str, str]:
@@ -165,7 +203,7 @@ def _histograms(scene: Scene | None, names: Sequence[str]) -> dict[str, str]:
     return {name: as_text(values.histogram_of(scene.splats, name)) for name in names if name in held}
 
 
-def write_page(path: Path, sections: Sequence[Section], *, overwrite: bool) -> int:
+def write_page(path: Path, sections: Sequence[FileSection], *, overwrite: bool) -> int:
     """Write the page of some files, and return its bytes."""
     from ..inspection.html import page
 

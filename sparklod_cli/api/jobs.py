@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from ..cameras.frame import Settings
     from ..cameras.path import CameraPath
     from ..cameras.sources import CameraSource
-    from ..images.output import Output
-    from ..images.sequence import Pictures, PictureSettings
+    from ..images.output import PictureOutput
+    from ..images.sequence import PictureSettings, WrittenPictures
     from ..lod.budget import Budget
     from ..lod.settings import LodSettings
     from ..model.instances import Instance
@@ -110,7 +110,7 @@ class UnfitError(ValueError):
 
 
 @dataclass(frozen=True)
-class Drawn:
+class DrawnPath:
     """Result of rendering a camera path.
 
     Attributes:
@@ -120,9 +120,9 @@ class Drawn:
         render: how they were drawn.
     """
 
-    pictures: Pictures
+    pictures: WrittenPictures
     path: CameraPath
-    output: Output
+    output: PictureOutput
     render: RenderSettings
 
 
@@ -131,30 +131,25 @@ def draw_files(
     budget: Budget | None,
     lod: LodSettings,
     render: RenderSettings,
-    place: Callable[[CameraPath], tuple[Output, PictureSettings]],
+    place: Callable[[CameraPath], tuple[PictureOutput, PictureSettings]],
     *,
     fit_planes: bool,
     through: str | None = None,
     loading: tuple[StreamingSettings, float] | None = None,
     reference: Path | None = None,
     overwrite: bool = False,
-    ready: Callable[[CameraPath, Scenes], None] = lambda path, scenes: None,
-) -> Drawn:
+    ready: Callable[[CameraPath, Scenes], None],
+) -> DrawnPath:
     """Draw files and write the pictures.
 
     Args:
-        files: splat files, and the cameras that look at them.
         budget: of the cuts; None draws full detail.
-        lod: settings of the cuts, but for the budget.
-        render: how pictures are drawn.
         place: tells where the pictures of some cameras go and how they become files; is asked before a file is read,
             if the cameras do not depend on one.
-        fit_planes: move the near and the far plane apart where cameras are chosen for the scenes.
         through: one of `rounding.ROUND_TRIPS`, after which splats are drawn.
         loading: how chunks get to the viewer, and how many seconds after a page was opened pictures are of, each of a
             visitor who opened it in front of that camera; None where every chunk is there.
         reference: the file whose pictures are compared with these: the difference is written.
-        overwrite: replace files that exist.
         ready: called with the cameras and the scenes before the first picture is drawn.
 
     Raises:
@@ -179,7 +174,7 @@ def draw_files(
     pictures = write_pictures(
         source, path, output, render, settings, reference=other, overwrite=overwrite, progress=files.progress
     )
-    return Drawn(pictures, path, output, render)
+    return DrawnPath(pictures, path, output, render)
 
 
 def _source(
@@ -243,22 +238,14 @@ def compare_files(
     asserts: Sequence[tuple[int | None, Assertion]] = (),
     plot: Path | None = None,
     overwrite: bool = False,
-    ready: Callable[[CameraPath, Scenes], None] = lambda path, scenes: None,
+    ready: Callable[[CameraPath, Scenes], None],
     passed: Filter | None = None,
 ) -> Compared:
     """Measure how far cuts of files are from full detail, and write the table and the charts.
 
     Args:
-        files: splat files, and the cameras that look at them.
-        budgets: at least one.
-        lod: settings of the cuts, but for the budget.
-        render: how pictures are drawn.
         table: where the rows go, at once when all are known.
-        fit_planes: move the near and the far plane apart where cameras are chosen for the scenes.
         asserts: assertions, each with the index of its budget; None for all budgets.
-        plot: file of the charts; None for none.
-        overwrite: replace files that exist.
-        ready: called with the cameras and the scenes before the first picture is drawn.
         passed: what the bytes of the table are passed through on their way to standard output.
 
     Raises:
@@ -307,22 +294,14 @@ def traverse_files(
     *,
     by_instance: bool = False,
     asserts: Sequence[Assertion] = (),
-    ready: Callable[[CameraPath, Scenes], None] = lambda path, scenes: None,
+    ready: Callable[[CameraPath, Scenes], None],
     passed: Filter | None = None,
     bar: bool = True,
 ) -> Traversed:
     """Simulate what a viewer draws of files along a path, and write what is made of the frames.
 
     Args:
-        files: splat files, and the cameras that look at them.
-        budget: of the cuts.
-        lod: settings of the cuts, but for the budget.
-        streaming: how chunks get to the viewer.
-        outputs: where the frames go.
         by_instance: make rows of single instances, too.
-        asserts: assertions on the table.
-        ready: called with the cameras and the scenes before the first frame.
-        passed: what the bytes of the table are passed through on their way to standard output.
         bar: tell how many frames are done.
 
     Raises:

@@ -20,9 +20,8 @@ from ..support.printable import MOST, shortened
 from ..support.stdin import DASH, name_of
 from .build_lod_files import FORMS, VERIFY, BakedFiles, check_formats, check_inputs, record_of
 from .build_lod_text import report_baked, report_extracted
-from .command import Command
 from .console import Console, say
-from .option_groups import COMMON, check_declared, exclude, flags_set, is_set, parameters_of, values_of, with_options
+from .option_groups import COMMON, check_declared, command, exclude, flags_set, is_set, parameters_of, values_of
 from .options.baking import (
     OF_TREES,
     ClusterOptions,
@@ -49,9 +48,7 @@ if TYPE_CHECKING:
     #: Makes the outputs of inputs, and yields what came of each, in order.
     Make = Callable[[Sequence[tuple[Source, Place]]], Iterator[Outcome | SparklodError]]
 
-EXAMPLES = """
-\b
-Examples:
+EXAMPLES = """\
   sparklod build-lod scene.ply                          # writes scene-lod.spz
   sparklod build-lod scene.ply --up -y                  # y up, as viewers want it
   sparklod build-lod scene.ply --method quality         # for publishing
@@ -131,9 +128,7 @@ HEADINGS = (
 )
 
 
-@click.command("build-lod", cls=Command, headings=HEADINGS, epilog=EXAMPLES, context_settings={"show_default": True})
-@with_options(BuildLodOptions)
-@click.pass_context
+@command("build-lod", BuildLodOptions, examples=EXAMPLES, headings=HEADINGS)
 def build_lod(ctx: click.Context, /, **_: Any) -> None:
     """Bake splat files into Level-of-Detail files for Spark, PlayCanvas, SuperSplat and Babylon.js.
 

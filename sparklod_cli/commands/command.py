@@ -43,8 +43,6 @@ class Option(click.Option):
     """An option that stands under a heading of `--help`.
 
     Args:
-        declared: its declaration.
-        heading: of `--help`.
         bare: its value where it stands alone; another one follows after "=", never as the next argument.
     """
 

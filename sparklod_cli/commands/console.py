@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from time import monotonic
 from types import TracebackType
@@ -13,6 +13,7 @@ from typing import Any, TextIO
 
 import click
 
+from ..support import interrupts
 from ..support.printable import MOST, printable
 from ..support.stdout import silence
 from ..support.units import count_of as count_of
@@ -162,60 +163,41 @@ class Console:
             self.say(f"{stage}: {amount} ({100 * done / total:.0f} %), {now - self._stage_start:.0f} s")
 
     def announce_compiling(self) -> None:
-        """Print messages about kernels that are compiled, until this console ends."""
-        self._ended.callback(_CompilingReporter(self).listen())
+        """Announce the first kernel that is compiled, show a bar, and print at the end how long all of them took.
 
-
-class _CompilingReporter:
-    """Announces the first kernel that is compiled, shows a bar, and prints at the end how long all of them took.
-
-    Args:
-        console: prints it.
-    """
-
-    def __init__(self, console: Console) -> None:
-        self._console = console
-        self._begun = self._done = 0
-        self._seconds = 0.0
-        self._troubles: set[str] = set()
-
-    def listen(self) -> Callable[[], None]:
-        """Start listening to the compiler; return the function that stops it."""
+        What is wrong with the cache is wrong for every kernel, and printed once.
+        """
         from ..support import jit
 
-        stop = jit.listen(self._begin, self._end, self._say_once)
+        begun, seconds, troubles = [], [], set[str]()
+
+        def show() -> None:
+            self.progress("compiling", len(seconds), 0, "kernel")  # how many a command needs is not known
+
+        def begin(name: str) -> None:
+            interrupts.leave_if_lost()
+            if not begun:
+                from ..warmup import missing
+
+                advance = f"once; sparklod warmup compiles all {len(missing())} in advance"
+                often = advance if jit.CACHE_FOLDER else "in every run: no cache can be written"
+                self.say(f"Compiling kernels for this machine, half a minute or less ({often}) ...")
+            begun.append(name)
+            show()
+
+        def end(duration: float) -> None:
+            seconds.append(duration)
+            show()
+
+        def say_once(trouble: str) -> None:
+            if trouble not in troubles:
+                troubles.add(trouble)
+                self.say(trouble)
 
         def close() -> None:
             stop()
-            if self._done:
-                self._console.say(f"compiled {count_of(self._done, 'kernel')} in {self._seconds:.1f} s")
+            if seconds:
+                self.say(f"compiled {count_of(len(seconds), 'kernel')} in {sum(seconds):.1f} s")
 
-        return close
-
-    def _say_once(self, trouble: str) -> None:
-        """Print each trouble once: what is wrong with the cache is wrong for every kernel."""
-        if trouble not in self._troubles:
-            self._troubles.add(trouble)
-            self._console.say(trouble)
-
-    def _begin(self, _name: str) -> None:
-        if not self._begun:
-            self._announce()
-        self._begun += 1
-        self._show()
-
-    def _announce(self) -> None:
-        from ..support import jit
-        from ..warmup import missing
-
-        advance = f"once; sparklod warmup compiles all {len(missing())} in advance"
-        often = advance if jit.CACHE_FOLDER else "in every run: no cache can be written"
-        self._console.say(f"Compiling kernels for this machine, half a minute or less ({often}) ...")
-
-    def _end(self, seconds: float) -> None:
-        self._done += 1
-        self._seconds += seconds
-        self._show()
-
-    def _show(self) -> None:
-        self._console.progress("compiling", self._done, 0, "kernel")  # how many a command needs is not known
+        stop = jit.listen(begin, end, say_once)
+        self._ended.callback(close)

@@ -10,17 +10,14 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ..support.printable import printable
-from .command import Command
 from .console import count_of
-from .option_groups import values_of, with_options
+from .option_groups import command, values_of
 from .options.common import Messages, quiet_flag, verbose_flag
 
 if TYPE_CHECKING:
     from ..doctor import Check
 
-EXAMPLES = """
-\b
-Examples:
+EXAMPLES = """\
   sparklod doctor
   sparklod doctor --quiet || exit 1                       # in CI
   sparklod doctor --json > doctor.json                    # to attach to a report
@@ -33,9 +30,7 @@ class _Messages(Messages):
     verbose: bool = verbose_flag("Print what is being checked.")
 
 
-@click.command("doctor", cls=Command, epilog=EXAMPLES)
-@with_options(_Messages)
-@click.pass_context
+@command("doctor", _Messages, examples=EXAMPLES)
 def doctor(ctx: click.Context, /, **_: Any) -> None:
     """Check the installation: packages, extras, OpenGL, compiled kernels, threads and memory.
 

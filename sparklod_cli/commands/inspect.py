@@ -14,24 +14,20 @@ import click
 from ..support.errors import OutOfMemoryError, SparklodError, StdoutError
 from ..support.printable import printable
 from ..support.stdin import name_of
-from .command import Command
 from .console import Console, count_of, size_of
 from .inspect_text import finding_line, lines
-from .option_groups import argument, values_of, with_options
+from .option_groups import argument, command, values_of
 from .options.common import General, quiet_flag
 from .options.inspecting import Checks, InspectOutput, check_usage
 from .paths import InputPath, keep_apart, name_outputs
 
 if TYPE_CHECKING:
-    from ..api.inspect_jobs import DrawSettings, Inspected
-    from ..inspection.checking import CheckSettings
+    from ..api.inspect_jobs import Inspected, InspectSettings
     from ..inspection.expectations import Expectations
-    from ..inspection.html import Section
+    from ..inspection.html import FileSection
     from ..inspection.report import Report, ReportSettings
 
-EXAMPLES = """
-\b
-Examples:
+EXAMPLES = """\
   sparklod inspect scene-lod.spz
   sparklod inspect web/*.spz --check --format github      # exit status 3 if one is broken
   sparklod inspect scene-lod.spz --assert 'nodes<5M' --assert 'growth<=1.4' --assert 'bytes<40MB'
@@ -43,7 +39,7 @@ Examples:
 
 
 @dataclass(frozen=True)
-class _General(General):
+class _InspectGeneral(General):
     quiet: bool = quiet_flag("Print only what other options ask for, and errors.")
 
 
@@ -54,12 +50,10 @@ class InspectOptions:
     files: tuple[Path, ...] = argument(InputPath(stdin=True), metavar="FILE...", required=True)
     checks: Checks = dataclasses.field(default_factory=Checks)
     output: InspectOutput = dataclasses.field(default_factory=InspectOutput)
-    general: _General = dataclasses.field(default_factory=_General)
+    general: _InspectGeneral = dataclasses.field(default_factory=_InspectGeneral)
 
 
-@click.command("inspect", cls=Command, epilog=EXAMPLES, context_settings={"show_default": True})
-@with_options(InspectOptions)
-@click.pass_context
+@command("inspect", InspectOptions, examples=EXAMPLES)
 def inspect(ctx: click.Context, /, **_: Any) -> None:
     """Report on splat files and check them.
 
@@ -75,28 +69,31 @@ def inspect(ctx: click.Context, /, **_: Any) -> None:
     keep_apart(ctx)
     check_usage(ctx, len(files), checks, output, as_json=general.as_json)
     with general.console() as console:
-        from ..api.inspect_jobs import CheckSettings, DrawSettings
-        from ..inspection.checking import read_original
+        from ..api.inspect_jobs import InspectSettings, check_outputs, read_original
 
         console.announce_compiling()
-        drawn = DrawSettings(
+        table = output.table()
+        check_outputs(output.plot, output.html, table, overwrite=output.overwrite)
+        expected = checks.expectations()
+        original = None
+        if checks.leaves_of is not None:
+            original = read_original(checks.leaves_of, threads=general.threads, progress=console.progress)
+        settings = InspectSettings(
+            report=_report_settings(checks, output, expected, as_json=general.as_json),
+            expected=expected,
+            original=original,
+            everything=checks.check,
             histograms=output.histogram,
             plot=output.plot,
             depth=output.plot_level,
             by=output.plot_by,
             html=output.html,
             overwrite=output.overwrite,
-            chunks=output.table(),
+            chunks=table,
+            threads=general.threads,
+            progress=console.progress,
         )
-        drawn.check()
-        expected = checks.expectations()
-        original = None
-        if checks.leaves_of is not None:
-            original = read_original(checks.leaves_of, threads=general.threads, progress=console.progress)
-        settings = CheckSettings(
-            _report_settings(checks, output, expected, as_json=general.as_json), expected, original, checks.check
-        )
-        job = _Job(console, general, output, settings, drawn, checks)
+        job = _Job(console, options, settings)
         worst = max(job.inspect(file) for file in files)
         job.write_page()
     if worst:
@@ -135,12 +132,9 @@ class _Job:
     """Inspection of all files with the same settings, and the sections of the page so far."""
 
     console: Console
-    general: General
-    output: InspectOutput
-    settings: CheckSettings
-    drawn: DrawSettings
-    checks: Checks
-    sections: list[Section] = dataclasses.field(default_factory=list)
+    options: InspectOptions
+    settings: InspectSettings
+    sections: list[FileSection] = dataclasses.field(default_factory=list)
 
     def inspect(self, file: Path) -> int:
         """Print the report of a file and return its exit status; one too large for memory does not stop the others."""
@@ -148,9 +142,7 @@ class _Job:
 
         start, name = time.perf_counter(), name_of(file)
         try:
-            inspected = inspect_file(
-                file, self.settings, self.drawn, threads=self.general.threads, progress=self.console.progress
-            )
+            inspected = inspect_file(file, self.settings)
         except OutOfMemoryError as error:
             self.console.error(f"{name}: {error}")
             return 1
@@ -163,9 +155,9 @@ class _Job:
 
     def _report(self, name: str, inspected: Inspected) -> int:
         """Print the results for a file and return the exit status."""
-        report, holds = inspected.report, self.settings.holds
-        status = 3 if holds and report.fails(self.checks.fail_on) else 0
-        if report.format is None and not holds:
+        report, checks = inspected.report, self.options.checks
+        status = 3 if checks.holds and report.fails(checks.fail_on) else 0
+        if report.format is None and not checks.holds:
             status = 1
             for finding in report.findings or []:
                 self.console.error(f"{name}: {finding.message}")
@@ -182,8 +174,8 @@ class _Job:
             click.echo(f"\n  {quantity}\n{text}")
         if inspected.picture is not None:
             description, size = inspected.picture
-            self.console.say(f"{self.drawn.plot}  {description.partition(';')[0]}, {size_of(size)}")
-        elif inspected.problem is not None and self.drawn.plot is not None:
+            self.console.say(f"{self.settings.plot}  {description.partition(';')[0]}, {size_of(size)}")
+        elif inspected.problem is not None and self.settings.plot is not None:
             self.console.error(f"{name}: {inspected.problem}")
             status = max(status, 1)
         elif inspected.problem is not None:
@@ -197,24 +189,24 @@ class _Job:
         if report.chunks is None:
             self.console.error(f"{name}: its chunks cannot be told, for it does not hold all of its splats")
             return 1
-        if self.output.chunks and not self.general.as_json:
+        if self.options.output.chunks and not self.options.general.as_json:
             click.echo("\n".join(lines_of_chunks(report.chunks)))
-        if self.drawn.chunks is not None:
-            self.console.say(f"{self.drawn.chunks.path}  table of {count_of(len(report.chunks), 'chunk')}")
+        if self.settings.chunks is not None:
+            self.console.say(f"{self.settings.chunks.path}  table of {count_of(len(report.chunks), 'chunk')}")
         return 0
 
     def _print(self, name: str, report: Report) -> None:
         """Print the report of one file to standard output."""
-        plain = report.as_dict()
-        if self.general.as_json:
+        plain, checks, output = report.as_dict(), self.options.checks, self.options.output
+        if self.options.general.as_json:
             click.echo(json.dumps(plain, allow_nan=False))
-        elif self.output.field:
+        elif output.field:
             if report.format is not None:
-                value = report.value_at(self.output.field)
+                value = report.value_at(output.field)
                 click.echo(printable(value) if isinstance(value, str) else json.dumps(value))
-        elif self.settings.holds:
+        elif checks.holds:
             for finding in report.findings or []:
-                click.echo(finding_line(name, finding, self.checks.style))
+                click.echo(finding_line(name, finding, checks.style))
             if not report.findings:
                 noun = "node" if report.tree is not None else "splat"
                 self.console.say(f"{name}: nothing is wrong with its {count_of(report.splats or 0, noun)}")
@@ -223,9 +215,9 @@ class _Job:
 
     def write_page(self) -> None:
         """Write the page, if there is an option for it."""
-        if self.drawn.html is None:
+        if self.settings.html is None:
             return
         from ..api.inspect_jobs import write_page
 
-        size = write_page(self.drawn.html, self.sections, overwrite=self.drawn.overwrite)
-        self.console.say(f"{self.drawn.html}  page of {count_of(len(self.sections), 'file')}, {size_of(size)}")
+        size = write_page(self.settings.html, self.sections, overwrite=self.settings.overwrite)
+        self.console.say(f"{self.settings.html}  page of {count_of(len(self.sections), 'file')}, {size_of(size)}")

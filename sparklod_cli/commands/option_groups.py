@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, TypeVar
 
 import click
@@ -10,11 +10,10 @@ import click
 from .. import __version__
 from ..support.setting_fields import setting, settings_in
 from .command import COMMON as COMMON
-from .command import GENERAL, Option
+from .command import GENERAL, Command, Option
 from .parameter_types import click_type
 
 Group = TypeVar("Group")
-Decorated = TypeVar("Decorated", bound=Callable[..., Any])
 
 
 def option(help: str, kind: Any = None, default: Any = None, **attributes: Any) -> Any:
@@ -32,16 +31,23 @@ def argument(kind: click.ParamType, **attributes: Any) -> Any:
     return setting((), "", kind, argument=True, nargs=-1, **attributes)
 
 
-def with_options(kind: type[Any]) -> Callable[[Decorated], Decorated]:
-    """Return the decorator that adds the options of a group, and of the groups in it, and `--version` to a command."""
+def command(
+    name: str, options: type[Any], *, examples: str, headings: Sequence[str] = (COMMON,)
+) -> Callable[[Callable[..., None]], click.Command]:
+    """Return the decorator that makes a command of a function of the context.
 
-    def add(command: Decorated) -> Decorated:
-        command = click.version_option(__version__, package_name="sparklod")(command)
-        for decorator in reversed(list(_options(kind, GENERAL))):
-            command = decorator(command)
-        return command
+    The options are those of a group and of the groups in it, and `--version`; `headings` are as for `Command`.
+    """
 
-    return add
+    def decorate(function: Callable[..., None]) -> click.Command:
+        decorated = click.version_option(__version__, package_name="sparklod")(click.pass_context(function))
+        for decorator in reversed(list(_options(options, GENERAL))):
+            decorated = decorator(decorated)
+        settings = {"show_default": True}
+        epilog = f"\n\b\nExamples:\n{examples}"
+        return click.command(name, cls=Command, headings=headings, epilog=epilog, context_settings=settings)(decorated)
+
+    return decorate
 
 
 def _options(kind: type[Any], heading: str) -> Iterator[Callable[[Any], Any]]:

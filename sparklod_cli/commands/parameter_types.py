@@ -10,7 +10,7 @@ import click
 
 from ..support.setting_fields import Quantity, Range
 
-COLORS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "transparent": None}
+COLORS: dict[str, tuple[float, ...] | None] = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "transparent": None}
 
 #: Pixels along a side of a picture, and digits of no more than a few times that.
 MAX_SIDE, DIGITS = 1 << 16, 6
@@ -54,16 +54,7 @@ class Choice(click.Choice):
         return self._values[super().convert(str(value), param, ctx)]
 
 
-class _Shown(click.ParamType):
-    """A type whose name is the placeholder in `--help`."""
-
-    name = ""
-
-    def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
-        return self.name
-
-
-class Text(_Shown):
+class Text(click.ParamType):
     """A text that a `Quantity` parses."""
 
     def __init__(self, quantity: Quantity) -> None:
@@ -82,66 +73,8 @@ class Text(_Shown):
         return parsed
 
 
-class Numbers(_Shown):
-    """`count` finite numbers with commas between, as a tuple of floats."""
-
-    def __init__(self, *names: str) -> None:
-        self.name = ",".join(names)
-        self._count = len(names)
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        if isinstance(value, tuple):
-            return value
-        try:
-            numbers = tuple(float(part) for part in value.split(","))
-        except ValueError:
-            numbers = ()
-        if len(numbers) != self._count or not all(map(math.isfinite, numbers)):
-            self.fail(f"{value!r} is not {self.name}, {self._count} numbers with commas between", param, ctx)
-        return numbers
-
-
-POINT = Numbers("x", "y", "z")
-
-
-class Direction(Numbers):
-    """An axis by its name (y, -y, ...), or x,y,z, as a tuple of three floats."""
-
-    def __init__(self) -> None:
-        super().__init__("x", "y", "z")
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, ...]:
-        axes = {f"{sign}{name}" for name in "xyz" for sign in ("", "-")}
-        if value not in axes:
-            numbers: tuple[float, ...] = super().convert(value, param, ctx)
-            return numbers
-        return tuple((-1.0 if value[0] == "-" else 1.0) if name == value[-1] else 0.0 for name in "xyz")
-
-    def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
-        return "AXIS|x,y,z"
-
-
-class Ball(Numbers):
-    """x, y, z and a positive radius, as ((x, y, z), radius)."""
-
-    def __init__(self) -> None:
-        super().__init__("x", "y", "z", "radius")
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        *center, radius = super().convert(value, param, ctx)
-        if radius <= 0:
-            self.fail(f"radius {radius:g} is not positive", param, ctx)
-        return tuple(center), radius
-
-
 class OptionalNumber(click.IntRange):
-    """A number that may be left out, so that an input after its option is taken for it; says what to do then.
-
-    Args:
-        range: of the number.
-        placeholder: in `--help`.
-        example: a number for that message.
-    """
+    """A number that may be left out, so that an input after its option is taken for it; says what to do then."""
 
     def __init__(self, range: Range, *, placeholder: str = "N", example: int) -> None:
         super().__init__(range.least, range.most)  # type: ignore[arg-type]  # whole numbers
@@ -159,61 +92,78 @@ class OptionalNumber(click.IntRange):
         return f"[{self.placeholder}]"
 
 
-class Background(_Shown):
-    """A colour as (red, green, blue), 0..1; None for none."""
-
-    name = "COLOR"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        if not isinstance(value, str):
-            return value
-        if value.lower() in COLORS:
-            return COLORS[value.lower()]
-        digits = value[1:]
-        if not value.startswith("#") or len(digits) not in (3, 6) or set(digits) - set(string.hexdigits):
-            self.fail(f"{value!r} is not a colour: '#rrggbb', {', '.join(COLORS)}", param, ctx)
-        if len(digits) == 3:
-            digits = "".join(2 * digit for digit in digits)
-        return tuple(byte / 255 for byte in bytes.fromhex(digits))
+def _numbers(text: str, names: str = "x,y,z") -> tuple[float, ...]:
+    """Parse finite numbers with commas between."""
+    count = names.count(",") + 1
+    try:
+        numbers = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        numbers = ()
+    if len(numbers) != count or not all(map(math.isfinite, numbers)):
+        raise ValueError(f"{text!r} is not {names}, {count} numbers with commas between")
+    return numbers
 
 
-class View(_Shown):
-    """Camera position and target, as (eye, target), two tuples of three numbers."""
-
-    name = "EYE:TARGET"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        eye, colon, target = value.partition(":")
-        if not colon:
-            self.fail(f"{value!r} is not EYE:TARGET, x,y,z:x,y,z", param, ctx)
-        view = POINT.convert(eye, param, ctx), POINT.convert(target, param, ctx)
-        if view[0] == view[1]:
-            self.fail(f"{value!r} looks at its own eye; give a target elsewhere", param, ctx)
-        return view
+def _direction(text: str) -> tuple[float, ...]:
+    """Parse an axis by its name (y, -y, ...), or x,y,z."""
+    if text.removeprefix("-") not in ("x", "y", "z"):
+        return _numbers(text)
+    return tuple((-1.0 if text[0] == "-" else 1.0) if name == text[-1] else 0.0 for name in "xyz")
 
 
-class Views(View):
-    """Two or more views, with spaces or semicolons between."""
-
-    name = "'EYE:TARGET ...'"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        views = tuple(super(Views, self).convert(view, param, ctx) for view in value.replace(";", " ").split())
-        if len(views) < 2:
-            self.fail(f"{value!r} has fewer than two keyframes, EYE:TARGET EYE:TARGET", param, ctx)
-        return views
+def _ball(text: str) -> tuple[tuple[float, ...], float]:
+    """Parse x, y, z and a positive radius."""
+    *center, radius = _numbers(text, "x,y,z,radius")
+    if radius <= 0:
+        raise ValueError(f"radius {radius:g} is not positive")
+    return tuple(center), radius
 
 
-class Size(_Shown):
-    """Width and height in pixels, as a tuple."""
+def _color(text: str) -> tuple[float, ...] | None:
+    """Parse a colour as (red, green, blue), 0..1; None for none."""
+    if text.lower() in COLORS:
+        return COLORS[text.lower()]
+    digits = text[1:]
+    if not text.startswith("#") or len(digits) not in (3, 6) or set(digits) - set(string.hexdigits):
+        raise ValueError(f"{text!r} is not a colour: '#rrggbb', {', '.join(COLORS)}")
+    if len(digits) == 3:
+        digits = "".join(2 * digit for digit in digits)
+    return tuple(byte / 255 for byte in bytes.fromhex(digits))
 
-    name = "WxH"
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int]:
-        sides = [side.lstrip("0") for side in value.lower().split("x")]
-        if len(sides) != 2 or not all(side.isascii() and side.isdigit() for side in sides):
-            self.fail(f"{value!r} is not a width and a height in pixels, such as 1280x720", param, ctx)
-        if any(len(side) > DIGITS or int(side) > MAX_SIDE for side in sides):
-            most = f"{MAX_SIDE:,} pixels along a side"
-            self.fail(f"{value!r} is too large; give at most {most}, such as 1280x720", param, ctx)
-        return int(sides[0]), int(sides[1])
+def _view(text: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Parse camera position and target."""
+    eye, colon, target = text.partition(":")
+    if not colon:
+        raise ValueError(f"{text!r} is not EYE:TARGET, x,y,z:x,y,z")
+    view = _numbers(eye), _numbers(target)
+    if view[0] == view[1]:
+        raise ValueError(f"{text!r} looks at its own eye; give a target elsewhere")
+    return view
+
+
+def _views(text: str) -> tuple[Any, ...]:
+    """Parse two or more views, with spaces or semicolons between."""
+    views = tuple(map(_view, text.replace(";", " ").split()))
+    if len(views) < 2:
+        raise ValueError(f"{text!r} has fewer than two keyframes, EYE:TARGET EYE:TARGET")
+    return views
+
+
+def _size(text: str) -> tuple[int, int]:
+    """Parse width and height in pixels."""
+    sides = [side.lstrip("0") for side in text.lower().split("x")]
+    if len(sides) != 2 or not all(side.isascii() and side.isdigit() for side in sides):
+        raise ValueError(f"{text!r} is not a width and a height in pixels, such as 1280x720")
+    if any(len(side) > DIGITS or int(side) > MAX_SIDE for side in sides):
+        raise ValueError(f"{text!r} is too large; give at most {MAX_SIDE:,} pixels along a side, such as 1280x720")
+    return int(sides[0]), int(sides[1])
+
+
+POINT, DIRECTION, BALL = (
+    Quantity("x,y,z", _numbers),
+    Quantity("AXIS|x,y,z", _direction),
+    Quantity("x,y,z,radius", _ball),
+)
+COLOR, SIZE = Quantity("COLOR", _color), Quantity("WxH", _size)
+VIEW, VIEWS = Quantity("EYE:TARGET", _view), Quantity("'EYE:TARGET ...'", _views)

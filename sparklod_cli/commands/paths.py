@@ -99,7 +99,6 @@ def name_outputs(ctx: click.Context, source: Place | None) -> None:
     """Replace each parameter that is a `Folder` by the path of the file in it, which is named after an input.
 
     Args:
-        ctx: of the command.
         source: the input; None where there is none, which other checks report.
 
     Raises:
@@ -119,7 +118,6 @@ def require_suffix(flag: str, output: Place, endings: Iterable[str]) -> None:
     """Raise a `click.UsageError` where the name of an output has no suffix, which would choose its format.
 
     Args:
-        flag: that names the output.
         output: a file; standard output, pipes and devices need no suffix.
         endings: suffixes, and names of files, that are possible.
     """
@@ -182,9 +180,6 @@ def claim_stdout(ctx: click.Context, name: str, *, as_json: bool, binary: bool =
     """Raise a `click.UsageError` where an output is - and standard output is taken, or no place for it.
 
     Args:
-        ctx: of the command.
-        name: of the parameter.
-        as_json: standard output gets JSON.
         binary: the output is nothing that a terminal could show.
     """
     if ctx.params[name] != DASH:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import json
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,26 +12,23 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ..images.defaults import THUMBNAIL_SIZE, THUMBNAIL_SUPERSAMPLE
-from .command import Command
 from .console import Console, count_of, size_of
-from .option_groups import COMMON, check_declared, exclude, flags_set, values_of, with_options
+from .option_groups import COMMON, check_declared, command, exclude, flags_set, values_of
 from .options.cameras import PictureCameras
 from .options.common import General, json_flag
-from .options.cut import Inputs, PictureCut, PictureStreaming, check_scenes
-from .options.pictures import Appearance, Comparison, PictureFiles, check_sizes
+from .options.cut import Inputs, PictureCut, PictureStreaming, check_scenes, viewed_files
+from .options.pictures import Appearance, ComparisonOptions, PictureFiles, check_sizes
 from .paths import claim_stdout, keep_apart, name_outputs
 
 if TYPE_CHECKING:
-    from ..api.jobs import Drawn, ViewedFiles
+    from ..api.jobs import DrawnPath
     from ..cameras.path import CameraPath
-    from ..images.output import Output
-    from ..images.sequence import Pictures, PictureSettings
+    from ..images.output import PictureOutput
+    from ..images.sequence import PictureSettings, WrittenPictures
     from ..model.instances import Instance
     from ..scenes.loaded import Scenes
 
-EXAMPLES = """
-\b
-Examples:
+EXAMPLES = """\
   sparklod render scene-lod.spz --budget 500k --size 1280x720 -o preview.png
   sparklod render scene.ply --thumbnail
   sparklod render scene.ply --look-at 0,-1,4:0,0,0 --supersample 2 --alpha -o view.webp
@@ -53,7 +48,7 @@ HEADINGS = (
 
 
 @dataclass(frozen=True)
-class _General(General):
+class _RenderGeneral(General):
     as_json: bool = json_flag("Print what was drawn as one JSON object on standard output.")
 
 
@@ -67,8 +62,8 @@ class RenderOptions:
     cut: PictureCut = field(default_factory=PictureCut)
     streaming: PictureStreaming = field(default_factory=PictureStreaming)
     appearance: Appearance = field(default_factory=Appearance)
-    comparison: Comparison = field(default_factory=Comparison)
-    general: _General = field(default_factory=_General)
+    comparison: ComparisonOptions = field(default_factory=ComparisonOptions)
+    general: _RenderGeneral = field(default_factory=_RenderGeneral)
 
     @classmethod
     def of(cls, ctx: click.Context) -> RenderOptions:
@@ -94,9 +89,7 @@ class RenderOptions:
         return dataclasses.replace(options, cameras=small, appearance=look)
 
 
-@click.command("render", cls=Command, headings=HEADINGS, epilog=EXAMPLES, context_settings={"show_default": True})
-@with_options(RenderOptions)
-@click.pass_context
+@command("render", RenderOptions, examples=EXAMPLES, headings=HEADINGS)
 def render(ctx: click.Context, /, **_: Any) -> None:
     """Draw pictures of splat files as a viewer draws them.
 
@@ -130,7 +123,7 @@ def _draw(ctx: click.Context, options: RenderOptions) -> None:
 
         console.announce_compiling()
 
-        def place(path: CameraPath) -> tuple[Output, PictureSettings]:
+        def place(path: CameraPath) -> tuple[PictureOutput, PictureSettings]:
             return _place(ctx, options, instances, path)
 
         def ready(path: CameraPath, scenes: Scenes) -> None:
@@ -139,7 +132,7 @@ def _draw(ctx: click.Context, options: RenderOptions) -> None:
                 console.say(note)
             console.detail(f"  read in {time.perf_counter() - start:.2f} s")
 
-        with usage_errors(options):
+        with options.cameras.usage_errors():
             drawn = draw_files(
                 viewed_files(options, instances, console),
                 budget,
@@ -157,35 +150,9 @@ def _draw(ctx: click.Context, options: RenderOptions) -> None:
         _report(console, drawn, time.perf_counter() - start, as_json=general.as_json)
 
 
-def viewed_files(options: RenderOptions, instances: list[Instance], console: Console) -> ViewedFiles:
-    """Return the files and the cameras that look at them."""
-    from ..api.jobs import ViewedFiles
-
-    return ViewedFiles(
-        instances,
-        options.cameras.camera_source(),
-        options.cameras.settings(),
-        options.cut.precision,
-        options.general.threads,
-        console.progress,
-    )
-
-
 def fit_planes(ctx: click.Context) -> bool:
     """Return whether the near and the far plane may move apart, so that a view of the whole scene clips nothing."""
     return not flags_set(ctx, ["near", "far"])
-
-
-@contextlib.contextmanager
-def usage_errors(options: RenderOptions) -> Iterator[None]:
-    """Turn errors that the values of options cause into usage errors."""
-    from ..api.jobs import UnfitError
-
-    try:
-        with options.cameras.usage_errors():
-            yield
-    except UnfitError as error:
-        raise click.UsageError(str(error)) from None
 
 
 def _upside_down(options: RenderOptions, scenes: Scenes) -> list[str]:
@@ -203,7 +170,7 @@ def _upside_down(options: RenderOptions, scenes: Scenes) -> list[str]:
     ]
 
 
-def _output(ctx: click.Context, options: RenderOptions, cameras: int) -> Output:
+def _output(ctx: click.Context, options: RenderOptions, cameras: int) -> PictureOutput:
     """Return the output of the pictures of some cameras."""
     assert options.inputs.first is not None  # or there would be no instances
     return options.pictures.place(
@@ -213,7 +180,7 @@ def _output(ctx: click.Context, options: RenderOptions, cameras: int) -> Output:
 
 def _place(
     ctx: click.Context, options: RenderOptions, instances: list[Instance], path: CameraPath
-) -> tuple[Output, PictureSettings]:
+) -> tuple[PictureOutput, PictureSettings]:
     """Return the output of the pictures of a path, and how they become files.
 
     Raises:
@@ -248,15 +215,8 @@ def files_read(options: RenderOptions, instances: list[Instance]) -> dict[str, l
     return {"scene": options.inputs.read(instances), "world_transform": options.cameras.files()}
 
 
-def _report(console: Console, drawn: Drawn, seconds: float, *, as_json: bool) -> None:
-    """Print a line on the pictures, with `as_json` an object too, and a warning if nothing is visible.
-
-    Args:
-        console: prints the line.
-        drawn: the pictures.
-        seconds: duration of the whole command.
-        as_json: print one JSON object on standard output.
-    """
+def _report(console: Console, drawn: DrawnPath, seconds: float, *, as_json: bool) -> None:
+    """Print a line on the pictures, with `as_json` an object too, and a warning if nothing is visible."""
     written, output, settings = drawn.pictures, drawn.output, drawn.render
     if not any(frame["splats"] for frame in written.frames):
         console.say("warning: the picture is empty, for the first chunk has not arrived yet (--after)")
@@ -283,7 +243,7 @@ def _report(console: Console, drawn: Drawn, seconds: float, *, as_json: bool) ->
     )
 
 
-def _describe(written: Pictures) -> str:
+def _describe(written: WrittenPictures) -> str:
     """Return what was drawn, such as "60 frames, 1280 x 720, 499,102 to 500,000 splats"."""
     frames = written.frames
     sizes = dict.fromkeys(f"{frame['width']} x {frame['height']}" for frame in frames)

@@ -13,8 +13,8 @@ import click
 
 from ..support.stdin import DASH
 from .console import Console, count_of, for_screen, is_terminal
-from .options.common import table_form
-from .options.cut import check_scenes
+from .options.common import report_outcomes, table_form
+from .options.cut import check_scenes, viewed_files
 from .paths import Folder, keep_apart
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ def compare(ctx: click.Context, options: RenderOptions) -> int:
     table = _table(options)
     instances = options.inputs.instances()
     from ..api.jobs import compare_files
-    from .render import files_read, fit_planes, usage_errors, viewed_files
+    from .render import files_read, fit_planes
 
     keep_apart(ctx, files_read(options, instances))
     with options.general.console() as console:
@@ -50,7 +50,7 @@ def compare(ctx: click.Context, options: RenderOptions) -> int:
             console.clear()  # a bar and a table do not go together on one screen
             return for_screen(pieces) if is_terminal(sys.stdout) and table.form != "parquet" else pieces
 
-        with usage_errors(options):
+        with options.cameras.usage_errors():
             compared = compare_files(
                 viewed_files(options, instances, console),
                 budgets,
@@ -102,17 +102,14 @@ def _report(console: Console, options: RenderOptions, compared: Compared, about:
     """Print the results of a comparison; return the exit status.
 
     Args:
-        console: prints them.
-        options: values of the options.
-        compared: the results.
         about: for each assertion the index of its budget; None for all budgets.
     """
     summary, outcomes = compared.summary, compared.outcomes
     if options.general.as_json:
-        held = [{"assert": each.assertion.text, "held": each.held, "value": each.value} for each in outcomes]
+        asserts = [each.as_dict() for each in outcomes]
         figures = [each.as_dict() for each in summary]
         frames = len(compared.path.cameras)
-        whole = {"frames": frames, "leaves": compared.leaves, "budgets": figures, "asserts": held}
+        whole = {"frames": frames, "leaves": compared.leaves, "budgets": figures, "asserts": asserts}
         click.echo(json.dumps(whole, allow_nan=False))
     texts = lines(summary, compared.path, compared.leaves)
     if _on_screen(options):
@@ -120,13 +117,11 @@ def _report(console: Console, options: RenderOptions, compared: Compared, about:
     else:
         for line in texts:
             console.say(line)
-    for at, outcome in zip(about, outcomes, strict=True):
-        of = f", at a budget of {outcome.worst['budget']:,}" if at is None and outcome.worst is not None else ""
-        if outcome.held:
-            console.detail(f"  holds: {outcome.message()}{of}")
-        else:
-            console.error(f"{outcome.message()}{of}")
-    return 0 if all(outcome.held for outcome in outcomes) else 3
+    places = (
+        f", at a budget of {each.worst['budget']:,}" if at is None and each.worst is not None else ""
+        for at, each in zip(about, outcomes, strict=True)
+    )
+    return report_outcomes(console, outcomes, places)
 
 
 def lines(summary: Sequence[BudgetSummary], path: CameraPath, leaves: int) -> Iterator[str]:

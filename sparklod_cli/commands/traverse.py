@@ -14,9 +14,8 @@ import click
 from ..simulation.streaming_settings import StreamingSettings
 from ..support.stdin import DASH
 from ..tables.files import FORMS
-from .command import Command
 from .console import Console, for_screen, is_terminal
-from .option_groups import COMMON, check_declared, exclude, flag, option, refuse, values_of, with_options
+from .option_groups import COMMON, check_declared, command, exclude, flag, option, refuse, values_of
 from .options.cameras import Cameras
 from .options.common import (
     General,
@@ -26,9 +25,10 @@ from .options.common import (
     output_option,
     overwrite_flag,
     plot_option,
+    report_outcomes,
     table_form,
 )
-from .options.cut import Cut, Inputs, check_scenes
+from .options.cut import CutOptions, Inputs, check_scenes, viewed_files
 from .paths import OutputPath, claim_stdout, keep_apart, name_outputs
 
 if TYPE_CHECKING:
@@ -41,9 +41,7 @@ if TYPE_CHECKING:
 #: Below this share of splats in front of the cameras, path and scene probably do not share their axes.
 LEAST_IN_FRONT = 0.05
 
-EXAMPLES = """
-\b
-Examples:
+EXAMPLES = """\
   sparklod traverse scene-lod.spz --budget 500k            # an orbit; the summary, or CSV into a pipe
   sparklod traverse scene-lod.spz --camera-path path.json -o frames.csv --summary
   sparklod traverse scene-lod.spz --preset quest --assert 'churn_p95<0.2'    # exit status 3
@@ -138,7 +136,7 @@ HEADINGS = (COMMON, "Inputs", "Cameras", "Cut", "Streamed SOG", "Streaming", "Ou
 
 
 @dataclass(frozen=True)
-class _General(General):
+class _TraverseGeneral(General):
     as_json: bool = json_flag(
         "Print the summary as one JSON object on standard output; write a table only to --output."
     )
@@ -151,14 +149,12 @@ class TraverseOptions:
     table: FrameTable = field(default_factory=FrameTable)
     inputs: Inputs = field(default_factory=Inputs)
     cameras: Cameras = field(default_factory=Cameras)
-    cut: Cut = field(default_factory=Cut)
+    cut: CutOptions = field(default_factory=CutOptions)
     streaming: StreamingSettings = field(default_factory=StreamingSettings)
-    general: _General = field(default_factory=_General)
+    general: _TraverseGeneral = field(default_factory=_TraverseGeneral)
 
 
-@click.command("traverse", cls=Command, headings=HEADINGS, epilog=EXAMPLES, context_settings={"show_default": True})
-@with_options(TraverseOptions)
-@click.pass_context
+@command("traverse", TraverseOptions, examples=EXAMPLES, headings=HEADINGS)
 def traverse(ctx: click.Context, /, **_: Any) -> None:
     """Simulate what a viewer draws of Level-of-Detail files or Streamed SOG along a camera path.
 
@@ -185,7 +181,7 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
     asserts = table.assertions()
     start = time.perf_counter()
     with general.console() as console:
-        from ..api.jobs import UnfitError, ViewedFiles, traverse_files
+        from ..api.jobs import traverse_files
 
         def ready(path: CameraPath, scenes: Scenes) -> None:
             for note in path.notes:
@@ -195,30 +191,19 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
 
         console.announce_compiling()
         screen = outputs.table.on_stdout and is_terminal(sys.stdout)
-        files = ViewedFiles(
-            instances,
-            options.cameras.camera_source(),
-            options.cameras.settings(),
-            options.cut.precision,
-            general.threads,
-            console.progress,
-        )
-        try:
-            with options.cameras.usage_errors():
-                traversed = traverse_files(
-                    files,
-                    budget,
-                    options.cut.settings(),
-                    options.streaming,
-                    outputs,
-                    by_instance=table.per_instance,
-                    asserts=asserts,
-                    ready=ready,
-                    passed=for_screen if screen and outputs.table.form != "parquet" else None,
-                    bar=not screen,  # a bar and a table do not go together on one screen
-                )
-        except UnfitError as error:
-            raise click.UsageError(str(error)) from None
+        with options.cameras.usage_errors():
+            traversed = traverse_files(
+                viewed_files(options, instances, console),
+                budget,
+                options.cut.settings(),
+                options.streaming,
+                outputs,
+                by_instance=table.per_instance,
+                asserts=asserts,
+                ready=ready,
+                passed=for_screen if screen and outputs.table.form != "parquet" else None,
+                bar=not screen,  # a bar and a table do not go together on one screen
+            )
         written, cameras_read = traversed.frames, len(traversed.path.cameras)
         console.clear()
         console.detail(f"  {cameras_read:,} frames of {traversed.path.format}, {time.perf_counter() - start:.2f} s")
@@ -237,26 +222,18 @@ def _report(console: Console, traversed: Traversed, summary: bool | None, *, as_
     """Print the results of a traversal; return the exit status.
 
     Args:
-        console: prints them on standard error.
-        traversed: the results.
         summary: print the summary; None prints it if standard error is a terminal.
-        as_json: print it as JSON on standard output.
         on_stdout: print it on standard output, instead of the table.
     """
     from .traverse_text import lines
 
     whole, outcomes = traversed.summary, traversed.outcomes
     if as_json:
-        held = [{"assert": each.assertion.text, "held": each.held, "value": each.value} for each in outcomes]
-        click.echo(json.dumps(whole.as_dict() | {"asserts": held}, allow_nan=False))
+        asserts = [each.as_dict() for each in outcomes]
+        click.echo(json.dumps(whole.as_dict() | {"asserts": asserts}, allow_nan=False))
     if on_stdout and summary is not False:
         click.echo("\n".join(lines(whole)))
     elif summary or (summary is None and is_terminal(sys.stderr)):
         for line in lines(whole):
             console.say(line)
-    for outcome in outcomes:
-        if not outcome.held:
-            console.error(outcome.message())
-        else:
-            console.detail(f"  holds: {outcome.message()}")
-    return 0 if all(outcome.held for outcome in outcomes) else 3
+    return report_outcomes(console, outcomes)

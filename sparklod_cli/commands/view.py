@@ -16,19 +16,16 @@ import click
 from ..support.printable import printable
 from ..support.setting_fields import Quantity, Range, whole
 from ..support.units import parse_count
-from .command import Command
 from .console import Console, count_of, size_of
-from .option_groups import COMMON, argument, check_declared, flag, option, values_of, with_options
+from .option_groups import COMMON, argument, check_declared, command, flag, option, values_of
 from .options.common import General, json_flag, overwrite_flag, quiet_flag, verbose_flag
-from .parameter_types import Direction, View
+from .parameter_types import DIRECTION, VIEW
 from .paths import InputPath, OutputPath, keep_apart
 
 if TYPE_CHECKING:
-    from ..api.viewing import Prepared, Server
+    from ..api.viewing import Server, Site
 
-EXAMPLES = """
-\b
-Examples:
+EXAMPLES = """\
   sparklod view scene-lod.rad
   sparklod view web/lod-meta.json                         # in PlayCanvas
   sparklod view scene-lod.spz --look-at 0,-1,4:0,0,0 --budget 500k
@@ -48,7 +45,7 @@ class _Page:
 
     look_at: Any = option(
         "Place the camera at EYE, looking at TARGET, each x,y,z.  [default: it sees the whole scene]",
-        View(),
+        VIEW,
         heading=COMMON,
     )
     camera_path: Path | None = option(
@@ -67,7 +64,7 @@ class _Page:
     up: tuple[float, float, float] | None = option(
         "Direction that is up, as an axis such as -y or as x,y,z.  [default: the axis that the files note, or -y, as"
         " training leaves scenes]",
-        Direction(),
+        DIRECTION,
     )
     fov: float | None = option(
         "Vertical field of view, in degrees.  [default: 60]", Range(above=0, below=180, unit="DEGREES")
@@ -99,7 +96,7 @@ class _Place:
 
 
 @dataclass(frozen=True)
-class _General(General):
+class _ViewGeneral(General):
     as_json: bool = json_flag("Print the address and the files as one JSON object on standard output.")
     quiet: bool = quiet_flag("Print nothing but the address, and errors.")
     verbose: bool = verbose_flag("Print each request.")
@@ -112,15 +109,13 @@ class _ViewOptions:
     files: tuple[Path, ...] = argument(InputPath(), metavar="FILE...", required=True)
     page: _Page = field(default_factory=_Page)
     place: _Place = field(default_factory=_Place)
-    general: _General = field(default_factory=_General)
+    general: _ViewGeneral = field(default_factory=_ViewGeneral)
 
 
 HEADINGS = (COMMON, "Page", "Server")
 
 
-@click.command("view", cls=Command, headings=HEADINGS, epilog=EXAMPLES, context_settings={"show_default": True})
-@with_options(_ViewOptions)
-@click.pass_context
+@command("view", _ViewOptions, examples=EXAMPLES, headings=HEADINGS)
 def view(ctx: click.Context, /, **_: Any) -> None:
     """Show splat files in Spark or PlayCanvas, in a browser.
 
@@ -139,31 +134,29 @@ def view(ctx: click.Context, /, **_: Any) -> None:
     with general.console() as console:
         from ..api import viewing
 
-        served = place.export is None
         if place.export is not None:
             viewing.check_folder(place.export, overwrite=place.overwrite)
-        settings = viewing.ViewSettings(page.look_at, page.fov, page.up, page.budget, page.camera_path, page.spark_dir)
-        prepared = viewing.prepare(files, settings, served=served, threads=general.threads, progress=console.progress)
+        site = viewing.prepare(
+            files, served=place.export is None, threads=general.threads, progress=console.progress, **vars(page)
+        )
         console.clear()
-        for note in prepared.notes:
+        for note in site.notes:
             console.say(note)
         if place.export is not None:
-            size = viewing.export(prepared.site, place.export, overwrite=place.overwrite, progress=console.progress)
+            size = viewing.export(site, place.export, overwrite=place.overwrite, progress=console.progress)
             console.clear()
-            _report_export(console, place.export, prepared, size, as_json=general.as_json)
+            _report_export(console, place.export, site, size, as_json=general.as_json)
         else:
-            server = viewing.Server(
-                prepared.site, host=place.host, port=place.port, cors=place.cors, log=console.detail
-            )
-            _serve(console, server, prepared, opens=not place.no_open, as_json=general.as_json)
+            server = viewing.Server(site, host=place.host, port=place.port, cors=place.cors, log=console.detail)
+            _serve(console, server, opens=not place.no_open, as_json=general.as_json)
 
 
-def _serve(console: Console, server: Server, prepared: Prepared, *, opens: bool, as_json: bool) -> None:
+def _serve(console: Console, server: Server, *, opens: bool, as_json: bool) -> None:
     """Serve until an interrupt, which is how a server ends."""
     with server, contextlib.suppress(KeyboardInterrupt):
-        click.echo(json.dumps({"url": server.url, "files": _files(prepared)}) if as_json else server.url)
+        click.echo(json.dumps({"url": server.url, "files": _files(server.site)}) if as_json else server.url)
         sys.stdout.flush()
-        names = ", ".join(printable(file.name) for file in prepared.shown)
+        names = ", ".join(printable(file.name) for file in server.site.shown)
         everybody = "" if server.loopback else "; everybody who can reach this machine can read them"
         console.say(f"serving {names}{everybody}; Ctrl-C ends it")
         if opens:
@@ -184,13 +177,13 @@ def _open(console: Console, url: str) -> None:
         console.say("no browser can be opened here; open the address above in one")
 
 
-def _report_export(console: Console, folder: Path, prepared: Prepared, size: int, *, as_json: bool) -> None:
-    console.say(f"wrote {printable(str(folder))}: {count_of(len(prepared.site.resources), 'file')}, {size_of(size)}")
+def _report_export(console: Console, folder: Path, site: Site, size: int, *, as_json: bool) -> None:
+    console.say(f"wrote {printable(str(folder))}: {count_of(len(site.resources), 'file')}, {size_of(size)}")
     if as_json:
-        click.echo(json.dumps({"folder": str(folder), "bytes": size, "files": _files(prepared)}))
+        click.echo(json.dumps({"folder": str(folder), "bytes": size, "files": _files(site)}))
 
 
-def _files(prepared: Prepared) -> list[dict[str, Any]]:
+def _files(site: Site) -> list[dict[str, Any]]:
     return [
-        {"file": str(file.path), "url": file.url, "format": file.format, "bytes": file.bytes} for file in prepared.shown
+        {"file": str(file.path), "url": file.url, "format": file.format, "bytes": file.bytes} for file in site.shown
     ]

@@ -10,14 +10,11 @@ from typing import Any
 import click
 
 from ..support.setting_fields import whole
-from .command import Command
 from .console import count_of
-from .option_groups import option, values_of, with_options
+from .option_groups import command, option, values_of
 from .options.common import Messages, processors_to_use, verbose_flag
 
-EXAMPLES = """
-\b
-Examples:
+EXAMPLES = """\
   sparklod warmup                                  # once, after pip install
   RUN pip install ./sparklod && sparklod warmup    # in a Dockerfile
   NUMBA_CACHE_DIR=.cache/numba sparklod warmup     # in CI, with that folder cached
@@ -35,9 +32,7 @@ class _Options(Messages):
     verbose: bool = verbose_flag("Print which kernels are missing.")
 
 
-@click.command("warmup", cls=Command, epilog=EXAMPLES, context_settings={"show_default": True})
-@with_options(_Options)
-@click.pass_context
+@command("warmup", _Options, examples=EXAMPLES)
 def warmup(ctx: click.Context, /, **_: Any) -> None:
     """Compile all kernels for this machine, so that no later command has to.
 

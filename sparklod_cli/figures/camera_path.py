@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from ..render.color_scales import range_of, whole_numbers
 from ..support.errors import SparklodError
 from ..support.units import count_of
 from .geometry import Points, Viewpoint, bounds, box_lines, evenly, is_drawable, viewpoint
-from .pyvista_scene import Stage, write_png
+from .pyvista_scene import PyvistaStage, write_png
 
 #: Most splats that are drawn; of more, an even sample.
 MOST_POINTS = 600_000
@@ -35,47 +36,51 @@ BEHIND = 0.45
 FRAME = (0.09, 0.17, 0.85, 0.93)
 
 
-@np.errstate(over="ignore", invalid="ignore")  # of numbers that are out of range in the file
-def picture_of_path(
-    cameras: Sequence[Camera],
-    splats: Splats,
-    depth: NDArray[Any],
-    *,
-    title: str = "tree depth",
-    frame: int | None = None,
-    size: tuple[int, int] = (1600, 1000),
-) -> bytes:
-    """Return the PNG of a path, its frusta and a cut.
+@dataclass(frozen=True)
+class PathScene:
+    """Content of the picture of a camera path.
 
-    Args:
-        cameras: of the path; at least one.
-        splats: N splats of the cut; those that are not finite are left out.
+    Attributes:
+        cameras: of the path.
+        splats: N splats of the cut of one frame.
         depth: (N,) edges from the root to each node of the cut, or the detail level of each splat.
-        title: which of both it is, for display.
-        frame: index of the camera whose cut it is; that camera is marked.
-        size: width and height in pixels.
+        frame: index of the camera whose cut it is; that camera is marked. None for none.
+        title: which of both the depths are, for display.
+    """
+
+    cameras: Sequence[Camera]
+    splats: Splats
+    depth: NDArray[Any]
+    frame: int | None = None
+    title: str = "tree depth"
+
+
+@np.errstate(over="ignore", invalid="ignore")  # of numbers that are out of range in the file
+def picture_of_path(scene: PathScene, *, size: tuple[int, int] = (1600, 1000)) -> bytes:
+    """Return the PNG of a path, its frusta and a cut, whose splats are left out where they are not finite.
 
     Raises:
         SparklodError: pyvista is not installed or cannot draw here, or there is nothing to draw.
     """
+    cameras, splats, depth, frame = scene.cameras, scene.splats, scene.depth, scene.frame
     index = np.flatnonzero(is_drawable(splats))
     if not len(index):
         raise SparklodError("there is nothing to draw: no splat of the cut is finite and has a size")
     drawable = splats.with_max_sh(0).take(index)
     chosen = index[evenly(len(index), MOST_POINTS)]
     shown = splats.with_max_sh(0).take(chosen)
-    coloring = whole_numbers(title, depth[chosen], *range_of(depth[chosen]))
+    coloring = whole_numbers(scene.title, depth[chosen], *range_of(depth[chosen]))
     low, high = bounds(drawable)
     way = np.array([camera.position for camera in cameras])
     low, high = np.minimum(low, way.min(axis=0)), np.maximum(high, way.max(axis=0))
     eye = _above(cameras, low, high, size)
     parts = _path_lines(cameras, way, frame, float((high - low).max()))
-    with Stage(low, high, size, BACKGROUND) as stage:
+    with PyvistaStage(low, high, size, BACKGROUND) as stage:
         drawn = stage.splats(shown, coloring.rgb, eye)
         for ends, color in parts:
             stage.lines(ends, color, 1.0, width=1.5)
         pixels = stage.photograph(eye)
-    with Stage(low, high, size, BACKGROUND) as stage:
+    with PyvistaStage(low, high, size, BACKGROUND) as stage:
         for ends, color in parts:
             stage.lines(ends, color, 1.0, width=1.5)
         pixels = _seen_through(pixels, stage.photograph(eye))

@@ -23,7 +23,7 @@ GREEN, BLUE, INDIGO, ORANGE, YELLOW, PINK = "#44bf70", "#2a788e", "#414487", "#e
 Series = NDArray[np.float64]
 
 
-class Frames:
+class FrameColumns:
     """Columns of rows as arrays, along an axis of time or of frame numbers.
 
     Attributes:
@@ -98,8 +98,6 @@ def draw(lines: int, height: int, fill: Callable[[ModuleType, NDArray[Any]], Non
     """(H, WIDTH, 3) a figure in the style of this package, whatever a matplotlibrc says.
 
     Args:
-        lines: rows of two charts, each
-        height: pixels high.
         fill: draws into the axes of the charts, (2 lines,), given matplotlib and these.
 
     Raises:

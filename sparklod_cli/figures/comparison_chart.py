@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..images.pixels import FAINT
 from ..tables.columns import Row
 from ..tables.statistics import numbers
-from .charts import BLUE, GREEN, INDIGO, ORANGE, PINK, YELLOW, Axes, Frames, draw, head, stacked
+from .charts import BLUE, GREEN, INDIGO, ORANGE, PINK, YELLOW, Axes, FrameColumns, draw, head, stacked
 
 #: Heights of a row of charts and of the title above them, in pixels.
 ROW, HEAD = 420, 122
@@ -31,7 +31,6 @@ def plot(series: Sequence[Series], title: str) -> bytes:
 
     Args:
         series: one for each budget, all of the same frames.
-        title: the name of the scene.
 
     Raises:
         SparklodError: matplotlib is not installed.
@@ -82,7 +81,7 @@ def _by_frame(axes: Axes, series: Sequence[Series], name: str, title: str, unit:
         axes.set_visible(False)
         return
     for at, (budget, rows) in enumerate(series):
-        frames = Frames(rows)
+        frames = FrameColumns(rows)
         axes.plot(frames.x, frames.column(name), color=COLORS[at % len(COLORS)], linewidth=1.4, label=budget)
         axes.xaxis.set_major_formatter(frames.tick)
         axes.set_xlim(frames.x[0], frames.x[-1])

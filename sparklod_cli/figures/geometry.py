@@ -66,9 +66,7 @@ def ellipsoids(splats: Splats, deviations: float, of: Mesh, thinnest: float) -> 
     Points of the sphere are multiplied by the radii, its normals divided by them.
 
     Args:
-        splats: N splats.
         deviations: the radii, in standard deviations.
-        of: the unit sphere.
         thinnest: smallest radius that is drawn, world units, so that no splat falls between pixels.
     """
     axes = rotation(splats.quat_xyzw)
@@ -152,7 +150,6 @@ def viewpoint(
     Args:
         points: (N, 3) points to show.
         direction, up: (3,) world axes.
-        aspect: width over height.
         frame: left, top, right and bottom of the frame in the picture, 0..1 from the left and from the top.
     """
     angle = 25.0

@@ -42,8 +42,6 @@ def write_png(
     Args:
         pixels: (H, W, 3) of the scene.
         title, lines: texts for the upper left corner, which must fit into the width.
-        coloring: the colour scale.
-        eye: viewpoint of the picture.
         low, high: (3,) corners of the box along whose edges the axes run, world units.
     """
     image = Image.fromarray(pixels)
@@ -152,7 +150,7 @@ def load_pyvista() -> ModuleType:
     return pyvista
 
 
-class Stage:
+class PyvistaStage:
     """A scene to render, in units of its extent and around its middle, so that float32 suffices wherever it lies.
 
     A context manager: it frees pyvista's memory at the end.
@@ -165,7 +163,7 @@ class Stage:
         self._plotter = self._pyvista.Plotter(off_screen=True, window_size=window, lighting="light kit")
         self._plotter.set_background(background)
 
-    def __enter__(self) -> Stage:
+    def __enter__(self) -> PyvistaStage:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:

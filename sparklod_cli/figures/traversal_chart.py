@@ -12,14 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from ..cameras.camera import Camera
 from ..images.pixels import FAINT, INK
-from ..model.splats import Splats
 from ..support.errors import SparklodError
 from ..tables.columns import Row
 from ..tables.statistics import numbers, totals
+from .camera_path import PathScene as PathScene
 from .camera_path import picture_of_path
-from .charts import BLUE, GREEN, INDIGO, ORANGE, PINK, YELLOW, Axes, Frames, Series, draw, head, stacked
+from .charts import BLUE, GREEN, INDIGO, ORANGE, PINK, YELLOW, Axes, FrameColumns, Series, draw, head, stacked
 
 #: Height of a row of two charts, pixels.
 ROW = 255
@@ -41,11 +40,11 @@ class Panel:
 
     title: str
     columns: tuple[str, ...]
-    draw: Callable[[Axes, Frames, ModuleType], Series]
+    draw: Callable[[Axes, FrameColumns, ModuleType], Series]
     marks: tuple[str, ...] = ()
 
 
-def _drawn(axes: Axes, frames: Frames, matplotlib: ModuleType) -> Series:
+def _drawn(axes: Axes, frames: FrameColumns, matplotlib: ModuleType) -> Series:
     _stack(axes, frames, (("leaves", "leaves", GREEN), ("merged", "interior", BLUE)))
     budget = frames.column("budget")
     axes.plot(frames.x, budget, color=YELLOW, linewidth=1.4, label="budget")
@@ -55,7 +54,7 @@ def _drawn(axes: Axes, frames: Frames, matplotlib: ModuleType) -> Series:
     return frames.column("selected")
 
 
-def _where(axes: Axes, frames: Frames, matplotlib: ModuleType) -> Series:
+def _where(axes: Axes, frames: FrameColumns, matplotlib: ModuleType) -> Series:
     parts = (("inside", "in_frustum", GREEN), ("outside", "outside", BLUE), ("behind", "behind", INDIGO))
     _stack(axes, frames, parts)
     _counted(axes, matplotlib)
@@ -63,7 +62,7 @@ def _where(axes: Axes, frames: Frames, matplotlib: ModuleType) -> Series:
     return frames.column("in_frustum")
 
 
-def _stack(axes: Axes, frames: Frames, parts: Sequence[tuple[str, str, str]]) -> None:
+def _stack(axes: Axes, frames: FrameColumns, parts: Sequence[tuple[str, str, str]]) -> None:
     floor = np.zeros(len(frames.x))
     for label, name, color in parts:
         top = floor + np.nan_to_num(frames.column(name))
@@ -90,7 +89,7 @@ def _beside(axes: Axes) -> Axes:
     return other
 
 
-def _coarse(axes: Axes, frames: Frames, matplotlib: ModuleType) -> Series:
+def _coarse(axes: Axes, frames: FrameColumns, matplotlib: ModuleType) -> Series:
     values = frames.ratio("pixel_scale_min", "pixel_scale_limit")
     values[~(values > 0)] = np.nan
     axes.plot(frames.x, values, color=ORANGE, linewidth=1.4)
@@ -104,7 +103,7 @@ def _coarse(axes: Axes, frames: Frames, matplotlib: ModuleType) -> Series:
     return values
 
 
-def _churn(axes: Axes, frames: Frames, matplotlib: ModuleType) -> Series:
+def _churn(axes: Axes, frames: FrameColumns, matplotlib: ModuleType) -> Series:
     values = frames.column("churn")
     axes.fill_between(frames.x, 0, values, color=ORANGE, alpha=0.25, linewidth=0)
     axes.plot(frames.x, values, color=ORANGE, linewidth=1.2)
@@ -114,7 +113,7 @@ def _churn(axes: Axes, frames: Frames, matplotlib: ModuleType) -> Series:
     return values
 
 
-def _fetched(axes: Axes, frames: Frames, matplotlib: ModuleType) -> Series:
+def _fetched(axes: Axes, frames: FrameColumns, matplotlib: ModuleType) -> Series:
     values = frames.column("bytes_new")
     some = values > 0
     axes.vlines(frames.x[some], 0, values[some], color=ORANGE, linewidth=1.8, label="per frame")
@@ -131,7 +130,7 @@ def _fetched(axes: Axes, frames: Frames, matplotlib: ModuleType) -> Series:
     return values
 
 
-def _cache(axes: Axes, frames: Frames, matplotlib: ModuleType) -> Series:
+def _cache(axes: Axes, frames: FrameColumns, matplotlib: ModuleType) -> Series:
     values = frames.column("missing")
     axes.fill_between(frames.x, 0, values, color=ORANGE, alpha=0.35, linewidth=0)
     axes.plot(frames.x, values, color=ORANGE, linewidth=1.2, label="nodes missing")
@@ -148,7 +147,7 @@ def _cache(axes: Axes, frames: Frames, matplotlib: ModuleType) -> Series:
     return values
 
 
-def _depths(axes: Axes, frames: Frames, matplotlib: ModuleType) -> Series:
+def _depths(axes: Axes, frames: FrameColumns, matplotlib: ModuleType) -> Series:
     mean, most = frames.column("level_mean"), frames.column("level_max")
     axes.fill_between(frames.x, frames.column("level_min"), most, color=BLUE, alpha=0.5, linewidth=0, label="range")
     axes.plot(frames.x, mean, color=GREEN, linewidth=1.6, label="mean")
@@ -162,8 +161,8 @@ def _depths(axes: Axes, frames: Frames, matplotlib: ModuleType) -> Series:
     return mean
 
 
-def _line(name: str, unit: str, color: str) -> Callable[[Axes, Frames, ModuleType], Series]:
-    def draw(axes: Axes, frames: Frames, matplotlib: ModuleType) -> Series:
+def _line(name: str, unit: str, color: str) -> Callable[[Axes, FrameColumns, ModuleType], Series]:
+    def draw(axes: Axes, frames: FrameColumns, matplotlib: ModuleType) -> Series:
         values = frames.column(name)
         axes.plot(frames.x, values, color=color, linewidth=1.3)
         _from_zero(axes, values)
@@ -201,25 +200,6 @@ CALLED = {
 
 
 @dataclass(frozen=True)
-class PathScene:
-    """Content of the picture of a camera path.
-
-    Attributes:
-        cameras: of the path.
-        splats: N splats of the cut of one frame.
-        depth: (N,) edges from the root to each node of the cut, or the detail level of each splat.
-        frame: index of the camera whose cut it is; that camera is marked. None for none.
-        title: which of both the depths are, for display.
-    """
-
-    cameras: Sequence[Camera]
-    splats: Splats
-    depth: NDArray[Any]
-    frame: int | None = None
-    title: str = "tree depth"
-
-
-@dataclass(frozen=True)
 class Plot:
     """The bytes of a PNG, and why it has no picture of the path; None if it has one or none was asked for."""
 
@@ -233,8 +213,6 @@ def plot(rows: Iterable[Row], marked: Mapping[str, int], title: str, scene: Path
     Args:
         rows: of all frames; those of single instances are left out.
         marked: numbers of frames worth a look, by the reason, a key of `CALLED`.
-        title: the name of the scene.
-        scene: what the picture of the path shows; None for charts alone.
 
     Raises:
         SparklodError: matplotlib is not installed, or there is no frame.
@@ -249,7 +227,7 @@ def plot(rows: Iterable[Row], marked: Mapping[str, int], title: str, scene: Path
     note = None
     if scene is not None:
         try:
-            picture = picture_of_path(scene.cameras, scene.splats, scene.depth, title=scene.title, frame=scene.frame)
+            picture = picture_of_path(scene)
             images.append(Image.open(io.BytesIO(picture)).convert("RGB"))
         except SparklodError as error:
             note = f"drawn without the picture of the path: {error}"
@@ -288,7 +266,7 @@ def draw_charts(rows: Sequence[Row], marked: Mapping[str, int]) -> NDArray[np.ui
     Raises:
         SparklodError: matplotlib is not installed.
     """
-    frames = Frames(rows)
+    frames = FrameColumns(rows)
     panels = [panel for panel in PANELS if frames.has(*panel.columns)]
 
     def fill(matplotlib: ModuleType, grid: NDArray[Any]) -> None:

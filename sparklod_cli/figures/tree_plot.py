@@ -11,7 +11,7 @@ from ..cameras.frame import direction_of
 from ..images.pixels import BACKGROUND
 from ..lod.kernels.tree_links import find_depths
 from ..model.gaussian import lod_opacity, spark_size
-from ..model.nodes import CHUNK_NODES
+from ..model.lod_tree import CHUNK_NODES
 from ..model.scene import Scene
 from ..model.splats import FloatArray, Splats
 from ..render.color_scales import (
@@ -33,7 +33,7 @@ from ..render.color_scales import (
 from ..support.defaults import DEFAULT_BASE, PLOT_BY
 from ..support.errors import SparklodError
 from .geometry import Points, bounds, box_lines, cells, evenly, is_drawable, level_of_step, viewpoint, wall_lines
-from .pyvista_scene import Stage, write_png
+from .pyvista_scene import PyvistaStage, write_png
 
 #: Marks closer to an end of a scale than this share of it are left out: they would touch the mark of the end.
 APART = 0.04
@@ -44,7 +44,6 @@ def color_by(by: str, splats: Splats, index: NDArray[np.int64], depth: NDArray[n
 
     Args:
         by: one of `PLOT_BY`: "level", the depth of a node, needs `depth`; else "opacity", "size" or "chunk".
-        splats: all N splats.
         index: (M,) indices of the splats that are coloured; at least one.
         depth: (N,) edges from the root; None for a scene without a tree.
     """
@@ -98,41 +97,23 @@ GREY, VOXELS, BOXES = "#5b6673", "#6ea8fe", "#dfe7ef"
 
 
 @dataclass(frozen=True)
-class Picture:
+class DescribedPicture:
     """The bytes of a PNG, and a description of what it shows."""
 
     png: bytes
     description: str
 
 
-@dataclass(frozen=True)
-class _Subject:
-    """Splats that a tree plot shows.
-
-    Attributes:
-        index: (M,) splats that are drawn in colour.
-        total: number of splats that they are a sample of.
-        others: (K,) leaves above the depth that is drawn; grey dots.
-        depths: (N,) depth of each node, -1 for a node that the root does not lead to; None without a tree.
-        title: what is drawn, in words.
-    """
-
-    index: NDArray[np.int64]
-    total: int
-    others: NDArray[np.int64]
-    depths: NDArray[np.int32] | None
-    title: str
-
-
 @np.errstate(over="ignore", invalid="ignore")  # of numbers that are out of range in the file
-def plot(scene: Scene, *, by: str = "level", depth: int | None = None, size: tuple[int, int] = (1600, 1000)) -> Picture:
+def plot(
+    scene: Scene, *, by: str = "level", depth: int | None = None, size: tuple[int, int] = (1600, 1000)
+) -> DescribedPicture:
     """Draws a scene. All depths of a tree are seen from the same viewpoint.
 
     Args:
         scene: N splats; invalid ones are left out. Its tree may be broken.
         by: one of `PLOT_BY`; for a scene without a tree, "level" means "size".
         depth: edges from the root to the nodes that are drawn; None for all leaves, or all splats.
-        size: width and height in pixels.
 
     Raises:
         SparklodError: pyvista is not installed or cannot draw here, no node has this depth, or there is
@@ -144,26 +125,27 @@ def plot(scene: Scene, *, by: str = "level", depth: int | None = None, size: tup
     drawable = is_drawable(splats)
     if not drawable.any():
         raise SparklodError("there is nothing to draw: no splat is valid and has a size")
-    subject = _subject(scene, depth, drawable)
-    by = "size" if by == "level" and subject.depths is None else by
-    coloring = color_by(by, splats, subject.index, subject.depths)
-    chosen = splats.take(subject.index)
+    chosen, others, depths, title = _subject(scene, depth, drawable)
+    index, others = (of[evenly(len(of), MOST_POINTS)] for of in (chosen, others))
+    by = "size" if by == "level" and depths is None else by
+    coloring = color_by(by, splats, index, depths)
+    shown = splats.take(index)
     low, high = bounds(splats.take(drawable))
     up = np.array(direction_of(scene.up))
     eye = viewpoint(box_lines(low[None], high[None]), _direction(up), up, aspect=size[0] / size[1], frame=FRAME)
-    with Stage(low, high, size, BACKGROUND) as stage:
-        drawn = stage.splats(chosen, coloring.rgb, eye)
-        if len(subject.index) < subject.total:
-            drawn += f", an even sample of {len(subject.index):,}"
-        if len(subject.others):
-            stage.dots(splats.center[subject.others], GREY)
-            drawn += f"; grey: {len(subject.others):,} leaves of smaller depth"
-        voxels = _voxels(stage, chosen, low, high, eye.position)
-        boxes = _boxes(stage, scene, subject.index, drawable, by) if scene.tree is not None or by == "chunk" else ""
+    with PyvistaStage(low, high, size, BACKGROUND) as stage:
+        drawn = stage.splats(shown, coloring.rgb, eye)
+        if len(index) < len(chosen):
+            drawn += f", an even sample of {len(index):,}"
+        if len(others):
+            stage.dots(splats.center[others], GREY)
+            drawn += f"; grey: {len(others):,} leaves of smaller depth"
+        voxels = _voxels(stage, shown, low, high, eye.position)
+        boxes = _boxes(stage, scene, index, drawable, by) if scene.tree is not None or by == "chunk" else ""
         pixels = stage.photograph(eye)
     lines = [line for line in (drawn, voxels, boxes) if line]
-    png = write_png(pixels, subject.title, lines, coloring, eye, low, high)
-    return Picture(png, "; ".join([subject.title, f"coloured by {coloring.title}", *lines]))
+    png = write_png(pixels, title, lines, coloring, eye, low, high)
+    return DescribedPicture(png, "; ".join([title, f"coloured by {coloring.title}", *lines]))
 
 
 def _direction(up: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -172,7 +154,13 @@ def _direction(up: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.array(DIRECTION) @ np.stack([right, up, np.cross(right, up)])
 
 
-def _subject(scene: Scene, depth: int | None, drawable: NDArray[np.bool_]) -> _Subject:
+def _subject(
+    scene: Scene, depth: int | None, drawable: NDArray[np.bool_]
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int32] | None, str]:
+    """Return the splats in colour, leaves above the depth that is drawn, the depth of each node, and a title.
+
+    Depths are (N,), -1 for a node that the root does not lead to; None without a tree.
+    """
     none = np.empty(0, np.int64)
     if scene.tree is None:
         if depth is not None:
@@ -191,15 +179,14 @@ def _subject(scene: Scene, depth: int | None, drawable: NDArray[np.bool_]) -> _S
         if not len(index):
             what = "leaf" if depth is None else f"node of depth {depth}"
             raise SparklodError(f"there is no {what} to draw: the tree has depths 0 to {depths.max()}")
-    chosen, others = (of[evenly(len(of), MOST_POINTS)] for of in (index, others))
-    return _Subject(chosen, len(index), others, depths, title)
+    return index, others, depths, title
 
 
 def _counted(count: int, one: str, many: str = "") -> str:
     return f"{count:,} {one if count == 1 else many or one + 's'}"
 
 
-def _voxels(stage: Stage, splats: Splats, low: Points, high: Points, eye: Points) -> str:
+def _voxels(stage: PyvistaStage, splats: Splats, low: Points, high: Points, eye: Points) -> str:
     """Draws the voxel grid in which Quick-LoD would merge splats of this size; returns a description.
 
     A file says neither the base of its grids nor to which of them a node belongs, so the grid is the one of the default
@@ -219,7 +206,7 @@ def _voxels(stage: Stage, splats: Splats, low: Points, high: Points, eye: Points
     return f"blue: on the walls, the grid of voxels {said}{line}"
 
 
-def _boxes(stage: Stage, scene: Scene, index: NDArray[np.int64], drawable: NDArray[np.bool_], by: str) -> str:
+def _boxes(stage: PyvistaStage, scene: Scene, index: NDArray[np.int64], drawable: NDArray[np.bool_], by: str) -> str:
     """Draws boxes around the chunks that hold some nodes; returns a description."""
     count = -(-len(drawable) // CHUNK_NODES)
     chunks = np.unique(index // CHUNK_NODES)

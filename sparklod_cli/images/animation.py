@@ -71,9 +71,7 @@ def animate(frames: Iterable[Pixels], count: int, form: str, fps: float) -> byte
 
     Args:
         frames: at least one, all of one size; with alpha for "webp" only.
-        count: number of frames.
         form: one of `defaults.MOVING`.
-        fps: frames per second.
 
     Raises:
         SparklodError: videos cannot be written here, or the animation is too large for its format.

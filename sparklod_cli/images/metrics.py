@@ -143,7 +143,6 @@ def worst_tile(a: Image, b: Image, size: int = TILE) -> Tile:
 
     Args:
         a, b: (H, W, C) of the same shape, 0..1.
-        size: side of a tile, pixels.
     """
     error = _squared_error(a, b).mean(axis=2)
     height, width = error.shape

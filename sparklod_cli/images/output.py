@@ -18,7 +18,7 @@ NUMBER = re.compile(r"%(?:0\d{1,2})?d")
 
 
 @dataclass(frozen=True)
-class Output:
+class PictureOutput:
     """The destination of pictures.
 
     Attributes:
@@ -50,14 +50,12 @@ class Output:
             check_writable(path, overwrite=overwrite)
 
 
-def output_for(name: Path | None, default: Path, cameras: int, *, sheet: bool) -> Output:
+def output_for(name: Path | None, default: Path, cameras: int, *, sheet: bool) -> PictureOutput:
     """Return the destination of the pictures of a number of cameras.
 
     Args:
         name: the requested path; "-" for standard output; None for a path derived from `default`.
         default: a path without suffix.
-        cameras: number of cameras.
-        sheet: put all pictures on one contact sheet.
 
     Raises:
         ValueError: this destination cannot hold that many pictures, or its format is unknown.
@@ -66,7 +64,7 @@ def output_for(name: Path | None, default: Path, cameras: int, *, sheet: bool) -
     if name is not None and str(name) == "-":
         if several:
             raise ValueError(f"standard output takes one picture, not {cameras:,}; name a file with --output")
-        return Output(None, "png", "sheet" if sheet else "picture")
+        return PictureOutput(None, "png", "sheet" if sheet else "picture")
     if name is None:
         name = default.with_name(f"{default.name.replace('%', '_')}{'.%04d' if several else ''}.png")
     form = name.suffix.lower().removeprefix(".")
@@ -77,20 +75,20 @@ def output_for(name: Path | None, default: Path, cameras: int, *, sheet: bool) -
     if sheet:
         if form not in SHEETS or places:
             raise ValueError(f"a contact sheet is one {_suffixes(SHEETS)}, which --output {name} is not")
-        return Output(name, form, "sheet")
+        return PictureOutput(name, form, "sheet")
     if places:
         if places > 1 or form not in STILL:
             stills = _suffixes(STILL, "out.%04d")
             raise ValueError(f"--output {name} does not name frames; write {stills}")
-        return Output(name, form, "frames")
+        return PictureOutput(name, form, "frames")
     if form not in STILL or (several and form in MOVING):
-        return Output(name, form, "animation")
+        return PictureOutput(name, form, "animation")
     if several:
         raise ValueError(
             f"--output {name} is one picture, and there are {cameras:,} cameras: write frames"
             f" ({name.stem}.%04d{name.suffix}), an animation ({_suffixes(MOVING)}) or a --sheet"
         )
-    return Output(name, form, "picture")
+    return PictureOutput(name, form, "picture")
 
 
 def _suffixes(forms: Sequence[str] | dict[str, None], stem: str = "") -> str:

@@ -39,7 +39,6 @@ def write_title(draw: ImageDraw.ImageDraw, unit: float, title: str, lines: Seque
     """Write a title, and lines below it, at the upper left of a picture.
 
     Args:
-        draw: draws on the picture.
         unit: pixels in a thousandth of the picture's height; 1 for a picture of 1600 x 1000.
         title: cut to `MAX_TITLE` characters.
         lines: text and colour of each; not cut.
@@ -54,9 +53,7 @@ def write_scale(image: Pillow.Image, draw: ImageDraw.ImageDraw, unit: float, col
     """Draws a colour scale at the right of a picture: what the colours mean.
 
     Args:
-        image, draw: the picture, and what draws on it.
         unit: pixels in a thousandth of the picture's height; 1 for a picture of 1600 x 1000.
-        coloring: the scale's title, ramp and marks.
     """
     left, right = image.width - 170 * unit, image.width - 146 * unit
     top, bottom = 0.26 * image.height, 0.84 * image.height
@@ -183,7 +180,6 @@ def encode(pixels: Pixels, form: str, jpeg_quality: int = JPEG_QUALITY) -> bytes
     Args:
         pixels: with alpha for "png" and "webp" only.
         form: one of the three.
-        jpeg_quality: of a "jpg", 1 to 100.
     """
     out = io.BytesIO()
     picture = Pillow.fromarray(pixels)

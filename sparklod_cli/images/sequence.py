@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from ..render.renderer import DrawnPicture
     from ..render.settings import RenderSettings
     from ..scenes.finder import CutSource
-    from .output import Output
+    from .output import PictureOutput
     from .pixels import Color, Pixels
 
 #: Maximum total number of pixels of the pictures that are cached after finding a gain until their frames are written:
@@ -59,7 +59,7 @@ class PictureSettings:
 
 
 @dataclass(frozen=True)
-class Pictures:
+class WrittenPictures:
     """The pictures that were written.
 
     Attributes:
@@ -89,24 +89,19 @@ class _Frame:
 def write_pictures(
     source: CutSource,
     path: CameraPath,
-    output: Output,
+    output: PictureOutput,
     render: RenderSettings,
     settings: PictureSettings,
     *,
     reference: CutSource | None = None,
     overwrite: bool = False,
     progress: Progress = silent,
-) -> Pictures:
+) -> WrittenPictures:
     """Render and write the pictures of a camera path.
 
     Args:
-        source: the cuts to render.
         path: the cameras; all of one size for an animation or a contact sheet.
-        output: the destination of the pictures.
-        render: settings of the renderer.
-        settings: settings of the files.
         reference: cuts to compare with; the pictures are then differences from it.
-        overwrite: replace existing files.
         progress: called with the number of frames scanned for the colour scale, compared and drawn.
 
     Raises:
@@ -134,7 +129,7 @@ class _Writer:
         self,
         renderer: Renderer,
         path: CameraPath,
-        output: Output,
+        output: PictureOutput,
         settings: PictureSettings,
         reference: Renderer | None,
         overwrite: bool,
@@ -147,7 +142,7 @@ class _Writer:
         self._gain = 1.0 if reference is None else settings.gain or self._fitting_gain(reference)
         self._bytes = 0
 
-    def run(self) -> Pictures:
+    def run(self) -> WrittenPictures:
         output, facts, empty = self._output, [], True
 
         def drawn() -> Iterator[_Frame]:
@@ -170,7 +165,7 @@ class _Writer:
         else:
             whole = sheet([_pixels(frame) for frame in drawn()], self._captions())
             self._write(output.name, [self._encode(whole)])
-        return Pictures(facts, self._bytes, self._gain if self._reference is not None else None, empty)
+        return WrittenPictures(facts, self._bytes, self._gain if self._reference is not None else None, empty)
 
     def _captions(self) -> list[str]:
         cameras = zip(self._path.numbers, self._path.cameras, strict=True)

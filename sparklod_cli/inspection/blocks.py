@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..io.rad_file import RadFile
-from ..model.lod_tree import LodTree
-from ..model.nodes import CHUNK_NODES
+from ..model.lod_tree import CHUNK_NODES, LodTree
 from ..model.scene import Scene
 from ..model.splats import COLUMNS, FloatArray, Splats
 from ..support.parallel import ordered_map
@@ -67,7 +66,7 @@ class Block:
 
 
 @dataclass(frozen=True, eq=False)
-class Blocks:
+class ReportBlocks:
     """A scene, block by block.
 
     Attributes:
@@ -75,7 +74,7 @@ class Blocks:
         count: N splats.
         is_tree: whether they are the nodes of a tree.
         map: called with a function of a block, columns of `Splats` and a number of threads, returns the results in
-            order; may be called again. Blocks in memory have all columns and are processed on that many threads.
+            order; may be called again. ReportBlocks in memory have all columns and are processed on that many threads.
         in_memory: whether several threads may call `map`.
     """
 
@@ -86,11 +85,10 @@ class Blocks:
     in_memory: bool = True
 
     @classmethod
-    def of(cls, scene: Scene, unread: Collection[str] = ()) -> Blocks:
+    def of(cls, scene: Scene, unread: Collection[str] = ()) -> ReportBlocks:
         """Blocks of an in-memory scene, as long as the chunks of its file, or `CHUNK_NODES`.
 
         Args:
-            scene: as it was read.
             unread: columns that were not read and count as valid.
         """
         step, tree = scene.header.get("chunk_size") or CHUNK_NODES, scene.tree
@@ -113,7 +111,7 @@ class Blocks:
         return cls(scene, len(scene.splats), tree is not None, mapped)
 
     @classmethod
-    def of_file(cls, file: RadFile, *, threads: int = 1, progress: Progress = silent) -> Blocks:
+    def of_file(cls, file: RadFile, *, threads: int = 1, progress: Progress = silent) -> ReportBlocks:
         """Chunks of a file. The first time they are read, all of their columns are unpacked, to find damage."""
         header, noted, again = file.header, file.header.noted, False
 
@@ -137,21 +135,21 @@ class Blocks:
 
 
 @dataclass(frozen=True)
-class Tally:
+class MaskTally:
     """Number of splats or nodes that have something, and the index of the first."""
 
     count: int = 0
     first: int = -1
 
     @classmethod
-    def of(cls, mask: Mask, start: int) -> Tally:
+    def of(cls, mask: Mask, start: int) -> MaskTally:
         """Tally of a block that begins at `start`."""
         count = int(np.count_nonzero(mask))
         return cls(count, start + int(np.argmax(mask))) if count else cls()
 
-    def __add__(self, following: Tally) -> Tally:
+    def __add__(self, following: MaskTally) -> MaskTally:
         """Tally of two parts, in order."""
-        return Tally(self.count + following.count, self.first if self.count else following.first)
+        return MaskTally(self.count + following.count, self.first if self.count else following.first)
 
     def finding(self, code: str, text: str) -> list[Finding]:
         """Return a finding if there are any; in its text, {first} is the first and {more} how many others."""
@@ -161,15 +159,15 @@ class Tally:
         return [Finding(code, message, self.first, self.count)]
 
 
-def tallies(masks: dict[str, Mask], start: int) -> dict[str, Tally]:
+def tallies(masks: dict[str, Mask], start: int) -> dict[str, MaskTally]:
     """Tallies of the masks of a block that begins at `start`, by their names."""
-    return {name: Tally.of(mask, start) for name, mask in masks.items()}
+    return {name: MaskTally.of(mask, start) for name, mask in masks.items()}
 
 
-def merged(parts: Iterable[dict[str, Tally]]) -> dict[str, Tally]:
+def merged(parts: Iterable[dict[str, MaskTally]]) -> dict[str, MaskTally]:
     """Tallies of all blocks, in order; a name that a block lacks counts as none there."""
-    total: dict[str, Tally] = {}
+    total: dict[str, MaskTally] = {}
     for part in parts:
         for name, tally in part.items():
-            total[name] = total.get(name, Tally()) + tally
+            total[name] = total.get(name, MaskTally()) + tally
     return total

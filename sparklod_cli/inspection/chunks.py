@@ -9,10 +9,9 @@ import numpy as np
 
 from ..lod.kernels.tree_links import find_depths, find_parents
 from ..model.gaussian import spark_size
-from ..model.scene import Scene
 from ..tables.columns import Cell, Column, Row
 from . import tree
-from .blocks import Block, Blocks, merged
+from .blocks import Block
 
 COLUMNS = (
     Column("chunk", int, "", "", "number of the chunk, from 0"),
@@ -65,7 +64,7 @@ def row_of(block: Block) -> dict[str, Any]:
 
 
 def table_of(
-    rows: Sequence[dict[str, Any]], chunk_bytes: Sequence[int] | None, nodes: tree.Columns | None
+    rows: Sequence[dict[str, Any]], chunk_bytes: Sequence[int] | None, nodes: tree.TreeColumns | None
 ) -> list[Row]:
     """Return the rows with a cell for each of `COLUMNS`.
 
@@ -81,7 +80,7 @@ def table_of(
     return [{column.name: column.rounded(row[column.name]) for column in COLUMNS} for row in rows]
 
 
-def _add_links(rows: Sequence[dict[str, Any]], nodes: tree.Columns) -> None:
+def _add_links(rows: Sequence[dict[str, Any]], nodes: tree.TreeColumns) -> None:
     links = nodes.tree
     depth, _ = find_depths(links.child_count, links.child_start, nodes.size)
     parent, _ = find_parents(links.child_count, links.child_start)
@@ -92,15 +91,6 @@ def _add_links(rows: Sequence[dict[str, Any]], nodes: tree.Columns) -> None:
         elsewhere = np.unique(above[above >= 0] // step)
         row["parent_chunks"] = int(np.count_nonzero(elsewhere != number))
         row["depth_min"], row["depth_max"] = (int(max(end, 0)) for end in (depth[part].min(), depth[part].max()))
-
-
-def rows_of(scene: Scene) -> list[Row]:
-    """Return the rows of a scene in memory."""
-    blocks = Blocks.of(scene)
-    nodes = tree.Columns.of(blocks) if blocks.is_tree and blocks.count else None
-    if nodes is not None:
-        merged(blocks.map(nodes.add, (), 1))
-    return table_of(list(blocks.map(row_of, (), 1)), scene.chunk_bytes, nodes)
 
 
 def lines(rows: list[dict[str, Any]]) -> Iterator[str]:

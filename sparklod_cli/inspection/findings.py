@@ -1,4 +1,4 @@
-"""`Finding`, one fault of a file, the table of all kinds of findings, and `Survey`, findings about headers."""
+"""`Finding`, one fault of a file, the table of all kinds of findings, and `HeaderScan`, findings about headers."""
 
 from __future__ import annotations
 
@@ -144,7 +144,7 @@ class ChunkBytes:
 
 
 @dataclass(frozen=True)
-class Survey:
+class HeaderScan:
     """Facts and broken rules from the headers of a file and of the files that it names.
 
     Attributes:

@@ -9,7 +9,7 @@ from importlib.resources import files
 from typing import Any
 
 from .. import __version__
-from ..figures.tree_plot import Picture
+from ..figures.tree_plot import DescribedPicture
 from ..model.scene import Scene
 from ..tables.histograms import Histogram
 from . import values
@@ -90,7 +90,7 @@ MAX_FINDINGS = 200
 
 
 @dataclass(frozen=True)
-class Section:
+class FileSection:
     """The part of a page about one file.
 
     Attributes:
@@ -101,22 +101,22 @@ class Section:
     """
 
     report: Mapping[str, Any]
-    picture: Picture | None = None
+    picture: DescribedPicture | None = None
     histograms: Mapping[str, Histogram] = field(default_factory=dict)
-    thumbnail: Picture | None = None
+    thumbnail: DescribedPicture | None = None
 
 
 def section_of(
-    report: Report, scene: Scene | None, picture: Picture | None, thumbnail: Picture | None = None
-) -> Section:
+    report: Report, scene: Scene | None, picture: DescribedPicture | None, thumbnail: DescribedPicture | None = None
+) -> FileSection:
     """Return the section about a file: its report, its pictures, and histograms of what was read of it."""
     drawn = {}
     if scene is not None and len(scene.splats):
         drawn = {name: values.histogram_of(scene.splats, name) for name in values.names_of(scene.splats)}
-    return Section(report.as_dict(), picture, drawn, thumbnail)
+    return FileSection(report.as_dict(), picture, drawn, thumbnail)
 
 
-def page(sections: Sequence[Section]) -> str:
+def page(sections: Sequence[FileSection]) -> str:
     """Return the page about one or more files, as HTML to be written in UTF-8."""
     one = len(sections) == 1
     title = f"{text_of(sections[0].report.get('file', ''))} \u2013 sparklod inspect" if one else "sparklod inspect"
@@ -157,7 +157,7 @@ def _verdict(report: Mapping[str, Any]) -> str:
     return '<span class="badge good">no faults found</span>'
 
 
-def _contents(sections: Sequence[Section]) -> str:
+def _contents(sections: Sequence[FileSection]) -> str:
     rows = []
     for number, report in enumerate((section.report for section in sections), 1):
         name = f'<a href="#file-{number}">{text_of(report.get("file", number))}</a>'
@@ -175,7 +175,7 @@ def _contents(sections: Sequence[Section]) -> str:
     return f'<nav class="panel" aria-label="Files">{table_of(head, rows, "The files")}</nav>\n'
 
 
-def _section(section: Section, anchor: str) -> str:
+def _section(section: FileSection, anchor: str) -> str:
     report = section.report
     form = f'<span class="badge plain">{text_of(report["format"])}</span>' if report.get("format") else ""
     name = text_of(report.get("file", ""))

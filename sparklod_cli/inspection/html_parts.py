@@ -9,7 +9,7 @@ from html import escape
 
 import numpy as np
 
-from ..figures.tree_plot import Picture
+from ..figures.tree_plot import DescribedPicture
 from ..tables.histograms import Histogram, edge_names
 
 #: Width and height of a chart, and what the labels below and the figure above take of it, in units of its view box.
@@ -32,8 +32,6 @@ def chart(counts: Sequence[int], tooltips: Sequence[str], labels: Iterable[tuple
     """Return a bar chart.
 
     Args:
-        counts: one for each bar.
-        tooltips: one for each bar.
         labels: positions along the axis, in bars, and their texts.
         summary: description for screen readers.
     """
@@ -78,11 +76,7 @@ def histogram_chart(histogram: Histogram, name: str) -> str:
 
 
 def children_groups(children: Mapping[str, int]) -> list[tuple[str, int]]:
-    """Numbers of nodes by their number of children: first single numbers, then ranges that double.
-
-    Args:
-        children: counts of nodes, by number of children as text.
-    """
+    """Numbers of nodes by their number of children: first single numbers, then ranges that double."""
     if not children:
         return []
     most = max(int(number) for number in children)
@@ -144,7 +138,7 @@ def _cell(content: str) -> str:
     return f'<td class="wide">{content}</td>' if content.startswith('<div class="track"') else f"<td>{content}</td>"
 
 
-def figure_of(picture: Picture | None, *, small: bool = False) -> str:
+def figure_of(picture: DescribedPicture | None, *, small: bool = False) -> str:
     """Return a picture with its description; nothing where there is none."""
     if picture is None:
         return ""

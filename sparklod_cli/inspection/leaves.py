@@ -15,8 +15,8 @@ from ..codecs.rad.property_codings import CODINGS
 from ..codecs.rad.rad_encoder import rounded
 from ..codecs.rad.rad_layout import PROPERTIES, Row
 from ..codecs.spark_codings import STEPS_8_8_8, encode_axis_angle, encode_lod_alpha
-from ..codecs.spz_encoder import to_code
-from ..codecs.spz_layout import LOD, Layout
+from ..codecs.spz import to_code
+from ..codecs.spz_streams import LOD, Layout
 from ..codecs.statistics import ALL_BITS, ShBytes, Statistics, enough, fine_bits
 from ..model.scene import Scene
 from ..model.selection import Selection
@@ -36,7 +36,7 @@ DEGREES = {3: 14.0, 4: 0.8}
 #: As f16 and f32 it has no w, which is the less exact the nearer it is to 0.
 RAD_DEGREES = {"oct88r8": 4.0, "f16": 4.0, "f32": 0.2}
 
-#: The columns of SPZ whose codes may differ by a step, in the order in which `Coded.numbers` has them.
+#: The columns of SPZ whose codes may differ by a step, in the order in which `CodedSplats.numbers` has them.
 COLUMNS = ("center", "opacity", "rgb", "scale", "sh")
 
 #: Most bits after the binary point of centres that were rounded: those of SPZ.
@@ -47,7 +47,7 @@ PLAIN = {"f32_lebytes": "f32", "f16_lebytes": "f16", "r8_delta": "r8", "s8_delta
 
 
 @dataclass(frozen=True)
-class Coded:
+class CodedSplats:
     """N splats as codes.
 
     Attributes:
@@ -62,26 +62,24 @@ class Coded:
 
 
 @dataclass(frozen=True)
-class Coding:
+class LeafCoding:
     """Coding of splats as integers, for comparing the splats of a file, and its tolerances.
 
     Attributes:
         encode: N splats to codes.
-        steps: (n,) int64 largest differences of `Coded.numbers` between two codes of one splat.
+        steps: (n,) int64 largest differences of `CodedSplats.numbers` between two codes of one splat.
         degrees: largest angle between two codes of one rotation.
     """
 
-    encode: Callable[[Splats], Coded]
+    encode: Callable[[Splats], CodedSplats]
     steps: NDArray[np.int64]
     degrees: float
 
 
-def codings_of(scene: Scene, leaves: Splats, original: Splats, facts: RadFacts | None) -> Iterator[Coding | str]:
+def codings_of(scene: Scene, leaves: Splats, original: Splats, facts: RadFacts | None) -> Iterator[LeafCoding | str]:
     """Yield the codings in which a writer may have put leaves, the most likely first; or why there is none.
 
     Args:
-        scene: the tree.
-        leaves: of the tree.
         original: the splats that may have become the leaves.
         facts: of the RAD file that the tree is from; None for SPZ.
     """
@@ -95,7 +93,7 @@ def codings_of(scene: Scene, leaves: Splats, original: Splats, facts: RadFacts |
         yield of_rad(facts, leaves, guess, covering=covering)
 
 
-def of_spz(scene: Scene, leaves: Splats, *, covering: bool) -> Coding:
+def of_spz(scene: Scene, leaves: Splats, *, covering: bool) -> LeafCoding:
     """Return the coding of an SPZ file that a scene was read from.
 
     Args:
@@ -109,7 +107,7 @@ def of_spz(scene: Scene, leaves: Splats, *, covering: bool) -> Coding:
     steps[10:] = SH_STEPS
     sh_bits = enough(ShBytes.of(leaves.sh)) if degree else ALL_BITS
 
-    def encode(splats: Splats) -> Coded:
+    def encode(splats: Splats) -> CodedSplats:
         parts, numbers = [], {}
         splats = to_code(splats, None, bits, sh_bits, covering=covering)
         for stream in Layout(version, len(splats), degree, bits, LOD).streams():
@@ -122,19 +120,16 @@ def of_spz(scene: Scene, leaves: Splats, *, covering: bool) -> Coding:
         center = numbers["center"].reshape(-1, 3, 3) @ np.array([1, 1 << 8, 1 << 16], np.int32)
         numbers["center"] = np.where(center >= 1 << 23, center - (1 << 24), center)
         columns = [numbers[name] for name in COLUMNS if name in numbers]
-        return Coded(_rows(parts), np.concatenate(columns, axis=1), splats.quat_xyzw)
+        return CodedSplats(_rows(parts), np.concatenate(columns, axis=1), splats.quat_xyzw)
 
-    return Coding(encode, steps, DEGREES[3 if version == 2 else 4])
+    return LeafCoding(encode, steps, DEGREES[3 if version == 2 else 4])
 
 
-def of_rad(facts: RadFacts, leaves: Splats, rounded_to: int | None, *, covering: bool) -> Coding | str:
+def of_rad(facts: RadFacts, leaves: Splats, rounded_to: int | None, *, covering: bool) -> LeafCoding | str:
     """Yield the coding of a RAD file; or why there is none. A palette of SH, whose entries stand for many, is left out.
 
     Args:
-        facts: of the file.
-        leaves: its leaves.
         rounded_to: bits after the binary point to which its writer rounded centres; None for not at all.
-        covering: as for SPZ.
     """
     mixed = [name for name, found in facts.properties.items() if "," in found.encoding]
     if mixed:
@@ -158,16 +153,16 @@ def of_rad(facts: RadFacts, leaves: Splats, rounded_to: int | None, *, covering:
             else:
                 yield _rad_codes(splats, row, found, name)
 
-    def encode(splats: Splats) -> Coded:
+    def encode(splats: Splats) -> CodedSplats:
         splats = _covering(splats, facts, rounded_to) if covering else splats
         if rounded_to is not None:
             splats = dataclasses.replace(splats, center=rounded(splats.center, rounded_to))
         numbers = np.concatenate(list(numbers_of(splats)), axis=1)
         axis = np.stack(encode_axis_angle(splats.quat_xyzw, STEPS_8_8_8), axis=1)
         parts = [np.ascontiguousarray(each).view(np.uint8).reshape(len(splats), -1) for each in (numbers, axis)]
-        return Coded(_rows(parts), numbers, splats.quat_xyzw)
+        return CodedSplats(_rows(parts), numbers, splats.quat_xyzw)
 
-    return Coding(encode, np.concatenate(steps), RAD_DEGREES[rotation])
+    return LeafCoding(encode, np.concatenate(steps), RAD_DEGREES[rotation])
 
 
 def _fractional_bits(center: FloatArray) -> int | None:
@@ -226,7 +221,6 @@ def check(scene: Scene, original: Scene, facts: RadFacts | None = None) -> list[
 
     Args:
         scene: of an SPZ or RAD file.
-        original: of any file.
         facts: of the RAD file that the tree is from; None for SPZ.
     """
     if scene.tree is None:
@@ -256,7 +250,7 @@ def check(scene: Scene, original: Scene, facts: RadFacts | None = None) -> list[
     return [Finding("expect.leaves", what, index, len(missing))]
 
 
-def _unpaired(ours: Coded, theirs: Coded, coding: Coding) -> NDArray[np.intp]:
+def _unpaired(ours: CodedSplats, theirs: CodedSplats, coding: LeafCoding) -> NDArray[np.intp]:
     """Ascending indices of ours without a counterpart among theirs; each of theirs pairs with one of ours only."""
     left, right = _not_equal(ours.rows, theirs.rows)
     # Splats of a writer that rounds differently mostly still have the same order when sorted.
@@ -285,7 +279,7 @@ def _unpaired(ours: Coded, theirs: Coded, coding: Coding) -> NDArray[np.intp]:
 
 
 def _alike(
-    ours: Coded, left: NDArray[np.intp], theirs: Coded, right: NDArray[np.intp], coding: Coding
+    ours: CodedSplats, left: NDArray[np.intp], theirs: CodedSplats, right: NDArray[np.intp], coding: LeafCoding
 ) -> NDArray[np.bool_]:
     """Whether pairs of splats of ours and theirs lie within a step of each other in every code."""
     near = (_apart(theirs.numbers[right], ours.numbers[left]) <= coding.steps).all(axis=1)

@@ -13,7 +13,7 @@ from ..codecs.rad.rad_reader import scan_chunks, scan_header
 from ..codecs.splat_encoding import log_scale_table
 from ..io import opened
 from ..support.printable import MOST, printable
-from .findings import ChunkBytes, Head, Survey, findings_of
+from .findings import ChunkBytes, Head, HeaderScan, findings_of
 from .value_checks import Ends
 
 #: Name of the format in `codecs.formats`.
@@ -67,7 +67,7 @@ class RadFacts:
     properties: dict[str, PropertyFacts]
 
 
-def survey(path: Path, *, check: bool) -> Survey | None:
+def survey(path: Path, *, check: bool) -> HeaderScan | None:
     """Read the headers of a RAD file and of its chunks; None for a file of another format.
 
     Args:
@@ -89,11 +89,11 @@ def survey(path: Path, *, check: bool) -> Survey | None:
                     gathered.add(chunk.header)
     fatal = findings_of(each for each in violations if each.fatal)
     if fatal:
-        return Survey("rad", None, None, findings_of(violations), fatal)
+        return HeaderScan("rad", None, None, findings_of(violations), fatal)
     facts = _facts(header, gathered)
     noted = header.noted
     head = Head(header.format, facts.bytes, header.count, header.max_sh, noted.antialiased, noted.up)
-    return Survey("rad", head, facts, findings_of(violations), [])
+    return HeaderScan("rad", head, facts, findings_of(violations), [])
 
 
 @dataclass

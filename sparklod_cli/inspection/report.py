@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..codecs.spz_layout import KNOWN_FLAGS
+from ..codecs.spz_streams import KNOWN_FLAGS
 from ..io import examine_scene, read_arrays, size_of_input
 from ..io.rad_file import RadFile
 from ..model.scene import Scene
@@ -20,8 +20,8 @@ from ..support.progress import Progress, silent
 from ..support.untrusted import QUOTED
 from ..tables.columns import Row
 from . import arrays, chunks, rad, streamed_sog, tree, value_checks, values
-from .blocks import Block, Blocks, merged
-from .findings import Finding, Head, Survey
+from .blocks import Block, ReportBlocks, merged
+from .findings import Finding, Head, HeaderScan
 from .value_checks import ValueTally
 
 #: Version of the report: counts up when a field changes its meaning or is removed. schema.json describes this one.
@@ -145,9 +145,6 @@ def inspect(
 
     Args:
         path: of the file, or of the folder of an unpacked SOG.
-        settings: what to report.
-        threads: to read with.
-        progress: called while the file is read.
     """
     columns = set(COLUMNS) if settings.values or settings.check or settings.chunks else OF_TREE
     size, unread, surveyed = size_of_input(path), set[str](), None
@@ -167,7 +164,7 @@ def inspect(
         if surveyed is not None and surveyed.field == "rad" and settings.at_once is not True:
             file = RadFile.open(path)
             if file is not None and not (settings.at_once is None and file.fits):
-                blocks = Blocks.of_file(file, threads=threads, progress=progress)
+                blocks = ReportBlocks.of_file(file, threads=threads, progress=progress)
                 return _of_blocks(path, blocks, columns, size, settings, surveyed, threads), None
         if surveyed is None and settings.at_once is not True:
             # Only SPZ files are read by columns. None of their codes is invalid but positions of version 1.
@@ -179,17 +176,17 @@ def inspect(
         known = any(each.code == error.code for each in found)
         return Report(str(path), size, findings=[*found, *([] if known else [Finding(error.code, str(error))])]), None
     partial = surveyed is None and settings.at_once is not True and "fractional_bits" in scene.header
-    blocks = Blocks.of(scene, unread if partial else ())
+    blocks = ReportBlocks.of(scene, unread if partial else ())
     return _of_blocks(path, blocks, columns, size, settings, surveyed, threads), None if partial else scene
 
 
 def _of_blocks(
     path: Path,
-    blocks: Blocks,
+    blocks: ReportBlocks,
     columns: Collection[str],
     size: int | None,
     settings: ReportSettings,
-    surveyed: Survey | None,
+    surveyed: HeaderScan | None,
     threads: int,
 ) -> Report:
     """Return the report on a file that can be read, block by block."""
@@ -200,7 +197,7 @@ def _of_blocks(
         size, findings = surveyed.facts.bytes, findings + surveyed.findings
     if surveyed is not None and surveyed.field == "rad":
         ends = rad.ends_of(surveyed.facts)
-    nodes = tree.Columns.of(blocks) if blocks.is_tree and blocks.count else None
+    nodes = tree.TreeColumns.of(blocks) if blocks.is_tree and blocks.count else None
 
     def examined(block: Block) -> tuple[Any, Any, Any]:
         return (
@@ -244,7 +241,7 @@ def _of_blocks(
     )
 
 
-def _report(path: Path, head: Head | None, surveyed: Survey | None) -> Report:
+def _report(path: Path, head: Head | None, surveyed: HeaderScan | None) -> Report:
     """Return the report that headers alone give."""
     assert head is not None
     size, count = head.bytes, head.splats

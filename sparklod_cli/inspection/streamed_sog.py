@@ -16,7 +16,7 @@ from ..io import opened
 from ..support.printable import MOST, printable
 from ..support.progress import Progress, silent
 from ..support.untrusted import LARGEST
-from .findings import ChunkBytes, Head, Survey, findings_of
+from .findings import ChunkBytes, Head, HeaderScan, findings_of
 from .values import Box
 
 #: Name of the format in `codecs.formats`.
@@ -94,14 +94,12 @@ class StreamedSogFacts:
     environment: EnvironmentFacts | None
 
 
-def survey(path: Path, *, check: bool, threads: int = 1, progress: Progress = silent) -> Survey | None:
+def survey(path: Path, *, check: bool, threads: int = 1, progress: Progress = silent) -> HeaderScan | None:
     """Read a manifest and the headers of its chunk files; None for a file of another format.
 
     Args:
         path: of the manifest, or of its folder; - is standard input.
         check: decode the chunk files and look at their splats, too.
-        threads: to decode with.
-        progress: called while they are decoded.
 
     Raises:
         FormatError: the manifest cannot be parsed, or the path is no splat file.
@@ -113,13 +111,13 @@ def survey(path: Path, *, check: bool, threads: int = 1, progress: Progress = si
         manifest, files, violations = scan_files(file, more["beside"])
         fatal = [each for each in violations if each.fatal]
         if fatal:
-            return Survey("streamed_sog", None, None, findings_of(violations), findings_of(fatal))
+            return HeaderScan("streamed_sog", None, None, findings_of(violations), findings_of(fatal))
         if check:
             found = scan_splats(more["beside"], manifest, files, threads=threads, progress=progress)
             violations = [*violations, *found]
     chunks = {name: chunk for name, chunk in files.items() if isinstance(chunk, Chunk)}
     facts = _facts(manifest, chunks, size)
-    return Survey("streamed_sog", _head(manifest, chunks, facts), facts, findings_of(violations), [])
+    return HeaderScan("streamed_sog", _head(manifest, chunks, facts), facts, findings_of(violations), [])
 
 
 def _head(manifest: Manifest, chunks: Mapping[str, Chunk], facts: StreamedSogFacts) -> Head:

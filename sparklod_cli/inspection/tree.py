@@ -24,12 +24,11 @@ from ..lod.kernels.tree_links import (
     sum_by_depth,
 )
 from ..model.gaussian import spark_size
-from ..model.lod_tree import LodTree
-from ..model.nodes import CHUNK_BITS, CHUNK_NODES
+from ..model.lod_tree import CHUNK_BITS, CHUNK_NODES, LodTree
 from ..model.scene import Scene
 from ..model.splats import FloatArray, Splats
 from ..support.parallel import blocks_of, ordered_map
-from .blocks import Block, Blocks, Mask, Tally, largest, merged, tallies
+from .blocks import Block, Mask, MaskTally, ReportBlocks, largest, merged, tallies
 from .findings import Finding
 
 #: Smallest feature size of a node over the mean of its children's, weighted by area. A merged splat has at least their
@@ -53,7 +52,7 @@ def parts_of(tree: LodTree) -> list[slice]:
     return blocks_of(len(tree), CHUNK_NODES)
 
 
-def node_text(tally: Tally, what: str) -> str:
+def node_text(tally: MaskTally, what: str) -> str:
     """Return the text of a finding about nodes."""
     return f"node {{first}} {what}{' (and {more} more)' if tally.count > 1 else ''}"
 
@@ -64,10 +63,8 @@ def link_findings(
     """Return findings about the links of a tree of N nodes.
 
     Args:
-        tree: of them.
         parent, references: (N,) of `find_parents`.
         depth: (N,) of `find_depths`.
-        threads: to work on.
     """
     faults = {
         "tree.root": "is the root but the child of another node",
@@ -81,7 +78,7 @@ def link_findings(
     }
     cycles = find_cycles(parent, depth)
 
-    def tallied(part: slice) -> dict[str, Tally]:
+    def tallied(part: slice) -> dict[str, MaskTally]:
         count, start, held = tree.child_count[part], tree.child_start[part].astype(np.int64), references[part]
         node = np.arange(part.start, part.stop)
         inner = count > 0
@@ -102,7 +99,7 @@ def link_findings(
 
 
 def size_findings(
-    blocks: Blocks,
+    blocks: ReportBlocks,
     tree: LodTree,
     parent: NDArray[np.int32],
     size: FloatArray,
@@ -113,11 +110,9 @@ def size_findings(
 
     Args:
         blocks: of the nodes; read if a node may be too small.
-        tree: of them.
         parent: (N,) of `find_parents`.
         size: (N,) feature sizes, world units.
         scale_ends: as for `tree.examine_blocks`.
-        threads: to work on.
     """
     # No mean is larger than the largest child, but for rounding. In a good tree, that tells of nearly all nodes that
     # they are large enough.
@@ -152,13 +147,13 @@ def size_findings(
         add_weighted(above, size[part], weight, sums, weights)
         excused[above[line & (above >= 0)]] = True
         excused[part] |= clamped
-    small = Tally()
+    small = MaskTally()
     for part in parts_of(tree):
         if not marks[part].any():
             continue
         weight = weights[part]
         mean = np.divide(sums[part], weight, out=np.zeros(len(weight)), where=weight > 0)
-        small += Tally.of((size[part] < MIN_SIZE_RATIO * mean) & ~excused[part], part.start)
+        small += MaskTally.of((size[part] < MIN_SIZE_RATIO * mean) & ~excused[part], part.start)
     return small.finding("tree.size", node_text(small, "is less than a third as large as the mean of its children"))
 
 
@@ -168,7 +163,6 @@ def order_findings(parent: NDArray[np.int32], limit: FloatArray, threads: int) -
     Args:
         parent: (N,) of `find_parents`.
         limit: (N,) of `find_depths`.
-        threads: to work on.
     """
     held = parent >= 0
     count = int(np.count_nonzero(held))
@@ -244,7 +238,7 @@ class TreeFacts:
 
 
 @dataclass(frozen=True, eq=False)
-class Columns:
+class TreeColumns:
     """Columns of a tree of N nodes that its facts are computed from; 10 bytes a node.
 
     Attributes:
@@ -258,7 +252,7 @@ class Columns:
     size: FloatArray
 
     @classmethod
-    def of(cls, blocks: Blocks) -> Columns:
+    def of(cls, blocks: ReportBlocks) -> TreeColumns:
         """For the nodes of some blocks, none of which has been added."""
         count, tree = blocks.count, blocks.about.tree
         size = np.empty(count, np.float32)
@@ -266,7 +260,7 @@ class Columns:
             return cls(LodTree(np.empty(count, np.uint16), np.empty(count, np.uint32)), False, size)
         return cls(tree, True, size)
 
-    def add(self, block: Block) -> dict[str, Tally]:
+    def add(self, block: Block) -> dict[str, MaskTally]:
         """Set what is here of the nodes of a block; return the tallies of its nodes and of its leaves of D > 1.
 
         Args:
@@ -289,19 +283,18 @@ def examine(
     Args:
         splats: N nodes, of which scale and opacity are used.
         tree: of N nodes, at least one.
-        check: look for faults.
         scale_ends: smallest and largest scale that the format holds, world units.
     """
-    blocks = Blocks.of(Scene(splats, tree))
-    columns = Columns.of(blocks)
+    blocks = ReportBlocks.of(Scene(splats, tree))
+    columns = TreeColumns.of(blocks)
     opaque = merged(blocks.map(columns.add, USED, 1))
     return examine_blocks(blocks, columns, opaque, check=check, scale_ends=scale_ends)
 
 
 def examine_blocks(
-    blocks: Blocks,
-    columns: Columns,
-    opaque: Mapping[str, Tally],
+    blocks: ReportBlocks,
+    columns: TreeColumns,
+    opaque: Mapping[str, MaskTally],
     *,
     check: bool,
     scale_ends: tuple[float, float] = (0.0, math.inf),
@@ -315,12 +308,10 @@ def examine_blocks(
     Args:
         blocks: read once more to compare nodes with their children, where faults are looked for.
         columns: of all blocks, and
-        opaque: what `Columns.add` returned of them.
-        check: look for faults.
+        opaque: what `TreeColumns.add` returned of them.
         scale_ends: smallest and largest scale that the format holds, world units. A scale at one of them may have been
             clamped.
         in_chunks: the format orders nodes by chunks, so that they need not be coarse before fine.
-        threads: to work on.
     """
     tree, size = columns.tree, columns.size
     depth, limit = find_depths(tree.child_count, tree.child_start, size)

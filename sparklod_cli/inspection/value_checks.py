@@ -11,7 +11,7 @@ import numpy as np
 from ..codecs import clamps, quantize
 from ..model.scene import Scene
 from ..model.splats import COLUMNS, FloatArray
-from .blocks import Block, Blocks, Mask, Tally, largest, merged, tallies
+from .blocks import Block, Mask, MaskTally, ReportBlocks, largest, merged, tallies
 from .findings import Finding
 
 #: Code and message of each reason that makes a splat invalid (`splats.INVALID`).
@@ -68,7 +68,7 @@ class ValueTally:
     count: int
     checked: int
     invisible: int
-    by_name: dict[str, Tally]
+    by_name: dict[str, MaskTally]
     valid: dict[int, Mask]
     low: FloatArray
     high: FloatArray
@@ -125,30 +125,24 @@ class ValueTally:
 
     def number(self, name: str) -> int:
         """Return the number of splats in a tally."""
-        return self.by_name.get(name, Tally()).count
+        return self.by_name.get(name, MaskTally()).count
 
 
 def check(scene: Scene) -> list[Finding]:
     """Return findings about the values of a scene in memory."""
-    ends, blocks = ends_of(scene.header), Blocks.of(scene)
+    ends, blocks = ends_of(scene.header), ReportBlocks.of(scene)
     parts = blocks.map(lambda block: ValueTally.of(block, ends), COLUMNS, 1)
     return findings_about(ValueTally.total(parts), ends, is_tree=blocks.is_tree)
 
 
 def findings_about(values: ValueTally, ends: Ends, *, is_tree: bool) -> list[Finding]:
-    """Return findings about the values of all splats of a file.
-
-    Args:
-        values: of all blocks.
-        ends: of the codes of the file.
-        is_tree: they are the nodes of a tree.
-    """
+    """Return findings about the values of all splats of a file."""
     if not values.count:
         return [Finding("values.empty", "there are no splats")]
     findings: list[Finding] = []
 
     def report(code: str, name: str, text: str) -> None:
-        tally = values.by_name.get(name, Tally())
+        tally = values.by_name.get(name, MaskTally())
         more = " and {more} more" if tally.count > 1 else ""
         findings.extend(tally.finding(code, f"splat {{first}}{more}: {text}"))
 

@@ -16,7 +16,7 @@ from ..model.sh import COEFFICIENTS
 from ..model.splats import COLUMNS, FloatArray, Splats
 from ..support.parallel import ordered_map
 from ..tables.histograms import Histogram, histogram
-from .blocks import Block, Blocks, largest, smallest
+from .blocks import Block, ReportBlocks, largest, smallest
 from .percentiles import Percentiles
 from .value_checks import Ends, ValueTally
 
@@ -24,7 +24,7 @@ from .value_checks import Ends, ValueTally
 AXES = ("x", "y", "z")
 
 
-class Quantity(NamedTuple):
+class SplatQuantity(NamedTuple):
     """A number of each splat.
 
     Attributes:
@@ -42,34 +42,38 @@ class Quantity(NamedTuple):
     sh_degree: int = 0
 
 
-def _component(meaning: str, column: str, at: int) -> Quantity:
-    return Quantity(meaning, (column,), lambda splats: getattr(splats, column)[:, at], linear=True)
+def _component(meaning: str, column: str, at: int) -> SplatQuantity:
+    return SplatQuantity(meaning, (column,), lambda splats: getattr(splats, column)[:, at], linear=True)
 
 
 def _anisotropy(splats: Splats) -> FloatArray:
     return np.divide(largest(splats.scale), smallest(splats.scale), dtype=np.float64)
 
 
-def _sh(degree: int) -> Quantity:
+def _sh(degree: int) -> SplatQuantity:
     def of(splats: Splats) -> FloatArray:
         lengths = np.empty(len(splats), np.float64)
         sh_lengths(splats.sh, COEFFICIENTS[degree - 1], COEFFICIENTS[degree], lengths)
         return lengths
 
-    return Quantity(f"root mean square of the coefficients of degree {degree}", ("sh",), of, sh_degree=degree)
+    return SplatQuantity(f"root mean square of the coefficients of degree {degree}", ("sh",), of, sh_degree=degree)
 
 
 QUANTITIES = {
     **{axis: _component("centres, world units", "center", at) for at, axis in enumerate(AXES)},
-    "scale": Quantity("the largest standard deviation, world units", ("scale",), lambda splats: largest(splats.scale)),
-    "scale_min": Quantity(
+    "scale": SplatQuantity(
+        "the largest standard deviation, world units", ("scale",), lambda splats: largest(splats.scale)
+    ),
+    "scale_min": SplatQuantity(
         "the smallest standard deviation, world units", ("scale",), lambda splats: smallest(splats.scale)
     ),
-    "anisotropy": Quantity("the largest standard deviation over the smallest", ("scale",), _anisotropy),
-    "opacity": Quantity(
+    "anisotropy": SplatQuantity("the largest standard deviation over the smallest", ("scale",), _anisotropy),
+    "opacity": SplatQuantity(
         "linear opacity; above 1 for merged splats", ("opacity",), lambda splats: splats.opacity, linear=True
     ),
-    "size": Quantity("the feature size by which Spark chooses nodes, world units", ("scale", "opacity"), spark_size),
+    "size": SplatQuantity(
+        "the feature size by which Spark chooses nodes, world units", ("scale", "opacity"), spark_size
+    ),
     **{name: _component("display-referred colour", "rgb", at) for at, name in enumerate(("red", "green", "blue"))},
     **{f"sh{degree}": _sh(degree) for degree in (1, 2, 3)},
 }
@@ -132,18 +136,15 @@ def histogram_of(splats: Splats, name: str, *, bins: int = 40) -> Histogram:
 
 def examine(splats: Splats, *, all_quantities: bool = False) -> ValueFacts:
     """Statistics of N splats in memory."""
-    blocks = Blocks.of(Scene(splats))
+    blocks = ReportBlocks.of(Scene(splats))
     tally = ValueTally.total(blocks.map(lambda block: ValueTally.of(block, Ends()), COLUMNS, 1))
     return statistics_of(blocks, tally, all_quantities=all_quantities, threads=1)
 
 
-def statistics_of(blocks: Blocks, tally: ValueTally, *, all_quantities: bool, threads: int) -> ValueFacts:
+def statistics_of(blocks: ReportBlocks, tally: ValueTally, *, all_quantities: bool, threads: int) -> ValueFacts:
     """Statistics of splats, which pass as often as percentiles need.
 
     Args:
-        blocks: of the splats.
-        tally: of all blocks.
-        all_quantities: compute all quantities, not only those of `MAIN`.
         threads: to work on, each on quantities of some columns, where blocks are in memory.
     """
     none = blocks.about.splats.take(slice(0))

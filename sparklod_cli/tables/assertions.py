@@ -81,10 +81,6 @@ def parse_condition(text: str, *, example: str) -> Condition:
     VALUE is a number, which may end in k, M, G, % or a unit of bytes (3MB, 3MiB); or true, false, null or a text in
     double quotes.
 
-    Args:
-        text: of the condition.
-        example: of one, for the error.
-
     Raises:
         BadAssertionError: it cannot be understood.
     """
@@ -168,6 +164,10 @@ class Outcome:
     frames: int
     worst: Row | None
 
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {"assert": self.assertion.text, "held": self.held, "value": self.value}
+
     def message(self) -> str:
         """Return the outcome, in a line."""
         asked = self.assertion
@@ -189,10 +189,6 @@ def parse(text: str, columns: Sequence[Column]) -> Assertion:
 
     NAME is that of a numeric column, the longest one that fits: `pixel_scale_min<1` is about every cell of the column
     pixel_scale_min, `pixel_scale_min_max<1` about the largest of them. NUMBER may end in k, M, G or %.
-
-    Args:
-        text: the assertion.
-        columns: of the table.
 
     Raises:
         BadAssertionError: it is not well formed; suggests similar names.
@@ -237,7 +233,6 @@ def check(
     """Return the outcomes of assertions, in their order.
 
     Args:
-        assertions: to check.
         rows: of all frames; rows of single instances are left out.
         empty: why all cells of a column may be empty, by the column's name, for the error.
 

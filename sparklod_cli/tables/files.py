@@ -33,8 +33,6 @@ def encode(rows: Iterable[Row], columns: Sequence[Column], form: str) -> Iterato
 
     Args:
         rows: with a cell for each column; other cells are ignored.
-        columns: of the file, in this order.
-        form: one of `FORMS`.
 
     Raises:
         SparklodError: pyarrow is not installed, for Parquet; raised by the call itself, before the first row.

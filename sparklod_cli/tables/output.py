@@ -46,7 +46,6 @@ class TableOutput:
         """Make all rows and write them, as they come.
 
         Args:
-            rows: of the table.
             passed: what the bytes are passed through on their way to standard output.
 
         Raises:

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from ..io import read_text, write_whole
-from ..io.paths import open_plain, reason_of
+from ..io.beside import open_plain, reason_of
 from ..support.errors import OutputError, SparklodError
 from ..support.progress import Progress, silent
 from ..support.untrusted import parse_json
@@ -32,9 +32,7 @@ def check_folder(folder: Path, site: Site | None = None, *, overwrite: bool) -> 
     in a folder, such as the .git of the pages that it is published from, is not ours to remove.
 
     Args:
-        folder: of the site.
         site: that will be written; its files must lie elsewhere.
-        overwrite: replace a site that is there.
     """
     try:
         if folder.exists() and not folder.is_dir():
@@ -71,10 +69,7 @@ def export(site: Site, folder: Path, *, overwrite: bool, progress: Progress = si
     """Write a site and return its bytes.
 
     Args:
-        site: that is written.
         folder: that gets it; appears when it is complete.
-        overwrite: replace a site that is there.
-        progress: called with how much is done.
 
     Raises:
         OutputError: see `check_folder`, or the file system refused something.

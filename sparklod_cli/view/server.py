@@ -21,7 +21,7 @@ from typing import Any, BinaryIO
 from urllib.parse import unquote_to_bytes
 
 from .. import __version__
-from ..io.paths import open_plain
+from ..io.beside import open_plain
 from ..support.errors import SparklodError
 from .files import media_type
 from .site import CAMERAS, INDEX, MAX_BYTES, Site, parse_drop
@@ -67,11 +67,8 @@ class Server(ThreadingHTTPServer):
     """Serves a site, a thread for each connection.
 
     Args:
-        site: that is served.
         host: name or address to listen on.
         port: to listen on; 0 for any that is free.
-        cors: pages of other origins may read the files.
-        log: is told of each request.
 
     Raises:
         SparklodError: it cannot listen there.
@@ -297,10 +294,6 @@ def span_of(text: str | None, size: int) -> Span | None:
 
     That is where there is no header, or where it is one that a server may ignore: of another unit, with several
     ranges, or broken.
-
-    Args:
-        text: of the header.
-        size: of the file.
     """
     found = RANGE.fullmatch(text.strip()) if text is not None else None
     if found is None:

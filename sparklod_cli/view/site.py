@@ -26,12 +26,12 @@ from ..cameras.frame import Settings as CameraSettings
 from ..cameras.path import CameraPath
 from ..cameras.sources import read_path
 from ..io import write_whole
-from ..io.paths import leads_away
+from ..io.beside import leads_away
 from ..support.errors import CameraPathError
 from ..support.untrusted import parse_json, quoted_value
 from .files import Resources, ShownFile
 from .libraries import Libraries
-from .start import Extent, Point, Start
+from .start import Extent, Start
 
 #: Bytes of a request with camera files, in base64: COLMAP's images.txt of a large scene has 50 MB.
 MAX_BYTES = 1 << 27
@@ -128,51 +128,38 @@ GENERATOR = "sparklod view"
 
 
 @dataclass(frozen=True)
-class Look:
-    """Initial view of the page.
-
-    Attributes:
-        start: the camera.
-        up: direction that is up.
-        budget: splats; None for Spark's default on the device.
-        path: cameras that the page plays; None for none.
-    """
-
-    start: Start
-    up: Point
-    budget: int | None
-    path: CameraPath | None
-
-
-@dataclass(frozen=True)
 class Site:
     """A site.
 
     Attributes:
         resources: all of it, by name.
         cameras: settings of camera paths that are dropped onto the page.
+        shown: its splat files.
+        notes: what a person should know.
     """
 
     resources: Resources
     cameras: CameraSettings
+    shown: Sequence[ShownFile]
+    notes: Sequence[str]
 
 
 def site_of(
     shown: Sequence[ShownFile],
     extents: Sequence[Extent],
-    look: Look,
+    start: Start,
+    budget: int | None,
+    path: CameraPath | None,
     libraries: Libraries,
     *,
     cameras: CameraSettings,
     served: bool,
 ) -> Site:
-    """Return the site of some files.
+    """Return the site of some files, of given extents.
 
     Args:
-        shown: the files, and
-        extents: what they hold.
-        look: how the page shows them at first.
-        libraries: that it draws with.
+        budget: splats; None for Spark's default on the device.
+        path: cameras that the page plays; None for none.
         cameras: settings of camera paths that are dropped onto the page.
         served: by `server`, which parses camera paths; otherwise the page can read those of sparklod itself.
     """
@@ -184,10 +171,10 @@ def site_of(
         "title": title,
         "engine": shown[0].engine,
         "files": [_file(file, extent) for file, extent in zip(shown, extents, strict=True)],
-        "start": dataclasses.asdict(look.start),
-        "up": look.up,
-        "budget": look.budget,
-        "path": None if look.path is None else frames_of(look.path),
+        "start": dataclasses.asdict(start),
+        "up": cameras.up_axis,
+        "budget": budget,
+        "path": None if path is None else frames_of(path),
         "cameras": CAMERAS if served else None,
         "libraries": {"source": libraries.source, "versions": dict(libraries.versions)},
     }
@@ -200,7 +187,8 @@ def site_of(
     resources.update(libraries.files)
     for file in shown:
         resources.update(file.files)
-    return Site(resources, cameras)
+    notes = [file.note for file in shown if file.note is not None]
+    return Site(resources, cameras, shown, [*libraries.notes(), *notes, *(path.notes if path else ())])
 
 
 def _file(shown: ShownFile, extent: Extent) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from ..cameras.sources import SingleViews, WholeScene
 from ..codecs.rad.rad_header import RadHeader
 from ..codecs.rad.rad_reader import count_leaves, file_of, read_chunk
 from ..io import examine_scene, read_levels
-from ..io.paths import open_plain, reason_of
+from ..io.beside import open_plain, reason_of
 from ..model.balls import USED, Balls, balls_of
 from ..model.splats import Splats
 from ..support.defaults import ELEVATION
@@ -152,10 +152,7 @@ def start_of(extents: Sequence[Extent], view: tuple[Point, Point] | None, up: Po
     """Return the extent of some files together.
 
     Args:
-        extents: of the files.
         view: eye and target, where they are given; else the whole scene is in view, from its front.
-        up: direction that is up.
-        fov: vertical field of view, degrees.
 
     Raises:
         CameraPathError: the camera makes no sense.

@@ -1,4 +1,4 @@
-"""Cuts, pictures, traversals and comparisons of the public interface: those of the commands."""
+"""Views of trees by the API: cuts, pictures, refining, detail levels."""
 
 from __future__ import annotations
 

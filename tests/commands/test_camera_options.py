@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from click.testing import CliRunner, Result
 from sparklod_cli.cameras import generators
 from sparklod_cli.cameras.framing import FILLED
 from sparklod_cli.cameras.path import CameraPath
-from sparklod_cli.commands.option_groups import values_of, with_options
+from sparklod_cli.commands.option_groups import argument, command, values_of
 from sparklod_cli.commands.options.cameras import Cameras
 from sparklod_cli.model.balls import Balls
 from sparklod_cli.support.errors import CameraPathError
@@ -23,6 +24,11 @@ from tests.cameras.known import FOLDER, KNOWN, SIZE, check_pose
 #: A ball around (1, 2, 3), of which nine in ten are nearer than 2.
 SHELLS = [2.0] * 50 + [1.0] * 45 + [50.0] * 5
 TURN = "-1,0,0,0,0,-1,0,0,0,0,1,0,0,0,0,1"
+
+
+@dataclass(frozen=True)
+class Flight(Cameras):
+    inputs: tuple[str, ...] = argument(click.STRING)
 
 
 def scene_of_shells() -> Balls:
@@ -36,17 +42,14 @@ def scene_of_shells() -> Balls:
 def run(*arguments: str | Path, scene: Any = scene_of_shells) -> tuple[Result, list[CameraPath]]:
     found: list[CameraPath] = []
 
-    @click.command()
-    @with_options(Cameras)
-    @click.argument("inputs", nargs=-1)
-    @click.pass_context
-    def command(ctx: click.Context, **_: Any) -> None:
-        asked = values_of(ctx, Cameras)
+    @command("fly", Flight, examples="")
+    def fly(ctx: click.Context, **_: Any) -> None:
+        asked = values_of(ctx, Flight)
         asked.check(ctx)
         with asked.usage_errors():
             found.append(asked.camera_source().cameras(asked.settings(), scene))
 
-    return CliRunner().invoke(command, [str(argument) for argument in arguments]), found
+    return CliRunner().invoke(fly, [str(argument) for argument in arguments]), found
 
 
 def cameras(*arguments: str | Path, scene: Any = scene_of_shells) -> CameraPath:

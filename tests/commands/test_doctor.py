@@ -14,7 +14,7 @@ import pytest
 from sparklod_cli import doctor
 from sparklod_cli.cli import run
 from sparklod_cli.doctor import Check
-from tests.conftest import ROOT
+from tests.conftest import ROOT, Capture
 
 FINE = Check("sparklod", "ok", "0.1.0")
 NOTE = Check("extra video", "note", "imageio is missing", "pip install imageio")
@@ -29,9 +29,7 @@ def find(monkeypatch: pytest.MonkeyPatch, *checks: Check) -> None:
     monkeypatch.setattr(doctor, "check_all", check_all)
 
 
-def test_columns_are_aligned_and_advice_is_below(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_columns_are_aligned_and_advice_is_below(monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
     find(monkeypatch, FINE, NOTE, PROBLEM)
     assert run(["doctor"]) == 1
     captured = capsys.readouterr()
@@ -45,13 +43,13 @@ def test_columns_are_aligned_and_advice_is_below(
     assert captured.err == "1 problem, 1 note\n"
 
 
-def test_notes_alone_are_no_failure(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_notes_alone_are_no_failure(monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
     find(monkeypatch, FINE, NOTE)
     assert run(["doctor", "-v"]) == 0
     assert capsys.readouterr().err == "checking everything\n0 problems, 1 note\n"
 
 
-def test_quiet_prints_problems_only(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_quiet_prints_problems_only(monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
     find(monkeypatch, FINE, NOTE, PROBLEM)
     assert run(["doctor", "-q"]) == 1
     captured = capsys.readouterr()
@@ -60,9 +58,7 @@ def test_quiet_prints_problems_only(monkeypatch: pytest.MonkeyPatch, capsys: pyt
 
 
 @pytest.mark.parametrize("checks", [(FINE, NOTE), (FINE, PROBLEM)])
-def test_json_has_all_of_it(
-    checks: tuple[Check, ...], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_json_has_all_of_it(checks: tuple[Check, ...], monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
     find(monkeypatch, *checks)
     fine = PROBLEM not in checks
     assert run(["doctor", "--json", "--quiet"]) == (0 if fine else 1)

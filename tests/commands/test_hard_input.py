@@ -25,7 +25,7 @@ from sparklod_cli.cli import run
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod.builders import METHODS
 from sparklod_cli.model.splats import COLUMNS
-from tests.conftest import FIXTURES
+from tests.conftest import FIXTURES, Capture
 from tests.scenes import splat_columns
 
 Columns = dict[str, Any]
@@ -37,7 +37,7 @@ PROPERTIES = [name for name in splat_columns(1, sh_degree=1) if name[0] != "n"]
 
 
 @pytest.fixture
-def bake(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> Bake:
+def bake(tmp_path: Path, capfd: Capture) -> Bake:
     """Bakes files of these contents in one call; gives an error's text or what was reported of each, law checked."""
 
     def bake_all(*contents: bytes, options: Iterable[str] = ()) -> list[str]:
@@ -250,7 +250,7 @@ def test_files_that_are_no_scene_are_refused_with_a_reason(what: str, bake: Bake
     assert reason in result
 
 
-def test_paths_that_are_not_files_are_one_error(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_paths_that_are_not_files_are_one_error(tmp_path: Path, capfd: Capture) -> None:
     (tmp_path / "directory").mkdir()
     for name in ("directory", "missing.ply", "n" * 250 + ".ply", "n" * 300):
         source = tmp_path / name

@@ -11,7 +11,7 @@ import pytest
 
 from sparklod_cli.cli import COMMANDS, cli, run
 from sparklod_cli.commands.command import ALIASES, COMMON, GENERAL, Command
-from tests.conftest import ROOT
+from tests.conftest import ROOT, Capture
 
 COMMAND_NAMES = [name for name in COMMANDS if name != "help"]
 
@@ -22,13 +22,13 @@ def command_of(name: str) -> Command:
     return command
 
 
-def printed(*arguments: str, capsys: pytest.CaptureFixture[str]) -> str:
+def printed(*arguments: str, capsys: Capture) -> str:
     assert run([*arguments]) == 0
     return capsys.readouterr().out
 
 
 @pytest.mark.parametrize("name", COMMAND_NAMES)
-def test_each_option_stands_under_one_heading(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_each_option_stands_under_one_heading(name: str, capsys: Capture) -> None:
     command = command_of(name)
     headings = command.by_heading(click.Context(command))
     listed = [param for params in headings.values() for param in params]
@@ -52,18 +52,18 @@ def test_the_first_heading_has_the_few_options_that_most_people_need(name: str) 
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_the_help_of_a_command_can_be_had_by_help(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_help_of_a_command_can_be_had_by_help(name: str, capsys: Capture) -> None:
     assert printed("help", name, capsys=capsys) == printed(name, "--help", capsys=capsys)
 
 
-def test_without_a_command_the_program_prints_its_help(capsys: pytest.CaptureFixture[str]) -> None:
+def test_without_a_command_the_program_prints_its_help(capsys: Capture) -> None:
     help_text = printed("--help", capsys=capsys)
     run([])
     said = capsys.readouterr()
     assert (said.out + said.err).strip() == help_text.strip()
 
 
-def test_help_alone_is_that_of_the_program(capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_alone_is_that_of_the_program(capsys: Capture) -> None:
     text = printed("help", capsys=capsys)
     assert text == printed("--help", capsys=capsys)
     for name, summary in COMMANDS.items():
@@ -83,9 +83,7 @@ def test_help_alone_is_that_of_the_program(capsys: pytest.CaptureFixture[str]) -
         ("warm-up", "warmup"),
     ],
 )
-def test_a_command_that_there_is_not_names_the_one_that_was_meant(
-    typed: str, meant: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_command_that_there_is_not_names_the_one_that_was_meant(typed: str, meant: str, capsys: Capture) -> None:
     for arguments in ([typed, "scene.ply"], ["help", typed]):
         assert run(arguments) == 2
         assert capsys.readouterr().err.endswith(f"error: there is no command {typed!r}; did you mean {meant}?\n")
@@ -96,7 +94,7 @@ def test_every_alias_means_a_command() -> None:
     assert not set(ALIASES) & set(COMMANDS)
 
 
-def test_a_command_like_no_other_lists_them(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_command_like_no_other_lists_them(capsys: Capture) -> None:
     assert run(["xyzzy"]) == 2
     assert f"there is no command 'xyzzy'; the commands are {', '.join(COMMANDS)}\n" in capsys.readouterr().err
 
@@ -112,7 +110,7 @@ def test_a_command_like_no_other_lists_them(capsys: pytest.CaptureFixture[str]) 
     ],
 )
 def test_an_option_that_there_is_not_names_the_one_that_was_meant(
-    arguments: list[str], meant: str, capsys: pytest.CaptureFixture[str]
+    arguments: list[str], meant: str, capsys: Capture
 ) -> None:
     assert run(arguments) == 2
     err = capsys.readouterr().err

@@ -14,7 +14,7 @@ import pytest
 from sparklod_cli.cli import COMMANDS, cli, run
 from sparklod_cli.commands import paths
 from sparklod_cli.commands.paths import InputPath, OutputPath
-from tests.conftest import FIXTURES
+from tests.conftest import FIXTURES, Capture
 
 PLAIN, LOD = FIXTURES / "one.ply", FIXTURES / "golden" / "tree-v3.spz"
 CAMERAS = "x,y,z,target_x,target_y,target_z\n0,0,-3,0,0,0\n"
@@ -93,7 +93,7 @@ def test_the_table_has_all_parameters_that_are_files(name: str) -> None:
 @pytest.mark.parametrize("way", ["itself", "symbolic", "hard"])
 @pytest.mark.parametrize(("command", "given", "written"), ROWS)
 def test_an_output_that_is_an_input_is_refused(
-    command: str, given: str, written: str, way: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    command: str, given: str, written: str, way: str, tmp_path: Path, capsys: Capture
 ) -> None:
     source = tmp_path / f"x{SUFFIXES[command]}"
     target = source if way == "itself" else source.with_stem("y")
@@ -111,7 +111,7 @@ def test_an_output_that_is_an_input_is_refused(
 
 
 @pytest.mark.parametrize("command", ["inspect", "traverse"])
-def test_two_outputs_are_two_files(command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_two_outputs_are_two_files(command: str, tmp_path: Path, capsys: Capture) -> None:
     one, two, *_ = OUTPUTS[command].values()
     target = str(tmp_path / f"y{SUFFIXES[command]}")
     arguments = [target if argument == "Y" else argument for argument in (*one, *two)]
@@ -119,7 +119,7 @@ def test_two_outputs_are_two_files(command: str, tmp_path: Path, capsys: pytest.
     assert f"two outputs would be written to {target}" in capsys.readouterr().err
 
 
-def test_the_images_of_an_unpacked_sog_are_inputs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_images_of_an_unpacked_sog_are_inputs(tmp_path: Path, capsys: Capture) -> None:
     meta = {"version": 2, "count": 1, "means": {"files": ["a.spz", "b.spz"]}, "sh0": {"files": ["c.spz"]}}
     (tmp_path / "meta.json").write_text(json.dumps(meta))
     for name in ("a", "b", "c", "other"):
@@ -134,7 +134,7 @@ def test_the_images_of_an_unpacked_sog_are_inputs(tmp_path: Path, capsys: pytest
     assert (tmp_path / "a.spz").read_bytes() == b"precious"
 
 
-def test_the_files_that_belong_to_a_camera_path_are_inputs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_files_that_belong_to_a_camera_path_are_inputs(tmp_path: Path, capsys: Capture) -> None:
     for name in ("cameras.txt", "images.txt"):
         (tmp_path / name).write_text("precious")
     for source in (tmp_path, tmp_path / "images.txt"):
@@ -143,7 +143,7 @@ def test_the_files_that_belong_to_a_camera_path_are_inputs(tmp_path: Path, capsy
         assert "cameras.txt is an input" in capsys.readouterr().err
 
 
-def test_files_that_a_scene_names_are_inputs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_files_that_a_scene_names_are_inputs(tmp_path: Path, capsys: Capture) -> None:
     (tmp_path / "tree.csv").write_bytes(LOD.read_bytes())
     (tmp_path / "scene.json").write_text('{"instances": [{"file": "tree.csv"}]}')
     given = ["traverse", "--scene", str(tmp_path / "scene.json"), *LOOK, "-o", str(tmp_path / "tree.csv")]
@@ -151,7 +151,7 @@ def test_files_that_a_scene_names_are_inputs(tmp_path: Path, capsys: pytest.Capt
     assert "tree.csv is an input" in capsys.readouterr().err
 
 
-def test_frames_and_indices_do_not_replace_inputs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_frames_and_indices_do_not_replace_inputs(tmp_path: Path, capsys: Capture) -> None:
     frame, indices = tmp_path / "out.0000.png", tmp_path / "000000.npy"
     for file in (frame, indices):
         file.write_bytes(LOD.read_bytes())
@@ -163,7 +163,7 @@ def test_frames_and_indices_do_not_replace_inputs(tmp_path: Path, capsys: pytest
     assert frame.read_bytes() == indices.read_bytes() == LOD.read_bytes()
 
 
-def test_a_folder_is_not_filled_with_inputs_replaced(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_folder_is_not_filled_with_inputs_replaced(tmp_path: Path, capsys: Capture) -> None:
     plain, other = tmp_path / "a.ply", tmp_path / "a-lod.spz"
     for file in (plain, other):
         file.write_bytes(PLAIN.read_bytes())
@@ -174,7 +174,7 @@ def test_a_folder_is_not_filled_with_inputs_replaced(tmp_path: Path, capsys: pyt
 
 
 def test_names_that_differ_in_case_are_one_file_where_case_is_ignored(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
 ) -> None:
     large, small = (str(tmp_path / name) for name in ("Out.png", "out.png"))
     given = ["inspect", str(tmp_path / "missing.spz"), "--plot", large, "--html", small]
@@ -208,7 +208,7 @@ TAKE_ADDRESSES = {("build-lod", "inputs"), ("build-lod", "output"), ("build-lod"
 @pytest.mark.parametrize("name", ["", "s3://bucket/x.spz", "https://example.org/x.spz"])
 @pytest.mark.parametrize(("command", "given", "written"), ROWS)
 def test_names_that_cannot_be_paths_are_refused(
-    command: str, given: str, written: str, name: str, capsys: pytest.CaptureFixture[str]
+    command: str, given: str, written: str, name: str, capsys: Capture
 ) -> None:
     said = "is an address on a network, not a path" if name else "the name is empty"
     for x, y in ((PLAIN, name), (name, "out.png")):

@@ -19,7 +19,7 @@ from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.support.errors import OutOfMemoryError, memory_errors_translated, out_of_memory
 from sparklod_cli.support.parallel import ordered_map
-from tests.conftest import FIXTURES, ROOT
+from tests.conftest import FIXTURES, ROOT, Capture
 
 #: Runs a command twice: with something small HERE, so that all code is loaded and compiled, then with something large
 #: and no room but for some megabytes more.
@@ -113,7 +113,7 @@ def test_a_picture_that_is_too_large_is_said_to_be(tmp_path: Path) -> None:
 
 
 def test_one_file_that_is_too_large_does_not_stop_the_others(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+    monkeypatch: pytest.MonkeyPatch, capsys: Capture, tmp_path: Path
 ) -> None:
     from sparklod_cli.inspection import tree
 

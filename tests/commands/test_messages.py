@@ -1,10 +1,13 @@
-"""Messages that say what is wrong, with the value, and what to do."""
+"""Messages of all commands: on the console, of faults that nobody foresaw, and of missing packages."""
 
 from __future__ import annotations
 
 import dataclasses
+import io
 import json
 import re
+import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,14 +15,16 @@ import pytest
 
 from sparklod_cli.cli import run
 from sparklod_cli.codecs import ply
+from sparklod_cli.commands import console as console_module
 from sparklod_cli.commands.build_lod_text import CLAMPED_BY_SPZ
-from sparklod_cli.io import read_scene
+from sparklod_cli.commands.console import Console, count_of, say_error
+from sparklod_cli.figures.pyvista_scene import load_pyvista
+from sparklod_cli.io import read_scene, reading
 from sparklod_cli.model.scene import Scene
-from tests.conftest import FIXTURES
+from tests.conftest import FIXTURES, Capture
 from tests.scenes import random_splats
 
 TREE, PLAIN = FIXTURES / "golden" / "tree-v3.spz", FIXTURES / "one.ply"
-Said = pytest.CaptureFixture[str]
 
 #: A plural of one.
 ONES = re.compile(r"(?<![\d.,])1 (?:\w+ )?(splats|nodes|levels|leaves|frames|cameras|chunks|texels|rows|instances)\b")
@@ -38,7 +43,7 @@ ONES = re.compile(r"(?<![\d.,])1 (?:\w+ )?(splats|nodes|levels|leaves|frames|cam
         ("8x²", "is not a width and a height"),
     ],
 )
-def test_a_wrong_picture_size_is_quoted(size: str, said: str, capsys: Said) -> None:
+def test_a_wrong_picture_size_is_quoted(size: str, said: str, capsys: Capture) -> None:
     assert run(["render", str(TREE), "--size", size]) == 2
     err = capsys.readouterr().err
     assert said in err
@@ -51,7 +56,7 @@ def test_max_bytes_takes_units(size: str, status: int) -> None:
 
 
 @pytest.mark.parametrize("size", ["-1", "3Mbit", "3 apples", "1.5", "3iB"])
-def test_a_text_that_is_not_a_size_is_wrong_usage(size: str, capsys: Said) -> None:
+def test_a_text_that_is_not_a_size_is_wrong_usage(size: str, capsys: Capture) -> None:
     assert run(["inspect", str(TREE), f"--max-bytes={size}"]) == 2
     assert f"{size!r} is not a size: whole bytes, such as 3000000, 3MB or 3MiB" in capsys.readouterr().err
 
@@ -65,7 +70,7 @@ def test_a_text_that_is_not_a_size_is_wrong_usage(size: str, capsys: Said) -> No
         ("frame,position,rotation", "lacks x, y, z, target_x, target_y, target_z"),
     ],
 )
-def test_a_camera_csv_is_told_its_columns(first: str, said: str, tmp_path: Path, capsys: Said) -> None:
+def test_a_camera_csv_is_told_its_columns(first: str, said: str, tmp_path: Path, capsys: Capture) -> None:
     path = tmp_path / "cameras.csv"
     path.write_text(f"{first}\n0,0,0,0,0\n")
     for arguments in ([], ["--camera-format", "csv"]):
@@ -99,7 +104,7 @@ def clamped_scene(tmp_path: Path, **values: float) -> Path:
     ],
 )
 def test_what_is_clamped_is_said_in_a_line_and_with_verbose_in_detail(
-    name: str, value: float, detail: str, consequence: str, tmp_path: Path, capsys: Said
+    name: str, value: float, detail: str, consequence: str, tmp_path: Path, capsys: Capture
 ) -> None:
     source = clamped_scene(tmp_path, **{name: value, "opacity": 0.5})
     assert run(["build-lod", str(source)]) == 0
@@ -117,7 +122,7 @@ def test_what_is_clamped_is_said_in_a_line_and_with_verbose_in_detail(
 
 @pytest.mark.parametrize("column", [slice(0, 1), slice(0, 3)])
 @pytest.mark.parametrize("count", [0, 1, 2, 300])
-def test_the_note_and_inspect_go_by_one_rule(count: int, column: slice, tmp_path: Path, capsys: Said) -> None:
+def test_the_note_and_inspect_go_by_one_rule(count: int, column: slice, tmp_path: Path, capsys: Capture) -> None:
     """That flat splats get thicker cannot be seen; that whole splats grow can, if they are more than 0.1 %."""
     splats = random_splats(1_000)
     splats.scale[:count, column] = 1e-6
@@ -131,7 +136,7 @@ def test_the_note_and_inspect_go_by_one_rule(count: int, column: slice, tmp_path
     assert ("values.scale-clamped" in codes) == (count > 1 and column.stop == 3)
 
 
-def test_counts_of_one_have_a_singular_noun(tmp_path: Path, capsys: Said) -> None:
+def test_counts_of_one_have_a_singular_noun(tmp_path: Path, capsys: Capture) -> None:
     look = ("--look-at", "0,-1,4:0,0,0", "--size", "8x8")
     lod = tmp_path / "one-lod.spz"
     for arguments in (
@@ -153,3 +158,153 @@ def test_counts_of_one_have_a_singular_noun(tmp_path: Path, capsys: Said) -> Non
         out, err = capsys.readouterr()
         assert out + err
         assert ONES.search(out + err) is None, (arguments, out, err)
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def shown_on(stream: io.StringIO, monkeypatch: pytest.MonkeyPatch, *, quiet: bool = False) -> str:
+    monkeypatch.setattr("sys.stderr", stream)
+    with Console(quiet=quiet, verbose=False) as console:
+        for done in (0, 5, 10):
+            console.progress("reading", done, 10, "splat")
+        console.progress("writing", 1, 4, "B")
+    return stream.getvalue()
+
+
+def test_a_terminal_gets_a_bar_a_stage(monkeypatch: pytest.MonkeyPatch) -> None:
+    text = shown_on(Terminal(), monkeypatch)
+    assert "reading:" in text
+    assert "splats" in text
+    assert "writing:" in text
+    assert text.endswith("\r")  # and takes it away
+
+
+def test_a_file_or_a_quiet_terminal_gets_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert shown_on(io.StringIO(), monkeypatch) == ""
+    assert shown_on(Terminal(), monkeypatch, quiet=True) == ""
+
+
+@pytest.mark.parametrize("quiet", [False, True])
+def test_a_log_gets_a_line_of_a_long_stage_every_ten_seconds(quiet: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    log, clock = io.StringIO(), iter([0, 4, 9, 11, 15, 22, 29, 33, 100, 104, 109])
+    monkeypatch.setattr("sys.stderr", log)
+    monkeypatch.setattr(console_module, "monotonic", lambda: next(clock))
+    with Console(quiet=quiet, verbose=False) as console:
+        for done in range(8):
+            console.progress("refining", 250 * done, 1750, "step")
+        for done in range(3):
+            console.progress("writing", done, 4, "B")
+    lines = ["refining: 750 of 1,750 steps (43 %), 11 s", "refining: 1,250 of 1,750 steps (71 %), 22 s"]
+    assert log.getvalue().splitlines() == ([] if quiet else lines)
+
+
+def test_colour_is_for_terminals_that_want_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value, colour in (("NO_COLOR", "", True), ("NO_COLOR", "1", False), ("TERM", "dumb", False)):
+        with monkeypatch.context() as patch:
+            patch.delenv("NO_COLOR", raising=False)
+            patch.setenv("TERM", "xterm")
+            patch.setenv(name, value)
+            patch.setattr("sys.stderr", stream := Terminal())
+            say_error("no")
+            assert ("\x1b[31m" in stream.getvalue()) == colour
+
+
+def test_counts_are_said_properly() -> None:
+    assert [count_of(n, "node") for n in (0, 1, 1234)] == ["0 nodes", "1 node", "1,234 nodes"]
+
+
+SCENE = FIXTURES / "one.ply"
+Break = Callable[[BaseException], None]
+
+
+@pytest.fixture
+def broken(monkeypatch: pytest.MonkeyPatch) -> Break:
+    """Makes the reading of any file end in an exception."""
+
+    def end_in(error: BaseException) -> None:
+        def fail(*args: object, **kwargs: object) -> None:
+            raise error
+
+        monkeypatch.setattr(reading, "opened", fail)
+
+    return end_in
+
+
+@pytest.mark.parametrize("command", ["build-lod", "build-lod --unlod", "inspect", "inspect --check", "render"])
+@pytest.mark.parametrize(
+    "error",
+    [ZeroDivisionError("division\nby zero"), EOFError("cut"), AssertionError(), KeyError("x"), StopIteration(1)],
+)
+def test_a_bug_is_one_line_that_asks_for_a_report(
+    command: str, error: Exception, broken: Break, tmp_path: Path, capsys: Capture
+) -> None:
+    broken(error)
+    out = [] if command.startswith("inspect") else ["-o", str(tmp_path / "out.spz" if "build" in command else "a.png")]
+    assert run([*command.split(), str(SCENE), *out]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("error: sparklod failed in a way that it should not: ")
+    assert type(error).__name__ in line
+    assert "please report" in line
+    assert "-v shows" in line
+    assert not list(tmp_path.iterdir())
+
+
+def test_verbose_shows_the_traceback_before_the_error(broken: Break, capsys: Capture) -> None:
+    broken(ZeroDivisionError("division by zero"))
+    assert run(["inspect", str(SCENE), "-v"]) == 1
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0].startswith("Traceback")
+    assert lines[-2] == "ZeroDivisionError: division by zero"
+    assert lines[-1].startswith("error: sparklod failed")
+    assert "-v shows" not in lines[-1]
+    assert run(["inspect", str(SCENE)]) == 1  # what one run was told does not last
+    assert "Traceback" not in capsys.readouterr().err
+
+
+def test_the_line_of_a_bug_is_short_and_printable(broken: Break, capsys: Capture) -> None:
+    broken(RuntimeError("\x1b[31m" + "x" * 100_000))
+    assert run(["inspect", str(SCENE)]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "\x1b" not in line
+    assert len(line) < 400
+
+
+def test_an_interruption_is_not_reported_as_a_bug(broken: Break, capsys: Capture) -> None:
+    broken(KeyboardInterrupt())
+    assert run(["inspect", str(SCENE)]) == 130
+    assert capsys.readouterr().err.strip() == "interrupted"
+    broken(SystemExit(7))
+    with pytest.raises(SystemExit) as caught:
+        run(["inspect", str(SCENE)])
+    assert caught.value.code == 7
+
+
+@pytest.mark.parametrize(
+    ("package", "command"),
+    [
+        ("matplotlib", ["traverse", "missing.spz", "--plot", "x.png"]),
+        ("matplotlib", ["render", "missing.spz", "--compare", "--plot", "x.png"]),
+        ("pyvista", ["inspect", "missing.spz", "--plot", "x.png"]),
+        ("pyarrow", ["traverse", "missing.spz", "-o", "x.parquet"]),
+        ("pyarrow", ["render", "missing.spz", "--compare", "-o", "x.parquet"]),
+        ("pyarrow", ["inspect", "missing.spz", "--chunks-out", "x.parquet"]),
+    ],
+)
+def test_a_missing_package_is_reported_before_the_work(
+    package: str,
+    command: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: Capture,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(sys.modules, package, None)
+    load_pyvista.cache_clear()
+    assert run(command) == 1
+    err = capsys.readouterr().err
+    assert f" by {package}: " in err
+    assert "missing.spz" not in err
+    assert not any(tmp_path.iterdir())

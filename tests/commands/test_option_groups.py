@@ -18,6 +18,7 @@ from sparklod_cli.lod.settings import LodSettings
 from sparklod_cli.render.settings import RasterSettings, RenderSettings
 from sparklod_cli.simulation.streaming_settings import Network, StreamingSettings
 from sparklod_cli.support.setting_fields import CheckedSettings, Range, Setting, setting, settings_in
+from tests.conftest import Capture
 
 SETTINGS = (
     *(RasterSettings, RenderSettings, LodSettings, DetailRule, DetailSettings, Network, StreamingSettings),
@@ -55,7 +56,7 @@ def outside(kind: Any) -> list[Any]:
 
 
 @pytest.mark.parametrize(("command", "option"), options())
-def test_a_command_refuses_other_values(command: str, option: Option, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_command_refuses_other_values(command: str, option: Option, capsys: Capture) -> None:
     for value in (*outside(option.declared.kind), "word"):
         assert run([command, f"{option.opts[0]}={value}", "a.spz"]) == 2
         assert "--" + option.opts[0].lstrip("-") in capsys.readouterr().err.splitlines()[-1]

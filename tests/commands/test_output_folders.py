@@ -9,7 +9,7 @@ import pytest
 
 from sparklod_cli.cli import run
 from tests.commands.test_keep_apart import LOD, LOOK, OUTPUTS, PLAIN
-from tests.conftest import FIXTURES
+from tests.conftest import FIXTURES, Capture
 
 pytestmark = pytest.mark.slow
 
@@ -30,8 +30,6 @@ WRITTEN: dict[str, dict[str, tuple[tuple[object, ...], str]]] = {
     },
 }
 ROWS = [(command, name) for command, rows in WRITTEN.items() for name in rows]
-
-Said = pytest.CaptureFixture[str]
 
 
 def arguments(command: str, name: str, target: object) -> list[str]:
@@ -66,7 +64,7 @@ def test_a_folder_gets_a_file_named_after_the_input(command: str, name: str, fol
 
 
 @pytest.mark.parametrize(("command", "name"), ROWS)
-def test_a_name_without_suffix_is_refused_with_a_hint(command: str, name: str, tmp_path: Path, capsys: Said) -> None:
+def test_a_name_without_suffix_is_refused_with_a_hint(command: str, name: str, tmp_path: Path, capsys: Capture) -> None:
     target, flag = tmp_path / "noname", f"--{name.replace('_', '-')}"
     assert run(arguments(command, name, target)) == 2
     err = capsys.readouterr().err
@@ -85,7 +83,7 @@ def test_a_name_without_suffix_is_refused_with_a_hint(command: str, name: str, t
     ],
 )
 def test_the_hint_names_the_formats_that_are_possible(
-    options: tuple[str, ...], endings: str, tmp_path: Path, capsys: Said
+    options: tuple[str, ...], endings: str, tmp_path: Path, capsys: Capture
 ) -> None:
     assert run(["build-lod", str(LOD), "-o", f"{tmp_path}/noname", *options]) == 2
     assert f"end it in {endings}, or" in capsys.readouterr().err
@@ -98,7 +96,7 @@ def test_a_format_that_is_chosen_needs_no_suffix(tmp_path: Path) -> None:
     assert (tmp_path / "b").read_bytes()[:1] == b"{"
 
 
-def test_several_inputs_go_to_one_folder(tmp_path: Path, capsys: Said) -> None:
+def test_several_inputs_go_to_one_folder(tmp_path: Path, capsys: Capture) -> None:
     out = f"{tmp_path}/out/"
     assert run(["build-lod", str(PLAIN), str(FIXTURES / "sh0.ply"), "-o", out]) == 0
     assert names(out) == ["one-lod.spz", "sh0-lod.spz"]
@@ -123,7 +121,7 @@ def test_frames_and_tables_go_to_a_folder(tmp_path: Path) -> None:
     ]
 
 
-def test_what_a_folder_holds_is_not_replaced(tmp_path: Path, capsys: Said) -> None:
+def test_what_a_folder_holds_is_not_replaced(tmp_path: Path, capsys: Capture) -> None:
     tree = tmp_path / "tree.csv"
     shutil.copy(LOD, tree)
     given = ["traverse", str(tree), *LOOK, "-o", str(tmp_path)]
@@ -133,7 +131,7 @@ def test_what_a_folder_holds_is_not_replaced(tmp_path: Path, capsys: Said) -> No
     assert f"{tree} is a file, not a folder" in capsys.readouterr().err
 
 
-def test_standard_input_has_no_name(tmp_path: Path, capsys: Said) -> None:
+def test_standard_input_has_no_name(tmp_path: Path, capsys: Capture) -> None:
     for given in (["build-lod", "-", "-o", f"{tmp_path}/"], ["inspect", "-", "--html", str(tmp_path)]):
         assert run(given) == 2
         assert "standard input has no name to derive one from; name the output file" in capsys.readouterr().err

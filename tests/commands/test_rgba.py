@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from sparklod_cli.cli import run
 from sparklod_cli.io import read_rgba, read_scene
 from sparklod_cli.support.errors import FormatError
-from tests.conftest import FIXTURES
+from tests.conftest import FIXTURES, Capture
 
 SCENE = FIXTURES / "sh2.ply"
 COUNT = len(read_scene(SCENE).splats)
@@ -47,7 +47,7 @@ def test_colours_are_read_from_npy_and_raw_of_bytes_and_floats(suffix: str, kind
         assert np.array_equal(read_rgba(path, COUNT, slice(3, COUNT - 2)), got[3:-2])
 
 
-def test_colours_replace_those_of_the_splats(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_colours_replace_those_of_the_splats(tmp_path: Path, capsys: Capture) -> None:
     """What is drawn of a leaf is its new colour; SH stay, and alpha 0 removes."""
     codes = bytes_of()
     codes[:7, 3] = 0
@@ -95,13 +95,13 @@ def test_a_npy_file_that_is_cut_is_refused(cut: int, tmp_path: Path) -> None:
         read_rgba(path, COUNT)
 
 
-def test_a_missing_file_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_missing_file_is_named(tmp_path: Path, capsys: Capture) -> None:
     missing = tmp_path / "missing.npy"
     assert run(["build-lod", str(SCENE), "--rgba", str(missing), "-o", str(tmp_path / "a.spz")]) == 1
     assert f"{missing} cannot be read: no such file" in capsys.readouterr().err
 
 
-def test_one_file_of_colours_is_for_one_scene(capsys: pytest.CaptureFixture[str]) -> None:
+def test_one_file_of_colours_is_for_one_scene(capsys: Capture) -> None:
     assert run(["build-lod", str(SCENE), str(FIXTURES / "sh1.ply"), "--rgba", "a.npy"]) == 2
     assert "--rgba takes one input, not 2" in capsys.readouterr().err
 

@@ -118,7 +118,7 @@ class TestCharts:
         matplotlib = charts.load_matplotlib()
         (panel,) = (each for each in traversal_chart.PANELS if "level_mean" in each.columns)
         axes = matplotlib.figure.Figure().subplots()
-        panel.draw(axes, charts.Frames([each | {"pixel_scale_limit": limit} for each in flight(4)]), matplotlib)
+        panel.draw(axes, charts.FrameColumns([each | {"pixel_scale_limit": limit} for each in flight(4)]), matplotlib)
         assert axes.get_ylabel() == said
 
     def test_a_chart_leaves_single_instances_out(self) -> None:

@@ -15,7 +15,7 @@ from PIL import Image
 
 from sparklod_cli.figures import pyvista_scene
 from sparklod_cli.figures import tree_plot as plotting
-from sparklod_cli.figures.tree_plot import Picture, color_by, plot
+from sparklod_cli.figures.tree_plot import DescribedPicture, color_by, plot
 from sparklod_cli.images.pixels import BACKGROUND
 from sparklod_cli.lod import quick
 from sparklod_cli.model.gaussian import spark_size
@@ -107,13 +107,13 @@ def scene() -> Scene:
     return Scene(*quick.build(splats))
 
 
-def pixels(picture: Picture) -> np.ndarray:
+def pixels(picture: DescribedPicture) -> np.ndarray:
     image = Image.open(io.BytesIO(picture.png))
     assert image.format == "PNG"
     return np.asarray(image.convert("RGB")).astype(int)
 
 
-def drawn(picture: Picture) -> np.ndarray:
+def drawn(picture: DescribedPicture) -> np.ndarray:
     """Where the middle of the picture, without title, scale and axes, is not of the colour of the ground."""
     middle = pixels(picture)[50:-30, 60:-70]
     ground = [int(BACKGROUND[at : at + 2], 16) for at in (1, 3, 5)]

@@ -11,7 +11,7 @@ from sparklod_cli.cameras.path import CameraPath
 from sparklod_cli.cameras.sources import SingleViews
 from sparklod_cli.images import sequence
 from sparklod_cli.images.output import output_for
-from sparklod_cli.images.sequence import Pictures, PictureSettings, write_pictures
+from sparklod_cli.images.sequence import PictureSettings, WrittenPictures, write_pictures
 from sparklod_cli.lod.settings import LodSettings
 from sparklod_cli.model.instances import instances_of
 from sparklod_cli.render.renderer import DrawnPicture, Renderer
@@ -28,7 +28,7 @@ def path_of(count: int) -> CameraPath:
     return SingleViews(views).cameras(Settings(size=(48, 32)), lambda: pytest.fail("nobody needs to know the scene"))
 
 
-def written(folder: Path, count: int, budget: int = 900) -> Pictures:
+def written(folder: Path, count: int, budget: int = 900) -> WrittenPictures:
     """Differences of cuts of a budget from others of 3000."""
     scenes = read_scenes(instances_of([TOWN]))
     finders = [CutFinder(scenes, LodSettings(each)) for each in (budget, 3000)]

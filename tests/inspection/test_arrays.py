@@ -12,7 +12,7 @@ from sparklod_cli.cli import run
 from sparklod_cli.codecs.formats import ENCODINGS
 from sparklod_cli.inspection.report import ReportSettings, inspect
 from sparklod_cli.io import read_arrays
-from tests.conftest import FIXTURES
+from tests.conftest import FIXTURES, Capture
 from tests.inspection.test_schema import VALIDATOR
 
 SCENE = FIXTURES / "sh3.ply"
@@ -66,7 +66,7 @@ def test_arrays_of_nodes_have_the_facts_of_the_tree(folder: Path) -> None:
 @pytest.mark.parametrize("encoding", ENCODINGS)
 @pytest.mark.slow
 def test_the_command_prints_reports_pages_and_json(
-    encoding: str, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    encoding: str, folder: Path, tmp_path: Path, capsys: Capture
 ) -> None:
     path = str(folder / f"{encoding}.npz")
     for options in ([], ["--check"], ["--json", "--stats"], ["--assert", "nodes>1"]):
@@ -76,7 +76,7 @@ def test_the_command_prints_reports_pages_and_json(
     assert run(["inspect", path, "--html", str(tmp_path / "page.html"), "-q"]) == 0
 
 
-def test_what_arrays_do_not_hold_is_not_checked_silently(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_arrays_do_not_hold_is_not_checked_silently(folder: Path, capsys: Capture) -> None:
     for encoding in ("lodtree", "texture"):
         assert run(["inspect", str(folder / f"{encoding}.npz"), "--leaves-of", str(SCENE)]) == 3
         assert "expect.leaves: the file does not contain all of its splats" in capsys.readouterr().out
@@ -84,7 +84,7 @@ def test_what_arrays_do_not_hold_is_not_checked_silently(folder: Path, capsys: p
     assert "growth<2: the file has no tree" in capsys.readouterr().out
 
 
-def test_other_commands_say_that_they_are_no_scene(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_other_commands_say_that_they_are_no_scene(folder: Path, capsys: Capture) -> None:
     for command in ("build-lod", "traverse", "render"):
         assert run([command, str(folder / "packed.npz")]) == 1
         assert (
@@ -92,7 +92,7 @@ def test_other_commands_say_that_they_are_no_scene(folder: Path, capsys: pytest.
         )
 
 
-def test_words_alone_tell_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_words_alone_tell_nothing(tmp_path: Path, capsys: Capture) -> None:
     for suffix in (".bin", ".raw"):
         path = tmp_path / f"tree{suffix}"
         assert run(["build-lod", str(SCENE), "-q", "--encoding", "ext", "-o", str(path)]) == 0
@@ -115,7 +115,7 @@ def test_words_alone_tell_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[
     ],
 )
 def test_arrays_of_another_shape_are_refused(
-    arrays: dict[str, np.ndarray], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    arrays: dict[str, np.ndarray], message: str, tmp_path: Path, capsys: Capture
 ) -> None:
     np.savez(tmp_path / "odd.npz", **arrays)
     assert run(["inspect", str(tmp_path / "odd.npz")]) == 1

@@ -1,4 +1,4 @@
-"""The table of the chunks says what each covers."""
+"""Tables of chunks, and reports that are made chunk by chunk."""
 
 from __future__ import annotations
 
@@ -6,21 +6,37 @@ import csv
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
 
 from sparklod_cli.cli import run
-from sparklod_cli.inspection import chunks
+from sparklod_cli.inspection import chunks, percentiles
+from sparklod_cli.inspection.blocks import ReportBlocks, merged
+from sparklod_cli.inspection.report import Report, ReportSettings, inspect
+from sparklod_cli.inspection.tree import TreeColumns
 from sparklod_cli.io import examine_scene
+from sparklod_cli.io.rad_file import RadFile
 from sparklod_cli.model.gaussian import spark_size
 from sparklod_cli.model.scene import Scene
-from tests.conftest import FIXTURES
-from tests.inspection.rad_files import CHUNK, tree
+from tests.conftest import FIXTURES, Capture, real_scene
+from tests.inspection.rad_files import CHUNK, Rad, tree
+from tests.inspection.test_rad_faults import FAULTS, column
 from tests.scenes import random_splats
 
-Said = pytest.CaptureFixture[str]
 GOLDEN = FIXTURES / "golden" / "sh1-tree.rad"
+
+
+def rows_of(scene: Scene) -> list[dict[str, Any]]:
+    blocks = ReportBlocks.of(scene)
+    nodes = TreeColumns.of(blocks) if blocks.is_tree and blocks.count else None
+    if nodes is not None:
+        merged(blocks.map(nodes.add, (), 1))
+    return chunks.table_of(list(blocks.map(chunks.row_of, (), 1)), scene.chunk_bytes, nodes)
 
 
 def parents_of(scene: Scene) -> dict[int, int]:
@@ -39,7 +55,7 @@ def test_rows_are_what_can_be_counted_by_hand() -> None:
     scene = examine_scene(GOLDEN)
     assert scene.tree is not None
     step, parents, size = scene.header["chunk_size"], parents_of(scene), spark_size(scene.splats)
-    rows = chunks.rows_of(scene)
+    rows = rows_of(scene)
     assert len(rows) == scene.header["chunks"] > 1
     for number, row in enumerate(rows):
         nodes = range(number * step, min(len(scene), (number + 1) * step))
@@ -58,21 +74,21 @@ def test_rows_are_what_can_be_counted_by_hand() -> None:
 
 
 def test_other_formats_have_the_chunks_of_a_viewer() -> None:
-    rows = chunks.rows_of(Scene(random_splats(CHUNK + 3)))
+    rows = rows_of(Scene(random_splats(CHUNK + 3)))
     assert [row["splats"] for row in rows] == [CHUNK, 3]
     assert {row[name] for row in rows for name in ("bytes", "leaves", "depth_max", "parent_chunks")} == {None}
-    assert chunks.rows_of(Scene(random_splats(0))) == []
+    assert rows_of(Scene(random_splats(0))) == []
 
 
 def test_what_is_not_finite_is_empty() -> None:
     splats = random_splats(3)
     splats.center[1, 0] = np.nan
-    (row,) = chunks.rows_of(Scene(splats))
+    (row,) = rows_of(Scene(splats))
     assert (row["min_x"], row["max_x"], row["extent"]) == (None, None, None)
     assert row["min_y"] is not None
 
 
-def test_the_table_is_printed_and_written(tmp_path: Path, capsys: Said) -> None:
+def test_the_table_is_printed_and_written(tmp_path: Path, capsys: Capture) -> None:
     path = tree(CHUNK + 8).write(tmp_path / "a.rad")
     output = tmp_path / "chunks.csv"
     assert run(["inspect", str(path), "--chunks", "--chunks-out", str(output), "-q"]) == 0
@@ -88,7 +104,7 @@ def test_the_table_is_printed_and_written(tmp_path: Path, capsys: Said) -> None:
     assert [str(row["extent"]) for row in plain["chunks"]] == [row["extent"] for row in rows]
 
 
-def test_the_table_without_a_tree_has_no_empty_columns(capsys: Said) -> None:
+def test_the_table_without_a_tree_has_no_empty_columns(capsys: Capture) -> None:
     assert run(["inspect", str(FIXTURES / "sh0.ply"), "--chunks", "-q"]) == 0
     head, row = capsys.readouterr().out.splitlines()
     assert head.split() == ["chunk", "base", "splats", "extent", "size_min", "size_max"]
@@ -98,10 +114,10 @@ def test_the_table_without_a_tree_has_no_empty_columns(capsys: Said) -> None:
 def test_the_table_of_a_chunked_file_is_that_of_the_whole_one(tmp_path: Path) -> None:
     whole, chunked = tree(CHUNK + 8), replace(tree(CHUNK + 8), stem="a")
     one, other = (examine_scene(rad.write(tmp_path / f"{name}.rad")) for rad, name in ((whole, "w"), (chunked, "c")))
-    assert chunks.rows_of(one) == chunks.rows_of(other)
+    assert rows_of(one) == rows_of(other)
 
 
-def test_the_table_of_what_has_no_splats_is_refused(tmp_path: Path, capsys: Said) -> None:
+def test_the_table_of_what_has_no_splats_is_refused(tmp_path: Path, capsys: Capture) -> None:
     source = FIXTURES / "sh0.ply"
     assert run(["build-lod", str(source), "--encoding", "lodtree", "-o", str(tmp_path / "a.npz"), "-q"]) == 0
     assert run(["inspect", str(tmp_path / "a.npz"), "--chunks", "-q"]) == 1
@@ -116,6 +132,129 @@ def test_the_table_of_what_has_no_splats_is_refused(tmp_path: Path, capsys: Said
         ([str(GOLDEN), "--chunks-out", "a.csv"], "--chunks-out takes one file, not 2"),
     ],
 )
-def test_options_that_exclude_each_other_are_usage_errors(options: list[str], message: str, capsys: Said) -> None:
+def test_options_that_exclude_each_other_are_usage_errors(options: list[str], message: str, capsys: Capture) -> None:
     assert run(["inspect", str(GOLDEN), *options]) == 2
     assert message in capsys.readouterr().err
+
+
+EVERYTHING = ReportSettings(chunks=True, values=True, all_quantities=True, check=True)
+PLAIN = ReportSettings()
+
+
+def both(path: Path, settings: ReportSettings = EVERYTHING) -> list[Report]:
+    return [inspect(path, replace(settings, at_once=at_once), threads=2)[0] for at_once in (True, False)]
+
+
+def random_tree(seed: int, *, links: bool) -> Rad:
+    """Ten chunks whose numbers are any bits, in some files those of the tree, too."""
+    rng = np.random.default_rng(seed)
+    rad = tree(240, chunk=24, max_sh=2, palette=bool(seed % 2))
+    names = {"center": 12, "alpha": 2, "rgb": 3, "scales": 3, "orientation": 3}
+    if links:
+        names |= {"child_count": 2, "child_start": 4}
+    for number in range(10):
+        for name, size in names.items():
+            data = rng.integers(0, 256, 24 * size, dtype=np.uint8)
+            if name in ("child_count", "child_start") and rng.random() < 0.8:  # mostly small numbers
+                data.reshape(-1, 24)[1:] = 0
+            rad = column(rad, name, number, data=data.tobytes())
+    return rad
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_of_files_with_faults(name: str, tmp_path: Path) -> None:
+    one, other = both(FAULTS[name][0].write(tmp_path / "a.rad"))
+    assert one == other
+    assert one.findings
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # any bits are numbers
+@pytest.mark.parametrize("links", [False, True])
+@pytest.mark.parametrize("seed", range(6))
+def test_of_files_with_any_numbers(seed: int, links: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(percentiles, "KEPT", 100)  # so that more numbers pass several times
+    path = random_tree(seed, links=links).write(tmp_path / "a.rad")
+    for settings in (EVERYTHING, PLAIN):
+        one, other = both(path, settings)
+        assert repr(one) == repr(other)  # NaN differs from itself
+        assert one.tree is not None
+
+
+@pytest.mark.parametrize("name", ["golden/sh3-rad/sh3.rad", "rad/biker-spark.rad", "rad/playbot-125k-spark/p-lod.rad"])
+def test_of_sound_files(name: str) -> None:
+    path = FIXTURES / name if name.startswith("golden") else real_scene(name)
+    one, other = both(path)
+    assert one == other
+    assert one.values is not None
+    assert one.chunks
+
+
+def test_of_a_file_without_a_tree_and_of_one_without_splats(tmp_path: Path) -> None:
+    for rad in (FAULTS["children without a tree"][0], replace(tree(24), chunks=(), fields={"count": 0})):
+        one, other = both(rad.write(tmp_path / "a.rad"))
+        assert one == other
+
+
+def test_large_files_are_read_by_chunk_and_others_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tree(240, chunk=24).write(tmp_path / "a.rad")
+    _, scene = inspect(path, EVERYTHING)
+    assert scene is not None
+    monkeypatch.setattr("sparklod_cli.io.rad_file.available_memory", lambda: 40_000)
+    report, scene = inspect(path, EVERYTHING)
+    assert scene is None
+    assert report.splats == 240
+    assert inspect(path, replace(EVERYTHING, at_once=True))[1] is not None
+
+
+def test_a_chunk_is_what_all_of_them_have_in_its_place(tmp_path: Path) -> None:
+    file = RadFile.open(tree(240, chunk=24, max_sh=1, palette=True).write(tmp_path / "a.rad"))
+    assert file is not None
+    for number, (start, splats, nodes) in enumerate(file.chunks({"center", "sh"}, thorough=True, threads=2)):
+        some, tree_of_some, _ = file.chunk(number, {"center"})
+        assert start == 24 * number
+        assert np.array_equal(splats.center, some.center)
+        assert splats.sh.any()
+        assert not some.sh.any()
+        assert nodes is not None
+        assert tree_of_some is not None
+        assert np.array_equal(nodes.child_start, tree_of_some.child_start)
+    assert RadFile.open(FIXTURES / "sh0.ply") is None
+
+
+def numbers_of(kind: str) -> st.SearchStrategy[np.ndarray]:
+    elements = arrays.from_dtype(np.dtype(kind), allow_nan=False, allow_infinity=False)
+    return arrays.arrays(kind, st.integers(1, 60), elements=elements | st.sampled_from([0.0, -0.0, 1.0, 1.5]))
+
+
+@pytest.mark.filterwarnings("ignore:overflow")
+@given(st.one_of(numbers_of("<f4"), numbers_of("<f8")), st.integers(1, 20), st.integers(0, 50))
+@example(np.array([-0.0, 0.0, 0.0], np.float32), 2, 0)
+def test_percentiles_are_those_of_numpy(values: np.ndarray, step: int, kept: int) -> None:
+    levels, passes = (0, 1, 25, 50, 75, 99, 100), 0
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(percentiles, "KEPT", kept)
+        found = percentiles.Percentiles(levels, values.dtype)
+        while found.passes:
+            for start in range(0, len(values), step):
+                found.add(values[start : start + step])
+            found.end_pass()
+            passes += 1
+    most = 1 if len(values) <= kept or len(np.unique(values)) == 1 else values.dtype.itemsize // 2
+    assert 1 <= passes <= most
+    assert np.array_equal(found.values(), np.percentile(values.astype(np.float64), levels), equal_nan=True)
+    assert found.mean == pytest.approx(values.mean(dtype=np.float64), rel=1e-9, abs=1e-9 * float(np.abs(values).max()))
+
+
+@pytest.mark.parametrize(("kind", "step", "passes"), [("<f4", 2.0**-7, 1), ("<f4", 2.0**-23, 2), ("<f8", 2.0**-52, 4)])
+def test_numbers_pass_until_their_digits_tell_them_apart(
+    kind: str, step: float, passes: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(percentiles, "KEPT", 0)
+    values = (1 + step * np.arange(20)).astype(kind)
+    found, count = percentiles.Percentiles((0, 50, 99), values.dtype), 0
+    while found.passes:
+        found.add(np.concatenate([values, [np.nan, np.inf]]).astype(kind))
+        found.end_pass()
+        count += 1
+    assert (count, found.count) == (passes, len(values))
+    assert np.array_equal(found.values(), np.percentile(values.astype(np.float64), (0, 50, 99)))

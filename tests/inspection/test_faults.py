@@ -16,7 +16,7 @@ from sparklod_cli.codecs.compression import PIECE
 from sparklod_cli.commands.inspect_text import lines
 from sparklod_cli.inspection.findings import CODES, ERROR
 from sparklod_cli.inspection.report import Report, ReportSettings, inspect
-from tests.conftest import FIXTURES, real_scene
+from tests.conftest import FIXTURES, Capture, real_scene
 
 FOLDER = FIXTURES / "faults"
 
@@ -162,7 +162,7 @@ UNPLANTED = {"values.opacity", "values.rotation"}
 
 @pytest.mark.parametrize("name", FAULTS)
 def test_each_fault_is_found_by_its_code_and_no_other(
-    name: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    name: str, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(FOLDER)
     code = run(["inspect", "--check", name])

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sparklod_cli.figures.tree_plot import Picture
-from sparklod_cli.inspection.html import Section, page
+from sparklod_cli.figures.tree_plot import DescribedPicture
+from sparklod_cli.inspection.html import FileSection, page
 from sparklod_cli.inspection.html_parts import children_groups
 from sparklod_cli.inspection.report import ReportSettings, inspect
 from sparklod_cli.inspection.values import histogram_of, names_of
@@ -116,12 +116,12 @@ def read(text: str) -> Reader:
     return reader
 
 
-def said(section: Section) -> str:
+def said(section: FileSection) -> str:
     return " ".join(" ".join(read(page([section])).text).split())
 
 
 def test_a_page_has_the_figures_of_its_report() -> None:
-    text = said(Section(REPORT))
+    text = said(FileSection(REPORT))
     for part in (
         "scene-lod.spz",
         "SPZ 3 LoD",
@@ -138,14 +138,14 @@ def test_a_page_has_the_figures_of_its_report() -> None:
 
 
 def test_levels_have_bars_of_their_shares() -> None:
-    text = page([Section(REPORT)])
+    text = page([FileSection(REPORT)])
     rows = re.findall(r'<tr><th scope="row">(\d)</th>.*?<div class="track"[^>]*>(.*?)</div>', text)
     widths = {level: re.findall(r'class="of(\d)" style="width:([\d.]+)%', bars) for level, bars in rows[:3]}
     assert widths == {"0": [("0", "0.02")], "1": [("0", "0.02"), ("1", "0.04")], "2": [("1", "100.00")]}
 
 
 def test_a_page_suits_light_and_dark_and_loads_nothing() -> None:
-    text = page([Section(REPORT)])
+    text = page([FileSection(REPORT)])
     assert "prefers-color-scheme: dark" in text
     assert "color-scheme: light dark" in text
     assert "default-src &#x27;none&#x27;" in text
@@ -155,8 +155,8 @@ def test_a_page_suits_light_and_dark_and_loads_nothing() -> None:
 def test_names_on_the_page_are_escaped(name: str) -> None:
     finding = {"severity": "error", "code": name, "message": name, "index": None, "count": None}
     report = REPORT | {"file": name, "format": name, "notes": [name], "findings": [finding]}
-    picture = Picture(b"png", f"{name}; {name}")
-    section = Section(report, picture, {name: histogram(np.arange(5, dtype=np.float32))})
+    picture = DescribedPicture(b"png", f"{name}; {name}")
+    section = FileSection(report, picture, {name: histogram(np.arange(5, dtype=np.float32))})
     text = page([section, section])
     read(text)
     assert "<script" not in text
@@ -176,7 +176,7 @@ def test_names_on_the_page_are_escaped(name: str) -> None:
     ],
 )
 def test_missing_figures_are_left_out(report: dict[str, Any]) -> None:
-    said(Section(report))
+    said(FileSection(report))
 
 
 def test_findings_come_worst_first() -> None:
@@ -186,20 +186,20 @@ def test_findings_come_worst_first() -> None:
         {"severity": "warning", "code": "tree.size", "message": "the warning", "index": 1, "count": 2},
         {"severity": "error", "code": "tree.order", "message": "another error", "index": None, "count": None},
     ]
-    text = said(Section(REPORT | {"findings": findings}))
+    text = said(FileSection(REPORT | {"findings": findings}))
     places = [text.index(message) for message in ("the error", "another error", "the warning", "the note")]
     assert places == sorted(places)
     assert "2 errors" in text
     assert "a node has children beyond the last node" in text
-    assert "1 warning" in said(Section(REPORT | {"findings": findings[2:3]}))
-    assert "no faults found" in said(Section(REPORT | {"findings": []}))
+    assert "1 warning" in said(FileSection(REPORT | {"findings": findings[2:3]}))
+    assert "no faults found" in said(FileSection(REPORT | {"findings": []}))
 
 
 @pytest.mark.parametrize("count", [200, 201, 5000])
 def test_findings_are_bounded_and_the_worst_are_kept(count: int) -> None:
     finding = {"code": "expect.value", "message": "x", "index": None, "count": None}
     findings = [finding | {"severity": "note"}] * (count - 1) + [finding | {"severity": "error", "message": "worst"}]
-    text = page([Section(REPORT | {"findings": findings})])
+    text = page([FileSection(REPORT | {"findings": findings})])
     assert read(text).all("li")[0]["class"] == "error"
     assert "worst" in text
     assert (f"{count - 200:,} more findings are not listed" in text) == (count > 200)
@@ -207,7 +207,7 @@ def test_findings_are_bounded_and_the_worst_are_kept(count: int) -> None:
 
 
 def test_a_picture_is_inside_the_page() -> None:
-    section = Section(REPORT, Picture(b"\x89PNG bytes", "Level 3 of 9: 14 nodes; coloured by level"))
+    section = FileSection(REPORT, DescribedPicture(b"\x89PNG bytes", "Level 3 of 9: 14 nodes; coloured by level"))
     (image,) = read(page([section])).all("img")
     assert image["alt"] == "Drawing of Level 3 of 9: 14 nodes"
     assert base64.b64decode(str(image["src"]).partition(",")[2]) == b"\x89PNG bytes"
@@ -219,7 +219,7 @@ def test_a_page_draws_every_histogram_that_has_bins() -> None:
     values = np.array([np.nan, 1, 2, 3, 1e9, -1e9] + [2] * 2000, np.float32)
     counted = {name: histogram_of(splats, name) for name in names_of(splats)}
     counted |= {"odd": histogram(values), "none": histogram(values[:1]), "same": histogram(values[8:])}
-    reader = read(page([Section(REPORT, histograms=counted)]))
+    reader = read(page([FileSection(REPORT, histograms=counted)]))
     assert len(reader.all("svg")) == len(counted) - 1
     text = " ".join(reader.text)
     assert "no numbers" in text
@@ -228,7 +228,7 @@ def test_a_page_draws_every_histogram_that_has_bins() -> None:
 
 
 def test_many_files_are_listed() -> None:
-    sections = [Section(REPORT | {"file": f"{name}.spz"}) for name in "abc"]
+    sections = [FileSection(REPORT | {"file": f"{name}.spz"}) for name in "abc"]
     reader = read(page(sections))
     assert [link["href"] for link in reader.all("a")] == ["#file-1", "#file-2", "#file-3"]
     assert len(reader.all("article")) == 3
@@ -242,7 +242,7 @@ def test_a_page_of_a_real_file_says_what_its_report_says(name: str) -> None:
     settings = ReportSettings(values=True, all_quantities=True, check=True, at_once=True)
     report, scene = inspect(FIXTURES / name, settings)
     counted = {} if scene is None else {name: histogram_of(scene.splats, name) for name in names_of(scene.splats)}
-    text = said(Section(report.as_dict(), histograms=counted))
+    text = said(FileSection(report.as_dict(), histograms=counted))
     assert name in text
     assert ("Nodes by depth" in text) == (report.tree is not None)
     assert ("Detail levels" in text) == (report.streamed_sog is not None)

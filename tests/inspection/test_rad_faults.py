@@ -13,7 +13,7 @@ from sparklod_cli.cli import run
 from sparklod_cli.codecs.rad import rad_rules as rad_promises
 from sparklod_cli.inspection.findings import CODES
 from sparklod_cli.inspection.report import Report, ReportSettings, inspect
-from tests.conftest import FIXTURES, real_scene
+from tests.conftest import FIXTURES, Capture, real_scene
 from tests.inspection.rad_files import CHUNK, RANGES, Chunk, Rad, deflated, tree, with_chunk, with_fields
 
 #: Files to damage: two chunks, and a palette for spherical harmonics. Of small ones, chunks of all nodes.
@@ -196,7 +196,7 @@ def test_files_that_spark_wrote_have_no_findings(name: str) -> None:
 
 @pytest.mark.parametrize("name", FAULTS)
 def test_what_is_fatal_is_an_error_and_the_reader_gives_the_same_code(
-    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    name: str, tmp_path: Path, capsys: Capture
 ) -> None:
     """`inspect` without --check fails where the other commands do."""
     rad, expected = FAULTS[name]
@@ -217,13 +217,13 @@ def test_a_finding_is_about_the_first_chunk_and_counts_the_others(tmp_path: Path
     assert ranges.message == "splatEncoding of chunk 0 is not that of the file (and 9 more like it)"
 
 
-def test_a_chunk_alone_is_refused_with_what_to_give(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_chunk_alone_is_refused_with_what_to_give(capsys: Capture) -> None:
     assert run(["inspect", str(FIXTURES / "golden" / "sh3-rad" / "sh3-0.radc")]) == 1
     assert "one chunk of a RAD file; give the .rad file" in capsys.readouterr().err
 
 
 def test_a_header_without_its_chunks_is_refused_on_standard_input(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = replace(SMALL, stem="a").write(tmp_path / "a.rad")
     with path.open("rb") as file:

@@ -16,15 +16,14 @@ from sparklod_cli.cli import run
 from sparklod_cli.codecs.rad import codec as codec
 from sparklod_cli.codecs.rad import rad_reader
 from sparklod_cli.inspection import leaves, rad
-from sparklod_cli.inspection.html import Section, page
+from sparklod_cli.inspection.html import FileSection, page
 from sparklod_cli.inspection.rad import PropertyFacts
 from sparklod_cli.inspection.report import ReportSettings, inspect
 from sparklod_cli.io import examine_scene, read_scene
 from sparklod_cli.model.scene import Scene
-from tests.conftest import FIXTURES, real_scene
+from tests.conftest import FIXTURES, Capture, real_scene
 from tests.inspection.rad_files import CHUNK, RANGES, Rad, tree, with_chunk, with_fields
 
-Said = pytest.CaptureFixture[str]
 PALETTE = tree(24, max_sh=2, palette=True)
 
 
@@ -68,7 +67,7 @@ def test_chunks_may_differ(tmp_path: Path) -> None:
     assert (properties["rgb"].min, properties["rgb"].max) == (-1, 3)
 
 
-def test_a_comment_is_shown_on_a_line_and_shortened(tmp_path: Path, capsys: Said) -> None:
+def test_a_comment_is_shown_on_a_line_and_shortened(tmp_path: Path, capsys: Capture) -> None:
     comment = "made by\n\x1b[31m" + "me " * 400
     path = with_fields(tree(24), comment=comment).write(tmp_path / "a.rad")
     found = facts_of(path).comment
@@ -79,7 +78,7 @@ def test_a_comment_is_shown_on_a_line_and_shortened(tmp_path: Path, capsys: Said
     assert max(map(len, capsys.readouterr().out.splitlines())) < 180
 
 
-def test_a_person_reads_what_is_stored_how(tmp_path: Path, capsys: Said) -> None:
+def test_a_person_reads_what_is_stored_how(tmp_path: Path, capsys: Capture) -> None:
     path = PALETTE.write(tmp_path / "a.rad")
     assert run(["inspect", str(path)]) == 0
     lines = capsys.readouterr().out.splitlines()
@@ -93,7 +92,7 @@ def test_a_person_reads_what_is_stored_how(tmp_path: Path, capsys: Said) -> None
 
 def test_the_page_has_the_properties(tmp_path: Path) -> None:
     report, _ = inspect(PALETTE.write(tmp_path / "a.rad"), ReportSettings())
-    text = page([Section(report.as_dict())])
+    text = page([FileSection(report.as_dict())])
     for part in ("Properties", "ln_0r8", "sh2_code", "Palette of SH", "24 entries", "Header and first chunk"):
         assert part in text
 
@@ -111,7 +110,7 @@ FIELDS = {
 
 @pytest.mark.parametrize(("name", "expected"), FIELDS.items())
 def test_a_field_of_the_headers_needs_no_data(
-    name: str, expected: str, tmp_path: Path, capsys: Said, monkeypatch: pytest.MonkeyPatch
+    name: str, expected: str, tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*arguments: object, **options: object) -> None:
         raise AssertionError("the file is decoded")
@@ -157,7 +156,7 @@ EXPECTED: list[tuple[str, bool]] = [
 
 
 @pytest.mark.parametrize(("text", "holds"), EXPECTED)
-def test_what_can_be_expected(text: str, holds: bool, tmp_path: Path, capsys: Said) -> None:
+def test_what_can_be_expected(text: str, holds: bool, tmp_path: Path, capsys: Capture) -> None:
     path = PALETTE.write(tmp_path / "a.rad")
     assert run(["inspect", str(path), "--assert", text]) == (0 if holds else 3)
     out = capsys.readouterr().out
@@ -165,7 +164,7 @@ def test_what_can_be_expected(text: str, holds: bool, tmp_path: Path, capsys: Sa
 
 
 @pytest.mark.parametrize("name", ["chunk_bytes", "first_bytes", "chunked", "palette"])
-def test_other_formats_have_no_chunks_to_expect_something_of(name: str, capsys: Said) -> None:
+def test_other_formats_have_no_chunks_to_expect_something_of(name: str, capsys: Capture) -> None:
     assert run(["inspect", str(FIXTURES / "golden" / "tree-v3.spz"), "--assert", f"{name}==1"]) == 3
     assert "the file is not RAD" in capsys.readouterr().out
 
@@ -207,7 +206,7 @@ def test_coordinates_at_the_end_of_float16_are_found(tmp_path: Path) -> None:
 )
 @pytest.mark.slow
 def test_leaves_of_files_that_spark_wrote_are_the_splats_of_their_scenes(
-    name: str, original: str, capsys: Said
+    name: str, original: str, capsys: Capture
 ) -> None:
     assert run(["inspect", str(real_scene(name)), "--leaves-of", str(real_scene(original))]) == 0
     capsys.readouterr()
@@ -226,7 +225,7 @@ ENCODINGS = [
 @pytest.mark.parametrize("options", ENCODINGS)
 @pytest.mark.parametrize("name", ["sh3.ply", "needle.ply"])
 def test_files_that_we_write_have_no_findings_and_the_leaves_of_their_scenes(
-    name: str, options: str, tmp_path: Path, capsys: Said
+    name: str, options: str, tmp_path: Path, capsys: Capture
 ) -> None:
     source, path = str(FIXTURES / name), str(tmp_path / "a.rad")
     assert run(["build-lod", source, "-o", path, "-q", *options.split()]) == 0
@@ -276,7 +275,7 @@ def test_leaves_in_several_encodings_cannot_be_compared() -> None:
     assert "center in several encodings" in found.message
 
 
-def test_json_has_the_facts(tmp_path: Path, capsys: Said) -> None:
+def test_json_has_the_facts(tmp_path: Path, capsys: Capture) -> None:
     path = Rad(PALETTE.chunks, 2, PALETTE.fields).write(tmp_path / "a.rad")
     assert run(["inspect", str(path), "--json"]) == 0
     plain = json.loads(capsys.readouterr().out)

@@ -25,7 +25,7 @@ from sparklod_cli.inspection.report import SCHEMA_VERSION, ReportSettings, inspe
 from sparklod_cli.lod import quick
 from sparklod_cli.model.lod_tree import MAX_CHILDREN, LodTree
 from sparklod_cli.model.scene import Scene
-from tests.conftest import FIXTURES, ROOT
+from tests.conftest import FIXTURES, ROOT, Capture
 from tests.scenes import random_splats
 
 SCHEMA = json.loads(files("sparklod_cli.inspection").joinpath("schema.json").read_text(encoding="utf-8"))
@@ -141,7 +141,7 @@ def test_reports_of_unreadable_files_follow_the_schema(tmp_path: Path, path: str
     assert report["findings"][0]["code"] == "file.unreadable"
 
 
-def test_reports_that_the_command_prints_follow_the_schema(lod: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_reports_that_the_command_prints_follow_the_schema(lod: Path, capsys: Capture) -> None:
     """With findings of expectations, too; many files give JSON lines."""
     options = ["--json", "--stats", "--check", "--sh", "0", "--max-bytes", "1", "--max-growth", "1"]
     assert run(["inspect", str(lod), "missing.spz", str(FIXTURES / "sh2.ply"), *options]) == 3

@@ -14,9 +14,8 @@ from sparklod_cli.codecs.streamed_sog.manifest import MAX_MANIFEST
 from sparklod_cli.inspection import html
 from sparklod_cli.inspection.report import Report, ReportSettings, inspect
 from sparklod_cli.io import read_levels, read_scene
+from tests.conftest import Capture
 from tests.inspection.streamed_sog_files import COUNTS, Folder, Node, folder, regions
-
-Said = pytest.CaptureFixture[str]
 
 
 @pytest.fixture(scope="module")
@@ -103,19 +102,19 @@ def test_errors_are_weighted_by_splats_of_full_detail(tmp_path: Path) -> None:
         ("leaves>=229", True),
     ],
 )
-def test_expectations_hold_or_not(path: Path, text: str, holds: bool, capsys: Said) -> None:
+def test_expectations_hold_or_not(path: Path, text: str, holds: bool, capsys: Capture) -> None:
     assert run(["inspect", str(path), "--assert", text]) == (0 if holds else 3)
     assert ("expect." in capsys.readouterr().out) == (not holds)
 
 
 @pytest.mark.parametrize(("name", "form"), [("levels", "Streamed SOG"), ("palette", "RAD")])
-def test_other_formats_have_no_such_names(path: Path, name: str, form: str, capsys: Said) -> None:
+def test_other_formats_have_no_such_names(path: Path, name: str, form: str, capsys: Capture) -> None:
     other = path.parent / "0_0"
     assert run(["inspect", str(path if form == "RAD" else other), "--assert", f"{name}==1"]) == 3
     assert f"the file is not {form}" in capsys.readouterr().out
 
 
-def test_headers_alone_tell_the_fields_of_the_manifest(path: Path, report: Report, capsys: Said) -> None:
+def test_headers_alone_tell_the_fields_of_the_manifest(path: Path, report: Report, capsys: Capture) -> None:
     assert run(["inspect", str(path.parent), "--field", "streamed_sog.levels.2.bytes"]) == 0
     assert json.loads(capsys.readouterr().out) == report.value_at("streamed_sog.levels.2.bytes")
     for field in ("bytes", "format", "splats", "sh_degree", "bytes_per_splat", "compression_ratio", "streamed_sog"):
@@ -130,7 +129,7 @@ def test_headers_alone_need_no_sound_images(tmp_path: Path) -> None:
     assert report.value_at("streamed_sog.levels.0.splats") == sum(row[0] for row in COUNTS)
 
 
-def test_a_person_reads_a_table_of_the_levels(path: Path, capsys: Said) -> None:
+def test_a_person_reads_a_table_of_the_levels(path: Path, capsys: Capture) -> None:
     assert run(["inspect", str(path)]) == 0
     lines = capsys.readouterr().out.splitlines()
     (head,) = (number for number, line in enumerate(lines) if line.startswith("  levels "))
@@ -164,7 +163,7 @@ def test_a_manifest_that_is_too_large_is_refused(tmp_path: Path) -> None:
     assert found.code == "container.corrupt"
 
 
-def test_standard_input_has_no_chunk_files(path: Path, capsys: Said, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_standard_input_has_no_chunk_files(path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     with path.open("rb") as file:
         monkeypatch.setattr("sys.stdin", type("Stdin", (), {"buffer": file, "isatty": lambda self: False})())
         assert run(["inspect", "-"]) == 1

@@ -1,18 +1,21 @@
-"""What is said of the numbers of splats: against numpy, and by hand."""
+"""Statistics of values, and the columns of SPZ that a report reads."""
 
 from __future__ import annotations
 
 import dataclasses
+import gzip
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from sparklod_cli.codecs.spz_layout import ANTIALIASED, HEADER, LOD, MAGIC, Layout
 
 from sparklod_cli.cli import run
 from sparklod_cli.codecs import ply, splat, spz
-from sparklod_cli.inspection import values
+from sparklod_cli.inspection import percentiles, values
 from sparklod_cli.inspection.report import ReportSettings, inspect
 from sparklod_cli.inspection.value_checks import check
 from sparklod_cli.inspection.values import (
@@ -24,10 +27,12 @@ from sparklod_cli.inspection.values import (
     names_of,
     quantity,
 )
+from sparklod_cli.io import examine_scene
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.sh import COEFFICIENTS
 from sparklod_cli.model.splats import COLUMNS, Splats
+from tests.conftest import FIXTURES, Capture
 from tests.scenes import random_splats
 
 NAN, INF = math.nan, math.inf
@@ -282,7 +287,7 @@ def test_values_of_files_are_those_of_what_was_written(count: int, tmp_path: Pat
     assert (report.bytes_per_splat, report.compression_ratio) == (32.0, 1.75)
 
 
-def test_every_quantity_is_a_field_of_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_quantity_is_a_field_of_the_command_line(tmp_path: Path, capsys: Capture) -> None:
     path = tmp_path / "scene.ply"
     path.write_bytes(b"".join(ply.encode(Scene(random_splats(10, sh_degree=2)))))
     for name in values.names_of(random_splats(1, sh_degree=2)):
@@ -295,3 +300,65 @@ def test_a_histogram_of_a_quantity_counts_every_splat() -> None:
     splats.opacity[0] = 1e-3
     assert not histogram_of(splats, "opacity").log
     assert histogram_of(splats, "scale", bins=10).counts.sum() == 200
+
+
+SETTINGS = [
+    ReportSettings(),
+    ReportSettings(values=True),
+    ReportSettings(check=True),
+    ReportSettings(chunks=True, values=True, all_quantities=True, check=True),
+]
+FILES = sorted([*(FIXTURES / "golden").glob("*.spz"), *(FIXTURES / "faults").glob("*.spz")])
+
+
+def check_both(path: Path) -> None:
+    for settings in SETTINGS:
+        expected, _ = inspect(path, replace(settings, at_once=True), threads=2)
+        for threads in (1, 3):
+            found, scene = inspect(path, settings, threads=threads)
+            assert repr(found) == repr(expected)  # NaN differs from itself
+            assert scene is None
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_of_sound_and_of_broken_files(path: Path) -> None:
+    check_both(path)
+
+
+def random_file(version: int, *, flags: int, count: int = 300, links: int = 0) -> bytes:
+    """A file of any codes; its links lead anywhere up to `links`."""
+    rng = np.random.default_rng(version)
+    layout = Layout(version, count, 2, 12, flags)
+    data = HEADER.pack(MAGIC, version, count, 2, 12, flags, 0)
+    for stream in layout.streams():
+        codes = rng.integers(0, 256, (count, stream.size), np.uint8)
+        if stream.name.startswith("child"):
+            kind = "<u2" if stream.size == 2 else "<u4"
+            codes = rng.integers(0, links, count).astype(kind).view(np.uint8)
+        data += codes.tobytes()
+    return gzip.compress(data, 1)
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # any bits are numbers
+@pytest.mark.parametrize("flags", [0, ANTIALIASED, LOD])
+@pytest.mark.parametrize("version", [1, 2, 3])
+def test_of_any_codes(version: int, flags: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(percentiles, "KEPT", 100)  # so that more numbers pass several times
+    monkeypatch.setattr("sparklod_cli.inspection.blocks.CHUNK_NODES", 64)
+    path = tmp_path / "any.spz"
+    path.write_bytes(random_file(version, flags=flags, links=5))
+    check_both(path)
+
+
+@pytest.mark.parametrize("version", [1, 2, 3])
+@pytest.mark.parametrize("flags", [0, LOD])
+def test_no_code_but_positions_of_version_1_stands_for_an_invalid_splat(
+    version: int, flags: int, tmp_path: Path
+) -> None:
+    path = tmp_path / "any.spz"
+    path.write_bytes(random_file(version, flags=flags, count=40_000, links=1))
+    splats = examine_scene(path).splats
+    assert set(splats.invalid()) == ({"non_finite"} if version == 1 else set())
+    splats = replace(splats, center=np.zeros_like(splats.center))
+    assert splats.invalid() == {}

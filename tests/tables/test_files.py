@@ -1,4 +1,4 @@
-"""The same rows give the same cells in every format, and the same bytes again."""
+"""Tables as files, and their columns."""
 
 from __future__ import annotations
 

@@ -8,6 +8,7 @@ import threading
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -20,8 +21,6 @@ from tests.conftest import FIXTURES
 TREE = FIXTURES / "golden" / "tree-v3.spz"
 CHUNKED = FIXTURES / "golden" / "sh3-rad" / "sh3.rad"
 
-PLAIN = viewing.ViewSettings(None, None, None, None, None, None)
-
 
 @dataclass(frozen=True)
 class Answer:
@@ -32,9 +31,9 @@ class Answer:
     body: bytes
 
 
-def prepared(paths: Sequence[Path], settings: viewing.ViewSettings = PLAIN, *, served: bool = True) -> Site:
+def prepared(paths: Sequence[Path], *, served: bool = True, **options: Any) -> Site:
     """The site of some files."""
-    return viewing.prepare(paths, settings, served=served, threads=1).site
+    return viewing.prepare(paths, served=served, threads=1, **options)
 
 
 @contextlib.contextmanager

@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 
 from sparklod_cli.cli import run
+from tests.conftest import Capture
 from tests.signals import heed_signals
 from tests.view.conftest import CHUNKED, TREE
 
@@ -68,9 +69,7 @@ def test_without_a_browser_it_says_so() -> None:
     ]
 
 
-def test_a_browser_is_opened_with_the_address(
-    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_browser_is_opened_with_the_address(monkeypatch: pytest.MonkeyPatch, capfd: Capture) -> None:
     import webbrowser
 
     from sparklod_cli.api import viewing
@@ -115,7 +114,7 @@ def test_what_cannot_be_done_is_one_line(
     text: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    capfd: pytest.CaptureFixture[str],
+    capfd: Capture,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert run(["view", *map(str, arguments)]) == code
@@ -125,7 +124,7 @@ def test_what_cannot_be_done_is_one_line(
     assert not list(tmp_path.iterdir())
 
 
-def test_a_port_in_use_is_one_line(capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_port_in_use_is_one_line(capfd: Capture) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
@@ -137,7 +136,7 @@ def test_a_port_in_use_is_one_line(capfd: pytest.CaptureFixture[str]) -> None:
     )
 
 
-def test_export_writes_a_site(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_export_writes_a_site(tmp_path: Path, capfd: Capture) -> None:
     folder = tmp_path / "site"
     command = ["view", str(TREE), "--export", str(folder)]
     assert run([*command, "--json"]) == 0

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from sparklod_cli.api import viewing
 from sparklod_cli.support.errors import OutputError
 from sparklod_cli.view import export as exporting
 from sparklod_cli.view.export import check_folder, export
@@ -36,7 +35,7 @@ def test_a_site_has_every_resource_under_its_name(static: Site, tmp_path: Path) 
 
 
 def test_the_libraries_are_copied_too(packages: Path, tmp_path: Path) -> None:
-    site = prepared([TREE], viewing.ViewSettings(None, None, None, None, None, packages), served=False)
+    site = prepared([TREE], served=False, spark_dir=packages)
     export(site, tmp_path / "site", overwrite=False)
     assert (tmp_path / "site/lib/three/build/three.core.js").is_file()
     assert (tmp_path / "site/lib/three/LICENSE").read_text() == "license of three"

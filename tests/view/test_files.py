@@ -7,24 +7,24 @@ import json
 import os
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 import sparklod_cli as sparklod
-from sparklod_cli.api import viewing
 from sparklod_cli.codecs.rad.rad_header import RadChunkEntry, RadHeader, pack_header, read_chunk_header
 from sparklod_cli.io import read_levels
 from sparklod_cli.support.errors import CameraPathError, FormatError, SparklodError
 from sparklod_cli.view.files import shown_files
 from tests.conftest import FIXTURES
-from tests.view.conftest import CHUNKED, PLAIN, TREE, prepared
+from tests.view.conftest import CHUNKED, TREE, prepared
 
 GOLDEN = FIXTURES / "golden"
 
 
-def settings_of(*paths: Path, settings: viewing.ViewSettings = PLAIN) -> dict:  # type: ignore[type-arg]
-    content = prepared(paths, settings).resources["view.json"]
+def settings_of(*paths: Path, **options: Any) -> dict[str, Any]:
+    content = prepared(paths, **options).resources["view.json"]
     assert isinstance(content, bytes)
     return json.loads(content)
 
@@ -229,17 +229,17 @@ def keep_child_counts(path: Path) -> None:
 
 def test_the_options_of_the_first_look_are_told() -> None:
     look = ((1.0, 2.0, 3.0), (0.0, 0.0, 0.0))
-    told = settings_of(TREE, settings=viewing.ViewSettings(look, 40.0, (0.0, 0.0, 1.0), 500, None, None))
+    told = settings_of(TREE, look_at=look, fov=40.0, up=(0.0, 0.0, 1.0), budget=500)
     assert (told["start"]["eye"], told["start"]["target"], told["start"]["fov"]) == ([1, 2, 3], [0, 0, 0], 40)
     assert (told["up"], told["budget"], told["start"]["chosen"]) == ([0, 0, 1], 500, False)
     assert settings_of(TREE)["start"]["fov"] == 60
     with pytest.raises(CameraPathError):
-        settings_of(TREE, settings=viewing.ViewSettings(((1.0,) * 3, (1.0,) * 3), None, None, None, None, None))
+        settings_of(TREE, look_at=((1.0,) * 3, (1.0,) * 3))
 
 
 def test_a_camera_path_is_told() -> None:
     path = FIXTURES / "cameras" / "sparklod.json"
-    told = settings_of(TREE, settings=viewing.ViewSettings(None, None, None, None, path, None))["path"]
+    told = settings_of(TREE, camera_path=path)["path"]
     assert len(told["frames"]) == len(sparklod.read_cameras(path))
 
 

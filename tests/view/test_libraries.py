@@ -11,7 +11,6 @@ from pathlib import Path
 
 import pytest
 
-from sparklod_cli.api import viewing
 from sparklod_cli.support.errors import SparklodError
 from sparklod_cli.view.libraries import MODULES, PACKAGES, VERSIONS, from_cdn, from_folder
 from tests.conftest import FIXTURES
@@ -23,8 +22,7 @@ SHOWN = {"spark": TREE, "playcanvas": FIXTURES / "golden" / "sh1-streamed-sog"}
 
 def page_of(libraries: Path | None, engine: str) -> tuple[dict[str, dict[str, str]], str]:
     """The import map of the page, and its policy."""
-    settings = viewing.ViewSettings(None, None, None, None, None, libraries)
-    index = prepared([SHOWN[engine]], settings).resources["index.html"]
+    index = prepared([SHOWN[engine]], spark_dir=libraries).resources["index.html"]
     assert isinstance(index, bytes)
     found = re.search(r'<script type="importmap">(.*?)</script>', index.decode(), re.DOTALL)
     policy = re.search(r'http-equiv="Content-Security-Policy" content="([^"]*)"', index.decode())
@@ -50,7 +48,7 @@ def test_the_cdn_is_asked_for_fixed_versions_by_their_digests(engine: str) -> No
 def test_a_folder_needs_no_other_host(packages: Path, engine: str) -> None:
     mapped, policy = page_of(packages, engine)
     assert "http" not in json.dumps(mapped) + policy
-    site = prepared([SHOWN[engine]], viewing.ViewSettings(None, None, None, None, None, packages))
+    site = prepared([SHOWN[engine]], spark_dir=packages)
     for url in mapped["imports"].values():
         name = url.removeprefix("./")
         assert any(each == name or (url.endswith("/") and each.startswith(name)) for each in site.resources)

@@ -19,7 +19,7 @@ from ...support.addresses import Place
 from ...support.setting_fields import Quantity, Range, setting_of, whole
 from ...support.units import parse_size
 from ..option_groups import COMMON, flag, is_set, option, parameters_of, refuse
-from ..parameter_types import POINT, Ball, OptionalNumber
+from ..parameter_types import BALL, POINT, OptionalNumber
 from ..paths import InputPath, OutputPath
 from .common import General
 
@@ -95,7 +95,7 @@ class SelectionOptions:
         "Leave out splats whose opacity is lower than this.", Range(0, 1, unit="N"), 0.0, heading=COMMON
     )
     within: Any = option(
-        "Leave out splats whose centre is outside this ball, in the input's coordinates.", Ball(), heading=COMMON
+        "Leave out splats whose centre is outside this ball, in the input's coordinates.", BALL, heading=COMMON
     )
     min_box: tuple[float, ...] | None = option(
         "Leave out splats whose centre is below this on any axis, in the input's coordinates.", POINT

@@ -16,7 +16,7 @@ from ...support.defaults import ELEVATION, ORBIT
 from ...support.errors import CameraPathError, TooManyCamerasError
 from ...support.setting_fields import Range, whole
 from ..option_groups import COMMON, flag, flag_of, is_set, option, refuse
-from ..parameter_types import POINT, Direction, Size, View, Views
+from ..parameter_types import DIRECTION, POINT, SIZE, VIEW, VIEWS
 from ..paths import InputPath, file_of
 
 if TYPE_CHECKING:
@@ -66,16 +66,16 @@ class Cameras:
         "Read the cameras from a file, or from a folder written by COLMAP.", InputPath(), heading=COMMON
     )
     orbit: int | None = _orbit_option(f"an orbit of {ORBIT}")
-    look_at: Any = option("Place one camera at EYE that looks at TARGET, each x,y,z.", View(), heading=COMMON)
+    look_at: Any = option("Place one camera at EYE that looks at TARGET, each x,y,z.", VIEW, heading=COMMON)
     size: tuple[int, int] | None = option(
         "Width and height of the images, in pixels; the vertical field of view is kept."
         "  [default: the file's, or 1280x720]",
-        Size(),
+        SIZE,
         heading=COMMON,
     )
     dolly: bool = flag("Move the camera straight towards the scene, from far to near.")
     keyframes: Any = option(
-        "Move the camera smoothly through two or more views, separated by spaces or semicolons.", Views()
+        "Move the camera smoothly through two or more views, separated by spaces or semicolons.", VIEWS
     )
     camera_format: str | None = option(
         "Format of --camera-path; auto recognises it by its content.  [default: auto]",
@@ -102,7 +102,7 @@ class Cameras:
         "Direction that is up, as an axis such as -y or as x,y,z, for cameras of which only eye and target are known."
         "  [default: the axis that the files note, or -y, as training leaves scenes with y down; y in SuperSplat's"
         " files]",
-        Direction(),
+        DIRECTION,
     )
     world_transform: str | None = option(
         "Transform from the world of the cameras to that of the splats: 16 numbers with commas between, row by row, or"
@@ -213,9 +213,13 @@ class Cameras:
 
     @contextlib.contextmanager
     def usage_errors(self) -> Iterator[None]:
-        """Turn the error that an option asks for too many cameras into a usage error that names the option."""
+        """Turn errors that the values of options cause into usage errors; of too many cameras one names the option."""
+        from ...api.jobs import UnfitError
+
         try:
             yield
+        except UnfitError as error:
+            raise click.UsageError(str(error)) from None
         except TooManyCamerasError as error:
             if self.camera_path is not None:
                 raise
@@ -230,7 +234,7 @@ class PictureCameras(Cameras):
     orbit: int | None = _orbit_option("one camera that sees the whole scene")
     views: tuple[Any, ...] = option(
         "Place a camera as --look-at does; several --view make a contact sheet.",
-        View(),
+        VIEW,
         flags=("--view",),
         multiple=True,
     )

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+import itertools
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -18,6 +19,9 @@ from ...tables.files import FORMS
 from ..console import Console, Verbosity
 from ..option_groups import COMMON, flag, option
 from ..paths import OutputPath, require_suffix
+
+if TYPE_CHECKING:
+    from ...tables.assertions import Outcome
 
 #: Suffixes, without a point, of what is no table, whatever format is asked for: splats, pictures, pages and arrays.
 NO_TABLES = {suffix[1:] for form in FORMATS for suffix in form.suffixes} - {*FORMS}
@@ -115,6 +119,16 @@ def table_form(flag: str, output: Path | None, form: str | None = None) -> str:
     if suffix[1:] not in FORMS:
         raise click.UsageError(f"{flag} {output}: tables are written as {', '.join(f'.{form}' for form in FORMS)}")
     return suffix[1:]
+
+
+def report_outcomes(console: Console, outcomes: Sequence[Outcome], places: Iterable[str] = itertools.repeat("")) -> int:
+    """Print the outcomes of assertions, each with where it is; return the exit status."""
+    for outcome, place in zip(outcomes, places):  # noqa: B905  # places may be endless
+        if outcome.held:
+            console.detail(f"  holds: {outcome.message()}{place}")
+        else:
+            console.error(f"{outcome.message()}{place}")
+    return 0 if all(outcome.held for outcome in outcomes) else 3
 
 
 @contextlib.contextmanager

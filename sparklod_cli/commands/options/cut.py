@@ -12,7 +12,7 @@ import click
 from ...codecs.formats import PRECISIONS
 from ...lod import detail_rule
 from ...lod.settings import FACTOR, LodSettings
-from ...model.foveation import Cones, Foveation, Frustum
+from ...model.instances import Cones, Foveation, Frustum
 from ...simulation.streaming_settings import StreamingSettings
 from ...support import defaults
 from ...support.setting_fields import Quantity, Range
@@ -21,9 +21,13 @@ from ..option_groups import COMMON, argument, flag, option, parameters_of, refus
 from ..paths import InputPath
 
 if TYPE_CHECKING:
+    from ...api.jobs import ViewedFiles
     from ...lod.budget import Budget
     from ...model.instances import Instance
     from ...scenes.loaded import Scenes
+    from ..console import Console
+    from ..render import RenderOptions
+    from ..traverse import TraverseOptions
 
 #: A key of `defaults.PRESETS`.
 DEFAULT_PRESET = "desktop"
@@ -101,7 +105,7 @@ def _budget_option(unit: str, several: str = "") -> Any:
 
 
 @dataclass(frozen=True)
-class Cut:
+class CutOptions:
     """Options of the cuts of trees, and of how detail levels of Streamed SOG are chosen."""
 
     HEADING: ClassVar[str] = "Cut"
@@ -176,7 +180,7 @@ class Cut:
 
 
 @dataclass(frozen=True)
-class PictureCut(Cut):
+class PictureCut(CutOptions):
     """Options of the cuts that pictures show."""
 
     budget: tuple[Budget, ...] | None = _budget_option("N|P%,...", "; with --compare several, such as 5%,500k")
@@ -221,6 +225,15 @@ class PictureStreaming:
     def loading(self) -> tuple[StreamingSettings, float] | None:
         """Return how chunks get to a viewer, and the seconds that it has had for them; None where all are resident."""
         return None if self.after is None else (self.streaming, self.after)
+
+
+def viewed_files(options: RenderOptions | TraverseOptions, instances: list[Instance], console: Console) -> ViewedFiles:
+    """Return the files and the cameras that look at them."""
+    from ...api.jobs import ViewedFiles
+
+    cameras, general = options.cameras, options.general
+    source, settings = cameras.camera_source(), cameras.settings()
+    return ViewedFiles(instances, source, settings, options.cut.precision, general.threads, console.progress)
 
 
 def check_scenes(ctx: click.Context, scenes: Scenes) -> None:

@@ -145,14 +145,7 @@ class InspectOutput:
 
 
 def check_usage(ctx: click.Context, count: int, checks: Checks, output: InspectOutput, *, as_json: bool) -> None:
-    """Raise a `click.UsageError` where options exclude each other or would do nothing.
-
-    Args:
-        ctx: of the command.
-        count: how many files there are.
-        checks, output: options.
-        as_json: --json was given.
-    """
+    """Raise a `click.UsageError` where options exclude each other or would do nothing."""
     if output.plot is not None and count > 1:
         raise click.UsageError(f"--plot takes one file, not {count}")
     if output.chunks_out is not None and count > 1:

@@ -16,13 +16,13 @@ from ...render.settings import OF_PIXELS, SORTINGS, RenderSettings
 from ...support import defaults
 from ...support.setting_fields import Range, whole
 from ..option_groups import COMMON, exclude, flag, is_set, option, require
-from ..parameter_types import Background
+from ..parameter_types import COLOR
 from ..paths import Folder, InputPath, require_suffix, stem_of
 from .common import assert_errors, assert_option, output_option, overwrite_flag, plot_option
 
 if TYPE_CHECKING:
     from ...cameras.camera import Camera
-    from ...images.output import Output
+    from ...images.output import PictureOutput
     from ...images.pixels import Color
     from ...lod.budget import Budget
     from ...tables.assertions import Assertion
@@ -62,7 +62,7 @@ class Appearance:
     HEADING: ClassVar[str] = "Appearance"
 
     background: Color | None = option(
-        "Colour behind the splats: '#rrggbb', black, white or transparent.", Background(), "black", heading=COMMON
+        "Colour behind the splats: '#rrggbb', black, white or transparent.", COLOR, "black", heading=COMMON
     )
     alpha: bool = flag("Keep alpha, as --background transparent does.")
     render: RenderSettings = field(default_factory=RenderSettings)
@@ -128,7 +128,7 @@ class Appearance:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class ComparisonOptions:
     """Options of comparisons: of cuts with full detail (`--compare`), and of one file with another (`--diff`)."""
 
     HEADING: ClassVar[str] = "Comparison"
@@ -223,14 +223,11 @@ class PictureFiles:
     )
     jpeg_quality: int = option("Quality of a .jpg, from 1 to 100.", whole(1, 100), JPEG_QUALITY)
 
-    def place(self, ctx: click.Context, scene: Path, cameras: int, *, sheet: bool) -> Output:
+    def place(self, ctx: click.Context, scene: Path, cameras: int, *, sheet: bool) -> PictureOutput:
         """Return the output of the pictures of some cameras.
 
         Args:
-            ctx: of the command.
             scene: the file beside which an output goes that has no name, and whose name it has.
-            cameras: how many there are.
-            sheet: they are put on a contact sheet.
 
         Raises:
             click.UsageError: the cameras do not fit into the output.
@@ -251,15 +248,8 @@ class PictureFiles:
         return output
 
 
-def check_sizes(output: Output, cameras: Sequence[Camera], supersample: int, *, bar: bool) -> None:
-    """Raise a `click.UsageError` where a picture is larger than can be drawn, or than its file can be.
-
-    Args:
-        output: where the pictures go.
-        cameras: that they are of.
-        supersample: samples along each side of a pixel.
-        bar: a colour bar stands beside each.
-    """
+def check_sizes(output: PictureOutput, cameras: Sequence[Camera], supersample: int, *, bar: bool) -> None:
+    """Raise a `click.UsageError` where a picture is larger than can be drawn, or than its file can be."""
     from ...images.pixels import scale_width
 
     for camera in cameras:

@@ -12,7 +12,7 @@ pytest.importorskip("fsspec")
 
 from sparklod_cli.support.addresses import Address
 from tests.commands.build_lod.runs import SMALL, build
-from tests.conftest import FIXTURES
+from tests.conftest import FIXTURES, Capture
 
 pytestmark = pytest.mark.slow
 
@@ -35,9 +35,7 @@ def content(place: Address) -> bytes:
 
 
 @pytest.mark.parametrize("form", ["spz", "rad", "rad-chunked"])
-def test_the_bytes_are_those_of_paths(
-    form: str, scan: Address, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_bytes_are_those_of_paths(form: str, scan: Address, tmp_path: Path, capsys: Capture) -> None:
     path = tmp_path / "scan.ply"
     path.write_bytes(SMALL.read_bytes())
     assert build(path, "--format", form) == 0
@@ -75,7 +73,7 @@ def test_a_folder_of_sog_is_written(folder: Address) -> None:
     assert build(tree.url, "--unlod", "-o", meta.url, "-f") == 0
 
 
-def test_an_output_is_replaced_only_where_that_is_asked_for(scan: Address, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_output_is_replaced_only_where_that_is_asked_for(scan: Address, capsys: Capture) -> None:
     for form, name in (("spz", "scan-lod.spz"), ("rad-chunked", "scan-lod.rad")):
         options = [scan.url, "--format", form]
         assert build(*options) == 0
@@ -84,9 +82,7 @@ def test_an_output_is_replaced_only_where_that_is_asked_for(scan: Address, capsy
         assert build(*options, "--overwrite") == 0
 
 
-def test_chunks_of_a_longer_output_go_and_chunks_without_a_header_are_refused(
-    scan: Address, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_chunks_of_a_longer_output_go_and_chunks_without_a_header_are_refused(scan: Address, capsys: Capture) -> None:
     old, other = scan.parent / "scan-lod-7.radc", scan.parent / "scan-lod-old.radc"
     for place in (old, other):
         place.write([b"old"])
@@ -109,7 +105,7 @@ def test_nothing_stays_of_an_output_that_fails(scan: Address, monkeypatch: pytes
     assert scan.parent.files() == ["scan.ply"]
 
 
-def test_what_cannot_be_is_said(scan: Address, folder: Address, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_cannot_be_is_said(scan: Address, folder: Address, capsys: Capture) -> None:
     for arguments, said in (
         ([folder / "none.ply"], f"{folder}/none.ply: cannot be read: no such file"),
         ([SMALL, "-o", "https://host/x.spz?secret=1"], "cannot write https://host/x.spz?***: https:// is for reading"),
@@ -121,7 +117,7 @@ def test_what_cannot_be_is_said(scan: Address, folder: Address, capsys: pytest.C
     assert scan.parent.files() == ["scan.ply"]
 
 
-def test_an_input_is_not_replaced(folder: Address, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_input_is_not_replaced(folder: Address, capsys: Capture) -> None:
     tree = folder / "tree.spz"
     tree.write([SMALL.read_bytes()])
     assert build(tree.url, "-o", tree.url, "-f") == 2

@@ -21,7 +21,7 @@ from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.model.transforms import Transform
 from tests.commands.build_lod.runs import build
-from tests.conftest import FIXTURES
+from tests.conftest import FIXTURES, Capture
 from tests.scenes import random_splats
 
 #: Where an instances file puts the second tile and the third, which is the first one again.
@@ -41,7 +41,7 @@ def tiles(tmp_path: Path) -> list[Path]:
     return [put(tmp_path / f"tile-{k}.ply", random_splats(300, sh_degree=k)) for k in (1, 0)]
 
 
-def baked(*arguments: object, capsys: pytest.CaptureFixture[str]) -> dict[str, object]:
+def baked(*arguments: object, capsys: Capture) -> dict[str, object]:
     assert build(*arguments, "--json", "-f") == 0
     out, _ = capsys.readouterr()
     found: dict[str, object] = json.loads(out)
@@ -78,7 +78,7 @@ EXACT += ["--rad-center=f32", "--rad-scales=f32"]
 
 @pytest.mark.parametrize("method", ["quick", "quality"])
 def test_merged_files_give_the_tree_of_one_that_holds_them_all(
-    method: str, tiles: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    method: str, tiles: list[Path], tmp_path: Path, capsys: Capture
 ) -> None:
     whole = put(tmp_path / "whole.ply", together(tiles, (Transform(), Transform())))
     one = baked(whole, "-o", tmp_path / "one.rad", "--method", method, capsys=capsys)
@@ -99,7 +99,7 @@ def instances_file(tmp_path: Path, tiles: list[Path], **more: object) -> Path:
 
 @pytest.mark.parametrize("flags", [[], ["--merge"]])
 def test_an_instances_file_places_what_is_merged(
-    flags: list[str], tiles: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    flags: list[str], tiles: list[Path], tmp_path: Path, capsys: Capture
 ) -> None:
     city = instances_file(tmp_path, tiles)
     record = baked("--scene", city, *flags, "-o", tmp_path / "city.rad", *EXACT, capsys=capsys)
@@ -129,9 +129,7 @@ def test_pictures_of_a_merged_scene_are_those_of_its_instances(tmp_path: Path) -
     assert np.abs(one - other).max() <= 2
 
 
-def test_selection_goes_by_where_the_tiles_stand(
-    tiles: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_selection_goes_by_where_the_tiles_stand(tiles: list[Path], tmp_path: Path, capsys: Capture) -> None:
     city = instances_file(tmp_path, tiles)
     centers = together([tiles[1]], (Transform(),)).center
     moved = Transform(Transform.from_quat(PLACES[0]["rotation"]).rotation, 1.5, np.array([30.0, 0, -5]))
@@ -145,7 +143,7 @@ def test_selection_goes_by_where_the_tiles_stand(
 
 
 def test_what_an_instance_says_to_viewers_is_said_to_be_left_out(
-    tiles: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tiles: list[Path], tmp_path: Path, capsys: Capture
 ) -> None:
     assert build("--scene", instances_file(tmp_path, tiles, lod_scale=2), "-o", tmp_path / "x.spz") == 0
     assert "lod_scale and foveation of instances are for viewers, and no part of a tree" in capsys.readouterr().err
@@ -167,12 +165,12 @@ def test_what_an_instance_says_to_viewers_is_said_to_be_left_out(
         ),
     ],
 )
-def test_contradictions_are_refused(arguments: list[str], text: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_contradictions_are_refused(arguments: list[str], text: str, capsys: Capture) -> None:
     assert build(*arguments) == 2
     assert text in capsys.readouterr().err
 
 
-def test_a_tree_among_merged_files_is_refused_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_tree_among_merged_files_is_refused_by_name(tmp_path: Path, capsys: Capture) -> None:
     tree = FIXTURES / "golden/tree-v3.spz"
     assert build(FIXTURES / "sh1.ply", tree, "--merge", "-o", tmp_path / "x.spz") == 1
     text = "tree-v3.spz: it is a Level-of-Detail file already; give the splats that it was built from"
@@ -181,7 +179,7 @@ def test_a_tree_among_merged_files_is_refused_by_name(tmp_path: Path, capsys: py
 
 
 def test_the_output_is_none_of_the_files_that_an_instances_file_names(
-    tiles: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tiles: list[Path], tmp_path: Path, capsys: Capture
 ) -> None:
     assert build("--scene", instances_file(tmp_path, tiles), "-o", tiles[1], "-f", "--format", "spz") == 2
     assert build("--scene", instances_file(tmp_path, tiles), "-o", tmp_path / "city.json", "-f") == 2

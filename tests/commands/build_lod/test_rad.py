@@ -18,7 +18,7 @@ from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quick
 from sparklod_cli.model.scene import Scene
 from tests.commands.build_lod.runs import ONE, SMALL, build
-from tests.conftest import FIXTURES
+from tests.conftest import FIXTURES, Capture
 from tests.scenes import random_splats
 
 TREE = FIXTURES / "golden" / "tree-v3.spz"
@@ -48,7 +48,7 @@ def rows(scene: Scene) -> np.ndarray:
 
 @pytest.mark.parametrize("arguments", [["--format", "rad"], ["-o", "scene-lod.rad"], ["-o", "scene-lod.RAD"]])
 def test_rad_is_written_where_it_is_asked_for(
-    arguments: list[str], scene: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    arguments: list[str], scene: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
 ) -> None:
     monkeypatch.chdir(scene.parent)
     assert build(scene, *arguments) == 0
@@ -60,7 +60,7 @@ def test_rad_is_written_where_it_is_asked_for(
     assert f"{len(baked):,} nodes, depth {baked.tree.depths().max()}, 1 chunk, " in capsys.readouterr().err
 
 
-def test_chunks_are_files_beside_their_header(large: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_chunks_are_files_beside_their_header(large: Path, tmp_path: Path, capsys: Capture) -> None:
     assert build(large, "--format", "rad-chunked", "--output-dir", tmp_path / "web", "--json") == 0
     record = json.loads(capsys.readouterr().out)
     assert names(tmp_path / "web") == ["scene-lod-0.radc", "scene-lod-1.radc", "scene-lod.rad"]
@@ -86,9 +86,7 @@ def test_a_shorter_output_removes_the_chunks_of_a_longer_one(large: Path, tmp_pa
 
 
 @pytest.mark.slow
-def test_a_tree_is_the_same_in_the_other_format(
-    large: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_tree_is_the_same_in_the_other_format(large: Path, tmp_path: Path, capsys: Capture) -> None:
     before = read_scene(large)
     assert build(large, "-o", tmp_path / "there.rad", "-v", "--json") == 0
     out, err = capsys.readouterr()
@@ -148,7 +146,7 @@ def test_a_converted_tree_keeps_its_opacities(large: Path, tmp_path: Path) -> No
     np.testing.assert_allclose(read_scene(tmp_path / "leaves.spz").splats.opacity, leaves, atol=1 / 510 + 1e-6)
 
 
-def test_a_converted_tree_has_the_name_of_the_other_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_converted_tree_has_the_name_of_the_other_one(tmp_path: Path, capsys: Capture) -> None:
     source = tmp_path / "scene-lod.spz"
     shutil.copy(TREE, source)
     assert build(source, "--format", "rad") == 0
@@ -164,7 +162,7 @@ def test_a_converted_tree_has_the_name_of_the_other_one(tmp_path: Path, capsys: 
         assert path.read_bytes() == before
 
 
-def test_a_tree_is_refused_where_nothing_is_to_be_converted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_tree_is_refused_where_nothing_is_to_be_converted(tmp_path: Path, capsys: Capture) -> None:
     for name, options in {"tree.rad": [], "many.rad": ["--format", "rad-chunked"]}.items():
         assert build(TREE, "-o", tmp_path / name, *options) == 0
     whole, many = tmp_path / "tree.rad", tmp_path / "many.rad"
@@ -197,9 +195,7 @@ def test_a_tree_is_refused_where_nothing_is_to_be_converted(tmp_path: Path, caps
 
 
 @pytest.mark.parametrize("name", rad_layout.OPTIONS)
-def test_every_encoding_reaches_the_file_and_the_report(
-    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_every_encoding_reaches_the_file_and_the_report(name: str, tmp_path: Path, capsys: Capture) -> None:
     for encoding in rad_layout.choices(name)[1:]:
         output = tmp_path / f"{encoding}.rad"
         assert build(SMALL, "-o", output, f"--rad-{name}", encoding, "--json") == 0
@@ -218,9 +214,7 @@ def test_options_of_both_formats_reach_rad(scene: Path, tmp_path: Path) -> None:
     assert sizes[1] < sizes[0]
 
 
-def test_the_splats_of_a_rad_are_written_back_out(
-    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_splats_of_a_rad_are_written_back_out(scene: Path, tmp_path: Path, capsys: Capture) -> None:
     assert build(scene, "-o", tmp_path / "scene-lod.rad") == 0
     baked = read_scene(tmp_path / "scene-lod.rad")
     assert baked.tree is not None
@@ -237,7 +231,7 @@ def test_the_splats_of_a_rad_are_written_back_out(
     capsys.readouterr()
 
 
-def test_centres_that_float16_does_not_reach_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_centres_that_float16_does_not_reach_are_refused(tmp_path: Path, capsys: Capture) -> None:
     splats = random_splats(40)
     splats.center[3] = 1e6
     source = tmp_path / "far.rad"
@@ -249,7 +243,7 @@ def test_centres_that_float16_does_not_reach_are_refused(tmp_path: Path, capsys:
 @pytest.mark.parametrize(("value", "encoding"), [(5e4, "f16"), (1e6, "f32")])
 @pytest.mark.parametrize("column", ["rgb", "sh"])
 def test_the_encoding_that_is_advised_holds_the_values(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], column: str, value: float, encoding: str
+    tmp_path: Path, capsys: Capture, column: str, value: float, encoding: str
 ) -> None:
     splats = random_splats(400, sh_degree=1)
     getattr(splats, column)[3] = value
@@ -289,21 +283,19 @@ def test_the_encoding_that_is_advised_holds_the_values(
         ),
     ],
 )
-def test_options_that_do_not_suit_the_format_are_refused(
-    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_options_that_do_not_suit_the_format_are_refused(arguments: list[str], message: str, capsys: Capture) -> None:
     assert build("a.ply", *arguments) == 2
     assert message in capsys.readouterr().err
 
 
-def test_a_palette_without_spherical_harmonics_is_no_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_palette_without_spherical_harmonics_is_no_error(tmp_path: Path, capsys: Capture) -> None:
     assert build(ONE, "-o", tmp_path / "x.rad", "--max-sh", "0", "--cluster-sh", "--json") == 0
     record = json.loads(capsys.readouterr().out)
     assert record["sh_codes"] is None
     assert "sh" not in record["encodings"]
 
 
-def test_chunks_of_an_input_are_not_replaced(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_chunks_of_an_input_are_not_replaced(tmp_path: Path, capsys: Capture) -> None:
     assert build(ONE, "--format", "rad-chunked", "-o", tmp_path / "a.rad") == 0
     moved = (tmp_path / "a.rad").rename(tmp_path / "b.rad")  # it still names a-0.radc
     before = (tmp_path / "a-0.radc").read_bytes()

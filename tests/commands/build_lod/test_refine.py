@@ -13,7 +13,7 @@ import pytest
 
 from sparklod_cli.io import read_scene
 from tests.commands.build_lod.runs import ONE, build
-from tests.conftest import FIXTURES, ROOT
+from tests.conftest import FIXTURES, ROOT, Capture
 from tests.fittings import STEPS, StandIn
 from tests.fittings import stand_in as stand_in
 from tests.signals import heed_signals
@@ -49,13 +49,13 @@ def test_steps_and_seed_are_those_that_were_asked_for(
     assert len(settings.path) == 2
 
 
-def test_without_it_nothing_is_fitted(scene: Path, stand_in: StandIn, capsys: pytest.CaptureFixture[str]) -> None:
+def test_without_it_nothing_is_fitted(scene: Path, stand_in: StandIn, capsys: Capture) -> None:
     assert build(scene, "--json") == 0
     assert not stand_in.calls
     assert json.loads(capsys.readouterr().out)["refine"] is None
 
 
-def test_json_has_what_it_brought(scene: Path, stand_in: StandIn, capsys: pytest.CaptureFixture[str]) -> None:
+def test_json_has_what_it_brought(scene: Path, stand_in: StandIn, capsys: Capture) -> None:
     assert build(scene, "--refine", "--seed", 2, "--json", "-q") == 0
     out, err = capsys.readouterr()
     record = json.loads(out)
@@ -69,9 +69,7 @@ def test_json_has_what_it_brought(scene: Path, stand_in: StandIn, capsys: pytest
     assert err == ""
 
 
-def test_the_report_has_a_line_for_each_stage_and_one_for_all(
-    scene: Path, stand_in: StandIn, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_report_has_a_line_for_each_stage_and_one_for_all(scene: Path, stand_in: StandIn, capsys: Capture) -> None:
     assert build(scene, "--refine", "-v") == 0
     err = capsys.readouterr().err
     assert "fit 1 of 1: 2 % 30.0 -> 32.5 dB\n" in err
@@ -80,7 +78,7 @@ def test_the_report_has_a_line_for_each_stage_and_one_for_all(
     assert "quick tree, refined -> SPZ" in err
 
 
-def test_a_scene_of_which_nothing_is_seen_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_scene_of_which_nothing_is_seen_is_said(tmp_path: Path, capsys: Capture) -> None:
     assert build(ONE, "--refine", "-o", tmp_path / "out.spz") == 0
     said = "refined in 0 steps: no held-out camera sees anything of it; 0 % of the merged splats are new\n"
     assert said in capsys.readouterr().err
@@ -107,7 +105,7 @@ def test_the_output_of_a_tree_has_a_name_of_its_own(
     assert (scene.parent / "scene-lod.spz").read_bytes() == before
 
 
-def test_a_rad_stays_a_rad(scene: Path, stand_in: StandIn, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_rad_stays_a_rad(scene: Path, stand_in: StandIn, capsys: Capture) -> None:
     assert build(scene, "--format", "rad") == 0
     tree = scene.with_name("scene-lod.rad")
     assert build(tree, "--refine") == 0
@@ -119,9 +117,7 @@ def test_a_rad_stays_a_rad(scene: Path, stand_in: StandIn, capsys: pytest.Captur
     assert scene.with_name("other-0.radc").exists()
 
 
-def test_a_tree_is_replaced_only_with_overwrite(
-    scene: Path, stand_in: StandIn, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_tree_is_replaced_only_with_overwrite(scene: Path, stand_in: StandIn, capsys: Capture) -> None:
     assert build(scene) == 0
     tree = scene.with_name("scene-lod.spz")
     before = read_scene(tree)
@@ -153,20 +149,20 @@ def test_a_tree_is_replaced_only_with_overwrite(
     ],
 )
 def test_what_contradicts_it_is_wrong_usage(
-    options: tuple[object, ...], said: str, scene: Path, stand_in: StandIn, capsys: pytest.CaptureFixture[str]
+    options: tuple[object, ...], said: str, scene: Path, stand_in: StandIn, capsys: Capture
 ) -> None:
     assert build(scene, *options) == 2
     assert said in capsys.readouterr().err
     assert not stand_in.calls
 
 
-def test_an_input_after_it_is_not_taken_for_a_number(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_input_after_it_is_not_taken_for_a_number(scene: Path, capsys: Capture) -> None:
     assert build("--refine", scene) == 2
     assert "is no number; put --refine after the inputs, or write --refine=2000" in capsys.readouterr().err
 
 
 def test_cameras_that_are_none_fail_before_any_work(
-    scene: Path, cameras: Path, stand_in: StandIn, capsys: pytest.CaptureFixture[str]
+    scene: Path, cameras: Path, stand_in: StandIn, capsys: Capture
 ) -> None:
     cameras.write_text("nonsense\n")
     assert build(scene, "--refine", "--camera-path", cameras) == 1

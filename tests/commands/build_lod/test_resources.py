@@ -13,7 +13,7 @@ from sparklod_cli.bake.out_of_core import estimate
 from sparklod_cli.bake.out_of_core.scratch_folder import SUFFIX
 from sparklod_cli.io import read_scene
 from tests.commands.build_lod.runs import SMALL, build
-from tests.conftest import FIXTURES
+from tests.conftest import FIXTURES, Capture
 
 DEMO = FIXTURES / "demo.ply"
 
@@ -30,7 +30,7 @@ def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("suffix", [".spz", ".rad"])
 @pytest.mark.usefixtures("small_blocks")
 def test_what_does_not_fit_goes_out_of_core_and_gives_the_same_bytes(
-    tmp_path: Path, suffix: str, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, suffix: str, capsys: Capture
 ) -> None:
     whole, pieces, scratch = (tmp_path / name for name in (f"a{suffix}", f"b{suffix}", "scratch"))
     assert build(DEMO, "-o", whole, "--json", "--up", "-y") == 0
@@ -57,7 +57,7 @@ def test_what_does_not_fit_goes_out_of_core_and_gives_the_same_bytes(
 
 @pytest.mark.usefixtures("small_blocks")
 def test_the_default_memory_is_a_share_of_what_is_available(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
 ) -> None:
     monkeypatch.setattr("sparklod_cli.support.machine.available_memory", lambda: 4_000_000)
     assert build(DEMO, "-o", tmp_path / "a.spz") == 0
@@ -67,9 +67,7 @@ def test_the_default_memory_is_a_share_of_what_is_available(
     assert "out of core" not in capsys.readouterr().err
 
 
-def test_too_little_memory_is_an_error_that_says_how_much_is_enough(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_too_little_memory_is_an_error_that_says_how_much_is_enough(tmp_path: Path, capsys: Capture) -> None:
     assert build(DEMO, "-o", tmp_path / "a.spz", "--memory", "20M") == 1
     words = r"20 MB of memory is too little even out of core; give --memory (.*) or more"
     found = re.search(words, capsys.readouterr().err)
@@ -79,7 +77,7 @@ def test_too_little_memory_is_an_error_that_says_how_much_is_enough(
 
 
 @pytest.mark.usefixtures("small_blocks")
-def test_arrays_and_trees_go_on_in_memory(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_arrays_and_trees_go_on_in_memory(tmp_path: Path, capsys: Capture) -> None:
     assert build(DEMO, "-o", tmp_path / "a.npz", "--encoding", "ext", "--memory", "3M") == 0
     assert "goes on in memory, although it would take about" in capsys.readouterr().err
     assert build(FIXTURES / "golden" / "tree-v3.spz", "-o", tmp_path / "a.rad", "--memory", "1k") == 0
@@ -113,20 +111,18 @@ def test_standard_input_is_baked_out_of_core(
         (["--scratch-dir", "-"], "it cannot go to standard output"),
     ],
 )
-def test_contradictions_are_wrong_usage(
-    arguments: list[str], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_contradictions_are_wrong_usage(arguments: list[str], words: str, tmp_path: Path, capsys: Capture) -> None:
     assert build(DEMO, *([] if "-o" in arguments else ["--output-dir", tmp_path]), *arguments) == 2
     assert words in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 
-def test_resume_without_a_bake_to_go_on_with_begins(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_resume_without_a_bake_to_go_on_with_begins(tmp_path: Path, capsys: Capture) -> None:
     assert build(DEMO, "--output-dir", tmp_path, "--resume") == 0
     assert "goes on" not in capsys.readouterr().err
 
 
-def test_scenes_that_are_there_are_skipped(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_scenes_that_are_there_are_skipped(tmp_path: Path, capsys: Capture) -> None:
     scenes = [tmp_path / f"{name}.ply" for name in "ab"]
     for path in scenes:
         path.write_bytes((FIXTURES / "sh2.ply").read_bytes())
@@ -143,9 +139,7 @@ def test_scenes_that_are_there_are_skipped(tmp_path: Path, capsys: pytest.Captur
     assert not list(tmp_path.rglob(f"*{SUFFIX}"))
 
 
-def test_a_value_of_skip_existing_follows_after_an_equals_sign_only(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_value_of_skip_existing_follows_after_an_equals_sign_only(tmp_path: Path, capsys: Capture) -> None:
     target = tmp_path / "a.spz"
     assert build("--skip-existing", SMALL, "-o", target) == 0
     first = target.stat().st_mtime_ns

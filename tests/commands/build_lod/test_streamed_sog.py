@@ -15,7 +15,7 @@ from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.io import read_scene
 from sparklod_cli.model.scene import Scene
 from tests.commands.build_lod.runs import ONE, SMALL, build
-from tests.conftest import FIXTURES
+from tests.conftest import FIXTURES, Capture
 from tests.scenes import random_splats
 
 TREE = FIXTURES / "golden" / "tree-v3.spz"
@@ -53,14 +53,12 @@ def splats_in(folder: Path) -> int:
     return int(json.loads((folder / "meta.json").read_text())["count"])
 
 
-def record_of(capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
+def record_of(capsys: Capture) -> dict[str, Any]:
     found: dict[str, Any] = json.loads(capsys.readouterr().out)
     return found
 
 
-def test_what_is_reported_is_what_the_files_hold(
-    town: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_reported_is_what_the_files_hold(town: Path, tmp_path: Path, capsys: Capture) -> None:
     web = tmp_path / "new" / "web"
     options = ["--levels", "50%,20%,5%", "--region-min-splats", 200, "--region-extent", 8, "--chunk-splats", 900]
     assert build(town, "-o", web / MANIFEST, "--json", *options) == 0
@@ -103,9 +101,7 @@ def test_threads_do_not_change_the_files(town: Path, tmp_path: Path) -> None:
     assert files(tmp_path / "1") == files(tmp_path / "2")
 
 
-def test_the_tree_is_of_quality_unless_another_one_is_asked_for(
-    town: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_tree_is_of_quality_unless_another_one_is_asked_for(town: Path, tmp_path: Path, capsys: Capture) -> None:
     made = {}
     for name, options in {"none": [], "quality": ["--method", "quality"], "quick": ["--method", "quick"]}.items():
         assert build(town, "-o", tmp_path / name / MANIFEST, "--json", *options) == 0
@@ -114,7 +110,7 @@ def test_the_tree_is_of_quality_unless_another_one_is_asked_for(
     assert made["none"] == made["quality"] != made["quick"]
 
 
-def test_levels_can_be_made_of_an_existing_tree(town: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_levels_can_be_made_of_an_existing_tree(town: Path, tmp_path: Path, capsys: Capture) -> None:
     assert build(town, "-o", tmp_path / "town-lod.rad", "--method", "quality", "--rad-center", "f32") == 0
     capsys.readouterr()
     assert build(tmp_path / "town-lod.rad", "--format", "streamed-sog", "--json") == 0
@@ -133,9 +129,7 @@ def test_several_files_become_one_scene(tmp_path: Path) -> None:
     assert manifest(tmp_path / "web")["counts"][0] == 600
 
 
-def test_an_environment_is_a_file_or_what_is_far_away(
-    town: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_environment_is_a_file_or_what_is_far_away(town: Path, tmp_path: Path, capsys: Capture) -> None:
     sky = written(tmp_path / "sky.ply", 70, extent=100)
     assert build(town, "-o", tmp_path / "file" / MANIFEST, "--environment", sky, "--json", "--translate", "5,0,0") == 0
     out, err = capsys.readouterr()
@@ -154,7 +148,7 @@ def test_an_environment_is_a_file_or_what_is_far_away(
     assert "no splat is within 0.001 of the middle of the scene" in capsys.readouterr().err
 
 
-def test_an_environment_that_cannot_be_one_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_environment_that_cannot_be_one_is_named(tmp_path: Path, capsys: Capture) -> None:
     for path, said in {
         tmp_path / "missing.ply": f"{tmp_path / 'missing.ply'} cannot be read: no such file",
         TREE: f"the environment {TREE}: it is a Level-of-Detail file; give the splats that its tree was built from",
@@ -164,9 +158,7 @@ def test_an_environment_that_cannot_be_one_is_named(tmp_path: Path, capsys: pyte
     assert not (tmp_path / "web").exists()
 
 
-def test_full_detail_and_environment_are_what_is_read(
-    town: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_full_detail_and_environment_are_what_is_read(town: Path, tmp_path: Path, capsys: Capture) -> None:
     web = tmp_path / "web"
     assert build(town, "-o", web / MANIFEST, "--environment-beyond", 20) == 0
     capsys.readouterr()
@@ -178,9 +170,7 @@ def test_full_detail_and_environment_are_what_is_read(
 
 
 @pytest.mark.parametrize("source", [".", MANIFEST, "0_0", "0_0/meta.json"])
-def test_an_output_does_not_replace_its_input(
-    source: str, town: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_output_does_not_replace_its_input(source: str, town: Path, tmp_path: Path, capsys: Capture) -> None:
     assert build(town, "-o", tmp_path / MANIFEST) == 0
     before = files(tmp_path)
     assert build(tmp_path / source, "-o", tmp_path / MANIFEST, "--overwrite") == 2
@@ -188,9 +178,7 @@ def test_an_output_does_not_replace_its_input(
     assert files(tmp_path) == before
 
 
-def test_a_smaller_output_removes_the_files_of_a_larger_one(
-    town: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_smaller_output_removes_the_files_of_a_larger_one(town: Path, tmp_path: Path, capsys: Capture) -> None:
     assert build(town, "-o", tmp_path / MANIFEST, "--chunk-splats", 500, "--region-min-splats", 100) == 0
     (tmp_path / "index.html").write_text("precious")
     assert build(ONE, "-o", tmp_path / MANIFEST) == 1
@@ -225,16 +213,14 @@ def test_an_interruption_leaves_what_was_there(
     assert files(tmp_path) == former
 
 
-def test_a_bake_that_takes_much_memory_goes_on_in_memory(
-    town: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_bake_that_takes_much_memory_goes_on_in_memory(town: Path, tmp_path: Path, capsys: Capture) -> None:
     assert build(town, "-o", tmp_path / "web" / MANIFEST, "--memory", "1M") == 0
     err = capsys.readouterr().err
     assert "town.ply: goes on in memory, although it would take about" in err
     assert "--memory gives it 1.0 MB: detail levels are made of a whole tree" in err
 
 
-def test_the_same_bake_is_skipped(town: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_same_bake_is_skipped(town: Path, tmp_path: Path, capsys: Capture) -> None:
     web, sky = tmp_path / "web", written(tmp_path / "sky.ply", 40)
     given = [town, "-o", web / MANIFEST, "--skip-existing", "--environment", sky]
     assert build(*given) == 0
@@ -257,7 +243,7 @@ def test_the_same_bake_is_skipped(town: Path, tmp_path: Path, capsys: pytest.Cap
     assert "sky.ply changed since" in capsys.readouterr().err
 
 
-def test_other_outputs_have_no_detail(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_other_outputs_have_no_detail(scene: Path, tmp_path: Path, capsys: Capture) -> None:
     assert build(scene, "-o", tmp_path / "x.spz", "--json") == 0
     assert record_of(capsys)["detail"] is None
 
@@ -296,8 +282,6 @@ def test_other_outputs_have_no_detail(scene: Path, tmp_path: Path, capsys: pytes
         (["-o", MANIFEST, "--levels", ",".join(f"{share}%" for share in range(60, 44, -1))], "at most 15"),
     ],
 )
-def test_options_that_do_not_suit_are_refused(
-    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_options_that_do_not_suit_are_refused(arguments: list[str], message: str, capsys: Capture) -> None:
     assert build("a.ply", *arguments) == 2
     assert message in capsys.readouterr().err

@@ -5,17 +5,19 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 import sparklod_cli as api
-from sparklod_cli.api.viewing import ViewSettings, prepare
+from sparklod_cli.api.viewing import prepare
 from sparklod_cli.cli import run
 from sparklod_cli.images.metrics import psnr
 from sparklod_cli.io import read_levels, read_scene
 from sparklod_cli.model.transforms import AXES
 from tests.commands.build_lod.runs import SMALL, build
+from tests.conftest import Capture
 
 pytestmark = pytest.mark.slow
 
@@ -29,8 +31,6 @@ OUTPUTS = {
     "web/lod-meta.json": ("--method", "quick", "--levels", "30%"),
 }
 
-Said = pytest.CaptureFixture[str]
-
 
 def render(path: Path, output: Path, *options: object) -> np.ndarray:
     command = ["render", path, "-o", output, "--size", "120x90", "--full", "-q", "--overwrite", *options]
@@ -39,7 +39,7 @@ def render(path: Path, output: Path, *options: object) -> np.ndarray:
     return image
 
 
-def inspected(path: Path, capsys: Said) -> dict[str, object]:
+def inspected(path: Path, capsys: Capture) -> dict[str, object]:
     capsys.readouterr()
     assert run(["inspect", str(path), "--json"]) == 0
     report: dict[str, object] = json.loads(capsys.readouterr().out)
@@ -67,26 +67,25 @@ def test_a_picture_of_the_turned_scene_is_that_of_the_scene(name: str, turned: P
 
 
 @pytest.mark.parametrize("name", OUTPUTS)
-def test_inspect_and_view_say_which_axis_is_up(name: str, turned: Path, tmp_path: Path, capsys: Said) -> None:
+def test_inspect_and_view_say_which_axis_is_up(name: str, turned: Path, tmp_path: Path, capsys: Capture) -> None:
     assert inspected(turned / name, capsys)["up"] == "y"
     assert run(["inspect", str(turned / name)]) == 0
     assert "y is up" in capsys.readouterr().out
     if name.endswith(".json"):
         assert read_levels(turned / name).up == "y"
         return
-    settings = ViewSettings(None, None, None, None, None, None)
-    assert shown_up(turned / name, settings) == [0, 1, 0]
-    assert shown_up(turned / name, ViewSettings(None, None, (0.0, -1.0, 0.0), None, None, None)) == [0, -1, 0]
+    assert shown_up(turned / name) == [0, 1, 0]
+    assert shown_up(turned / name, up=(0.0, -1.0, 0.0)) == [0, -1, 0]
 
 
-def shown_up(path: Path, settings: ViewSettings) -> list[float]:
-    page = prepare([path], settings, served=True, threads=1).site.resources["view.json"]
+def shown_up(path: Path, **options: Any) -> list[float]:
+    page = prepare([path], served=True, threads=1, **options).resources["view.json"]
     assert isinstance(page, bytes)
     found: list[float] = json.loads(page)["up"]
     return found
 
 
-def test_traverse_and_the_api_go_around_the_axis_that_is_up(turned: Path, capsys: Said) -> None:
+def test_traverse_and_the_api_go_around_the_axis_that_is_up(turned: Path, capsys: Capture) -> None:
     command = ["traverse", str(turned / "x.spz"), "--orbit", "3", "--elevation", "40", "--budget", "500", "--json"]
     summaries = []
     for up in ([], ["--up=y"], ["--up=-y"]):
@@ -105,7 +104,7 @@ def test_traverse_and_the_api_go_around_the_axis_that_is_up(turned: Path, capsys
 
 @pytest.mark.parametrize("options", [(), ("--rotate", "90,0,0"), ("--translate", "1,2,3")])
 @pytest.mark.parametrize("suffix", [".spz", ".rad"])
-def test_without_up_nothing_is_said(suffix: str, options: tuple[str, ...], tmp_path: Path, capsys: Said) -> None:
+def test_without_up_nothing_is_said(suffix: str, options: tuple[str, ...], tmp_path: Path, capsys: Capture) -> None:
     path = tmp_path / f"x{suffix}"
     assert build(SMALL, "-o", path, *options) == 0
     assert b'"up"' not in path.read_bytes()[:4096]
@@ -127,7 +126,7 @@ def test_the_axis_turns_with_the_scene(options: tuple[str, ...], up: str, tmp_pa
     assert read_scene(tmp_path / "x.rad").up == up
 
 
-def test_whatever_is_made_of_a_file_has_its_axis(turned: Path, tmp_path: Path, capsys: Said) -> None:
+def test_whatever_is_made_of_a_file_has_its_axis(turned: Path, tmp_path: Path, capsys: Capture) -> None:
     source = turned / "x.spz"
     for name, options in {"a.rad": (), "b.rad": ("--format", "rad-chunked"), "c.rad": ("--refine", 2)}.items():
         assert build(source, "-o", tmp_path / name, *options) == 0
@@ -145,7 +144,7 @@ def test_whatever_is_made_of_a_file_has_its_axis(turned: Path, tmp_path: Path, c
     assert read_scene(tmp_path / "folder").up == "y"
 
 
-def test_a_format_that_cannot_note_it_is_told(turned: Path, tmp_path: Path, capsys: Said) -> None:
+def test_a_format_that_cannot_note_it_is_told(turned: Path, tmp_path: Path, capsys: Capture) -> None:
     assert build(turned / "x.rad", "--unlod", "-o", tmp_path / "x.splat") == 0
     (option,) = re.findall(r"y is up, which this format cannot note; give (--up=y) to render", capsys.readouterr().err)
     output = tmp_path / "x.npy"
@@ -189,7 +188,7 @@ def test_every_axis_can_be_noted(name: str, tmp_path: Path) -> None:
         )
 
 
-def test_a_wrong_axis_is_a_finding_and_ignored(turned: Path, tmp_path: Path, capsys: Said) -> None:
+def test_a_wrong_axis_is_a_finding_and_ignored(turned: Path, tmp_path: Path, capsys: Capture) -> None:
     for name in ("x.spz", "x.rad"):
         data = (turned / name).read_bytes()
         assert data.count(b'"up": "y"' if name == "x.spz" else b'\\"up\\": \\"y\\"') == 1

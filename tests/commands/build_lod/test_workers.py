@@ -12,6 +12,7 @@ pytest.importorskip("cryptography")
 pytest.importorskip("distributed")
 
 from tests.commands.build_lod.runs import ONE, SMALL, build, sparklod
+from tests.conftest import Capture
 
 pytestmark = pytest.mark.slow
 
@@ -44,13 +45,11 @@ def test_scenes_side_by_side_are_those_of_one_after_the_other(tmp_path: Path) ->
         (["--workers", 0], "0 is not in the range 1<=x<=256"),
     ],
 )
-def test_what_contradicts_itself_is_refused(
-    options: list[object], said: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_contradicts_itself_is_refused(options: list[object], said: str, capsys: Capture) -> None:
     assert build(ONE, *options) == 2
     assert said in capsys.readouterr().err
 
 
-def test_workers_cannot_read_standard_input(capsys: pytest.CaptureFixture[str]) -> None:
+def test_workers_cannot_read_standard_input(capsys: Capture) -> None:
     assert build("-", "-o", "x.spz", "--scheduler", "host:1") == 2
     assert "--scheduler cannot be used with standard input, which workers cannot read" in capsys.readouterr().err

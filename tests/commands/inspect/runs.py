@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 from typing import Any
 
-import pytest
-
 from sparklod_cli.cli import run
 from tests.conftest import FIXTURES
 
@@ -21,9 +19,6 @@ BROKEN, MISSING = FAULTS / "tree-orphan.spz", FAULTS / "missing.spz"
 
 def inspect(*arguments: object) -> int:
     return run(["inspect", *map(str, arguments)])
-
-
-Said = pytest.CaptureFixture[str]
 
 
 def records(text: str) -> list[dict[str, Any]]:

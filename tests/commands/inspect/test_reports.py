@@ -1,7 +1,8 @@
-"""`sparklod inspect` as a shell sees it: exit codes, and what goes where."""
+"""Reports of `sparklod inspect`: text, JSON, annotations, fields, charts and pictures."""
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -10,11 +11,12 @@ import pytest
 
 from sparklod_cli.cli import run
 from sparklod_cli.figures import pyvista_scene, tree_plot
-from tests.commands.inspect.runs import BROKEN, CORRUPT, MISSING, NOTED, PLAIN, TREE, WARNED, Said, inspect, records
-from tests.conftest import FIXTURES, ROOT
+from sparklod_cli.inspection.findings import CODES, Finding
+from tests.commands.inspect.runs import BROKEN, CORRUPT, MISSING, NOTED, PLAIN, TREE, WARNED, inspect, records
+from tests.conftest import FIXTURES, ROOT, Capture
 
 
-def test_a_person_gets_a_report_on_standard_output(capsys: Said) -> None:
+def test_a_person_gets_a_report_on_standard_output(capsys: Capture) -> None:
     assert inspect(TREE, PLAIN) == 0
     out, err = capsys.readouterr()
     assert err == ""
@@ -32,7 +34,7 @@ def test_a_person_gets_a_report_on_standard_output(capsys: Said) -> None:
     assert "depth" not in plain
 
 
-def test_stats_adds_quantities(capsys: Said) -> None:
+def test_stats_adds_quantities(capsys: Capture) -> None:
     assert inspect(PLAIN, "--stats") == 0
     out = capsys.readouterr().out
     rows = [line.split()[0] for line in out.splitlines()]
@@ -41,7 +43,7 @@ def test_stats_adds_quantities(capsys: Said) -> None:
     assert "sh1" not in capsys.readouterr().out
 
 
-def test_histograms_are_printed_by_name(capsys: Said) -> None:
+def test_histograms_are_printed_by_name(capsys: Capture) -> None:
     assert inspect(PLAIN, "--histogram", "sh1", "--histogram", "opacity") == 0
     lines = [line.strip() for line in capsys.readouterr().out.splitlines()]
     assert 0 < lines.index("sh1") < lines.index("opacity") < len(lines) - 1
@@ -53,7 +55,7 @@ def test_histograms_are_printed_by_name(capsys: Said) -> None:
     ids=lambda value: getattr(value, "name", None),
 )
 def test_the_exit_code_says_whether_a_file_was_read_and_checked(
-    file: Path, without: int, with_check: int, capsys: Said
+    file: Path, without: int, with_check: int, capsys: Capture
 ) -> None:
     assert inspect(file) == without
     assert inspect(file, "--json") == without
@@ -96,12 +98,12 @@ def test_the_exit_code_says_whether_a_file_was_read_and_checked(
         ([TREE, "--histogram", "beauty"], "--histogram: there is no quantity"),
     ],
 )
-def test_wrong_usage_of_inspect_is_exit_code_2(arguments: list[object], message: str, capsys: Said) -> None:
+def test_wrong_usage_of_inspect_is_exit_code_2(arguments: list[object], message: str, capsys: Capture) -> None:
     assert inspect(*arguments) == 2
     assert message in capsys.readouterr().err
 
 
-def test_an_unreadable_file_does_not_stop_the_others(capsys: Said) -> None:
+def test_an_unreadable_file_does_not_stop_the_others(capsys: Capture) -> None:
     assert inspect(MISSING, TREE, CORRUPT, PLAIN) == 1
     out, err = capsys.readouterr()
     assert [line for line in out.splitlines() if not line.startswith(" ")] == [
@@ -114,7 +116,7 @@ def test_an_unreadable_file_does_not_stop_the_others(capsys: Said) -> None:
     )
 
 
-def test_findings_go_to_stdout_and_good_news_to_stderr(capsys: Said) -> None:
+def test_findings_go_to_stdout_and_good_news_to_stderr(capsys: Capture) -> None:
     assert inspect("--check", MISSING, TREE, BROKEN, WARNED) == 3
     out, err = capsys.readouterr()
     assert out.splitlines() == [
@@ -125,7 +127,7 @@ def test_findings_go_to_stdout_and_good_news_to_stderr(capsys: Said) -> None:
     assert err == f"{TREE}: nothing is wrong with its 9 nodes\n"
 
 
-def test_quiet_prints_only_what_options_name(capsys: Said) -> None:
+def test_quiet_prints_only_what_options_name(capsys: Capture) -> None:
     assert inspect("--check", "-q", TREE, BROKEN) == 3
     out, err = capsys.readouterr()
     assert (out.count("\n"), err) == (1, "")
@@ -146,7 +148,7 @@ def test_quiet_prints_only_what_options_name(capsys: Said) -> None:
     assert capsys.readouterr().err.startswith(f"error: {CORRUPT}")
 
 
-def test_threads_do_not_change_a_report(capsys: Said) -> None:
+def test_threads_do_not_change_a_report(capsys: Capture) -> None:
     printed = set()
     for threads in (1, 2, 5):
         assert inspect(FIXTURES / "demo.ply", TREE, "--json", "--stats", "--check", "--threads", threads) == 0
@@ -167,10 +169,10 @@ def test_a_process_prints_findings_and_exits_3() -> None:
 
 
 def test_the_paths_of_page_and_picture_are_printed(
-    tmp_path: Path, capsys: Said, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def drawn(*args: object, **kwargs: object) -> tree_plot.Picture:
-        return tree_plot.Picture(b"\x89PNG" * 100, "all leaves: 6 nodes; coloured by level")
+    def drawn(*args: object, **kwargs: object) -> tree_plot.DescribedPicture:
+        return tree_plot.DescribedPicture(b"\x89PNG" * 100, "all leaves: 6 nodes; coloured by level")
 
     monkeypatch.setattr(tree_plot, "plot", drawn)
     monkeypatch.setattr(pyvista_scene, "load_pyvista", lambda: None)  # which may be missing
@@ -187,8 +189,120 @@ def test_the_paths_of_page_and_picture_are_printed(
 
 @pytest.mark.parametrize(("option", "name"), [("--html", "page.spz"), ("--plot", "picture.html")])
 def test_wrong_suffixes_of_page_and_picture_are_refused(
-    option: str, name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    option: str, name: str, tmp_path: Path, capsys: Capture
 ) -> None:
     assert run(["inspect", str(FIXTURES / "one.ply"), option, str(tmp_path / name)]) == 2
     assert f"{name}' does not end in ." in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+def test_every_finding_is_an_annotation_for_github(capsys: Capture) -> None:
+    assert inspect("--check", "--format", "github", CORRUPT, BROKEN, WARNED, NOTED, TREE) == 3
+    out, err = capsys.readouterr()
+    lines = out.splitlines()
+    assert [line.split(" ")[0] for line in lines] == ["::error", "::error", "::warning", "::notice"]
+    assert lines[1] == f"::error file={BROKEN},title=tree.orphan::node 9 has no parent"
+    assert err == f"{TREE}: nothing is wrong with its 9 nodes\n"
+
+
+def test_no_name_ends_an_annotation_or_begins_a_command(
+    tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A name could end the annotation, or begin another command."""
+    path = tmp_path / "50%, a:b\n::stop.spz"
+    shutil.copy(BROKEN, path)
+    monkeypatch.setitem(CODES, "tree.orphan", CODES["tree.orphan"])
+    monkeypatch.setattr(
+        "sparklod_cli.inspection.tree.link_findings",
+        lambda *_: [Finding("tree.orphan", "100% of it\r\nis: lost, all")],
+    )
+    monkeypatch.chdir(tmp_path)
+    assert inspect("--check", "--format", "github", path.name) == 3
+    name = "50%25%2C a%3Ab%0A%3A%3Astop.spz"
+    assert capsys.readouterr().out == f"::error file={name},title=tree.orphan::100%25 of it%0D%0Ais: lost, all\n"
+
+
+def test_a_line_is_a_finding_whatever_the_name_is(tmp_path: Path, capsys: Capture) -> None:
+    path = tmp_path / "two\nlines.spz"
+    shutil.copy(BROKEN, path)
+    assert inspect("--check", path) == 3
+    assert capsys.readouterr().out.count("\n") == 1
+
+
+def test_json_is_one_object_and_one_line_a_file(capsys: Capture) -> None:
+    assert inspect("--json", TREE, MISSING, PLAIN) == 1
+    out, err = capsys.readouterr()
+    tree, missing, plain = records(out)
+    assert err == f"error: {MISSING}: cannot be read: no such file or directory\n"
+    assert [record["file"] for record in (tree, missing, plain)] == [str(TREE), str(MISSING), str(PLAIN)]
+    assert {record["schema_version"] for record in (tree, missing, plain)} == {1}
+    assert (tree["format"], tree["splats"], tree["bytes"]) == ("SPZ 3 LoD", 9, TREE.stat().st_size)
+    assert tree["tree"]["leaves"] == 6
+    assert tree["findings"] is tree["values"] is plain["tree"] is None
+    assert (missing["format"], missing["bytes"]) == (None, None)
+    assert [found["code"] for found in missing["findings"]] == ["file.unreadable"]
+    assert tree.keys() == missing.keys() == plain.keys()
+
+
+def test_json_has_the_parts_that_options_ask_for(capsys: Capture) -> None:
+    assert inspect("--json", "--stats", "--check", "--sh", "1", BROKEN) == 3
+    out, err = capsys.readouterr()
+    (record,) = records(out)
+    assert err == ""
+    assert [(found["severity"], found["code"], found["index"]) for found in record["findings"]] == [
+        ("error", "tree.orphan", 9),
+        ("error", "expect.sh", None),
+    ]
+    assert set(record["values"]["quantities"]) >= {"x", "scale", "size", "blue"}
+    assert inspect("--json", "--check", TREE) == 0
+    assert records(capsys.readouterr().out)[0]["findings"] == []
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("splats", "9"),
+        ("format", "SPZ 3 LoD"),
+        ("antialiased", "false"),
+        ("tree.growth", "1.5"),
+        ("tree.levels.1", '{"nodes": 3, "leaves": 1, "size": '),
+        ("tree.levels.2.leaves", "5"),
+        ("header.flags", "128"),
+        ("values.quantities.x.max", "4.0"),
+        ("values.box.min", "[0.0, -2.0, 1.0]"),
+        ("values", '{"box": {"min": '),
+        ("notes", "[]"),
+        ("findings", "[]"),
+        ("bytes", str(TREE.stat().st_size)),
+    ],
+)
+def test_a_field_is_printed_as_a_script_wants_it(field: str, value: str, capsys: Capture) -> None:
+    assert inspect(TREE, "--field", field) == 0
+    out, err = capsys.readouterr()
+    assert out.startswith(value)
+    assert (out.count("\n"), err) == (1, "")
+
+
+def test_a_field_of_several_files_is_a_line_each(capsys: Capture) -> None:
+    assert inspect(TREE, MISSING, PLAIN, "--field", "splats") == 1
+    out, err = capsys.readouterr()
+    assert out.splitlines() == ["9", "60"]
+    assert err == f"error: {MISSING}: cannot be read: no such file or directory\n"
+    assert inspect(BROKEN, "--check", "--field", "splats") == 3
+    assert capsys.readouterr().out == "10\n"
+
+
+def test_a_field_missing_in_one_file_does_not_stop_the_others(capsys: Capture) -> None:
+    assert inspect(PLAIN, TREE, "--field", "tree.leaves") == 1
+    out, err = capsys.readouterr()
+    assert out == "6\n"
+    assert err.startswith(f"error: {PLAIN}: ")
+    assert "the report has no tree.leaves" in err
+
+
+def test_an_unknown_field_is_an_error(capsys: Capture) -> None:
+    assert inspect(TREE, "--field", "tree.leafs") == 1
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("error: ")
+    assert "the report has no tree.leafs" in err

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.commands.inspect.runs import BROKEN, CORRUPT, PLAIN, Said, inspect
-from tests.conftest import FIXTURES
+from tests.commands.inspect.runs import BROKEN, CORRUPT, PLAIN, inspect
+from tests.conftest import FIXTURES, Capture
 
 TREE = FIXTURES / "golden" / "tree-v3.spz"
 IMAGE = re.compile(r'<img alt="Drawing of The scene from its front" src="data:image/png;base64,([^"]+)">')
@@ -32,7 +32,7 @@ def test_a_page_shows_the_scene(file: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("file", [BROKEN, CORRUPT, FIXTURES / "faults" / "no-splats.ply"])
-def test_what_cannot_be_drawn_gives_a_page_without_one(file: Path, tmp_path: Path, capsys: Said) -> None:
+def test_what_cannot_be_drawn_gives_a_page_without_one(file: Path, tmp_path: Path, capsys: Capture) -> None:
     inspect(file, "--html", tmp_path / "page.html", "--check")
     assert thumbnails(tmp_path / "page.html") == []
     assert "in a way that it should not" not in capsys.readouterr().err

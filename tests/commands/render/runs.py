@@ -6,7 +6,6 @@ import io
 from pathlib import Path
 
 import numpy as np
-import pytest
 from PIL import Image
 
 from sparklod_cli.cli import run
@@ -17,7 +16,6 @@ DEMO, PLAIN = FIXTURES / "demo.ply", FIXTURES / "sh2.ply"
 FAULTS, CAMERAS = FIXTURES / "faults", FIXTURES / "cameras"
 SIZE = ("--size", "160x90")
 AT = ("--look-at", "0,-3,9:0,0,0")
-Said = pytest.CaptureFixture[str]
 
 
 def render(*arguments: object) -> int:

@@ -12,12 +12,10 @@ import pytest
 
 from sparklod_cli.cli import run
 from sparklod_cli.tables.comparison import COLUMNS
-from tests.conftest import FIXTURES, ROOT
+from tests.conftest import FIXTURES, ROOT, Capture
 
 TOWN = FIXTURES / "traverse" / "town.spz"
 VIEW = ("--size", "160x90", "--look-at", "0,-3,9:0,0,0")
-
-Said = pytest.CaptureFixture[str]
 
 
 def render(*arguments: object) -> int:
@@ -30,11 +28,11 @@ def compiled() -> None:
     assert render(TOWN, *VIEW, "--compare", "--budget", "1k", "-q", "-o", "-") == 0
 
 
-def table(capsys: Said) -> list[dict[str, str]]:
+def table(capsys: Capture) -> list[dict[str, str]]:
     return list(csv.DictReader(io.StringIO(capsys.readouterr().out)))
 
 
-def test_larger_budgets_come_nearer_to_full_detail(capsys: Said) -> None:
+def test_larger_budgets_come_nearer_to_full_detail(capsys: Capture) -> None:
     assert render(TOWN, *VIEW, "--compare", "--budget", "0.5%,5%,100%") == 0
     rows = table(capsys)
     assert len(rows) == 3
@@ -44,7 +42,7 @@ def test_larger_budgets_come_nearer_to_full_detail(capsys: Said) -> None:
     assert [float(row["ssim"]) for row in rows][-1] == 1
 
 
-def test_an_assertion_of_a_comparison_that_fails_is_exit_code_3(capsys: Said, tmp_path: Path) -> None:
+def test_an_assertion_of_a_comparison_that_fails_is_exit_code_3(capsys: Capture, tmp_path: Path) -> None:
     how = (TOWN, *VIEW, "--compare", "--budget", "1%,100%", "--overwrite", "-o", tmp_path / "rows.csv")
     assert render(*how, "--assert", "100%:psnr>99", "-q") == 0
     capsys.readouterr()
@@ -65,7 +63,7 @@ def huge(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("source", [(), ("--orbit", "2"), ("--dolly", "--every", "20")])
 @pytest.mark.slow
-def test_a_scene_of_any_size_is_compared_as_it_is_drawn(source: tuple[str, ...], huge: Path, capsys: Said) -> None:
+def test_a_scene_of_any_size_is_compared_as_it_is_drawn(source: tuple[str, ...], huge: Path, capsys: Capture) -> None:
     """Wherever cameras are chosen for the scene, near and far are, too."""
     size = ("--size", "160x90")
     assert render("--scene", huge, *size, *source, "--compare", "--budget", "0.5%,100%") == 0
@@ -78,7 +76,9 @@ def test_a_scene_of_any_size_is_compared_as_it_is_drawn(source: tuple[str, ...],
 
 
 @pytest.mark.parametrize("look", [("--look-at", "0,-3,9:0,-3,18"), ("--look-at", "0,-3,9:0,0,0", "--far", "0.02")])
-def test_a_comparison_without_a_covered_pixel_is_refused(look: tuple[str, ...], tmp_path: Path, capsys: Said) -> None:
+def test_a_comparison_without_a_covered_pixel_is_refused(
+    look: tuple[str, ...], tmp_path: Path, capsys: Capture
+) -> None:
     for how in (("--compare", "-o", tmp_path / "out.csv"), ("--diff", TOWN, "-o", tmp_path / "out.png")):
         assert render(TOWN, "--size", "64x48", *look, *how) == 1
         out, err = capsys.readouterr()
@@ -87,7 +87,7 @@ def test_a_comparison_without_a_covered_pixel_is_refused(look: tuple[str, ...], 
     assert list(tmp_path.iterdir()) == []
 
 
-def test_json_of_a_comparison_is_its_summary(capsys: Said) -> None:
+def test_json_of_a_comparison_is_its_summary(capsys: Capture) -> None:
     assert render(TOWN, *VIEW, "--compare", "--budget", "1k,5%", "--json", "-q") == 0
     summary = json.loads(capsys.readouterr().out)
     assert summary["frames"] == 1
@@ -111,7 +111,7 @@ def test_json_of_a_comparison_is_its_summary(capsys: Said) -> None:
     ],
 )
 def test_options_that_cannot_be_used_with_compare_are_refused(
-    arguments: tuple[str, ...], tmp_path: Path, capsys: Said
+    arguments: tuple[str, ...], tmp_path: Path, capsys: Capture
 ) -> None:
     name = "x.csv" if "--compare" in arguments else "x.png"
     assert render(TOWN, *VIEW, *arguments, "-o", tmp_path / name) == 2
@@ -120,7 +120,7 @@ def test_options_that_cannot_be_used_with_compare_are_refused(
 
 
 @pytest.mark.parametrize("name", ["table.png", "table.xlsx", "table.txt"])
-def test_the_suffix_decides_the_format_of_a_comparison_table(name: str, tmp_path: Path, capsys: Said) -> None:
+def test_the_suffix_decides_the_format_of_a_comparison_table(name: str, tmp_path: Path, capsys: Capture) -> None:
     assert render(TOWN, *VIEW, "--compare", "-o", tmp_path / name) == 2
     assert f"{name}: tables are written as .csv, .json, .parquet" in capsys.readouterr().err
     assert render(TOWN, *VIEW, "--compare", "--plot", tmp_path / "charts.svg") == 2

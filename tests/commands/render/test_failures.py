@@ -10,7 +10,8 @@ from typing import Any
 import pytest
 
 from sparklod_cli.render.renderer import Renderer
-from tests.commands.render.runs import CAMERAS, FAULTS, PLAIN, SIZE, TREE, Said, pixels, render
+from tests.commands.render.runs import CAMERAS, FAULTS, PLAIN, SIZE, TREE, pixels, render
+from tests.conftest import Capture
 
 
 @pytest.mark.parametrize(
@@ -61,7 +62,7 @@ from tests.commands.render.runs import CAMERAS, FAULTS, PLAIN, SIZE, TREE, Said,
     ],
 )
 def test_wrong_usage_of_render_is_exit_code_2(
-    arguments: list[object], message: str, capsys: Said, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    arguments: list[object], message: str, capsys: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert render(*arguments) == 2
@@ -90,7 +91,7 @@ def test_a_file_that_cannot_be_drawn_is_named_in_a_line(
     arguments: list[object],
     named: object,
     message: str,
-    capsys: Said,
+    capsys: Capture,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -104,7 +105,7 @@ def test_a_file_that_cannot_be_drawn_is_named_in_a_line(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_render_never_writes_over_its_inputs(tmp_path: Path, capsys: Said) -> None:
+def test_render_never_writes_over_its_inputs(tmp_path: Path, capsys: Capture) -> None:
     scene, path, sheet = tmp_path / "scene.png", tmp_path / "0001.png", tmp_path / "x.png"
     shutil.copy(PLAIN, scene)
     shutil.copy(CAMERAS / "sparklod.json", path)
@@ -121,7 +122,7 @@ def test_render_never_writes_over_its_inputs(tmp_path: Path, capsys: Said) -> No
     assert {each: each.read_bytes() for each in before} == before
 
 
-def test_an_existing_frame_stays_without_overwrite(tmp_path: Path, capsys: Said) -> None:
+def test_an_existing_frame_stays_without_overwrite(tmp_path: Path, capsys: Capture) -> None:
     (tmp_path / "out.0002.png").write_text("precious")
     assert render(TREE, *SIZE, "--orbit", 3, "-o", tmp_path / "out.%04d.png") == 1
     assert "out.0002.png exists, add --overwrite to replace it" in capsys.readouterr().err
@@ -131,7 +132,7 @@ def test_an_existing_frame_stays_without_overwrite(tmp_path: Path, capsys: Said)
 
 
 def test_an_interrupted_render_leaves_no_half_picture(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Said
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
 ) -> None:
     draw, count = Renderer.draw, []
 
@@ -151,7 +152,7 @@ def test_an_interrupted_render_leaves_no_half_picture(
     assert "interrupted" in capsys.readouterr().err
 
 
-def test_cameras_that_see_nothing_give_a_warning(tmp_path: Path, capsys: Said) -> None:
+def test_cameras_that_see_nothing_give_a_warning(tmp_path: Path, capsys: Capture) -> None:
     assert render(PLAIN, *SIZE, "--look-at", "0,0,50:0,0,99", "-o", tmp_path / "x.png") == 0
     assert capsys.readouterr().err.startswith("warning: nothing is in view")
     assert render(PLAIN, *SIZE, "--look-at", "0,0,50:0,0,99", "-o", tmp_path / "x.png", "--overwrite", "-q") == 0
@@ -168,7 +169,7 @@ def test_cameras_that_see_nothing_give_a_warning(tmp_path: Path, capsys: Said) -
     ],
 )
 def test_options_of_levels_are_refused_for_files_without(
-    options: tuple[str, ...], tmp_path: Path, capsys: Said
+    options: tuple[str, ...], tmp_path: Path, capsys: Capture
 ) -> None:
     assert render(PLAIN, *SIZE, *options, "-o", tmp_path / "x.png") == 2
     err = capsys.readouterr().err

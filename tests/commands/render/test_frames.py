@@ -1,4 +1,4 @@
-"""`sparklod render` of several views: frames, contact sheets and animations."""
+"""Frames, thumbnails, and pictures while chunks are loading, of `sparklod render`."""
 
 from __future__ import annotations
 
@@ -13,12 +13,13 @@ from PIL import Image
 from sparklod_cli.images.contact_sheet import cells
 from sparklod_cli.render.renderer import Renderer
 from sparklod_cli.support.optional import install_hint
-from tests.commands.render.runs import CAMERAS, DEMO, SIZE, TOWN, TREE, Said, pixels, render
+from tests.commands.render.runs import CAMERAS, DEMO, SIZE, TOWN, TREE, pixels, render
+from tests.conftest import Capture
 
 pytestmark = pytest.mark.slow
 
 
-def test_frames_of_a_path_are_its_views(tmp_path: Path, capsys: Said) -> None:
+def test_frames_of_a_path_are_its_views(tmp_path: Path, capsys: Capture) -> None:
     how = (TOWN, "--budget", "2k", *SIZE, "-q")
     views = ["-6,-2,-6:0,0,0", "0,-1,-3:0,-0.5,0"]
     keys = ("--keyframes", " ".join(views), "--seconds", 1, "--fps", 4)
@@ -63,7 +64,7 @@ def test_several_views_make_a_contact_sheet(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("form", ["gif", "webp", "mp4", "webm"])
-def test_an_animation_has_the_frames_of_its_path(form: str, tmp_path: Path, capsys: Said) -> None:
+def test_an_animation_has_the_frames_of_its_path(form: str, tmp_path: Path, capsys: Capture) -> None:
     if form in ("mp4", "webm"):
         pytest.importorskip("imageio_ffmpeg", reason="the extra video is not installed")
     output = tmp_path / f"orbit.{form}"
@@ -80,7 +81,7 @@ def test_an_animation_has_the_frames_of_its_path(form: str, tmp_path: Path, caps
 
 
 def test_mp4_without_imageio_is_an_error_before_the_work(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Said
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
 ) -> None:
     monkeypatch.setitem(sys.modules, "imageio", None)
     monkeypatch.setattr(Renderer, "draw", None)
@@ -89,7 +90,7 @@ def test_mp4_without_imageio_is_an_error_before_the_work(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_cameras_of_several_sizes_need_one(tmp_path: Path, capsys: Said) -> None:
+def test_cameras_of_several_sizes_need_one(tmp_path: Path, capsys: Capture) -> None:
     frames = json.loads((CAMERAS / "transforms.json").read_text())
     for number, frame in enumerate(frames["frames"]):
         frame |= {"w": 64 + number, "h": 48, "fl_x": 50, "fl_y": 50, "cx": 32, "cy": 24}

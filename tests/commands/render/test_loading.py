@@ -11,7 +11,7 @@ import pytest
 from sparklod_cli.cli import run
 from sparklod_cli.codecs.rad import codec as rad
 from sparklod_cli.io import read_scene
-from tests.conftest import FIXTURES
+from tests.conftest import FIXTURES, Capture
 
 TOWN = FIXTURES / "traverse" / "town.spz"
 VIEW = ("--look-at", "1,-1,-2:0,0,0", "--size", "64x48", "--budget", "20k")
@@ -42,9 +42,7 @@ def test_the_picture_becomes_that_of_the_whole_cut(town: Path) -> None:
     assert errors[-1] == 0
 
 
-def test_nothing_is_drawn_before_the_first_chunk(
-    town: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_nothing_is_drawn_before_the_first_chunk(town: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     """And a line says why."""
     monkeypatch.chdir(town.parent)
     for look in ((), ("--color-by", "overdraw"), ("--color-by", "depth"), ("--style", "points")):
@@ -68,7 +66,7 @@ def test_nothing_is_drawn_before_the_first_chunk(
         assert not np.nan_to_num(np.load("x.npy")).any()
 
 
-def test_views_are_of_visitors_of_their_own(town: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_views_are_of_visitors_of_their_own(town: Path, capsys: Capture) -> None:
     """Each of whom opened the page in front of that view, so that none has more than a moment's chunks."""
     views = ["--view", "1,-1,-2:0,0,0"] * 3
     out = town.with_suffix(".png")
@@ -91,7 +89,7 @@ def test_views_are_of_visitors_of_their_own(town: Path, capsys: pytest.CaptureFi
     ],
 )
 def test_what_does_not_go_together_is_refused(
-    town: Path, capsys: pytest.CaptureFixture[str], options: tuple[str, ...], error: str
+    town: Path, capsys: Capture, options: tuple[str, ...], error: str
 ) -> None:
     assert run(["render", str(town), *options, "-o", "x.png"]) == 2
     assert error in capsys.readouterr().err

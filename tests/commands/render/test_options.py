@@ -22,7 +22,7 @@ from sparklod_cli.render.backends import Backend
 from sparklod_cli.render.rasterizer import Image
 from sparklod_cli.render.settings import RasterSettings
 from sparklod_cli.render.shading import ShadedSplats
-from tests.conftest import FIXTURES
+from tests.conftest import FIXTURES, Capture
 from tests.lod.details import row_of_regions
 from tests.scenes import random_splats
 from tests.streamed import write_streamed
@@ -187,7 +187,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("mode", MODES)
 def test_every_option_of_render_is_used_or_refused(
-    mode: str, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    mode: str, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
 ) -> None:
     monkeypatch.chdir(folder)
     inputs = set(folder.iterdir())

@@ -1,4 +1,4 @@
-"""`sparklod render` as a shell sees it: pictures of trees and files, styles, colours and backends."""
+"""Pictures, differences and reports of `sparklod render`."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ import pytest
 from sparklod_cli.images.metrics import psnr
 from sparklod_cli.render import settings
 from sparklod_cli.render.backends import BACKENDS
-from tests.commands.render.runs import AT, DEMO, PLAIN, SIZE, TOWN, TREE, Said, floats, pixels, render
-from tests.conftest import FIXTURES
+from tests.commands.render.runs import AT, DEMO, PLAIN, SIZE, TOWN, TREE, floats, pixels, render
+from tests.conftest import FIXTURES, Capture
 
 pytestmark = pytest.mark.slow
 
 
-def test_a_tree_is_drawn_to_a_png(built: Path, tmp_path: Path, capsys: Said) -> None:
+def test_a_tree_is_drawn_to_a_png(built: Path, tmp_path: Path, capsys: Capture) -> None:
     output = tmp_path / "preview.png"
     assert render(built, "--budget", "5k", "--size", "320x180", "-o", output) == 0
     out, err = capsys.readouterr()
@@ -135,7 +135,7 @@ def test_every_style_draws_something(style: str, tmp_path: Path) -> None:
     assert pixels(tmp_path / "x.png").any()
 
 
-def test_every_file_of_an_instances_file_is_drawn(tmp_path: Path, capsys: Said) -> None:
+def test_every_file_of_an_instances_file_is_drawn(tmp_path: Path, capsys: Capture) -> None:
     shutil.copy(TREE, tmp_path / "tree.spz")
     shutil.copy(PLAIN, tmp_path / "plain.ply")
     scene = tmp_path / "scene.json"
@@ -163,7 +163,7 @@ def test_a_scene_of_any_size_is_seen_from_where_it_fits(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("backend", ["osmesa", "open3d"])
-def test_other_backends_draw_or_say_what_is_missing(backend: str, tmp_path: Path, capsys: Said) -> None:
+def test_other_backends_draw_or_say_what_is_missing(backend: str, tmp_path: Path, capsys: Capture) -> None:
     code = render(PLAIN, *SIZE, "--backend", backend, "-o", tmp_path / "x.png")
     err = capsys.readouterr().err
     if code == 0:
@@ -175,7 +175,7 @@ def test_other_backends_draw_or_say_what_is_missing(backend: str, tmp_path: Path
         assert list(tmp_path.iterdir()) == []
 
 
-def test_every_backend_can_be_named(capsys: Said) -> None:
+def test_every_backend_can_be_named(capsys: Capture) -> None:
     assert render("--help") == 0
     said = capsys.readouterr().out
     assert f"[{'|'.join(BACKENDS)}]" in said

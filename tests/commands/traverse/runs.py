@@ -7,8 +7,6 @@ import io
 import json
 from pathlib import Path
 
-import pytest
-
 from sparklod_cli.cli import run
 from sparklod_cli.simulation.columns import COLUMNS
 from tests.conftest import FIXTURES
@@ -18,7 +16,6 @@ OTHER = FIXTURES / "golden" / "tree-v3.spz"
 FAULTS, CAMERAS = FIXTURES / "faults", FIXTURES / "cameras"
 NAMES = [column.name for column in COLUMNS]
 ORBIT = ("--orbit", 3, "--distance", 5, "--center", "0,0,0")
-Said = pytest.CaptureFixture[str]
 
 
 def traverse(*arguments: object) -> int:

@@ -14,8 +14,8 @@ from typing import Any
 import pytest
 
 from sparklod_cli.simulation.frames import Simulation
-from tests.commands.traverse.runs import CAMERAS, FAULTS, ORBIT, OTHER, TOWN, TREE, Said, scene_file, traverse
-from tests.conftest import FIXTURES, ROOT
+from tests.commands.traverse.runs import CAMERAS, FAULTS, ORBIT, OTHER, TOWN, TREE, scene_file, traverse
+from tests.conftest import FIXTURES, ROOT, Capture
 
 
 @pytest.mark.parametrize(
@@ -60,7 +60,7 @@ from tests.conftest import FIXTURES, ROOT
         ([TREE, OTHER, "--chunk-cache", "1"], "cannot hold the roots of 2 trees"),
     ],
 )
-def test_wrong_usage_of_traverse_is_exit_code_2(arguments: list[object], message: str, capsys: Said) -> None:
+def test_wrong_usage_of_traverse_is_exit_code_2(arguments: list[object], message: str, capsys: Capture) -> None:
     assert traverse(*arguments) == 2
     out, err = capsys.readouterr()
     assert message in err
@@ -68,7 +68,7 @@ def test_wrong_usage_of_traverse_is_exit_code_2(arguments: list[object], message
 
 
 @pytest.mark.slow
-def test_traverse_never_writes_over_its_inputs(tmp_path: Path, capsys: Said) -> None:
+def test_traverse_never_writes_over_its_inputs(tmp_path: Path, capsys: Capture) -> None:
     tree, cameras = tmp_path / "tree.spz", tmp_path / "path.json"
     shutil.copy(TREE, tree)
     shutil.copy(CAMERAS / "sparklod.json", cameras)
@@ -109,7 +109,7 @@ def test_traverse_never_writes_over_its_inputs(tmp_path: Path, capsys: Said) -> 
     ids=str,
 )
 def test_a_file_that_cannot_be_traversed_is_named_in_a_line(
-    arguments: list[object], named: object, message: str, capsys: Said
+    arguments: list[object], named: object, message: str, capsys: Capture
 ) -> None:
     assert traverse(*arguments) == 1
     out, err = capsys.readouterr()
@@ -120,7 +120,7 @@ def test_a_file_that_cannot_be_traversed_is_named_in_a_line(
 
 
 def test_an_interrupted_traversal_leaves_no_half_table(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Said
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
 ) -> None:
     fly = Simulation.run
 
@@ -166,7 +166,7 @@ def test_sigterm_leaves_nothing_behind(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_usage_error_makes_no_folder(tmp_path: Path, capsys: Said) -> None:
+def test_a_usage_error_makes_no_folder(tmp_path: Path, capsys: Capture) -> None:
     """Also one that only shows when the cameras are looked at."""
     folder = tmp_path / "cuts"
     assert traverse(TREE, "--look-at", "0,0,4:0,0,0", "--seconds", "2", "--indices-out", folder) == 2

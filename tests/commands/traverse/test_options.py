@@ -15,7 +15,7 @@ from sparklod_cli.figures import traversal_chart
 from sparklod_cli.lod import quick
 from sparklod_cli.model.scene import Scene
 from tests.commands.render.test_options import GIVEN as OF_RENDER
-from tests.conftest import FIXTURES
+from tests.conftest import FIXTURES, Capture
 from tests.lod.details import row_of_regions
 from tests.scenes import random_splats
 from tests.streamed import write_streamed
@@ -97,7 +97,7 @@ def test_every_option_of_traverse_is_used_or_refused(
     trees: dict[str, bytes],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    capsys: Capture,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(

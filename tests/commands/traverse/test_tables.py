@@ -1,7 +1,9 @@
-"""`sparklod traverse` as a shell sees it: the table, the summary, what must hold, and what goes where."""
+"""`sparklod traverse` as a shell sees it: the table, the summary, what must hold, plots and cameras."""
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 import subprocess
 import sys
@@ -10,13 +12,13 @@ from pathlib import Path
 import pytest
 
 from sparklod_cli.simulation.columns import COLUMNS
-from tests.commands.traverse.runs import NAMES, ORBIT, TOWN, TREE, Said, table, traverse
-from tests.conftest import ROOT
+from tests.commands.traverse.runs import CAMERAS, NAMES, ORBIT, TOWN, TREE, table, traverse
+from tests.conftest import ROOT, Capture
 
 pytestmark = pytest.mark.slow
 
 
-def test_a_table_comes_on_standard_output_and_nothing_else_is_said(capsys: Said) -> None:
+def test_a_table_comes_on_standard_output_and_nothing_else_is_said(capsys: Capture) -> None:
     assert traverse(TOWN) == 0
     out, err = capsys.readouterr()
     rows = table(out)
@@ -27,7 +29,7 @@ def test_a_table_comes_on_standard_output_and_nothing_else_is_said(capsys: Said)
     assert err == ""
 
 
-def test_two_traversals_give_the_same_bytes(capsys: Said) -> None:
+def test_two_traversals_give_the_same_bytes(capsys: Capture) -> None:
     outs = set()
     for threads in (1, 2, 5):
         assert traverse(TOWN, *ORBIT, "--budget", "4k", "--no-timing", "--threads", threads, "--per-instance") == 0
@@ -36,7 +38,7 @@ def test_two_traversals_give_the_same_bytes(capsys: Said) -> None:
     assert list(table(out)[0]) == [name for name in NAMES if name != "traverse_ms"]
 
 
-def test_an_output_is_a_file(tmp_path: Path, capsys: Said) -> None:
+def test_an_output_is_a_file(tmp_path: Path, capsys: Capture) -> None:
     output = tmp_path / "frames.csv"
     assert traverse(TREE, *ORBIT, "-o", output, "--no-timing") == 0
     assert capsys.readouterr() == ("", "")
@@ -51,7 +53,7 @@ def test_an_output_is_a_file(tmp_path: Path, capsys: Said) -> None:
     assert capsys.readouterr().out.encode() == before
 
 
-def test_json_has_the_same_cells(tmp_path: Path, capsys: Said) -> None:
+def test_json_has_the_same_cells(tmp_path: Path, capsys: Capture) -> None:
     settings = (TOWN, *ORBIT, "--budget", "4k", "--no-timing", "--per-instance")
     assert traverse(*settings) == 0
     rows = table(capsys.readouterr().out)
@@ -63,7 +65,7 @@ def test_json_has_the_same_cells(tmp_path: Path, capsys: Said) -> None:
     assert texts == rows
 
 
-def test_parquet_has_the_same_cells(tmp_path: Path, capsys: Said) -> None:
+def test_parquet_has_the_same_cells(tmp_path: Path, capsys: Capture) -> None:
     parquet = pytest.importorskip("pyarrow.parquet")
     settings = (TOWN, *ORBIT, "--budget", "4k", "--no-timing")
     assert traverse(*settings, "-o", tmp_path / "frames.parquet") == 0
@@ -82,7 +84,7 @@ def test_the_suffix_decides_the_format_unless_an_option_does(tmp_path: Path) -> 
     assert begins == {"a.csv": b"f", "a.JSON": b"{", "a.txt": b"f", "a": b"{"}
 
 
-def test_a_summary_is_said_when_it_is_asked_for(tmp_path: Path, capsys: Said) -> None:
+def test_a_summary_is_said_when_it_is_asked_for(tmp_path: Path, capsys: Capture) -> None:
     output = tmp_path / "out.csv"
     assert traverse(TOWN, *ORBIT, "--budget", "4k", "--summary", "-o", output) == 0
     out, err = capsys.readouterr()
@@ -94,7 +96,7 @@ def test_a_summary_is_said_when_it_is_asked_for(tmp_path: Path, capsys: Said) ->
         assert capsys.readouterr() == ("", "")
 
 
-def test_json_is_the_summary_and_the_table_goes_to_its_file(tmp_path: Path, capsys: Said) -> None:
+def test_json_is_the_summary_and_the_table_goes_to_its_file(tmp_path: Path, capsys: Capture) -> None:
     output = tmp_path / "out.csv"
     assert traverse(TOWN, *ORBIT, "--budget", "4k", "--json", "-o", output, "--assert", "selected<=4k") == 0
     out, err = capsys.readouterr()
@@ -107,7 +109,7 @@ def test_json_is_the_summary_and_the_table_goes_to_its_file(tmp_path: Path, caps
     assert json.loads(capsys.readouterr().out)["frames"] == 3
 
 
-def test_an_assertion_that_does_not_hold_is_exit_code_3(tmp_path: Path, capsys: Said) -> None:
+def test_an_assertion_that_does_not_hold_is_exit_code_3(tmp_path: Path, capsys: Capture) -> None:
     output = tmp_path / "out.csv"
     settings = (TOWN, *ORBIT, "--budget", "4k", "-o", output, "--overwrite")
     assert traverse(*settings, "--assert", "selected<=4k", "--assert", "missing==0") == 0
@@ -128,7 +130,7 @@ def test_an_assertion_that_does_not_hold_is_exit_code_3(tmp_path: Path, capsys: 
     assert json.loads(capsys.readouterr().out)["asserts"][0]["held"] is False
 
 
-def test_help_of_traverse_has_examples(capsys: Said) -> None:
+def test_help_of_traverse_has_examples(capsys: Capture) -> None:
     assert traverse("--help") == 0
     out = capsys.readouterr().out
     assert "Examples:" in out
@@ -137,7 +139,7 @@ def test_help_of_traverse_has_examples(capsys: Said) -> None:
         assert option in out
 
 
-def test_verbose_says_how_long_it_took(capsys: Said) -> None:
+def test_verbose_says_how_long_it_took(capsys: Capture) -> None:
     assert traverse(TREE, *ORBIT, "-v", "--assert", "selected>0") == 0
     err = capsys.readouterr().err
     assert "3 frames of an orbit, " in err
@@ -150,3 +152,73 @@ def test_a_process_writes_a_row_for_a_view() -> None:
     assert done.returncode == 0
     assert len(table(done.stdout)) == 1
     assert "Traceback" not in done.stderr
+
+
+def test_a_plot_is_a_picture(tmp_path: Path, capsys: Capture) -> None:
+    pytest.importorskip("matplotlib")
+    image = pytest.importorskip("PIL.Image")
+    assert traverse(TOWN, *ORBIT, "--budget", "4k", "--plot", tmp_path / "path.png", "-o", tmp_path / "out.csv") == 0
+    capsys.readouterr()
+    with image.open(tmp_path / "path.png") as picture:
+        assert picture.width == 1600
+    assert traverse(TOWN, *ORBIT, "--plot", tmp_path / "path.png", "-o", tmp_path / "other.csv") == 1
+    assert "path.png exists, add --overwrite" in capsys.readouterr().err
+    assert not (tmp_path / "other.csv").exists()
+
+
+def test_a_plot_shows_what_the_frame_had(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Over a slow network few chunks are there; the picture is of what was drawn with these."""
+    pytest.importorskip("matplotlib", reason="charts need the extra `render`")
+    from sparklod_cli.figures import traversal_chart
+
+    shown: list[traversal_chart.PathScene] = []
+
+    def drawn(rows: object, marked: object, title: str, scene: traversal_chart.PathScene) -> traversal_chart.Plot:
+        shown.append(scene)
+        return traversal_chart.Plot(b"a plot", None)
+
+    monkeypatch.setattr(traversal_chart, "plot", drawn)
+    slow = ("--bandwidth", "0.1Mbit", "--latency", "50ms")
+    for number, network in enumerate(((), slow)):
+        table = tmp_path / f"{number}.csv"
+        assert traverse(TOWN, *ORBIT, *network, "--plot", tmp_path / f"{number}.png", "-o", table) == 0
+        rows = list(csv.DictReader(io.StringIO(table.read_text())))
+        scene = shown[-1]
+        assert scene.frame is not None
+        assert len(scene.splats) == len(scene.depth) == int(rows[scene.frame]["selected"])
+    assert len(shown[1].splats) < len(shown[0].splats)
+
+
+AWAY = "axes (--camera-axes, --world-transform, --up)"
+
+
+def test_cameras_that_look_away_give_a_warning(capsys: Capture) -> None:
+    assert traverse(TOWN, "--look-at", "0,-1,-9:0,-1,-20", "--budget", "4k") == 0
+    err = capsys.readouterr().err
+    assert err.startswith("warning: only 0.0% of the splats lie in front of the cameras")
+    assert err.endswith(f"{AWAY}\n")
+    assert traverse(TOWN, "--look-at", "0,-1,-9:0,-1,-20", "--budget", "4k", "-q") == 0
+    assert capsys.readouterr().err == ""
+    assert traverse(TOWN, "--look-at", "0,-1,-9:0,0,0", "--budget", "4k") == 0
+    assert capsys.readouterr().err == ""
+
+
+def test_notes_on_a_camera_file_are_printed(tmp_path: Path, capsys: Capture) -> None:
+    path = json.loads((CAMERAS / "transforms.json").read_text()) | {"k1": 0.25}
+    (tmp_path / "transforms.json").write_text(json.dumps(path))
+    assert traverse(TREE, "--camera-path", tmp_path / "transforms.json") == 0
+    out, err = capsys.readouterr()
+    assert "Its lens distortion was ignored." in err.splitlines()
+    assert len(table(out)) == len(path["frames"])
+    assert traverse(TREE, "--camera-path", tmp_path / "transforms.json", "-q") == 0
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize("path", sorted(CAMERAS.iterdir()), ids=lambda path: path.name)
+def test_every_camera_format_can_be_traversed(path: Path, capsys: Capture) -> None:
+    if path.name.startswith("open3d"):
+        pytest.importorskip("open3d")
+    assert traverse(TREE, "--camera-path", path, "-q") == 0
+    out, err = capsys.readouterr()
+    assert len(table(out)) >= 3
+    assert err == ""
