@@ -31,7 +31,7 @@ from sparklod_cli.scenes.finder import view_of
 from sparklod_cli.scenes.loaded import Scenes
 from sparklod_cli.scenes.reading import read_scenes
 from sparklod_cli.simulation.loading import chunks_of
-from sparklod_cli.simulation.streaming import Stream
+from sparklod_cli.simulation.streaming import ChunkStream
 from sparklod_cli.simulation.streaming_settings import Network
 from sparklod_cli.support.parallel import processors
 
@@ -138,9 +138,9 @@ class Viewer:
         nodes = self.cut(at, share).indices()[0]
         return np.bincount(nodes // CHUNK_NODES, minlength=self.scenes.forest.chunks) / len(nodes)
 
-    def stream(self) -> Stream:
+    def stream(self) -> ChunkStream:
         """A cold start."""
-        stream = Stream(chunks_of(self.scenes), NETWORK)
+        stream = ChunkStream(chunks_of(self.scenes), NETWORK)
         stream.want([])
         return stream
 

@@ -26,7 +26,7 @@ from sparklod_cli.cameras.pose import look_at
 from sparklod_cli.codecs.gpu import lod_tree
 from sparklod_cli.lod.continuous import ContinuousCuts
 from sparklod_cli.lod.cut_statistics import Changes, measure
-from sparklod_cli.lod.traversal import Forest, Traversal, TreeInstance, View
+from sparklod_cli.lod.traversal import CutView, Forest, Traversal, TreeInstance
 from sparklod_cli.model.lod_tree import Nodes
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
@@ -93,12 +93,12 @@ class Spark:
         self._node.wait()
 
 
-def flight(center: np.ndarray, radius: float, frames: int) -> list[View]:
+def flight(center: np.ndarray, radius: float, frames: int) -> list[CutView]:
     """Returns views on half a circle around a scene, at 1.5 times the radius of one tile, looking at its centre."""
     views = []
     for angle in np.linspace(0, np.pi, frames):
         eye = center + 1.5 * radius * np.array([np.sin(angle), -0.4, np.cos(angle)])
-        views.append(View(look_at(eye, center, (0, -1, 0)), np.radians(90), np.radians(60)))
+        views.append(CutView(look_at(eye, center, (0, -1, 0)), np.radians(90), np.radians(60)))
     return views
 
 
@@ -125,7 +125,7 @@ class Flight:
 
     labels: dict[str, Label]
     nodes: Nodes
-    views: Sequence[View]
+    views: Sequence[CutView]
 
 
 def rows(flights: Iterable[Flight], budgets: Sequence[int], runs: int, spark: Spark | None) -> Iterator[Row]:

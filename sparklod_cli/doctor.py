@@ -108,7 +108,7 @@ def _packages() -> Iterator[Check]:
     try:
         for one in required_by(DISTRIBUTION):
             advice = pip_install("--upgrade", f"{one.name}>={one.least}") if one.missing else ""
-            yield Check(one.name, "problem" if one.missing else "ok", one.found, advice)
+            yield Check(one.name, "problem" if one.missing else "ok", one.state, advice)
     except metadata.PackageNotFoundError:
         value = "sparklod itself is not installed, so nothing tells what it requires"
         yield Check("packages", "note", value, install_hint())
@@ -127,7 +127,7 @@ def _extras() -> Iterator[Check]:
         yield Check(
             f"extra {extra}",
             "note" if missing else "ok",
-            ", ".join(f"{package.name} {package.found}" for package in packages),
+            ", ".join(f"{package.name} {package.state}" for package in packages),
             advice,
         )
 

@@ -7,8 +7,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from ..cameras.axes import Axes
-from ..cameras.formats.table import FORMATS
+from ..cameras.formats.table import FORMATS, Axes
 from ..cameras.frame import MAX_FRAMES, Settings, direction_of
 from ..cameras.path import CameraPath
 from ..cameras.sources import Orbit, read_path, similarity

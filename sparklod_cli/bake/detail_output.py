@@ -14,7 +14,7 @@ from ..model.scene import DetailScene, Scene
 from ..model.splats import Splats
 from ..support.parallel import on_threads
 from ..support.progress import Progress
-from .output import Encode, WholeOutput
+from .output import BakeOutput, Encode
 from .records import BuiltTree, Clock, WrittenDetail, WrittenLevel, WrittenTree
 
 
@@ -27,14 +27,7 @@ def detail_levels(
     threads: int,
     progress: Progress,
 ) -> DetailScene:
-    """Return regions of a tree at several detail levels, with their errors.
-
-    Args:
-        scene: a tree.
-        environment: splats beside it; None without.
-        settings: of levels and regions.
-        threads: to work on; the result does not depend on it.
-    """
+    """Return regions of a tree at several detail levels, with their errors, and an environment, if any."""
     from ..lod.detail_levels import make
     from .region_errors import measured
 
@@ -49,14 +42,8 @@ def detail_levels(
 
 
 @dataclass(frozen=True)
-class DetailOutput(WholeOutput):
-    """A Streamed SOG.
-
-    Attributes:
-        settings: of levels and regions.
-        options: how chunk files are written.
-        sink: writes it.
-    """
+class DetailOutput(BakeOutput):
+    """A Streamed SOG."""
 
     settings: DetailSettings
     options: WriteOptions

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol
 
-from ..codecs.encoder import Encoder, Get
 from ..support.addresses import Place
 from ..support.errors import memory_errors_translated
 from ..support.progress import Progress, silent
@@ -13,23 +11,10 @@ from .in_memory import InMemory
 from .out_of_core.planning import blocks_for, has_published
 from .out_of_core.tasks import Engine
 from .output import output_of
-from .records import Baked, BuiltTree, Clock
+from .records import Baked, Clock
 from .refining import fit_settings, refined
 from .settings import BakeSettings, Resources
 from .sources import Source
-
-
-class Workspace(Protocol):
-    """Place in which a tree is built: in memory, as one block, or block by block in a scratch folder."""
-
-    def build(self) -> BuiltTree:
-        """Read the input, select and transform its splats, and build their tree, or keep the one that it has."""
-
-    def order(self, tree: BuiltTree) -> None:
-        """Put the nodes into the order of the output, and count them."""
-
-    def encode(self, tree: BuiltTree, encoder: Encoder) -> Get:
-        """Encode the windows of a tree that is in order; return what reads their results."""
 
 
 def bake(
@@ -51,10 +36,6 @@ def bake(
     Args:
         source: a file of any format that is read, - for standard input, or several files as one scene.
         target: a file of the format that is set, or one of arrays, whatever its name; - is standard output.
-        settings: how.
-        overwrite: replace files that exist.
-        threads: to work on.
-        progress: called with how much of a stage is done.
         resources: that it may use; None for those of a machine that is otherwise idle.
         engine: runs the tasks of a bake that goes out of core because of it; None for this process.
         say: called with a line when it goes out of core, what is left after an interruption, and what fitting brought.
@@ -84,7 +65,7 @@ def bake(
             engine=engine,
             say=say,
         ) as blocks:
-            work: Workspace = blocks or InMemory(source, settings, output, clock, threads, progress)
+            work = blocks or InMemory(source, settings, output, clock, threads, progress)
             tree, fit = work.build(), None
             if fitting is not None:
                 tree.nodes, fit = refined(tree.scene, fitting, threads=threads, progress=progress, say=say)

@@ -15,7 +15,7 @@ from ..model.scene import Scene
 from ..model.splats import Splats
 from ..support.parallel import on_threads
 from ..support.progress import Progress
-from .output import FileOutput, Output, output_of_kept
+from .output import BakeOutput, FileOutput, output_of_existing_tree
 from .records import BuiltTree, Clock
 from .selecting import read_environment, select, split_environment, transformed
 from .settings import BakeSettings
@@ -24,24 +24,22 @@ from .sources import Source, read_source
 
 @dataclass
 class InMemory:
-    """Workspace in memory, see `flow.Workspace`.
+    """Workspace in memory; that of a bake out of core, `in_blocks.InBlocks`, has the same three steps.
 
     Attributes:
         source, settings, threads, progress: as for `flow.bake`.
-        output: where the tree goes.
-        clock: of the stages.
     """
 
     source: Source
     settings: BakeSettings
-    output: Output
+    output: BakeOutput
     clock: Clock
     threads: int
     progress: Progress
     _leaves: Statistics | None = None
 
     def build(self) -> BuiltTree:
-        """Read the input and build its tree, or keep the one that it has."""
+        """Read the input, select and transform its splats, and build their tree, or keep the one that it has."""
         settings, threads, progress = self.settings, self.threads, self.progress
         scene = read_source(self.source, threads=threads, progress=progress)
         tree = BuiltTree(
@@ -54,7 +52,7 @@ class InMemory:
         )
         antialiased, up = scene.antialiased, settings.up_of(scene.up)
         if scene.tree is not None:
-            tree.output, tree.is_ordered = output_of_kept(self.output, self.source, scene, settings)
+            tree.output, tree.is_ordered = output_of_existing_tree(self.output, self.source, scene, settings)
             tree.splats = int(np.count_nonzero(scene.tree.is_leaf))
             tree.nodes = Scene(scene.splats, scene.tree, antialiased, up=up)
             self.clock.end("read")
@@ -101,7 +99,7 @@ class InMemory:
             tree.statistics = Statistics.of_scene(scene, output.needed, threads=self.threads)
 
     def encode(self, tree: BuiltTree, encoder: Encoder) -> Get:
-        """Encode the windows of a tree."""
+        """Encode the windows of a tree that is in order; return what reads their results."""
         encoded = list(results(encoder, tree.scene, self.threads, self.progress, "encoding"))
         return lambda number, name: encoded[number][name]
 
@@ -112,8 +110,6 @@ def build_tree(
     """Build the tree of splats, which are taken out of a list so that the builder can free them.
 
     Args:
-        leaves: a list of these splats.
-        settings: method and its setting.
         in_chunks: the nodes are put into the order for streaming later.
     """
     row = BUILDERS[settings.method]

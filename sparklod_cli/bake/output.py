@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 from ..codecs import clamps
 from ..codecs.encoder import CLAMPED, Encoder, Get, Stored, windows_of
@@ -30,25 +30,29 @@ from .sources import Merged, Source
 Encode = Callable[[BuiltTree, Encoder], Get]
 
 
-class Output(Protocol):
-    """Destination of a tree."""
+class BakeOutput:
+    """Destination of a tree; by default one that is made of all nodes at once, in memory, and holds any tree.
 
-    @property
-    def in_chunks(self) -> bool:
-        """Whether it is read in chunks, so that nodes are put in an order for that first."""
+    Attributes:
+        in_chunks: it is read in chunks, so that nodes are put in an order for that first.
+    """
+
+    in_chunks: bool = False
 
     @property
     def needed(self) -> frozenset[str]:
-        """The statistics of all nodes by which it is written, see `codecs.statistics`."""
+        """Statistics of all nodes by which it is written, see `codecs.statistics`."""
+        return frozenset()
 
     def check(self, leaves: Statistics) -> None:
         """Raise `FormatError` where a tree of leaves with these statistics cannot be written."""
 
     def write(self, tree: BuiltTree, encode: Encode, clock: Clock, threads: int, progress: Progress) -> WrittenTree:
         """Write a tree whose nodes are in order; in memory, unless this is a `FileOutput`."""
+        raise NotImplementedError
 
 
-def output_of(target: Place, settings: BakeSettings, *, overwrite: bool) -> Output:
+def output_of(target: Place, settings: BakeSettings, *, overwrite: bool) -> BakeOutput:
     """Return the output that settings ask for; fail now if it cannot be written later.
 
     Raises:
@@ -66,7 +70,9 @@ def output_of(target: Place, settings: BakeSettings, *, overwrite: bool) -> Outp
     return FileOutput(form, settings.options, write, in_chunks=settings.suffix == RAD)
 
 
-def output_of_kept(output: Output, source: Source, scene: Scene, settings: BakeSettings) -> tuple[Output, bool]:
+def output_of_existing_tree(
+    output: BakeOutput, source: Source, scene: Scene, settings: BakeSettings
+) -> tuple[BakeOutput, bool]:
     """Return the output of an input that has a tree, which is kept, and whether its nodes are in order already.
 
     Nodes keep their opacities. In the same format, what was not chosen of how to write is that of the file, and nodes
@@ -75,8 +81,6 @@ def output_of_kept(output: Output, source: Source, scene: Scene, settings: BakeS
 
     Args:
         output: of an input without a tree.
-        source: the input.
-        scene: its content.
 
     Raises:
         FormatError: nobody asked for another format than that of the scene, or for merged splats to be fitted; or for
@@ -111,24 +115,13 @@ def output_of_kept(output: Output, source: Source, scene: Scene, settings: BakeS
     return dataclasses.replace(output, options=dataclasses.replace(options, covering=False)), False
 
 
-class WholeOutput:
-    """Base of outputs that are made of a tree in memory, and hold any."""
-
-    in_chunks = False
-    needed: frozenset[str] = frozenset()
-
-    def check(self, leaves: Statistics) -> None:
-        """Accept any tree."""
-
-
 @dataclass(frozen=True)
-class ArrayOutput(WholeOutput):
+class ArrayOutput(BakeOutput):
     """Arrays in the layout of a viewer's memory.
 
     Attributes:
         encoding: of `codecs.formats.ENCODINGS`.
         raw: their words alone, rather than a .npz.
-        sink: writes them.
     """
 
     encoding: str
@@ -147,13 +140,8 @@ class ArrayOutput(WholeOutput):
 
 
 @dataclass(frozen=True)
-class RepackedOutput(WholeOutput):
-    """RAD file with the chunks of another one.
-
-    Attributes:
-        source: the other file.
-        sink: writes it.
-    """
+class RepackedOutput(BakeOutput):
+    """RAD file with the chunks of another one."""
 
     source: Place
     sink: SceneSink
@@ -174,14 +162,11 @@ class RepackedOutput(WholeOutput):
 
 
 @dataclass(frozen=True)
-class FileOutput:
+class FileOutput(BakeOutput):
     """SPZ or RAD file, written in windows.
 
     Attributes:
-        form: its format.
-        options: how it is written.
-        sink: writes it.
-        in_chunks: see `Output`; RAD is.
+        in_chunks: see `BakeOutput`; RAD is.
         stored: codes that nodes keep which still have the values of `before`; None where there are none.
         before: (N,) nodes with these codes.
     """

@@ -13,7 +13,7 @@ from ..model.splats import Splats
 from ..model.streams import NodeStream
 
 if TYPE_CHECKING:
-    from .output import Output
+    from .output import BakeOutput
     from .refining import Refined
 
 
@@ -37,7 +37,6 @@ class BuiltTree:
 
     Attributes:
         nodes: of the tree, in memory or in a store; None while a step replaces them.
-        output: where they go.
         format, notes: of the input, for display.
         read: number of splats of the input, which are nodes where it has a tree.
         splats: leaves of the tree.
@@ -51,7 +50,7 @@ class BuiltTree:
     """
 
     nodes: Scene | NodeStream | None
-    output: Output
+    output: BakeOutput
     format: str = ""
     notes: tuple[str, ...] = ()
     read: int = 0

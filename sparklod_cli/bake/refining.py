@@ -52,8 +52,6 @@ def refined(
     A first Ctrl-C ends the fitting early: what the finished stages gained is kept.
 
     Args:
-        scene: a tree.
-        threads: to work on; the result does not depend on it.
         say: told what came of each stage.
 
     Raises:

@@ -63,7 +63,6 @@ def measured(scene: DetailScene, *, threads: int | None = None, progress: Progre
 
     Args:
         scene: its errors are not read.
-        threads: None for all processors.
     """
     order = np.argsort(scene.counts == 0, axis=1, kind="stable")  # levels that have splats come first
     runs = np.take_along_axis(np.stack([scene.starts, scene.counts], 2), order[:, :, None], 1)

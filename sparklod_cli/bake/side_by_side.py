@@ -34,7 +34,6 @@ def bake_side_by_side(
 
     Args:
         pairs: inputs and outputs, which all workers see.
-        engine: of the cluster.
         resources: of a worker; a scene that its memory holds is one task.
         bake_large: bakes one that none can, and returns what came of it.
         make: bakes one; a function of a module.
@@ -49,7 +48,7 @@ def bake_side_by_side(
         (make, *pair, settings, overwrite, resources) for pair, is_small in zip(whole, small, strict=True) if is_small
     ]
     engine.check(None, [place for source, _ in whole for place in places_of(source)])
-    with engine.each("baking", _bake_small, calls, progress, "scene") as outcomes:
+    with engine.map_calls("baking", _bake_small, calls, progress, "scene") as outcomes:
         for pair, is_small in zip(pairs, small, strict=True):
             yield _checked_outcome(next(outcomes), pair[1]) if is_small else bake_large(*pair)
 

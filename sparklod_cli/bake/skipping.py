@@ -35,7 +35,6 @@ def bake_unless_there(
 
     Args:
         verify: read all of the inputs and of the output, also where size and date are those of the last bake.
-        how: further arguments of `bake`.
 
     Raises:
         OutputError: the output is there and of another recipe, and `overwrite` is not set.

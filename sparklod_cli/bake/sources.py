@@ -21,11 +21,7 @@ from ..support.units import count_of
 
 @dataclass(frozen=True, eq=False)
 class Merged:
-    """Several files that are one scene.
-
-    Attributes:
-        files: where each stands; one may be named more than once.
-    """
+    """Several files, with where each stands, that are one scene; one may be named more than once."""
 
     files: tuple[PlacedFile, ...]
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from ..model.transforms import AXES
 from ..support.errors import TooManyCamerasError
-from .axes import Axes
 from .camera import Camera, Matrix
+from .formats.table import Axes
 
 #: x, y and z in world units, or of a direction.
 Point = tuple[float, float, float]
@@ -45,7 +45,7 @@ def direction_of(up: str | None) -> Point:
 
 
 @dataclass(frozen=True)
-class Lens:
+class Intrinsics:
     """Intrinsics of a camera in a file; None for those that the file does not have.
 
     Attributes:
@@ -64,7 +64,7 @@ class Lens:
 
 
 #: The lens of a file that says nothing about it.
-NO_LENS = Lens()
+NO_LENS = Intrinsics()
 
 
 @dataclass(frozen=True)
@@ -73,14 +73,13 @@ class Frame:
 
     Attributes:
         matrix: (4, 4), in the axes of its format.
-        lens: of the camera.
         time: seconds from an arbitrary start; None if the file has no times.
         name: for display; may be empty.
         axes: of this matrix if they are certain, since it was computed from an eye and a target; otherwise None.
     """
 
     matrix: Matrix
-    lens: Lens = NO_LENS
+    lens: Intrinsics = NO_LENS
     time: float | None = None
     name: str = ""
     axes: Axes | None = None
@@ -162,7 +161,7 @@ class Settings:
         return self.up or self.up_of_scene()
 
 
-def camera_of(pose: Matrix, lens: Lens, time: float, name: str, settings: Settings) -> Camera:
+def camera_of(pose: Matrix, lens: Intrinsics, time: float, name: str, settings: Settings) -> Camera:
     """Return the camera of a rigid pose in OpenGL's axes, with defaults for what neither file nor user says.
 
     Raises:
@@ -194,7 +193,7 @@ def _check(focal: tuple[float, float], principal: tuple[float, float]) -> None:
         )
 
 
-def _focal_of(lens: Lens, size: tuple[int, int]) -> tuple[float, float]:
+def _focal_of(lens: Intrinsics, size: tuple[int, int]) -> tuple[float, float]:
     """fx, fy of square pixels for the field of view of a lens."""
     fov = lens.fov if lens.fov is not None else DEFAULT_FOV_Y
     if not 0 < fov < math.pi:

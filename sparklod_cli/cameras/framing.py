@@ -139,12 +139,7 @@ def _support(scene: Balls, camera: Camera) -> tuple[Matrix, Matrix, Matrix]:
 
 
 def fitted(camera: Camera, scene: Balls) -> Camera:
-    """Return a camera of the same direction that has a scene just inside its picture.
-
-    Args:
-        camera: whose principal point is the middle of its picture.
-        scene: of `covered`.
-    """
+    """Return a camera, centred on its picture, in the same direction, which has a scene just inside the picture."""
     middle = middle_of(scene)
     reach, aside, back = _support(Balls(scene.center - middle, scene.radius), camera)
     away = float(((reach[::2] + reach[1::2]) / (2 * back)).max())
@@ -160,7 +155,6 @@ def distance(cameras: Sequence[Camera], center: Matrix, scene: Balls) -> float:
     Args:
         cameras: at least one, wherever they are; their directions count.
         center: (3,) in the middle of all pictures.
-        scene: of `covered`.
     """
     local = Balls(scene.center - center, scene.radius)
     needed = []

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..support.errors import CameraPathError
-from .axes import Axes
 from .camera import Matrix
-from .frame import DEFAULT_FOV_Y, DEFAULT_FPS, NO_LENS, NUMBERED, Frame, Lens, Sampled, sampled
+from .formats.table import Axes
+from .frame import DEFAULT_FOV_Y, DEFAULT_FPS, NO_LENS, NUMBERED, Frame, Intrinsics, Sampled, sampled
 from .pose import look_at, normalized
 
 #: Mean seconds from one key to the next, if the keys have no times.
@@ -46,7 +46,12 @@ class Key:
 
 
 def frame_looking(
-    eye: ArrayLike, target: ArrayLike, up: ArrayLike, lens: Lens = NO_LENS, time: float | None = None, name: str = ""
+    eye: ArrayLike,
+    target: ArrayLike,
+    up: ArrayLike,
+    lens: Intrinsics = NO_LENS,
+    time: float | None = None,
+    name: str = "",
 ) -> Frame:
     """Return a frame at `eye`, (3,), that looks at `target`, (3,), with `up`, (3,), pointing up in the image.
 
@@ -110,7 +115,7 @@ def _looking_at(center: ArrayLike, distance: Matrix, offset: Matrix, up: Matrix)
 
 
 def between(
-    keys: Sequence[Key], fps: float | None, up: ArrayLike, lens: Lens = NO_LENS, seconds: float = SECONDS
+    keys: Sequence[Key], fps: float | None, up: ArrayLike, lens: Intrinsics = NO_LENS, seconds: float = SECONDS
 ) -> Sampled:
     """Return frames from the first key to the last, on a Catmull-Rom spline through all of them.
 
@@ -156,10 +161,6 @@ def between(
 
 def along(curve: Callable[[Matrix], Matrix], at: Matrix) -> Matrix:
     """(N, K) points of a curve.
-
-    Args:
-        curve: maps parameters to points.
-        at: (N,) parameters.
 
     Raises:
         CameraPathError: some points are not finite: keys are too far apart, or too close in time.

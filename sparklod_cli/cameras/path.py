@@ -72,7 +72,6 @@ def read(files: Files, *, format: str | None = None, settings: Settings | None =
     Args:
         files: the file, and those that belong to it.
         format: name of a row of `FORMATS`; None recognizes the format by the content.
-        settings: what the user says.
 
     Raises:
         CameraPathError: the file has no known format or is broken, or a camera makes no sense.
@@ -101,11 +100,6 @@ def _known(files: Files) -> PathFormat:
 
 def cameras_of(parsed: Parsed, form: PathFormat, settings: Settings) -> CameraPath:
     """Return the cameras of frames from a file or a generator.
-
-    Args:
-        parsed: the frames.
-        form: their format.
-        settings: what the user says.
 
     Raises:
         CameraPathError: there are none, or one makes no sense; the text names it.

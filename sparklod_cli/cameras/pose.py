@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..model.gaussian import rotation_matrix
-from .axes import Axes
 from .camera import Matrix
+from .formats.table import Axes
 
 #: Largest deviation of an element of R^T R from a multiple of the identity. Files that round to three decimals stay
 #: well below it.
@@ -25,7 +25,6 @@ def to_opengl(matrix: Matrix, axes: Axes) -> Matrix:
 
     Args:
         matrix: (4, 4), with 0 0 0 1 as its last row; may have a uniform scale.
-        axes: its convention.
 
     Raises:
         ValueError: it cannot be inverted; the text continues a sentence about it.

@@ -18,10 +18,9 @@ from ..support.defaults import ELEVATION
 from ..support.errors import CameraPathError, SparklodError
 from ..support.untrusted import parse_json
 from . import framing, generators
-from .axes import Axes
 from .camera import Matrix
 from .formats.source import Files, Json, Parsed, finite
-from .formats.table import NAMES, PathFormat
+from .formats.table import NAMES, Axes, PathFormat
 from .frame import DEFAULT_FPS, Frame, Settings, camera_of
 from .path import CameraPath, cameras_of, read
 from .pose import rigid
@@ -44,7 +43,6 @@ class CameraFile:
     """The cameras of a file, or of a folder that COLMAP wrote.
 
     Attributes:
-        path: of the file or folder.
         format: its name in `formats.table.FORMATS`; None tells it by the content.
     """
 
@@ -77,14 +75,18 @@ class _Aimed:
 
         Args:
             frames: makes cameras of their directions; called where something is chosen for the scene.
-            settings: that the cameras are made with.
-            scene: gives what the splats cover.
             times: the distance, where it is chosen, as a multiple of where the scene just fits the image.
         """
         if self.center is not None and self.distance is not None:
             return self.center, self.distance
-        center, fits = _fit(frames(), self.center, scene(), settings)
-        return center, self.distance or times * fits
+        visible = framing.covered(scene())
+        center = framing.middle_of(visible) if self.center is None else np.asarray(self.center, np.float64)
+        some = framing.sampled_cameras(frames())
+        try:
+            cameras = [camera_of(frame.matrix, frame.lens, 0, "", settings) for frame in some]
+        except ValueError as error:
+            raise CameraPathError(f"the camera {error}") from None
+        return center, self.distance or times * framing.distance(cameras, center, visible)
 
 
 @dataclass(frozen=True)
@@ -92,7 +94,6 @@ class Orbit(_Aimed):
     """Cameras once around a scene.
 
     Attributes:
-        count: how many.
         center: what they look at; None for the middle of the scene.
         distance: from there, world units; None for where the scene fits the image.
         elevation: above there, degrees.
@@ -116,7 +117,6 @@ class Dolly(_Aimed):
     """Cameras straight towards a scene, from far to near.
 
     Attributes:
-        seconds: how long it takes.
         center: what they look at; None for the middle of the scene.
         distance: of the first camera from there, world units; None for 4 times where the scene fits the image.
         elevation: above there, degrees.
@@ -139,11 +139,7 @@ class Dolly(_Aimed):
 
 @dataclass(frozen=True)
 class WholeScene:
-    """One camera that has the whole scene just inside its picture.
-
-    Attributes:
-        elevation: above the middle of the scene, degrees.
-    """
+    """One camera, so many degrees above the middle of the scene, that has all of it just inside its picture."""
 
     elevation: float = ELEVATION
 
@@ -157,7 +153,7 @@ class WholeScene:
 
 
 @dataclass(frozen=True)
-class Views:
+class SingleViews:
     """A camera for each pair of an eye and the target that it looks at.
 
     Attributes:
@@ -207,7 +203,7 @@ class Keyframes:
 #: Each has `fits_scene`, whether its cameras are as far away as the scene asks for, and
 #: `cameras(settings, scene) -> CameraPath`, which raises a `CameraPathError` where a camera makes no sense, its
 #: subclass `TooManyCamerasError` where there are too many, and an `InvalidSplatsError` where there is no scene to fit.
-CameraSource = CameraFile | Orbit | Dolly | WholeScene | Views | Keyframes
+CameraSource = CameraFile | Orbit | Dolly | WholeScene | SingleViews | Keyframes
 
 
 def read_path(path: Path, format: str | None = None, settings: Settings | None = None) -> CameraPath:
@@ -274,21 +270,3 @@ def read_world_transform(path: Path) -> Matrix:
 
 def _generated(title: str, frames: Sequence[Frame], settings: Settings) -> CameraPath:
     return cameras_of(Parsed(frames), PathFormat("", title, "", Axes.OPENGL_C2W), settings)
-
-
-def _fit(frames: Sequence[Frame], center: Point | None, scene: Balls, settings: Settings) -> tuple[Any, float]:
-    """Return the target of cameras, (3,), and the distance from there at which all of them see the whole scene.
-
-    Args:
-        frames: at least one.
-        center: (3,) where it is known; None for the middle of the scene.
-        scene: all that the splats cover.
-        settings: that the cameras are made with.
-    """
-    visible = framing.covered(scene)
-    middle = framing.middle_of(visible) if center is None else np.asarray(center, np.float64)
-    try:
-        cameras = [camera_of(frame.matrix, frame.lens, 0, "", settings) for frame in framing.sampled_cameras(frames)]
-    except ValueError as error:
-        raise CameraPathError(f"the camera {error}") from None
-    return middle, framing.distance(cameras, middle, visible)

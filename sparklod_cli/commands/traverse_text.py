@@ -9,7 +9,7 @@ from ..support.printable import printable
 from .console import count_of, size_of
 
 if TYPE_CHECKING:
-    from ..simulation.summary import Moment, Quantity, Summary
+    from ..simulation.summary import FrameStatistics, Moment, Summary
     from ..tables.columns import Row
 
 #: No line is longer; names of frames are cut to fit.
@@ -89,7 +89,7 @@ def _loading(figures: Row) -> str:
     return ", ".join(parts)
 
 
-def _quantity(quantity: Quantity) -> str:
+def _quantity(quantity: FrameStatistics) -> str:
     name, style = QUANTITIES[quantity.name]
     numbers = (quantity.min, quantity.p50, quantity.p95, quantity.max)
     return f"{name:<18} " + " ".join(f"{_said(number, style):>12}" for number in numbers)

@@ -16,7 +16,7 @@ from ..support.progress import Progress, silent
 from .cameras import HELD_OUT, Place, placed, split_path
 from .nodes import FittedNodes
 from .optimiser import ROUNDS, STAGES, Optimiser, default_steps, rates_at
-from .pictures import Picture, Scores, gain, keep_gains, keep_sizes, pictures, scores_of
+from .pictures import FullDetailPicture, Scores, gain, keep_gains, keep_sizes, pictures, scores_of
 from .settings import FitReport, FitSettings, FitStage
 
 #: Near plane at most and far plane at least, in radii of the scene, for scenes of tiny or huge units.
@@ -42,10 +42,7 @@ def fit(
     Args:
         nodes: N nodes in final order.
         tree: of them; it stays as it is, and so do the leaves, bit for bit.
-        settings: steps, seed and cameras.
         antialiased: of the scene; splats are drawn the same either way, as Spark draws them.
-        threads: to work on; the result does not depend on it.
-        progress: called with the number of steps done.
         say: called with a line of text after each stage.
         interrupted: asked between steps; when it returns True, what the finished stages gained is returned.
 
@@ -115,7 +112,7 @@ class _Fitting:
         return True
 
     def _fit_to(
-        self, picture: Picture, shares: Sequence[float], progress: Progress, interrupted: Callable[[], bool]
+        self, picture: FullDetailPicture, shares: Sequence[float], progress: Progress, interrupted: Callable[[], bool]
     ) -> bool:
         """Take a step for cuts of some shares of the leaves; return False if it was interrupted."""
         shown = []

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras.camera import Camera
-from ..lod.traversal import Forest, Traversal, TreeInstance, View
+from ..lod.traversal import CutView, Forest, Traversal, TreeInstance
 from ..model.gaussian import linear_opacity, lod_opacity, normalized_quat, size_factor
 from ..model.instances import Cones
 from ..model.lod_tree import LodTree
@@ -29,9 +29,6 @@ class FittedNodes:
 
     Args:
         nodes: N nodes, as they are at first.
-        tree: of them.
-        raster: how they are drawn.
-        threads: to prepare them on.
 
     Attributes:
         columns: of the nodes, as they are now; changed in place.
@@ -53,10 +50,10 @@ class FittedNodes:
     def cut(self, camera: Camera, share: float) -> Index:
         """Return the nodes, ascending, of a cut of a share of the leaves, without pixel-scale limit or foveation."""
         budget = max(1, int(share * len(self.leaves)))
-        view = View(camera.camera_to_world, camera.fov_x, camera.fov_y)
+        view = CutView(camera.camera_to_world, camera.fov_x, camera.fov_y)
         return self._traversal.cut(view, budget=budget).indices()[0].astype(np.int64)
 
-    def seen(self, index: Index, camera: Camera) -> tuple[Index, ShadedSplats]:
+    def visible(self, index: Index, camera: Camera) -> tuple[Index, ShadedSplats]:
         """Return those of some nodes that a camera may see, and how it sees them."""
         now = self.columns
         whole = ShadedSplats(now.center, now.scale, now.quat_xyzw, now.lod_opacity, now.rgb)

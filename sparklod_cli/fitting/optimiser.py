@@ -12,7 +12,7 @@ from ..render import gradients
 from .kernels import adam
 from .kernels.adam import Rates
 from .nodes import FittedNodes, Index
-from .pictures import Picture
+from .pictures import FullDetailPicture
 
 #: Root of the mean squared error of pictures, that of 30 dB, for which the rates are. The steps of a splat are
 #: proportional to the errors of the pictures that it is in: what is wrong with the splats of a fine cut is small.
@@ -49,10 +49,10 @@ class Optimiser:
             reach_of(nodes),
         )
 
-    def step(self, picture: Picture, index: Index, rates: adam.Rates) -> Index:
+    def step(self, picture: FullDetailPicture, index: Index, rates: adam.Rates) -> Index:
         """Take one step for a picture of a cut; return the nodes that it showed."""
         nodes, camera = self.nodes, picture.camera
-        seen, shaded = nodes.seen(index, camera)
+        seen, shaded = nodes.visible(index, camera)
         drawing = gradients.draw(shaded, camera, nodes.raster)
         by_image, error = picture.gradient(drawing.image)
         found = drawing.gradients(by_image)

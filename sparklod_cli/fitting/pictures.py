@@ -40,7 +40,7 @@ HALVES = 12
 
 
 @dataclass(frozen=True)
-class Picture:
+class FullDetailPicture:
     """Picture of full detail from one camera.
 
     Attributes:
@@ -66,26 +66,26 @@ class Picture:
         return result, math.sqrt(sum(errors) / 2)
 
 
-def pictures(cameras: Iterator[Camera], nodes: FittedNodes) -> Iterator[Picture]:
+def pictures(cameras: Iterator[Camera], nodes: FittedNodes) -> Iterator[FullDetailPicture]:
     """Yield the pictures of full detail of cameras that see enough to compare cuts by; end if hardly any does."""
     misses = 0
     for camera in cameras:
-        full = draw(nodes.seen(nodes.leaves, camera)[1], camera, nodes.raster)
+        full = draw(nodes.visible(nodes.leaves, camera)[1], camera, nodes.raster)
         if full[..., 3].mean() >= COVERED and on_background(full, 0.5).std(axis=(0, 1)).max() >= VARIED:
             misses = 0
-            yield Picture(camera, full)
+            yield FullDetailPicture(camera, full)
         misses += 1
         if misses > MOST_MISSES:
             return
 
 
-def scores_of(nodes: FittedNodes, held_out: Sequence[Picture]) -> Scores:
+def scores_of(nodes: FittedNodes, held_out: Sequence[FullDetailPicture]) -> Scores:
     """Return the means over held-out pictures and a black and a white background; empty without pictures."""
     scores: Scores = {}
     for share in SHARES if held_out else ():
         psnr: list[float] = []
         for picture in held_out:
-            _, shaded = nodes.seen(nodes.cut(picture.camera, share), picture.camera)
+            _, shaded = nodes.visible(nodes.cut(picture.camera, share), picture.camera)
             psnr += map(psnr_of, picture.errors(draw(shaded, picture.camera, nodes.raster)))
         scores[share] = float(np.mean(psnr))
     return scores
@@ -130,7 +130,7 @@ def _ratios(columns: Columns, nodes: FittedNodes, parent: Index) -> FloatArray:
     return np.divide(size * weights, sums, out=np.full(len(parent), np.inf), where=sums > 0)
 
 
-def keep_gains(nodes: FittedNodes, held_out: Sequence[Picture], before: Scores) -> Scores:
+def keep_gains(nodes: FittedNodes, held_out: Sequence[FullDetailPicture], before: Scores) -> Scores:
     """Halve changes of the nodes that cuts of a share draw, while one scores less than before; return the scores."""
     for _ in range(HALVES):
         now = scores_of(nodes, held_out)

@@ -41,7 +41,6 @@ class FitStage:
 
     Attributes:
         name: for display.
-        steps: that were done.
         psnr_before, psnr_after: share of the leaves -> mean PSNR in dB of the held-out cameras.
     """
 
@@ -56,8 +55,6 @@ class FitReport:
     """Result of fitting a tree.
 
     Attributes:
-        steps: that were done.
-        stages: those that were finished, in order.
         psnr_before, psnr_after: share of the leaves -> mean PSNR in dB of the held-out cameras.
         kept: share of the merged splats that have new values.
         is_complete: False if it was interrupted.

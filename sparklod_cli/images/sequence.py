@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from ..cameras.camera import Camera
     from ..cameras.path import CameraPath
     from ..render.color_scales import Coloring
-    from ..render.renderer import Drawn
+    from ..render.renderer import DrawnPicture
     from ..render.settings import RenderSettings
     from ..scenes.finder import CutSource
     from .output import PictureOutput
@@ -137,7 +137,8 @@ class _Writer:
     ) -> None:
         self._renderer, self._path, self._output, self._settings = renderer, path, output, settings
         self._reference, self._overwrite, self._progress = reference, overwrite, progress
-        self._drawn: dict[int, tuple[Drawn, Drawn]] = {}  # by camera index: pictures that were drawn to find the gain
+        # By camera index, pictures that were drawn to find the gain.
+        self._drawn: dict[int, tuple[DrawnPicture, DrawnPicture]] = {}
         self._gain = 1.0 if reference is None else settings.gain or self._fitting_gain(reference)
         self._bytes = 0
 
@@ -200,7 +201,7 @@ class _Writer:
             return _Frame(facts, None, self._encode(pixels), empty)
         return _Frame(facts, pixels, b"", empty)
 
-    def _draw(self, at: int) -> tuple[Drawn, Drawn | None]:
+    def _draw(self, at: int) -> tuple[DrawnPicture, DrawnPicture | None]:
         """Return the picture of a camera, and the picture of the reference."""
         if at in self._drawn:
             return self._drawn.pop(at)
@@ -229,14 +230,14 @@ class _Writer:
             self._progress("comparing", done, len(some), "frame")
         return codes.gain_for(differences)
 
-    def _facts(self, number: int, camera: Camera, drawn: Drawn) -> dict[str, Any]:
+    def _facts(self, number: int, camera: Camera, drawn: DrawnPicture) -> dict[str, Any]:
         facts = {"frame": number, "time_s": camera.time, "name": camera.name, "splats": drawn.splats}
         facts |= {"width": camera.width, "height": camera.height}
         if self._output.kind == "frames":
             facts["file"] = str(self._output.path(number))
         return facts
 
-    def _floats(self, drawn: Drawn, image: NDArray[np.float32]) -> NDArray[np.float32]:
+    def _floats(self, drawn: DrawnPicture, image: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the content of a .npy file: the values behind the colours if they are per pixel, else the colours."""
         by = self._renderer.settings.color_by
         return drawn.values if by in OF_PIXELS and drawn.values is not None else image

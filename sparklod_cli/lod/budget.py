@@ -69,11 +69,7 @@ def parse_budget(text: str) -> Budget:
 
 
 def parse_budgets(text: str) -> tuple[Budget, ...]:
-    """Return the budgets of a text such as "2%,5%,500k".
-
-    Raises:
-        ValueError: the text has no budget, or one that is invalid.
-    """
+    """Return the budgets of a text such as "2%,5%,500k"; raise `ValueError` if one is invalid, or there is none."""
     budgets = tuple(map(parse_budget, filter(None, map(str.strip, text.split(",")))))
     if not budgets:
         raise ValueError(f"{text!r} names no budget, such as 5% or 500k")

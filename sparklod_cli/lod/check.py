@@ -36,11 +36,7 @@ def check_setting(name: str, value: float, least: float, most: float) -> None:
 
 
 def check(splats: Splats) -> Bounds:
-    """Check that a tree can be built of splats, and returns their bounds.
-
-    Raises:
-        InvalidSplatsError: there is no splat, or one is invalid or cannot be seen.
-    """
+    """Return the bounds of splats; raise `InvalidSplatsError` without any, or if one is invalid or invisible."""
     if len(splats) == 0:
         raise InvalidSplatsError("no splat is left to build a tree of")
     with threads_for(len(splats)) as threads:

@@ -70,9 +70,7 @@ def arrange(splats: Splats, tree: LodTree, *, progress: Progress = silent) -> tu
     threads.
 
     Args:
-        splats: M nodes.
         tree: their children; `LodTree.validate` accepts it.
-        progress: called with the number of nodes that have a chunk.
     """
     order, child_start = chunk_order(splats, tree, progress=progress)
     return reordered([(splats, tree)], order, child_start)
@@ -109,7 +107,6 @@ def family_order(
         size: (F,) its feature size, world units.
         most: how many families are put in order at a time, see `family_bytes`; None for all. Parts, see
             `parts_of`, are each put in order as if they were a tree, one after the other.
-        progress: called with the number of nodes that have a chunk.
 
     Returns:
         (F,) int32 places here, in the order in which the children are written.
@@ -195,7 +192,6 @@ def _sequence(families: Families, filled: int, total: int, progress: Progress) -
         families: of a part, F at least 1.
         filled: number of nodes that come before.
         total: number of nodes of the tree.
-        progress: of `arrange`.
     """
     length, own = len(families.count), int(families.count.sum(dtype=np.int64))
     sequence = np.arange(length, dtype=np.int32)

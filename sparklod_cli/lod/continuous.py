@@ -34,7 +34,7 @@ from ..support.defaults import BLEND
 from .kernels.cut_arrays import BUCKET_BITS, BUCKETS
 from .kernels.pixel_scale import pixel_scales
 from .kernels.tree_links import find_depths, find_limits, find_parents
-from .traversal import Traversal, View, views_of
+from .traversal import CutView, Traversal, views_of
 
 #: Bisections of the threshold's interval, whose ends differ by a factor of the width; 40 leave a share of 1e-12 of it.
 HALVINGS = 40
@@ -66,22 +66,17 @@ class BlendedCut:
 
 
 class ContinuousCuts:
-    """Finds continuous cuts.
-
-    Args:
-        traversal: provides the trees and instances.
-    """
+    """Finds continuous cuts."""
 
     def __init__(self, traversal: Traversal) -> None:
         self._forest, self._instances = traversal.forest, traversal.instances
         bases = self._forest.node_base
         self._inner = [_Inner(self._forest.nodes[bases[i] : bases[i + 1]]) for i in range(len(self._forest))]
 
-    def cut(self, view: View, *, budget: int, smallest: float = 0.0, width: float = BLEND) -> BlendedCut:
+    def cut(self, view: CutView, *, budget: int, smallest: float = 0.0, width: float = BLEND) -> BlendedCut:
         """Return the continuous cut.
 
         Args:
-            view: the camera.
             budget: sum of the weights, all instances together, unless `smallest` or the leaves are reached first; at
                 least the number of instances. The number of nodes is larger, because fading nodes count in part.
             smallest: nodes of this pixel scale or less are not refined; see `settings.pixel_limit`.
@@ -190,11 +185,7 @@ class _Inner:
         return limit
 
     def blended(self, share: Shares) -> tuple[NDArray[np.uint32], Shares]:
-        """Return the nodes with a weight above 0, ascending, and their weights.
-
-        Args:
-            share: (M,) by which nodes are refined.
-        """
+        """Return the nodes with a weight above 0, ascending, and their weights, for (M,) shares of `shares`."""
         refined = np.zeros(len(self._nodes))
         refined[self._node] = share
         weight = refined[self._parent] - refined

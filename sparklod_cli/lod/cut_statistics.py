@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from .kernels import cut_statistics as kernels
 from .kernels.cut_arrays import CutNodes
 from .settings import pixel_limit
-from .traversal import Forest, TreeCut, TreeInstance, View
+from .traversal import CutView, Forest, TreeCut, TreeInstance
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ def measure(
     forest: Forest,
     level: NDArray[np.int32],
     cut: TreeCut,
-    view: View,
+    view: CutView,
     *,
     size: tuple[int, int],
     by_instance: bool = False,
@@ -54,12 +54,9 @@ def measure(
     """Return the statistics of a cut as a whole and, optionally, of each instance in it.
 
     Args:
-        forest: the trees.
         level: (nodes,) int32 depths, edges from the root, of all trees.
         cut: a cut found for `view`.
-        view: the camera.
         size: width and height of the picture, pixels.
-        by_instance: compute statistics of each instance, too.
     """
     width, height = size
     counts = np.empty((len(cut.views), kernels.COUNTS), np.int64)
@@ -119,12 +116,7 @@ def _percentiles(values: NDArray[np.float32], shares: Sequence[float]) -> list[f
 
 
 class Changes:
-    """Compares each cut with the one before it.
-
-    Args:
-        forest: the trees.
-        instances: instances of them.
-    """
+    """Compares each cut with the one before it."""
 
     def __init__(self, forest: Forest, instances: Sequence[TreeInstance]) -> None:
         sizes = np.diff(forest.node_base)

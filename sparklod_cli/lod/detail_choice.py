@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from .detail_rule import DetailRule
 
 if TYPE_CHECKING:
-    from .traversal import View
+    from .traversal import CutView
 
 Levels = NDArray[np.int64]
 
@@ -85,7 +85,6 @@ class Distant:
     """An instance of regions, as far as their levels depend on a camera.
 
     Attributes:
-        chains: of its regions.
         squared_distance: (R,) of `RegionBounds.squared_distances`.
         base_distance: `DetailRule.base_distance`, of this instance.
     """
@@ -117,7 +116,6 @@ def choose(instances: Sequence[Distant], budget: int, rule: DetailRule) -> Detai
     Args:
         instances: at least one.
         budget: maximum number of splats, all instances together.
-        rule: for its `mode` and `multiplier`.
     """
     limit = rule.mode == "limit"
     coarsest = sum(int(each.chains.count[:, -1].sum()) for each in instances)
@@ -156,7 +154,6 @@ def _threshold(instances: Sequence[Distant], keys: Sequence[Levels], room: int, 
     """Return the least key of a step that is taken: the highest at which the budget suffices, to a part.
 
     Args:
-        instances: of the regions.
         keys: for each instance (R, S - 1).
         room: splats by which all regions together may exceed their coarsest levels.
         bins: how many bins the threshold may be above.
@@ -207,16 +204,14 @@ class RegionBounds:
         median = np.sort(half32, axis=0)[len(half32) // 2].astype(np.float64)
         self.excess = np.maximum(half32 - median, 0).astype(np.float32).astype(np.float64)
 
-    def squared_distances(self, view: View, object_to_world: Matrix, rule: DetailRule) -> Distances:
+    def squared_distances(self, view: CutView, object_to_world: Matrix, rule: DetailRule) -> Distances:
         """Return (R,) squared distances by which levels are chosen, world units at a field of view of 45 degrees.
 
         The distance is that from the camera to the nearest point of the bound, shrunk by `rule.shrink` of its excess;
         what lies behind the camera counts as farther. As `GSplatOctreeInstance.evaluateNodeDistances` of PlayCanvas.
 
         Args:
-            view: the camera.
             object_to_world: (4, 4) where the scene stands: a rotation, a uniform scale and a translation.
-            rule: for its `shrink` and `behind_penalty`.
         """
         # PlayCanvas holds matrices in float32.
         placed, camera = (

@@ -65,9 +65,6 @@ def make(nodes: Splats, tree: LodTree, settings: DetailSettings, *, progress: Pr
 
     Args:
         nodes: M splats, those of a tree in final order.
-        tree: of them.
-        settings: shares of the levels and sizes of regions.
-        progress: called with the number of levels done in the stage dividing.
 
     Returns:
         the scene, without errors; within a run, splats are in the order of the tree.
@@ -145,7 +142,6 @@ def detail_cuts(nodes: Splats, tree: LodTree, shares: Sequence[float]) -> Detail
 
     Args:
         nodes: M splats, final order.
-        tree: of them.
         shares: of each level after full detail, descending, between 0 and 1.
     """
     parent, _ = find_parents(tree.child_count, tree.child_start)
@@ -177,7 +173,6 @@ def losses(nodes: Splats, tree: LodTree, parent: NDArray[np.int32]) -> Column:
 
     Args:
         nodes: M splats of a tree in final order.
-        tree: of them.
         parent: (M,) of each node, -1 of the root.
     """
     size = spark_size(nodes).astype(np.float64)

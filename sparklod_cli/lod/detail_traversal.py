@@ -20,7 +20,7 @@ from ..model.splats import Splats
 from .detail_choice import Chains, Distances, Distant, Levels, RegionBounds, choose
 from .detail_rule import LEAST_BASE_DISTANCE, DetailRule
 from .kernels import pixel_scale
-from .traversal import Forest, TreeCut, TreeInstance, View, views_of
+from .traversal import CutView, Forest, TreeCut, TreeInstance, views_of
 
 #: Priorities of files, whole numbers: for regions of which nothing is drawn, for those at another level, and for what
 #: comes next. The environment is asked for before all others.
@@ -60,9 +60,6 @@ class DetailTraversal:
     """Finds cuts of scenes at several detail levels; several threads may ask it, unless it remembers.
 
     Args:
-        forest: the scenes.
-        instances: of them.
-        rule: how levels are chosen.
         fixed: splats that are drawn besides, and count against the budget.
         remembers: while files are missing, regions stay as the cut before had them; without, nothing was drawn before.
     """
@@ -83,12 +80,11 @@ class DetailTraversal:
         self._before: list[Levels | None] = [None] * len(self.instances)
 
     def cut(
-        self, view: View, *, budget: int, smallest: float = 0.0, resident: NDArray[np.bool_] | None = None
+        self, view: CutView, *, budget: int, smallest: float = 0.0, resident: NDArray[np.bool_] | None = None
     ) -> TreeCut:
         """Return the cut that a viewer draws: the splats of the levels of all regions, and the environments.
 
         Args:
-            view: the camera.
             budget: maximum number of splats, all instances together; those of environments do not count.
             smallest: has no meaning here; traversals of trees have it.
             resident: (chunks,) bool, which chunk files of all scenes are there; all are unless given.
@@ -109,14 +105,14 @@ class DetailTraversal:
             tree = instance.tree
             scene, files, own = forest.scenes[tree], forest.files[tree], slice(*forest.chunk_base[tree : tree + 2])
             before = self._before[at] if self.remembers else None
-            state = loading(self._chains[tree], files, levels, distance, there[own], before, rule.underfill)
+            drawn, priority = loading(self._chains[tree], files, levels, distance, there[own], before, rule.underfill)
             if self.remembers and resident is not None:
-                self._before[at] = state.drawn
+                self._before[at] = drawn
             around = files.environment is not None and bool(there[own][files.environment])
-            nodes.append(_splats_of(scene, state.drawn, environment=around))
-            wrong = (state.drawn != levels) & (levels >= 0)
+            nodes.append(_splats_of(scene, drawn, environment=around))
+            wrong = (drawn != levels) & (levels >= 0)
             missing += int(scene.counts[wrong, levels[wrong]].sum())
-            wanted[own] = np.maximum(wanted[own], np.maximum(state.priority, np.where(state.priority > 0, 1e-30, 0)))
+            wanted[own] = np.maximum(wanted[own], np.maximum(priority, np.where(priority > 0, 1e-30, 0)))
         return TreeCut(
             views=views_of(forest, self.instances, view),
             node=np.concatenate(nodes),
@@ -160,19 +156,6 @@ class DetailFiles:
     manifest: int = 0
 
 
-@dataclass(frozen=True, eq=False)
-class Loading:
-    """Drawn levels of R regions, and priorities of F chunk files, while files load.
-
-    Attributes:
-        drawn: (R,) the level of each; -1 where nothing is.
-        priority: (F,) of the files that are in use or asked for, above 0; 0 for others.
-    """
-
-    drawn: Levels
-    priority: NDArray[np.float64]
-
-
 def loading(
     chains: Chains,
     files: DetailFiles,
@@ -181,17 +164,19 @@ def loading(
     resident: NDArray[np.bool_],
     before: Levels | None,
     underfill: int,
-) -> Loading:
+) -> tuple[Levels, NDArray[np.float64]]:
     """Return what is drawn of the regions of an instance, and what is asked for.
 
     Args:
-        chains: of its regions.
-        files: of its scene.
         chosen: (R,) the level that is chosen for each region; -1 for one without splats.
         squared_distance: (R,) by which it was chosen.
         resident: (F,) which files are there.
         before: (R,) what was drawn before, -1 where nothing was; None for nothing at all.
         underfill: levels by which a region may be coarser as long as a file is missing; see `DetailRule`.
+
+    Returns:
+        (R,) the drawn level of each region, -1 where nothing is; and (F,) priorities of the files that are in use or
+        asked for, above 0, and 0 for others.
     """
     levels = files.of_run.shape[1]
     before = np.full(len(chosen), -1) if before is None else before
@@ -212,7 +197,7 @@ def loading(
     ask(np.where(desired == chosen, chosen, _finer(chains, desired)), NEXT)
     if files.environment is not None:
         priority[files.environment] = ENVIRONMENT
-    return Loading(drawn, priority)
+    return drawn, priority
 
 
 def _desired(chains: Chains, files: DetailFiles, chosen: Levels, resident: NDArray[np.bool_], underfill: int) -> Levels:

@@ -70,7 +70,6 @@ def reordered(
 
     Args:
         built: the tree; the list is emptied, so that columns are freed one by one where nobody else holds them.
-        order, child_start: of `node_order`.
     """
     nodes, tree = built.pop()
     columns = dict(vars(nodes))

@@ -50,7 +50,6 @@ class FinalTree:
 
     Attributes:
         splats: M nodes as they are drawn.
-        tree: of them.
         order: (M,) uint32 node of the binary tree.
         parents: (F,) uint32 final indices of the merged nodes, in the order of their children.
         ranks: (F,) int32, ascending.
@@ -83,13 +82,9 @@ def in_final_order(
     """Prune a tree, and writes its nodes and their colours in final order. The binary tree is of no use afterwards.
 
     Args:
-        binary: the tree.
         index: (N,) splat of each of its leaves.
         columns: of the splats as the leaves are drawn; emptied, so that they are freed one by one where nobody else
             holds them.
-        goal: bounds and order of its nodes.
-        curve: for the order of nodes of one rank.
-        progress: told of the nodes.
     """
     n, hidden = binary.leaves, 0 if goal.is_whole else 1
     parent, saved, rank = _prune(binary, goal, progress)

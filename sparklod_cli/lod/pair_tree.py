@@ -117,7 +117,6 @@ class Curve:
             rows: node rows, or any whose first columns are the centre, in units.
             at: (n,) uint32 indices of rows; those in one place stay in their order.
             turn: number of the round.
-            threads: number of threads.
         """
         bits = 3 * node_rows.CURVE_BITS
         return sort_by_key(self.keys(rows, at, turn), np.arange(len(at), dtype=np.uint32), bits, threads)[1]
@@ -218,11 +217,8 @@ def merge_levels(
     """Merge pairs, level by level, but for nodes whose partners may be beyond a border; without one up to the root.
 
     Args:
-        binary: the tree.
         levels: (N,) that its leaves join at.
-        curve: to sort nodes along.
         region: that the leaves are in, None for the whole scene.
-        progress: told of the merges.
 
     Returns:
         nodes: (n,) uint32, without a parent.
@@ -262,12 +258,9 @@ def _merge(
     """Merge active nodes in rounds; returns those that are left, which is one if `rounds` is None.
 
     Args:
-        binary: the tree.
         active: (n,) uint32 nodes without a parent.
-        curve: the curve to sort them along.
         largest: largest trace of the covariance of a merged node, units squared.
         rounds: maximum number of rounds; None for no limit.
-        progress: as for `merge_levels`.
     """
     done, leaves = 0, binary.leaves
     while len(active) > 1 and (rounds is None or done < rounds):

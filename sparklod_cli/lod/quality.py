@@ -34,7 +34,7 @@ from .final_tree import FinalTree, PruningGoal, in_final_order
 from .kernels import pair_cost
 from .kernels.sort import Nodes
 from .pair_tree import BinaryTree, Curve, Levels, levels_of, lowest_level, merge_levels
-from .stage_records import NO_FAMILY, STAGE_BITS, Families, Pending, Region, Survey
+from .stage_records import NO_FAMILY, STAGE_BITS, Pending, Region, StageFamilies
 
 #: For each node that a stage hands on, it leaves this many times what the growth allows for a leaf to those above it:
 #: more than once, as the pruning of a stage adds to what it hands on. Measured: once loses up to 0.3 dB.
@@ -57,7 +57,6 @@ def build(splats: Splats, growth: float = DEFAULT_GROWTH, *, progress: Progress 
     Args:
         splats: N splats, finite, with positive opacity and at least one positive scale each.
         growth: maximum ratio of nodes to leaves, 1.05 to 2.
-        progress: called with the number of nodes done in each of the stages building, pruning and ordering.
 
     Returns:
         M >= N splats and their tree.
@@ -95,7 +94,6 @@ class Plan:
 
     Attributes:
         growth: maximum ratio of nodes to leaves of the whole tree.
-        curve: of the whole scene.
         lowest: first level that nodes merge at.
     """
 
@@ -142,12 +140,11 @@ class _Nodes:
         return Pending.of(splats, **vars(self))
 
 
-def plan(survey: Survey, setting: float) -> Plan:
+def plan(bounds: Bounds, sample: Splats, setting: float) -> Plan:
     """See `StagedBuilder`; the setting is the growth, 1.05 to 2."""
     check_setting("growth", setting, MIN_GROWTH, MAX_GROWTH)
-    bounds = Bounds(np.array(survey.low), np.array(survey.high), survey.smallest, survey.largest)
-    curve = Curve.of(survey.sample, bounds)
-    _, size = curve.leaf_rows(survey.sample, np.arange(len(survey.sample), dtype=np.uint32))
+    curve = Curve.of(sample, bounds)
+    _, size = curve.leaf_rows(sample, np.arange(len(sample), dtype=np.uint32))
     return Plan(setting, curve, lowest_level(levels_of(size)))
 
 
@@ -158,7 +155,7 @@ def leaves(splats: Splats, index: NDArray[np.int64], plan: Plan) -> Pending:
 
 def advance(
     pending: Pending, region: Region | None, stage: int, plan: Plan, *, progress: Progress
-) -> tuple[Families, Pending]:
+) -> tuple[StageFamilies, Pending]:
     """See `StagedBuilder`."""
     splats, count = pending.splats, len(pending)
     if count <= 1:
@@ -195,19 +192,19 @@ def _pruning_goal(nodes: _Nodes, handed: int, region: Region | None, plan: Plan)
     return PruningGoal(max(most - reserve, 0), splats, False, HIGHEST, nodes.rank)
 
 
-def _families(final: FinalTree, numbers: NDArray[np.int64]) -> Families:
+def _families(final: FinalTree, numbers: NDArray[np.int64]) -> StageFamilies:
     """Return the families of the nodes that a stage kept; `numbers` are those of all nodes' families."""
     children = slice(final.first_child, None)
     nodes, parents = final.splats.take(children), final.splats.take(final.parents)
     count, size = final.tree.child_count[final.parents], spark_size(parents)
-    return Families(final.ranks, final.keys[:, None], count, nodes, numbers[children], parents.center, size)
+    return StageFamilies(final.ranks, final.keys[:, None], count, nodes, numbers[children], parents.center, size)
 
 
-def _no_families(splats: Splats) -> Families:
+def _no_families(splats: Splats) -> StageFamilies:
     """Return the empty families of a stage without a merge."""
     none = splats.take(slice(0, 0))
     empty = np.empty(0, np.int32), np.empty((0, 1), np.uint64), np.empty(0, np.uint16)
-    return Families(*empty, none, np.empty(0, np.int64), none.center, none.opacity)
+    return StageFamilies(*empty, none, np.empty(0, np.int64), none.center, none.opacity)
 
 
 def _rest(
@@ -222,13 +219,10 @@ def _rest(
     """Return the nodes that a stage hands on: those without a parent, which come right after the first.
 
     Args:
-        final: tree of the stage.
-        pending: what it began with.
         index: (n,) places there of the tree's leaves.
         left: nodes without a parent before the tree was pruned, and the levels at which they merge next.
         numbers: (M,) of the families of the nodes of `final`.
         sums: numbers of leaves and of merged nodes under all that is handed on.
-        plan: of the build.
     """
     here = slice(1, final.first_child)
     splats, node, family = final.splats.take(here), final.order[here], numbers[here]

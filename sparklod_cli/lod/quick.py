@@ -35,14 +35,14 @@ from ..support.progress import Progress, silent
 from .check import Bounds, check, check_setting
 from .kernels.pair_cost import WIDTH
 from .kernels.sort import PART_BITS, Keys, Nodes, cell_words, sort_by_cell, sort_by_key
-from .stage_records import NO_FAMILY, STAGE_BITS, Families, Pending, Region, Survey
+from .stage_records import NO_FAMILY, STAGE_BITS, Pending, Region, StageFamilies
 from .voxel_grid import Margins, VoxelGrid
 from .voxel_tree import (
     MERGED,
     Final,
     Joining,
+    NodeRows,
     Offsets,
-    Rows,
     VoxelTree,
     fill_rows,
     joining,
@@ -66,7 +66,6 @@ def build(splats: Splats, base: float = DEFAULT_BASE, *, progress: Progress = si
     Args:
         splats: N splats, finite, with positive opacity and at least one positive scale each.
         base: growth of the cells from level to level, 1.1 to 2.0.
-        progress: called with the number of splats that have joined the tree.
 
     Returns:
         M >= N splats and their tree; merged ones have linear opacities up to 1000.
@@ -101,26 +100,23 @@ class Arrivals:
 
     splats: int
     joining: dict[int, Joining]
-    waiting: dict[int, Rows] = field(default_factory=dict)
+    waiting: dict[int, NodeRows] = field(default_factory=dict)
 
 
 def grow(
     tree: VoxelTree, grid: VoxelGrid, arrivals: Arrivals, margins: Margins | None, progress: Progress
-) -> list[tuple[int, Rows]]:
+) -> list[tuple[int, NodeRows]]:
     """Merge the nodes of each cell, level by level.
 
     Args:
-        tree: without nodes.
-        grid: of the scene.
         arrivals: all nodes that are given; it is emptied.
         margins: of the region that they are in, at level 0; None if they are all that there are, and get one root.
-        progress: told of the splats that have joined.
 
     Returns:
         the nodes without a parent, by the level that they wait for; only the root if there are no margins.
     """
     active, level, joined = np.empty(0, np.uint32), 0, 0
-    left: list[tuple[int, Rows]] = []
+    left: list[tuple[int, NodeRows]] = []
     while True:
         if level in arrivals.waiting:
             active = tree.join(active, arrivals.waiting.pop(level))
@@ -157,14 +153,10 @@ def _by_cell(
         return sort_by_cell(tree.nodes, nodes, grid.parts(level), threads, within=within)
 
 
-def plan(survey: Survey, setting: float) -> VoxelGrid:
-    """Return the grid of the scene; the setting is the base.
-
-    Raises:
-        ValueError: the base is out of its range.
-    """
+def plan(bounds: Bounds, sample: Splats, setting: float) -> VoxelGrid:
+    """Return the grid of the scene; the setting is the base, and `ValueError` is raised if it is out of range."""
     check_setting("base", setting, MIN_BASE, MAX_BASE)
-    return VoxelGrid.of(Bounds(np.array(survey.low), np.array(survey.high), survey.smallest, survey.largest), setting)
+    return VoxelGrid.of(bounds, setting)
 
 
 def leaves(splats: Splats, index: NDArray[np.int64], plan: VoxelGrid) -> Pending:
@@ -178,7 +170,7 @@ def leaves(splats: Splats, index: NDArray[np.int64], plan: VoxelGrid) -> Pending
 
 def advance(
     pending: Pending, region: Region | None, stage: int, plan: VoxelGrid, *, progress: Progress = silent
-) -> tuple[Families, Pending]:
+) -> tuple[StageFamilies, Pending]:
     """Merge the nodes of cells that no unknown node can be in.
 
     Families with the same batch and key come from one stage: a stable sort keeps them as they are.
@@ -191,7 +183,7 @@ def advance(
         tree = VoxelTree(len(pick), leaves, plan.space, partial(_keys, plan))
         margins = Margins(plan, region.low, region.high) if region else None
         left = grow(tree, plan, arrivals, margins, progress)
-        tops = Rows.concat([rows for _, rows in left])
+        tops = NodeRows.concat([rows for _, rows in left])
         final = tree.finish(tops, pick, Splats(**{name: given[name] for name in COLUMNS}))
     waits = np.repeat(np.array([level for level, _ in left], np.int32), [len(rows) for _, rows in left])
     was_given = tops.count == 0
@@ -236,7 +228,7 @@ def _arrivals(given: Mapping[str, NDArray[Any]], grid: VoxelGrid, threads: int) 
     place = old
     old = np.concatenate([old[~is_merged], old[is_merged]])
     numbers = np.arange(len(new), len(new) + len(old), dtype=np.uint32)
-    survivors = Rows(given["rows"][old], numbers, np.zeros(len(old), np.uint16))
+    survivors = NodeRows(given["rows"][old], numbers, np.zeros(len(old), np.uint16))
     number = np.empty(len(old), np.uint32)  # among the survivors, of each in the order of the stages
     number[np.searchsorted(place, old)] = np.arange(len(old), dtype=np.uint32)
     levels = given["level"][place]
@@ -258,12 +250,12 @@ def _keys(grid: VoxelGrid, level: int, rows: FloatArray) -> Keys:
     return np.stack(words[::-1], axis=1)
 
 
-def _families(tree: VoxelTree, final: Final, family: NDArray[np.int64], tops: int, words: int) -> Families:
+def _families(tree: VoxelTree, final: Final, family: NDArray[np.int64], tops: int, words: int) -> StageFamilies:
     """Return the families of a stage, from its nodes and their families; the first are without a parent."""
     batches = tree.batches[::-1]
     number = np.array([LEVELS - batch.level for batch in batches], np.int32)  # coarse levels first
     parents = final.nodes.take(final.parents)
-    return Families(
+    return StageFamilies(
         batch=np.repeat(number, [batch.families for batch in batches]),
         key=np.concatenate([*(batch.keys for batch in batches), np.empty((0, words), np.uint64)]),
         count=final.tree.child_count[final.parents],

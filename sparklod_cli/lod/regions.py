@@ -97,11 +97,7 @@ def united(boxes: FloatArray, number: NDArray[np.int64], count: int) -> Boxes:
 
 
 def middle_of(splats: Splats) -> NDArray[np.float64]:
-    """Return the (3,) median of the centres along each axis, which few splats far outside do not move.
-
-    Args:
-        splats: at least one; all count the same.
-    """
+    """Return the (3,) median of one or more centres along each axis, which few splats far outside do not move."""
     return np.asarray(np.median(splats.center.astype(np.float64), axis=0))
 
 

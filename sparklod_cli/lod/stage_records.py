@@ -9,13 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..model.splats import COLUMNS, FloatArray, Splats
 from ..support.progress import Progress
+
+if TYPE_CHECKING:
+    from .check import Bounds
 
 #: Number of the family of a leaf, which has no children.
 NO_FAMILY = -1
@@ -34,27 +37,6 @@ class Region:
 
     low: tuple[float, float, float]
     high: tuple[float, float, float]
-
-
-@dataclass(frozen=True, eq=False)
-class Survey:
-    """Facts about the whole scene that stages need before any of it is built.
-
-    Attributes:
-        count: N splats that are kept.
-        sh_degree: of them.
-        low, high: corners of the box of their centres, world units.
-        smallest, largest: range of their sizes, 2 * max(scale), world units.
-        sample: an even sample of them, in their order.
-    """
-
-    count: int
-    sh_degree: int
-    low: tuple[float, float, float]
-    high: tuple[float, float, float]
-    smallest: float
-    largest: float
-    sample: Splats
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +73,7 @@ class Pending:
 
 
 @dataclass(frozen=True, eq=False)
-class Families:
+class StageFamilies:
     """The children that a stage gave to F nodes, in the order of the tree.
 
     In the tree the root comes first, then all families of all stages by batch and then by key: that of a node comes
@@ -125,11 +107,12 @@ class StagedBuilder(Protocol):
     `plan` is a value of plain numbers and small arrays, the same for all stages, which can be pickled.
     """
 
-    def plan(self, survey: Survey, setting: float) -> Any:
+    def plan(self, bounds: Bounds, sample: Splats, setting: float) -> Any:
         """Return what all stages share.
 
         Args:
-            survey: of the whole scene.
+            bounds: of the whole scene.
+            sample: an even sample of its splats, in their order.
             setting: of the builder, base or growth.
 
         Raises:
@@ -142,18 +125,15 @@ class StagedBuilder(Protocol):
         Args:
             splats: n splats, valid and visible.
             index: (n,) ascending place of each among all splats of the scene.
-            plan: of `plan`.
         """
 
     def advance(
         self, pending: Pending, region: Region | None, stage: int, plan: Any, *, progress: Progress
-    ) -> tuple[Families, Pending]:
+    ) -> tuple[StageFamilies, Pending]:
         """Give nodes parents as far as the rest of the scene cannot matter.
 
         Args:
             pending: all nodes without a parent whose centres lie in the region, from blocks in ascending order.
             region: of the scene; None for all of it, after which one node is left, the root.
             stage: number of the stage, which is part of the numbers of its families.
-            plan: of `plan`.
-            progress: told of the splats or nodes.
         """

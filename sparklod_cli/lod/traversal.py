@@ -54,7 +54,7 @@ class TreeInstance:
 
 
 @dataclass(frozen=True)
-class View:
+class CutView:
     """A camera for the traversal.
 
     Attributes:
@@ -171,7 +171,6 @@ class Traversal:
     """Finds cuts. Each thread has its own buffers, which are reused from one cut to the next.
 
     Args:
-        forest: the trees.
         instances: instances of them, at most 65,535.
     """
 
@@ -182,12 +181,11 @@ class Traversal:
         self._most = sum(int(sizes[instance.tree]) for instance in self.instances)
 
     def cut(
-        self, view: View, *, budget: int, smallest: float = 0.0, resident: NDArray[np.bool_] | None = None
+        self, view: CutView, *, budget: int, smallest: float = 0.0, resident: NDArray[np.bool_] | None = None
     ) -> TreeCut:
         """Return the cut that a viewer draws.
 
         Args:
-            view: the camera.
             budget: maximum number of splats, all instances together; at least one per instance.
             smallest: nodes of this pixel scale or less are not refined; see `settings.pixel_limit`.
             resident: (chunks,) bool, of all trees; all chunks are resident unless given.
@@ -202,7 +200,7 @@ class Traversal:
             if not self.forest.read_some(cut.wanted, present):
                 return cut
 
-    def _cut(self, view: View, budget: int, smallest: float, present: NDArray[np.bool_]) -> TreeCut:
+    def _cut(self, view: CutView, budget: int, smallest: float, present: NDArray[np.bool_]) -> TreeCut:
         """Return the cut with these chunks, which are in memory."""
         start = time.perf_counter()
         views = views_of(self.forest, self.instances, view)
@@ -264,7 +262,7 @@ def _node_at(slots: cut_arrays.Slots, at: int) -> tuple[float, int, int]:
     return float(slots.limit.view(np.float32)[at]), int(slots.instance[at]), int(slots.node[at])
 
 
-def views_of(forest: Forest, instances: Sequence[TreeInstance], view: View) -> NDArray[np.void]:
+def views_of(forest: Forest, instances: Sequence[TreeInstance], view: CutView) -> NDArray[np.void]:
     """Return (instances,) `pixel_scale.VIEW`: the camera in the space of each instance, in Spark's precision."""
     views = np.zeros(len(instances), pixel_scale.VIEW)
     for row, instance in zip(views, instances, strict=True):

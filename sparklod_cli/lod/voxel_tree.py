@@ -38,7 +38,7 @@ FillRows = Callable[[Nodes, FloatArray], None]
 
 
 @dataclass(frozen=True, eq=False)
-class Rows:
+class NodeRows:
     """Columns of n nodes without a parent.
 
     Attributes:
@@ -56,19 +56,19 @@ class Rows:
         return len(self.number)
 
     @classmethod
-    def empty(cls, size: int) -> Rows:
+    def empty(cls, size: int) -> NodeRows:
         """Room for nodes."""
         node = np.empty((size, WIDTH), np.float32)
         return cls(node, np.empty(size, np.uint32), np.empty(size, np.uint16))
 
     @classmethod
-    def concat(cls, parts: list[Rows]) -> Rows:
+    def concat(cls, parts: list[NodeRows]) -> NodeRows:
         """Return all parts in order."""
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__dataclass_fields__))
 
-    def take(self, nodes: Nodes | slice) -> Rows:
+    def take(self, nodes: Nodes | slice) -> NodeRows:
         """Return some of the nodes."""
-        return Rows(self.node[nodes], self.number[nodes], self.count[nodes])
+        return NodeRows(self.node[nodes], self.number[nodes], self.count[nodes])
 
     def shrink(self, size: int) -> None:
         """Give memory back but for the first rows. Nobody may have a view of them."""
@@ -76,7 +76,7 @@ class Rows:
             column = getattr(self, name)
             column.resize((size, *column.shape[1:]), refcheck=False)
 
-    def put(self, into: Rows, start: int) -> None:
+    def put(self, into: NodeRows, start: int) -> None:
         """Write these rows over others, from `start` on."""
         part = slice(start, start + len(self))
         into.node[part], into.number[part], into.count[part] = self.node, self.number, self.count
@@ -89,7 +89,6 @@ class Joining:
     Attributes:
         index: (n,) uint32 the splat of each node.
         number: of the first node; the others follow.
-        fill: fills the node rows of splats.
     """
 
     index: Nodes
@@ -99,16 +98,16 @@ class Joining:
     def __len__(self) -> int:
         return len(self.index)
 
-    def put(self, into: Rows, start: int) -> None:
+    def put(self, into: NodeRows, start: int) -> None:
         """Write their rows over others, from `start` on."""
         part = slice(start, start + len(self))
         self.fill(self.index, into.node[part])
         into.number[part] = np.arange(self.number, self.number + len(self), dtype=np.uint32)
         into.count[part] = 0
 
-    def rows(self) -> Rows:
+    def rows(self) -> NodeRows:
         """Return their rows."""
-        rows = Rows.empty(len(self))
+        rows = NodeRows.empty(len(self))
         self.put(rows, 0)
         return rows
 
@@ -146,15 +145,13 @@ class VoxelTree:
 
         Args:
             given: number of nodes that will be given.
-            leaves: see above.
-            space: coordinates of node rows.
             keys: returns the keys of a batch, by the level and the rows of the nodes made; None if nobody wants them.
         """
         self.leaves, self.batches, self.total, self._space, self._keys = leaves, list[Batch](), 0, space, keys
         # Twice the nodes are the most that there will be; memory that is not written to is not taken. So much room is
         # enough for the rows, too: half of them for what the others are merged into.
         size = 2 * given
-        self._rows, self._used, self._awaited = Rows.empty(size), 0, given
+        self._rows, self._used, self._awaited = NodeRows.empty(size), 0, given
         self._center, self._scale = np.empty((size, 3), np.float32), np.empty((size, 3), np.float32)
         self._quat, self._opacity = np.empty((size, 4), np.float32), np.empty(size, np.float32)
         self._weight, self._number = np.empty(size, np.float64), np.empty(size, np.uint32)
@@ -165,11 +162,11 @@ class VoxelTree:
         """Rows of the nodes without a parent."""
         return self._rows.node
 
-    def take(self, nodes: Nodes) -> Rows:
+    def take(self, nodes: Nodes) -> NodeRows:
         """Return copies of some of them."""
         return self._rows.take(nodes)
 
-    def join(self, active: Nodes, rows: Rows | Joining) -> Nodes:
+    def join(self, active: Nodes, rows: NodeRows | Joining) -> Nodes:
         """Add nodes; returns where the active ones and they are. Others may be forgotten."""
         active = self.tidy(active, len(rows))
         rows.put(self._rows, self._used)
@@ -229,7 +226,7 @@ class VoxelTree:
         fill_merged_splats(at, 1, nodes, rows.node, self._space, *columns)
         self.total += count
 
-    def finish(self, tops: Rows, index: Nodes, given: Splats) -> Final:
+    def finish(self, tops: NodeRows, index: Nodes, given: Splats) -> Final:
         """Return the nodes as they are drawn: those without a parent, then children of the batches, the last first.
 
         Colours are merged here, where those of siblings are adjacent. The tree is of no use afterwards.
@@ -241,7 +238,7 @@ class VoxelTree:
         """
         self._rows = tops
         self.write(np.arange(len(tops), dtype=np.uint32))
-        self._rows = Rows.empty(0)
+        self._rows = NodeRows.empty(0)
         total, part = self.total, slice(len(self._weight) - self.total, None)
         weight, number, count = self._weight[part], self._number[part], self._count[part]
         inner = np.flatnonzero(count).astype(np.uint32)
@@ -294,8 +291,6 @@ def sorted_leaves(
 
     Args:
         center, scale: (n, 3) of the splats.
-        grid: of the scene.
-        threads: to work on.
         order: (n,) the splats in the order of the scene; by default they are in it.
     """
     keys, levels, bits = grid.leaf_keys(center, scale)
@@ -314,7 +309,6 @@ def joining(index: Nodes, ends: Offsets, fill: FillRows) -> dict[int, Joining]:
     Args:
         index: (n,) the splat of each node; nodes are numbered in this order.
         ends: where each level ends.
-        fill: fills the node rows of splats.
     """
     found, begin = {}, 0
     for level, end in enumerate(ends.tolist()):

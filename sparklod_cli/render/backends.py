@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, Protocol, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from ..support.errors import SparklodError
 
@@ -19,19 +19,6 @@ class BackendError(SparklodError):
     """A backend cannot draw here; its text says what is missing and which package brings it."""
 
 
-class Draw(Protocol):
-    """Drawing function of a backend.
-
-    Returns:
-        (height, width, 4) float32: red, green and blue, multiplied by alpha, and alpha, all 0..1.
-
-    Raises:
-        BackendError: it cannot draw here.
-    """
-
-    def __call__(self, splats: ShadedSplats, camera: Camera, settings: RasterSettings, **options: Any) -> Image: ...
-
-
 @dataclass(frozen=True)
 class Backend:
     """One way to draw; its module has a function `draw`."""
@@ -40,8 +27,16 @@ class Backend:
     module: str
 
     def draw(self, splats: ShadedSplats, camera: Camera, settings: RasterSettings, **options: Any) -> Image:
-        """Draw splats; see `Draw`. Options are those of the module's function."""
-        return cast(Draw, import_module(self.module, __package__).draw)(splats, camera, settings, **options)
+        """Draw splats; options are those of the module's function.
+
+        Returns:
+            (height, width, 4) float32: red, green and blue, multiplied by alpha, and alpha, all 0..1.
+
+        Raises:
+            BackendError: it cannot draw here.
+        """
+        module = import_module(self.module, __package__)
+        return cast("Image", module.draw(splats, camera, settings, **options))
 
 
 #: By name; the first is the default.

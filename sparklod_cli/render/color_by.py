@@ -86,9 +86,6 @@ def scale_of_splats(by: str, source: CutSource, cameras: Sequence[Camera], progr
 
     Args:
         by: "level", "lod-opacity", "size" or "chunk".
-        source: of the splats.
-        cameras: that see them.
-        progress: called with the number of cuts that were examined.
 
     Raises:
         SparklodError: by level, where no file has any.

@@ -45,15 +45,13 @@ class Drawing:
     Attributes:
         image: (height, width, 4) float32, as `rasterizer.draw` gives it.
         splats, camera, settings: what it was drawn of. The arrays of `splats` must not have changed before `gradients`.
-        seen: the splats on the screen.
-        tiles: of the picture.
     """
 
     image: Image
     splats: ShadedSplats
     camera: Camera
     settings: RasterSettings
-    seen: Projected
+    projected: Projected
     tiles: Tiles
 
     def gradients(self, by_image: Image) -> SplatGradients:
@@ -67,7 +65,7 @@ class Drawing:
                 multiplied by alpha, and by alpha.
         """
         across, _ = rasterizer.tiles_across(self.camera)
-        screen, boxes = self.seen.screen, self.seen.boxes
+        screen, boxes = self.projected.screen, self.projected.boxes
         first = backward.first_rows(boxes)
         sums = np.empty((first[-1], backward.SUMS), np.float32)
         drawn = backward.Drawn(screen, boxes, self.tiles.start, self.tiles.splats, self.tiles.stop, across)

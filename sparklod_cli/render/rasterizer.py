@@ -80,11 +80,7 @@ def draw_projected(seen: Projected, camera: Camera, settings: RasterSettings) ->
 
 
 def tiles_across(camera: Camera) -> tuple[int, int]:
-    """Return numbers of tiles across and down the picture of a camera.
-
-    Raises:
-        ValueError: the picture is larger than `MAX_SIDE`.
-    """
+    """Return the numbers of tiles across and down a picture; raise `ValueError` above `MAX_SIDE` pixels."""
     if max(camera.width, camera.height) > MAX_SIDE:
         raise ValueError(f"a picture of {camera.width} x {camera.height} pixels; at most {MAX_SIDE:,} along a side")
     return -(-camera.width // project.TILE), -(-camera.height // project.TILE)

@@ -25,7 +25,7 @@ _KERNELS = threading.Lock()
 
 
 @dataclass(frozen=True)
-class Drawn:
+class DrawnPicture:
     """A picture.
 
     Attributes:
@@ -43,10 +43,7 @@ class Renderer:
     """Draws pictures with the same settings; several threads may ask it.
 
     Args:
-        source: what is drawn.
-        settings: how.
         cameras: that will be drawn; a color scale is the same in the pictures of all of them.
-        progress: called with the number of cameras that were examined for that.
 
     Attributes:
         scale: the color scale; None where splats have their own colours.
@@ -72,20 +69,16 @@ class Renderer:
             return color_by.scale_of_overdraw([self._overdraw(self.source.cut(at), at) for at in some.values()])
         return color_by.scale_of_splats(by, self.source, cameras, progress)
 
-    def draw(self, camera: Camera) -> Drawn:
-        """Draw the picture of a camera.
-
-        Raises:
-            BackendError: the backend cannot draw here.
-        """
+    def draw(self, camera: Camera) -> DrawnPicture:
+        """Draw the picture of a camera; raise `BackendError` if the backend cannot draw here."""
         cut = self.source.cut(camera)
         by = self.settings.color_by
         if by == "overdraw":
             values = self._overdraw(cut, camera)
-            return Drawn(self._colored(values, (values > 0).astype(np.float32)), values, len(cut))
+            return DrawnPicture(self._colored(values, (values > 0).astype(np.float32)), values, len(cut))
         if by == "depth":
             values, alpha = self._depth(cut, camera)
-            return Drawn(self._colored(values, alpha), values, len(cut))
+            return DrawnPicture(self._colored(values, alpha), values, len(cut))
         fine = finer(camera, self.settings.supersample)
         with _KERNELS:
             shaded = self._shaded(cut, fine)
@@ -93,7 +86,7 @@ class Renderer:
                 rgb = [self.scale.rgb(color_by.values_of(by, part)) for part in cut.parts]
                 shaded = dataclasses.replace(shaded, rgb=np.concatenate(rgb))
             image = self._image(shaded, fine)
-        return Drawn(averaged(image, self.settings.supersample), None, len(cut))
+        return DrawnPicture(averaged(image, self.settings.supersample), None, len(cut))
 
     def _shaded(self, cut: Cut, camera: Camera) -> ShadedSplats:
         """Shade splats, without SH where colours are not their own."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,24 +22,6 @@ from .shading import ShadedSplats
 BILLBOARD_ALPHA = 0.5
 
 
-@dataclass(frozen=True)
-class OnScreen:
-    """Splats whose centres a camera sees; M of them.
-
-    Attributes:
-        index: (M,) which of those that are shaded.
-        x, y: (M,) float32 pixels from the upper left corner.
-        depth: (M,) float32 along the axis.
-        distance: (M,) float32 from the camera.
-    """
-
-    index: NDArray[np.intp]
-    x: NDArray[np.float32]
-    y: NDArray[np.float32]
-    depth: NDArray[np.float32]
-    distance: NDArray[np.float32]
-
-
 def draw(
     style: str,
     backend: str,
@@ -55,11 +36,6 @@ def draw(
         style: one of `settings.STYLES`. "points" are opaque, a pixel each, "billboards" discs of one opacity, as wide
             as the splats; both are drawn in the order of the file. "sorted-billboards" are drawn from far to near, as
             "splats" are.
-        backend: one of `BACKENDS`, which draws splats.
-        splats: what is drawn.
-        camera: that sees it.
-        settings: how splats become pixels.
-        options: of the backend.
 
     Raises:
         BackendError: the backend cannot draw here.
@@ -68,24 +44,24 @@ def draw(
         return np.zeros((camera.height, camera.width, 4), np.float32)
     if style == "splats":
         return BACKENDS[backend].draw(splats, camera, settings, **(options or {}))
-    seen = on_screen(splats, camera, settings)
+    index, x, y, depth, distance = on_screen(splats, camera, settings)
     image: Image = np.zeros((camera.height, camera.width, 4), np.float32)
     if style == "points":
-        inside = (seen.x >= 0) & (seen.x < camera.width) & (seen.y >= 0) & (seen.y < camera.height)
-        row, column = seen.y[inside].astype(np.intp), seen.x[inside].astype(np.intp)
-        image[row, column, :3] = np.minimum(splats.rgb[seen.index[inside]], 1)  # of several, the last one stays
+        inside = (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+        row, column = y[inside].astype(np.intp), x[inside].astype(np.intp)
+        image[row, column, :3] = np.minimum(splats.rgb[index[inside]], 1)  # of several, the last one stays
         image[row, column, 3] = 1
         return image
-    order = np.arange(len(seen.index))
+    order = np.arange(len(index))
     if style == "sorted-billboards":
-        order = np.argsort(-(seen.distance if settings.sort == "radial" else seen.depth), kind="stable")
-    index, depth = seen.index[order], seen.depth[order]
+        order = np.argsort(-(distance if settings.sort == "radial" else depth), kind="stable")
+    index, depth = index[order], depth[order]
     width = splats.scale[index].mean(axis=1) * size_factor(splats.lod_opacity[index])
     radius = np.clip(width * np.float32(camera.focal[1]) / depth, 0.5, settings.max_radius)
     rgb = np.minimum(splats.rgb[index], 1)
     bands.draw_discs(
-        np.ascontiguousarray(seen.x[order]),
-        np.ascontiguousarray(seen.y[order]),
+        np.ascontiguousarray(x[order]),
+        np.ascontiguousarray(y[order]),
         radius.astype(np.float32),
         rgb,
         np.float32(BILLBOARD_ALPHA),
@@ -94,8 +70,12 @@ def draw(
     return image
 
 
-def on_screen(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> OnScreen:
-    """Return the splats between near and far whose centres are inside the picture, or within `CLIP` of it."""
+def on_screen(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> tuple[NDArray[Any], ...]:
+    """Return the splats between near and far whose centres are inside the picture, or within `CLIP` of it.
+
+    Returns:
+        (M,) indices; (M,) float32 x and y in pixels from the upper left corner, depths along the axis, and distances.
+    """
     local = (splats.center - camera.position.astype(np.float32)) @ camera.camera_to_world[:3, :3].astype(np.float32)
     depth = -local[:, 2]
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -103,7 +83,7 @@ def on_screen(splats: ShadedSplats, camera: Camera, settings: RasterSettings) ->
         seen = (depth > settings.near) & (depth < settings.far) & (splats.lod_opacity >= MIN_ALPHA)
         seen &= (abs(dx) <= CLIP * camera.width / 2) & (abs(dy) <= CLIP * camera.height / 2)
     index = np.flatnonzero(seen)
-    return OnScreen(
+    return (
         index,
         (dx[index] + camera.principal[0]).astype(np.float32),
         (dy[index] + camera.principal[1]).astype(np.float32),

@@ -10,7 +10,7 @@ from ..cameras.camera import Camera
 from ..lod.continuous import ContinuousCuts
 from ..lod.detail_traversal import DetailTraversal
 from ..lod.settings import LodSettings
-from ..lod.traversal import Traversal, View
+from ..lod.traversal import CutView, Traversal
 from .loaded import Cut, Part, Scenes
 
 
@@ -94,6 +94,6 @@ class CutFinder:
         )
 
 
-def view_of(camera: Camera) -> View:
+def view_of(camera: Camera) -> CutView:
     """Return a camera as the traversal sees it."""
-    return View(camera.camera_to_world, camera.fov_x, camera.fov_y)
+    return CutView(camera.camera_to_world, camera.fov_x, camera.fov_y)

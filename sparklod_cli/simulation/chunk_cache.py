@@ -24,7 +24,6 @@ def header_answers(header_bytes: int, file_bytes: int) -> tuple[int, ...]:
 
     Args:
         header_bytes: of the header; 0 where the format has none that a viewer would need.
-        file_bytes: of the file that it is in.
     """
     answers: list[int] = []
     for request in HEADER_REQUESTS:
@@ -44,13 +43,11 @@ class Chunks:
             for a chunk, see `header_answers`; none unless given.
         rooted: whether trees are drawn from their first chunks on, which hold their roots; chunk files of Streamed SOG
             are drawn each for itself.
-        fetchers: how many a viewer fetches at a time unless told otherwise.
 
     Attributes:
         sizes: of each chunk, bytes.
         firsts: the first chunk of each tree.
         roots: the chunks that are always wanted: the first of each tree if `rooted`.
-        headers: for each tree.
 
     Raises:
         ValueError: a tree has no chunks, or a size is negative; or there are not as many headers as trees.
@@ -103,7 +100,6 @@ class ChunkCache:
 
     Args:
         chunks: the chunks of all trees. Chunks with roots are always wanted, and come first.
-        capacity: maximum number of chunks; None for all.
 
     Attributes:
         wanted: the wanted chunks, each once, the most important first.

@@ -21,17 +21,16 @@ from ..support.progress import Progress, silent
 from ..tables.columns import Row
 from .columns import COLUMNS, OF_TREES
 from .loading import Viewer
-from .streaming import Stream
+from .streaming import ChunkStream
 from .streaming_settings import StreamingSettings
 
 
 @dataclass(frozen=True)
-class Frame:
+class SimulatedFrame:
     """One frame.
 
     Attributes:
         number: number of the frame on the path.
-        camera: its camera.
         cut: the cut that is drawn.
         resident: (chunks,) bool, of all trees, the chunks that it was found with.
         rows: the row of all instances together, then one per instance, if requested.
@@ -56,12 +55,7 @@ class _MeasuredCut:
 
 
 class Simulation(Viewer):
-    """A viewer that moves along a camera path through scenes that all have cuts.
-
-    Args:
-        scenes, settings, streaming: as of `Viewer`.
-        by_instance: make a row per instance, too.
-    """
+    """A viewer that moves along a camera path through scenes that all have cuts."""
 
     def __init__(
         self,
@@ -75,7 +69,7 @@ class Simulation(Viewer):
         self._by_instance, self._depth = by_instance, scenes.depth
         self._names = [instance.name for instance in scenes.instances]
 
-    def run(self, path: CameraPath, *, threads: int = 1, progress: Progress = silent) -> Iterator[Frame]:
+    def run(self, path: CameraPath, *, threads: int = 1, progress: Progress = silent) -> Iterator[SimulatedFrame]:
         """Yield the frames of a path, in order.
 
         Cuts are found on several threads, some frames ahead; anything that depends on the previous frame is done in
@@ -95,7 +89,7 @@ class Simulation(Viewer):
             in_front = 1 - whole.behind / whole.selected if whole.selected else 1.0
             if self.scenes.details:
                 rows = [row | dict.fromkeys(OF_TREES) for row in rows]
-            yield Frame(number, camera, drawn.cut, resident, [_rounded(row) for row in rows], in_front)
+            yield SimulatedFrame(number, camera, drawn.cut, resident, [_rounded(row) for row in rows], in_front)
             progress("traverse", at + 1, len(path.cameras), "frame")
 
     def _find(self, camera: Camera, resident: NDArray[np.bool_] | None = None) -> _MeasuredCut:
@@ -104,7 +98,7 @@ class Simulation(Viewer):
         return _MeasuredCut(cut, *measure(forest, self._depth, cut, view, size=size, by_instance=self._by_instance))
 
     def _fetched(
-        self, camera: Camera, ideal: _MeasuredCut, stream: Stream
+        self, camera: Camera, ideal: _MeasuredCut, stream: ChunkStream
     ) -> tuple[_MeasuredCut, NDArray[np.bool_], Row]:
         """Return the cut with the resident chunks, these chunks, and the cells of the row that describe chunks."""
         wanted = ideal.cut.chunks()

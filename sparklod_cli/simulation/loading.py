@@ -17,7 +17,7 @@ from ..scenes.loaded import Cut, Scenes
 from ..tables.columns import Row
 from .chunk_cache import Chunks, header_answers
 from .columns import LOADING
-from .streaming import Stream
+from .streaming import ChunkStream
 from .streaming_settings import StreamingSettings
 
 #: The share of a cut that makes a picture almost what it will be; chosen.
@@ -68,9 +68,9 @@ class Viewer:
         self._chunks = chunks_of(scenes)
         self._stream()  # raises what would fail later
 
-    def _stream(self, start: float = 0.0) -> Stream:
+    def _stream(self, start: float = 0.0) -> ChunkStream:
         """Return a stream that starts at a time in seconds."""
-        return Stream(self._chunks, self._streaming.network, capacity=self._streaming.chunk_cache, start=start)
+        return ChunkStream(self._chunks, self._streaming.network, capacity=self._streaming.chunk_cache, start=start)
 
     def _cut(self, camera: Camera, resident: NDArray[np.bool_] | None = None) -> TreeCut:
         """Return the cut with the resident chunks, all unless given."""
@@ -135,7 +135,6 @@ class LoadingCuts(Loader):
     """Cuts of visitors some time after they opened the page, one visitor for each camera; a `CutSource`.
 
     Args:
-        scenes, settings, streaming: as of `Loader`.
         seconds: since then.
 
     Raises:

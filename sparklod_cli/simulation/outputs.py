@@ -18,7 +18,7 @@ from .summary import Lookout
 if TYPE_CHECKING:
     from ..cameras.path import CameraPath
     from ..tables.columns import Row
-    from .frames import Frame, Simulation
+    from .frames import SimulatedFrame, Simulation
 
 #: Nodes per row of Spark's index texture.
 ROW = 16_384
@@ -29,11 +29,9 @@ class FrameOutputs:
     """Destinations of the frames of a simulation.
 
     Attributes:
-        table: the table of the rows.
         indices: folder for the node indices of each cut; None for none.
         padded: pad the index files to whole rows of `ROW`.
         plot: file of the charts; None for none.
-        overwrite: replace existing files.
     """
 
     table: TableOutput
@@ -82,15 +80,15 @@ class _ChartData:
     rows: list[Row] = field(default_factory=list)
     in_front: list[float] = field(default_factory=list)
     lookout: Lookout = field(default_factory=Lookout)
-    frames: dict[str, Frame] = field(default_factory=dict)
+    frames: dict[str, SimulatedFrame] = field(default_factory=dict)
 
-    def add(self, frame: Frame) -> None:
+    def add(self, frame: SimulatedFrame) -> None:
         """Store a frame if it exceeds all earlier frames in one of the criteria."""
         for what in self.lookout.add(frame.rows[0]):
             self.frames[what] = frame
         self.frames.setdefault("first", frame)
 
-    def best(self) -> Frame:
+    def best(self) -> SimulatedFrame:
         """Return the first extreme frame that draws anything, as none does before the first chunk has arrived."""
         extremes = [self.frames[what] for what in (*(moment.what for moment in self.lookout.moments()), "first")]
         return next((each for each in extremes if len(each.cut)), extremes[0])
@@ -108,11 +106,6 @@ def write_frames(
     """Simulate a camera path and writes the outputs: table and index files frame by frame, then the charts.
 
     Args:
-        simulation: the simulation.
-        path: the camera path.
-        outputs: destinations.
-        threads: number of threads that find cuts.
-        progress: called with the number of finished frames.
         passed: a filter for the bytes of a table on standard output.
 
     Raises:
@@ -141,7 +134,7 @@ def index_files(folder: Path, frame: int, instances: int) -> list[Path]:
     return [folder / f"{frame:06d}.{instance}.npy" for instance in range(instances)]
 
 
-def _write_indices(frame: Frame, outputs: FrameOutputs) -> None:
+def _write_indices(frame: SimulatedFrame, outputs: FrameOutputs) -> None:
     if outputs.indices is None:
         return
     parts = frame.cut.indices()

@@ -12,7 +12,7 @@ from .chunk_cache import ChunkCache, Chunks
 from .streaming_settings import Network
 
 
-class Stream:
+class ChunkStream:
     """Fetches the chunks that a viewer wants and keeps them in a cache.
 
     For each frame: `advance` to its time, `want` the chunks that its cut reads, and `take_arrivals` for the new ones;
@@ -28,13 +28,9 @@ class Stream:
     The state changes at events only, so the result does not depend on the steps in which time advances.
 
     Args:
-        chunks: the chunks of all trees.
         network: the network; everything arrives at once unless given.
-        capacity: maximum number of chunks in the cache; None for all.
-        start: the time at the start, seconds.
 
     Attributes:
-        cache: the resident chunks.
         now: the current time, seconds.
         received: bytes that have arrived since the start, of headers too.
 
@@ -68,11 +64,7 @@ class Stream:
         self._arrived: list[int] = []
 
     def advance(self, to_time: float) -> None:
-        """Process all events up to and including a time in seconds.
-
-        Raises:
-            ValueError: the time is in the past, or not finite.
-        """
+        """Process all events up to a time in seconds; raise `ValueError` if it is in the past, or not finite."""
         if not self.now <= to_time < math.inf:
             raise ValueError(f"time went from {self.now:g} s to {to_time:g} s; it must increase and be finite")
         while self._step(to_time):
@@ -80,11 +72,7 @@ class Stream:
         self.now = to_time
 
     def want(self, wanted: Iterable[int]) -> None:
-        """Replace the list of wanted chunks, the most important first, see `ChunkCache.want`.
-
-        Raises:
-            ValueError: there is no such chunk.
-        """
+        """Replace the list of wanted chunks, the most important first, and raise `ValueError`, as `ChunkCache.want`."""
         self.cache.want(wanted)
         self._next = 0
         self._request(self.now)
@@ -124,7 +112,7 @@ class Stream:
             missing.difference_update(future.take_arrivals())
         return future._since - self.now
 
-    def _copy(self) -> Stream:
+    def _copy(self) -> ChunkStream:
         twin = copy.copy(self)
         twin.cache = self.cache.copy()
         twin._under_way, twin._requested = self._under_way.copy(), self._requested.copy()

@@ -26,7 +26,7 @@ STATISTICS = ("min", "p50", "p95", "max")
 
 
 @dataclass(frozen=True)
-class Quantity:
+class FrameStatistics:
     """Statistics over the frames.
 
     Attributes:
@@ -88,7 +88,7 @@ class Summary:
     chunks_first: int
     bytes_first: int
     stop_reasons: dict[str, float]
-    quantities: tuple[Quantity, ...]
+    quantities: tuple[FrameStatistics, ...]
     moments: tuple[Moment, ...]
     loading: Row | None = None
 
@@ -106,6 +106,9 @@ def summarize(rows: Iterable[Row], loading: Row | None = None) -> Summary:
     times = numbers(frames, "time_s")
     reasons = Counter(str(row["stop_reason"]) for row in frames if row["stop_reason"] is not None)
     chunks, size = numbers(frames, "chunks_new"), numbers(frames, "bytes_new")
+    lookout = Lookout()
+    for row in frames:
+        lookout.add(row)
     return Summary(
         frames=len(frames),
         seconds=round(times[-1] - times[0], 6) if times else 0.0,
@@ -115,19 +118,19 @@ def summarize(rows: Iterable[Row], loading: Row | None = None) -> Summary:
         bytes_first=int(sum(numbers(frames[:1], "bytes_new"))),
         stop_reasons={reason: round(count / reasons.total(), 6) for reason, count in reasons.most_common()},
         quantities=tuple(quantity for name in QUANTITIES if (quantity := _quantity(name, frames)) is not None),
-        moments=tuple(look_at(frames)),
+        moments=tuple(lookout.moments()),
         loading=loading,
     )
 
 
-def _quantity(name: str, frames: Sequence[Row]) -> Quantity | None:
+def _quantity(name: str, frames: Sequence[Row]) -> FrameStatistics | None:
     values = [share for row in frames if (share := _share(row)) is not None]
     if name != IN_FRUSTUM:
         values = numbers(frames, name)
     if not values:
         return None
     found = {each: _rounded(statistic(each, values)) for each in STATISTICS}
-    return Quantity(name, UNITS.get(name, "share"), len(values), **found)
+    return FrameStatistics(name, UNITS.get(name, "share"), len(values), **found)
 
 
 def _share(row: Row) -> Number | None:
@@ -192,11 +195,3 @@ class Lookout:
                 time = cast("float | None", row["time_s"])
                 moments.append(Moment(what, frame, time, name or None, _rounded(value), unit))
         return moments
-
-
-def look_at(frames: Sequence[Row]) -> list[Moment]:
-    """Return the frames with the largest values of the criteria `MOMENTS`."""
-    lookout = Lookout()
-    for row in frames:
-        lookout.add(row)
-    return lookout.moments()

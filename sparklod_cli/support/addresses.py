@@ -105,13 +105,7 @@ class Address:
     def open(
         self, mode: Literal["rb"] = "rb", buffering: int = READ_AHEAD, *, size: int | None = None
     ) -> io.BufferedReader:
-        """Open the file for reading, wherever in it.
-
-        Args:
-            mode: as of a path.
-            buffering: bytes that are read at once where less is wanted.
-            size: bytes of the file, where that is known.
-        """
+        """Open the file, whose size in bytes may be known, for reading wherever in it."""
         return io.BufferedReader(_Ranged(self, self.size() if size is None else size), buffering)
 
     def read(self, start: int, stop: int) -> bytes:

@@ -104,8 +104,6 @@ def write(target: Path, pieces: Iterable[bytes | memoryview], *, overwrite: bool
 
     Args:
         target: path of the file; a symbolic link would be replaced, not followed.
-        pieces: content of the file, in order.
-        overwrite: replace an existing file.
         sync: wait until it is on the disk. Otherwise it may be damaged after a power failure, though not after a kill.
 
     Raises:

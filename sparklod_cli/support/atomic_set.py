@@ -40,7 +40,6 @@ def write(
     Args:
         folder: of all files.
         files: the name of each, with the folders that it is in there ("0_0/means_l.webp"), and its content in order.
-        overwrite: replace existing files.
         outdated: given the names of the files, those of existing files that are removed where `overwrite` is set.
 
     Raises:

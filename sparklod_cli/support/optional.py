@@ -32,7 +32,6 @@ def optional_import(
     Args:
         purpose: what takes the package, and which one: "charts are drawn by matplotlib".
         extra: the extra that brings it: "render".
-        error: class of the error.
         package: what pip installs, if no extra brings it.
 
     Raises:
@@ -62,11 +61,8 @@ def install_hint(extra: str = "", *options: str) -> str:
 
     Args:
         extra: name of the extra; empty for what sparklod always requires.
-        options: of pip.
     """
     from importlib import metadata  # takes long to load
-
-    from .optional import required_by
 
     checkout = _checkout()
     if checkout is not None:
@@ -101,7 +97,6 @@ class Required:
     """A distribution that another one requires.
 
     Attributes:
-        name: its name for pip.
         least: the minimum version; empty for any.
         version: the installed version; None if it is not installed.
     """
@@ -118,7 +113,7 @@ class Required:
         return self.version is None or bool(self.least and Version(self.version) < Version(self.least))
 
     @property
-    def found(self) -> str:
+    def state(self) -> str:
         """Return the state for display: "2.4.6", "is missing", or "1.20, older than 1.26"."""
         if self.version is None:
             return "is missing"

@@ -65,11 +65,7 @@ def for_blocks(work: Callable[[slice], None], rows: int, threads: int, done: Cal
 
 
 def thread_count(threads: int | None) -> int:
-    """Return the number of threads; None means all processors.
-
-    Raises:
-        ValueError: it is less than 1.
-    """
+    """Return the number of threads, that of all processors for None; raise `ValueError` below 1."""
     if threads is None:
         return processors()
     if threads < 1:
@@ -79,11 +75,7 @@ def thread_count(threads: int | None) -> int:
 
 @contextlib.contextmanager
 def on_threads(threads: int | None) -> Iterator[int]:
-    """Run kernels that this thread calls inside on this many threads; yield the number.
-
-    Raises:
-        ValueError: it is less than 1.
-    """
+    """Run kernels that this thread calls inside on so many threads; yield the number. `ValueError` if it is below 1."""
     from . import jit  # loads numpy
 
     count, before = thread_count(threads), jit.threads_in_use()

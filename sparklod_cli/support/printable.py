@@ -36,7 +36,6 @@ def printable(text: str, most: int | None = None) -> str:
     surrogates. So is the start of a GitHub Actions command. What addresses must not show is hidden, see `redacted`.
 
     Args:
-        text: any text.
         most: maximum length. A longer text loses its middle, since it may begin with a path and end with a reason.
     """
     text = shortened(redacted(text), most)
@@ -84,8 +83,6 @@ def near(name: str, known: Iterable[str], *, cutoff: float = 0.6, folder: Path |
     """Return the end of an error about an unknown name, ", did you mean ...?"; empty if no known name is similar.
 
     Args:
-        name: the unknown name.
-        known: names that exist.
         cutoff: how similar they must be, 0 to 1, as `difflib` measures it.
         folder: of the names, where they are files.
     """

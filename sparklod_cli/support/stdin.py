@@ -19,11 +19,7 @@ def name_of(path: object) -> str:
 
 
 def spooled() -> BinaryIO:
-    """Return standard input as a temporary file, at its beginning, which must not be closed.
-
-    Raises:
-        UnreadableError: standard input is closed, or a terminal.
-    """
+    """Return standard input as a temporary file, not to be closed; `UnreadableError` if it is closed or a terminal."""
     if sys.stdin is None:
         raise UnreadableError("standard input is closed")
     if sys.stdin.isatty():

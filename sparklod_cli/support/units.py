@@ -71,13 +71,7 @@ def parse_count(text: str) -> int:
     Raises:
         ValueError: the text is not a count.
     """
-    from fractions import Fraction  # which takes milliseconds, and every command loads this module
-
-    match = re.fullmatch(COUNT, text.strip())
-    value = Fraction(match["number"]) * PREFIXES[match["prefix"].lower()] if match else Fraction(-1, 2)
-    if value.denominator != 1:
-        raise ValueError(f"{text!r} is not a count: a whole number, such as 500000, 500k or 1.5M")
-    return int(value)
+    return _whole(COUNT, text, "is not a count: a whole number, such as 500000, 500k or 1.5M")
 
 
 def parse_size(text: str) -> int:
@@ -86,10 +80,14 @@ def parse_size(text: str) -> int:
     Raises:
         ValueError: the text is not a size.
     """
-    from fractions import Fraction
+    return _whole(SIZE, text, "is not a size: whole bytes, such as 3000000, 3MB or 3MiB")
 
-    match = re.fullmatch(SIZE, text.strip())
+
+def _whole(pattern: str, text: str, otherwise: str) -> int:
+    from fractions import Fraction  # which takes milliseconds, and every command loads this module
+
+    match = re.fullmatch(pattern, text.strip())
     value = Fraction(match["number"]) * PREFIXES[match["prefix"].lower()] if match else Fraction(-1, 2)
     if value.denominator != 1:
-        raise ValueError(f"{text!r} is not a size: whole bytes, such as 3000000, 3MB or 3MiB")
+        raise ValueError(f"{text!r} {otherwise}")
     return int(value)

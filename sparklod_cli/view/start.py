@@ -13,7 +13,7 @@ import numpy as np
 from ..cameras import framing
 from ..cameras.camera import Camera, Matrix
 from ..cameras.frame import DEFAULT_FOV_Y, Settings
-from ..cameras.sources import Views, WholeScene
+from ..cameras.sources import SingleViews, WholeScene
 from ..codecs.rad.rad_header import RadHeader
 from ..codecs.rad.rad_reader import count_leaves, file_of, read_chunk
 from ..io import examine_scene, read_levels
@@ -163,7 +163,7 @@ def start_of(extents: Sequence[Extent], view: tuple[Point, Point] | None, up: Po
         middle, radius = framing.framing(balls.center)
     except InvalidSplatsError:  # nothing that could be framed
         middle, radius, view = np.zeros(3), 1.0, view or ((0.0, 0.0, 3.0), (0.0, 0.0, 0.0))
-    source = WholeScene(ELEVATION) if view is None else Views((view,))
+    source = WholeScene(ELEVATION) if view is None else SingleViews((view,))
     (camera,) = source.cameras(settings, lambda: balls).cameras
     sizes = min(extent.sizes[0] for extent in extents), max(extent.sizes[1] for extent in extents)
     target = view[1] if view is not None else _ahead(camera, middle)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sparklod_cli.bake.output import Output, output_of
+from sparklod_cli.bake.output import BakeOutput, output_of
 from sparklod_cli.bake.records import BuiltTree, Clock, WrittenTree
 from sparklod_cli.bake.settings import BakeSettings
 from sparklod_cli.codecs import encoder
@@ -40,7 +40,7 @@ def files_of(folder: Path) -> dict[str, bytes]:
     return {each.name: each.read_bytes() for each in folder.iterdir()}
 
 
-def written(output: Output, nodes: Scene | NodeStream, found: Statistics) -> WrittenTree:
+def written(output: BakeOutput, nodes: Scene | NodeStream, found: Statistics) -> WrittenTree:
     """Writes a tree window by window."""
 
     def encode(tree: BuiltTree, made: encoder.Encoder) -> encoder.Get:

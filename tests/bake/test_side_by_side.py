@@ -30,7 +30,9 @@ class Engine:
         self.checked += files
 
     @contextlib.contextmanager
-    def each(self, stage: str, call: Any, arguments: list[Any], progress: Any, unit: str) -> Iterator[Iterator[Any]]:
+    def map_calls(
+        self, stage: str, call: Any, arguments: list[Any], progress: Any, unit: str
+    ) -> Iterator[Iterator[Any]]:
         yield (call(*each, threads=1) for each in arguments)
 
 

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sparklod_cli.cameras.axes import Axes
 from sparklod_cli.cameras.formats.source import Parsed
-from sparklod_cli.cameras.formats.table import PathFormat
-from sparklod_cli.cameras.frame import Frame, Lens, Settings
+from sparklod_cli.cameras.formats.table import Axes, PathFormat
+from sparklod_cli.cameras.frame import Frame, Intrinsics, Settings
 from sparklod_cli.cameras.generators import (
     Key,
     between,
@@ -117,7 +116,7 @@ def test_keyframes_in_one_place_turn_the_camera() -> None:
 
 
 def test_keyframes_without_a_lens_keep_the_given_one() -> None:
-    lens = Lens((640, 480), (600, 610), (300, 200))
+    lens = Intrinsics((640, 480), (600, 610), (300, 200))
     keys = [Key(key.eye, key.target) for key in KEYS]
     assert all(frame.lens == lens for frame in between(keys, 5, DOWN_Y, lens))
     mixed = between([keys[0], KEYS[1]], 5, DOWN_Y)

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sparklod_cli.cameras.axes import Axes
 from sparklod_cli.cameras.camera import Camera
+from sparklod_cli.cameras.formats.table import Axes
 from sparklod_cli.cameras.frame import Settings
 from sparklod_cli.cameras.path import CameraPath, read
 from sparklod_cli.support.errors import CameraPathError

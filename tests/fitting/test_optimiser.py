@@ -12,7 +12,7 @@ from sparklod_cli.fitting.cameras import Place, placed
 from sparklod_cli.fitting.kernels.adam import MOST_D, Rates
 from sparklod_cli.fitting.nodes import FittedNodes
 from sparklod_cli.fitting.optimiser import LAST, MOST_REACH, RATES, ROUNDS, Optimiser, default_steps, rates_at, reach_of
-from sparklod_cli.fitting.pictures import Picture, pictures
+from sparklod_cli.fitting.pictures import FullDetailPicture, pictures
 from sparklod_cli.lod import quality
 from sparklod_cli.render.rasterizer import draw
 from sparklod_cli.render.settings import RasterSettings
@@ -28,13 +28,13 @@ def nodes(monkeypatch: pytest.MonkeyPatch) -> FittedNodes:
     return FittedNodes(*quality.build(random_splats(COUNT, sh_degree=1)), RasterSettings(), 1)
 
 
-def picture_of(nodes: FittedNodes) -> Picture:
+def picture_of(nodes: FittedNodes) -> FullDetailPicture:
     seen = placed(Place.of(nodes.old.center[nodes.leaves]), np.random.SeedSequence(1))
     return next(pictures(seen, nodes))
 
 
-def error(nodes: FittedNodes, picture: Picture) -> float:
-    _, shaded = nodes.seen(nodes.cut(picture.camera, SHARE), picture.camera)
+def error(nodes: FittedNodes, picture: FullDetailPicture) -> float:
+    _, shaded = nodes.visible(nodes.cut(picture.camera, SHARE), picture.camera)
     return sum(picture.errors(draw(shaded, picture.camera, nodes.raster)))
 
 

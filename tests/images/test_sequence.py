@@ -8,13 +8,13 @@ import pytest
 
 from sparklod_cli.cameras.frame import Settings
 from sparklod_cli.cameras.path import CameraPath
-from sparklod_cli.cameras.sources import Views
+from sparklod_cli.cameras.sources import SingleViews
 from sparklod_cli.images import sequence
 from sparklod_cli.images.output import output_for
 from sparklod_cli.images.sequence import PictureSettings, WrittenPictures, write_pictures
 from sparklod_cli.lod.settings import LodSettings
 from sparklod_cli.model.instances import instances_of
-from sparklod_cli.render.renderer import Drawn, Renderer
+from sparklod_cli.render.renderer import DrawnPicture, Renderer
 from sparklod_cli.render.settings import RenderSettings
 from sparklod_cli.scenes.finder import CutFinder
 from sparklod_cli.scenes.reading import read_scenes
@@ -25,7 +25,7 @@ TOWN = FIXTURES / "traverse" / "town.spz"
 
 def path_of(count: int) -> CameraPath:
     views = [((float(number), -3.0, 9.0), (0.0, 0.0, 0.0)) for number in range(count)]
-    return Views(views).cameras(Settings(size=(48, 32)), lambda: pytest.fail("nobody needs to know the scene"))
+    return SingleViews(views).cameras(Settings(size=(48, 32)), lambda: pytest.fail("nobody needs to know the scene"))
 
 
 def written(folder: Path, count: int, budget: int = 900) -> WrittenPictures:
@@ -47,7 +47,7 @@ def test_a_difference_draws_every_picture_once(count: int, tmp_path: Path, monke
     drawn = []
     draw = Renderer.draw
 
-    def counted(self: Renderer, camera: object) -> Drawn:
+    def counted(self: Renderer, camera: object) -> DrawnPicture:
         drawn.append(camera)
         return draw(self, camera)  # type: ignore[arg-type]
 
@@ -95,7 +95,7 @@ def test_an_interrupted_animation_leaves_nothing_and_what_was_there(
     (tmp_path / name).write_bytes(b"before")
     draw, drawn = Renderer.draw, []
 
-    def interrupted(self: Renderer, camera: object) -> Drawn:
+    def interrupted(self: Renderer, camera: object) -> DrawnPicture:
         drawn.append(camera)
         if len(drawn) == 30:
             raise KeyboardInterrupt
@@ -117,7 +117,7 @@ def test_an_animation_is_written_while_frames_are_drawn(
     events: list[str] = []
     draw, animate = Renderer.draw, sequence.animate
 
-    def drawn(self: Renderer, camera: object) -> Drawn:
+    def drawn(self: Renderer, camera: object) -> DrawnPicture:
         events.append("draw")
         return draw(self, camera)  # type: ignore[arg-type]
 

@@ -16,7 +16,7 @@ from sparklod_cli.cameras.pose import look_at
 from sparklod_cli.codecs.gpu import ext_splats, lod_tree
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod.settings import pixel_limit
-from sparklod_cli.lod.traversal import Forest, Traversal, TreeInstance, View
+from sparklod_cli.lod.traversal import CutView, Forest, Traversal, TreeInstance
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.render.rasterizer import draw
@@ -74,7 +74,7 @@ def cut_of(held: Scene, camera: Camera, budget: int) -> NDArray[np.uint32]:
     """Returns the nodes of sparklod's cut, ascending, without foveation."""
     assert held.tree is not None
     nodes = lod_tree.unpack(lod_tree.pack(held.splats, held.tree))
-    view = View(camera.camera_to_world, camera.fov_x, camera.fov_y)
+    view = CutView(camera.camera_to_world, camera.fov_x, camera.fov_y)
     smallest = pixel_limit(camera.fov_y, camera.height)
     return Traversal(Forest([nodes]), [TreeInstance()]).cut(view, budget=budget, smallest=smallest).indices()[0]
 

@@ -18,7 +18,7 @@ from sparklod_cli.codecs.rad.rad_options import HALF
 from sparklod_cli.codecs.splat_encoding import SplatEncoding
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quick
-from sparklod_cli.lod.traversal import Traversal, TreeInstance, View
+from sparklod_cli.lod.traversal import CutView, Traversal, TreeInstance
 from sparklod_cli.model.gaussian import linear_opacity
 from sparklod_cli.model.instances import Instance
 from sparklod_cli.model.lod_tree import CHUNK_NODES, Nodes
@@ -93,7 +93,7 @@ def check_cuts(spark: Spark, path: Path, precision: str, views: int) -> None:
         budget = BUDGETS[number % len(BUDGETS)]
         smallest = LIMITS[number // 2 % len(LIMITS)] if number % 4 else 0.0
         found = Traversal(scenes.forest, [TreeInstance(0, np.eye(4), lod_scale, cones)])
-        ours = found.cut(View(camera, FOV_Y, FOV_Y), budget=budget, smallest=smallest)
+        ours = found.cut(CutView(camera, FOV_Y, FOV_Y), budget=budget, smallest=smallest)
         asked = {"lodId": tree, "viewToObjectCols": camera.T.ravel().tolist(), "lodScale": lod_scale}
         asked |= {"coneFov0": cones.fov0, "coneFov": cones.fov, "coneFoveate": cones.foveate}
         theirs = spark.traverse(budget, smallest, [asked | {"behindFoveate": cones.behind}])
@@ -132,9 +132,9 @@ def check_dynamic_cuts(spark: Spark, path: Path, precision: str, views: int) -> 
     cones, limit = SPARKS_CONES, LIMITS[2]
     found = Traversal(scenes.forest, [TreeInstance(0, foveation=cones)])
     for number, camera in enumerate(cameras(Nodes.of(splats, loaded.scene.tree), views, seed=count)):
-        budget, view = BUDGETS[1 + number % 4], View(camera, FOV_Y, FOV_Y)
+        budget, view = BUDGETS[1 + number % 4], CutView(camera, FOV_Y, FOV_Y)
 
-        def nodes_at(scale: float, view: View = view) -> int:
+        def nodes_at(scale: float, view: CutView = view) -> int:
             return len(found.cut(view, budget=count, smallest=scale))
 
         ours = found.cut(view, budget=count, smallest=dynamic_limit(nodes_at, budget, limit))

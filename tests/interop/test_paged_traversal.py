@@ -14,7 +14,7 @@ from sparklod_cli.codecs.gpu import lod_tree
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod.builders import BUILDERS
 from sparklod_cli.lod.settings import LodSettings
-from sparklod_cli.lod.traversal import Forest, Traversal, TreeCut, TreeInstance, View
+from sparklod_cli.lod.traversal import CutView, Forest, Traversal, TreeCut, TreeInstance
 from sparklod_cli.model.instances import Cones, Instance
 from sparklod_cli.model.lod_tree import CHUNK_NODES, Nodes
 from sparklod_cli.model.scene import Scene
@@ -113,7 +113,7 @@ class Paged:
     def check(self, instances: Sequence[TreeInstance], camera: np.ndarray, budget: int, smallest: float) -> TreeCut:
         """Asserts that both draw the same nodes and want the same chunks, in the same order."""
         cut = Traversal(self.forest, instances).cut(
-            View(camera, FOV_Y, FOV_Y), budget=budget, smallest=smallest, resident=self.resident
+            CutView(camera, FOV_Y, FOV_Y), budget=budget, smallest=smallest, resident=self.resident
         )
         base = self.forest.chunk_base
         drawn = [number for number, each in enumerate(instances) if self.resident[base[each.tree]]]

@@ -16,7 +16,7 @@ from sparklod_cli.codecs.gpu import ext_splats, lod_tree
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod.builders import BUILDERS
 from sparklod_cli.lod.settings import pixel_limit
-from sparklod_cli.lod.traversal import Forest, Traversal, TreeCut, TreeInstance, View, views_of
+from sparklod_cli.lod.traversal import CutView, Forest, Traversal, TreeCut, TreeInstance, views_of
 from sparklod_cli.model.instances import Cones
 from sparklod_cli.model.lod_tree import CHUNK_NODES, Nodes
 from tests.conftest import FIXTURES, real_scene
@@ -84,7 +84,7 @@ class Both:
 
         Chunks of the roots are left out of the order, since Spark always visits them.
         """
-        view = View(camera, FOV_Y, FOV_Y)
+        view = CutView(camera, FOV_Y, FOV_Y)
         found = Traversal(self._forest, instances)
         cut = found.cut(view, budget=budget, smallest=smallest)
         theirs = self._spark.traverse(budget, smallest, [self._instance(each, camera) for each in instances])
@@ -106,7 +106,7 @@ class Both:
 
     def pixel_scale(self, instance: TreeInstance, camera: np.ndarray) -> np.float32:
         """Returns the pixel scale of the root."""
-        (view,) = views_of(self._forest, [instance], View(camera, FOV_Y, FOV_Y))
+        (view,) = views_of(self._forest, [instance], CutView(camera, FOV_Y, FOV_Y))
         return budgeted_cuts.pixel_scale(self._forest.nodes[view["node_base"]], view)
 
     def _instance(self, instance: TreeInstance, camera: np.ndarray) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from sparklod_cli.lod.check import check
-from sparklod_cli.lod.stage_records import NO_FAMILY, STAGE_BITS, Families, Pending, Region, StagedBuilder, Survey
+from sparklod_cli.lod.stage_records import NO_FAMILY, STAGE_BITS, Pending, Region, StagedBuilder, StageFamilies
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.support.progress import silent
@@ -34,7 +34,7 @@ class Stages:
 
     builder: StagedBuilder
     plan: Any
-    families: list[Families] = field(default_factory=list)
+    families: list[StageFamilies] = field(default_factory=list)
     pending: list[int] = field(default_factory=list)
 
     def advance(self, pending: Pending, region: Region | None) -> Pending:
@@ -54,14 +54,6 @@ class Stages:
             for part, inside in split(splats, index, region, splits[0])
         ]
         return self.advance(Pending.concat(parts), here)
-
-
-def survey_of(splats: Splats, step: int = 1) -> Survey:
-    """A survey of a whole scene whose sample is every so many splats."""
-    bounds = check(splats)
-    low, high = tuple(bounds.low.tolist()), tuple(bounds.high.tolist())
-    sample = splats.take(slice(None, None, step))
-    return Survey(len(splats), splats.sh_degree, low, high, bounds.smallest, bounds.largest, sample)
 
 
 def split(
@@ -99,7 +91,7 @@ def build_in_stages(
         splats: valid and visible ones.
         setting: of the builder.
         splits: of the scene; none for a single stage.
-        step: the survey's sample is every so many splats.
+        step: the plan's sample is every so many splats.
     """
     nodes, tree, _ = run_stages(builder, splats, setting, splits, step=step)
     return nodes, tree
@@ -109,13 +101,13 @@ def run_stages(
     builder: StagedBuilder, splats: Splats, setting: float, splits: Splits, *, step: int = 1
 ) -> tuple[Splats, LodTree, Stages]:
     """As `build_in_stages`, and the stages themselves."""
-    stages = Stages(builder, builder.plan(survey_of(splats, step), setting))
+    stages = Stages(builder, builder.plan(check(splats), splats.take(slice(None, None, step)), setting))
     left = stages.run(splats, np.arange(len(splats)), EVERYWHERE, splits, is_root=True)
     assert len(left) == 1
     return *assemble(stages.families, *left.root()), stages
 
 
-def assemble(families: Sequence[Families], root: Splats, family: int) -> tuple[Splats, LodTree]:
+def assemble(families: Sequence[StageFamilies], root: Splats, family: int) -> tuple[Splats, LodTree]:
     """The root, then all families by batch and then by key; where both are equal, by stage and then by place.
 
     Args:
@@ -143,7 +135,7 @@ def assemble(families: Sequence[Families], root: Splats, family: int) -> tuple[S
     return nodes, tree
 
 
-def check_families(families: Families, stage: int) -> None:
+def check_families(families: StageFamilies, stage: int) -> None:
     """What holds for the families of every stage."""
     assert (np.diff(families.batch) >= 0).all()
     assert (families.count >= 1).all()

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sparklod_cli.lod.traversal import View
+from sparklod_cli.lod.traversal import CutView
 from sparklod_cli.model.scene import DetailScene
 from tests.scenes import random_splats
 
@@ -42,7 +42,7 @@ def random_regions(random: np.random.Generator, regions: int, levels: int, *, ga
     return Regions(np.stack([low, low + size], axis=1), counts)
 
 
-def random_view(random: np.random.Generator, spread: float = 60.0) -> View:
+def random_view(random: np.random.Generator, spread: float = 60.0) -> CutView:
     """A camera somewhere, which looks somewhere."""
     camera = np.eye(4)
     camera[:3, :3] = np.linalg.qr(random.normal(size=(3, 3)))[0]
@@ -51,7 +51,7 @@ def random_view(random: np.random.Generator, spread: float = 60.0) -> View:
     camera[:3, 3] = random.uniform(-spread, spread, 3)
     fov_y = float(random.uniform(0.2, 2.0))
     aspect = float(random.uniform(0.4, 2.5))
-    return View(camera, 2 * float(np.arctan(np.tan(fov_y / 2) * aspect)), fov_y)
+    return CutView(camera, 2 * float(np.arctan(np.tan(fov_y / 2) * aspect)), fov_y)
 
 
 def row_of_regions(regions: int = 6, levels: int = 3, splats: int = 64, *, environment: int = 0) -> DetailScene:

@@ -8,10 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sparklod_cli.lod.check import check
 from sparklod_cli.lod.stage_records import Pending, Region, StagedBuilder
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.splats import Splats
-from tests.lod.assembled import EVERYWHERE, Stages, assemble, survey_of
+from tests.lod.assembled import EVERYWHERE, Stages, assemble
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,7 @@ def build_divided(
     builder: StagedBuilder, splats: Splats, setting: float, division: Division
 ) -> tuple[Splats, LodTree, Stages]:
     """As `assembled.run_stages`, with these blocks and joins."""
-    stages = Stages(builder, builder.plan(survey_of(splats), setting))
+    stages = Stages(builder, builder.plan(check(splats), splats, setting))
 
     def run(here: Division, region: Region | None) -> Pending:
         if here.parts:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from hypothesis import strategies as st
 
-from sparklod_cli.lod.traversal import Forest, Traversal, TreeCut, TreeInstance, View
+from sparklod_cli.lod.traversal import CutView, Forest, Traversal, TreeCut, TreeInstance
 from sparklod_cli.model.instances import Cones, Frustum
 from sparklod_cli.model.lod_tree import LodTree, Nodes
 from tests.references import budgeted_cuts
@@ -35,7 +35,7 @@ class Case:
 
     trees: list[Nodes]
     instances: list[TreeInstance]
-    view: View
+    view: CutView
     budget: int
     smallest: float
 
@@ -149,7 +149,7 @@ def some_trees(draw: st.DrawFn, max_nodes: int = 40) -> Nodes:
 
 
 @st.composite
-def views(draw: st.DrawFn, trees: list[Nodes]) -> View:
+def views(draw: st.DrawFn, trees: list[Nodes]) -> CutView:
     """A camera somewhere, or at a node's centre."""
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     camera = transform(rng, spread=draw(st.sampled_from([0.0, 0.5, 3.0, 100.0])))
@@ -157,7 +157,7 @@ def views(draw: st.DrawFn, trees: list[Nodes]) -> View:
         camera[:3, :3] = np.eye(3)
     if draw(st.booleans()):
         camera[:3, 3] = rng.choice(trees[0].center)
-    return View(camera, math.radians(80), math.radians(60))
+    return CutView(camera, math.radians(80), math.radians(60))
 
 
 @st.composite

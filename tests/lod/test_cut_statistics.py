@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from sparklod_cli.lod.cut_statistics import Changes, CutStatistics, measure
 from sparklod_cli.lod.settings import pixel_limit
-from sparklod_cli.lod.traversal import Traversal, TreeCut, TreeInstance, View
+from sparklod_cli.lod.traversal import CutView, Traversal, TreeCut, TreeInstance
 from sparklod_cli.model.lod_tree import Nodes
 from tests.lod.forests import Case, cases, drawn, expected_cut, links, views
 
@@ -118,7 +118,7 @@ def test_added_and_removed_nodes_are_those_of_sets(case: Case, data: st.DataObje
 def at_distance(center: list[float], size: float) -> CutStatistics:
     """Of one splat, seen from the origin."""
     tree = Nodes(np.array([center], np.float32), np.array([size], np.float32), links([]))
-    case = Case([tree], [TreeInstance()], View(np.eye(4), math.radians(90), math.radians(90)), 1, 0.0)
+    case = Case([tree], [TreeInstance()], CutView(np.eye(4), math.radians(90), math.radians(90)), 1, 0.0)
     found = Traversal(case.traversal().forest, case.instances)
     whole, parts = told(case, case.find(found), size=(100, 100))
     assert parts == [whole]
@@ -147,7 +147,7 @@ def test_a_size_that_is_not_finite_fills_the_picture(bad: float) -> None:
 
 def test_an_empty_cut_has_no_figures() -> None:
     tree = Nodes(np.zeros((1, 3), np.float32), np.ones(1, np.float32), links([]))
-    case = Case([tree], [TreeInstance()], View(np.eye(4), 1.0, 1.0), 1, 0.0)
+    case = Case([tree], [TreeInstance()], CutView(np.eye(4), 1.0, 1.0), 1, 0.0)
     cut = case.find(resident=np.zeros(1, np.bool_))
     whole, parts = told(case, cut)
     nothing = CutStatistics(0, 0, 0, 0, 0, 0, None, None, None, None, None, 0.0)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from sparklod_cli.lod.detail_choice import Chains, DetailChoice, Distant, RegionBounds, choose
 from sparklod_cli.lod.detail_rule import DetailRule
-from sparklod_cli.lod.traversal import View
+from sparklod_cli.lod.traversal import CutView
 from tests.lod.details import random_regions, random_view
 
 RULES = (DetailRule(), DetailRule(mode="limit"), DetailRule(finest=1, coarsest=2), DetailRule(multiplier=1.2))
@@ -106,7 +106,7 @@ def test_what_is_behind_or_seen_by_a_wide_lens_is_farther() -> None:
     bounds = np.array([[[-1.0, -1, -11], [1, 1, -9]], [[-1.0, -1, 9], [1, 1, 11]]])  # before the camera, and behind it
 
     def distances(fov: float, **rule: float) -> list[float]:
-        view = View(np.eye(4), fov, fov)
+        view = CutView(np.eye(4), fov, fov)
         return np.sqrt(RegionBounds(bounds).squared_distances(view, np.eye(4), DetailRule(**rule))).tolist()
 
     assert distances(np.pi / 4, behind_penalty=2.0) == pytest.approx([9.0, 18.0])
@@ -123,7 +123,7 @@ def test_distances_go_to_bounds_that_shrink_by_what_they_exceed_the_median() -> 
     camera[:3, 3] = [45.0, 105.0, 0.0]
     for shrink, high in ((0.0, 5.0), (1.0, 1.0), (0.5, 3.0)):
         rule = DetailRule(behind_penalty=1.0, shrink=shrink)
-        found = RegionBounds(bounds).squared_distances(View(camera, np.pi / 4, np.pi / 4), np.eye(4), rule)
+        found = RegionBounds(bounds).squared_distances(CutView(camera, np.pi / 4, np.pi / 4), np.eye(4), rule)
         assert np.sqrt(found[2]) == pytest.approx(105.0 - high)
 
 

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sparklod_cli.lod import traversal
-from sparklod_cli.lod.traversal import Forest, TreeInstance, View
+from sparklod_cli.lod.traversal import CutView, Forest, TreeInstance
 from tests.lod.forests import Case, ancestors_drawn, cases, check, random_tree, transform
 
 #: Nodes of a chunk in tests of small trees, as a power of 2; so large that no node's children are in three.
@@ -85,7 +85,7 @@ def test_the_cut_of_large_trees_with_missing_chunks_is_that_of_one_queue(seed: i
     rng = np.random.default_rng(seed)
     trees = [random_tree(rng, 200_000, 6), random_tree(rng, 100_000, 3)]
     instances = [TreeInstance(tree, transform(rng, spread=2.0), 1.0 + tree) for tree in (0, 1, 0)]
-    view = View(transform(rng, spread=4.0), math.radians(80), math.radians(60))
+    view = CutView(transform(rng, spread=4.0), math.radians(80), math.radians(60))
     case = Case(trees, instances, view, 30_000, 0.0)
     found = case.traversal()
     there = rng.random(found.forest.chunks) < 0.6

@@ -12,10 +12,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sparklod_cli.cameras.axes import Axes
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.cameras.formats.source import Parsed
-from sparklod_cli.cameras.formats.table import PathFormat
+from sparklod_cli.cameras.formats.table import Axes, PathFormat
 from sparklod_cli.cameras.frame import DEFAULT_UP, Settings
 from sparklod_cli.cameras.framing import framing
 from sparklod_cli.cameras.generators import orbit
@@ -35,9 +34,8 @@ from sparklod_cli.render.settings import RasterSettings
 from sparklod_cli.render.shading import shade
 from sparklod_cli.scenes.finder import view_of
 from sparklod_cli.support import jit
-from sparklod_cli.support.errors import InvalidSplatsError
 from tests.conftest import real_scene
-from tests.lod.trees import check_colours, check_threads, check_tree, children, coincident, hard_cases, parents
+from tests.lod.trees import check_tree, children, coincident, parents
 from tests.scenes import random_splats
 
 GROWTHS = [1.05, 1.4, 2.0]
@@ -71,12 +69,6 @@ def test_scenes_of_any_size_make_valid_trees(count: int, growth: float, seed: in
 
 
 @pytest.mark.parametrize("growth", GROWTHS)
-@pytest.mark.parametrize("name", hard_cases())
-def test_quality_makes_valid_trees_of_hard_scenes(name: str, growth: float) -> None:
-    check(hard_cases()[name], growth)
-
-
-@pytest.mark.parametrize("growth", GROWTHS)
 @pytest.mark.parametrize("count", [65_535, 65_536])
 def test_coincident_splats_give_no_quality_node_many_children(count: int, growth: float) -> None:
     _, tree = check(coincident(count), growth)
@@ -90,19 +82,9 @@ def test_one_splat_many_times_makes_a_shallow_tree() -> None:
 
 
 @pytest.mark.parametrize("growth", GROWTHS)
-def test_quality_makes_one_splat_a_tree_of_one_node(growth: float) -> None:
-    _, tree = check(random_splats(1, sh_degree=2), growth)
-    assert len(tree) == 1
-
-
-@pytest.mark.parametrize("growth", GROWTHS)
 def test_two_splats_have_one_parent(growth: float) -> None:
     _, tree = check(random_splats(2, sh_degree=1), growth)
     assert tree.child_count.tolist() == [2, 0, 0]
-
-
-def test_threads_do_not_change_a_bit_of_a_quality_tree() -> None:
-    check_threads(lambda: quality.build(random_splats(20_000, sh_degree=1, seed=3)))
 
 
 @pytest.mark.parametrize("growth", GROWTHS)
@@ -124,13 +106,6 @@ def test_a_prefix_of_a_quality_tree_is_a_coarser_scene(growth: float) -> None:
     medians = [np.median(part) for part in np.array_split(smallness[inner], 8)]
     assert all(later >= earlier for earlier, later in itertools.pairwise(medians))
     assert medians[-1] > medians[0] + STEPS
-
-
-@pytest.mark.parametrize("growth", GROWTHS)
-@pytest.mark.parametrize("sh_degree", [0, 3])
-def test_colours_are_means_of_the_leaves_by_what_they_cover(growth: float, sh_degree: int) -> None:
-    nodes, tree = quality.build(random_splats(2_000, sh_degree=sh_degree, seed=8), growth)
-    check_colours(nodes, tree)
 
 
 def test_merged_nodes_are_where_their_leaves_are() -> None:
@@ -165,34 +140,6 @@ def test_splats_farther_apart_than_float32_holds_make_a_node_as_large_as_it_hold
     nodes, _ = quality.build(splats)
     assert nodes.is_valid().all()
     assert nodes.scale.max() == np.finfo(np.float32).max
-
-
-def test_quality_makes_no_tree_of_no_splats() -> None:
-    with pytest.raises(InvalidSplatsError, match="no splat"):
-        quality.build(random_splats(0))
-
-
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-@pytest.mark.parametrize("name", ["center", "scale"])
-def test_a_splat_that_is_not_finite_is_an_error(name: str, value: float) -> None:
-    splats = random_splats(10)
-    getattr(splats, name)[3, 1] = value
-    with pytest.raises(InvalidSplatsError, match="not finite"):
-        quality.build(splats)
-
-
-@pytest.mark.parametrize("name", ["opacity", "scale"])
-def test_a_splat_that_cannot_be_seen_is_an_error(name: str) -> None:
-    splats = random_splats(10)
-    getattr(splats, name)[3] = 0
-    with pytest.raises(InvalidSplatsError, match="without opacity or scale"):
-        quality.build(splats)
-
-
-@pytest.mark.parametrize("growth", [1.0, 2.01, math.nan])
-def test_a_growth_out_of_range_is_an_error(growth: float) -> None:
-    with pytest.raises(ValueError, match="growth"):
-        quality.build(random_splats(2), growth)
 
 
 def cameras_around(splats: Splats) -> tuple[Camera, ...]:

@@ -10,14 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sparklod_cli.lod import quality
-from sparklod_cli.lod.builders import BUILDERS
+from sparklod_cli.lod.check import check as check_input
 from sparklod_cli.lod.kernels.prune import MOST_CHILDREN
 from sparklod_cli.lod.stage_records import Pending, Region
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.support.progress import silent
-from tests.lod.assembled import Splits, build_in_stages, check_families, run_stages, survey_of
-from tests.lod.trees import check_colours, check_threads, check_tree, coincident, hard_cases
+from tests.lod.assembled import Splits, build_in_stages, check_families, run_stages
+from tests.lod.trees import check_colours, check_tree, coincident, hard_cases
 from tests.scenes import random_splats
 
 GROWTHS = [1.05, 1.4, 2.0]
@@ -39,10 +39,6 @@ def check(splats: Splats, growth: float, splits: Splits) -> tuple[Splats, LodTre
 def same(a: tuple[Splats, LodTree], b: tuple[Splats, LodTree]) -> bool:
     columns = [getattr(a[0], name).tobytes() == getattr(b[0], name).tobytes() for name in COLUMNS]
     return all(columns) and np.array_equal(a[1].child_start, b[1].child_start)
-
-
-def test_the_builder_is_found_by_its_method() -> None:
-    assert BUILDERS["quality"].load() is quality
 
 
 @pytest.mark.parametrize("growth", GROWTHS)
@@ -93,14 +89,10 @@ def test_blocks_hand_on_few_of_their_nodes() -> None:
     assert sum(built.pending[:4]) < 0.15 * len(splats)
 
 
-def test_threads_do_not_change_a_bit() -> None:
-    check_threads(lambda: build_in_stages(quality, random_splats(20_000, sh_degree=1, seed=3), 1.4, SPLITS[0]))
-
-
 def test_the_order_of_tasks_does_not_change_a_bit() -> None:
     """Stages share nothing but what they hand on, and numbers of stages are only in the numbers of families."""
     splats = random_splats(3_000, seed=4)
-    plan = quality.plan(survey_of(splats), 1.4)
+    plan = quality.plan(check_input(splats), splats, 1.4)
     index = np.flatnonzero(splats.center[:, 0] < 0)
     region = Region((-np.inf,) * 3, (0.0, np.inf, np.inf))
     first, again = (
@@ -124,7 +116,7 @@ def test_colours_are_means_of_the_leaves_by_what_they_cover(splits: Splits) -> N
 
 def test_empty_blocks_hand_on_nothing() -> None:
     splats = random_splats(50, sh_degree=1, seed=2)
-    plan = quality.plan(survey_of(splats), 1.4)
+    plan = quality.plan(check_input(splats), splats, 1.4)
     nothing = quality.leaves(splats.take(slice(0, 0)), np.arange(0), plan)
     families, left = quality.advance(nothing, Region((0.0,) * 3, (1.0,) * 3), 0, plan, progress=silent)
     assert len(families) == len(families.nodes) == len(left) == 0
@@ -132,12 +124,6 @@ def test_empty_blocks_hand_on_nothing() -> None:
     _, one = quality.advance(some, Region((-np.inf,) * 3, (np.inf,) * 3), 1, plan, progress=silent)
     joined = Pending.concat([left, one])
     assert len(joined) == 1 and joined.columns["sh"].shape == (1, 3, 3)
-
-
-@pytest.mark.parametrize("growth", [1.0, 2.01, np.nan])
-def test_a_growth_out_of_range_is_an_error(growth: float) -> None:
-    with pytest.raises(ValueError, match="growth"):
-        quality.plan(survey_of(random_splats(2)), growth)
 
 
 def small_splats(count: int) -> Splats:

@@ -12,13 +12,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sparklod_cli.lod import quick
-from sparklod_cli.lod.builders import BUILDERS
+from sparklod_cli.lod.check import check as check_input
 from sparklod_cli.lod.stage_records import Region
 from sparklod_cli.model.gaussian import spark_size
 from sparklod_cli.model.splats import COLUMNS, Splats
-from tests.lod.assembled import check_families, run_stages, survey_of
+from tests.lod.assembled import check_families, run_stages
 from tests.lod.divisions import Division, build_divided, random_division
-from tests.lod.trees import check_threads, coincident, hard_cases
+from tests.lod.trees import coincident, hard_cases
 from tests.scenes import random_splats
 
 
@@ -102,26 +102,14 @@ def test_families_say_where_their_parents_are() -> None:
     assert np.array_equal(families.size, spark_size(nodes)[parents])
 
 
-def test_threads_do_not_change_a_bit_of_a_stage() -> None:
-    splats = random_splats(60_000, sh_degree=1, seed=3)
-    check_threads(lambda: run_stages(quick, splats, 1.5, [(2, 1, 1)])[:2])
-
-
-def test_the_plan_can_be_pickled_and_the_stages_are_in_the_table() -> None:
-    plan = quick.plan(survey_of(random_splats(10)), 1.5)
+def test_the_plan_can_be_pickled() -> None:
+    plan = quick.plan(check_input(random_splats(10)), random_splats(10), 1.5)
     assert pickle.loads(pickle.dumps(plan)) == plan
-    assert BUILDERS["quick"].load() is quick
-
-
-@pytest.mark.parametrize("base", [1.0, 2.01])
-def test_a_base_out_of_range_is_an_error(base: float) -> None:
-    with pytest.raises(ValueError, match="base"):
-        quick.plan(survey_of(random_splats(2)), base)
 
 
 def test_a_region_without_splats_hands_on_nothing() -> None:
     splats = random_splats(10)
-    plan = quick.plan(survey_of(splats), 1.5)
+    plan = quick.plan(check_input(splats), splats, 1.5)
     nothing = quick.leaves(splats.take(slice(0, 0)), np.empty(0, np.int64), plan)
     families, left = quick.advance(nothing, Region((0, 0, 0), (1, 1, 1)), 7, plan)
     assert len(families) == len(left) == 0

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
 from concurrent.futures import ThreadPoolExecutor
 
@@ -13,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sparklod_cli.lod.settings import pixel_limit
-from sparklod_cli.lod.traversal import VISITS, Forest, TreeInstance, View, views_of
+from sparklod_cli.lod.traversal import VISITS, CutView, Forest, TreeInstance, views_of
 from sparklod_cli.model.instances import Cones, Frustum
 from sparklod_cli.model.lod_tree import CHUNK_NODES, Nodes
-from tests.lod.forests import Case, ancestors_drawn, cases, check, drawn, links, random_tree, rotation, transform, views
+from tests.lod.forests import Case, ancestors_drawn, cases, check, drawn, links, random_tree, transform, views
 from tests.references import budgeted_cuts
 
 #: Pixel scales at which nothing happens, something does, and everything does.
@@ -111,7 +110,7 @@ def large_case(seed: int, *, nodes: int = 150_000, instances: int = 3) -> Case:
         )
         for number in range(instances)
     ]
-    return Case(trees, placed, View(transform(rng, spread=4.0), math.radians(80), math.radians(60)), 10_000, 0.0)
+    return Case(trees, placed, CutView(transform(rng, spread=4.0), math.radians(80), math.radians(60)), 10_000, 0.0)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -129,7 +128,10 @@ def test_threads_can_share_a_traversal() -> None:
     found = case.traversal()
     asked = [
         dataclasses.replace(
-            case, view=View(transform(rng, spread=4.0), 1.4, 1.0), budget=int(rng.integers(3, 80_000)), smallest=limit
+            case,
+            view=CutView(transform(rng, spread=4.0), 1.4, 1.0),
+            budget=int(rng.integers(3, 80_000)),
+            smallest=limit,
         )
         for limit in LIMITS * 14
     ]
@@ -156,11 +158,11 @@ def test_chains_longer_than_the_buffers_are_traversed(ends: int) -> None:
         assert cut.reason == ("budget" if ends > 1 and budget == 1 else "exhausted")
 
 
-def seen_from(distance: float) -> View:
+def seen_from(distance: float) -> CutView:
     """A camera that looks at the origin."""
     camera = np.eye(4)
     camera[2, 3] = distance
-    return View(camera, 1.4, 1.0)
+    return CutView(camera, 1.4, 1.0)
 
 
 def test_a_tree_as_long_as_the_buffers_is_cut_as_by_one_queue() -> None:
@@ -192,7 +194,7 @@ def test_pixel_scales_are_those_of_the_world(seed: int, foveation: Cones | Frust
     rng = np.random.default_rng(seed)
     scale = rng.uniform(0.2, 5)
     placed = TreeInstance(0, transform(rng, scale=scale), rng.uniform(0.5, 2), foveation)
-    view = View(transform(rng, spread=3.0), 1.4, 1.0)
+    view = CutView(transform(rng, spread=3.0), 1.4, 1.0)
     tree = random_tree(rng, 50, 3)
     forest = Forest([tree])
     (sight,) = views_of(forest, [placed], view)
@@ -220,27 +222,3 @@ def test_the_pixel_limit_is_a_pixels_size_at_distance_1() -> None:
     """At distance 1 the picture is 2 * tan(fov_y / 2) high."""
     assert pixel_limit(math.radians(90), 1000) == pytest.approx(2 / 1000)
     assert pixel_limit(math.radians(60), 1080, 2.0) == pytest.approx(2 * pixel_limit(math.radians(60), 1080))
-
-
-def test_the_order_of_equals_is_that_of_instances_and_indices() -> None:
-    """The last instance first, and in it the last node."""
-    tree = links([3, 2, 2, 2])
-    nodes = Nodes(np.zeros((10, 3), np.float32), np.ones(10, np.float32), tree)
-    case = Case([nodes], [TreeInstance(), TreeInstance()], seen_from(2.0), 0, 0.0)
-    found = case.traversal()
-    divided = {2: [], 3: [], 4: [(1, 0)], 5: [(1, 0), (1, 3)], 7: [(1, 0), (1, 3), (1, 2), (1, 1)], 9: [(1, 0), (0, 0)]}
-    everything = set(itertools.product(range(2), range(10)))
-    for budget in (2, 3, 4, 5, 7):
-        got = set(drawn(dataclasses.replace(case, budget=budget).find(found)))
-        children = {(i, child) for i, node in divided[budget] for child in children_of(nodes, node)}
-        assert got == ({(0, 0), (1, 0)} | children) - set(divided[budget])
-        assert got <= everything
-
-
-def children_of(nodes: Nodes, node: int) -> range:
-    start = int(nodes.tree.child_start[node])
-    return range(start, start + int(nodes.tree.child_count[node]))
-
-
-def test_random_rotations_do_not_mirror() -> None:
-    assert np.linalg.det(rotation(np.random.default_rng(0))) == pytest.approx(1)

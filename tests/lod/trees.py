@@ -10,7 +10,7 @@ import numpy as np
 from sparklod_cli.model.gaussian import MAX_OPACITY, MIN_OPACITY
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.splats import COLUMNS, Splats
-from sparklod_cli.support import jit
+from sparklod_cli.support.parallel import on_threads
 from tests.references import gaussians
 from tests.scenes import random_splats
 
@@ -50,9 +50,8 @@ def check_threads(build: Callable[[], tuple[Splats, LodTree]]) -> None:
     """The number of threads does not change a bit."""
     results = []
     for threads in (1, 2, 3):
-        jit.use_threads(threads)
-        results.append(build())
-    jit.use_threads(256)
+        with on_threads(threads):
+            results.append(build())
     for nodes, tree in results[1:]:
         for name in COLUMNS:
             assert getattr(nodes, name).tobytes() == getattr(results[0][0], name).tobytes(), name

@@ -19,8 +19,9 @@ from sparklod_cli.render import rasterizer
 from sparklod_cli.render.gradients import SplatGradients, by_sh, draw
 from sparklod_cli.render.settings import SORTS, RasterSettings
 from sparklod_cli.render.shading import ShadedSplats, shade
+from sparklod_cli.support.parallel import on_threads
 from tests.references import spark_pictures
-from tests.render.test_rasterizer import camera_at, joined, one, rows, shown, threads
+from tests.render.test_rasterizer import camera_at, joined, one, rows, shown
 from tests.scenes import random_splats
 
 LOOK = RasterSettings()
@@ -114,18 +115,13 @@ def test_each_value_of_a_gradient_is_that_of_the_twin(most: float) -> None:
             assert values[at] == pytest.approx(expected, rel=MOST, abs=MOST * float(np.abs(values).max())), (name, at)
 
 
-def test_needles_have_the_gradients_of_the_twin() -> None:
-    """A thousand times longer than they are thick."""
+@pytest.mark.parametrize("seed", range(4))
+def test_needles_and_splats_below_a_pixel_have_the_gradients_of_the_twin(seed: int) -> None:
+    """The former are a thousand times longer than thick; the latter become fainter as they shrink."""
     needles = shown(10, seed=5, most=3.0)
     needles.scale[:] = np.float32([0.5, 0.0005, 0.0005])
-    for seed in range(4):
-        check(needles, camera_at(size=(40, 30), focal=(45.0, 45.0)), seed=seed)
-
-
-def test_the_blur_s_compensation_is_part_of_gradients() -> None:
-    """Splats below a pixel become fainter as they shrink."""
-    for seed in range(4):
-        check(shown(20, scale=0.003, seed=seed), camera_at(size=(29, 19), focal=(120.0, 120.0)), seed=seed)
+    check(needles, camera_at(size=(40, 30), focal=(45.0, 45.0)), seed=seed)
+    check(shown(20, scale=0.003, seed=seed), camera_at(size=(29, 19), focal=(120.0, 120.0)), seed=seed)
 
 
 def test_colours_that_are_clamped_to_one_have_no_gradients() -> None:
@@ -229,7 +225,7 @@ def test_threads_do_not_change_a_bit_of_a_gradient() -> None:
     weights = np.random.default_rng(0).normal(size=(150, 200, 4)).astype(np.float32)
     found = []
     for count in (1, 2):
-        with threads(count):
+        with on_threads(count):
             gradients = draw(scene, camera, LOOK).gradients(weights)
         found.append([getattr(gradients, name).tobytes() for name in PROPERTIES])
     assert found[0] == found[1]

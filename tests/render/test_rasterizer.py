@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -19,7 +17,7 @@ from sparklod_cli.model.splats import Splats
 from sparklod_cli.render.rasterizer import Image, draw
 from sparklod_cli.render.settings import PROFILES, SORTS, RasterSettings
 from sparklod_cli.render.shading import ShadedSplats, shade
-from sparklod_cli.support import jit
+from sparklod_cli.support.parallel import on_threads
 from tests.references import spark_pictures
 from tests.scenes import random_splats
 
@@ -90,15 +88,6 @@ def check(
     return image
 
 
-@contextmanager
-def threads(count: int) -> Iterator[None]:
-    jit.use_threads(count)
-    try:
-        yield
-    finally:
-        jit.use_threads(256)
-
-
 @pytest.mark.parametrize("sort", SORTS)
 @pytest.mark.parametrize("profile", PROFILES)
 @pytest.mark.parametrize("most", [1.0, 5.0])
@@ -119,13 +108,6 @@ def test_an_off_centre_principal_point_shifts_the_picture(principal: tuple[float
     """What is dropped is told by where it is on the picture, not by its angle to the optical axis."""
     image = check(shown(400, spread=1.5), camera_at(principal=principal))
     assert image[..., 3].mean() > 0.02
-
-
-def test_needles_are_drawn_as_the_twin_draws_them() -> None:
-    """A thousand times longer than they are thick."""
-    needles = shown(40, seed=5, most=3.0)
-    needles.scale[:] = np.float32([0.5, 0.0005, 0.0005])
-    check(needles, camera_at(size=(90, 70), focal=(90.0, 90.0)))
 
 
 @pytest.mark.parametrize("most", [1.0, 5.0])
@@ -224,7 +206,7 @@ def test_threads_do_not_change_a_bit_of_a_picture(profile: str) -> None:
     scene = shown(5000, most=3.0, seed=11)
     pictures = []
     for count in (1, 2, 3):
-        with threads(count):
+        with on_threads(count):
             pictures.append(draw(scene, camera, RasterSettings(profile=profile)).tobytes())
     assert pictures[0] == pictures[1] == pictures[2]
 

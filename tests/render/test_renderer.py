@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli.render.backends import BACKENDS
-from sparklod_cli.render.renderer import Drawn, Renderer
+from sparklod_cli.render.renderer import DrawnPicture, Renderer
 from sparklod_cli.render.settings import COLOR_BY, STYLES, RasterSettings, RenderSettings
 from sparklod_cli.render.shading import shade
 from sparklod_cli.render.styles import BILLBOARD_ALPHA
@@ -22,7 +22,7 @@ RED, GREEN, BLUE = np.eye(3)
 MIDDLE = (24, 32)
 
 
-def drawn(source: CutFinder, **how: object) -> Drawn:
+def drawn(source: CutFinder, **how: object) -> DrawnPicture:
     return Renderer(source, RenderSettings(**how), [camera()]).draw(camera())
 
 

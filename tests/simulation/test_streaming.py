@@ -11,7 +11,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from sparklod_cli.simulation.chunk_cache import Chunks
-from sparklod_cli.simulation.streaming import Stream
+from sparklod_cli.simulation.streaming import ChunkStream
 from sparklod_cli.simulation.streaming_settings import Network
 from tests.references.streaming import NaiveCache, Twin, roots_first
 
@@ -27,11 +27,11 @@ headers = st.lists(st.lists(st.integers(1, 4000), max_size=3), min_size=3, max_s
 tree_sizes = st.lists(st.lists(st.integers(1, 9999), min_size=1, max_size=6), min_size=1, max_size=3)
 
 
-def here(stream: Stream) -> set[int]:
+def here(stream: ChunkStream) -> set[int]:
     return set(np.flatnonzero(stream.cache.resident()).tolist())
 
 
-def rest(stream: Stream, wanted: list[int]) -> list[tuple[float, int]]:
+def rest(stream: ChunkStream, wanted: list[int]) -> list[tuple[float, int]]:
     """When everything arrives, the camera resting: by what `complete_in` says of one more chunk after the other."""
     stream.want(wanted)
     arrivals = []
@@ -51,7 +51,7 @@ def test_a_stream_does_what_its_twin_does(
 ) -> None:
     chunks = Chunks(sizes, headers[: len(sizes)])
     capacity = data.draw(st.none() | st.integers(len(sizes), len(chunks)))
-    stream, twin = Stream(chunks, network, capacity=capacity), Twin(chunks, network, NaiveCache(capacity))
+    stream, twin = ChunkStream(chunks, network, capacity=capacity), Twin(chunks, network, NaiveCache(capacity))
     seen: list[int] = []
     for _ in range(data.draw(st.integers(1, 8))):
         wanted = data.draw(st.lists(st.integers(0, len(chunks) - 1), max_size=12))
@@ -83,7 +83,7 @@ def test_every_byte_comes_once_and_never_faster_than_the_link(
     data: st.DataObject, sizes: list[list[int]], network: Network
 ) -> None:
     chunks = Chunks(sizes)
-    stream = Stream(chunks, network)
+    stream = ChunkStream(chunks, network)
     stream.want(data.draw(st.permutations(range(len(chunks)))))
     arrived: list[int] = []
     before = 0
@@ -107,7 +107,7 @@ def test_the_number_of_time_steps_does_not_matter(
     data: st.DataObject, sizes: list[list[int]], network: Network
 ) -> None:
     chunks = Chunks(sizes)
-    one, many = (Stream(chunks, network, capacity=len(sizes) + 2) for _ in range(2))
+    one, many = (ChunkStream(chunks, network, capacity=len(sizes) + 2) for _ in range(2))
     for _ in range(3):
         wanted = data.draw(st.lists(st.integers(0, len(chunks) - 1), max_size=12))
         one.want(wanted)
@@ -126,7 +126,7 @@ def test_the_number_of_time_steps_does_not_matter(
 @given(tree_sizes, networks)
 def test_the_predicted_completion_is_when_all_is_there(sizes: list[list[int]], network: Network) -> None:
     chunks = Chunks(sizes)
-    stream = Stream(chunks, network, start=5.0)
+    stream = ChunkStream(chunks, network, start=5.0)
     wanted = list(range(len(chunks)))
     stream.want(wanted)
     left = stream.complete_in(wanted)
@@ -152,8 +152,8 @@ def test_with_more_bandwidth_a_resting_camera_waits_no_longer(
         (chunks, 0.0, network.fetchers),
         (even, network.latency, network.fetchers),
     ):
-        slow = Stream(case, Network(network.bandwidth, latency, fetchers)).complete_in(wanted)
-        fast = Stream(case, Network(network.bandwidth * factor, latency, fetchers)).complete_in(wanted)
+        slow = ChunkStream(case, Network(network.bandwidth, latency, fetchers)).complete_in(wanted)
+        fast = ChunkStream(case, Network(network.bandwidth * factor, latency, fetchers)).complete_in(wanted)
         assert slow is not None and fast is not None
         assert fast <= slow * (1 + 1e-9)
 
@@ -167,7 +167,7 @@ def test_a_wider_link_can_be_the_slower_one_by_a_little() -> None:
         twin.want([0, 1, 2, 3, 4, 5])
         twin.advance(Fraction(1000))
         assert float(twin.arrivals[-1][0]) == pytest.approx(expected, abs=1e-4)
-        assert Stream(chunks, network).complete_in([0, 1, 2, 3, 4, 5]) == pytest.approx(expected, abs=1e-4)
+        assert ChunkStream(chunks, network).complete_in([0, 1, 2, 3, 4, 5]) == pytest.approx(expected, abs=1e-4)
 
 
 @given(st.data(), tree_sizes, networks)
@@ -175,7 +175,7 @@ def test_one_fetcher_brings_them_in_order_one_after_the_other(
     data: st.DataObject, sizes: list[list[int]], network: Network
 ) -> None:
     chunks = Chunks(sizes)
-    stream = Stream(chunks, Network(network.bandwidth, network.latency, 1))
+    stream = ChunkStream(chunks, Network(network.bandwidth, network.latency, 1))
     wanted = data.draw(st.permutations(range(len(chunks))))
     stream.want(wanted)
     order = roots_first(chunks, wanted)
@@ -186,7 +186,7 @@ def test_one_fetcher_brings_them_in_order_one_after_the_other(
 
 
 def test_one_chunk_takes_the_latency_and_its_bytes() -> None:
-    stream = Stream(Chunks([[MB]]), Network(2.5 * MB, 0.06))
+    stream = ChunkStream(Chunks([[MB]]), Network(2.5 * MB, 0.06))
     assert stream.complete_in([0]) == pytest.approx(0.06 + 0.4)
     stream.want([])  # a root is always wanted
     stream.advance(0.459)
@@ -198,7 +198,7 @@ def test_one_chunk_takes_the_latency_and_its_bytes() -> None:
 
 def test_no_chunk_is_asked_for_before_the_header_is_there() -> None:
     """The header takes no fetcher, and what it brings of the first chunk is not counted as the chunk."""
-    stream = Stream(Chunks([[MB, MB]], [[MB // 2]]), Network(MB, 0.1, 1))
+    stream = ChunkStream(Chunks([[MB, MB]], [[MB // 2]]), Network(MB, 0.1, 1))
     stream.want([])
     stream.advance(0.599)
     assert stream.take_bytes() == 0
@@ -212,7 +212,7 @@ def test_no_chunk_is_asked_for_before_the_header_is_there() -> None:
 def test_headers_of_several_trees_come_at_once() -> None:
     """Each with half of the bandwidth; the second one has to be asked for twice."""
     chunks = Chunks([[MB], [MB]], [[MB], [MB, 2 * MB]])
-    assert rest(Stream(chunks, Network(2 * MB, 0.5, 1)), []) == [
+    assert rest(ChunkStream(chunks, Network(2 * MB, 0.5, 1)), []) == [
         (pytest.approx(0.5 + 1 + 0.5 + 1), 0),  # while half of the longer answer arrives
         (pytest.approx(3.0 + 0.5 + 0.5 + 0.5), 1),
     ]
@@ -223,18 +223,18 @@ def test_headers_of_several_trees_come_at_once() -> None:
 def test_equal_chunks_come_in_rounds(count: int, fetchers: int) -> None:
     rounds, remainder = divmod(count, fetchers)
     expected = rounds * (0.1 + fetchers * 0.5) + (0.1 + remainder * 0.5 if remainder else 0)
-    stream = Stream(Chunks([[MB] * count]), Network(2 * MB, 0.1, fetchers))
+    stream = ChunkStream(Chunks([[MB] * count]), Network(2 * MB, 0.1, fetchers))
     assert stream.complete_in(list(range(count))) == pytest.approx(expected)
 
 
 def test_transfers_share_the_link() -> None:
     # 1 and 3 MB together at 1 MB/s: the small one has half of it and ends after 2 s, the large one after 4 s.
-    stream = Stream(Chunks([[1 * MB], [3 * MB]]), Network(1 * MB, 1.0))
+    stream = ChunkStream(Chunks([[1 * MB], [3 * MB]]), Network(1 * MB, 1.0))
     assert [(pytest.approx(3.0), 0), (pytest.approx(5.0), 1)] == rest(stream, [])
 
 
 def test_fetches_are_not_cancelled_when_the_camera_turns() -> None:
-    stream = Stream(Chunks([[MB] * 5]), Network(MB, 0.5, 1))
+    stream = ChunkStream(Chunks([[MB] * 5]), Network(MB, 0.5, 1))
     stream.want([])
     stream.advance(1.5)
     stream.want([1, 2])
@@ -246,7 +246,7 @@ def test_fetches_are_not_cancelled_when_the_camera_turns() -> None:
 
 
 def test_a_late_chunk_evicts_no_wanted_one() -> None:
-    stream = Stream(Chunks([[MB] * 4]), Network(MB, 0.25, 1), capacity=2)
+    stream = ChunkStream(Chunks([[MB] * 4]), Network(MB, 0.25, 1), capacity=2)
     stream.want([1])
     stream.advance(3.0)
     stream.want([2])
@@ -263,7 +263,7 @@ def test_the_default_network_brings_at_once_what_fits(data: st.DataObject, sizes
     sizes = [[0 if size % 3 else size for size in tree] for tree in sizes]  # some of no bytes
     chunks = Chunks(sizes)
     capacity = data.draw(st.none() | st.integers(len(sizes), len(chunks)))
-    stream = Stream(chunks, capacity=capacity)
+    stream = ChunkStream(chunks, capacity=capacity)
     for time in range(data.draw(st.integers(1, 6))):
         stream.advance(time)
         assert stream.take_arrivals() == []
@@ -282,7 +282,7 @@ def test_the_default_network_brings_at_once_what_fits(data: st.DataObject, sizes
 
 
 def test_a_stream_refuses_to_go_back_in_time() -> None:
-    stream = Stream(Chunks([[1]]), start=1.0)
+    stream = ChunkStream(Chunks([[1]]), start=1.0)
     for time in (0.5, math.nan, math.inf):
         with pytest.raises(ValueError, match="it must increase"):
             stream.advance(time)

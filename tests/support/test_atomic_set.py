@@ -147,6 +147,35 @@ def breaking(work: Broken, call: int, after: bool, error: BaseException) -> tupl
     return wrapped, calls
 
 
+def broken_off(
+    step: tuple[object, str],
+    after: bool,
+    folders: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    before: dict[str, bytes],
+    new: dict[str, bytes],
+    others: dict[str, bytes],
+    outdated: Callable[[Collection[str]], list[str]],
+) -> int:
+    """Break a write off at each call of a step by turns: all is as before, or as it is to be; return the calls."""
+    for call in range(20):
+        folder, expected = folders / str(call), before | others
+        folder.mkdir()
+        put(folder, expected)
+        with monkeypatch.context() as patch:
+            wrapped, calls = breaking(getattr(*step), call, after, KeyboardInterrupt())
+            patch.setattr(*step, wrapped)
+            with contextlib.suppress(KeyboardInterrupt):
+                atomic_set.write(folder, files(new), overwrite=bool(before), outdated=outdated)
+                expected = new | others
+        if len(calls) <= call:
+            return call
+        left = {name: data for name, data in held(folder).items() if not name.startswith(".sparklod-")}
+        assert left == expected, call
+        assert step[1] in ("mkdir", "rmdir") or left == held(folder)
+    raise AssertionError("it has no end")
+
+
 @pytest.mark.parametrize("after", [False, True])
 @pytest.mark.parametrize("step", STEPS, ids=lambda step: step[1])
 @pytest.mark.parametrize("existing", [False, True])
@@ -160,22 +189,7 @@ def test_an_error_or_interrupt_at_any_step_leaves_what_was_there(
             raise PermissionError(1, "Operation not permitted")
 
         monkeypatch.setattr(os, "link", refused)
-    reached = 0
-    for call in range(9):
-        folder = tmp_path / str(call)
-        folder.mkdir()
-        before = OLD | OTHERS if existing else OTHERS
-        put(folder, before)
-        with monkeypatch.context() as patch:
-            wrapped, calls = breaking(getattr(*step), call, after, KeyboardInterrupt())
-            patch.setattr(*step, wrapped)
-            with contextlib.suppress(KeyboardInterrupt):
-                atomic_set.write(folder, files(NEW), overwrite=existing, outdated=longer)
-                before = NEW | OTHERS
-        if len(calls) <= call:
-            break
-        reached += 1
-        assert held(folder) == before, (call, len(calls))
+    reached = broken_off(step, after, tmp_path, monkeypatch, OLD if existing else {}, NEW, OTHERS, longer)
     expected = {("rename", True): 4, ("replace", True): 3, ("chmod", True): 3, ("link", False): 3}
     assert reached == (3 if not links and step[1] == "replace" else expected.get((step[1], existing), 0))
 
@@ -203,28 +217,10 @@ def test_folders_are_made_and_removed_with_their_files_and_no_others_are(tmp_pat
 def test_an_interrupt_at_any_step_leaves_folders_as_they_were(
     step: tuple[object, str], existing: bool, after: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    reached = 0
-    for call in range(20):
-        folder = tmp_path / str(call)
-        folder.mkdir()
-        before = OLD_FOLDERS | OTHER_FOLDERS if existing else OTHER_FOLDERS
-        put(folder, before)
-        with monkeypatch.context() as patch:
-            wrapped, calls = breaking(getattr(*step), call, after, KeyboardInterrupt())
-            patch.setattr(*step, wrapped)
-            with contextlib.suppress(KeyboardInterrupt):
-                atomic_set.write(folder, files(NEW_FOLDERS), overwrite=existing, outdated=no_more)
-                before = NEW_FOLDERS | OTHER_FOLDERS
-        if len(calls) <= call:
-            break
-        reached += 1
-        assert {name: data for name, data in held(folder).items() if not name.startswith(".sparklod-")} == before, call
-    assert reached or (step[1], existing) in {
-        ("link", True),
-        ("rename", False),
-        ("replace", False),
-        ("chmod", False),
-    } | {("rmdir", False)}
+    before = OLD_FOLDERS if existing else {}
+    reached = broken_off(step, after, tmp_path, monkeypatch, before, NEW_FOLDERS, OTHER_FOLDERS, no_more)
+    never = {("link", True), ("rename", False), ("replace", False), ("chmod", False), ("rmdir", False)}
+    assert reached or (step[1], existing) in never
 
 
 @pytest.mark.parametrize("overwrite", [False, True])

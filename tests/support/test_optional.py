@@ -174,5 +174,5 @@ def test_an_extra_requires_its_own_and_the_extras_of_those() -> None:
 )
 def test_versions_compare_as_numbers(least: str, version: str | None, found: str) -> None:
     required = Required("numpy", least, version)
-    assert required.found == found
+    assert required.state == found
     assert required.missing == (found != version)

@@ -19,7 +19,7 @@ OUTLIERS = 0.02
 
 
 @dataclass(frozen=True)
-class Stage:
+class BuildStage:
     """A stage of the build.
 
     Attributes:
@@ -38,7 +38,7 @@ class Stage:
 
 
 @dataclass(frozen=True)
-class Blocks:
+class BlockDivision:
     """Division of a scene into blocks.
 
     Attributes:
@@ -48,7 +48,7 @@ class Blocks:
     """
 
     splits: tuple[tuple[int, float, int, int], ...]
-    stages: tuple[Stage, ...]
+    stages: tuple[BuildStage, ...]
 
     @property
     def count(self) -> int:
@@ -65,9 +65,6 @@ class Blocks:
 
     def sort(self, center: FloatArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Sort splats by their blocks, stably.
-
-        Args:
-            center: (N, 3).
 
         Returns:
             (N,) the splats, and (blocks + 1,) where those of each block begin.
@@ -87,13 +84,7 @@ class Blocks:
 
 @dataclass(frozen=True)
 class _Part:
-    """A part of the scene: a block, or two halves.
-
-    Attributes:
-        side: as in `Blocks.splits`.
-        region: of the scene.
-        halves: without any, it is a block.
-    """
+    """A part of the scene: a block, or two halves."""
 
     side: int
     region: Region
@@ -106,7 +97,7 @@ class _Cut:
     def __init__(self, sample: FloatArray) -> None:
         self.sample = sample
         self.splits: list[tuple[int, float, int, int]] = []
-        self.stages: list[Stage] = []
+        self.stages: list[BuildStage] = []
         self.blocks = 0
 
     def part(self, index: NDArray[np.int64], wanted: int, region: Region) -> _Part:
@@ -138,10 +129,10 @@ class _Cut:
                 return axis, float(max(value, values[np.searchsorted(values, values[0], "right")]))
         return None
 
-    def stage(self, part: _Part, region: Region | None) -> Stage:
+    def stage(self, part: _Part, region: Region | None) -> BuildStage:
         """Make the stages of a part, the last one of this region."""
         below = [self.stage(each, each.region) for each in _joined(part)] if part.halves else []
-        stage = Stage(
+        stage = BuildStage(
             number=len(self.stages),
             region=region,
             block=None if part.halves else ~part.side,
@@ -166,16 +157,15 @@ def _moved(corner: tuple[float, float, float], axis: int, value: float) -> tuple
     return x, y, z
 
 
-def cut_into_blocks(sample: FloatArray, count: int, block_splats: int) -> Blocks:
+def cut_into_blocks(sample: FloatArray, count: int, block_splats: int) -> BlockDivision:
     """Cut a scene into blocks of at most about `block_splats`, by a sample of its centres.
 
     Args:
         sample: (n, 3) centres, evenly drawn; without any, the scene is one block.
-        count: splats of the scene.
         block_splats: at least 1.
     """
     cut = _Cut(sample)
     everywhere = Region((-math.inf,) * 3, (math.inf,) * 3)
     whole = cut.part(np.arange(len(sample)), -(-count // block_splats), everywhere)
     cut.stage(whole, None)
-    return Blocks(tuple(cut.splits), tuple(cut.stages))
+    return BlockDivision(tuple(cut.splits), tuple(cut.stages))

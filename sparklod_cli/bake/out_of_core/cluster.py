@@ -86,7 +86,6 @@ def cluster(
     """Yield an engine on a cluster, which is left alone at the end, or ended if it was started here.
 
     Args:
-        settings: which cluster.
         memory: bytes that workers of our own share, or that a task of a cluster that runs may take; None for the part
             of what is available, or of the memory of a worker, that is usual.
         scratch: folder for files of workers of our own; one for temporary files unless given.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import pickle
 import shutil
@@ -35,7 +36,6 @@ class ClusterEngine:
     one which is lost takes no result with it: what it had put is in the store.
 
     Attributes:
-        threads: that a task works on.
         memory: bytes that a task may take; None where nobody knows.
     """
 
@@ -86,13 +86,12 @@ class ClusterEngine:
                         submit(heir)
 
     @contextlib.contextmanager
-    def each(
+    def map_calls(
         self, stage: str, call: Callable[..., Any], arguments: Sequence[tuple[Any, ...]], progress: Progress, unit: str
     ) -> Iterator[Iterator[Any]]:
         """Call a function with each tuple of arguments, side by side, until the context ends.
 
         Args:
-            stage: word for what is done.
             call: a function of a module that takes `threads` besides, and returns something small.
             arguments: small, and can be pickled.
             unit: what a call is called.
@@ -102,7 +101,7 @@ class ClusterEngine:
         """
         with Pool(self._connection, stage) as pool:
             for place, each in enumerate(arguments):
-                pool.submit(str(place), place, run_call, call, each, self.threads)
+                pool.submit(str(place), place, functools.partial(call, threads=self.threads), *each)
             yield self._outcomes(pool, stage, len(arguments), progress, unit)
 
     def _outcomes(self, pool: Pool, stage: str, count: int, progress: Progress, unit: str) -> Iterator[Any]:
@@ -120,7 +119,6 @@ class ClusterEngine:
         """Raise a `SparklodError` where a worker cannot do its share: another sparklod, or a folder it does not see.
 
         Args:
-            store: of the bake, if it has one.
             files: that tasks read; those that are not here are left to the tasks.
         """
         here = [file for file in files if isinstance(file, Path) and file.exists()]
@@ -174,8 +172,6 @@ class Probed:
     """Result of probing a worker.
 
     Attributes:
-        version: of sparklod.
-        host: name of its machine.
         reads: it reads the result that the client wrote.
         writes: empty, or why it cannot write one.
         missing: of the files that were asked for, those that it does not see.
@@ -189,13 +185,7 @@ class Probed:
 
 
 def probe(store: Store | None, name: str, files: Sequence[Path]) -> Probed:
-    """Try whether this worker can do its share: read what others wrote, and write what they read.
-
-    Args:
-        store: of the bake, if it has one.
-        name: of a result that the client wrote.
-        files: that tasks read.
-    """
+    """Try whether this worker can read what the client wrote, by the name of the result, and write what it reads."""
     reads, writes = True, ""
     if store is not None:
         mine = f"{name}-{uuid.uuid4().hex}"
@@ -217,7 +207,6 @@ def run_task(packed: bytes, task: Task, threads: int) -> tuple[int, int]:
 
     Args:
         packed: the job, pickled; a copy for each task, so that each counts its own bytes.
-        task: to be run.
 
     Returns:
         bytes that it wrote to the store, and read there.
@@ -228,11 +217,6 @@ def run_task(packed: bytes, task: Task, threads: int) -> tuple[int, int]:
             task.run(job, *task.arguments, threads=threads, progress=silent)
         machine.release_memory()
     return job.store.traffic.written, job.store.traffic.read
-
-
-def run_call(call: Callable[..., Any], arguments: tuple[Any, ...], threads: int) -> Any:
-    """Call a function that returns something small."""
-    return call(*arguments, threads=threads)
 
 
 def dask_setup(worker: Any) -> None:

@@ -9,6 +9,8 @@ import functools
 
 from ...lod.builders import BUILDERS, SplatBytes
 from ...support import machine
+from ...support.errors import OutOfMemoryError
+from ...support.units import format_size
 
 #: Part of the memory available that a bake may take unless told otherwise: other programs need some, and figures for it
 #: are estimates. Chosen.
@@ -38,12 +40,7 @@ def default_memory() -> int | None:
 
 
 def in_memory_bytes(method: str, splats: int, sh_degree: int) -> int:
-    """Return bytes that a bake in memory takes at its peak.
-
-    Args:
-        method: of `lod.builders.BUILDERS`.
-        splats, sh_degree: of the input.
-    """
+    """Return bytes that a bake in memory takes at its peak."""
     return PROCESS + BUILDERS[method].in_memory.of(splats, sh_degree)
 
 
@@ -53,9 +50,7 @@ def out_of_core_bytes(
     """Return bytes that a bake out of core takes at its peak.
 
     Args:
-        method: of `lod.builders.BUILDERS`.
         splats, sh_degree: of the input; `sh_degree` as far as it is kept.
-        block_splats: of a block.
         in_chunks: families are put in an order for streaming at the end.
     """
     from ...lod.chunk_order import MOST_FAMILIES, family_bytes  # takes long to load, and this is asked out of core only
@@ -71,7 +66,6 @@ def scratch_bytes(method: str, splats: int, sh_degree: int) -> int:
     """Return bytes that the scratch folder takes at its peak, without what is unpacked of the input.
 
     Args:
-        method: of `lod.builders.BUILDERS`.
         splats, sh_degree: of the input; `sh_degree` as far as it is kept.
     """
     return BUILDERS[method].in_scratch.of(splats, sh_degree)
@@ -79,19 +73,22 @@ def scratch_bytes(method: str, splats: int, sh_degree: int) -> int:
 
 def block_splats_within(
     memory: int | None, method: str, splats: int, sh_degree: int, *, in_chunks: bool = False, threads: int = 1
-) -> int | None:
+) -> int:
     """Return the splats of a block, a power of two, so that nearly the same memory gives the same blocks.
 
     Args:
         memory: bytes that a bake may take; None for any number.
 
-    Returns:
-        None where the memory is too little for blocks of `LEAST_BLOCK_SPLATS`.
+    Raises:
+        OutOfMemoryError: the memory is too little for blocks of `LEAST_BLOCK_SPLATS`.
     """
     size = MOST_BLOCK_SPLATS
     needed = functools.partial(out_of_core_bytes, method, splats, sh_degree, in_chunks=in_chunks, threads=threads)
     while memory is not None and needed(size) > memory:
         size //= 2
         if size < LEAST_BLOCK_SPLATS:
-            return None
+            raise OutOfMemoryError(
+                f"{format_size(memory)} of memory is too little even out of core; give --memory"
+                f" {format_size(1.02 * needed(LEAST_BLOCK_SPLATS))} or more"
+            )
     return size

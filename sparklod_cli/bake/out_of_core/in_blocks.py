@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 from ...codecs.encoder import Encoder, Get
 from ...codecs.statistics import Statistics
 from ...lod.builders import BUILDERS
-from ...lod.stage_records import NO_FAMILY, Families, Pending
+from ...lod.stage_records import NO_FAMILY, Pending, StageFamilies
 from ...model.selection import SelectionTally
 from ...model.splats import Splats
 from ...support.parallel import blocks_of, on_threads
 from ...support.progress import Progress
-from ..output import Output
+from ..output import BakeOutput
 from ..records import BuiltTree, Clock
-from .blocks import Stage, cut_into_blocks
+from .blocks import BuildStage, cut_into_blocks
 from .job import ORDER, PUBLISHED, ROOT, Job, clean_of, encoded_of, families_of, pending_of, stage_of
 from .nodes import Rows, encode, encoded_chunk, node_stream, rows_of, splats_of, width_of
 from .order import WINDOW_NODES, put_order
@@ -41,19 +41,16 @@ JOIN_WORK = 0.1
 
 @dataclass
 class InBlocks:
-    """Workspace in a scratch folder, see `flow.Workspace`.
+    """Workspace in a scratch folder, with the steps of `in_memory.InMemory`.
 
     Attributes:
         job: of all tasks; `build` and `order` add what they find out.
-        output: where the tree goes.
-        clock: of the stages.
-        engine: runs the tasks.
         block_splats: of a block, about.
         progress: called with how much of a stage is done.
     """
 
     job: Job
-    output: Output
+    output: BakeOutput
     clock: Clock
     engine: Engine
     block_splats: int
@@ -68,7 +65,8 @@ class InBlocks:
         self.clock.end("read")
         self.output.check(findings.statistics)
         setting = getattr(settings, BUILDERS[settings.method].setting)
-        self.job = job = dataclasses.replace(self.job, plan=self.job.builder().plan(findings.survey(), setting))
+        plan = self.job.builder().plan(findings.bounds, splats_of(findings.sample), setting)
+        self.job = job = dataclasses.replace(self.job, plan=plan)
         self.engine.run("building", list(_stages(job)), job, self.progress)
         self.clock.end("build")
         return BuiltTree(
@@ -127,8 +125,8 @@ class InBlocks:
             parts = [Findings.from_arrays(each) for each in arrays]
             findings = Findings.merged(parts)
             check_findings(findings, job.settings)
-            kept = tuple(itertools.accumulate((part.tally.kept for part in parts), initial=0))
-            self.job = job = dataclasses.replace(job, kept=kept)
+            selected = tuple(itertools.accumulate((part.tally.kept for part in parts), initial=0))
+            self.job = job = dataclasses.replace(job, selected=selected)
             largest = int(np.sum([np.diff(each["first"]) for each in arrays], axis=0).max())
             again = cut_into_blocks(findings.sample[:, :3], findings.tally.kept, block_splats)
             if largest <= SLACK * block_splats or job.round + 1 == ROUNDS or again == job.blocks:
@@ -142,7 +140,7 @@ def _stages(job: Job) -> Iterator[Task]:
     """Yield the tasks of all stages, and those that remove what they no longer need, as soon as that can be."""
     blocks = job.blocks
     ends = {group.stop - 1: number for number, group in enumerate(blocks.groups)}
-    share = job.kept[-1] // blocks.count
+    share = job.selected[-1] // blocks.count
     begun = {stage.block: stage_of(stage.number) for stage in blocks.stages}
     for stage in blocks.stages:
         needs = tuple(stage_of(child) for child in stage.children)
@@ -183,7 +181,7 @@ def clean(job: Job, group: int, *, threads: int, progress: Progress) -> None:
     job.store.put(clean_of(group), {})
 
 
-def _begun(job: Job, stage: Stage, threads: int) -> Pending:
+def _begun(job: Job, stage: BuildStage, threads: int) -> Pending:
     """Return the nodes that a stage begins with."""
     if stage.block is None:
         return Pending.concat([Pending(job.store.get(pending_of(child))) for child in stage.children])
@@ -208,21 +206,11 @@ def block_of(job: Job, block: int, threads: int) -> tuple[Splats, NDArray[np.int
         here, name = slice(at, at + stop - start), job.splats(part, group)
         rows[here] = job.store.rows(name, "rows", start, stop)
         index[here] = job.store.rows(name, "index", start, stop)
-        index[here] += job.kept[part]
+        index[here] += job.selected[part]
         at = here.stop
     return splats_of(rows, threads), index
 
 
-def _put_families(job: Job, number: int, families: Families, threads: int) -> None:
-    job.store.put(
-        families_of(number),
-        {
-            "batch": families.batch,
-            "key": families.key,
-            "count": families.count,
-            "rows": rows_of(families.nodes, threads),
-            "family": families.family,
-            "center": families.center,
-            "size": families.size,
-        },
-    )
+def _put_families(job: Job, number: int, families: StageFamilies, threads: int) -> None:
+    columns = dict(vars(families))
+    job.store.put(families_of(number), {"rows": rows_of(columns.pop("nodes"), threads), **columns})

@@ -11,11 +11,11 @@ from ...lod.builders import BUILDERS
 from ...lod.stage_records import StagedBuilder
 from ...model.streams import SceneStream
 from ..settings import BakeSettings
-from .blocks import Blocks
+from .blocks import BlockDivision
 from .store import Store
 
 #: Those of a scene that is not cut yet.
-NO_BLOCKS = Blocks((), ())
+NO_BLOCKS = BlockDivision((), ())
 
 
 @dataclass(frozen=True)
@@ -23,15 +23,13 @@ class Job:
     """Data that all tasks of a bake share; small, so it can be pickled.
 
     Attributes:
-        store: of the results.
         stream: the input; can be pickled, too.
-        settings: how to bake.
         needed: statistics by which the output is settled.
         in_chunks: the output has the order for streaming.
         parts: where each part of the input begins, and at last the count; none before that is known.
         blocks: that the scene is cut into; none before that is known.
         round: how often it was cut before.
-        kept: how many splats of the parts before each part are kept; empty before that is known.
+        selected: how many splats of the parts before each part are selected; empty before that is known.
         plan: of the builder; None before it is known.
         families: how many each stage made, by its number; empty before they are known.
         encoder: of the output; None before the statistics of all nodes are known.
@@ -43,9 +41,9 @@ class Job:
     needed: frozenset[str]
     in_chunks: bool
     parts: tuple[int, ...] = ()
-    blocks: Blocks = NO_BLOCKS
+    blocks: BlockDivision = NO_BLOCKS
     round: int = 0
-    kept: tuple[int, ...] = ()
+    selected: tuple[int, ...] = ()
     plan: Any = None
     families: tuple[int, ...] = ()
     encoder: Encoder | None = None

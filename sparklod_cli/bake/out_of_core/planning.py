@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING
 
 from ...model.streams import SceneStream
 from ...support.addresses import Place, absolute
-from ...support.errors import FormatError, HasTreeError, OutOfMemoryError, ScratchError
+from ...support.errors import FormatError, HasTreeError, ScratchError
 from ...support.progress import Progress
 from ...support.stdin import name_of
 from ...support.units import count_of, format_size
 from ..fingerprint import files_named_in, source_fingerprint
-from ..output import Output
+from ..output import BakeOutput
 from ..records import Clock
 from ..settings import BakeSettings, Resources
 from ..sources import Merged, Source, absolute_source, opened_source
@@ -41,7 +41,7 @@ def blocks_for(
     source: Source,
     target: Place,
     settings: BakeSettings,
-    output: Output,
+    output: BakeOutput,
     clock: Clock,
     *,
     overwrite: bool,
@@ -52,10 +52,6 @@ def blocks_for(
     say: Callable[[str], None],
 ) -> Iterator[InBlocks | None]:
     """Open the workspace of a bake that goes out of core, if that is needed or requested; None for one in memory.
-
-    Args:
-        output: of the bake.
-        clock: of its stages.
 
     Raises:
         ScratchError: the scratch folder cannot be used, or has too little room.
@@ -90,8 +86,8 @@ def blocks_for(
     from .in_blocks import InBlocks  # what most bakes do without takes long to load
 
     splats, degree = header.count, min(header.sh_degree, settings.max_sh)
-    block_splats = resources.block_splats or _block_splats(
-        splats, degree, settings.method, memory, in_chunks=output.in_chunks, threads=threads
+    block_splats = resources.block_splats or estimate.block_splats_within(
+        memory, settings.method, splats, degree, in_chunks=output.in_chunks, threads=threads
     )
     needed = estimate.scratch_bytes(settings.method, splats, degree)
     if isinstance(folder, Path):
@@ -171,22 +167,6 @@ def _as_a_whole(settings: BakeSettings) -> str | None:
     if settings.refine is not None:
         return "--refine fits a whole tree"
     return None if settings.detail is None else "detail levels are made of a whole tree"
-
-
-def _block_splats(
-    splats: int, sh_degree: int, method: str, memory: int | None, *, in_chunks: bool, threads: int
-) -> int:
-    """Return the splats of a block; raise `OutOfMemoryError` where there is too little memory for the least ones."""
-    size = estimate.block_splats_within(memory, method, splats, sh_degree, in_chunks=in_chunks, threads=threads)
-    if size is None:
-        least = estimate.out_of_core_bytes(
-            method, splats, sh_degree, estimate.LEAST_BLOCK_SPLATS, in_chunks=in_chunks, threads=threads
-        )
-        raise OutOfMemoryError(
-            f"{format_size(memory or 0)} of memory is too little even out of core; give --memory"
-            f" {format_size(1.02 * least)} or more"
-        )
-    return size
 
 
 def _check_room(folder: Path, needed: int) -> None:

@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...codecs.statistics import Statistics
-from ...lod.check import check_visible
+from ...lod.check import Bounds, check_visible
 from ...lod.kernels.geometry import find_bounds
-from ...lod.stage_records import Survey
 from ...model.selection import REASONS, SelectionTally
 from ...model.splats import FloatArray, Splats
 from ...model.streams import SceneStream
@@ -31,7 +30,7 @@ PART_SPLATS, MAX_PARTS = 1 << 19, 256
 #: differ by a few per cent in their splats then, even where neighbours in the file are neighbours in space. Chosen.
 RANGES_OF_BLOCK, MIN_RANGES, MAX_RANGES, RANGE_SPLATS = 32, 64, 512, 256
 
-#: Splats of the survey's sample, or a few more. Chosen.
+#: Splats of the sample that a builder plans by, or a few more. Chosen.
 SAMPLE_SPLATS = 1 << 18
 
 
@@ -61,7 +60,6 @@ def first_look(stream: SceneStream, settings: BakeSettings, blocks: int) -> tupl
     """Return (n, 3) centres of selected splats, from ranges all over the input, and the share of selected splats.
 
     Args:
-        stream: the input.
         blocks: that the scene will be cut into, about; for a single one nothing is read.
     """
     if blocks == 1:
@@ -88,7 +86,6 @@ class Findings:
         box: (2, 3) float64 corners of the box of the centres that are kept, world units; infinite without any.
         sizes: (2,) float64 range of their sizes, 2 * max(scale), world units.
         sample: rows of an even sample of them.
-        statistics: of them.
     """
 
     tally: SelectionTally
@@ -150,20 +147,15 @@ class Findings:
             Statistics.from_array(arrays["statistics"]),
         )
 
-    def survey(self) -> Survey:
-        """Return what the builder has to know."""
-        sample = splats_of(self.sample)
-        low, high = (tuple(corner) for corner in self.box.tolist())
+    @property
+    def bounds(self) -> Bounds:
+        """Bounds of the splats that are kept."""
         smallest, largest = self.sizes.tolist()
-        return Survey(self.tally.kept, sample.sh_degree, low, high, smallest, largest, sample)
+        return Bounds(self.box[0], self.box[1], smallest, largest)
 
 
 def check_findings(findings: Findings, settings: BakeSettings) -> None:
-    """Check that a tree can be made of a whole scene.
-
-    Raises:
-        InvalidSplatsError: as `bake`.
-    """
+    """Check that a tree can be made of a whole scene; raise `InvalidSplatsError` as `bake` does."""
     settings.selection.check(findings.tally)
     check_transformed(findings.beyond)
     check_visible(float(findings.sizes[0]))

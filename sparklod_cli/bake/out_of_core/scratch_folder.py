@@ -70,12 +70,7 @@ def _digest(text: str) -> str:
 
 @dataclass(frozen=True)
 class _Manifest:
-    """Manifest that identifies the bake a store belongs to.
-
-    Attributes:
-        fingerprint: of the output.
-        block_splats: of the blocks that the scene was cut into.
-    """
+    """Manifest that identifies the bake a store belongs to."""
 
     fingerprint: Fingerprint
     block_splats: int
@@ -114,9 +109,7 @@ def at_work(
     After an error that another run need not meet, or an interrupt, the results stay.
 
     Args:
-        fingerprint: of the output.
         block_splats: of the blocks that the scene is cut into, unless that was done before.
-        resume: go on with the results that are there.
         overwrite: remove them, unless `resume` is set.
         say: told what was found, and what is left.
 

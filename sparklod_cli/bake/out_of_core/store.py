@@ -14,7 +14,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from io import BufferedReader, FileIO
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +37,10 @@ ALIGNMENT = 64
 
 #: Bytes of a table that are believed; those of results have some hundreds.
 MAX_TABLE = 1 << 24
+
+
+#: The file of a result, open.
+_File = FileIO | BufferedReader
 
 
 class DamagedError(ValueError):
@@ -70,19 +74,6 @@ class Entry:
         return math.prod(self.shape[1:]) * self.dtype.itemsize
 
 
-@dataclass(frozen=True)
-class Table:
-    """The arrays of a result, by name.
-
-    Attributes:
-        entries: them.
-        bytes: of the whole file.
-    """
-
-    entries: Mapping[str, Entry]
-    bytes: int
-
-
 def encode(arrays: Arrays) -> Iterator[bytes | memoryview]:
     """Yield the bytes of a result in pieces; nothing of an array that is C-contiguous is copied.
 
@@ -103,40 +94,29 @@ def encode(arrays: Arrays) -> Iterator[bytes | memoryview]:
         at = _aligned(at) + array.nbytes
 
 
-def table_bytes(head: bytes) -> int:
-    """Return how many bytes follow the head, and are the table.
+def read_table(file: _File, size: int) -> dict[str, Entry]:
+    """Return the arrays of a result by name, of its file of so many bytes.
 
     Raises:
-        DamagedError: it is no head of a result.
+        DamagedError: it is no result, its table is damaged, or it has another length than when it was written.
     """
+    file.seek(0)
+    head = file.read(HEAD.size)
     if len(head) < HEAD.size or not head.startswith(MAGIC):
         raise DamagedError("it does not begin as a result")
-    size: int = HEAD.unpack(head)[1]
-    if size > MAX_TABLE:
-        raise DamagedError(f"its table has {size:,} bytes")
-    return size
-
-
-def decode_table(head: bytes, text: bytes, file_bytes: int) -> Table:
-    """Return the table of a file.
-
-    Args:
-        head, text: what it begins with.
-        file_bytes: that it has.
-
-    Raises:
-        DamagedError: the table is damaged, or the file has another length than when it was written.
-    """
-    _, size, checksum, end = HEAD.unpack(head)
-    if len(text) != size or zlib.crc32(text) != checksum:
+    _, length, checksum, end = HEAD.unpack(head)
+    if length > MAX_TABLE:
+        raise DamagedError(f"its table has {length:,} bytes")
+    text = file.read(length)
+    if len(text) != length or zlib.crc32(text) != checksum:
         raise DamagedError("its table is damaged")
-    if end != file_bytes:
-        raise DamagedError(f"it has {file_bytes:,} bytes of {end:,}")
-    entries, at = {}, HEAD.size + size
+    if end != size:
+        raise DamagedError(f"it has {size:,} bytes of {end:,}")
+    entries, at = {}, HEAD.size + length
     for name, dtype, shape, each in json.loads(text):
         entries[name] = Entry(np.dtype(dtype), tuple(shape), _aligned(at), each)
         at = _aligned(at) + entries[name].bytes
-    return Table(entries, end)
+    return entries
 
 
 def check(entry: Entry, pieces: Iterable[NDArray[Any]]) -> None:
@@ -173,9 +153,6 @@ READ_AHEAD = 1 << 16
 
 #: What the system says of a disk, or a share of one, that is full.
 FULL = {errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC)}
-
-#: The file of a result, open.
-_File = FileIO | BufferedReader
 
 
 class Traffic:
@@ -214,7 +191,7 @@ class Store:
     def __init__(self, folder: Place) -> None:
         self.folder = folder
         self.traffic = Traffic()
-        self._tables: dict[str, Table] = {}
+        self._tables: dict[str, tuple[int, dict[str, Entry]]] = {}  # with the bytes of the file
         self._lock = threading.Lock()
 
     def __reduce__(self) -> tuple[type[Store], tuple[Place]]:
@@ -229,10 +206,8 @@ class Store:
         if isinstance(folder, Path):
             files = folder.rglob(f"*{SUFFIX}")
             return sorted(path.relative_to(folder).as_posix().removesuffix(SUFFIX) for path in files)
-        try:
+        with self._translated("read"):
             return [name.removesuffix(SUFFIX) for name in folder.files() if name.endswith(SUFFIX)]
-        except OSError as error:
-            self._refused("read", error)
 
     def _place(self, name: str) -> Place:
         """Return the file of a result."""
@@ -243,8 +218,8 @@ class Store:
         place = self._place(name)
         if isinstance(place, Path):
             return place.open("rb", buffering=0)
-        table = self._tables.get(name)
-        return place.open(buffering=READ_AHEAD, size=None if table is None else table.bytes)
+        size, _ = self._tables.get(name, (None, {}))
+        return place.open(buffering=READ_AHEAD, size=size)
 
     def _write(self, name: str, pieces: Iterable[bytes | memoryview]) -> int:
         """Write the file of a result, which appears when it is whole; return its size."""
@@ -257,31 +232,26 @@ class Store:
     def has(self, name: str) -> bool:
         """Return whether there is a result, in a folder of the length that it was written with."""
         place = self._place(name)
-        try:
+        with self._translated("read"):
             if isinstance(place, Address):
                 return place.is_file()
-            with self._open(name) as file:
+            with contextlib.suppress(FileNotFoundError, NotADirectoryError, DamagedError), self._open(name) as file:
                 self._table(name, file)
-        except (FileNotFoundError, NotADirectoryError, DamagedError):
-            return False
-        except OSError as error:
-            self._refused("read", error)
-        return True
+                return True
+        return False
 
     def put(self, name: str, arrays: Arrays) -> None:
         """Write a result; replaces one of this name."""
         self._forget(name)
-        try:
+        with self._translated("write"):
             self.traffic.add(written=self._write(name, encode(arrays)))
-        except OSError as error:
-            self._refused("write", error)
 
     def get(self, name: str, keys: Collection[str] | None = None) -> dict[str, NDArray[Any]]:
         """Read a result, or some of its arrays, and compare their checksums."""
         found = {}
         with self._reading(name) as (file, table):
-            for key in table.entries if keys is None else keys:
-                entry = table.entries[key]
+            for key in table if keys is None else keys:
+                entry = table[key]
                 found[key] = _filled(file, entry.offset, np.empty(entry.shape, entry.dtype))
                 check(entry, [found[key]])
                 self.traffic.add(read=entry.bytes)
@@ -290,7 +260,7 @@ class Store:
     def rows(self, name: str, key: str, start: int, stop: int) -> NDArray[Any]:
         """Read rows of an array and nothing else."""
         with self._reading(name) as (file, table):
-            entry = table.entries[key]
+            entry = table[key]
             start, stop, _ = slice(start, stop).indices(entry.shape[0])
             rows = np.empty((max(0, stop - start), *entry.shape[1:]), entry.dtype)
             _filled(file, entry.offset + start * entry.row_bytes, rows)
@@ -300,78 +270,74 @@ class Store:
     def shape(self, name: str, key: str) -> tuple[int, ...]:
         """Return the shape of an array."""
         with self._reading(name) as (_, table):
-            return table.entries[key].shape
+            return table[key].shape
 
     def remove(self, name: str) -> None:
         """Remove a result, if it is there."""
         self._forget(name)
-        try:
+        with self._translated("write"):
             self._place(name).unlink(missing_ok=True)
-        except OSError as error:
-            self._refused("write", error)
 
     def is_sound(self, name: str) -> bool:
         """Return whether a result is there, and has the bytes that were put; reads all of it."""
         self._forget(name)
         if not self.has(name):
             return False
-        try:
-            with self._open(name) as file:
-                for entry in self._table(name, file).entries.values():
-                    check(entry, _pieces(file, entry))
-                    self.traffic.add(read=entry.bytes)
-        except (FileNotFoundError, DamagedError):
-            return False
-        except OSError as error:
-            self._refused("read", error)
-        return True
+        with self._translated("read"), contextlib.suppress(FileNotFoundError, DamagedError), self._open(name) as file:
+            for entry in self._table(name, file).values():
+                check(entry, _pieces(file, entry))
+                self.traffic.add(read=entry.bytes)
+            return True
+        return False
 
     def _forget(self, name: str) -> None:
         with self._lock:
             self._tables.pop(name, None)
 
-    def _table(self, name: str, file: _File) -> Table:
+    def _table(self, name: str, file: _File) -> dict[str, Entry]:
         """Return the table of a file that is open, which is read once."""
         size = file.seek(0, os.SEEK_END)
         with self._lock:
-            table = self._tables.get(name)
-        if table is None or table.bytes != size:
-            file.seek(0)
-            head = file.read(HEAD.size)
-            table = decode_table(head, file.read(table_bytes(head)), size)
+            known, table = self._tables.get(name, (None, {}))
+        if known != size:
+            table = read_table(file, size)
             with self._lock:
-                self._tables[name] = table
+                self._tables[name] = size, table
         return table
 
     @contextlib.contextmanager
-    def _reading(self, name: str) -> Iterator[tuple[_File, Table]]:
+    def _reading(self, name: str) -> Iterator[tuple[_File, dict[str, Entry]]]:
         """Yield the file of a result, and its table."""
-        try:
-            with self._open(name) as file:
-                yield file, self._table(name, file)
-        except DamagedError as error:
-            raise ScratchError(
-                f"{name} in the scratch folder {self.folder} is damaged: {error}; run it again with --resume, which"
-                " makes it anew"
-            ) from None
-        except (FileNotFoundError, NotADirectoryError):
-            raise ScratchError(
-                f"{name} is missing in the scratch folder {self.folder}: somebody removed it; begin anew with"
-                " --overwrite, without --resume"
-            ) from None
-        except OSError as error:
-            self._refused("read", error)
+        with self._translated("read"):
+            try:
+                with self._open(name) as file:
+                    yield file, self._table(name, file)
+            except DamagedError as error:
+                raise ScratchError(
+                    f"{name} in the scratch folder {self.folder} is damaged: {error}; run it again with --resume, which"
+                    " makes it anew"
+                ) from None
+            except (FileNotFoundError, NotADirectoryError):
+                raise ScratchError(
+                    f"{name} is missing in the scratch folder {self.folder}: somebody removed it; begin anew with"
+                    " --overwrite, without --resume"
+                ) from None
 
-    def _refused(self, what: str, error: OSError) -> NoReturn:
-        reason = (error.strerror or str(error)).lower()
-        if error.errno in FULL:
+    @contextlib.contextmanager
+    def _translated(self, what: str) -> Iterator[None]:
+        """Turn errors of the system into `ScratchError`."""
+        try:
+            yield
+        except OSError as error:
+            reason = (error.strerror or str(error)).lower()
+            if error.errno in FULL:
+                raise ScratchError(
+                    f"there is no room left in the scratch folder {self.folder}: {reason}; free some and run it again"
+                    " with --resume, or choose another disk with --scratch-dir"
+                ) from None
             raise ScratchError(
-                f"there is no room left in the scratch folder {self.folder}: {reason}; free some and run it again with"
-                " --resume, or choose another disk with --scratch-dir"
+                f"cannot {what} in the scratch folder {self.folder}: {reason}; choose another one with --scratch-dir"
             ) from None
-        raise ScratchError(
-            f"cannot {what} in the scratch folder {self.folder}: {reason}; choose another one with --scratch-dir"
-        ) from None
 
 
 def _filled(file: _File, offset: int, array: NDArray[Any]) -> NDArray[Any]:

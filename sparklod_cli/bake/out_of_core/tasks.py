@@ -47,11 +47,7 @@ class Engine(Protocol):
 
 @dataclass(frozen=True)
 class LocalEngine:
-    """Engine without other processes; an interrupt leaves the results of all tasks that were done.
-
-    Attributes:
-        threads: that each task works on.
-    """
+    """Engine without other processes, on some threads; an interrupt leaves the results of all tasks that were done."""
 
     threads: int = 1
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from ...support.errors import CameraPathError
-from ..frame import Frame, Lens, Settings
+from ..frame import Frame, Intrinsics, Settings
 from ..generators import frame_looking
 from .source import Files, Json, Parsed
 
@@ -31,6 +31,6 @@ def parse(files: Files, settings: Settings) -> Parsed:
 
 
 def _frame(item: Json, up: tuple[float, ...]) -> Frame:
-    lens = Lens(fov=math.radians(item.get("fov").number())) if item.has("fov") else Lens()
+    lens = Intrinsics(fov=math.radians(item.get("fov").number())) if item.has("fov") else Intrinsics()
     up_axis = item.get("up").numbers(3) if item.has("up") else up
     return frame_looking(item.get("position").numbers(3), item.get("target").numbers(3), up_axis, lens)

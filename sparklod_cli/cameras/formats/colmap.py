@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ...support.errors import CameraPathError
-from ..frame import NO_LENS, Frame, Lens, Settings
+from ..frame import NO_LENS, Frame, Intrinsics, Settings
 from .source import Files, Parsed, finite, posed, side
 
 #: An image of images.bin: number, rotation w x y z, translation x y z, and number of its camera; its name follows.
@@ -76,7 +76,7 @@ MODELS = (
 )
 
 #: The cameras by their numbers, each with its model and its lens.
-Cameras = dict[int, tuple[Model, Lens]]
+Cameras = dict[int, tuple[Model, Intrinsics]]
 
 
 def recognises(files: Files) -> bool:
@@ -147,7 +147,7 @@ def _text_images(data: bytes) -> Iterator[Image]:
         next(lines, None)  # the points of the image; the line is empty without any
 
 
-def _text_cameras(data: bytes) -> Iterator[tuple[int, tuple[Model, Lens]]]:
+def _text_cameras(data: bytes) -> Iterator[tuple[int, tuple[Model, Intrinsics]]]:
     for number, line in enumerate(_lines(data, "cameras.txt"), 1):
         words = line.split()
         if not words or words[0].startswith("#"):
@@ -182,7 +182,7 @@ def _binary_images(data: bytes) -> Iterator[Image]:
         yield image, camera, [finite(x, way) for x in numbers[:4]], [finite(x, way) for x in numbers[4:]], name
 
 
-def _binary_cameras(data: bytes) -> Iterator[tuple[int, tuple[Model, Lens]]]:
+def _binary_cameras(data: bytes) -> Iterator[tuple[int, tuple[Model, Intrinsics]]]:
     reader = _Reader(data, "cameras.bin")
     (count,) = reader.take(COUNT)
     reader.expect(count, CAMERA.size)
@@ -226,7 +226,7 @@ class _Reader:
             raise CameraPathError(f"{self._name} ends before all of its data")
 
 
-def lens_of(model: Model, width: float, height: float, numbers: list[float], way: str) -> Lens:
+def lens_of(model: Model, width: float, height: float, numbers: list[float], way: str) -> Intrinsics:
     """Return the lens of a camera, without its distortion.
 
     Raises:
@@ -237,4 +237,4 @@ def lens_of(model: Model, width: float, height: float, numbers: list[float], way
     if len(numbers) != model.count:
         raise CameraPathError(f"{way} has {len(numbers)} parameters, not the {model.count} of {model.name}")
     principal = numbers[model.focals], numbers[model.focals + 1]
-    return Lens((side(width, way), side(height, way)), (numbers[0], numbers[model.focals - 1]), principal)
+    return Intrinsics((side(width, way), side(height, way)), (numbers[0], numbers[model.focals - 1]), principal)

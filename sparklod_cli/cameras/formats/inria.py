@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..frame import Frame, Lens, Settings
+from ..frame import Frame, Intrinsics, Settings
 from ..pose import pose
 from .source import Files, Json, Parsed
 
@@ -22,10 +22,10 @@ def parse(files: Files, settings: Settings) -> Parsed:
 
 def _frame(item: Json) -> Frame:
     rotation = np.array(item.get("rotation").matrix(3, columns=3)).reshape(3, 3)
-    lens = Lens()
+    lens = Intrinsics()
     if item.has("width", "height"):
         size = item.get("width").side(), item.get("height").side()
         focal = (item.get("fx").number(), item.get("fy").number()) if item.has("fx", "fy") else None
-        lens = Lens(size, focal)
+        lens = Intrinsics(size, focal)
     name = item.get("img_name").text() if item.has("img_name") else ""
     return Frame(pose(rotation, item.get("position").numbers(3)), lens, name=name)

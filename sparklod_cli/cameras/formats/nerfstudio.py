@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from ...support.errors import CameraPathError
-from ..frame import Frame, Lens, Settings
+from ..frame import Frame, Intrinsics, Settings
 from .source import Files, Json, Parsed
 
 #: The camera types that are read as pinhole cameras.
@@ -38,4 +38,4 @@ def _frame(item: Json, size: tuple[int, int] | None) -> Frame:
     """Return the field of view is vertical, in degrees, as in three.js; its aspect is that of the size."""
     fov = math.radians(item.get("fov").number()) if item.has("fov") else None
     matrix = np.array(item.get("camera_to_world").matrix(4)).reshape(4, 4)
-    return Frame(matrix, Lens(size, fov=fov))
+    return Frame(matrix, Intrinsics(size, fov=fov))

@@ -15,7 +15,7 @@ import numpy as np
 
 from ...support.errors import CameraPathError
 from ...support.optional import install_hint
-from ..frame import NO_LENS, Frame, Lens, Settings
+from ..frame import NO_LENS, Frame, Intrinsics, Settings
 from .source import Files, Parsed, finite, side
 
 CLASS = "PinholeCameraTrajectory"
@@ -59,7 +59,7 @@ def _frame(camera: Any, has_lens: bool) -> Frame:
         matrix = np.array(camera.intrinsic.intrinsic_matrix)
         size = side(camera.intrinsic.width, "width"), side(camera.intrinsic.height, "height")
         principal = float(matrix[0, 2]) + HALF, float(matrix[1, 2]) + HALF
-        lens = Lens(size, (float(matrix[0, 0]), float(matrix[1, 1])), principal)
+        lens = Intrinsics(size, (float(matrix[0, 0]), float(matrix[1, 1])), principal)
     return Frame(np.array(camera.extrinsic), lens)
 
 
@@ -87,11 +87,7 @@ def _check_log(files: Files) -> None:
 
 
 def load_open3d() -> ModuleType:
-    """Import Open3D.
-
-    Raises:
-        CameraPathError: it is not installed, or a library that it needs does not load.
-    """
+    """Import Open3D; raise `CameraPathError` if it is not installed, or does not load."""
     try:
         import open3d
     except ModuleNotFoundError as error:

@@ -7,7 +7,7 @@ import math
 from collections.abc import Collection
 
 from ...support.errors import CameraPathError
-from ..frame import Frame, Lens, Settings
+from ..frame import Frame, Intrinsics, Settings
 from ..generators import frame_looking
 from .source import Files, Parsed, finite, posed, side
 
@@ -75,7 +75,7 @@ def _frame(row: list[str], names: list[str], way: str, settings: Settings) -> Fr
     fov, time = maybe("fov"), maybe("time")
     width, height = (side(number, way) for number in numbers(SIZE)) if "width" in values else (None, None)
     size = (width, height) if width and height else None
-    lens = Lens(size, fov=None if fov is None else math.radians(fov))
+    lens = Intrinsics(size, fov=None if fov is None else math.radians(fov))
     name = values.get("name", "")
     if QUAT[0] not in values:
         up = numbers(UP) if UP[0] in values else settings.up_axis

@@ -8,11 +8,11 @@ import math
 import numpy as np
 
 from ...support.errors import CameraPathError
-from ..axes import Axes
 from ..camera import Matrix
-from ..frame import NO_LENS, Frame, Lens, Settings
+from ..frame import NO_LENS, Frame, Intrinsics, Settings
 from ..generators import Key, between, frame_looking
 from .source import Files, Json, Parsed, brief, posed, side
+from .table import Axes
 
 FORMAT, VERSION = "sparklod-camera-path", 1
 
@@ -49,7 +49,7 @@ def _axes(root: Json) -> Axes:
         raise CameraPathError(f"axes {name[:20]!r} are unknown; use one of {known}") from None
 
 
-def _frame(item: Json, default: Lens, axes: Axes, settings: Settings) -> Frame:
+def _frame(item: Json, default: Intrinsics, axes: Axes, settings: Settings) -> Frame:
     lens = _lens(item, default)
     time = item.get("time").number() if item.has("time") else None
     name = item.get("name").text() if item.has("name") else ""
@@ -76,7 +76,7 @@ def _key(item: Json) -> Key:
     )
 
 
-def _lens(item: Json, default: Lens) -> Lens:
+def _lens(item: Json, default: Intrinsics) -> Intrinsics:
     """Return the lens of an object, whose fields override those of the whole file."""
     size, focal, principal, fov = (item.first(key) for key in ("size", "focal", "principal", "fov"))
     if size is not None:

@@ -24,7 +24,6 @@ class Files:
     """The file of a camera path and those that belong to it.
 
     Attributes:
-        path: of the file, or of the folder.
         contents: bytes of each file by name; the one that was asked for comes first.
     """
 

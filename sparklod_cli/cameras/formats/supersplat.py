@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ...support.errors import CameraPathError
 from ..camera import Matrix
-from ..frame import Frame, Lens, Settings, sampled
+from ..frame import Frame, Intrinsics, Settings, sampled
 from ..generators import along, cardinal_tangents, frame_looking, hermite
 from .source import Files, Json, Parsed, brief
 
@@ -156,5 +156,5 @@ def _sampled(curve: Callable[[Matrix], Matrix], count: float, rate: float, setti
 
 def _looking(sample: Matrix | list[float], time: float | None, settings: Settings) -> Frame:
     """Return a frame whose field of view spans the longer side of the image."""
-    lens = Lens(fov=math.radians(sample[6]), fov_along="longer")
+    lens = Intrinsics(fov=math.radians(sample[6]), fov_along="longer")
     return frame_looking(sample[:3], sample[3:6], settings.up or UP, lens, time)

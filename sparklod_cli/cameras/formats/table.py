@@ -1,12 +1,39 @@
-"""The table of formats of camera paths: adding one is a module and a row. Imports nothing heavy, for `--help`."""
+"""Formats of camera paths: `Axes` of their poses, and their table: adding one is a module and a row.
+
+Imports nothing heavy, for `--help`.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import Enum
 from importlib import import_module
 from typing import Any
 
-from ..axes import Axes
+
+class Axes(Enum):
+    """Directions of a camera's own axes, and direction of its matrix.
+
+    In OpenGL's axes, also those of Blender, three.js and nerfstudio, y points up and the camera looks along -z. In
+    OpenCV's, also those of COLMAP, y points down and the camera looks along +z. In both x points right. A matrix
+    transforms from camera to world (its last column is the position of the camera) or from world to camera.
+    """
+
+    OPENGL_C2W = "opengl-c2w"
+    OPENCV_C2W = "opencv-c2w"
+    OPENGL_W2C = "opengl-w2c"
+    OPENCV_W2C = "opencv-w2c"
+
+    @property
+    def opencv(self) -> bool:
+        """Whether y points down and the camera looks along +z."""
+        return self in (Axes.OPENCV_C2W, Axes.OPENCV_W2C)
+
+    @property
+    def from_world(self) -> bool:
+        """Whether the matrix transforms from world to camera."""
+        return self in (Axes.OPENGL_W2C, Axes.OPENCV_W2C)
+
 
 #: PlayCanvas rotates what it loads by 180 degrees about z, so that y points up.
 PLAYCANVAS = (
@@ -21,7 +48,6 @@ class PathFormat:
 
     Attributes:
         name: value of `--camera-format`.
-        title: for display.
         module: in this package; has `recognises(files) -> bool` and `parse(files, settings) -> Parsed`.
         axes: of its matrices; None if it has eyes and targets instead.
         looking: its cameras have, or may have, an eye and a target, which need an up axis.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...support.errors import CameraPathError
-from ..frame import Frame, Lens, Settings
+from ..frame import Frame, Intrinsics, Settings
 from .source import Files, Json, Parsed
 
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
@@ -42,7 +42,7 @@ def _frame(item: Json, root: Json) -> Frame:
     return Frame(matrix, _lens(item, root), name=name)
 
 
-def _lens(item: Json, root: Json) -> Lens:
+def _lens(item: Json, root: Json) -> Intrinsics:
     """Return the lens of a frame: each value is that of the frame, or else of the whole file."""
 
     def number(key: str) -> float | None:
@@ -57,10 +57,10 @@ def _lens(item: Json, root: Json) -> Lens:
     angle_x, angle_y = number("camera_angle_x"), number("camera_angle_y")
     fov, along = (angle_x, "x") if angle_x is not None else (angle_y, "y")
     if width is None or height is None:
-        return Lens(fov=fov, fov_along=along)
+        return Intrinsics(fov=fov, fov_along=along)
     fx, fy = number("fl_x"), number("fl_y")
     fx, fy = fx if fx is not None else fy, fy if fy is not None else fx
     focal = (fx, fy) if fx is not None and fy is not None else None
     cx, cy = number("cx"), number("cy")
     principal = (cx, cy) if cx is not None and cy is not None else None
-    return Lens((width, height), focal, principal, fov, along)
+    return Intrinsics((width, height), focal, principal, fov, along)

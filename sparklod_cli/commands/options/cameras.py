@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import click
 
-from ...cameras.axes import Axes
-from ...cameras.formats.table import FORMATS
+from ...cameras.formats.table import FORMATS, Axes
 from ...support.defaults import ELEVATION, ORBIT
 from ...support.errors import CameraPathError, TooManyCamerasError
 from ...support.setting_fields import Range, whole
@@ -183,7 +182,7 @@ class Cameras:
                 self.camera_path, None if self.camera_format in (None, "auto") else self.camera_format
             )
         if self.all_views or self.look_at:
-            return sources.Views(self.all_views or (self.look_at,), named=bool(self.all_views))
+            return sources.SingleViews(self.all_views or (self.look_at,), named=bool(self.all_views))
         if self.keyframes:
             return sources.Keyframes(self.keyframes, seconds)
         if self.dolly:

@@ -56,24 +56,15 @@ def draw(
 
 
 @functools.lru_cache(maxsize=2)
-def _renderer(precision: str, sorting: str, throttle: float) -> Renderer:
-    return Renderer(precision=precision, sorting=sorting, throttle=throttle)
+def _renderer(precision: str, sorting: str, throttle: float) -> OpenGLRenderer:
+    return OpenGLRenderer(precision=precision, sorting=sorting, throttle=throttle)
 
 
-class Renderer:
-    """Draws a sequence of frames; compiles once, and uploads only what has changed.
-
-    Attributes:
-        uploads: number of uploads of the data texture.
-        sorts: number of times that the splats were sorted.
-    """
+class OpenGLRenderer:
+    """Draws a sequence of frames; compiles once, and uploads only what has changed."""
 
     def __init__(self, *, precision: str = "float", sorting: str = "exact", throttle: float = 0.0) -> None:
-        """Prepare OpenGL; see `draw` for the arguments.
-
-        Raises:
-            BackendError: OpenGL is not available.
-        """
+        """Prepare OpenGL; see `draw` for the arguments."""
         self._data, self._order = data_texture_of(precision), Order(sorting, throttle)
         self.uploads = self.sorts = 0
         self._count, self._capacity, self._size = 0, 0, (0, 0)

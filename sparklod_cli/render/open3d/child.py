@@ -62,11 +62,7 @@ def send(file: IO[bytes], message: dict[str, Any], array: Array | None = None) -
 
 
 def receive(file: IO[bytes]) -> tuple[dict[str, Any], Array | None]:
-    """Read a message and its array.
-
-    Raises:
-        EOFError: the other process has ended.
-    """
+    """Read a message and its array; raise `EOFError` if the other process has ended."""
     line = file.readline()
     if not line.endswith(b"\n"):
         raise EOFError
@@ -92,11 +88,7 @@ class _Log(io.TextIOBase):
 
 
 class Painter:
-    """Open3D's renderer, and what it renders.
-
-    Raises:
-        RuntimeError: Open3D cannot draw splats here; the message says why.
-    """
+    """Open3D's renderer; raises a `RuntimeError` that says why, if it cannot draw splats here."""
 
     def __init__(self, log: _Log) -> None:
         self._log = log

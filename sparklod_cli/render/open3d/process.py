@@ -30,11 +30,7 @@ def command() -> list[str]:
 
 
 class Child:
-    """A process in which Open3D draws; it ends with the parent process.
-
-    Raises:
-        BackendError: Open3D cannot draw here.
-    """
+    """A process in which Open3D draws, until this one ends; raises `BackendError` if it cannot draw here."""
 
     def __init__(self) -> None:
         # A file instead of a pipe, which would have to be read while the child writes.
@@ -57,11 +53,7 @@ class Child:
         return self._process.poll() is None
 
     def ask(self, request: dict[str, Any], splats: Array) -> Array:
-        """Draw pictures; see `Painter.draw`.
-
-        Raises:
-            BackendError: Open3D has crashed, takes too long, or reports an error.
-        """
+        """Draw pictures as `Painter.draw`; raise `BackendError` if Open3D has crashed, takes too long or fails."""
         pictures = self._answer(DRAW_LIMIT, request, splats)
         assert pictures is not None
         return pictures

@@ -1,56 +1,18 @@
-"""The plainest store, engine and stream: files of numpy, a loop, and a scene in memory."""
+"""The plainest engine and stream: a loop, and a scene in memory."""
 
 from __future__ import annotations
 
-import shutil
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from sparklod_cli.bake.out_of_core.store import Arrays
 from sparklod_cli.bake.out_of_core.tasks import Task
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.model.streams import SceneStream
 from sparklod_cli.support.progress import Progress, silent
-
-
-@dataclass
-class PlainStore:
-    """A folder for each result, in which each array is a file."""
-
-    folder: Path
-
-    def has(self, name: str) -> bool:
-        return self._path(name).is_dir()
-
-    def put(self, name: str, arrays: Arrays) -> None:
-        self.remove(name)
-        self._path(name).mkdir(parents=True)
-        for key, array in arrays.items():
-            np.save(self._path(name) / f"{key}.npy", array)
-
-    def get(self, name: str, keys: Collection[str] | None = None) -> dict[str, np.ndarray]:
-        found = sorted(path.stem for path in self._path(name).iterdir()) if keys is None else keys
-        return {key: np.load(self._path(name) / f"{key}.npy") for key in found}
-
-    def rows(self, name: str, key: str, start: int, stop: int) -> np.ndarray:
-        return np.array(np.load(self._path(name) / f"{key}.npy", mmap_mode="r")[start:stop])
-
-    def shape(self, name: str, key: str) -> tuple[int, ...]:
-        return np.load(self._path(name) / f"{key}.npy", mmap_mode="r").shape
-
-    def remove(self, name: str) -> None:
-        shutil.rmtree(self._path(name), ignore_errors=True)
-
-    def names(self) -> list[str]:
-        return sorted(path.name.replace("!", "/") for path in self.folder.iterdir())
-
-    def _path(self, name: str) -> Path:
-        return self.folder / name.replace("/", "!")
 
 
 @dataclass

@@ -12,12 +12,8 @@ import pytest
 pytest.importorskip("fsspec")
 
 from sparklod_cli.bake.out_of_core.store import Store
-from sparklod_cli.bake.out_of_core.tasks import LocalEngine
 from sparklod_cli.support.addresses import Address
 from sparklod_cli.support.errors import ScratchError
-from sparklod_cli.support.progress import silent
-
-from .made_up import Job, tree_of
 
 pytestmark = pytest.mark.slow
 
@@ -72,13 +68,3 @@ def test_damage_is_found(store: Store) -> None:
 def test_what_is_missing_is_said(store: Store) -> None:
     with pytest.raises(ScratchError, match=r"stage/1 is missing in .* memory://.*; begin anew with --overwrite"):
         store.get("stage/1")
-
-
-def test_tasks_run_on_it(store: Store) -> None:
-    tasks = tree_of(16)
-    LocalEngine().run("building", tasks, Job(store), silent)
-    assert int(store.get(tasks[-1].name)["total"][0]) == len(tasks)
-
-
-def test_a_path_gives_a_folder(tmp_path: Path) -> None:
-    assert isinstance(Store(tmp_path), Store)

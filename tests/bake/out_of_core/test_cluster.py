@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import pickle
 import threading
@@ -104,7 +105,7 @@ def test_other_errors_come_through_for_those_who_mend_them(engine: ClusterEngine
 def test_calls_side_by_side_give_results_and_failures_in_order(engine: ClusterEngine) -> None:
     told: list[tuple[str, int, int, str]] = []
     arguments = [(number,) for number in range(6)]
-    with engine.each("baking", made_up.twice, arguments, lambda *args: told.append(args), "scene") as outcomes:
+    with engine.map_calls("baking", made_up.twice, arguments, lambda *args: told.append(args), "scene") as outcomes:
         found = list(outcomes)
     assert [each if isinstance(each, int) else str(each) for each in found] == [0, 2, 4, "no 3", 8, 10]
     assert isinstance(found[3], ScratchError)
@@ -113,7 +114,7 @@ def test_calls_side_by_side_give_results_and_failures_in_order(engine: ClusterEn
 
 def test_a_result_that_is_lost_with_its_worker_is_waited_for(engine: ClusterEngine) -> None:
     with cluster_pool.Pool(engine._connection, "baking") as pool:
-        pool.submit("twice", 0, cluster_engine.run_call, made_up.twice, (21,), 1)
+        pool.submit("twice", 0, functools.partial(made_up.twice, threads=1), 21)
         future = pool._futures["twice"]
         future.result(timeout=60)
         loop, lost = engine._connection.client.loop, threading.Event()
@@ -125,9 +126,9 @@ def test_a_result_that_is_lost_with_its_worker_is_waited_for(engine: ClusterEngi
 
 
 def test_calls_that_nobody_waits_for_are_cancelled(engine: ClusterEngine) -> None:
-    with engine.each("baking", made_up.twice, [(0,)] * 100, silent, "scene") as outcomes:
+    with engine.map_calls("baking", made_up.twice, [(0,)] * 100, silent, "scene") as outcomes:
         assert next(outcomes) == 0
-    with engine.each("baking", made_up.twice, [(21,)], silent, "scene") as outcomes:
+    with engine.map_calls("baking", made_up.twice, [(21,)], silent, "scene") as outcomes:
         assert list(outcomes) == [42]
 
 

@@ -10,18 +10,19 @@ from sparklod_cli.bake.out_of_core import estimate
 from sparklod_cli.lod.builders import METHODS
 from sparklod_cli.support import machine
 from sparklod_cli.support.defaults import MAX_SH_DEGREE
+from sparklod_cli.support.errors import OutOfMemoryError
 
 CASES = (st.sampled_from(METHODS), st.integers(1, 10**9), st.integers(0, MAX_SH_DEGREE))
 
 
 @given(*CASES, st.integers(0, 1 << 40))
 def test_a_block_is_the_largest_power_of_two_that_fits(method: str, splats: int, degree: int, memory: int) -> None:
+    least = estimate.out_of_core_bytes(method, splats, degree, estimate.LEAST_BLOCK_SPLATS)
+    if memory < least:
+        with pytest.raises(OutOfMemoryError, match="too little even out of core"):
+            estimate.block_splats_within(memory, method, splats, degree)
+        memory = least
     size = estimate.block_splats_within(memory, method, splats, degree)
-    if size is None:
-        least = estimate.out_of_core_bytes(method, splats, degree, estimate.LEAST_BLOCK_SPLATS)
-        assert least > memory
-        assert estimate.block_splats_within(least, method, splats, degree) is not None
-        return
     assert size & (size - 1) == 0
     assert estimate.LEAST_BLOCK_SPLATS <= size <= estimate.MOST_BLOCK_SPLATS
     assert estimate.out_of_core_bytes(method, splats, degree, size) <= memory
@@ -39,7 +40,7 @@ def test_more_splats_and_more_coefficients_take_more(method: str, splats: int, d
 
 @pytest.mark.parametrize("method", METHODS)
 def test_five_million_splats_are_baked_in_600_mb(method: str) -> None:
-    assert estimate.block_splats_within(600_000_000, method, 5_000_000, 0, in_chunks=True, threads=2) is not None
+    estimate.block_splats_within(600_000_000, method, 5_000_000, 0, in_chunks=True, threads=2)
 
 
 def test_by_default_a_bake_takes_a_share_of_what_is_available(monkeypatch: pytest.MonkeyPatch) -> None:

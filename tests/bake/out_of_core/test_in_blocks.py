@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from sparklod_cli.bake.out_of_core import nodes, order
 from sparklod_cli.bake.out_of_core.in_blocks import InBlocks
 from sparklod_cli.bake.out_of_core.job import Job
-from sparklod_cli.bake.output import WholeOutput
+from sparklod_cli.bake.out_of_core.store import Store
+from sparklod_cli.bake.output import BakeOutput
 from sparklod_cli.bake.records import BuiltTree, Clock
 from sparklod_cli.bake.settings import BakeSettings
 from sparklod_cli.codecs.statistics import ALL
@@ -24,7 +25,7 @@ from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.support.progress import silent
-from tests.bake.out_of_core.plain import Loop, PlainStore, stream_of
+from tests.bake.out_of_core.plain import Loop, stream_of
 from tests.scenes import random_splats
 
 #: Without shrinking, which takes minutes, as any scene will do.
@@ -48,8 +49,8 @@ def _small_windows() -> Iterator[None]:
 
 def built(folder: str, splats: Splats, how: BakeSettings, block: int, engine: Loop, *, in_chunks: bool) -> BuiltTree:
     """A tree in a store, of blocks of about so many splats."""
-    job = Job(PlainStore(Path(folder)), stream_of(Scene(splats)), how, ALL, in_chunks)
-    blocks = InBlocks(job, WholeOutput(), Clock(), engine, block, silent)
+    job = Job(Store(Path(folder)), stream_of(Scene(splats)), how, ALL, in_chunks)
+    blocks = InBlocks(job, BakeOutput(), Clock(), engine, block, silent)
     tree = blocks.build()
     blocks.order(tree)
     return tree

@@ -29,6 +29,12 @@ EYE = np.eye(4).tolist()
 #: Open3D's own reader is behind checks of ours, which are what breaks first.
 NAMES = [name for name in CASES if not name.startswith("open3d")]
 
+
+def own(fields: str) -> str:
+    """A file of sparklod's own format with these fields, as JSON."""
+    return f'{{"format": "sparklod-camera-path", {fields}}}'
+
+
 #: Content, and what is said of it.
 FAULTS: dict[str, tuple[str | bytes, str]] = {
     "empty": ("", "it is empty"),
@@ -36,62 +42,53 @@ FAULTS: dict[str, tuple[str | bytes, str]] = {
     "a web page": ("<!DOCTYPE html><html></html>", "of no known format"),
     "other JSON": ('{"a": 1}', "of no known format"),
     "JSON of lists all the way down": ("[" * 100_000, "of no known format"),
-    "no frames": ('{"format": "sparklod-camera-path", "frames": []}', "it has no cameras"),
-    "no list": ('{"format": "sparklod-camera-path", "frames": 7}', "frames is not a list"),
+    "no frames": (own('"frames": []'), "it has no cameras"),
+    "no list": (own('"frames": 7'), "frames is not a list"),
     "neither": ('{"format": "sparklod-camera-path"}', "it has no 'frames'"),
-    "another version": ('{"format": "sparklod-camera-path", "version": 2, "frames": []}', "version 2 is unknown"),
-    "axes": ('{"format": "sparklod-camera-path", "axes": "up", "frames": []}', "axes 'up' are unknown"),
-    "a frame of text": ('{"format": "sparklod-camera-path", "frames": ["x"]}', "frames.0. has no 'quat_xyzw'"),
-    "a short matrix": (
-        '{"format": "sparklod-camera-path", "frames": [{"matrix": [1, 2]}]}',
-        "frames.0..matrix is not a list of 16 numbers",
-    ),
+    "another version": (own('"version": 2, "frames": []'), "version 2 is unknown"),
+    "axes": (own('"axes": "up", "frames": []'), "axes 'up' are unknown"),
+    "a frame of text": (own('"frames": ["x"]'), "frames.0. has no 'quat_xyzw'"),
+    "a short matrix": (own('"frames": [{"matrix": [1, 2]}]'), "frames.0..matrix is not a list of 16 numbers"),
     "NaN": (
-        '{"format": "sparklod-camera-path", "frames": [{"eye": [NaN, 0, 0], "target": [0, 0, 0]}]}',
+        own('"frames": [{"eye": [NaN, 0, 0], "target": [0, 0, 0]}]'),
         "frames.0..eye has nan, which is not a finite number",
     ),
     "a number of 5,000 digits": (
         '{"format": "sparklod-camera-path", "frames": [{"eye": [' + "9" * 4000 + ', 0, 0], "target": [0, 0, 0]}]}',
         "not a finite number",
     ),
-    "true is no number": (
-        '{"format": "sparklod-camera-path", "fps": true, "frames": []}',
-        "fps has True, which is not a finite number",
-    ),
+    "true is no number": (own('"fps": true, "frames": []'), "fps has True, which is not a finite number"),
     "looks at itself": (
-        '{"format": "sparklod-camera-path", "frames": [{"eye": [1, 2, 3], "target": [1, 2, 3]}]}',
+        own('"frames": [{"eye": [1, 2, 3], "target": [1, 2, 3]}]'),
         "the camera at 1, 2, 3 looks at its own position",
     ),
     "zero quaternion": (
-        '{"format": "sparklod-camera-path", "frames": [{"quat_xyzw": [0, 0, 0, 0], "position": [0, 0, 0]}]}',
+        own('"frames": [{"quat_xyzw": [0, 0, 0, 0], "position": [0, 0, 0]}]'),
         "frames.0. has a quaternion of length 0",
     ),
     "focal without size": (
-        '{"format": "sparklod-camera-path", "frames": [{"focal": [9, 9], "eye": [1, 0, 0], "target": [0, 0, 0]}]}',
+        own('"frames": [{"focal": [9, 9], "eye": [1, 0, 0], "target": [0, 0, 0]}]'),
         "frames.0. has a focal length .* but no size",
     ),
     "no focal length": (
-        '{"format": "sparklod-camera-path", "size": [9, 9], "focal": [0, 9], "frames": [{"eye": [1, 0, 0],'
-        ' "target": [0, 0, 0]}]}',
+        own('"size": [9, 9], "focal": [0, 9], "frames": [{"eye": [1, 0, 0], "target": [0, 0, 0]}]'),
         "frame 0 has a focal length .* not positive or too large",
     ),
     "a focal length beyond all measure": (
-        '{"format": "sparklod-camera-path", "size": [9, 9], "focal": [9, 1e200], "frames": [{"eye": [1, 0, 0],'
-        ' "target": [0, 0, 0]}]}',
+        own('"size": [9, 9], "focal": [9, 1e200], "frames": [{"eye": [1, 0, 0], "target": [0, 0, 0]}]'),
         "frame 0 has a focal length .* not positive or too large",
     ),
-    "half a pixel": ('{"format": "sparklod-camera-path", "size": [9.5, 9], "frames": []}', "size of 9.5 is not a"),
+    "half a pixel": (own('"size": [9.5, 9], "frames": []'), "size of 9.5 is not a"),
     "a fov of 180": (
-        '{"format": "sparklod-camera-path", "fov": 180, "frames": [{"eye": [1, 0, 0], "target": [0, 0, 0]}]}',
+        own('"fov": 180, "frames": [{"eye": [1, 0, 0], "target": [0, 0, 0]}]'),
         "frame 0 has a field of view of 180 degrees",
     ),
     "a name of two lines": (
-        '{"format": "sparklod-camera-path", "fov": 0, "frames": [{"name": "a\\nb", "eye": [1, 0, 0],'
-        ' "target": [0, 0, 0]}]}',
+        own('"fov": 0, "frames": [{"name": "a\\nb", "eye": [1, 0, 0], "target": [0, 0, 0]}]'),
         r"frame 0 \(a b\) has a field of view of 0 degrees",
     ),
-    "a version of two lines": ('{"format": "sparklod-camera-path", "version": "a\\nb"}', "version 'a"),
-    "a version of lists": ('{"format": "sparklod-camera-path", "version": [[1]]}', "version a list is unknown"),
+    "a version of two lines": (own('"version": "a\\nb"'), "version 'a"),
+    "a version of lists": (own('"version": [[1]]'), "version a list is unknown"),
     "angles of 0": (
         '{"w": 9, "h": 9, "camera_angle_x": 0, "camera_angle_y": 0, "frames": [{"transform_matrix":'
         " [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0]}]}",
@@ -100,7 +97,7 @@ FAULTS: dict[str, tuple[str | bytes, str]] = {
     "TUM of other words": ("1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 one\n", "qw of line 2 has 'one'"),
     "CSV in which nothing ends": ('x,y,z,qx,qy,qz,qw,name\n1,2,3,0,0,0,1,"' + "a" * 200_000 + '"\n', "it is not CSV"),
     "frames at no rate": ('{"frameRate": 0, "frames": [{"position": [0, 0, 0], "target": [1, 0, 0]}]}', "not positive"),
-    "own frames at no rate": ('{"format": "sparklod-camera-path", "fps": 0, "frames": []}', "fps is not positive"),
+    "own frames at no rate": (own('"fps": 0, "frames": []'), "fps is not positive"),
     "times beyond all measure": (
         '{"format": "sparklod-camera-path", "frames": [{"eye": [1, 0, 0], "target": [0, 0, 0], "time": -1.7e308},'
         ' {"eye": [1, 0, 0], "target": [0, 0, 0], "time": 1.7e308}]}',
@@ -111,10 +108,7 @@ FAULTS: dict[str, tuple[str | bytes, str]] = {
         ' {"position": [0, 0, 0], "target": [1, 0, 0], "fov": [60]}}}]}',
         "duration is not positive",
     ),
-    "one key": (
-        '{"format": "sparklod-camera-path", "keyframes": [{"eye": [1, 0, 0], "target": [0, 0, 0]}]}',
-        "needs at least two keyframes",
-    ),
+    "one key": (own('"keyframes": [{"eye": [1, 0, 0], "target": [0, 0, 0]}]'), "needs at least two keyframes"),
     "CSV without numbers": ("x,y,z,qx,qy,qz,qw\n1,2,3,0,0,0,one\n", "qw of line 2 has 'one'"),
     "CSV without an end": ("x,y,z,qx,qy,qz,qw\n1,2,3\n", "line 2 has 3 values, not 7"),
     "CSV of twins": ("x,y,z,qx,qy,qz,qw,x\n", "names a column twice"),

@@ -13,7 +13,7 @@ import pytest
 
 from sparklod_cli.lod.detail_choice import Chains, Distant, RegionBounds, choose
 from sparklod_cli.lod.detail_rule import DetailRule
-from sparklod_cli.lod.traversal import View
+from sparklod_cli.lod.traversal import CutView
 from tests.interop.node import Node
 from tests.lod.details import Regions, random_regions, random_view
 
@@ -64,7 +64,7 @@ def manifest(regions: Regions) -> dict[str, Any]:
     }
 
 
-def seen_by(view: View) -> dict[str, Any]:
+def seen_by(view: CutView) -> dict[str, Any]:
     return {
         "matrix": view.camera_to_world.T.ravel().tolist(),
         "fov": math.degrees(view.fov_y),
