@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..model.gaussian import spark_size
-from ..model.instances import SPARK
+from ..model.foveation import SPARK
 from ..model.lod_tree import CHUNK_NODES, LodTree
 from ..model.splats import FloatArray, Splats
 from ..support.jit import threads_for

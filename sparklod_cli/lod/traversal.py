@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..model.instances import Cones, Foveation, Frustum
+from ..model.foveation import Cones, Foveation, Frustum
 from ..model.lod_tree import CHUNK_BITS, CHUNK_NODES, Nodes
 from .kernels import cut_arrays, pixel_scale
 from .kernels.cut import find_cut

@@ -18,7 +18,8 @@ from ..lod.settings import LodSettings
 from ..lod.traversal import Forest, Traversal, TreeCut, TreeInstance
 from ..model.balls import Balls, balls_of
 from ..model.gaussian import placed
-from ..model.instances import Foveation, Instance, Matrix
+from ..model.foveation import Foveation
+from ..model.instances import Instance, Matrix
 from ..model.lod_tree import Nodes
 from ..model.scene import Scene
 from ..model.splats import Splats

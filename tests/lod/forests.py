@@ -9,7 +9,7 @@ import numpy as np
 from hypothesis import strategies as st
 
 from sparklod_cli.lod.traversal import CutView, Forest, Traversal, TreeCut, TreeInstance
-from sparklod_cli.model.instances import Cones, Frustum
+from sparklod_cli.model.foveation import Cones, Frustum
 from sparklod_cli.model.lod_tree import LodTree, Nodes
 from tests.references import budgeted_cuts
 

@@ -14,7 +14,7 @@ from sparklod_cli.lod.continuous import BlendedCut, ContinuousCuts, faded, find_
 from sparklod_cli.lod.kernels.pixel_scale import pixel_scales
 from sparklod_cli.lod.traversal import CutView, Forest, Traversal, TreeInstance
 from sparklod_cli.model.gaussian import lod_opacity
-from sparklod_cli.model.instances import Cones
+from sparklod_cli.model.foveation import Cones
 from tests.lod.forests import Case, cases, random_tree, transform
 from tests.references import continuous_cuts
 
