@@ -21,8 +21,6 @@ class TableOutput:
     Attributes:
         path: of its file; None for standard output, or for nowhere.
         form: a key of `files.FORMS`; None for nowhere: rows are made, and not written.
-        columns: of the table.
-        overwrite: replace a file that exists.
     """
 
     path: Path | None
