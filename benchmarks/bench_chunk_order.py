@@ -24,8 +24,7 @@ from sparklod_cli.lod.chunk_order import arrange
 from sparklod_cli.lod.settings import LodSettings, pixel_limit
 from sparklod_cli.lod.traversal import Traversal, TreeCut
 from sparklod_cli.model.instances import Instance
-from sparklod_cli.model.lod_tree import LodTree
-from sparklod_cli.model.nodes import CHUNK_NODES
+from sparklod_cli.model.lod_tree import CHUNK_NODES, LodTree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.scenes.finder import view_of

@@ -18,7 +18,7 @@ from sparklod_cli.codecs import compression, spz
 from sparklod_cli.codecs.compression import MIXED, DataRun
 from sparklod_cli.codecs.options import DEFAULTS, WriteOptions
 from sparklod_cli.codecs.rad import codec as rad
-from sparklod_cli.codecs.spz_encoder import WAYS
+from sparklod_cli.codecs.spz import WAYS
 from sparklod_cli.lod.builders import METHODS
 from sparklod_cli.lod.chunk_order import arrange
 from sparklod_cli.model.scene import Scene

@@ -44,8 +44,8 @@ if TYPE_CHECKING:  # mypy then resolves the modules first, which import this one
     from .lod.detail_rule import DetailRule as DetailRule
     from .lod.detail_rule import DetailSettings as DetailSettings
     from .lod.settings import LodSettings as LodSettings
-    from .model.foveation import Cones as Cones
-    from .model.foveation import Frustum as Frustum
+    from .model.instances import Cones as Cones
+    from .model.instances import Frustum as Frustum
     from .model.instances import Instance as Instance
     from .model.lod_tree import LodTree as LodTree
     from .model.scene import Scene as Scene

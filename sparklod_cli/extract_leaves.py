@@ -11,7 +11,7 @@ import numpy as np
 from .codecs import clamps
 from .codecs.formats import WRITABLE
 from .codecs.options import WriteOptions
-from .codecs.spz_encoder import like
+from .codecs.spz import like
 from .codecs.validation import check_scene
 from .io import read_scene, scene_sink
 from .model.scene import Scene

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from fixtures import by_hand, by_hand_ksplat, by_hand_splat
 from sparklod_cli.bake.flow import bake
 from sparklod_cli.bake.settings import BakeSettings
-from sparklod_cli.codecs import ply, spz_encoder
+from sparklod_cli.codecs import ply, spz
 from sparklod_cli.codecs.formats import ENCODINGS
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import rad_options
@@ -191,7 +191,7 @@ def test_a_coordinate_is_written_up_to_the_last_but_one_code(bits: int | None, m
     for code, sign in itertools.product((-1, 0, 1), (1, -1)):
         splats = random_splats(5)
         splats.center[:] = 0
-        splats.center[3, 1] = sign * (spz_encoder.LAST_CODE + code) * step
+        splats.center[3, 1] = sign * (spz.LAST_CODE + code) * step
         source = file_of(tmp_path, splats)
         how = BakeSettings(method=method, options=WriteOptions(fractional_bits=bits))
         if code < 1:

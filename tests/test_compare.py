@@ -25,8 +25,7 @@ from sparklod_cli.compare import Comparison, measured
 from sparklod_cli.images.metrics import MOST_PSNR, on_background
 from sparklod_cli.lod.budget import parse_budgets
 from sparklod_cli.lod.settings import LodSettings
-from sparklod_cli.model.foveation import Cones
-from sparklod_cli.model.instances import Instance
+from sparklod_cli.model.instances import Cones, Instance
 from sparklod_cli.render.settings import RenderSettings
 from sparklod_cli.scenes.loaded import Scenes
 from sparklod_cli.scenes.reading import read_scenes

@@ -12,8 +12,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from sparklod_cli.model.foveation import Cones, Frustum
-from sparklod_cli.model.instances import Instance
+from sparklod_cli.model.instances import Cones, Frustum, Instance
 from sparklod_cli.scenes.instances_file import KEYS, InstancesFileError, read_instances
 from sparklod_cli.support.errors import FormatError, SparklodError
 

@@ -13,8 +13,7 @@ from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.lod.budget import Budget, parse_budget
 from sparklod_cli.lod.detail_rule import BUDGET, DetailRule
 from sparklod_cli.lod.settings import LodSettings
-from sparklod_cli.model.foveation import Cones
-from sparklod_cli.model.instances import Instance
+from sparklod_cli.model.instances import Cones, Instance
 from sparklod_cli.model.scene import DetailScene, Scene
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.render.color_by import numbers_of, scale_of_splats

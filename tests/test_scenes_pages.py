@@ -16,10 +16,8 @@ from sparklod_cli.codecs.rad import codec as rad
 from sparklod_cli.lod import quick
 from sparklod_cli.lod.chunk_order import arrange
 from sparklod_cli.lod.settings import LodSettings
-from sparklod_cli.model.foveation import Frustum
-from sparklod_cli.model.instances import Instance
-from sparklod_cli.model.lod_tree import LodTree
-from sparklod_cli.model.nodes import CHUNK_NODES
+from sparklod_cli.model.instances import Frustum, Instance
+from sparklod_cli.model.lod_tree import CHUNK_NODES, LodTree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS
 from sparklod_cli.scenes import pages

@@ -18,13 +18,17 @@ SEEDS = (
 )
 COMPARISONS = ("psnr_min>30", "5%:psnr>30", "100: ssim_mean >= 0.9", "worst_tile_psnr_p05>10")
 
+#: Characters of an argument: what Linux passes to a program, with its terminating zero. Lines that mutations repeat grow
+#: to hundreds of megabytes.
+LONGEST = (1 << 17) - 1
+
 
 def make(rng: Rng) -> Case:
     """Changes the text of an assertion; most cases only parse it, some run a command with it."""
     compares = rng.integers(20) == 0
     text = text_mutated(rng, pick(rng, COMPARISONS if compares else SEEDS))
     text = text[: int(rng.integers(len(text) + 1))] + pick(rng, WORDS) if rng.integers(8) == 0 else text
-    text = text.encode("utf-8", "replace").decode().replace("\0", "")
+    text = text.encode("utf-8", "replace").decode().replace("\0", "")[:LONGEST]
     if compares:
         line = ["render", "tree.spz", "--compare", "--budget", "5", "--size", "16x12"]
     else:

@@ -16,7 +16,7 @@ from ..codecs.rad.rad_layout import OPTIONS
 from ..codecs.statistics import Statistics
 from ..io.reading import opened, read_stored
 from ..io.writing import SceneSink, Sink, scene_sink, sink
-from ..model.nodes import CHUNK_NODES
+from ..model.lod_tree import CHUNK_NODES
 from ..model.scene import Scene
 from ..model.splats import Splats, same_rows
 from ..support.addresses import Place

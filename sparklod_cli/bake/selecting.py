@@ -8,7 +8,7 @@ import numpy as np
 
 from ..codecs.validation import is_valid_and_visible
 from ..io.reading import read_rgba, read_scene
-from ..model.selection import Selection, Tally
+from ..model.selection import Selection, SelectionTally
 from ..model.splats import Splats
 from ..model.transforms import Transform
 from ..support.errors import FormatError, InvalidSplatsError
@@ -18,7 +18,7 @@ from .settings import BakeSettings
 
 def select(
     splats: Splats, settings: BakeSettings, *, start: int = 0, total: int | None = None, threads: int = 1
-) -> tuple[Splats, Tally]:
+) -> tuple[Splats, SelectionTally]:
     """Recolour splats, limit their SH, and return those that are kept, with a tally of the others.
 
     Args:
@@ -31,7 +31,7 @@ def select(
     splats, selection = splats.with_max_sh(settings.max_sh), settings.selection
     drops_nothing = len(splats) and dataclasses.replace(selection, drop_invalid=False) == Selection()
     if drops_nothing and all(is_valid_and_visible(splats, threads)):
-        return splats, Tally(len(splats))
+        return splats, SelectionTally(len(splats))
     keep, tally = selection.examine(splats, threads=threads)
     return (splats if keep.all() else splats.take(keep)), tally
 

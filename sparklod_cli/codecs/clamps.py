@@ -12,11 +12,10 @@ from ..model.lod_tree import LodTree
 from ..model.splats import FloatArray, Splats
 from ..support.parallel import blocks_of, ordered_map
 from . import quantize
-from .encoder import rows_of
 
 
 @dataclass(frozen=True)
-class Range:
+class CodeRange:
     """Values of a column that a format holds without clamping them.
 
     Attributes:
@@ -36,7 +35,7 @@ class Range:
 
 
 #: What SPZ holds.
-SPZ = tuple(Range(column, low, high) for column, (low, high) in quantize.CLAMPS.items())
+SPZ = tuple(CodeRange(column, low, high) for column, (low, high) in quantize.CLAMPS.items())
 
 
 #: Share of leaves from which on a visible loss of each matters, by column. Measured: with 0.36 % of colours clamped,
@@ -63,7 +62,7 @@ class Clamp:
         splats: number of splats with such a value.
         end: the end of the range.
         farthest: the value farthest beyond the end.
-        degree: as in `Range`.
+        degree: as in `CodeRange`.
         both: the range is -end to end; the values lie beyond either, and `farthest` is a magnitude.
         visible: number of leaves whose loss can be seen, see `tally`.
     """
@@ -90,17 +89,11 @@ def matters(column: str, *, above: bool, visible: int, leaves: int) -> bool:
     """Return whether a person should know of clamped values.
 
     Splats that move or shrink may be large in a picture, so that one is enough; of others, a share of `MANY`.
-
-    Args:
-        column: of `Splats`.
-        above: whether the values lie above the upper end.
-        visible: number of leaves whose loss can be seen.
-        leaves: number of all of them.
     """
     return visible > (0 if column == "center" or (column == "scale" and above) else MANY[column] * leaves)
 
 
-def tally(splats: Splats, ranges: Sequence[Range], leaf: NDArray[np.bool_] | None = None) -> Tally:
+def tally(splats: Splats, ranges: Sequence[CodeRange], leaf: NDArray[np.bool_] | None = None) -> Tally:
     """Count the values of splats that lie beyond ranges.
 
     The loss of a leaf can be seen if a coordinate is clamped; if its colour, as it is displayed on black, changes by
@@ -108,7 +101,6 @@ def tally(splats: Splats, ranges: Sequence[Range], leaf: NDArray[np.bool_] | Non
     thicker than a number that small cannot be seen.
 
     Args:
-        splats: n of them.
         ranges: those of one column are side by side.
         leaf: (n,) which of them are leaves; None for all.
 
@@ -147,7 +139,7 @@ def merged(tallies: Sequence[Tally]) -> Tally:
     return np.column_stack([parts[:, :, :4].sum(axis=0), *ends, parts[:, :, 6:].sum(axis=0)])
 
 
-def clamps_of(found: Tally, ranges: Sequence[Range]) -> Clamps:
+def clamps_of(found: Tally, ranges: Sequence[CodeRange]) -> Clamps:
     """Return what a tally of these ranges says, in their order."""
     counts: dict[str, int] = {}
     ends = []
@@ -168,20 +160,19 @@ def clamps_of(found: Tally, ranges: Sequence[Range]) -> Clamps:
     return Clamps(counts, tuple(ends))
 
 
-def find(splats: Splats, threads: int = 1, ranges: Sequence[Range] = SPZ, tree: LodTree | None = None) -> Clamps:
+def find(splats: Splats, threads: int = 1, ranges: Sequence[CodeRange] = SPZ, tree: LodTree | None = None) -> Clamps:
     """Find the values of splats, or of the nodes of a tree, that lie beyond ranges, in the order of the ranges."""
     if not len(splats):
         return Clamps()
 
     def counted(part: slice) -> Tally:
-        some, links = rows_of(splats, tree, part)
-        return tally(some, ranges, None if links is None else links.is_leaf)
+        return tally(splats.rows(part), ranges, None if tree is None else tree.rows(part).is_leaf)
 
     return clamps_of(merged(list(ordered_map(counted, blocks_of(len(splats)), threads))), ranges)
 
 
 @np.errstate(over="ignore")  # of numbers near the end of float32
-def _is_seen(each: Range, values: FloatArray, opacity: FloatArray) -> NDArray[np.bool_]:
+def _is_seen(each: CodeRange, values: FloatArray, opacity: FloatArray) -> NDArray[np.bool_]:
     """Return (n,) whether the loss can be seen of leaves with values, (n, K), beyond a range."""
     if each.column == "center":
         return np.ones(len(values), np.bool_)

@@ -74,8 +74,6 @@ def gzip_member(
         pieces: bytes, or contiguous arrays, asked for a few blocks ahead.
         runs: what they hold, in order. A block holds data of one, unless all fit into a block.
         level: of compression. Below the default, which means haste, no other is used, and above it no lower one.
-        threads: to deflate on.
-        progress: called with the bytes.
         comment: of the header, without a zero byte; empty for none.
     """
     check = 0

@@ -69,13 +69,11 @@ class Target:
 
     def rows(self, part: slice) -> Splats:
         """Return views of rows, which are counted as those of the file."""
-        views = slice(part.start - self.start, part.stop - self.start)
-        return Splats(**{name: getattr(self.splats, name)[views] for name in COLUMNS})
+        return self.splats.rows(slice(part.start - self.start, part.stop - self.start))
 
     def nodes(self, part: slice) -> LodTree | None:
         """Return views of nodes, counted as `rows`."""
-        views = slice(part.start - self.start, part.stop - self.start)
-        return None if self.tree is None else LodTree(self.tree.child_count[views], self.tree.child_start[views])
+        return None if self.tree is None else self.tree.rows(slice(part.start - self.start, part.stop - self.start))
 
 
 class Fill(Protocol):
@@ -128,8 +126,6 @@ class Content:
 
         Args:
             columns: of `Splats` to read; the others may be 0.
-            threads: to decode on.
-            progress: called while splats are read.
             validate: refuse a broken tree.
 
         Raises:

@@ -6,28 +6,22 @@ machines share; then the pieces of the file are made of the results.
 
 from __future__ import annotations
 
-import math
-import os
-import tempfile
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
-from pathlib import Path
-from types import TracebackType
-from typing import TYPE_CHECKING, Any, Protocol
+from dataclasses import dataclass
+from typing import Any, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..model.lod_tree import LodTree
-from ..model.nodes import CHUNK_NODES
+from ..model.lod_tree import CHUNK_NODES, LodTree
 from ..model.scene import Scene
-from ..model.splats import COLUMNS, Splats
+from ..model.splats import Splats
 from ..model.streams import NodeStream
 from ..support.parallel import blocks_of, ordered_map
 from ..support.progress import Progress
+from . import clamps
 from .options import WriteOptions
-
-if TYPE_CHECKING:
-    from .clamps import Range
 
 #: The result of a window: arrays by name.
 Encoded = dict[str, NDArray[Any]]
@@ -39,34 +33,53 @@ Get = Callable[[int, str], NDArray[Any]]
 CLAMPED = "clamped"
 
 
-class Encoder(Protocol):
-    """Encodes the windows of one file. It can be pickled."""
+@dataclass(frozen=True, eq=False)
+class Encoder(ABC):
+    """Encoder of the windows of one file. It can be pickled.
 
-    @property
-    def count(self) -> int:
-        """Splats of the file."""
+    Attributes:
+        count: splats of the file, which are nodes where there is a tree.
+        sh_degree: of all splats.
+        tree: whether there is one.
+        antialiased, up: as in `Scene`.
+        options: with nothing left open.
+        ranges: beyond which values are counted, see `clamps.tally`; none unless somebody wants to know.
+    """
 
-    @property
-    def sh_degree(self) -> int:
-        """SH degree of all splats."""
+    count: int
+    sh_degree: int
+    tree: bool
+    antialiased: bool
+    up: str | None
+    options: WriteOptions
+    ranges: tuple[clamps.CodeRange, ...] = ()
 
-    @property
-    def options(self) -> WriteOptions:
-        """With nothing left open."""
+    @classmethod
+    def of(cls, scene: Scene | NodeStream, options: WriteOptions, ranges: tuple[clamps.CodeRange, ...]) -> Self:
+        """Return the encoder of a scene, of which nothing is read."""
+        if isinstance(scene, NodeStream):
+            count, sh_degree, tree = scene.count, scene.sh_degree, True
+        else:
+            count, sh_degree, tree = len(scene), scene.splats.sh_degree, scene.tree is not None
+        return cls(count, sh_degree, tree, scene.antialiased, scene.up, options, ranges)
 
-    @property
-    def ranges(self) -> tuple[Range, ...]:
-        """Beyond which values are counted, see `clamps.tally`; none unless somebody wants to know."""
+    @abstractmethod
+    def codes(self, splats: Splats, tree: LodTree | None, start: int) -> Encoded:
+        """Encode a window, see `encode`."""
 
     def encode(self, splats: Splats, tree: LodTree | None, start: int) -> Encoded:
-        """Encode a window.
+        """Encode a window, and count what that clamps.
 
         Args:
-            splats: of the window, all columns.
             tree: of the window, whose children have the numbers of the file; None where the file has no tree.
             start: number of the first splat; the start of one of `windows_of`.
         """
+        encoded = self.codes(splats, tree, start)
+        if self.ranges:
+            encoded[CLAMPED] = clamps.tally(splats, self.ranges, None if tree is None else tree.is_leaf)
+        return encoded
 
+    @abstractmethod
     def pieces(self, get: Get, *, threads: int, progress: Progress) -> Iterator[bytes]:
         """Return the bytes of the file, piece by piece, made of the results of all windows."""
 
@@ -86,62 +99,12 @@ def windows_of(count: int) -> list[slice]:
     return blocks_of(count, CHUNK_NODES)
 
 
-def rows_of(splats: Splats, tree: LodTree | None, part: slice) -> tuple[Splats, LodTree | None]:
-    """Return views of some rows."""
-    views = Splats(**{name: getattr(splats, name)[part] for name in COLUMNS})
-    return views, None if tree is None else LodTree(tree.child_count[part], tree.child_start[part])
-
-
-def results(
-    encoder: Encoder, scene: Scene | NodeStream, threads: int, progress: Progress, stage: str
-) -> Iterator[Encoded]:
+def results(encoder: Encoder, scene: Scene, threads: int, progress: Progress, stage: str) -> Iterator[Encoded]:
     """Encode all windows of a scene in order, a few ahead; `stage` is the word for it that `progress` gets."""
-
-    def encode(part: slice) -> Encoded:
-        if isinstance(scene, NodeStream):
-            return encoder.encode(*scene.read(part.start, part.stop), part.start)
-        return encoder.encode(*rows_of(scene.splats, scene.tree, part), part.start)
-
     windows = windows_of(encoder.count)
-    for part, result in zip(windows, ordered_map(encode, windows, threads), strict=True):
+    tree = scene.tree
+    rows = ((scene.splats.rows(part), None if tree is None else tree.rows(part), part.start) for part in windows)
+    encoded = ordered_map(lambda arguments: encoder.encode(*arguments), rows, threads)
+    for part, result in zip(windows, encoded, strict=True):
         progress(stage, part.stop, encoder.count, "splat")
         yield result
-
-
-class Kept:
-    """Results of windows, in the order in which they are put, in a temporary file. A context manager.
-
-    Args:
-        folder: of the file, which has no name; None for that of the system.
-        in_memory: bytes up to which they stay in memory.
-    """
-
-    def __init__(self, folder: Path | None = None, in_memory: int = 0) -> None:
-        self._places: list[dict[str, tuple[int, np.dtype[Any], tuple[int, ...]]]] = []
-        name = None if folder is None else str(folder)
-        # A limit of 0 would mean none.
-        self._file = tempfile.SpooledTemporaryFile(max(in_memory, 1), dir=name)  # noqa: SIM115
-
-    def __enter__(self) -> Kept:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._file.close()
-
-    def put(self, arrays: Encoded) -> None:
-        """Add the result of the next window."""
-        places = {}
-        self._file.seek(0, os.SEEK_END)
-        for name, array in arrays.items():
-            places[name] = self._file.tell(), array.dtype, array.shape
-            self._file.write(np.ascontiguousarray(array).data)
-        self._places.append(places)
-
-    def get(self, number: int, name: str) -> NDArray[Any]:
-        """Return an array of a result."""
-        at, dtype, shape = self._places[number][name]
-        self._file.seek(at)
-        size = math.prod(shape) * dtype.itemsize
-        return np.frombuffer(self._file.read(size), dtype).reshape(shape)

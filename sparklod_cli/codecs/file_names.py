@@ -34,12 +34,7 @@ _CHUNK_FOLDER = re.compile(r"(?:0|[1-9]\d{0,8})_(?:0|[1-9]\d{0,8})", re.ASCII)
 
 
 def rad_chunk_name(stem: str, number: int) -> str:
-    """Return the name of the file of a chunk.
-
-    Args:
-        stem: the name of the header's file without its suffix.
-        number: of the chunk, from 0.
-    """
+    """Return the name of the file of a chunk."""
     return f"{stem}-{number}{RAD_CHUNK_SUFFIX}"
 
 

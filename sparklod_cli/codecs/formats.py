@@ -26,14 +26,14 @@ class Format:
         module: in this package; has `open_content(source) -> Content`, see `content`.
         writable: its module also has `encode(scene, options, *, threads, progress) -> Iterator[bytes]`;
             `settled(scene, options) -> WriteOptions`, the options with nothing left open, which raises `FormatError`
-            if the scene cannot be written; and `held(options, sh_degree)`, the `clamps.Range`s that it can hold.
+            if the scene cannot be written; and `held(options, sh_degree)`, the `clamps.CodeRange`s that it can hold.
         unbundled: the name of the first of the files as which a scene can also be written, all in one folder; None if
             there is no such way. Its module then has `encode_files(scene, options, *, threads, progress)`, too, which
             yields the name and the bytes of each, this one last.
-        trees: it can be written with a Level-of-Detail tree. Its `encode` then takes a `NodeStream`, too, and
-            `scratch`, a folder; its `settled` takes `Statistics`, too, those that `needed(options)` names; and
-            `encoder(scene, options, ranges, *, threads, progress)` gives its `encoder.Encoder`, and `stored(file)`,
-            with `beside` where it has companions, the `encoder.Stored` of a file.
+        trees: it can be written with a Level-of-Detail tree. Its `settled` then takes `Statistics`, too,
+            those that `needed(options)` names; `encoder(scene, options, ranges, *, threads, progress)` gives its
+            `encoder.Encoder`, and `stored(file)`, with `beside` where it has companions, the `encoder.Stored` of a
+            file.
         suffixes: lower case, with the dot.
         beginning: a regular expression that the first bytes of its files match; None if any bytes are possible, so that
             only the suffix decides.

@@ -75,7 +75,7 @@ def row_type(level: int, sh_degree: int) -> np.dtype[Any]:
 
 
 @dataclass(frozen=True)
-class Section:
+class KsplatSection:
     """Place of a section, and coding of its centres.
 
     Attributes:
@@ -158,7 +158,7 @@ def open_content(source: Source) -> Content:
 decode = decoder(open_content)
 
 
-def _centers(section: Section, part: slice, codes: NDArray[np.uint16]) -> FloatArray:
+def _centers(section: KsplatSection, part: slice, codes: NDArray[np.uint16]) -> FloatArray:
     of_section = np.arange(part.start - section.first, part.stop - section.first)
     bucket = np.searchsorted(section.ends, of_section, side="right")
     return (codes.astype(np.float32) - np.float32(section.steps)) * section.step + section.middles[bucket]
@@ -171,7 +171,7 @@ def _read(file: BinaryIO, kind: np.dtype[Any], count: int, what: str) -> NDArray
     return np.frombuffer(data, kind)
 
 
-def _read_sections(file: BinaryIO, size: int, count: int, level: int) -> Iterator[Section]:
+def _read_sections(file: BinaryIO, size: int, count: int, level: int) -> Iterator[KsplatSection]:
     at = HEADER.itemsize + count * SECTION.itemsize
     if at > size:
         raise TruncatedError(f"cut short: its header announces {count:,} sections")
@@ -199,6 +199,6 @@ def _read_sections(file: BinaryIO, size: int, count: int, level: int) -> Iterato
             if of["splats"] > (ends[-1] if len(ends) else 0):
                 raise FormatError(f"the buckets of a section are too small for its {of['splats']:,} splats")
         step = np.float32(of["bucket_width"] / 2 / steps)
-        yield Section(first, of["splats"], rows, offset, end, middles, ends, step, steps)
+        yield KsplatSection(first, of["splats"], rows, offset, end, middles, ends, step, steps)
         first += of["splats"]
         at = end

@@ -25,7 +25,7 @@ from ..support.parallel import blocks_of
 from ..support.progress import Progress, silent
 from ..support.untrusted import quoted
 from . import quantize
-from .clamps import Range
+from .clamps import CodeRange
 from .content import Content, Scratch, Source, Target, decoder
 from .file_notes import comment_of, read_comment
 from .options import DEFAULTS, WriteOptions
@@ -186,7 +186,7 @@ def settled(scene: Scene, options: WriteOptions) -> WriteOptions:
     return options
 
 
-def held(options: WriteOptions, sh_degree: int) -> tuple[Range, ...]:
+def held(options: WriteOptions, sh_degree: int) -> tuple[CodeRange, ...]:
     """Return the values that PLY holds without clamping them: all, so there is no range."""
     return ()
 

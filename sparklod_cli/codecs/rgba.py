@@ -81,8 +81,6 @@ def decode(file: BinaryIO, count: int, rows: slice | None = None) -> FloatArray:
     The type of a raw file follows from its size.
 
     Args:
-        file: of all of them.
-        count: of splats.
         rows: a range of them, from a start to a stop, to read alone; None for all.
 
     Raises:

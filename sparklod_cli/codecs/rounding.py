@@ -56,12 +56,6 @@ ROUND_TRIPS: dict[str, Callable[[Scene, int], Splats]] = {
 def after(through: str | None, file: Path, scene: Scene, threads: int = 1) -> Splats:
     """Encode and decode the splats of a scene.
 
-    Args:
-        through: one of `ROUND_TRIPS`; None leaves the splats as they are.
-        file: that the scene was read from, for errors.
-        scene: with a tree or without.
-        threads: to work on.
-
     Raises:
         FormatError: SPZ cannot hold the splats, or some are invalid; names the file.
     """

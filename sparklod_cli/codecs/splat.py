@@ -13,7 +13,7 @@ from ..model.splats import Splats
 from ..support.errors import FormatError, TruncatedError
 from ..support.progress import Progress, silent
 from . import quantize
-from .clamps import Range
+from .clamps import CodeRange
 from .content import Content, Source, Target, decoder
 from .options import DEFAULTS, WriteOptions
 from .stream import Positioned, decode_rows, encode_rows, rows_between, size_of
@@ -30,7 +30,7 @@ ROW = np.dtype(
 assert ROW.itemsize == 32
 
 #: What is held without being clamped: colours that round to a code, and no SH.
-HELD = (Range("rgb", -0.5 / 255, 255.5 / 255), Range("sh", 0, 0))
+HELD = (CodeRange("rgb", -0.5 / 255, 255.5 / 255), CodeRange("sh", 0, 0))
 
 
 def open_content(source: Source) -> Content:
@@ -79,7 +79,7 @@ def settled(scene: Scene, options: WriteOptions) -> WriteOptions:
     return options
 
 
-def held(options: WriteOptions, sh_degree: int) -> Sequence[Range]:
+def held(options: WriteOptions, sh_degree: int) -> Sequence[CodeRange]:
     """Return the values that .splat holds without clamping them."""
     return HELD
 

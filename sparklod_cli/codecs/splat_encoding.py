@@ -104,8 +104,6 @@ def encode_log_scale(
     """Encode linear scales: 0 for scales below e ** -30, 1..255 for logarithms from low to high.
 
     Args:
-        scale: of any shape.
-        low, high: ends of the range.
         log: of Spark's worker, `spark_codings.log`, or rounded once.
         least: scales below it are 0.
     """

@@ -1,6 +1,6 @@
 """SPZ, Niantic's compressed splats, and Spark's extension of it for Level-of-Detail trees.
 
-Reads versions 1 to 4, see `spz_reader`; writes versions 2 and 3. `docs/formats.md` lays the extension out byte by
+Reads versions 1 to 4, see `spz_streams`; writes versions 2 and 3. `docs/formats.md` lays the extension out byte by
 byte.
 """
 
@@ -8,72 +8,251 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import BinaryIO
+from dataclasses import dataclass, field
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..model.lod_tree import LodTree
 from ..model.scene import Scene
-from ..model.splats import COLUMNS
+from ..model.splats import COLUMNS, FloatArray, Splats
 from ..model.streams import NodeStream
-from ..support.defaults import MAX_FRACTIONAL_BITS
+from ..support.defaults import DEFAULT_SPZ_VERSION, MAX_FRACTIONAL_BITS, SPZ_VERSIONS
+from ..support.errors import FormatError
+from ..support.parallel import blocks_of
 from ..support.progress import Progress, silent
-from . import clamps
-from .clamps import Range
+from . import clamps, compression, coverage, quantize
+from .clamps import CodeRange
+from .compression import DataRun
 from .content import Source, decoder
-from .encoder import Kept, results
+from .encoder import Encoded, Encoder, Get, results, windows_of
+from .file_notes import comment_of
 from .options import DEFAULTS, WriteOptions
 from .quantize import Bytes
-from .spz_encoder import SpzEncoder, like
-from .spz_encoder import encoder as encoder
-from .spz_encoder import needed as needed
-from .spz_encoder import settled as settled
-from .spz_layout import Layout, Stream
-from .spz_reader import open_content as open_content
-from .spz_reader import read_codes
+from .spz_streams import ANTIALIASED, HEADER, LOD, MAGIC, Layout, SpzStream, column_of, read_codes
+from .spz_streams import open_content as open_content
+from .statistics import ALL_BITS, Statistics, enough, fine_bits
+
+#: The largest code that a coordinate is given, 2 ** 23 - 2. Writers clamp what does not fit to the code after it, of
+#: either sign, so `inspect` takes a coordinate that has that one for clamped.
+LAST_CODE = quantize.FIXED24_MAX - 1
+
+
+def largest_fractional_bits(largest: float) -> int:
+    """Return the most fractional bits, 0 to 24, with which 24-bit fixed point holds this magnitude of a coordinate.
+
+    Raises:
+        FormatError: not even whole units fit.
+    """
+    if np.rint(largest) > LAST_CODE:
+        reach = f"{largest:.0f}" if largest < 1e7 else f"{largest:.3g}"
+        raise FormatError(f"coordinates reach {reach}, SPZ holds at most {LAST_CODE}: scale the scene down")
+    bits = MAX_FRACTIONAL_BITS
+    while bits and np.rint(largest * 2.0**bits) > LAST_CODE:
+        bits -= 1
+    return bits
+
+
+def needed(options: WriteOptions) -> frozenset[str]:
+    """Return the statistics by which `settled` settles these options."""
+    needed = {"reach"}
+    if options.fractional_bits is None:
+        needed.add("leaf_scale")
+    if options.sh_bits is None:
+        needed.add("leaf_sh")
+    return frozenset(needed)
+
+
+def settled(scene: Scene | Statistics, options: WriteOptions) -> WriteOptions:
+    """Return the options with nothing left open: `encode` writes the scene with them.
+
+    Positions get as many fractional bits as all nodes allow, up to where a step is far below the smallest splats of
+    full detail (`statistics.STEPS_A_SPLAT`): merged splats are larger. SH get as many bits as colours need (`enough`).
+
+    Raises:
+        FormatError: a coordinate does not fit the fractional bits; the text names the most that would.
+        ValueError: there are no such bits.
+    """
+    version = DEFAULT_SPZ_VERSION if options.spz_version is None else options.spz_version
+    found = scene if isinstance(scene, Statistics) else Statistics.of_scene(scene, needed(options))
+    assert found.reach is not None
+    bits, most = options.fractional_bits, largest_fractional_bits(found.reach)
+    if bits is None:
+        assert found.leaf_scale is not None
+        bits = max(0, min(most, fine_bits(found.leaf_scale)))
+    if bits > most:
+        raise FormatError(f"a coordinate does not fit {bits} fractional bits; use at most {most}")
+    sh_bits = options.sh_bits
+    if sh_bits is None:
+        sh_bits = quantize.LEAST_SH_BITS if found.leaf_sh is None else enough(found.leaf_sh)
+    if not quantize.LEAST_SH_BITS <= sh_bits <= ALL_BITS:
+        raise ValueError(f"sh_bits is {sh_bits}, not {quantize.LEAST_SH_BITS} to {ALL_BITS}")
+    return dataclasses.replace(options, spz_version=version, fractional_bits=bits, sh_bits=sh_bits)
+
+
+def like(header: Mapping[str, int], options: WriteOptions) -> WriteOptions:
+    """Return the options, and where they leave a choice open, that of the SPZ file which a scene was read from.
+
+    Its values then stay as they are. A version that is not written becomes the newest one that is; a scene from
+    another format, by its `Scene.header`, leaves the choice open.
+    """
+    version, bits = options.spz_version, options.fractional_bits
+    if "fractional_bits" not in header:
+        return options
+    if version is None:
+        version = int(header["version"])
+        version = version if version in SPZ_VERSIONS else max(SPZ_VERSIONS)
+    bits = int(header["fractional_bits"]) if bits is None else bits
+    return dataclasses.replace(options, spz_version=version, fractional_bits=bits)
+
+
+#: How streams are deflated; the others have repetitions of all kinds.
+WAYS = {
+    **dict.fromkeys(("alphas", "scales", "rotations"), compression.NOISE),
+    "colors": compression.TRIPLES,
+    "child_counts": compression.RUNS,
+    "child_starts": compression.LINKS,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class SpzEncoder(Encoder):
+    """Encoder of a file: the result of a window has its part of each stream, by its name.
+
+    Attributes:
+        stored: (N, bytes or more) codes of streams by name, see `kept`. Of SH, there may be more coefficients than are
+            written.
+        kept: (N,) nodes that get their codes of `stored`; None for none.
+    """
+
+    stored: Mapping[str, Bytes] = field(default_factory=dict)
+    kept: NDArray[np.bool_] | None = None
+
+    @property
+    def layout(self) -> Layout:
+        """Layout of the file."""
+        version, bits = self.options.spz_version, self.options.fractional_bits
+        assert version is not None and bits is not None
+        flags = ANTIALIASED * self.antialiased | LOD * self.tree
+        return Layout(version, self.count, self.sh_degree, bits, flags)
+
+    def codes(self, splats: Splats, tree: LodTree | None, start: int) -> Encoded:
+        """Encode a window, wherever it begins."""
+        layout, sh_bits = self.layout, self.options.sh_bits
+        streams, bits = layout.streams(), layout.fractional_bits
+        codes = {stream.name: np.empty((len(splats), stream.size), np.uint8) for stream in streams}
+        assert sh_bits is not None
+        for part in blocks_of(len(splats)):
+            some, links = splats.rows(part), None if tree is None else tree.rows(part)
+            is_leaf = None if links is None else links.is_leaf
+            some = dataclasses.replace(some, opacity=opacities(some, bits, covering=self.options.covering))
+            for stream in streams:
+                if stream.name == "sh":
+                    values = sh_codes(some.sh, is_leaf, sh_bits)
+                else:
+                    values = np.ascontiguousarray(stream.encode(column_of(some, links, stream)))
+                codes[stream.name][part] = values.view(np.uint8).reshape(-1, stream.size)
+        if self.kept is not None:
+            here = slice(start, start + len(splats))
+            kept = self.kept[here]
+            for name, stored in self.stored.items():
+                codes[name][kept] = stored[here][kept, : codes[name].shape[1]]
+        return codes
+
+    def pieces(self, get: Get, *, threads: int, progress: Progress) -> Iterator[bytes]:
+        """Return the header and all streams, as one gzip member, piece by piece."""
+        layout = self.layout
+        fields = layout.version, layout.count, layout.sh_degree, layout.fractional_bits, layout.flags, 0
+
+        def data() -> Iterator[bytes | NDArray[Any]]:
+            yield HEADER.pack(MAGIC, *fields)
+            for stream in layout.streams():
+                for number in range(len(windows_of(layout.count))):
+                    yield get(number, stream.name)
+
+        runs = [
+            DataRun(stream.size * layout.count, WAYS.get(stream.name, compression.MIXED)) for stream in layout.streams()
+        ]
+        runs[0] = runs[0]._replace(size=runs[0].size + HEADER.size)
+        comment = "" if self.up is None else comment_of(up=self.up)
+        level = self.options.compression_level
+        yield from compression.gzip_member(data(), runs, level, threads, progress, comment=comment.encode())
+
+
+def encoder(
+    scene: Scene | NodeStream,
+    options: WriteOptions,
+    ranges: tuple[CodeRange, ...] = (),
+    *,
+    threads: int = 1,
+    progress: Progress = silent,
+) -> SpzEncoder:
+    """Return the encoder of a scene, of which nothing is read; `threads` and `progress` are not needed.
+
+    Raises:
+        ValueError: the options are not settled.
+    """
+    if options.spz_version is None or options.fractional_bits is None or options.sh_bits is None:
+        raise ValueError("the options leave choices open; `settled` makes them")
+    return SpzEncoder.of(scene, options, ranges)
+
+
+def to_code(
+    splats: Splats, is_leaf: NDArray[np.bool_] | None, fractional_bits: int, sh_bits: int, *, covering: bool
+) -> Splats:
+    """Return the values that the streams of a file are coded from; those of a file stay as they are.
+
+    Args:
+        splats: N splats or nodes.
+        is_leaf: (N,) which of them are leaves; None for splats without a tree.
+        fractional_bits: of the positions, a step of which is too thin to matter.
+        sh_bits: bits kept of the SH bytes of leaves; merged splats keep `quantize.LEAST_SH_BITS`.
+        covering: opacities make up for the rounding of scales.
+    """
+    sh = splats.sh
+    if sh.shape[1] and len(sh):
+        sh = quantize.decode_sh(sh_codes(sh, is_leaf, sh_bits))
+    return dataclasses.replace(splats, opacity=opacities(splats, fractional_bits, covering=covering), sh=sh)
+
+
+def opacities(splats: Splats, fractional_bits: int, *, covering: bool) -> FloatArray:
+    """Return (N,) linear opacities that make up for the rounding of scales, if `covering`."""
+    if not covering:
+        return splats.opacity
+    rounded = quantize.decode_log_scale(quantize.encode_log_scale(splats.scale))
+    return coverage.kept(splats.opacity, splats.scale, rounded, 2.0**-fractional_bits)
+
+
+def sh_codes(sh: FloatArray, is_leaf: NDArray[np.bool_] | None, sh_bits: int) -> Bytes:
+    """Return (N, K, 3) bytes of SH, of which merged splats keep fewer bits."""
+    codes = quantize.encode_sh(sh, sh_bits)
+    if is_leaf is not None and sh_bits > quantize.LEAST_SH_BITS:
+        codes[~is_leaf] = quantize.encode_sh(sh[~is_leaf], quantize.LEAST_SH_BITS)
+    return codes
+
 
 decode = decoder(open_content)
 
 
-def held(options: WriteOptions, sh_degree: int) -> Sequence[Range]:
+def held(options: WriteOptions, sh_degree: int) -> Sequence[CodeRange]:
     """Return the values that SPZ holds without clamping them."""
     return clamps.SPZ
 
 
 def encode(
-    scene: Scene | NodeStream,
-    options: WriteOptions = DEFAULTS,
-    *,
-    threads: int = 1,
-    progress: Progress = silent,
-    scratch: Path | None = None,
+    scene: Scene, options: WriteOptions = DEFAULTS, *, threads: int = 1, progress: Progress = silent
 ) -> Iterator[bytes]:
     """Return the bytes of a file, piece by piece: an LoD file if the scene has a tree, otherwise a plain one.
 
-    The same scene and options give the same bytes for any number of threads, and for a stream of the same nodes.
-
-    Args:
-        scene: to write.
-        options: settled where the scene is a stream; otherwise they may leave choices open.
-        threads: to encode on.
-        progress: called with the splats, and then the bytes.
-        scratch: folder for a temporary file of the bytes before they are compressed; None to keep them in memory.
+    The same scene and options give the same bytes for any number of threads.
 
     Raises:
         FormatError: a coordinate does not fit the fractional bits; the text names the most that would.
     """
-    made = encoder(scene, settled(scene, options) if isinstance(scene, Scene) else options)
-    windows = results(made, scene, threads, progress, "encoding")
-    if scratch is None:
-        in_memory = list(windows)
-        yield from made.pieces(lambda number, name: in_memory[number][name], threads=threads, progress=progress)
-        return
-    with Kept(scratch) as spilled:
-        for window in windows:
-            spilled.put(window)
-        yield from made.pieces(spilled.get, threads=threads, progress=progress)
+    of_scene = encoder(scene, settled(scene, options))
+    windows = list(results(of_scene, scene, threads, progress, "encoding"))
+    yield from of_scene.pieces(lambda number, name: windows[number][name], threads=threads, progress=progress)
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +279,7 @@ class StoredSpz:
         codes = {each.name: self.codes[each.name] for each in streams if self._is_alike(each, encoder.layout)}
         return dataclasses.replace(encoder, stored=codes, kept=kept)
 
-    def _is_alike(self, stream: Stream, other: Layout) -> bool:
+    def _is_alike(self, stream: SpzStream, other: Layout) -> bool:
         """Return True if a layout has a stream of splats in the coding of the file."""
         own = self.layout
         if stream.column not in COLUMNS:

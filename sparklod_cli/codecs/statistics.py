@@ -275,7 +275,6 @@ class Statistics:
         """Count N splats or nodes.
 
         Args:
-            splats: of all columns.
             leaf: (N,) which nodes are leaves; None for splats that are no nodes.
             needed: what to count, of `ALL`.
         """

@@ -13,6 +13,7 @@ from typing import Any, TextIO
 
 import click
 
+from ..support import interrupts
 from ..support.printable import MOST, printable
 from ..support.stdout import silence
 from ..support.units import count_of as count_of
@@ -174,6 +175,7 @@ class Console:
             self.progress("compiling", len(seconds), 0, "kernel")  # how many a command needs is not known
 
         def begin(name: str) -> None:
+            interrupts.leave_if_lost()
             if not begun:
                 from ..warmup import missing
 

@@ -11,7 +11,7 @@ from ..cameras.frame import direction_of
 from ..images.pixels import BACKGROUND
 from ..lod.kernels.tree_links import find_depths
 from ..model.gaussian import lod_opacity, spark_size
-from ..model.nodes import CHUNK_NODES
+from ..model.lod_tree import CHUNK_NODES
 from ..model.scene import Scene
 from ..model.splats import FloatArray, Splats
 from ..render.color_scales import (

@@ -78,8 +78,7 @@ def _of_tree(arrays: Arrays, settings: ReportSettings) -> dict[str, Any]:
 
 
 def _of_texture(arrays: Arrays, settings: ReportSettings) -> dict[str, Any]:
-    capacity = data_texture.SPLATS_A_ROW * len(arrays["texture"]) if arrays["texture"].ndim else 0
-    data_texture.unpack(arrays, capacity)  # raises if the shape is wrong
+    capacity = data_texture.capacity(arrays)
     used = np.flatnonzero(np.ascontiguousarray(arrays["texture"]).reshape(capacity, 8).any(axis=1))
     note = "it has centres, covariances and colours of nodes, but no opacities above 1, SH and children"
     return _fields("NPZ of a data texture", int(used[-1]) + 1 if len(used) else 0, note, settings)

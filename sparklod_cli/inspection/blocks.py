@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..io.rad_file import RadFile
-from ..model.lod_tree import LodTree
-from ..model.nodes import CHUNK_NODES
+from ..model.lod_tree import CHUNK_NODES, LodTree
 from ..model.scene import Scene
 from ..model.splats import COLUMNS, FloatArray, Splats
 from ..support.parallel import ordered_map

@@ -15,8 +15,8 @@ from ..codecs.rad.property_codings import CODINGS
 from ..codecs.rad.rad_encoder import rounded
 from ..codecs.rad.rad_layout import PROPERTIES, Row
 from ..codecs.spark_codings import STEPS_8_8_8, encode_axis_angle, encode_lod_alpha
-from ..codecs.spz_encoder import to_code
-from ..codecs.spz_layout import LOD, Layout
+from ..codecs.spz import to_code
+from ..codecs.spz_streams import LOD, Layout
 from ..codecs.statistics import ALL_BITS, ShBytes, Statistics, enough, fine_bits
 from ..model.scene import Scene
 from ..model.selection import Selection

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..codecs.spz_layout import KNOWN_FLAGS
+from ..codecs.spz_streams import KNOWN_FLAGS
 from ..io import examine_scene, read_arrays, size_of_input
 from ..io.rad_file import RadFile
 from ..model.scene import Scene

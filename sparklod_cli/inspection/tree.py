@@ -24,8 +24,7 @@ from ..lod.kernels.tree_links import (
     sum_by_depth,
 )
 from ..model.gaussian import spark_size
-from ..model.lod_tree import LodTree
-from ..model.nodes import CHUNK_BITS, CHUNK_NODES
+from ..model.lod_tree import CHUNK_BITS, CHUNK_NODES, LodTree
 from ..model.scene import Scene
 from ..model.splats import FloatArray, Splats
 from ..support.parallel import blocks_of, ordered_map

@@ -16,8 +16,7 @@ from ..support import atomic, atomic_set
 from ..support.addresses import Address, Place
 from ..support.errors import FormatError, OutputError
 from ..support.stdin import DASH
-from .beside import companions, in_folder
-from .paths import reason_of
+from .beside import companions, in_folder, reason_of
 from .reading import opened
 from .writing import Files, SinkTogether, check_header, send_together
 
@@ -35,7 +34,6 @@ def detail_sink(path: Place, *, overwrite: bool) -> SinkTogether:
 
     Args:
         path: of the manifest; where it is a symbolic link, all files go to where that leads.
-        overwrite: replace a former output.
 
     Raises:
         OutputError: it is no place for several files, a folder is in the way, or see `check_writable`.
@@ -49,11 +47,7 @@ def detail_sink(path: Place, *, overwrite: bool) -> SinkTogether:
 
 
 def detail_files(path: Path) -> list[Path]:
-    """Return the files beside a manifest that are called as those of an output there, whether it names them or not.
-
-    Args:
-        path: of the manifest, which need not exist.
-    """
+    """Return the files beside a manifest that are called as those of an output there, whether it names them or not."""
     target = Path(os.path.realpath(path))
     return [target.parent / name for name in _standing(target)]
 

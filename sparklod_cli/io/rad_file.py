@@ -19,8 +19,7 @@ from ..model.scene import FileCoding
 from ..model.splats import FloatArray, Splats
 from ..support.errors import UnreadableError
 from ..support.machine import available_memory
-from .beside import open_beside
-from .paths import reason_of
+from .beside import open_beside, reason_of
 from .reading import opened
 
 #: Name of the format in `codecs.formats`.
@@ -82,7 +81,6 @@ class RadFile:
         """Yield all chunks in order: the index of the first splat of each, its splats, and its nodes if it has a tree.
 
         Args:
-            columns: of `Splats`; the others are 0.
             thorough: unpack the others, too, which finds what is corrupt.
 
         Raises:
@@ -125,7 +123,6 @@ def read_rad_chunk(path: Path, number: int, *, palette: FloatArray | None = None
 
     Args:
         path: of the file, or of the header whose chunks are files beside it.
-        number: of the chunk, from 0.
         palette: that of the first chunk, see `codecs.rad.codec.read_chunk`.
 
     Raises:

@@ -19,8 +19,7 @@ from ..support.addresses import Place, size_of
 from ..support.errors import FormatError, UnknownFormatError, UnreadableError
 from ..support.progress import Progress, silent
 from ..support.stdin import DASH, spooled
-from .beside import in_folder, open_beside
-from .paths import reason_unreadable
+from .beside import in_folder, open_beside, reason_unreadable
 
 if TYPE_CHECKING:
     from ..codecs.gpu import dump
@@ -80,9 +79,6 @@ def examine_scene(
     path: Place, *, columns: Collection[str] = COLUMNS, threads: int = 1, progress: Progress = silent
 ) -> Scene:
     """Read a splat file for a report on it: its tree may be broken, and columns that are not asked for may be 0.
-
-    Args:
-        columns: of `Splats`.
 
     Raises:
         FormatError: as `read_scene`, but for the tree.
@@ -189,7 +185,6 @@ def read_together(path: Path, sets: Collection[Collection[str]], limit: int) -> 
     Args:
         path: of a file, or of a folder that holds one of the sets.
         sets: names of files that belong together; where `path` is one of a set, the others beside it are read, too.
-        limit: bytes that a file may have.
 
     Raises:
         UnreadableError: there is no such file or set, or one is too large; the text names it.

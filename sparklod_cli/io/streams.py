@@ -24,7 +24,7 @@ from ..support.addresses import Address, Place
 from ..support.errors import FormatError, OutputError, SparklodError
 from ..support.progress import Progress, silent
 from ..support.stdin import DASH, name_of
-from .paths import reason_of
+from .beside import reason_of
 from .reading import opened, readable
 
 #: Makes the bytes of a scratch file.
@@ -64,7 +64,7 @@ def open_stream(
         source = _Source(path, store, threads, progress)
         with source.borrowed() as stream:
             found = stream
-        yield dataclasses.replace(found, read=_Read(source, found.count, found.sh_degree))
+        yield dataclasses.replace(found, read=_ReadAnew(source, found.count, found.sh_degree))
     finally:
         close_idle(lambda key: isinstance(key, _Key) and (key.store, key.path) == (store.name, path))
         store.close()
@@ -95,9 +95,6 @@ def open_streams(
     """Yield the splats of several files, each where it stands, as those of one scene; see `streams.merged`.
 
     Nothing is kept open between reads, and the header of a file that is named twice is read once.
-
-    Args:
-        files: at least one.
 
     Raises:
         HasTreeError, FormatError, ValueError: as `open_stream`; names the file.
@@ -267,7 +264,7 @@ class _Source:
 
 
 @dataclass(frozen=True)
-class _Read:
+class _ReadAnew:
     """`SceneStream.read` of a file that is opened anew."""
 
     source: _Source
@@ -295,12 +292,7 @@ _IDLE: list[tuple[Hashable, Opened]] = []
 
 @contextlib.contextmanager
 def borrowed(key: Hashable, opened: Callable[[], Opened]) -> Iterator[SceneStream]:
-    """Yield a stream that nobody else reads meanwhile: one that waits, or else a new one. It waits afterwards.
-
-    Args:
-        key: tells a file, its version and how it is read from others.
-        opened: makes a new one.
-    """
+    """Yield a stream that nobody else reads meanwhile: one that waits, or else a new one. It waits afterwards."""
     found = _taken(key) or opened()
     sound = False
     try:

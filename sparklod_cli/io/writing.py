@@ -9,9 +9,9 @@ import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from ..codecs.encoder import Encoder, Get
+from ..codecs.encoder import Get
 from ..codecs.formats import Format
 from ..codecs.options import WriteOptions
 from ..model.scene import Scene
@@ -21,7 +21,7 @@ from ..support.errors import OutputError, StdoutError
 from ..support.progress import Progress, silent
 from ..support.stdin import DASH
 from ..support.stdout import ReaderGoneError, guarded
-from .paths import number_of, reason_of
+from .beside import number_of, reason_of
 
 if TYPE_CHECKING:
     from ..codecs.rad.rad_reader import RadReader
@@ -47,10 +47,6 @@ def check_writable(path: Place, *, overwrite: bool) -> None:
     """Raise `OutputError` where an output cannot be written, as far as that can be told before work goes into it.
 
     Folders on the way to it that do not exist are no error: `write_whole` makes them.
-
-    Args:
-        path: of the output.
-        overwrite: an existing file may be replaced.
     """
     try:
         if isinstance(path, Address):
@@ -120,11 +116,7 @@ def write_stdout(pieces: Iterable[bytes]) -> int:
 
 
 def chunk_files(path: Path) -> list[Path]:
-    """Return the existing files beside a header whose names match its pattern, in the order of their numbers.
-
-    Args:
-        path: of a header, which need not exist: the meta.json of a SOG, or a RAD.
-    """
+    """Return the existing files beside a header whose names match its pattern, in the order of their numbers."""
     target = Path(os.path.realpath(path))
     try:
         return _numbered(target, (each.name for each in target.parent.iterdir()))
@@ -227,7 +219,6 @@ def send_together(address: Address, files: Files, *, former: Sequence[Address], 
     replaced, the old header is removed first for the same reason: services replace one object at a time.
 
     Args:
-        address: of the file that names the others.
         files: names, with the folders that they are in there, and contents; the last is that of `address`.
         former: files of a former output, which are removed where no new one has their name.
 
@@ -297,12 +288,8 @@ class SceneSink:
         assert self.together is not None
         return self.together(chunks.in_files(self.stem))
 
-    def assemble(self, encoder: Encoder, get: Get, *, threads: int = 1, progress: Progress = silent) -> int:
+    def assemble(self, encoder: Any, get: Get, *, threads: int = 1, progress: Progress = silent) -> int:
         """Write a tree whose windows are encoded, and return how many bytes it wrote.
-
-        Args:
-            encoder: of the tree, in the format of this sink.
-            get: reads the results of the windows.
 
         Raises:
             OutputError: see `scene_sink`.
@@ -310,7 +297,7 @@ class SceneSink:
         if self.whole is not None:
             return self.whole(encoder.pieces(get, threads=threads, progress=progress))
         assert self.together is not None
-        return self.together(self.form.codec().assemble_chunked(encoder, get, self.stem, progress=progress))
+        return self.together(encoder.files(get, self.stem, progress=progress))
 
 
 def scene_sink(path: Place, form: Format, *, chunked: bool = False, overwrite: bool) -> SceneSink:
@@ -319,7 +306,6 @@ def scene_sink(path: Place, form: Format, *, chunked: bool = False, overwrite: b
     Args:
         path: of the file, or of the header where `chunked`; - is standard output, for one file. One that is called as
             the `unbundled` of the format has the other files beside it.
-        form: that is written.
         chunked: with each chunk in a file of its own, beside the header; of RAD.
 
     Raises:

@@ -15,10 +15,9 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from ..model.foveation import SPARK
 from ..model.gaussian import spark_size
-from ..model.lod_tree import LodTree
-from ..model.nodes import CHUNK_NODES
+from ..model.instances import SPARK
+from ..model.lod_tree import CHUNK_NODES, LodTree
 from ..model.splats import FloatArray, Splats
 from ..support.jit import threads_for
 from ..support.parallel import blocks_of

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-from ..model.foveation import SPARK, Foveation
+from ..model.instances import SPARK, Foveation
 from ..support.defaults import PRESETS
 from ..support.setting_fields import CheckedSettings, Range, setting
 from .detail_rule import DetailRule

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..model.foveation import Cones, Foveation, Frustum
-from ..model.nodes import CHUNK_BITS, CHUNK_NODES, Nodes
+from ..model.instances import Cones, Foveation, Frustum
+from ..model.lod_tree import CHUNK_BITS, CHUNK_NODES, Nodes
 from .kernels import cut_arrays, pixel_scale
 from .kernels.cut import find_cut
 

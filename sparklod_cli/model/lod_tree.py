@@ -1,4 +1,4 @@
-"""`LodTree`: the child columns of a Level-of-Detail tree, and their invariants."""
+"""`LodTree`: the child columns of a Level-of-Detail tree and their invariants; `Nodes`: what a traversal reads."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..support.errors import TreeError
-from .splats import read_only
+from .gaussian import spark_size
+from .splats import FloatArray, Splats, read_only
 
 #: The most children of a node: child counts are uint16 in Spark's nodes and in SPZ files.
 MAX_CHILDREN = 65535
@@ -41,6 +42,10 @@ class LodTree:
         """Return this tree with read-only columns, as `Splats.frozen`."""
         count, start = read_only(self.child_count), read_only(self.child_start)
         return self if count is self.child_count and start is self.child_start else LodTree(count, start)
+
+    def rows(self, part: slice) -> LodTree:
+        """Return views of some consecutive nodes."""
+        return LodTree(self.child_count[part], self.child_start[part])
 
     @property
     def is_leaf(self) -> NDArray[np.bool_]:
@@ -96,3 +101,28 @@ class LodTree:
     def _fail_at(nodes: NDArray[np.int64], what: str) -> None:
         if nodes.size:
             raise TreeError(f"node {nodes[0]} {what}")
+
+
+#: Nodes of a chunk, the unit in which Spark streams trees; as a power of 2.
+CHUNK_BITS = 16
+CHUNK_NODES = 1 << CHUNK_BITS
+
+
+@dataclass(frozen=True)
+class Nodes:
+    """Node data that the traversal reads, N nodes.
+
+    Attributes:
+        center: (N, 3) float32 world units.
+        size: (N,) float32 feature sizes, world units.
+        tree: (N,) children; not validated.
+    """
+
+    center: FloatArray
+    size: FloatArray
+    tree: LodTree
+
+    @classmethod
+    def of(cls, splats: Splats, tree: LodTree) -> Nodes:
+        """Return the nodes of a tree in full precision, with Spark's feature sizes."""
+        return cls(splats.center, spark_size(splats), tree)

@@ -26,7 +26,7 @@ EXAMINED = 1 << 15
 
 
 @dataclass(frozen=True)
-class Tally:
+class SelectionTally:
     """Counts of the splats of a scene, or of a part of it, that a selection keeps and drops.
 
     Attributes:
@@ -44,13 +44,15 @@ class Tally:
         """Number of splats that are kept."""
         return self.count - sum(self.dropped.values())
 
-    def then(self, after: Tally) -> Tally:
+    def then(self, after: SelectionTally) -> SelectionTally:
         """Return the result for these splats and those that come after them."""
         first = self.first_invalid
         if first is None and after.first_invalid is not None:
             first = self.count + after.first_invalid
         dropped = {reason: self.dropped.get(reason, 0) + after.dropped.get(reason, 0) for reason in REASONS}
-        return Tally(self.count + after.count, {reason: count for reason, count in dropped.items() if count}, first)
+        return SelectionTally(
+            self.count + after.count, {reason: count for reason, count in dropped.items() if count}, first
+        )
 
 
 @dataclass(frozen=True)
@@ -80,19 +82,19 @@ class Selection:
         self.check(tally)
         return (splats if keep.all() else splats.take(keep)), tally.dropped
 
-    def examine(self, splats: Splats, *, threads: int = 1) -> tuple[NDArray[np.bool_], Tally]:
+    def examine(self, splats: Splats, *, threads: int = 1) -> tuple[NDArray[np.bool_], SelectionTally]:
         """Return which splats of a scene, or of a part of it, are kept, (N,), and what becomes of the others.
 
         Invalid ones are not kept in any case.
         """
-        keep, tally = np.ones(len(splats), np.bool_), Tally()
+        keep, tally = np.ones(len(splats), np.bool_), SelectionTally()
         parts = blocks_of(len(splats), EXAMINED)
         examined = ordered_map(lambda part: self._examine(splats.take(part)), parts, threads)
         for part, (kept, more) in zip(parts, examined, strict=True):
             keep[part], tally = kept, tally.then(more)
         return keep, tally
 
-    def _examine(self, splats: Splats) -> tuple[NDArray[np.bool_], Tally]:
+    def _examine(self, splats: Splats) -> tuple[NDArray[np.bool_], SelectionTally]:
         """`examine` for a few splats."""
         invalid = splats.invalid()
         keeps = {kind: ~mask for kind, mask in invalid.items()} | {
@@ -108,9 +110,9 @@ class Selection:
             keep &= keeps[reason]
             dropped[reason] = before - int(np.count_nonzero(keep))
         first = min((int(np.argmax(mask)) for mask in invalid.values()), default=None)
-        return keep, Tally(len(splats), {reason: count for reason, count in dropped.items() if count}, first)
+        return keep, SelectionTally(len(splats), {reason: count for reason, count in dropped.items() if count}, first)
 
-    def check(self, tally: Tally) -> None:
+    def check(self, tally: SelectionTally) -> None:
         """Check that a tree can be made of what is kept of a whole scene.
 
         Raises:

@@ -106,6 +106,10 @@ class Splats:
         """Return the splats of an index array, a mask or a slice: the one way to filter, permute and truncate."""
         return Splats(**{name: np.ascontiguousarray(getattr(self, name)[index]) for name in COLUMNS})
 
+    def rows(self, part: slice) -> Splats:
+        """Return views of some consecutive splats."""
+        return Splats(**{name: getattr(self, name)[part] for name in COLUMNS})
+
     def invalid(self) -> dict[str, NDArray[np.bool_]]:
         """Return (N,) masks of invalid splats, by the kinds of `INVALID` that occur; a splat is in at most one mask.
 
@@ -169,11 +173,7 @@ def same_rows(one: Splats, other: Splats) -> NDArray[np.bool_]:
 
 
 def describe_invalid(invalid: dict[str, NDArray[np.bool_]]) -> str:
-    """Return a message such as "3 of 50 splats are invalid (3 a scale below 0; the first is splat 7)".
-
-    Args:
-        invalid: the masks of `Splats.invalid`, not empty.
-    """
+    """Return a message such as "3 of 50 splats are invalid (3 a scale below 0; the first is splat 7)"."""
     counts = {kind: int(np.count_nonzero(mask)) for kind, mask in invalid.items()}
     total = len(next(iter(invalid.values())))
     return describe_counts(counts, total, min(int(np.argmax(mask)) for mask in invalid.values()))

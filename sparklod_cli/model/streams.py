@@ -69,23 +69,6 @@ class NodeStream:
     read: Callable[[int, int], tuple[Splats, LodTree]]
     up: str | None = None
 
-    def windows(self, rows: int) -> Iterator[tuple[Splats, LodTree]]:
-        """Read all nodes, in order, so many at a time."""
-        for start in range(0, self.count, rows):
-            yield self.read(start, min(start + rows, self.count))
-
-
-def stream_of(scene: Scene) -> SceneStream:
-    """Return a stream of a scene in memory, which has no tree."""
-    assert scene.tree is None
-
-    def read(start: int, stop: int) -> Iterator[Splats]:
-        for first in range(start, stop, BLOCK_SPLATS):
-            yield scene.splats.take(slice(first, min(first + BLOCK_SPLATS, stop)))
-
-    splats, about = scene.splats, (scene.antialiased, scene.format, scene.notes, scene.header, scene.up)
-    return SceneStream(len(splats), splats.sh_degree, read, *about)
-
 
 def collected(stream: SceneStream, progress: Progress = silent) -> Scene:
     """Read all of a stream into memory, which takes no more of it than the scene and a block."""
@@ -129,7 +112,7 @@ def merged(parts: Sequence[Placed]) -> SceneStream:
     return SceneStream(
         firsts[-1],
         degree,
-        _Read(tuple(parts), firsts, degree),
+        _ReadMerged(tuple(parts), firsts, degree),
         antialiased,
         " and ".join(sorted({part.stream.format for part in parts})),
         tuple(dict.fromkeys(notes)),
@@ -150,7 +133,7 @@ def _antialiased(parts: Sequence[Placed]) -> tuple[bool, tuple[str, ...]]:
 
 
 @dataclass(frozen=True, eq=False)
-class _Read:
+class _ReadMerged:
     """`SceneStream.read` of several scenes; can be pickled if their streams can."""
 
     parts: tuple[Placed, ...]

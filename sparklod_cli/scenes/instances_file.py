@@ -13,8 +13,7 @@ import numpy as np
 
 from ..cameras.pose import rotation_of
 from ..io import is_file_name, read_text
-from ..model.foveation import Cones, Foveation, Frustum
-from ..model.instances import TOTAL, Instance, Matrix, names_of
+from ..model.instances import TOTAL, Cones, Foveation, Frustum, Instance, Matrix, names_of
 from ..support.errors import SparklodError
 from ..support.untrusted import parse_json, quoted_value, well_formed
 

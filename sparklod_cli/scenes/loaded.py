@@ -17,10 +17,9 @@ from ..lod.detail_traversal import DetailForest, DetailTraversal
 from ..lod.settings import LodSettings
 from ..lod.traversal import Forest, Traversal, TreeCut, TreeInstance
 from ..model.balls import Balls, balls_of
-from ..model.foveation import Foveation
 from ..model.gaussian import placed
-from ..model.instances import Instance, Matrix
-from ..model.nodes import Nodes
+from ..model.instances import Foveation, Instance, Matrix
+from ..model.lod_tree import Nodes
 from ..model.scene import Scene
 from ..model.splats import Splats
 from ..model.transforms import common, rotated
@@ -210,7 +209,6 @@ class Scenes:
         """Find the cuts of the instances of trees, or of scenes at several detail levels.
 
         Args:
-            settings: of the viewer.
             remembers: of `DetailTraversal`: cuts are found one after the other, along a path.
 
         Raises:

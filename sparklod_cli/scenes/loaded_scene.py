@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from ..codecs.gpu import loaded_nodes, lod_tree
 from ..io.details import LevelFiles
 from ..lod.detail_traversal import DetailFiles
-from ..model.lod_tree import LodTree
-from ..model.nodes import CHUNK_NODES, Nodes
+from ..model.lod_tree import CHUNK_NODES, LodTree, Nodes
 from ..model.scene import DetailScene, FileCoding, Scene
 from ..model.splats import COLUMNS, Splats
 

@@ -18,8 +18,7 @@ from ..lod.kernels.pixel_scale import NODE
 from ..lod.traversal import Forest, fill_nodes
 from ..model.balls import USED, Balls, balls_of
 from ..model.instances import Instance
-from ..model.lod_tree import LodTree
-from ..model.nodes import CHUNK_BITS, CHUNK_NODES, Nodes
+from ..model.lod_tree import CHUNK_BITS, CHUNK_NODES, LodTree, Nodes
 from ..model.scene import FileCoding, Scene
 from ..model.splats import COLUMNS, Splats
 from ..support.errors import SparklodError, TreeError
@@ -293,12 +292,7 @@ def empty_scene(file: RadFile) -> Scene:
 
 
 def sampled_balls(instances: Sequence[Instance], scenes: Sequence[LoadedScene]) -> Balls:
-    """Return what the splats of instances cover, as many as cameras look at: those that they take of all.
-
-    Args:
-        instances: at least one.
-        scenes: that each is of.
-    """
+    """Return what the splats of instances cover, as many as cameras look at: those that they take of all."""
     counts = [loaded.leaf_count for loaded in scenes]
     while True:
         every = max(sum(counts) // SAMPLE, 1)

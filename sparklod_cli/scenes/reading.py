@@ -13,7 +13,7 @@ from ..io import examine_scene, read_levels, size_of_input
 from ..io.details import has_levels, read_level_files
 from ..io.rad_file import RadFile
 from ..model.instances import Instance
-from ..model.nodes import CHUNK_NODES
+from ..model.lod_tree import CHUNK_NODES
 from ..model.scene import DetailScene, Scene
 from ..model.selection import Selection, describe
 from ..model.splats import COLUMNS
@@ -41,15 +41,12 @@ def read_scenes(
     Splats that cannot be drawn are left out of scenes without trees; `Scenes.notes` has their number.
 
     Args:
-        instances: at least one.
         columns: of `Splats` that are read; only with `trees_only`; of scenes without trees all are read.
         trees_only: refuse scenes of which no cuts are drawn: those with neither a tree nor detail levels.
         through: one of `rounding.ROUND_TRIPS`, a coding after which splats are drawn; cuts are those of the scene.
         precision: one of `PRECISIONS`, of the nodes that cuts are found with.
         paged: only cuts are looked at, so that of large RAD trees those chunks suffice
             that cuts need. Chunks that no cut needs are not looked at; all the rest is the same.
-        threads: to decode on.
-        progress: called with how much is done.
 
     Raises:
         FormatError: a file cannot be read, is no tree but has to be, or does not fit the coding; names the file.

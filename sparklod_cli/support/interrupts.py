@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from types import FrameType
+from typing import NoReturn
 
 #: The signals that end a run, if the system has them.
 ENDING = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
@@ -23,6 +24,9 @@ COMPILERS = ("numba", "llvmlite")
 
 #: Seconds to wait for another thread to write the message.
 FAREWELL = 0.1
+
+#: Part of the error that Python prints of a second signal that came before the first one reset the handlers.
+RACE = "ignored due to race condition"
 
 #: What is written to the pipe of signals for an interruption that was lost, and the seconds until it is raised again.
 LOST, PATIENCE = 0, 0.02
@@ -119,6 +123,8 @@ def _raise_again_where_lost(interrupt: Callable[[int, FrameType | None], None], 
     otherwise = sys.unraisablehook
 
     def hook(lost: sys.UnraisableHookArgs) -> None:
+        if lost.exc_type is OSError and RACE in str(lost.exc_value):  # it came together with the first one
+            _leave()
         if lost.exc_type is not KeyboardInterrupt:
             otherwise(lost)
             return
@@ -154,11 +160,25 @@ def _leave_if_compiling() -> None:
         at: FrameType | None = frame
         while at is not None:
             if at.f_globals.get("__name__", "").partition(".")[0] in COMPILERS:
-                # A second thread, or a second signal in the same one, does not wait for the lock.
-                if _leaving.acquire(blocking=False):
-                    with contextlib.suppress(OSError):  # not `sys.stderr`, whose lock the other thread may hold
-                        os.write(2, b"\r\x1b[Kinterrupted\n" if os.isatty(2) else b"interrupted\n")
-                    os._exit(INTERRUPTED)
-                time.sleep(FAREWELL)
-                os._exit(INTERRUPTED)
+                _leave()
             at = at.f_back
+
+
+def leave_if_lost() -> None:
+    """End the process if it goes on although a signal has interrupted it: a library has lost the exception.
+
+    Called before what takes long, such as compilation.
+    """
+    if _came.is_set() and not _deferral.asked:
+        _leave()
+
+
+def _leave() -> NoReturn:
+    """Write the message and end the process, without any clean-up."""
+    # A second thread, or a second signal in the same one, does not wait for the lock.
+    if _leaving.acquire(blocking=False):
+        with contextlib.suppress(OSError):  # not `sys.stderr`, whose lock the other thread may hold
+            os.write(2, b"\r\x1b[Kinterrupted\n" if os.isatty(2) else b"interrupted\n")
+        os._exit(INTERRUPTED)
+    time.sleep(FAREWELL)
+    os._exit(INTERRUPTED)

@@ -15,10 +15,9 @@ from urllib.parse import quote
 from ..codecs.file_names import MANIFEST, META
 from ..codecs.formats import FORMATS, HEAD, sniff
 from ..codecs.rad.rad_header import MAGIC, RadHeader, read_header
-from ..io.beside import companions, in_folder, path_beside
+from ..io.beside import companions, in_folder, open_plain, path_beside, reason_unreadable
 from ..io.details import read_level_files
-from ..io.paths import open_plain, reason_unreadable
-from ..model.nodes import CHUNK_NODES
+from ..model.lod_tree import CHUNK_NODES
 from ..support.errors import FormatError, NotSplatsError, UnknownFormatError, UnreadableError
 from ..support.printable import printable
 from ..support.untrusted import quoted_value

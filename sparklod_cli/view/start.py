@@ -17,7 +17,7 @@ from ..cameras.sources import Views, WholeScene
 from ..codecs.rad.rad_header import RadHeader
 from ..codecs.rad.rad_reader import count_leaves, file_of, read_chunk
 from ..io import examine_scene, read_levels
-from ..io.paths import open_plain, reason_of
+from ..io.beside import open_plain, reason_of
 from ..model.balls import USED, Balls, balls_of
 from ..model.splats import Splats
 from ..support.defaults import ELEVATION

@@ -14,7 +14,7 @@ import pytest
 import sparklod_cli as sparklod
 from sparklod_cli.cli import run
 from sparklod_cli.lod import quick
-from sparklod_cli.model.nodes import CHUNK_NODES
+from sparklod_cli.model.lod_tree import CHUNK_NODES
 from sparklod_cli.model.splats import COLUMNS
 from tests.api.runs import DEMO, command
 from tests.scenes import random_splats

@@ -44,7 +44,9 @@ def written(output: Output, nodes: Scene | NodeStream, found: Statistics) -> Wri
     """Writes a tree window by window."""
 
     def encode(tree: BuiltTree, made: encoder.Encoder) -> encoder.Get:
-        results = list(encoder.results(made, nodes, 2, silent, "encoding"))
+        read = nodes.read if isinstance(nodes, NodeStream) else node_stream(nodes).read
+        parts = encoder.windows_of(made.count)
+        results = [made.encode(*read(part.start, part.stop), part.start) for part in parts]
         return lambda number, name: results[number][name]
 
     return output.write(BuiltTree(nodes=nodes, output=output, statistics=found), encode, Clock(), 2, silent)

@@ -7,7 +7,7 @@ import pytest
 
 from sparklod_cli.bake.selecting import select
 from sparklod_cli.bake.settings import BakeSettings
-from sparklod_cli.model.selection import Selection, Tally
+from sparklod_cli.model.selection import Selection, SelectionTally
 from sparklod_cli.support.errors import InvalidSplatsError
 from tests.lod.trees import hard_cases
 from tests.scenes import random_splats
@@ -16,7 +16,7 @@ from tests.scenes import random_splats
 @pytest.mark.parametrize("name", hard_cases())
 def test_splats_that_can_be_drawn_are_kept_as_they_are(name: str) -> None:
     splats = hard_cases()[name]
-    assert select(splats, BakeSettings()) == (splats, Tally(len(splats)))
+    assert select(splats, BakeSettings()) == (splats, SelectionTally(len(splats)))
 
 
 def test_a_splat_without_extent_is_dropped_and_counted() -> None:

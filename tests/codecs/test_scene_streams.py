@@ -15,11 +15,13 @@ from sparklod_cli.io import streams as idle_streams
 from sparklod_cli.model import streams
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
-from sparklod_cli.model.streams import Placed, SceneStream, collected, merged, stream_of
+from sparklod_cli.model.streams import Placed, SceneStream, collected, merged
 from sparklod_cli.model.transforms import Transform
 from sparklod_cli.support.errors import FormatError, HasTreeError, OutputError, UnreadableError
+from tests.bake.out_of_core.plain import stream_of
+from tests.codecs.cases import put
 from tests.codecs.test_round_trip import CASES, star
-from tests.codecs.writers import WRITERS, put
+from tests.codecs.writers import WRITERS
 from tests.conftest import FIXTURES
 from tests.scenes import random_splats
 

@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fixtures import by_hand
-from sparklod_cli.codecs import clamps, quantize, spz, spz_encoder
+from sparklod_cli.codecs import clamps, quantize, spz
 from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
@@ -144,12 +144,12 @@ def bits_of(splats: Splats, fractional_bits: int | None = None) -> int | None:
     return spz.settled(Scene(splats), WriteOptions(fractional_bits=fractional_bits)).fractional_bits
 
 
-@given(reach=st.floats(2.0**-10, spz_encoder.LAST_CODE, width=32))
+@given(reach=st.floats(2.0**-10, spz.LAST_CODE, width=32))
 def test_the_most_bits_are_the_most_that_fit(reach: float) -> None:
     splats = splats_with(reach=reach, count=2)
-    bits = spz_encoder.largest_fractional_bits(float(np.abs(splats.center).max()))
-    assert round(reach * 2.0**bits) <= spz_encoder.LAST_CODE == 2**23 - 2
-    assert bits == 24 or round(reach * 2.0 ** (bits + 1)) > spz_encoder.LAST_CODE
+    bits = spz.largest_fractional_bits(float(np.abs(splats.center).max()))
+    assert round(reach * 2.0**bits) <= spz.LAST_CODE == 2**23 - 2
+    assert bits == 24 or round(reach * 2.0 ** (bits + 1)) > spz.LAST_CODE
     back = spz.decode(io.BytesIO(b"".join(spz.encode(Scene(splats), WriteOptions(fractional_bits=bits)))))
     assert np.abs(back.splats.center.astype(np.float64) - splats.center).max() <= 0.5 * 2.0**-bits
 
@@ -223,10 +223,10 @@ def test_settled_options_are_settled_and_write_the_same_bytes() -> None:
 
 def test_options_default_to_those_of_the_file() -> None:
     scene = spz.decode(io.BytesIO(b"".join(spz.encode(Scene(random_splats(9)), WriteOptions(2, 9)))))
-    assert spz_encoder.like(scene.header, WriteOptions()) == WriteOptions(2, 9)
-    assert spz_encoder.like(scene.header, WriteOptions(3, 0, 7)) == WriteOptions(3, 0, 7)
-    assert spz_encoder.like({"version": 4, "fractional_bits": 12}, WriteOptions()) == WriteOptions(3, 12)
-    assert spz_encoder.like({}, WriteOptions()) == WriteOptions()
+    assert spz.like(scene.header, WriteOptions()) == WriteOptions(2, 9)
+    assert spz.like(scene.header, WriteOptions(3, 0, 7)) == WriteOptions(3, 0, 7)
+    assert spz.like({"version": 4, "fractional_bits": 12}, WriteOptions()) == WriteOptions(3, 12)
+    assert spz.like({}, WriteOptions()) == WriteOptions()
 
 
 def test_clamped_values_are_counted_by_splat() -> None:

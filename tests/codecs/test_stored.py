@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from sparklod_cli.codecs import spz
-from sparklod_cli.codecs.encoder import Kept, results
+from sparklod_cli.codecs.encoder import results
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import codec as rad
 from sparklod_cli.codecs.rad.rad_layout import OPTIONS, choices
-from sparklod_cli.codecs.spz_encoder import like
+from sparklod_cli.codecs.spz import like
 from sparklod_cli.lod import quick
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats, same_rows
@@ -60,10 +60,9 @@ def check(form: object, data: bytes, options: WriteOptions | None = None) -> Sce
     scene = dataclasses.replace(before, splats=others(before.splats, kept))
     settled = codec.settled(scene, stored.like(options or WriteOptions()))
     encoder = stored.keeping(codec.encoder(scene, settled), kept)
-    with Kept(None) as spooled:
-        for result in results(encoder, scene, 2, lambda *_: None, "encoding"):
-            spooled.put(result)
-        written = b"".join(encoder.pieces(spooled.get, threads=2, progress=lambda *_: None))
+    windows = list(results(encoder, scene, 2, lambda *_: None, "encoding"))
+    get = lambda number, name: windows[number][name]  # noqa: E731
+    written = b"".join(encoder.pieces(get, threads=2, progress=lambda *_: None))
     after = codec.decode(io.BytesIO(written))
     assert after.antialiased == before.antialiased
     assert after.tree is not None

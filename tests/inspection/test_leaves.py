@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sparklod_cli.cli import run
-from sparklod_cli.codecs import ply, spz, spz_encoder
+from sparklod_cli.codecs import ply, spz
 from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.inspection import leaves
 from sparklod_cli.inspection.findings import Finding
@@ -125,7 +125,7 @@ def coded(scene: Scene, **options: int) -> Scene:
 @settings(max_examples=60)
 def test_any_coding_has_the_same_leaves(count: int, bits: int, degree: int, seed: int) -> None:
     splats = random_splats(count, sh_degree=degree, seed=seed, extent=0.02)
-    bits = min(bits, spz_encoder.largest_fractional_bits(float(np.abs(splats.center).max())))
+    bits = min(bits, spz.largest_fractional_bits(float(np.abs(splats.center).max())))
     for version in (2, 3):
         assert check(tree_of(splats, spz_version=version, fractional_bits=bits), Scene(splats)) == []
 

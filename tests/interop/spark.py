@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sparklod_cli.model.nodes import CHUNK_NODES
+from sparklod_cli.model.lod_tree import CHUNK_NODES
 from tests.interop.node import Node
 
 PROGRAM = Path(__file__).with_name("spark_load.mjs")

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from sparklod_cli.codecs import spz, spz_encoder
+from sparklod_cli.codecs import spz
 from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.lod.builders import BUILDERS, METHODS
 from sparklod_cli.model.lod_tree import MAX_CHILDREN
@@ -52,7 +52,7 @@ def test_spark_reads_any_number_of_fractional_bits(spark: Spark, extent: float, 
 
 def test_spark_reads_coordinates_at_the_limit(spark: Spark) -> None:
     splats = random_splats(2)
-    limit = spz_encoder.LAST_CODE
+    limit = spz.LAST_CODE
     splats.center[:] = [[limit, -limit, 0.4], [-limit, limit, -0.6]]
     laws.check(spark, Scene(splats), WriteOptions(fractional_bits=0))
 

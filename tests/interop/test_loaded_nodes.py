@@ -21,7 +21,7 @@ from sparklod_cli.lod import quick
 from sparklod_cli.lod.traversal import Traversal, TreeInstance, View
 from sparklod_cli.model.gaussian import linear_opacity
 from sparklod_cli.model.instances import Instance
-from sparklod_cli.model.nodes import CHUNK_NODES, Nodes
+from sparklod_cli.model.lod_tree import CHUNK_NODES, Nodes
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import FloatArray
 from sparklod_cli.scenes.loaded_scene import nodes_of

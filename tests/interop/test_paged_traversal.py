@@ -15,9 +15,8 @@ from sparklod_cli.io import read_scene
 from sparklod_cli.lod.builders import BUILDERS
 from sparklod_cli.lod.settings import LodSettings
 from sparklod_cli.lod.traversal import Forest, Traversal, TreeCut, TreeInstance, View
-from sparklod_cli.model.foveation import Cones
-from sparklod_cli.model.instances import Instance
-from sparklod_cli.model.nodes import CHUNK_NODES, Nodes
+from sparklod_cli.model.instances import Cones, Instance
+from sparklod_cli.model.lod_tree import CHUNK_NODES, Nodes
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.scenes.reading import read_scenes
 from sparklod_cli.simulation.frames import Simulation

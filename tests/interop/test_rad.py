@@ -26,7 +26,7 @@ from sparklod_cli.codecs.spark_codings import encode_lod_alpha
 from sparklod_cli.codecs.splat_encoding import SplatEncoding
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quick
-from sparklod_cli.model.nodes import CHUNK_NODES
+from sparklod_cli.model.lod_tree import CHUNK_NODES
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.sh import COEFFICIENTS
 from sparklod_cli.model.splats import FloatArray
@@ -36,7 +36,6 @@ from tests.interop.laws import EXT_DEGREES, HALF, TINY, degrees_between, within
 from tests.interop.spark import Spark
 from tests.interop.ties import Words
 from tests.interop.words import check_ext, check_packed
-from tests.node_streams import node_stream
 from tests.scenes import random_splats
 
 pytestmark = pytest.mark.slow
@@ -199,11 +198,11 @@ def width_of(path: Path, name: str) -> float:
 
 
 def test_spark_reads_a_tree_that_was_written_window_by_window(spark: Spark, tmp_path: Path) -> None:
-    """Two chunks, which come out of a stream of nodes."""
+    """Two chunks."""
     scene = Scene(*quick.build(random_splats(60_000, sh_degree=1), 1.5))
     assert CHUNK_NODES < len(scene) < 2 * CHUNK_NODES
     path = tmp_path / "streamed.rad"
-    path.write_bytes(b"".join(rad.encode(node_stream(scene), rad.settled(scene, WriteOptions()), scratch=tmp_path)))
+    path.write_bytes(b"".join(rad.encode(scene)))
     check_close(spark, path, scene, RadOptions())
 
 

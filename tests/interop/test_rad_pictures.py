@@ -20,7 +20,7 @@ from sparklod_cli.codecs.rad.rad_header import RadHeader, read_header
 from sparklod_cli.codecs.splat_encoding import SplatEncoding
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quick
-from sparklod_cli.model.nodes import CHUNK_NODES
+from sparklod_cli.model.lod_tree import CHUNK_NODES
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.selection import Selection
 from sparklod_cli.model.splats import Splats

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import sparklod_cli as sparklod
-from sparklod_cli.model.nodes import CHUNK_NODES
+from sparklod_cli.model.lod_tree import CHUNK_NODES
 from tests.conftest import real_scene
 from tests.references.chunk_orders import size_order, spark_order
 

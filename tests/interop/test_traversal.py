@@ -17,8 +17,8 @@ from sparklod_cli.io import read_scene
 from sparklod_cli.lod.builders import BUILDERS
 from sparklod_cli.lod.settings import pixel_limit
 from sparklod_cli.lod.traversal import Forest, Traversal, TreeCut, TreeInstance, View, views_of
-from sparklod_cli.model.foveation import Cones
-from sparklod_cli.model.nodes import CHUNK_NODES, Nodes
+from sparklod_cli.model.instances import Cones
+from sparklod_cli.model.lod_tree import CHUNK_NODES, Nodes
 from tests.conftest import FIXTURES, real_scene
 from tests.interop.spark import NODE, Spark
 from tests.lod.forests import rotation, transform

@@ -9,9 +9,8 @@ import numpy as np
 from hypothesis import strategies as st
 
 from sparklod_cli.lod.traversal import Forest, Traversal, TreeCut, TreeInstance, View
-from sparklod_cli.model.foveation import Cones, Frustum
-from sparklod_cli.model.lod_tree import LodTree
-from sparklod_cli.model.nodes import Nodes
+from sparklod_cli.model.instances import Cones, Frustum
+from sparklod_cli.model.lod_tree import LodTree, Nodes
 from tests.references import budgeted_cuts
 
 FOVEATIONS = (

@@ -21,8 +21,7 @@ from sparklod_cli.lod.kernels.tree_links import find_limits, find_parents
 from sparklod_cli.lod.settings import LodSettings
 from sparklod_cli.lod.traversal import Forest, Traversal, TreeCut, TreeInstance, View
 from sparklod_cli.model.gaussian import spark_size
-from sparklod_cli.model.lod_tree import LodTree
-from sparklod_cli.model.nodes import CHUNK_NODES, Nodes
+from sparklod_cli.model.lod_tree import CHUNK_NODES, LodTree, Nodes
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.support.parallel import on_threads
 from tests.lod.forests import links

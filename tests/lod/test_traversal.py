@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 
 from sparklod_cli.lod.settings import pixel_limit
 from sparklod_cli.lod.traversal import VISITS, Forest, TreeInstance, View, views_of
-from sparklod_cli.model.foveation import Cones, Frustum
-from sparklod_cli.model.nodes import CHUNK_NODES, Nodes
+from sparklod_cli.model.instances import Cones, Frustum
+from sparklod_cli.model.lod_tree import CHUNK_NODES, Nodes
 from tests.lod.forests import Case, ancestors_drawn, cases, check, drawn, links, random_tree, rotation, transform, views
 from tests.references import budgeted_cuts
 

@@ -8,14 +8,14 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from sparklod_cli.model import streams
 from sparklod_cli.model.gaussian import placed
 from sparklod_cli.model.instances import Instance
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
-from sparklod_cli.model.streams import Placed, collected, merged, stream_of
+from sparklod_cli.model.streams import Placed, SceneStream, collected, merged
 from sparklod_cli.model.transforms import Transform
 from sparklod_cli.support.errors import FormatError
+from tests.bake.out_of_core.plain import stream_of
 from tests.scenes import random_splats
 
 TRANSFORMS = (
@@ -30,7 +30,7 @@ def scenes() -> list[Scene]:
     return [Scene(random_splats(count, sh_degree=degree)) for count, degree in ((90, 1), (1, 3), (0, 0), (300, 0))]
 
 
-def merge(scenes: Sequence[Scene], transforms: Sequence[Transform] = ()) -> streams.SceneStream:
+def merge(scenes: Sequence[Scene], transforms: Sequence[Transform] = ()) -> SceneStream:
     places = [*transforms, *[Transform()] * len(scenes)]
     return merged([Placed(stream_of(each), f"no. {k}", places[k]) for k, each in enumerate(scenes)])
 
@@ -46,11 +46,7 @@ def padded(splats: Splats, coefficients: int) -> Splats:
     return dataclasses.replace(splats, sh=sh)
 
 
-@pytest.mark.parametrize("block", [7, 1000])
-def test_any_range_is_that_of_the_placed_scenes_one_after_the_other(
-    block: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(streams, "BLOCK_SPLATS", block)
+def test_any_range_is_that_of_the_placed_scenes_one_after_the_other() -> None:
     given = scenes()
     found = merge(given, TRANSFORMS)
     parts = [padded(each.splats, 15) for each in given]

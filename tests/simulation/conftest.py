@@ -7,8 +7,7 @@ import pytest
 
 from sparklod_cli.codecs.rad import codec as rad
 from sparklod_cli.io import read_scene
-from sparklod_cli.model.foveation import Frustum
-from sparklod_cli.model.instances import Instance
+from sparklod_cli.model.instances import Frustum, Instance
 from sparklod_cli.scenes.loaded import Scenes
 from sparklod_cli.scenes.pages import TRAVERSED
 from sparklod_cli.scenes.reading import read_scenes

@@ -11,7 +11,7 @@ from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.cameras.path import CameraPath
 from sparklod_cli.cameras.pose import look_at
 from sparklod_cli.lod.settings import LodSettings
-from sparklod_cli.model.foveation import Cones, Frustum
+from sparklod_cli.model.instances import Cones, Frustum
 from sparklod_cli.scenes.loaded import Scenes
 from sparklod_cli.simulation.frames import Simulation
 from sparklod_cli.simulation.streaming_settings import Network, StreamingSettings

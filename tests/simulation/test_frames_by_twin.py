@@ -10,8 +10,7 @@ import pytest
 
 from sparklod_cli.lod.settings import LodSettings
 from sparklod_cli.lod.traversal import Forest
-from sparklod_cli.model.foveation import Frustum
-from sparklod_cli.model.instances import Instance
+from sparklod_cli.model.instances import Frustum, Instance
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.scenes.finder import CutFinder
 from sparklod_cli.scenes.loaded import Scenes

@@ -83,6 +83,59 @@ def test_an_error_that_a_library_makes_of_an_interruption_is_one(error: str) -> 
     assert "please report" not in done.stderr
 
 
+#: Two signals at once: Python prints an error of the second one, whose handler the first one has reset.
+TWO = """
+import os, signal, sys
+from sparklod_cli import cli
+from sparklod_cli.io import reading
+from sparklod_cli.support import interrupts
+
+def work(*args, **kwargs):
+    signal.pthread_sigmask(signal.SIG_BLOCK, interrupts.ENDING)
+    os.kill(os.getpid(), signal.SIGINT)
+    os.kill(os.getpid(), signal.SIGTERM)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, interrupts.ENDING)
+
+reading.opened = work
+interrupts.handle()
+sys.exit(cli.run(["inspect", "fixtures/one.ply"]))
+"""
+
+
+def test_two_signals_at_once_are_one_interruption() -> None:
+    command = [sys.executable, "-c", TWO]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, preexec_fn=heed_signals, check=False)
+    assert done.returncode == 130
+    assert done.stderr.strip() == "interrupted"
+
+
+#: A library that forgets an interruption, as some do of what an import raises; compilation comes next.
+FORGET = """
+import os, signal, sys
+from sparklod_cli import cli
+from sparklod_cli.io import reading
+from sparklod_cli.support import interrupts, jit
+
+def forget(*args, **kwargs):
+    try:
+        os.kill(os.getpid(), signal.SIGHUP)
+        signal.pause()
+    except KeyboardInterrupt:
+        jit.report_begun("kernel")
+    print("went on")
+
+reading.opened = forget
+interrupts.handle()
+sys.exit(cli.run(["inspect", "fixtures/one.ply"]))
+"""
+
+
+def test_nothing_is_compiled_after_an_interruption_that_a_library_forgets() -> None:
+    command = [sys.executable, "-c", FORGET]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, preexec_fn=heed_signals, check=False)
+    assert (done.returncode, done.stdout, done.stderr.strip()) == (130, "", "interrupted")
+
+
 #: An object that is interrupted while it is deleted, where Python prints exceptions and goes on.
 LOSE = """
 import os, signal, sys, time

@@ -16,7 +16,7 @@ from ...codecs.encoder import Encoder, Get
 from ...codecs.statistics import Statistics
 from ...lod.builders import BUILDERS
 from ...lod.stage_records import NO_FAMILY, Families, Pending
-from ...model.selection import Tally
+from ...model.selection import SelectionTally
 from ...model.splats import Splats
 from ...support.parallel import blocks_of, on_threads
 from ...support.progress import Progress
@@ -63,7 +63,7 @@ class InBlocks:
         """Scatter the splats of the input to blocks, and build the tree in stages."""
         stream, settings = self.job.stream, self.job.settings
         if not stream.count:
-            settings.selection.check(Tally())
+            settings.selection.check(SelectionTally())
         findings = self.scatter()
         self.clock.end("read")
         self.output.check(findings.statistics)

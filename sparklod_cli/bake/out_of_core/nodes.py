@@ -8,7 +8,6 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ...codecs import encoder as codec_encoder
 from ...codecs.encoder import windows_of
 from ...codecs.validation import check_valid
 from ...model.lod_tree import LodTree
@@ -102,7 +101,7 @@ def encode(job: Job, window: int, *, threads: int, progress: Progress) -> None:
     check_valid(splats, threads)
 
     def encoded(part: slice) -> dict[str, NDArray[np.generic]]:
-        return encoder.encode(*codec_encoder.rows_of(splats, tree, part), start + part.start)
+        return encoder.encode(splats.rows(part), tree.rows(part), start + part.start)
 
     arrays: dict[str, NDArray[np.generic]] = {}
     for number, found in enumerate(ordered_map(encoded, windows_of(stop - start), threads)):

@@ -14,7 +14,7 @@ from ...lod.chunk_order import MOST_FAMILIES, family_order
 from ...lod.families import band_order
 from ...lod.kernels.tree_links import find_limits
 from ...lod.stage_records import NO_FAMILY, STAGE_BITS
-from ...model.nodes import CHUNK_NODES
+from ...model.lod_tree import CHUNK_NODES
 from ...model.splats import FloatArray
 from ...support.parallel import blocks_of, on_threads
 from ...support.progress import Progress

@@ -12,7 +12,7 @@ from ...codecs.statistics import Statistics
 from ...lod.check import check_visible
 from ...lod.kernels.geometry import find_bounds
 from ...lod.stage_records import Survey
-from ...model.selection import REASONS, Tally
+from ...model.selection import REASONS, SelectionTally
 from ...model.splats import FloatArray, Splats
 from ...model.streams import SceneStream
 from ...support.parallel import blocks_of, on_threads
@@ -43,7 +43,7 @@ def parts_of(count: int, block_splats: int) -> tuple[int, ...]:
 
 def leaves_of(
     stream: SceneStream, start: int, stop: int, settings: BakeSettings
-) -> Iterator[tuple[Splats, Tally, int]]:
+) -> Iterator[tuple[Splats, SelectionTally, int]]:
     """Yield the leaves that a range of the input becomes, block by block.
 
     Yields:
@@ -91,7 +91,7 @@ class Findings:
         statistics: of them.
     """
 
-    tally: Tally
+    tally: SelectionTally
     beyond: int
     box: NDArray[np.float64]
     sizes: NDArray[np.float64]
@@ -100,7 +100,7 @@ class Findings:
 
     @classmethod
     def of(
-        cls, splats: Splats, tally: Tally, beyond: int, stride: int, needed: Collection[str], threads: int
+        cls, splats: Splats, tally: SelectionTally, beyond: int, stride: int, needed: Collection[str], threads: int
     ) -> Findings:
         """Examine splats that are kept; every so many are the sample."""
         low, high, smallest, largest = find_bounds(splats.center, splats.scale, threads)
@@ -111,7 +111,7 @@ class Findings:
     @classmethod
     def merged(cls, parts: Sequence[Findings]) -> Findings:
         """Return those of one part or more, in the order of the parts."""
-        tally = Tally()
+        tally = SelectionTally()
         for part in parts:
             tally = tally.then(part.tally)
         boxes, sizes = (np.stack([getattr(part, name) for part in parts]) for name in ("box", "sizes"))
@@ -142,7 +142,7 @@ class Findings:
         beyond, count, first, *dropped = arrays["counts"].tolist()
         reasons = {reason: number for reason, number in zip(REASONS, dropped, strict=True) if number}
         return cls(
-            Tally(count, reasons, None if first < 0 else first),
+            SelectionTally(count, reasons, None if first < 0 else first),
             beyond,
             arrays["box"],
             arrays["sizes"],
@@ -177,7 +177,7 @@ def scatter(job: Job, number: int, *, threads: int, progress: Progress) -> None:
     """
     start, stop = job.parts[number : number + 2]
     rows = np.empty((stop - start, width_of(job.sh_degree)), np.float32)
-    used, tally, beyond = 0, Tally(), 0
+    used, tally, beyond = 0, SelectionTally(), 0
     for leaves, dropped, outside in leaves_of(job.stream, start, stop, job.settings):
         fill_rows(leaves, rows[used : used + len(leaves)], threads)
         used += len(leaves)

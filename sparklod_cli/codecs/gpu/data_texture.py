@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 
 from ...model.gaussian import covariance
 from ...model.scene import Scene
-from ...model.splats import FloatArray, Splats
+from ...model.splats import Splats
 from ...support.errors import FormatError
 from ...support.parallel import for_blocks
 from .. import quantize
@@ -66,44 +65,18 @@ def dump(scene: Scene, *, threads: int = 1) -> dict[str, Words]:
     return pack(scene.splats, threads=threads)
 
 
-@dataclass(frozen=True)
-class Texels:
-    """The contents of a texture of N splats, float32.
-
-    Attributes:
-        center: (N, 3) world units.
-        covariance: (N, 6) xx xy xz yy yz zz, world units squared.
-        rgba: (N, 4) display-referred colour and linear opacity, 0..1.
-    """
-
-    center: FloatArray
-    covariance: FloatArray
-    rgba: FloatArray
-
-
-def unpack(arrays: Mapping[str, NDArray[Any]], count: int) -> Texels:
-    """Return the first `count` splats of a texture that `pack` made.
-
-    Largest errors: the centre is exact; 2 ** -11 of each element of the covariance, or 2 ** -27 if that is more, for
-    splats that were not shrunk; 1 / 510 of each channel of rgba.
+def capacity(arrays: Mapping[str, NDArray[Any]]) -> int:
+    """Return how many splats fit into a texture.
 
     Raises:
-        FormatError: the array is missing, has another shape or type, or is too small for `count` splats.
+        FormatError: the array is missing, or has another shape or type.
     """
     texture = arrays.get("texture")
     if texture is None:
         raise FormatError(f"there is no array texture, only {', '.join(arrays) or 'none'}")
     if texture.dtype != np.uint32 or texture.ndim != 3 or texture.shape[1:] != (WIDTH, 4):
         raise FormatError(f"texture is {texture.dtype}{list(texture.shape)}, expected uint32[H, {WIDTH}, 4]")
-    room = len(texture) * SPLATS_A_ROW
-    if not 0 <= count <= room:
-        raise FormatError(f"{count:,} splats, but the texture has room for {room:,}")
-    texels = np.ascontiguousarray(texture).reshape(-1, 8).view(SPLAT)[:count, 0]
-    return Texels(
-        texels["center"].astype(np.float32),
-        texels["covariance"].astype(np.float32) / np.float32(GAIN),
-        quantize.decode_unorm8(texels["rgba"]),
-    )
+    return len(texture) * SPLATS_A_ROW
 
 
 def _encode_covariance(values: NDArray[np.float64]) -> NDArray[np.float64]:

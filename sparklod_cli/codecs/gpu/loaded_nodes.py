@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...model.gaussian import size_factor
-from ...model.lod_tree import LodTree
-from ...model.nodes import Nodes
+from ...model.lod_tree import LodTree, Nodes
 from ...model.scene import PLAIN, FileCoding, ScaleCoding
 from ...model.splats import FloatArray, Splats
 from ...support.parallel import for_blocks
@@ -46,11 +45,9 @@ def nodes(splats: Splats, tree: LodTree, layout: str, coding: FileCoding = PLAIN
 
     Args:
         splats: N, as they were decoded; their centres, scales and opacities matter.
-        tree: of them.
         layout: one of `formats.LOADED`.
         coding: of the file that they were read from. Scales that do not come from its codes, or of splats that were not
             read from a file, are taken to be those that Spark has.
-        threads: to work on.
     """
     held = _layout(layout, coding.packed_range)
     found = Nodes(np.empty((len(splats), 3), np.float32), np.empty(len(splats), np.float32), tree)

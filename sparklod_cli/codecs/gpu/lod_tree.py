@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...model.gaussian import spark_size
-from ...model.lod_tree import MAX_CHILDREN, LodTree
-from ...model.nodes import Nodes
+from ...model.lod_tree import MAX_CHILDREN, LodTree, Nodes
 from ...model.scene import Scene
 from ...model.splats import FloatArray, Splats
 from ...support.errors import FormatError

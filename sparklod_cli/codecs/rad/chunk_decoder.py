@@ -123,12 +123,8 @@ def fill(
     """Decode a chunk.
 
     Args:
-        packed: the chunk.
-        header: of the file.
         splats: as many as the chunk has; other columns are left as they are.
-        tree: of them, or None.
         palette: of SH that labels point to; None where it is not known, which leaves SH at 0.
-        columns: of `Splats`; the others are not decoded.
         thorough: unpack the others, too, which finds what is corrupt.
 
     Returns:

@@ -31,7 +31,7 @@ BLOCK = 1 << 13
 _ALL = np.arange(256, dtype=np.uint8)
 
 
-class Coding(NamedTuple):
+class PropertyCoding(NamedTuple):
     """Pair of functions.
 
     Attributes:
@@ -48,7 +48,7 @@ class Coding(NamedTuple):
         return np.ascontiguousarray(self.decode(codes, len(values), values.shape[1], low, high))
 
 
-def _plain(code: str, most: np.float32 | None = None) -> Coding:
+def _plain(code: str, most: np.float32 | None = None) -> PropertyCoding:
     """Return the coding of plain numbers of a type."""
 
     def encode(values: NDArray[Any], low: float, high: float) -> NDArray[Any]:
@@ -58,10 +58,10 @@ def _plain(code: str, most: np.float32 | None = None) -> Coding:
     def decode(codes: Bytes, count: int, numbers: int, low: float, high: float) -> NDArray[Any]:
         return codes.view(code).reshape(numbers, count).T
 
-    return Coding(encode, decode)
+    return PropertyCoding(encode, decode)
 
 
-def _by_bytes(coding: Coding, size: int) -> Coding:
+def _by_bytes(coding: PropertyCoding, size: int) -> PropertyCoding:
     """Return the coding of numbers of another coding with their lowest bytes first, then their next ones."""
 
     def encode(values: NDArray[Any], low: float, high: float) -> NDArray[Any]:
@@ -72,10 +72,10 @@ def _by_bytes(coding: Coding, size: int) -> Coding:
         whole = np.ascontiguousarray(codes.reshape(size, -1).T).reshape(-1)
         return coding.decode(whole, count, numbers, low, high)
 
-    return Coding(encode, decode)
+    return PropertyCoding(encode, decode)
 
 
-def _by_differences(coding: Coding) -> Coding:
+def _by_differences(coding: PropertyCoding) -> PropertyCoding:
     """Return the coding of bytes of another coding as differences from those of the splat before, modulo 256."""
 
     def encode(values: NDArray[Any], low: float, high: float) -> NDArray[Any]:
@@ -86,12 +86,12 @@ def _by_differences(coding: Coding) -> Coding:
         whole = np.cumsum(codes.reshape(numbers, count), axis=1, dtype=np.uint8)
         return coding.decode(whole.reshape(-1), count, numbers, low, high)
 
-    return Coding(encode, decode)
+    return PropertyCoding(encode, decode)
 
 
 def _by_table(
     encode: Callable[[FloatArray, float, float], NDArray[Any]], table: Callable[[float, float], FloatArray]
-) -> Coding:
+) -> PropertyCoding:
     """Return the coding of a byte a number; the table has the values of all 256."""
 
     def encode_planes(values: FloatArray, low: float, high: float) -> NDArray[Any]:
@@ -105,7 +105,7 @@ def _by_table(
             values = table(low, high)
         return values[codes.reshape(numbers, count).T]
 
-    return Coding(encode_planes, decode)
+    return PropertyCoding(encode_planes, decode)
 
 
 @np.errstate(over="ignore")  # values may be any number of times the end of the range
@@ -162,10 +162,10 @@ CODINGS = {
     "s8": _S8,
     "s8_delta": _by_differences(_S8),
     "ln_0r8": _by_table(splat_encoding.encode_log_scale, splat_encoding.log_scale_table),
-    "ln_f16": Coding(
+    "ln_f16": PropertyCoding(
         lambda values, low, high: _plain("<f2").encode(_encode_log(values, low, high), low, high), _decode_log_f16
     ),
-    "oct88r8": Coding(_encode_octahedral, _decode_octahedral),
+    "oct88r8": PropertyCoding(_encode_octahedral, _decode_octahedral),
     "u16": _plain("<u2"),
     "u32": _plain("<u4"),
 }

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import dataclasses
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -10,17 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 from zlib_ng import zlib_ng
 
-from ...model.lod_tree import LodTree
-from ...model.nodes import CHUNK_NODES
+from ...model.lod_tree import CHUNK_NODES, LodTree
 from ...model.scene import Scene
 from ...model.sh import COEFFICIENTS
 from ...model.splats import COLUMNS, FloatArray, Splats
 from ...model.streams import NodeStream
 from ...support.parallel import blocks_of
 from ...support.progress import Progress, silent
-from .. import clamps, coverage, sh_palette, spark_codings
-from ..clamps import Range
-from ..encoder import CLAMPED, Encoded, Get, windows_of
+from .. import coverage, sh_palette, spark_codings
+from ..clamps import CodeRange
+from ..encoder import Encoded, Encoder, Get, windows_of
 from ..file_notes import comment_of
 from ..options import WriteOptions
 from ..splat_encoding import SplatEncoding
@@ -56,7 +56,7 @@ SAMPLE = 1 << 20
 RUN = 1 << 8
 
 
-class Coded(NamedTuple):
+class CodedProperty(NamedTuple):
     """Property of a chunk: encoding, codes of any shape that are not compressed, and ends of their range, if any."""
 
     encoding: str
@@ -109,27 +109,10 @@ def _sample(nodes: NodeStream) -> Splats:
 
 
 @dataclass(frozen=True, eq=False)
-class RadEncoder:
-    """Encoder of a file, see `encoder.Encoder`: the result of a window is a chunk.
+class RadEncoder(Encoder):
+    """Encoder of a file: the result of a window is a chunk; `palette` is that of SH, or None."""
 
-    Attributes:
-        count: splats of the file, which are nodes where there is a tree.
-        sh_degree: of them.
-        tree: whether there is one.
-        antialiased, up: as in `Scene`.
-        options: with nothing left open.
-        palette: of SH, or None.
-        ranges: beyond which values are counted; none unless somebody wants to know.
-    """
-
-    count: int
-    sh_degree: int
-    tree: bool
-    antialiased: bool
-    options: WriteOptions
     palette: Palette | None = None
-    ranges: tuple[Range, ...] = ()
-    up: str | None = None
 
     @property
     def _codes(self) -> SplatEncoding:
@@ -137,29 +120,30 @@ class RadEncoder:
         assert self.options.rad.ranges is not None
         return self.options.rad.ranges
 
-    def encode(self, splats: Splats, tree: LodTree | None, start: int) -> Encoded:
+    def codes(self, splats: Splats, tree: LodTree | None, start: int) -> Encoded:
         """Encode a chunk: its bytes, and how many they are."""
         chunk = np.frombuffer(self._chunk(splats, tree, start), np.uint8)
-        result = {CHUNK: chunk, SIZE: np.array([len(chunk)])}
-        return result | (
-            {CLAMPED: clamps.tally(splats, self.ranges, None if tree is None else tree.is_leaf)} if self.ranges else {}
-        )
+        return {CHUNK: chunk, SIZE: np.array([len(chunk)])}
 
     def pieces(self, get: Get, *, threads: int, progress: Progress) -> Iterator[bytes]:
         """Return the bytes of one file, piece by piece."""
-        windows = windows_of(self.count)
-        sizes = [int(get(number, SIZE)[0]) for number in range(len(windows))]
+        numbers = range(len(windows_of(self.count)))
+        sizes = [int(get(number, SIZE)[0]) for number in numbers]
+        yield from self.one_file(sizes, (get(number, CHUNK).tobytes() for number in numbers), progress)
 
-        def chunks() -> Iterator[bytes]:
-            for number, part in enumerate(windows):
-                yield get(number, CHUNK).tobytes()
-                progress("writing", part.stop, self.count, "splat")
+    def one_file(self, sizes: Sequence[int], chunks: Iterable[bytes], progress: Progress) -> Iterator[bytes]:
+        """Return the bytes of one file, piece by piece, of the sizes and the bytes of its chunks."""
+        return in_one_file(self._header, sizes, self._counted(chunks, progress))
 
-        yield from in_one_file(self._header, sizes, chunks())
+    def files(self, get: Get, stem: str, *, progress: Progress = silent) -> Files:
+        """Return the name and the bytes of each file of a scene with a file a chunk; see `rad_header.in_files`."""
+        chunks = (get(number, CHUNK).tobytes() for number in range(len(windows_of(self.count))))
+        return in_files(self._header, self._counted(chunks, progress), stem)
 
-    def files(self, chunks: Iterable[NDArray[np.uint8]], stem: str) -> Files:
-        """Return the files of chunks in order, asked for one by one, see `codec.encode_chunked`."""
-        return in_files(self._header, (chunk.tobytes() for chunk in chunks), stem)
+    def _counted(self, chunks: Iterable[bytes], progress: Progress) -> Iterator[bytes]:
+        for part, chunk in zip(windows_of(self.count), chunks, strict=True):
+            yield chunk
+            progress("writing", part.stop, self.count, "splat")
 
     @property
     def _header(self) -> RadHeader:
@@ -182,12 +166,12 @@ class RadEncoder:
 
     def coded(
         self, row: Row, splats: Splats, tree: LodTree | None, labels: NDArray[np.uint32] | None, start: int
-    ) -> Coded:
+    ) -> CodedProperty:
         """Encode a property of the chunk that begins with node `start`."""
         encoding = getattr(self.options.rad, row.option) if row.option else row.encodings[0]
         low, high = code_range(row, self._codes)
         codes = CODINGS[encoding].encode(self.values(row, encoding, splats, tree, labels), low, high)
-        return Coded(encoding, codes, *((low, high) if RANGES.get(encoding) else (None, None)))
+        return CodedProperty(encoding, codes, *((low, high) if RANGES.get(encoding) else (None, None)))
 
     def _rows(self, *, first: bool) -> Iterator[Row]:
         """Yield the properties of a chunk."""
@@ -250,7 +234,7 @@ class RadEncoder:
 def encoder(
     scene: Scene | NodeStream,
     options: WriteOptions,
-    ranges: tuple[Range, ...] = (),
+    ranges: tuple[CodeRange, ...] = (),
     *,
     threads: int = 1,
     progress: Progress = silent,
@@ -259,24 +243,16 @@ def encoder(
 
     Args:
         scene: of which nothing is read but what the palette is made of.
-        options: settled.
-        ranges: beyond which the results count values, see `clamps.tally`.
-        threads, progress: for the palette.
 
     Raises:
         ValueError: the options are not settled.
     """
-    rad = options.rad
-    if rad.ranges is None:
+    if options.rad.ranges is None:
         raise ValueError("the options leave choices open; `settled` makes them")
-    if isinstance(scene, NodeStream):
-        count, sh_degree, tree = scene.count, scene.sh_degree, True
-    else:
-        count, sh_degree, tree = len(scene), scene.splats.sh_degree, scene.tree is not None
-    palette = None
-    if rad.sh_codes is not None and sh_degree and count:
-        palette = Palette.of(scene, rad.sh_codes, threads, progress)
-    return RadEncoder(count, sh_degree, tree, scene.antialiased, options, palette, ranges, scene.up)
+    bare, codes = RadEncoder.of(scene, options, ranges), options.rad.sh_codes
+    if codes is None or not bare.sh_degree or not bare.count:
+        return bare
+    return dataclasses.replace(bare, palette=Palette.of(scene, codes, threads, progress))
 
 
 def rounded(center: FloatArray, bits: int) -> FloatArray:

@@ -412,13 +412,7 @@ def _encoding(fields: JsonFields) -> SplatEncoding | None:
 
 
 def in_one_file(header: RadHeader, sizes: Sequence[int], chunks: Iterable[bytes]) -> Iterator[bytes]:
-    """Return the bytes of one file, piece by piece.
-
-    Args:
-        header: of the file; the places of its chunks are filled in.
-        sizes: of the chunks, in bytes.
-        chunks: in order, asked for one by one.
-    """
+    """Return the bytes of one file, piece by piece."""
     yield _packed(header, map(RadChunkEntry, itertools.accumulate(sizes, initial=0), sizes))
     yield from chunks
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ...model.scene import Scene
 from ...model.sh import COEFFICIENTS
 from ...support.errors import FormatError
-from ..clamps import Range
+from ..clamps import CodeRange
 from ..options import RadOptions, WriteOptions
 from ..splat_encoding import LARGEST_END, SCALE_ZERO, SplatEncoding
 from ..statistics import EXACT_BITS, LOWER, SMALL_QUANTILE, UPPER, Magnitudes, Statistics, fine_bits, tops
@@ -77,10 +77,6 @@ def _rounds(rad: RadOptions) -> bool:
 def settled(scene: Scene | Statistics, options: WriteOptions) -> WriteOptions:
     """Return the options with nothing left open: `encode` writes the scene with them.
 
-    Args:
-        scene: or the statistics of one that are `needed`.
-        options: that may leave choices open.
-
     Raises:
         FormatError: there are more splats than the format can number, or centres as float16 do not reach far enough.
     """
@@ -123,7 +119,7 @@ def code_range(row: Row, ranges: SplatEncoding) -> tuple[float, float]:
     return ends.get(row.column, (0.0, 0.0))
 
 
-def held(options: WriteOptions, sh_degree: int) -> list[Range]:
+def held(options: WriteOptions, sh_degree: int) -> list[CodeRange]:
     """Return the values that a file of this SH degree holds with these settled options without clamping them."""
     rad, found, most = options.rad, [], float(LARGEST_F16)
     for row in PROPERTIES:
@@ -135,21 +131,17 @@ def held(options: WriteOptions, sh_degree: int) -> list[Range]:
         if encoding == "ln_0r8":
             half = (high - low) / 508
             ends = math.exp(low - half), math.exp(min(high + half, 88.0))
-            found.append(Range(row.column, *ends, zero=float(SCALE_ZERO)))
+            found.append(CodeRange(row.column, *ends, zero=float(SCALE_ZERO)))
         elif encoding in RANGES:
             half = (high - low) / (508 if encoding.startswith("s8") else 510)
-            found.append(Range(row.column, low - half, high + half, numbers, degree=row.degree))
+            found.append(CodeRange(row.column, low - half, high + half, numbers, degree=row.degree))
         elif encoding in ("f16", "f16_lebytes"):
-            found.append(Range(row.column, -most, most, numbers, degree=row.degree))
+            found.append(CodeRange(row.column, -most, most, numbers, degree=row.degree))
     return found
 
 
 def fitted(found: Statistics) -> SplatEncoding:
-    """Return the ranges that suit splats in any order: what clamping and rounding cost together is least.
-
-    Args:
-        found: of `NEEDED`.
-    """
+    """Return the ranges that suit splats in any order: what clamping and rounding cost together is least."""
     rgb_min, rgb_max = _linear_range(found.magnitudes["rgb"])
     low, high = _log_range(found.magnitudes["scale"])
     sh_max = dict.fromkeys(("sh1_max", "sh2_max", "sh3_max"), 1.0)

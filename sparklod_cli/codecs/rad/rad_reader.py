@@ -159,8 +159,6 @@ class RadReader:
         """Decode a chunk: its splats, and its nodes where there is a tree, whose children have the file's numbers.
 
         Args:
-            packed: the chunk.
-            columns: of `Splats`; the others are 0.
             target: rows to fill; None for new ones.
             thorough: unpack the other columns, too, which finds what is corrupt.
 
@@ -260,12 +258,6 @@ class RadChunk:
 def read_chunk(file: BinaryIO, entry: RadChunkEntry, header: RadHeader, palette: FloatArray | None = None) -> RadChunk:
     """Read one chunk, and nothing but its bytes.
 
-    Args:
-        file: that of the header, or the chunk's own where the entry names one.
-        entry: one of the header's.
-        header: of the file, see `rad_header.read_header`.
-        palette: that of the file's first chunk; labels stay labels without.
-
     Raises:
         FormatError: the chunk is cut short, corrupt, or not the one that the header means.
         ValueError: the palette is of another SH degree than the file.
@@ -285,11 +277,6 @@ def read_chunk(file: BinaryIO, entry: RadChunkEntry, header: RadHeader, palette:
 
 def count_leaves(file: BinaryIO, header: RadHeader, beside: Beside | None) -> int:
     """Return the number of leaves of a tree, of which only the numbers of children are read.
-
-    Args:
-        file: that of the header.
-        header: of a tree.
-        beside: opens the files that the header names; None if there are none to open.
 
     Raises:
         FormatError: a chunk is cut short, corrupt, or not the one that the header means.
@@ -348,14 +335,7 @@ def _size_or_reason(name: str, beside: Beside) -> int | str:
 
 
 def scan_chunks(file: BinaryIO, beside: Beside, header: RadHeader, *, paddings: bool) -> Iterator[ChunkScan]:
-    """Read the headers of the chunks, one after the other.
-
-    Args:
-        file: with the header.
-        beside: opens the files of chunks.
-        header: of the file, with chunks where it says.
-        paddings: look at the padding of properties, too.
-    """
+    """Read the headers of the chunks, one after the other."""
     for number, entry in enumerate(header.chunks):
         with file_of(entry, file, beside) as source:
             start = entry.start(header)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
 
-from ...model.nodes import CHUNK_NODES
+from ...model.lod_tree import CHUNK_NODES
 from ...support.defaults import MAX_SH_DEGREE
 from ...support.untrusted import quoted_value
 from ..quantize import LARGEST
@@ -63,7 +63,6 @@ def violations(
     """Yield the broken rules of a file's header.
 
     Args:
-        header: as read.
         file_size: bytes of the file that it was read from; without, nothing is said about where its chunks are.
         files: sizes of the files that it names for chunks, or why one cannot be opened. Without, they are not looked
             at.
@@ -148,14 +147,7 @@ def _end_of_file(name: str, size: int | str, end: int, last: int) -> Iterator[Ru
 
 
 def chunk_violations(header: RadHeader, number: int, chunk: RadChunkHeader, size: int) -> Iterator[RuleViolation]:
-    """Yield the broken rules of a chunk's header.
-
-    Args:
-        header: of the file.
-        number: of the chunk, from 0.
-        chunk: its header.
-        size: its bytes.
-    """
+    """Yield the broken rules of a chunk's header."""
     name = f"chunk {number:,}"
     base, count = number * header.chunk_size, expected_count(header, number)
     if (chunk.base, chunk.count) != (base, count):

@@ -25,12 +25,11 @@ from ..file_notes import read_note
 from ..kernels import texels
 from ..stream import Positioned
 from . import texel_codings as codings
-from .sog_container import Meta, SogFiles
+from .sog_container import Meta, Pixels, SogFiles
 from .sog_writer import encode as encode
 from .sog_writer import encode_files as encode_files
 from .sog_writer import held as held
 from .sog_writer import settled as settled
-from .webp_images import Pixels
 
 #: Most entries of the palette of SH: a label has 16 bits.
 MAX_PALETTE = 1 << 16

@@ -22,15 +22,14 @@ from ...support.parallel import blocks_of, ordered_map
 from ...support.progress import Progress, silent
 from ...support.units import count_of
 from .. import quantize, sh_palette
-from ..clamps import Range
+from ..clamps import CodeRange
 from ..file_names import META, SOG_IMAGES
 from ..file_notes import note_of
 from ..options import DEFAULTS, WriteOptions
 from ..validation import check_valid
 from . import texel_codings as codings
-from .sog_container import zipped
+from .sog_container import MAX_SIDE, Texels, encode_webp, image_of, size_for, zipped
 from .texel_codings import codebook, even_codebook, nearest
-from .webp_images import MAX_SIDE, Texels, encode_webp, image_of, size_for
 
 #: Power of the weights of splats in the palette of SH. With 1, pictures are better still, but the error of coefficients
 #: is larger than that of splat-transform's; benchmarks/notes/file-sizes.md has the measurements.
@@ -89,7 +88,7 @@ def settled(scene: Scene, options: WriteOptions) -> WriteOptions:
     return dataclasses.replace(options, sog=sog)
 
 
-def held(options: WriteOptions, sh_degree: int) -> tuple[Range, ...]:
+def held(options: WriteOptions, sh_degree: int) -> tuple[CodeRange, ...]:
     """Return the values that SOG holds without clamping them: its codebooks suit any."""
     return ()
 
@@ -112,12 +111,6 @@ def encode(
     """Return the bytes of a bundled SOG, piece by piece: the same for any number of threads.
 
     Splats are in Morton order.
-
-    Args:
-        scene: what is written.
-        options: that may leave choices open.
-        threads: to encode on.
-        progress: told of the palette of SH, and of the images.
 
     Raises:
         FormatError, ValueError: see `settled`.

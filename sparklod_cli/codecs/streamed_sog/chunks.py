@@ -56,12 +56,6 @@ class Chunk:
 def open_chunk(beside: Beside | None, name: str, pieces: Sequence[Piece] | None, row: int = 0) -> Chunk:
     """Read the meta.json of a chunk.
 
-    Args:
-        beside: opens files.
-        name: path of the meta.json.
-        pieces: to read; None for all of it.
-        row: of the first splat where all are read.
-
     Raises:
         FormatError: it is no SOG; names it.
     """
@@ -88,11 +82,8 @@ def read_pieces(
     """Fill rows with the pieces of chunks, several chunks at a time, on several threads.
 
     Args:
-        beside: opens files.
         chunks: whose pieces together have every row of `out` once.
         out: SH coefficients that a chunk does not have become 0.
-        threads: to decode with.
-        progress: called when a chunk is decoded.
         first_row: that the first row of `out` has in the pieces.
 
     Raises:

@@ -52,12 +52,6 @@ def decode_levels(
 
     Regions are in the order of the tree, depth first.
 
-    Args:
-        file: the manifest.
-        threads: to decode with.
-        progress: called when a chunk is decoded.
-        beside: opens the files that a manifest names, which may be in folders; None if there are none to open.
-
     Raises:
         FormatError: as `open_content`; also where another fatal rule of `manifest_rules` is broken.
     """

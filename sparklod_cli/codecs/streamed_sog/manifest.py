@@ -10,7 +10,7 @@ import bisect
 import decimal
 import functools
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -104,11 +104,7 @@ class Manifest:
 
     def place(self, number: int) -> str:
         """Return where a node is in the file: "tree.children[0]"."""
-        way = list[str]()
-        while (parent := self.nodes[number].parent) >= 0:
-            way.append(f".children[{bisect.bisect_left(self.nodes[parent].children, number)}]")
-            number = parent
-        return "tree" + "".join(reversed(way))
+        return _place(number, lambda each: self.nodes[each].parent, lambda each: self.nodes[each].children)
 
     def regions(self) -> Iterator[tuple[int, ManifestNode]]:
         """Return the nodes without children, and their numbers."""
@@ -149,69 +145,62 @@ def parse(data: bytes) -> Manifest:
     return Manifest(levels, tuple(filenames), nodes, environment, head)
 
 
+def _place(number: int, parent_of: Callable[[int], int], children_of: Callable[[int], Sequence[int]]) -> str:
+    """Return where a node is in the file: "tree.children[0]"."""
+    way = list[str]()
+    while (parent := parent_of(number)) >= 0:
+        way.append(f".children[{bisect.bisect_left(children_of(parent), number)}]")
+        number = parent
+    return "tree" + "".join(reversed(way))
+
+
 def _nodes(tree: Any, levels: int, files: int) -> tuple[ManifestNode, ...]:
     """Return the nodes of a tree, however deep, root first and depth first."""
     keys = {str(level): level for level in range(levels)}
-    parents, ordinals, children = list[int](), list[int](), list[list[int]]()
+    parents, children = list[int](), list[list[int]]()
     values = list[tuple[Bound | None, dict[int, Run] | None, Any]]()
-    waiting = [(tree, -1, 0)]  # a value, the number of its parent, and which child it is
+    waiting = [(tree, -1)]  # a value, and the number of its parent
 
-    def place(parent: int, ordinal: int) -> str:
-        way = list[int]()
-        while parent >= 0:
-            way.append(ordinal)
-            ordinal, parent = ordinals[parent], parents[parent]
-        return "tree" + "".join(f".children[{each}]" for each in reversed(way))
+    def place() -> str:
+        return _place(number, parents.__getitem__, children.__getitem__)
 
     while waiting:
-        value, parent, ordinal = waiting.pop()
+        value, parent = waiting.pop()
         number = len(values)
         if number == MAX_NODES:
             raise FormatError(f"the tree of {MANIFEST} has more than {MAX_NODES:,} nodes")
-        if not isinstance(value, dict):
-            raise _wrong(place(parent, ordinal), value, "a node")
-        below, lods = value.get("children", []), value.get("lods")
-        if not isinstance(below, list):
-            raise _wrong(f"{place(parent, ordinal)}.children", below, "a list")
-        try:
-            runs = None if lods is None else _runs(lods, keys, files)
-        except _RunError as error:
-            raise _wrong(f"{place(parent, ordinal)}.lods{error.place}", error.value, error.wanted) from None
-        values.append((_bound(value.get("bound")), runs, value.get("errors")))
         parents.append(parent)
-        ordinals.append(ordinal)
         children.append([])
         if parent >= 0:
             children[parent].append(number)
-        waiting.extend((below[each], number, each) for each in reversed(range(len(below))))
+        if not isinstance(value, dict):
+            raise _wrong(place(), value, "a node")
+        below, lods = value.get("children", []), value.get("lods")
+        if not isinstance(below, list):
+            raise _wrong(f"{place()}.children", below, "a list")
+        runs = None if lods is None else _runs(lods, keys, files, place)
+        values.append((_bound(value.get("bound")), runs, value.get("errors")))
+        waiting.extend((each, number) for each in reversed(below))
     rows = zip(values, children, parents, strict=True)
     return tuple(
         ManifestNode(bound, tuple(below), runs, errors, parent) for (bound, runs, errors), below, parent in rows
     )
 
 
-class _RunError(Exception):
-    """Impossible value below `lods`: where, what it is, and what it must be."""
-
-    def __init__(self, place: str, value: Any, wanted: str) -> None:
-        super().__init__(place)
-        self.place, self.value, self.wanted = place, value, wanted
-
-
-def _runs(lods: Any, keys: Mapping[str, int], files: int) -> dict[int, Run]:
+def _runs(lods: Any, keys: Mapping[str, int], files: int, place: Callable[[], str]) -> dict[int, Run]:
     """Return the runs of a region by detail level; `keys` has the levels by their names."""
     if not isinstance(lods, dict):
-        raise _RunError("", lods, "an object of runs")
+        raise _wrong(f"{place()}.lods", lods, "an object of runs")
     runs = dict[int, Run]()
     for key, value in lods.items():
         if key not in keys:
-            raise _RunError("", key, f"of the levels 0 to {len(keys) - 1}")
+            raise _wrong(f"{place()}.lods", key, f"of the levels 0 to {len(keys) - 1}")
         if not isinstance(value, dict):
-            raise _RunError(f".{key}", value, "a run")
+            raise _wrong(f"{place()}.lods.{key}", value, "a run")
         for name, most in (("file", files - 1), ("offset", MAX_RUN), ("count", MAX_RUN)):
             number = value.get(name)
             if type(number) is not int or not 0 <= number <= most:
-                raise _RunError(f".{key}.{name}", number, f"a whole number from 0 to {most:,}")
+                raise _wrong(f"{place()}.lods.{key}.{name}", number, f"a whole number from 0 to {most:,}")
         runs[keys[key]] = Run(value["file"], value["offset"], value["count"])
     return runs
 

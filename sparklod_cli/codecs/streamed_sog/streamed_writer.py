@@ -64,10 +64,6 @@ def encode_files(
 
     Args:
         scene: whose splats are valid.
-        options: of SOG.
-        settings: how the scene was divided.
-        threads: to encode with.
-        progress: told of the splats that are written.
 
     Raises:
         FormatError: SOG cannot hold the splats, or float32, as viewers have it, not the bounds of the regions.

@@ -12,7 +12,7 @@ import click
 from ...codecs.formats import PRECISIONS
 from ...lod import detail_rule
 from ...lod.settings import FACTOR, LodSettings
-from ...model.foveation import Cones, Foveation, Frustum
+from ...model.instances import Cones, Foveation, Frustum
 from ...simulation.streaming_settings import StreamingSettings
 from ...support import defaults
 from ...support.setting_fields import Quantity, Range

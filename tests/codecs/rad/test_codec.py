@@ -23,12 +23,11 @@ from sparklod_cli.codecs.splat_encoding import SplatEncoding
 from sparklod_cli.codecs.statistics import SMALL_QUANTILE, STEPS_A_SPLAT, Statistics
 from sparklod_cli.io import examine_scene, read_scene
 from sparklod_cli.model.gaussian import linear_opacity, lod_opacity
-from sparklod_cli.model.lod_tree import LodTree
-from sparklod_cli.model.nodes import CHUNK_NODES
+from sparklod_cli.model.lod_tree import CHUNK_NODES, LodTree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.support.errors import FormatError
-from tests.codecs.writers import linear
+from tests.codecs.cases import linear
 from tests.conftest import FIXTURES, real_scene
 from tests.scenes import random_splats
 

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 import sparklod_cli
 from sparklod_cli.codecs.options import SogOptions, WriteOptions
 from sparklod_cli.codecs.sog import codec as sog
-from sparklod_cli.codecs.sog import sog_writer, webp_images
+from sparklod_cli.codecs.sog import sog_container, sog_writer
 from sparklod_cli.io import read_scene
 from sparklod_cli.model.gaussian import normalized_quat
 from sparklod_cli.model.scene import Scene
@@ -196,10 +196,10 @@ def test_palettes_are_as_large_as_those_of_splat_transform() -> None:
 
 @pytest.mark.parametrize("count", [1, 15, 16, 17, 4096, 4097, 500_000, 16_380**2])
 def test_images_hold_all_splats_in_about_a_square(count: int) -> None:
-    width, height = webp_images.size_for(count)
+    width, height = sog_container.size_for(count)
     assert width * height >= count
     assert (width % 4, height % 4) == (0, 0)
-    assert height <= width <= webp_images.MAX_SIDE
+    assert height <= width <= sog_container.MAX_SIDE
     assert width * (height - 4) < count
 
 

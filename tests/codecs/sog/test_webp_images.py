@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from fixtures import by_hand_sog
-from sparklod_cli.codecs.sog import webp_images as webp
+from sparklod_cli.codecs.sog import sog_container as webp
 from sparklod_cli.support.errors import FormatError
 
 Texels = NDArray[np.uint8]

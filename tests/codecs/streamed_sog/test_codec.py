@@ -19,8 +19,9 @@ from sparklod_cli.model import streams
 from sparklod_cli.model.scene import DetailScene, Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.support.errors import FormatError, UnknownFormatError
+from tests.codecs.cases import linear
 from tests.codecs.test_round_trip import assert_close
-from tests.codecs.writers import linear, sog_precision
+from tests.codecs.writers import sog_precision
 from tests.conftest import FIXTURES
 from tests.scenes import random_splats
 

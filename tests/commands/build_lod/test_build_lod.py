@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli.cli import run
-from sparklod_cli.codecs import spz, spz_encoder
+from sparklod_cli.codecs import spz
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quality, quick
 from sparklod_cli.model.lod_tree import LodTree
@@ -96,7 +96,7 @@ def test_merged_splats_beyond_the_leaves_lower_the_fractional_bits(
     splats = dataclasses.replace(splats, center=splats.center * np.float32(1e5))
     far = tmp_path / "far.spz"
     far.write_bytes(b"".join(spz.encode(Scene(splats))))
-    most = spz_encoder.largest_fractional_bits(float(np.abs(read_scene(far).splats.center).max()))
+    most = spz.largest_fractional_bits(float(np.abs(read_scene(far).splats.center).max()))
     assert build(far, "-o", tmp_path / "out.spz", "--method", "quality", "--json") == 0
     assert json.loads(capsys.readouterr().out)["fractional_bits"] < most
 
