@@ -31,7 +31,7 @@ THUMBNAIL, THUMBNAIL_BUDGET, MOST_SPLATS = (512, 384), 200_000, 3_000_000
 
 @dataclass(frozen=True)
 class InspectSettings:
-    """What to report on files and to check, and the outputs besides: histograms, a picture, a page, a table of chunks.
+    """Settings of reports and checks, and of what is drawn: histograms, a picture, a page, a table of chunks.
 
     Attributes:
         expected: expectations that a file must meet.

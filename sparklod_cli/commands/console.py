@@ -169,7 +169,7 @@ class Console:
         """
         from ..support import jit
 
-        begun, seconds, troubles = [], [], set[str]()
+        begun, seconds, troubles = list[str](), list[float](), set[str]()
 
         def show() -> None:
             self.progress("compiling", len(seconds), 0, "kernel")  # how many a command needs is not known
