@@ -18,7 +18,7 @@ SEEDS = (
 )
 COMPARISONS = ("psnr_min>30", "5%:psnr>30", "100: ssim_mean >= 0.9", "worst_tile_psnr_p05>10")
 
-#: Characters of an argument: what Linux passes to a program, with its terminating zero. Lines that mutations repeat grow
+#: Characters of an argument: what Linux passes to a program, with its terminating zero. Lines that are repeated grow
 #: to hundreds of megabytes.
 LONGEST = (1 << 17) - 1
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -106,7 +107,7 @@ def from_folder(folder: Path, engine: str = "spark") -> Libraries:
     install = f"npm install --prefix {folder} " + " ".join(f"{name}@{VERSIONS[name]}" for name in PACKAGES[engine])
     versions, files = {}, {}
     for package in PACKAGES[engine]:
-        if not (packages / package).is_dir():
+        if not os.path.isdir(packages / package):  # noqa: PTH112, since `Path.is_dir` fails on names that are too long
             raise SparklodError(f"{packages} has no {package}; install it with {install}")
         versions[package] = _version(packages / package)
         files[f"lib/{package}/{LICENSE}"] = packages / package / LICENSE

@@ -67,6 +67,11 @@ def test_links_of_a_package_manager_are_followed(packages: Path, tmp_path: Path)
     assert from_folder(packages).files["lib/three/build/three.module.js"] == store / "build" / "three.module.js"
 
 
+def test_a_folder_whose_name_is_too_long_has_no_package() -> None:
+    with pytest.raises(SparklodError, match="has no @sparkjsdev/spark"):
+        from_folder(Path("9" * 300))
+
+
 @pytest.mark.parametrize("package", VERSIONS)
 def test_a_folder_without_a_package_says_how_to_install_it(packages: Path, package: str) -> None:
     (packages / "node_modules" / package).rename(packages / "away")
