@@ -106,14 +106,14 @@ def _failed(error: BaseException, verbosity: Verbosity) -> int:
 
         for line in "".join(traceback.format_exception(error)).splitlines():
             say(line)
-    told = out_of_memory(error)
-    if told is None:
-        told = (
+    message = out_of_memory(error)
+    if message is None:
+        message = (
             f"sparklod failed in a way that it should not: {printable(f'{type(error).__name__}: {error}', QUOTED)};"
             " please report this command, with its input if you can"
         )
-        told += "" if verbosity.verbose else " (-v shows where it happened)"
-    say_error(told)
+        message += "" if verbosity.verbose else " (-v shows where it happened)"
+    say_error(message)
     return 1
 
 

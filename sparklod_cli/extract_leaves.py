@@ -27,10 +27,7 @@ class Extracted:
     Attributes:
         format: of the input, for display.
         nodes, splats: of its tree, and those of them that are leaves, which were written.
-        sh_degree: of the splats.
-        bytes: of the output.
         seconds: by stage (read, write).
-        output_format: for display.
         clamped: by the column of `Splats`, the number of splats with a value that the output cannot hold.
         drops_sh: the output has no SH, and some splats do.
         up_lost: the axis that points up, which the format cannot note; None where nothing is lost.

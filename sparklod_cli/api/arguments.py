@@ -92,7 +92,7 @@ def _kind(value: Any) -> str:
 
 
 #: A callback `(stage, done, total, unit)`, a class of bars that is called as `tqdm.tqdm` is, or None.
-Told = Progress | type[Any] | None
+ProgressLike = Progress | type[Any] | None
 
 
 class _Bars:
@@ -115,7 +115,7 @@ class _Bars:
 
 
 @contextlib.contextmanager
-def telling(progress: Told) -> Iterator[Progress]:
+def progress_callback(progress: ProgressLike) -> Iterator[Progress]:
     """Yield the callback for work inside; bars are closed at its end."""
     if progress is None:
         yield silent

@@ -15,7 +15,7 @@ from ..model.scene import Scene, Tree
 from ..model.splats import COLUMNS, FloatArray
 from ..support.errors import FormatError, InvalidSplatsError, TreeError, memory_errors_translated
 from ..support.parallel import thread_count
-from .arguments import Told, scene_like, telling
+from .arguments import ProgressLike, progress_callback, scene_like
 
 if TYPE_CHECKING:
     import numpy as np
@@ -27,7 +27,11 @@ if TYPE_CHECKING:
 
 
 def read(
-    path: Path | str, *, columns: Collection[str] | None = None, threads: int | None = None, progress: Told = None
+    path: Path | str,
+    *,
+    columns: Collection[str] | None = None,
+    threads: int | None = None,
+    progress: ProgressLike = None,
 ) -> Scene:
     """Read a splat file; its content tells the format. The scene is a `Tree` if the file has a Level-of-Detail tree.
 
@@ -43,15 +47,15 @@ def read(
         OutOfMemoryError: it does not fit into memory.
     """
     path = Path(path)
-    with telling(progress) as told, memory_errors_translated(), naming(path):
+    with progress_callback(progress) as callback, memory_errors_translated(), naming(path):
         count = thread_count(threads)
         if columns is None:
-            scene = read_scene(path, threads=count, progress=told)
+            scene = read_scene(path, threads=count, progress=callback)
         else:
             unknown = sorted(set(columns) - set(COLUMNS))
             if unknown:
                 raise ValueError(f"there is no column {', '.join(unknown)}; give some of {', '.join(COLUMNS)}")
-            scene = examine_scene(path, columns=columns, threads=count, progress=told)
+            scene = examine_scene(path, columns=columns, threads=count, progress=callback)
         if scene.tree is not None:
             scene.tree.validate()
     return as_tree(scene)
@@ -135,7 +139,7 @@ def inspect(
     all_quantities: bool = False,
     check: bool = False,
     threads: int | None = None,
-    progress: Told = None,
+    progress: ProgressLike = None,
 ) -> Report:
     """Report what is in a file, and what is wrong with it; `Report.as_dict` is what `inspect --json` prints.
 
@@ -150,8 +154,8 @@ def inspect(
     from ..inspection import report
 
     wanted = report.ReportSettings(values=values or all_quantities, all_quantities=all_quantities, check=check)
-    with telling(progress) as told, memory_errors_translated():
-        found, _ = report.inspect(Path(path), wanted, threads=thread_count(threads), progress=told)
+    with progress_callback(progress) as callback, memory_errors_translated():
+        found, _ = report.inspect(Path(path), wanted, threads=thread_count(threads), progress=callback)
     return found
 
 

@@ -31,10 +31,9 @@ THUMBNAIL, THUMBNAIL_BUDGET, MOST_SPLATS = (512, 384), 200_000, 3_000_000
 
 @dataclass(frozen=True)
 class InspectSettings:
-    """What to report on files and to check, and the outputs besides: histograms, a picture, a page, a table of chunks.
+    """Settings of reports and checks, and of what is drawn: histograms, a picture, a page, a table of chunks.
 
     Attributes:
-        report: contents of the report.
         expected: expectations that a file must meet.
         original: the scene whose splats the leaves must equal.
         everything: report findings of all severities; otherwise a file with expectations has errors only.
@@ -43,10 +42,7 @@ class InspectSettings:
         depth: of the nodes in the picture; None for the leaves.
         by: what its colours show, one of `PLOT_BY`.
         html: file of a page, which `write_page` writes.
-        overwrite: replace files that exist.
         chunks: where the table of the chunks goes; None for nowhere.
-        threads: to work on.
-        progress: called with how much is done.
     """
 
     report: ReportSettings
@@ -94,7 +90,6 @@ class Inspected:
     """Result of an inspection.
 
     Attributes:
-        report: on it.
         histograms: as text, by quantity; those that the file does not have are left out.
         picture: in words, and the bytes of its file; None where none was written.
         section: of the page; None where none is wanted.

@@ -54,8 +54,6 @@ class ViewedFiles:
         cameras: the source of the cameras.
         settings: override those of a camera file.
         precision: one of `PRECISIONS`, of the nodes that cuts are found with.
-        threads: to work on.
-        progress: called with how much is done.
     """
 
     instances: Sequence[Instance]
@@ -111,14 +109,7 @@ class UnfitError(ValueError):
 
 @dataclass(frozen=True)
 class DrawnPath:
-    """Result of rendering a camera path.
-
-    Attributes:
-        pictures: what was written.
-        path: the cameras.
-        output: where the pictures went.
-        render: how they were drawn.
-    """
+    """Result of rendering a camera path."""
 
     pictures: WrittenPictures
     path: CameraPath
@@ -197,10 +188,7 @@ class Compared:
 
     Attributes:
         pictures: how many were compared.
-        path: the cameras.
         leaves: splats of full detail, all instances together.
-        summary: what the pictures come to, for each budget.
-        outcomes: whether each assertion held.
     """
 
     pictures: int
@@ -212,14 +200,7 @@ class Compared:
 
 @dataclass(frozen=True)
 class Traversed:
-    """Result of a traversal.
-
-    Attributes:
-        frames: what was written of them.
-        path: the cameras.
-        summary: what the frames come to.
-        outcomes: whether each assertion held.
-    """
+    """Result of a traversal."""
 
     frames: WrittenFrames
     path: CameraPath

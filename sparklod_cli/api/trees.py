@@ -27,7 +27,7 @@ from ..support.errors import FormatError, memory_errors_translated
 from ..support.parallel import on_threads, thread_count
 from ..support.progress import Progress
 from ..support.setting_fields import Range, whole
-from .arguments import Told, path_like, scene_like, telling
+from .arguments import ProgressLike, path_like, progress_callback, scene_like
 
 
 def build_lod(
@@ -40,7 +40,7 @@ def build_lod(
     selection: Selection | None = None,
     refine: bool | int | FitSettings = False,
     threads: int | None = None,
-    progress: Told = None,
+    progress: ProgressLike = None,
 ) -> Tree:
     """Build the Level-of-Detail tree of a scene; the same scene and options give the same tree.
 
@@ -68,13 +68,13 @@ def build_lod(
     Range(MIN_BASE, MAX_BASE).check("base", base)
     Range(MIN_GROWTH, MAX_GROWTH).check("growth", growth)
     whole(0, MAX_SH_DEGREE).check("max_sh", max_sh)
-    fitting = asked_for(refine)
+    fitting = fit_settings_of(refine)
     settings = BakeSettings(method, base, growth, max_sh, selection or Selection())
-    with on_threads(threads), telling(progress) as told, memory_errors_translated():
+    with on_threads(threads), progress_callback(progress) as callback, memory_errors_translated():
         leaves, tally = select(scene.splats, settings, threads=thread_count(threads))
         settings.selection.check(tally)
-        made = Tree(*build_tree([leaves], settings, in_chunks=False, progress=told), scene.antialiased, up=scene.up)
-        return made if fitting is None else refined_tree(made, fitting, thread_count(threads), told, None)[0]
+        tree = Tree(*build_tree([leaves], settings, in_chunks=False, progress=callback), scene.antialiased, up=scene.up)
+        return tree if fitting is None else refined_tree(tree, fitting, thread_count(threads), callback, None)[0]
 
 
 def refine(
@@ -84,7 +84,7 @@ def refine(
     seed: int = 0,
     cameras: CameraPath | Iterable[Camera] | None = None,
     threads: int | None = None,
-    progress: Told = None,
+    progress: ProgressLike = None,
     say: Callable[[str], None] | None = None,
 ) -> tuple[Tree, Refined]:
     """Fit the merged splats of a tree to pictures of full detail, as `build-lod --refine` does.
@@ -113,11 +113,11 @@ def refine(
     if scene_like(tree).tree is None:
         raise FormatError("the scene has no Level-of-Detail tree; build_lod makes one")
     settings = FitSettings(steps, seed, None if cameras is None else path_like(cameras))
-    with telling(progress) as told, memory_errors_translated():
-        return refined_tree(tree, settings, thread_count(threads), told, say)
+    with progress_callback(progress) as callback, memory_errors_translated():
+        return refined_tree(tree, settings, thread_count(threads), callback, say)
 
 
-def asked_for(refine: bool | int | FitSettings) -> FitSettings | None:
+def fit_settings_of(refine: bool | int | FitSettings) -> FitSettings | None:
     """Return the settings that an argument `refine` stands for; None for not at all.
 
     Raises:
@@ -140,7 +140,7 @@ def refined_tree(
     return Tree(found.splats, found.tree, found.antialiased, up=found.up), report
 
 
-def arrange_chunks(tree: Scene, *, threads: int | None = None, progress: Told = None) -> Tree:
+def arrange_chunks(tree: Scene, *, threads: int | None = None, progress: ProgressLike = None) -> Tree:
     """Return a tree with its nodes in the order for streaming; `write` keeps the order that nodes have.
 
     A chunk of a RAD is the next 65,536 nodes, so this order decides how many chunks a viewer fetches. docs/streaming.md
@@ -159,10 +159,10 @@ def arrange_chunks(tree: Scene, *, threads: int | None = None, progress: Told = 
     if links is None:
         raise FormatError("the scene has no Level-of-Detail tree; build_lod makes one")
     links.validate()
-    with on_threads(threads), telling(progress) as told, memory_errors_translated():
+    with on_threads(threads), progress_callback(progress) as callback, memory_errors_translated():
         from ..lod.chunk_order import arrange
 
-        splats, links = arrange(tree.splats, links, progress=told)
+        splats, links = arrange(tree.splats, links, progress=callback)
     return Tree(splats, links, tree.antialiased, up=tree.up)
 
 

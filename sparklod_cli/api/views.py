@@ -29,7 +29,7 @@ from ..support.defaults import BLEND
 from ..support.errors import FormatError, memory_errors_translated
 from ..support.parallel import on_threads, thread_count
 from ..tables.comparison import COLUMNS as OF_COMPARISON
-from .arguments import Told, camera_like, path_like, telling, viewed_like
+from .arguments import ProgressLike, camera_like, path_like, progress_callback, viewed_like
 from .results import ComparisonTable, Frames
 
 if TYPE_CHECKING:
@@ -125,7 +125,7 @@ def traverse(
     by_instance: bool = False,
     precision: str = PRECISIONS[0],
     threads: int | None = None,
-    progress: Told = None,
+    progress: ProgressLike = None,
 ) -> Frames:
     """Return what a viewer draws and fetches along a camera path: a row for each frame.
 
@@ -147,10 +147,10 @@ def traverse(
     from ..simulation.columns import COLUMNS
     from ..simulation.frames import Simulation
 
-    with on_threads(threads) as count, telling(progress) as told, memory_errors_translated():
+    with on_threads(threads) as count, progress_callback(progress) as callback, memory_errors_translated():
         scenes = _trees(viewed, count, precision)
         simulation = Simulation(scenes, _lod(scenes, budget, settings, False), streaming, by_instance=by_instance)
-        frames = simulation.run(path_like(cameras), threads=count, progress=told)
+        frames = simulation.run(path_like(cameras), threads=count, progress=callback)
         return Frames([row for frame in frames for row in frame.rows], COLUMNS)
 
 
@@ -164,7 +164,7 @@ def compare(
     render: RenderSettings | None = None,
     precision: str = PRECISIONS[0],
     threads: int | None = None,
-    progress: Told = None,
+    progress: ProgressLike = None,
 ) -> ComparisonTable:
     """Return how far cuts of some budgets are from full detail: PSNR, SSIM and PSNR at edges, on black and on white.
 
@@ -191,13 +191,13 @@ def compare(
         raise TypeError(f"budgets is {budgets!r}; give a list of budgets")
     if not budgets:
         raise ValueError("there are no budgets; give at least one")
-    with on_threads(threads) as count, telling(progress) as told, memory_errors_translated():
+    with on_threads(threads) as count, progress_callback(progress) as callback, memory_errors_translated():
         scenes = _trees(viewed, count, precision)
         full = None if scene is None else scenes_of(scene, count)
         given = [_budget(budget) for budget in budgets]
         lod = settings or LodSettings(pixel_scale_limit=0.0)
         comparison = Comparison(scenes, lod, given, render or RenderSettings(), full=full)
-        rows = list(comparison.run(path_like(cameras), threads=count, progress=told))
+        rows = list(comparison.run(path_like(cameras), threads=count, progress=callback))
     return ComparisonTable(rows, OF_COMPARISON, [budget.text for budget in given])
 
 

@@ -15,7 +15,7 @@ from ..model.scene import Scene
 from ..support.defaults import DEFAULT_COMPRESSION
 from ..support.errors import FormatError, InvalidSplatsError, memory_errors_translated
 from ..support.parallel import thread_count
-from .arguments import Told, file_path, scene_like, telling
+from .arguments import ProgressLike, file_path, progress_callback, scene_like
 from .files import naming, pack
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ def write(
     detail: DetailSettings | None = None,
     environment: Scene | None = None,
     threads: int | None = None,
-    progress: Told = None,
+    progress: ProgressLike = None,
 ) -> Written:
     """Write a scene, or a tree, whole or not at all. Nodes keep their order, see `arrange_chunks`.
 
@@ -119,20 +119,20 @@ def write(
     options = WriteOptions(spz_version, fractional_bits, compression_level, rad, sog or SogOptions())
     if not len(scene_like(scene).splats):
         raise InvalidSplatsError(f"{path}: the scene has no splats to write")
-    with telling(progress) as told, memory_errors_translated():
+    with progress_callback(progress) as callback, memory_errors_translated():
         if encoding is not None:
             return _write_arrays(path, scene, encoding, overwrite=overwrite, threads=count)
         with naming(path):
             check_scene(scene, count)
         if streamed:
             output = DetailOutput(detail or DetailSettings(), options, detail_sink(path, overwrite=overwrite))
-            return _write_levels(path, scene, environment, output, count, told)
+            return _write_levels(path, scene, environment, output, count, callback)
         if form is None or (scene.tree is not None and not form.trees):
             known = ", ".join(ending for ending, each in WRITABLE.items() if each.trees or scene.tree is None)
             what = "a tree" if scene.tree is not None else "a scene"
             raise FormatError(f"{path}: {what} is written as {known}, which the name does not end in")
         save = scene_sink(path, form, chunked=rad.chunked, overwrite=overwrite)
-        return Written(path, form.name, save(scene, options, threads=count, progress=told))
+        return Written(path, form.name, save(scene, options, threads=count, progress=callback))
 
 
 def _write_levels(

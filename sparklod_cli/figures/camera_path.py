@@ -41,7 +41,6 @@ class PathScene:
     """Content of the picture of a camera path.
 
     Attributes:
-        cameras: of the path.
         splats: N splats of the cut of one frame.
         depth: (N,) edges from the root to each node of the cut, or the detail level of each splat.
         frame: index of the camera whose cut it is; that camera is marked. None for none.

@@ -45,7 +45,6 @@ class PictureSettings:
         background: red, green and blue, 0..1, behind the splats; None keeps alpha.
         bar: add a colour bar to a picture whose colours encode a quantity.
         gain: factor by which differences are multiplied; None chooses one from the pictures.
-        jpeg_quality: quality of .jpg files, 1 to 100.
         jobs: number of pictures to process concurrently.
         threads: number of threads of the kernels.
     """

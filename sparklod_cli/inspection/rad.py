@@ -22,14 +22,7 @@ FORMAT = "RAD"
 
 @dataclass(frozen=True)
 class PropertyFacts:
-    """A property of all chunks.
-
-    Attributes:
-        encoding: its name; several with commas between, where chunks differ.
-        bytes: as stored, of all chunks.
-        share: of all bytes of the file.
-        min, max: ends of the range of its codes over all chunks; None where its encoding has none.
-    """
+    """A property of all chunks, see `schema.json`."""
 
     encoding: str
     bytes: int
@@ -40,20 +33,7 @@ class PropertyFacts:
 
 @dataclass(frozen=True)
 class RadFacts:
-    """Facts from the headers of a RAD file.
-
-    Attributes:
-        chunked: whether the chunks are files of their own.
-        bytes: of the file, or of the header and the files of all chunks.
-        header_bytes: of the header.
-        first_bytes: of the header and the first chunk, which a viewer needs before it can show anything.
-        chunk_size: splats of a chunk.
-        chunk_bytes: sizes of the chunks; None without any.
-        palette: entries of the palette of spherical harmonics; 0 without one.
-        ranges: "splatEncoding" of the header, by its keys; None without one.
-        comment: free text of the header, on one line and shortened; None without one.
-        properties: by name.
-    """
+    """Facts from the headers of a RAD file; `schema.json` describes the fields."""
 
     chunked: bool
     bytes: int

@@ -28,17 +28,7 @@ QUANTILES = {"min": 0.0, "p25": 0.25, "p50": 0.5, "p75": 0.75, "max": 1.0}
 
 @dataclass(frozen=True)
 class LevelFacts:
-    """A detail level.
-
-    Attributes:
-        splats: of all regions.
-        share: of the splats of level 0; None if that has none.
-        regions: that have splats at this level.
-        files: chunk files that hold it.
-        bytes: of these.
-        errors: quantiles of the errors of these regions, each weighted by its splats at level 0, and their mean; None
-            where not all of them have one.
-    """
+    """A detail level, see `schema.json`."""
 
     splats: int
     share: float | None
@@ -58,25 +48,7 @@ class EnvironmentFacts:
 
 @dataclass(frozen=True)
 class StreamedSogFacts:
-    """Facts from the manifest and the headers of the chunk files of Streamed SOG.
-
-    Attributes:
-        generator: the program that wrote it, on one line and shortened; None where the manifest does not say.
-        bytes: of the manifest and all files that it names.
-        manifest_bytes: of the manifest.
-        first_bytes: of the manifest, the chunk files of the coarsest level and the environment: what a viewer needs
-            before it can show all of the scene.
-        splats: of all levels, without the environment.
-        levels: from full detail to the coarsest.
-        regions: leaves of the tree.
-        depth: edges from the root of the tree to the deepest region.
-        region_splats: quantiles of the splats of a region at level 0.
-        region_edge: quantiles of the longest edge of the bound of a region, in world units.
-        bound: that of the root.
-        files: chunk files.
-        file_bytes: their sizes; None without any.
-        environment: None without one.
-    """
+    """Facts from the manifest and the headers of the chunk files, see `schema.json`."""
 
     generator: str | None
     bytes: int

@@ -194,12 +194,7 @@ MAX_DEPTHS = 1000
 
 @dataclass(frozen=True)
 class Level:
-    """The nodes of one depth.
-
-    Attributes:
-        nodes, leaves: their number, and that of the leaves among them.
-        size: geometric mean of their feature sizes (`gaussian.spark_size`), world units; None if one of them is 0.
-    """
+    """The nodes of one depth, see `schema.json`."""
 
     nodes: int
     leaves: int
@@ -208,21 +203,7 @@ class Level:
 
 @dataclass(frozen=True)
 class TreeFacts:
-    """The facts of a tree.
-
-    Attributes:
-        leaves, inner: nodes without and with children.
-        growth: nodes over leaves.
-        depth: edges from the root to the deepest node.
-        levels: the nodes of each depth, from 0 on; at most `MAX_DEPTHS`.
-        levels_left_out: depths beyond those.
-        children: number of inner nodes by number of children, as text.
-        more_than_opaque: share of nodes with D > 1.
-        chunks: of `CHUNK_NODES` nodes.
-        chunks_of_coarse_cut: chunks that a viewer needs for a coarse cut: the one of at most `CHUNK_NODES` nodes that
-            refines the largest nodes first.
-        split_siblings: inner nodes whose children lie in more than one chunk.
-    """
+    """Facts of a tree, see `schema.json`."""
 
     leaves: int
     inner: int

@@ -96,17 +96,7 @@ class Box:
 
 @dataclass(frozen=True)
 class ValueFacts:
-    """Statistics of splats; invalid ones (`splats.INVALID`) are counted but left out of the rest.
-
-    Attributes:
-        box: of all centres; None if no splat is valid.
-        box_98: from the 1 % to the 99 % quantile of each coordinate.
-        non_finite: splats with a number that is not finite.
-        negative_scale: splats with a scale below 0.
-        zero_opacity, zero_scale: splats that cannot be drawn.
-        more_than_opaque: splats with an opacity above 1.
-        quantities: min, mean, max and percentiles of each quantity, by name.
-    """
+    """Statistics of splats; invalid ones (`splats.INVALID`) are counted but left out of the rest. See `schema.json`."""
 
     box: Box | None
     box_98: Box | None

@@ -127,10 +127,8 @@ class Assertion:
     """A comparison of a column, or of a statistic of it, with a bound.
 
     Attributes:
-        text: as it was given, without spaces at its ends.
         column: a numeric column.
         statistic: of its cells, see `statistics`; empty if every frame must hold by itself.
-        sign: one of `SIGNS`.
         bound: right side of the comparison.
     """
 
@@ -151,7 +149,6 @@ class Outcome:
 
     Attributes:
         assertion: the assertion.
-        held: whether it holds.
         value: the statistic; without one, the value of the worst frame.
         failed, frames: frames that fail by themselves, and frames that have a value; `failed` is 0 for a statistic.
         worst: row of the frame that fails by most, or that comes closest to failing; None for a count.

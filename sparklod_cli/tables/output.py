@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,8 +21,6 @@ class TableOutput:
     Attributes:
         path: of its file; None for standard output, or for nowhere.
         form: a key of `files.FORMS`; None for nowhere: rows are made, and not written.
-        columns: of the table.
-        overwrite: replace a file that exists.
     """
 
     path: Path | None
@@ -60,10 +58,3 @@ class TableOutput:
             write_whole(self.path, data, overwrite=self.overwrite)
         else:
             write_stdout(passed(data) if passed is not None else data)
-
-
-def kept(rows: Iterable[Row], into: list[Row]) -> Iterator[Row]:
-    """Yield the rows, each put into a list on its way."""
-    for row in rows:
-        into.append(row)
-        yield row

@@ -1,4 +1,4 @@
-"""Views of trees by the API: cuts, pictures, refining, detail levels."""
+"""Cuts, pictures, traversals and comparisons of the public interface: those of the commands."""
 
 from __future__ import annotations
 

@@ -56,6 +56,12 @@ def test_the_help_of_a_command_can_be_had_by_help(name: str, capsys: Capture) ->
     assert printed("help", name, capsys=capsys) == printed(name, "--help", capsys=capsys)
 
 
+@pytest.mark.parametrize("name", COMMAND_NAMES)
+def test_help_ends_with_examples(name: str, capsys: Capture) -> None:
+    _, _, examples = printed(name, "--help", capsys=capsys).partition("Examples:\n")
+    assert f"  sparklod {name}" in examples
+
+
 def test_without_a_command_the_program_prints_its_help(capsys: Capture) -> None:
     help_text = printed("--help", capsys=capsys)
     run([])

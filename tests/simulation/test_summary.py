@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from sparklod_cli.commands.traverse_text import WIDTH, lines
+from sparklod_cli.commands.traverse import WIDTH, lines
 from sparklod_cli.simulation.columns import COLUMNS
 from sparklod_cli.simulation.summary import IN_FRUSTUM, MOMENTS, QUANTITIES, summarize
 from sparklod_cli.tables.assertions import check, parse

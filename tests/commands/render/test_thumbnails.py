@@ -136,15 +136,6 @@ def test_the_time_that_is_said_is_the_whole_time(
     assert float(err.rsplit(" ", 2)[1]) >= 0.5
 
 
-def test_help_of_render_has_examples(capsys: Capture) -> None:
-    assert render("--help") == 0
-    out = capsys.readouterr().out
-    assert "Examples:" in out
-    assert out.count("  sparklod render ") >= 6
-    for option in ("--camera-path", "--view", "--style", "--color-by", "--through", "--diff", "--supersample"):
-        assert option in out
-
-
 def test_a_process_writes_a_png_and_says_nothing(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "sparklod_cli", "render", str(TREE), "--size", "64x48", "-o", "-", "-q"]
     done = subprocess.run(command, capture_output=True, check=False, cwd=ROOT)

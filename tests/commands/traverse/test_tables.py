@@ -130,15 +130,6 @@ def test_an_assertion_that_does_not_hold_is_exit_code_3(tmp_path: Path, capsys: 
     assert json.loads(capsys.readouterr().out)["asserts"][0]["held"] is False
 
 
-def test_help_of_traverse_has_examples(capsys: Capture) -> None:
-    assert traverse("--help") == 0
-    out = capsys.readouterr().out
-    assert "Examples:" in out
-    assert out.count("  sparklod traverse ") >= 5
-    for option in ("--scene", "--assert", "--indices-out", "--bandwidth", "--camera-path", "--plot"):
-        assert option in out
-
-
 def test_verbose_says_how_long_it_took(capsys: Capture) -> None:
     assert traverse(TREE, *ORBIT, "-v", "--assert", "selected>0") == 0
     err = capsys.readouterr().err
