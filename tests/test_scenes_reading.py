@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from sparklod_cli.codecs.options import DEFAULTS
 from sparklod_cli.codecs.rad import codec as rad
 from sparklod_cli.io import read_scene
-from sparklod_cli.model.gaussian import moved, placed, spark_size
 from sparklod_cli.model.foveation import Cones, Frustum
+from sparklod_cli.model.gaussian import moved, placed, spark_size
 from sparklod_cli.model.instances import Instance, names_of
 from sparklod_cli.model.lod_tree import CHUNK_NODES
 from sparklod_cli.model.splats import Splats

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from ..cameras.camera import Camera
 from ..lod.traversal import CutView, Forest, Traversal, TreeInstance
-from ..model.gaussian import linear_opacity, lod_opacity, normalized_quat, size_factor
 from ..model.foveation import Cones
+from ..model.gaussian import linear_opacity, lod_opacity, normalized_quat, size_factor
 from ..model.lod_tree import LodTree
 from ..model.scene import PLAIN
 from ..model.sh import COEFFICIENTS

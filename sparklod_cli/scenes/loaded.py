@@ -17,8 +17,8 @@ from ..lod.detail_traversal import DetailForest, DetailTraversal
 from ..lod.settings import LodSettings
 from ..lod.traversal import Forest, Traversal, TreeCut, TreeInstance
 from ..model.balls import Balls, balls_of
-from ..model.gaussian import placed
 from ..model.foveation import Foveation
+from ..model.gaussian import placed
 from ..model.instances import Instance, Matrix
 from ..model.lod_tree import Nodes
 from ..model.scene import Scene

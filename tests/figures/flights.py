@@ -10,7 +10,7 @@ from PIL import Image
 
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.figures.traversal_chart import PathScene, Plot, plot
-from sparklod_cli.simulation.summary import look_at
+from sparklod_cli.simulation.summary import Lookout
 from sparklod_cli.tables.columns import Row
 from sparklod_cli.tables.statistics import totals
 from tests.scenes import random_splats
@@ -42,7 +42,10 @@ def path_scene(frame: int | None = 3) -> PathScene:
 
 def marked(rows: list[Row]) -> dict[str, int]:
     """The frames worth a look, as `traverse --plot` marks them."""
-    return {moment.what: moment.frame for moment in look_at(totals(rows))}
+    lookout = Lookout()
+    for row in totals(rows):
+        lookout.add(row)
+    return {moment.what: moment.frame for moment in lookout.moments()}
 
 
 def plotted(rows: list[Row], title: str = "scene.spz", path_scene: PathScene | None = None) -> Plot:

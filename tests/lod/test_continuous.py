@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from sparklod_cli.lod.continuous import BlendedCut, ContinuousCuts, faded, find_threshold, shares
 from sparklod_cli.lod.kernels.pixel_scale import pixel_scales
 from sparklod_cli.lod.traversal import CutView, Forest, Traversal, TreeInstance
-from sparklod_cli.model.gaussian import lod_opacity
 from sparklod_cli.model.foveation import Cones
+from sparklod_cli.model.gaussian import lod_opacity
 from tests.lod.forests import Case, cases, random_tree, transform
 from tests.references import continuous_cuts
 
