@@ -33,12 +33,12 @@ def decode(data: bytes) -> None:
         with contextlib.suppress(Exception):
             files = split_file(body)[0]
 
-    def beside(name: str) -> BinaryIO:
+    def open_companion(name: str) -> BinaryIO:
         if name not in files:
             raise FormatError("there is no such file")
         return io.BytesIO(files[name])
 
-    more = {"beside": beside} if form.companions else {}
+    more = {"open_companion": open_companion} if form.companions else {}
     with contextlib.suppress(SparklodError):
         scene = form.codec().decode(io.BytesIO(body), threads=1, **more)
         if scene.tree is not None:

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from sparklod_cli.io import companions, read_levels, read_scene
-from sparklod_cli.io.beside import leads_away
 from sparklod_cli.io.details import detail_files, detail_sink
 from sparklod_cli.io.identity import files_of
+from sparklod_cli.io.local_files import leads_away
 from sparklod_cli.support import atomic
 from sparklod_cli.support.addresses import Address
 from sparklod_cli.support.errors import OutputError

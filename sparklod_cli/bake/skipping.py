@@ -40,8 +40,8 @@ def bake_unless_there(
         OutputError: the output is there and of another recipe, and `overwrite` is not set.
         SparklodError: as `bake`.
     """
-    beside = target.parent / f"{target.name}{SUFFIX}"
-    former = _former(beside)
+    note_path = target.parent / f"{target.name}{SUFFIX}"
+    former = _former(note_path)
     files = [*(file for place in places_of(source) for file in files_of(place)), *files_named_in(settings)]
     seen = [identity_of(file) for file in files]
     fingerprint = _fingerprint(source, settings, files, seen, {} if verify else former)
@@ -55,7 +55,7 @@ def bake_unless_there(
             return None
         if not overwrite:
             raise OutputError(f"{target} is there, but {'; '.join(differences)}; add --overwrite to bake it anew")
-    _remove(beside)  # so that it never stands beside an output that it does not tell of
+    _remove(note_path)  # so that it never stands beside an output that it does not tell of
     baked = bake(source, target, settings, overwrite=overwrite, **how)
     if baked.refine is not None and not baked.refine.is_complete:
         return baked  # another run would get farther
@@ -65,16 +65,16 @@ def bake_unless_there(
         "inputs": inputs,
         "output": {_within(target, file): _record_of(file) for file in files_of(target)},
     }
-    sink(beside, overwrite=True)([json.dumps(note, indent=1).encode() + b"\n"])
+    sink(note_path, overwrite=True)([json.dumps(note, indent=1).encode() + b"\n"])
     return baked
 
 
-def _former(beside: Place) -> dict[str, Any]:
+def _former(note_path: Place) -> dict[str, Any]:
     """Return what the file beside an output says; empty where there is none that can be understood."""
     try:
-        if size_of(beside) > MAX_BYTES:
+        if size_of(note_path) > MAX_BYTES:
             return {}
-        with beside.open("rb") as file:
+        with note_path.open("rb") as file:
             found = parse_json(file.read())
         return {
             "recipe": Fingerprint.from_record(found["recipe"]),

@@ -24,7 +24,7 @@ from .validation import with_valid_tree
 Scratch = Callable[[Callable[[], Iterable[bytes]]], BinaryIO]
 
 #: Opens a file that another one names; raises `FormatError` where it cannot.
-Beside = Callable[[str], BinaryIO]
+OpenCompanion = Callable[[str], BinaryIO]
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,14 +33,14 @@ class Source:
 
     Attributes:
         file: open for reading, at its beginning.
-        beside: opens the files that it names; None if there are none to open.
+        open_companion: opens the files that it names; None if there are none to open.
         scratch: keeps what has to be unpacked before rows can be read in any order; None to read all rows once.
         threads: to inflate on.
         progress: called while a file is unpacked to `scratch`.
     """
 
     file: BinaryIO
-    beside: Beside | None = None
+    open_companion: OpenCompanion | None = None
     scratch: Scratch | None = None
     threads: int = 1
     progress: Progress = silent
@@ -165,9 +165,14 @@ def decoder(open_content: Callable[[Source], Content]) -> Callable[..., Scene]:
     """Return the function that reads a whole scene from a file: `decode(file, *, beside, threads, progress)`."""
 
     def decode(
-        file: BinaryIO, *, beside: Beside | None = None, threads: int = 1, progress: Progress = silent, **more: Any
+        file: BinaryIO,
+        *,
+        open_companion: OpenCompanion | None = None,
+        threads: int = 1,
+        progress: Progress = silent,
+        **more: Any,
     ) -> Scene:
-        content = open_content(Source(file, beside, None, threads, progress))
+        content = open_content(Source(file, open_companion, None, threads, progress))
         return content.scene(threads=threads, progress=progress, **more)
 
     return decode

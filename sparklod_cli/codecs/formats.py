@@ -32,12 +32,12 @@ class Format:
             yields the name and the bytes of each, this one last.
         trees: it can be written with a Level-of-Detail tree. Its `settled` then takes `Statistics`, too,
             those that `needed(options)` names; `encoder(scene, options, ranges, *, threads, progress)` gives its
-            `encoder.Encoder`, and `stored(file)`, with `beside` where it has companions, the `encoder.Stored` of a
-            file.
+            `encoder.Encoder`, and `stored(file)`, with `open_companion` where it has companions, the `encoder.Stored`
+            of a file.
         suffixes: lower case, with the dot.
         beginning: a regular expression that the first bytes of its files match; None if any bytes are possible, so that
             only the suffix decides.
-        companions: its files refer to others beside them, which the `beside` of a source opens.
+        companions: its files refer to others beside them, which the `open_companion` of a source opens.
         folders: those may be in folders there.
         detailed: its files have several detail levels. Its module also has `decode_levels(file, *,
             threads, progress, beside) -> DetailScene`, and `encode_files(scene, options, settings, *, threads,

@@ -60,10 +60,10 @@ def survey(path: Path, *, check: bool) -> HeaderScan | None:
     with opened(path) as (file, form, more):
         if form.name != FORMAT:
             return None
-        header, violations = scan_header(file, more["beside"])
+        header, violations = scan_header(file, more["open_companion"])
         gathered = _Gathered()
         if not any(each.fatal for each in violations):
-            for chunk in scan_chunks(file, more["beside"], header, paddings=check):
+            for chunk in scan_chunks(file, more["open_companion"], header, paddings=check):
                 violations += chunk.violations
                 if chunk.header is not None:
                     gathered.add(chunk.header)

@@ -80,12 +80,12 @@ def survey(path: Path, *, check: bool, threads: int = 1, progress: Progress = si
         if form.name != FORMAT:
             return None
         size = size_of(file)
-        manifest, files, violations = scan_files(file, more["beside"])
+        manifest, files, violations = scan_files(file, more["open_companion"])
         fatal = [each for each in violations if each.fatal]
         if fatal:
             return HeaderScan("streamed_sog", None, None, findings_of(violations), findings_of(fatal))
         if check:
-            found = scan_splats(more["beside"], manifest, files, threads=threads, progress=progress)
+            found = scan_splats(more["open_companion"], manifest, files, threads=threads, progress=progress)
             violations = [*violations, *found]
     chunks = {name: chunk for name, chunk in files.items() if isinstance(chunk, Chunk)}
     facts = _facts(manifest, chunks, size)

@@ -3,7 +3,7 @@
 What most jobs need is imported here; `rad_file` and `details` are imported by those who need them.
 """
 
-from .beside import companions, is_file_name
+from .local_files import companions, is_file_name
 from .reading import (
     MAX_TEXT,
     examine_scene,

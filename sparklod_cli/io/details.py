@@ -10,13 +10,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..codecs.file_names import META, chunk_folder, folders_of, is_chunk_folder, is_in_manifest, is_of_streamed_sog
-from ..codecs.sog.sog_container import MAX_META, names_beside
+from ..codecs.sog.sog_container import MAX_META, companion_names
 from ..codecs.streamed_sog.manifest import MAX_MANIFEST, Manifest, parse
 from ..support import atomic, atomic_set
 from ..support.addresses import Address, Place
 from ..support.errors import FormatError, OutputError
 from ..support.stdin import DASH
-from .beside import companions, in_folder, reason_of
+from .local_files import companions, in_folder, reason_of
 from .reading import opened
 from .writing import Files, SinkTogether, check_header, send_together
 
@@ -117,7 +117,7 @@ def _former(target: Place) -> list[str]:
             if is_in_manifest(meta) and not (isinstance(folder, Path) and folder.is_symlink()):
                 found.append(meta)
                 with contextlib.suppress(OSError):
-                    images = names_beside(_content(target.parent / meta, MAX_META))
+                    images = companion_names(_content(target.parent / meta, MAX_META))
                     names = (meta.removesuffix(META) + image for image in images)
                     found += [name for name in names if is_of_streamed_sog(name)]
     standing = set(_standing(target))

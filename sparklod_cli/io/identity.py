@@ -12,7 +12,7 @@ from typing import BinaryIO
 from ..support.addresses import Address, Place
 from ..support.errors import UnreadableError
 from ..support.stdin import DASH, name_of, spooled
-from .beside import companions, reason_unreadable
+from .local_files import companions, reason_unreadable
 
 #: Places of a file that are looked at, and bytes at each: 4 MB of a large one, which takes milliseconds. Chosen.
 PLACES, PLACE_BYTES = 64, 1 << 16

@@ -19,7 +19,7 @@ from ..support.addresses import Place, size_of
 from ..support.errors import FormatError, UnknownFormatError, UnreadableError
 from ..support.progress import Progress, silent
 from ..support.stdin import DASH, spooled
-from .beside import in_folder, open_beside, reason_unreadable
+from .local_files import companion_opener, in_folder, reason_unreadable
 
 if TYPE_CHECKING:
     from ..codecs.gpu import dump
@@ -117,8 +117,8 @@ def opened(path: Place) -> Iterator[tuple[BinaryIO, Format, dict[str, Any]]]:
                     "it holds arrays for a viewer and no scene; use the file that they were made of, or unpack them in"
                     " Python"
                 )
-            beside = functools.partial(open_beside, path, folders=form.folders)
-            yield file, form, {"beside": beside} if form.companions else {}
+            open_companion = functools.partial(companion_opener, path, folders=form.folders)
+            yield file, form, {"open_companion": open_companion} if form.companions else {}
 
 
 @contextlib.contextmanager

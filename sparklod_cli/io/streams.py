@@ -24,7 +24,7 @@ from ..support.addresses import Address, Place
 from ..support.errors import FormatError, OutputError, SparklodError
 from ..support.progress import Progress, silent
 from ..support.stdin import DASH, name_of
-from .beside import reason_of
+from .local_files import reason_of
 from .reading import opened, readable
 
 #: Makes the bytes of a scratch file.

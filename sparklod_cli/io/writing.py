@@ -21,7 +21,7 @@ from ..support.errors import OutputError, StdoutError
 from ..support.progress import Progress, silent
 from ..support.stdin import DASH
 from ..support.stdout import ReaderGoneError, guarded
-from .beside import number_of, reason_of
+from .local_files import number_of, reason_of
 
 if TYPE_CHECKING:
     from ..codecs.rad.rad_reader import RadReader

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from ..io import read_text, write_whole
-from ..io.beside import open_plain, reason_of
+from ..io.local_files import open_plain, reason_of
 from ..support.errors import OutputError, SparklodError
 from ..support.progress import Progress, silent
 from ..support.untrusted import parse_json

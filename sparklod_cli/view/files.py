@@ -15,8 +15,8 @@ from urllib.parse import quote
 from ..codecs.file_names import MANIFEST, META
 from ..codecs.formats import FORMATS, HEAD, sniff
 from ..codecs.rad.rad_header import MAGIC, RadHeader, read_header
-from ..io.beside import companions, in_folder, open_plain, path_beside, reason_unreadable
 from ..io.details import read_level_files
+from ..io.local_files import companion_path, companions, in_folder, open_plain, reason_unreadable
 from ..model.lod_tree import CHUNK_NODES
 from ..support.errors import FormatError, NotSplatsError, UnknownFormatError, UnreadableError
 from ..support.printable import printable
@@ -150,9 +150,11 @@ def _shown(path: Path, folder: str) -> ShownFile:
     name = f"{folder}/{path.name}"
     files = {name: path.resolve()}
     if form.detailed:
-        files |= {f"{folder}/{beside}": _inside(path, path.parent / beside) for beside in _manifest_files(path)}
+        files |= {
+            f"{folder}/{companion}": _inside(path, path.parent / companion) for companion in _manifest_files(path)
+        }
     elif header is not None:
-        files |= {f"{folder}/{chunk}": beside for chunk, beside in _chunk_files(path, header)}
+        files |= {f"{folder}/{chunk}": companion for chunk, companion in _chunk_files(path, header)}
     note = _note(path.name, head, header)
     file_type = SPARK_TYPES.get(form.name)
     return ShownFile(path, printable(path.name), url_of(name), form.name, file_type, header, files, note)
@@ -174,24 +176,24 @@ def _note(name: str, head: bytes, header: RadHeader | None) -> str | None:
 def _chunk_files(path: Path, header: RadHeader) -> Iterator[tuple[str, Path]]:
     """Yield the chunk files that the header of a RAD file names."""
     for name in header.filenames:
-        beside = path_beside(path, name)
-        if not beside.is_file():
+        companion = companion_path(path, name)
+        if not companion.is_file():
             raise FormatError(f"its chunk file {quoted_value(name)} is missing")
-        yield name, _inside(path, beside)
+        yield name, _inside(path, companion)
 
 
 def _manifest_files(path: Path) -> list[str]:
     """Return the names of all files that a manifest and its chunks refer to; `FormatError` where a chunk is missing."""
-    files = dict.fromkeys(beside.relative_to(path.parent).as_posix() for beside in companions(path, ()))
+    files = dict.fromkeys(companion.relative_to(path.parent).as_posix() for companion in companions(path, ()))
     missing = next((name for name in read_level_files(path).manifest.names() if name not in files), None)
     if missing is not None:
         raise FormatError(f"its chunk file {quoted_value(missing)} is missing")
     return list(files)
 
 
-def _inside(path: Path, beside: Path) -> Path:
+def _inside(path: Path, companion: Path) -> Path:
     """Return the real path of a file that another one names; `FormatError` where a link leads out of its folder."""
-    real = beside.resolve()
-    if real.parent != path.parent.resolve() / beside.relative_to(path.parent).parent:
-        raise FormatError(f"{quoted_value(beside.name)}, which it names, is a link to another folder; copy it there")
+    real = companion.resolve()
+    if real.parent != path.parent.resolve() / companion.relative_to(path.parent).parent:
+        raise FormatError(f"{quoted_value(companion.name)}, which it names, is a link to another folder; copy it there")
     return real

@@ -26,7 +26,7 @@ from ..cameras.frame import Settings as CameraSettings
 from ..cameras.path import CameraPath
 from ..cameras.sources import read_path
 from ..io import write_whole
-from ..io.beside import leads_away
+from ..io.local_files import leads_away
 from ..support.errors import CameraPathError
 from ..support.untrusted import parse_json, quoted_value
 from .files import Resources, ShownFile

@@ -17,7 +17,7 @@ from ..cameras.sources import SingleViews, WholeScene
 from ..codecs.rad.rad_header import RadHeader
 from ..codecs.rad.rad_reader import count_leaves, file_of, read_chunk
 from ..io import examine_scene, read_levels
-from ..io.beside import open_plain, reason_of
+from ..io.local_files import open_plain, reason_of
 from ..model.balls import USED, Balls, balls_of
 from ..model.splats import Splats
 from ..support.defaults import ELEVATION
@@ -112,10 +112,10 @@ def _coarse_extent(shown: ShownFile, header: RadHeader) -> Extent:
 
     A cut through the chunk, its nodes that have no children in it, covers the whole scene.
     """
-    beside = {Path(key).name: path for key, path in shown.files.items()}
+    open_companion = {Path(key).name: path for key, path in shown.files.items()}
 
     def opened(name: str) -> BinaryIO:
-        return open_plain(beside[name])
+        return open_plain(open_companion[name])
 
     entry = header.chunks[0]
     with opened(shown.path.name) as file:

@@ -78,14 +78,14 @@ def attempt(name: str, data: bytes, *, files: Mapping[str, bytes] | None = None,
     if form is None:
         return "unknown"
 
-    def beside(other: str) -> BinaryIO:
+    def open_companion(other: str) -> BinaryIO:
         if other not in among:
             raise FormatError("there is no such file")
         return io.BytesIO(among[other])
 
     among = files_of(name) if name and files is None and form.folders else files or {}
 
-    more = {"beside": beside} if form.companions else {}
+    more = {"open_companion": open_companion} if form.companions else {}
     _compile_kernels()
     start = time.process_time()
     try:

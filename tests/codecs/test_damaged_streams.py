@@ -45,12 +45,12 @@ def compare(name: str, data: bytes) -> str:
         return "unknown"
     codec: Any = form.codec()
 
-    def beside(other: str) -> BinaryIO:
+    def open_companion(other: str) -> BinaryIO:
         if other not in files_of(name):
             raise FormatError("there is no such file")
         return io.BytesIO(files_of(name)[other])
 
-    more = {"beside": beside} if form.folders else {}
+    more = {"open_companion": open_companion} if form.folders else {}
 
     def streamed() -> Splats:
         stream = codec.open_content(Source(io.BytesIO(data), scratch=in_memory, **more)).stream(1)

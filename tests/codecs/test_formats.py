@@ -37,7 +37,7 @@ def test_a_codec_has_the_signatures_of_all(form: Format) -> None:
     assert hasattr(codec, "encode_files") == (form.unbundled is not None or form.detailed)
     assert hasattr(codec, "decode_levels") == form.detailed
     if form.detailed:
-        named = {"threads": True, "progress": True, "beside": True}
+        named = {"threads": True, "progress": True, "open_companion": True}
         assert parameters(codec.decode_levels) == {"file": False} | named
     assert hasattr(codec, "encoder") == hasattr(codec, "needed") == form.trees
     if form.trees:

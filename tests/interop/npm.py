@@ -68,8 +68,8 @@ def _install(folder: Path, packages: Mapping[str, str]) -> None:
     if npm is None:
         pytest.skip("npm is not installed")
     names = ", ".join(packages)
-    with tempfile.TemporaryDirectory(dir=folder.parent) as beside:
-        work = Path(beside) / "packages"
+    with tempfile.TemporaryDirectory(dir=folder.parent) as open_companion:
+        work = Path(open_companion) / "packages"
         # Peer dependencies are for pages only, or listed among the packages.
         options = [
             "--no-audit",

@@ -133,8 +133,8 @@ def test_one_splat_in_a_cut_has_the_size_and_overdraw_of_its_place() -> None:
     # 0.1 is two standard deviations, so the radius is sqrt(8) / 2 * 5 pixels.
     assert ahead.overdraw_estimate == pytest.approx(math.pi * (math.sqrt(8) / 2 * 5) ** 2 / 100**2, rel=1e-3)
     assert at_distance([0, 0, -1], 1e6).overdraw_estimate == pytest.approx(1)  # it fills the picture, not more
-    beside, behind = at_distance([1.1, 0, -1], 0.1), at_distance([0, 0, 1], 0.1)
-    assert (beside.outside, beside.projected_px_p50, beside.overdraw_estimate) == (1, None, 0)
+    open_companion, behind = at_distance([1.1, 0, -1], 0.1), at_distance([0, 0, 1], 0.1)
+    assert (open_companion.outside, open_companion.projected_px_p50, open_companion.overdraw_estimate) == (1, None, 0)
     assert (behind.behind, behind.projected_px_p95, behind.overdraw_estimate) == (1, None, 0)
     assert at_distance([0, 0, 0], 0.1).behind == 1  # where the camera is, nothing is seen
     assert at_distance([0, 1, -1], 0.1).in_frustum == 1  # on the edge

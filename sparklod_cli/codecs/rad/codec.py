@@ -18,7 +18,7 @@ from ...model.lod_tree import LodTree
 from ...model.scene import Scene
 from ...model.splats import COLUMNS, Splats
 from ...support.progress import Progress, silent
-from ..content import Beside, decoder
+from ..content import OpenCompanion, decoder
 from ..encoder import results
 from ..options import DEFAULTS, WriteOptions
 from ..quantize import Bytes
@@ -140,9 +140,9 @@ class StoredRad:
         return found[0], np.concatenate(codes)
 
 
-def stored(file: BinaryIO, *, beside: Beside | None = None) -> StoredRad:
-    """Read the codes of a file; `beside` opens the files that it names; raises `FormatError` as `RadReader.open`."""
-    reader, chunks = RadReader.open(file, beside), []
+def stored(file: BinaryIO, *, open_companion: OpenCompanion | None = None) -> StoredRad:
+    """Read the codes of a file and of those that it names; raises `FormatError` as `RadReader.open`."""
+    reader, chunks = RadReader.open(file, open_companion), []
     for packed in reader.packed():
         count, properties = packed.header.count, {each.name: each for each in packed.header.properties}
         codes = {}

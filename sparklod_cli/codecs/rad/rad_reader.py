@@ -20,7 +20,7 @@ from ...support.errors import FormatError, TruncatedError
 from ...support.parallel import ordered_map
 from ...support.progress import Progress
 from .. import compression
-from ..content import Beside, Content, Source, Target
+from ..content import Content, OpenCompanion, Source, Target
 from ..stream import size_of
 from ..validation import RuleViolation, check_rules, error_of
 from . import rad_rules
@@ -41,19 +41,19 @@ from .rad_rules import broken
 
 
 @contextlib.contextmanager
-def file_of(entry: RadChunkEntry, file: BinaryIO, beside: Beside | None) -> Iterator[BinaryIO]:
+def file_of(entry: RadChunkEntry, file: BinaryIO, open_companion: OpenCompanion | None) -> Iterator[BinaryIO]:
     """Open the file that has a chunk: `file`, which has the header, or one that is closed afterwards."""
     if entry.filename is None:
         yield file
         return
-    with _open_beside(entry.filename, beside) as own:
+    with _open_companion(entry.filename, open_companion) as own:
         yield own
 
 
-def _open_beside(name: str, beside: Beside | None) -> BinaryIO:
-    if beside is None:
+def _open_companion(name: str, open_companion: OpenCompanion | None) -> BinaryIO:
+    if open_companion is None:
         raise FormatError("its chunks are in files beside it; give it as a file in their folder")
-    return beside(name)
+    return open_companion(name)
 
 
 def bytes_of(entry: RadChunkEntry, header: RadHeader, file: BinaryIO) -> bytes:
@@ -73,17 +73,17 @@ class RadReader:
     Attributes:
         header: of the file.
         file: open for reading.
-        beside: opens the files that the header names.
+        open_companion: opens the files that the header names.
         palette: (codes, K, 3) of SH; None without one.
     """
 
     header: RadHeader
     file: BinaryIO
-    beside: Beside | None = None
+    open_companion: OpenCompanion | None = None
     palette: FloatArray | None = None
 
     @classmethod
-    def open(cls, file: BinaryIO, beside: Beside | None = None) -> RadReader:
+    def open(cls, file: BinaryIO, open_companion: OpenCompanion | None = None) -> RadReader:
         """Read the header of a file, and its palette.
 
         Raises:
@@ -93,17 +93,17 @@ class RadReader:
         header = read_header(file)
         sizes = {}
         for name in header.filenames:
-            with _open_beside(name, beside) as own:
+            with _open_companion(name, open_companion) as own:
                 sizes[name] = size_of(own)
         check_rules(rad_rules.violations(header, size, sizes))
         _check_promise(header.count, header, size + sum(sizes.values()))
-        reader = cls(header, file, beside)
+        reader = cls(header, file, open_companion)
         first = reader.first()
         return reader if first is None else dataclasses.replace(reader, palette=first.palette(header))
 
-    def reopened(self, file: BinaryIO, beside: Beside | None) -> RadReader:
+    def reopened(self, file: BinaryIO, open_companion: OpenCompanion | None) -> RadReader:
         """Return a reader of the same file, opened again."""
-        return dataclasses.replace(self, file=file, beside=beside)
+        return dataclasses.replace(self, file=file, open_companion=open_companion)
 
     @property
     def facts(self) -> dict[str, int]:
@@ -135,7 +135,7 @@ class RadReader:
         """Read the bytes of chunks, all by default, when they are asked for."""
         for number in range(len(self.header.chunks)) if numbers is None else numbers:
             entry = self.header.chunks[number]
-            with file_of(entry, self.file, self.beside) as source:
+            with file_of(entry, self.file, self.open_companion) as source:
                 yield bytes_of(entry, self.header, source)
 
     def packed(self, numbers: range | None = None) -> Iterator[PackedChunk]:
@@ -233,7 +233,7 @@ class RadReader:
 
 def open_content(source: Source) -> Content:
     """Open a RAD file, whole or with chunks in files of their own; raises `FormatError` as `RadReader.open`."""
-    return RadReader.open(source.file, source.beside).content()
+    return RadReader.open(source.file, source.open_companion).content()
 
 
 @dataclass(frozen=True, eq=False)
@@ -275,7 +275,7 @@ def read_chunk(file: BinaryIO, entry: RadChunkEntry, header: RadHeader, palette:
     return RadChunk(packed.header, splats, tree, own, labels)
 
 
-def count_leaves(file: BinaryIO, header: RadHeader, beside: Beside | None) -> int:
+def count_leaves(file: BinaryIO, header: RadHeader, open_companion: OpenCompanion | None) -> int:
     """Return the number of leaves of a tree, of which only the numbers of children are read.
 
     Raises:
@@ -283,7 +283,7 @@ def count_leaves(file: BinaryIO, header: RadHeader, beside: Beside | None) -> in
     """
     leaves = 0
     for number, entry in enumerate(header.chunks):
-        with file_of(entry, file, beside) as source:
+        with file_of(entry, file, open_companion) as source:
             start = entry.start(header)
             source.seek(start)
             chunk = read_chunk_header(source)
@@ -313,7 +313,7 @@ class ChunkScan:
     violations: tuple[RuleViolation, ...]
 
 
-def scan_header(file: BinaryIO, beside: Beside) -> tuple[RadHeader, tuple[RuleViolation, ...]]:
+def scan_header(file: BinaryIO, open_companion: OpenCompanion) -> tuple[RadHeader, tuple[RuleViolation, ...]]:
     """Read the header of a file, and return it with its violations, those about the files of chunks among them.
 
     Raises:
@@ -321,23 +321,25 @@ def scan_header(file: BinaryIO, beside: Beside) -> tuple[RadHeader, tuple[RuleVi
     """
     size = size_of(file)
     header = read_header(file)
-    sizes = {name: _size_or_reason(name, beside) for name in header.filenames}
+    sizes = {name: _size_or_reason(name, open_companion) for name in header.filenames}
     return header, tuple(rad_rules.violations(header, size, sizes))
 
 
-def _size_or_reason(name: str, beside: Beside) -> int | str:
+def _size_or_reason(name: str, open_companion: OpenCompanion) -> int | str:
     """Return the bytes of a file that the header names, or why it cannot be opened."""
     try:
-        with beside(name) as file:
+        with open_companion(name) as file:
             return size_of(file)
     except FormatError as error:
         return str(error)
 
 
-def scan_chunks(file: BinaryIO, beside: Beside, header: RadHeader, *, paddings: bool) -> Iterator[ChunkScan]:
+def scan_chunks(
+    file: BinaryIO, open_companion: OpenCompanion, header: RadHeader, *, paddings: bool
+) -> Iterator[ChunkScan]:
     """Read the headers of the chunks, one after the other."""
     for number, entry in enumerate(header.chunks):
-        with file_of(entry, file, beside) as source:
+        with file_of(entry, file, open_companion) as source:
             start = entry.start(header)
             source.seek(start)
             try:

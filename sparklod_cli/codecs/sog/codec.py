@@ -61,7 +61,7 @@ def open_content(source: Source) -> Content:
     Raises:
         FormatError: the file is not SOG, not of version 1 or 2, corrupt, or lacks an image.
     """
-    files = SogFiles(source.file, source.beside)
+    files = SogFiles(source.file, source.open_companion)
     meta = files.meta
     version = meta.integer("version") if meta.has("version") else 1
     if version not in (1, 2):

@@ -21,7 +21,7 @@ from ...support.errors import ChecksumError, FormatError, NotSplatsError
 from ...support.units import count_of
 from ...support.untrusted import ZIP_ERRORS, parse_json, quoted, quoted_value
 from ..compression import check_promise
-from ..content import Beside
+from ..content import OpenCompanion
 from ..file_names import META
 from ..stream import size_of
 
@@ -204,7 +204,7 @@ def _finite(value: Any, way: tuple[str | int, ...]) -> float:
     return float(value)
 
 
-def names_beside(data: bytes) -> list[str]:
+def companion_names(data: bytes) -> list[str]:
     """Return the files that a meta.json names, as far as it can be parsed; otherwise none."""
     try:
         root = Meta(data).root
@@ -222,17 +222,17 @@ class SogFiles:
         size: bytes of all its files, which bound the sizes that images may announce.
     """
 
-    def __init__(self, file: BinaryIO, beside: Beside | None) -> None:
+    def __init__(self, file: BinaryIO, open_companion: OpenCompanion | None) -> None:
         self.size = size_of(file)
         zipped = file.read(2) == b"PK"
         file.seek(0)
         self._archive = _Archive(file, self.size) if zipped else None
-        self._beside = beside
+        self._companion = open_companion
         data = self._archive.read(META) if self._archive else file.read(MAX_META + 1)
         if len(data) > MAX_META:
             raise FormatError(f"{META} has more than {MAX_META:,} bytes, too many for a SOG")
         self.meta = Meta(data)
-        self._sizes = {} if self._archive else {name: self._size_beside(name) for name in self._names()}
+        self._sizes = {} if self._archive else {name: self._companion_size(name) for name in self._names()}
         self.size += sum(self._sizes.values())
 
     def _names(self) -> list[str]:
@@ -241,19 +241,19 @@ class SogFiles:
             self.meta.name(texture, "files", index) for texture, count in textures.items() for index in range(count)
         ]
 
-    def _open_beside(self, name: str) -> BinaryIO:
-        if self._beside is None:
+    def _open_companion(self, name: str) -> BinaryIO:
+        if self._companion is None:
             raise FormatError(f"{META} names {quoted_value(name)}, but other files cannot be opened here")
-        return self._beside(name)
+        return self._companion(name)
 
-    def _size_beside(self, name: str) -> int:
-        with self._open_beside(name) as file:
+    def _companion_size(self, name: str) -> int:
+        with self._open_companion(name) as file:
             return size_of(file)
 
     @contextlib.contextmanager
     def _opened(self, name: str, most: int) -> Iterator[tuple[WebPHeader, IO[bytes]]]:
         """Open an image that may have at most `most` texels, and read its header."""
-        with self._archive.opened(name) if self._archive else self._open_beside(name) as file:
+        with self._archive.opened(name) if self._archive else self._open_companion(name) as file:
             header = read_header(file.read, name)
             if header.width * header.height > most:
                 raise FormatError(f"{quoted_value(name)} has {header.width} x {header.height} texels, far too many")

@@ -13,7 +13,7 @@ from ...support.errors import FormatError
 from ...support.parallel import ordered_map
 from ...support.progress import Progress, silent
 from ...support.untrusted import quoted_value
-from ..content import Beside, Source
+from ..content import OpenCompanion, Source
 from ..file_names import MANIFEST
 from ..sog import codec as sog
 from ..validation import error_of
@@ -53,13 +53,13 @@ class Chunk:
         return sum(piece.count for piece in self.pieces)
 
 
-def open_chunk(beside: Beside | None, name: str, pieces: Sequence[Piece] | None, row: int = 0) -> Chunk:
+def open_chunk(open_companion: OpenCompanion | None, name: str, pieces: Sequence[Piece] | None, row: int = 0) -> Chunk:
     """Read the meta.json of a chunk.
 
     Raises:
         FormatError: it is no SOG; names it.
     """
-    with _opened(beside, name) as source:
+    with _opened(open_companion, name) as source:
         content = sog.open_content(source)
     return Chunk(
         name,
@@ -72,7 +72,7 @@ def open_chunk(beside: Beside | None, name: str, pieces: Sequence[Piece] | None,
 
 
 def read_pieces(
-    beside: Beside | None,
+    open_companion: OpenCompanion | None,
     chunks: Sequence[Chunk],
     out: Splats,
     threads: int = 1,
@@ -92,7 +92,7 @@ def read_pieces(
     together = min(threads, len(chunks))
 
     def work(chunk: Chunk) -> int:
-        with _opened(beside, chunk.name) as source:
+        with _opened(open_companion, chunk.name) as source:
             splats = sog.open_content(source).scene(threads=max(1, threads // together)).splats
         if (len(splats), splats.sh_degree) != (chunk.count, chunk.sh_degree):
             raise FormatError(f"{quoted_value(chunk.name)} was changed while it was read; start again")
@@ -120,17 +120,17 @@ def _copy(out: Splats, piece: Piece, row: int, splats: Splats) -> None:
 
 
 @contextlib.contextmanager
-def _opened(beside: Beside | None, name: str) -> Iterator[Source]:
+def _opened(open_companion: OpenCompanion | None, name: str) -> Iterator[Source]:
     """Open the meta.json of a chunk, and what opens the files beside that; errors of the body name the chunk."""
-    if beside is None:
+    if open_companion is None:
         raise FormatError(f"{MANIFEST} names {quoted_value(name)}, but other files cannot be opened here")
     folder = posixpath.dirname(name)
 
     def images(other: str) -> BinaryIO:
-        return beside(f"{folder}/{other}" if folder else other)
+        return open_companion(f"{folder}/{other}" if folder else other)
 
     try:
-        opened = beside(name)
+        opened = open_companion(name)
     except FormatError as error:  # which names it
         raise error_of("streamed-sog.chunk-files", str(error)) from None
     with opened as file:

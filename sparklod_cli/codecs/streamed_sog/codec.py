@@ -19,7 +19,7 @@ from ...support.progress import Progress, silent
 from ...support.units import count_of
 from ...support.untrusted import quoted_value
 from ..compression import check_promise
-from ..content import Beside, Content, Source, Target, decoder
+from ..content import Content, OpenCompanion, Source, Target, decoder
 from ..file_names import MANIFEST
 from ..stream import size_of
 from ..validation import check_rules, error_of
@@ -46,7 +46,7 @@ decode = decoder(open_content)
 
 
 def decode_levels(
-    file: BinaryIO, *, threads: int = 1, progress: Progress = silent, beside: Beside | None = None
+    file: BinaryIO, *, threads: int = 1, progress: Progress = silent, open_companion: OpenCompanion | None = None
 ) -> DetailScene:
     """Read all detail levels, in whatever order the runs lie in the chunks.
 
@@ -55,7 +55,7 @@ def decode_levels(
     Raises:
         FormatError: as `open_content`; also where another fatal rule of `manifest_rules` is broken.
     """
-    layout, content = _open(Source(file, beside, threads=threads), full_detail=False)
+    layout, content = _open(Source(file, open_companion, threads=threads), full_detail=False)
     bounds, children, errors = layout.bounds(), layout.children(), layout.errors()
     scene, environment = content.scene(threads=threads, progress=progress), None
     splats = scene.splats
@@ -127,7 +127,7 @@ def layout_of(manifest: Manifest) -> RegionLayout:
 
 def _open(source: Source, *, full_detail: bool) -> tuple[RegionLayout, Content]:
     """Read a manifest, and open its chunks: those of level 0, or all."""
-    size, beside = size_of(source.file), source.beside
+    size, open_companion = size_of(source.file), source.open_companion
     manifest = parse(source.file.read(MAX_MANIFEST + 1))
     check_rules(run_violations(manifest) if full_detail else violations(manifest))
     layout = layout_of(manifest)
@@ -145,7 +145,7 @@ def _open(source: Source, *, full_detail: bool) -> tuple[RegionLayout, Content]:
             raise FormatError(f"{MANIFEST} names {quoted_value(name)} twice")
         names.add(name)
         pieces = [Piece(int(layout.offset[run]), int(layout.count[run]), int(rows[run])) for run in here]
-        chunks.append(open_chunk(beside, name, pieces))
+        chunks.append(open_chunk(open_companion, name, pieces))
         if chunks[-1].count != (expected := int(layout.count[begin:end].sum())):
             has = count_of(chunks[-1].count, "splat")
             text = f"{quoted_value(name)} has {has}, but its runs in {MANIFEST} have {expected:,}"
@@ -153,7 +153,7 @@ def _open(source: Source, *, full_detail: bool) -> tuple[RegionLayout, Content]:
     if not chunks:
         raise FormatError(f"{MANIFEST} has no splats of {'level 0' if full_detail else 'any level'}")
     if manifest.environment is not None:
-        chunks.append(open_chunk(beside, manifest.environment, None, sum(chunk.rows for chunk in chunks)))
+        chunks.append(open_chunk(open_companion, manifest.environment, None, sum(chunk.rows for chunk in chunks)))
     count, degree = sum(chunk.rows for chunk in chunks), max(chunk.sh_degree for chunk in chunks)
     size += sum(chunk.bytes for chunk in chunks)
     check_promise(count * 4 * (14 + 3 * COEFFICIENTS[degree]), size)
@@ -163,13 +163,13 @@ def _open(source: Source, *, full_detail: bool) -> tuple[RegionLayout, Content]:
         if row not in last:
             last.clear()
             splats = Splats.empty(chunk.rows, degree)
-            read_pieces(beside, [chunk], splats, source.threads, first_row=row)
+            read_pieces(open_companion, [chunk], splats, source.threads, first_row=row)
             last[row] = splats
         return last[row]
 
     def fill(target: Target, threads: int, progress: Progress) -> None:
         if len(target.splats) == count:
-            read_pieces(beside, chunks, target.splats, threads, progress)
+            read_pieces(open_companion, chunks, target.splats, threads, progress)
             return
         end = 0
         for chunk in chunks:

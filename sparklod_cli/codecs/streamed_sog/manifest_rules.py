@@ -19,7 +19,7 @@ from ...support.parallel import blocks_of
 from ...support.progress import Progress, silent
 from ...support.units import count_of
 from ...support.untrusted import quoted_value
-from ..content import Beside
+from ..content import OpenCompanion
 from ..sog import texel_codings
 from ..validation import RuleViolation
 from .chunks import Chunk, open_chunk, read_pieces
@@ -264,7 +264,9 @@ CELLS = 1 << 10
 OUT_OF_ORDER, FEW = 0.05, 16
 
 
-def scan_files(file: BinaryIO, beside: Beside) -> tuple[Manifest, dict[str, Chunk | str], list[RuleViolation]]:
+def scan_files(
+    file: BinaryIO, open_companion: OpenCompanion
+) -> tuple[Manifest, dict[str, Chunk | str], list[RuleViolation]]:
     """Read the manifest, each file that it names, or why that cannot be read, and the rules that they break.
 
     Raises:
@@ -276,20 +278,20 @@ def scan_files(file: BinaryIO, beside: Beside) -> tuple[Manifest, dict[str, Chun
     for name in manifest.names():
         if leads_away(name):
             continue  # a violation says so
-        files[name] = _chunk_or_reason(beside, name)
+        files[name] = _chunk_or_reason(open_companion, name)
     return manifest, files, [*found, *file_violations(manifest, files)]
 
 
-def _chunk_or_reason(beside: Beside, name: str) -> Chunk | str:
+def _chunk_or_reason(open_companion: OpenCompanion, name: str) -> Chunk | str:
     """Read the meta.json of a file, or return why it cannot be read."""
     try:
-        return open_chunk(beside, name, None)
+        return open_chunk(open_companion, name, None)
     except FormatError as error:
         return str(error)
 
 
 def scan_splats(
-    beside: Beside,
+    open_companion: OpenCompanion,
     manifest: Manifest,
     files: Mapping[str, Chunk | str],
     *,
@@ -309,7 +311,7 @@ def scan_splats(
             continue
         try:
             splats = Splats.empty(chunk.rows, chunk.sh_degree)
-            read_pieces(beside, [chunk], splats, threads)
+            read_pieces(open_companion, [chunk], splats, threads)
         except FormatError as error:
             yield broken("chunk-files", str(error))
             continue

@@ -282,7 +282,7 @@ def test_threads_do_not_change_a_palette_and_chunk_files_have_it_in_the_first(sh
     assert written(shared, 1, sh_codes=20) == written(shared, 2, sh_codes=20)
     options = WriteOptions(rad=RadOptions(sh_codes=20))
     files = {name: b"".join(pieces) for name, pieces in rad.encode_chunked(shared, options, "scene")}
-    back = rad.decode(io.BytesIO(files["scene.rad"]), beside=lambda name: io.BytesIO(files[name]))
+    back = rad.decode(io.BytesIO(files["scene.rad"]), open_companion=lambda name: io.BytesIO(files[name]))
     assert_same(back.splats, read(written(shared, sh_codes=20)).splats)
 
 

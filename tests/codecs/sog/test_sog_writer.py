@@ -39,7 +39,7 @@ def meta_of(scene: Scene, **how: Any) -> dict[str, Any]:
 def back(scene: Scene, **how: Any) -> Splats:
     """What is read of the files of a scene, in its order."""
     files = files_of(scene, in_order=True, **how)
-    return sog.decode(io.BytesIO(files["meta.json"]), beside=lambda name: io.BytesIO(files[name])).splats
+    return sog.decode(io.BytesIO(files["meta.json"]), open_companion=lambda name: io.BytesIO(files[name])).splats
 
 
 @pytest.mark.parametrize("degree", range(4))
@@ -70,7 +70,7 @@ def test_whether_a_scene_is_antialiased_is_kept_in_both_spellings(antialiased: b
     for spelling in ("antialias", "model"):
         files = files_of(scene)
         files["meta.json"] = json.dumps({key: value for key, value in meta.items() if key != spelling}).encode()
-        read = sog.decode(io.BytesIO(files["meta.json"]), beside=lambda name: io.BytesIO(files[name]))  # noqa: B023
+        read = sog.decode(io.BytesIO(files["meta.json"]), open_companion=lambda name: io.BytesIO(files[name]))  # noqa: B023
         assert read.antialiased is antialiased
 
 

@@ -45,7 +45,7 @@ def files_of(scene: DetailScene, *, threads: int = 1) -> dict[str, bytes]:
     return {name: b"".join(pieces) for name, pieces in files}
 
 
-def beside(files: Mapping[str, bytes]) -> Callable[[str], BinaryIO]:
+def open_companion(files: Mapping[str, bytes]) -> Callable[[str], BinaryIO]:
     """What opens files by name."""
 
     def opened(name: str) -> BinaryIO:
@@ -58,4 +58,6 @@ def beside(files: Mapping[str, bytes]) -> Callable[[str], BinaryIO]:
 
 def levels_of(files: Mapping[str, bytes], *, threads: int = 1) -> DetailScene:
     """What is read of files."""
-    return codec.decode_levels(io.BytesIO(files["lod-meta.json"]), threads=threads, beside=beside(files))
+    return codec.decode_levels(
+        io.BytesIO(files["lod-meta.json"]), threads=threads, open_companion=open_companion(files)
+    )

@@ -25,7 +25,7 @@ from tests.codecs.writers import sog_precision
 from tests.conftest import FIXTURES
 from tests.scenes import random_splats
 
-from .scenes import beside, detail_scene, files_of, levels_of
+from .scenes import detail_scene, files_of, levels_of, open_companion
 
 GOLDEN = FIXTURES / "golden" / "sh1-streamed-sog"
 
@@ -44,7 +44,7 @@ def with_meta(change: Callable[[Any], object], files: dict[str, bytes] | None = 
 
 
 def scene_of(files: dict[str, bytes]) -> Scene:
-    return codec.decode(io.BytesIO(files["lod-meta.json"]), beside=beside(files))
+    return codec.decode(io.BytesIO(files["lod-meta.json"]), open_companion=open_companion(files))
 
 
 def assert_same(one: Splats, other: Splats) -> None:
@@ -120,9 +120,9 @@ def test_a_stream_decodes_each_chunk_once(monkeypatch: pytest.MonkeyPatch) -> No
     decoded = list[str]()
     read_pieces = codec.read_pieces
 
-    def counted(beside: Any, chunks: Any, *rest: Any, **more: Any) -> None:
+    def counted(open_companion: Any, chunks: Any, *rest: Any, **more: Any) -> None:
         decoded.extend(chunk.name for chunk in chunks)
-        read_pieces(beside, chunks, *rest, **more)
+        read_pieces(open_companion, chunks, *rest, **more)
 
     monkeypatch.setattr(codec, "read_pieces", counted)
     with open_stream(GOLDEN) as stream:
@@ -278,10 +278,10 @@ def test_a_chunk_that_changes_meanwhile_is_refused() -> None:
         nonlocal opened
         opened += name == "0_0/meta.json"
         files = golden() if opened < 2 else golden() | {f"0_0/{each}": data for each, data in other.items()}
-        return beside(files)(name)
+        return open_companion(files)(name)
 
     with pytest.raises(FormatError, match=r"'0_0/meta.json' was changed while it was read; start again"):
-        codec.decode(io.BytesIO(golden()["lod-meta.json"]), beside=changing)
+        codec.decode(io.BytesIO(golden()["lod-meta.json"]), open_companion=changing)
 
 
 def test_progress_ends_with_all_splats() -> None:
@@ -289,7 +289,7 @@ def test_progress_ends_with_all_splats() -> None:
     codec.decode(
         io.BytesIO(golden()["lod-meta.json"]),
         threads=2,
-        beside=beside(golden()),
+        open_companion=open_companion(golden()),
         progress=lambda what, done, total, unit: told.append((done, total)),
     )
     assert told[-1] == (66, 66)

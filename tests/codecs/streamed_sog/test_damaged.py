@@ -17,7 +17,7 @@ from sparklod_cli.support.errors import FormatError
 from tests.codecs.sog.test_damaged import VALUES, places_of, replaced
 from tests.codecs.test_damaged import attempt, content, files_of
 
-from .scenes import beside
+from .scenes import open_companion
 
 NAME = "golden/sh1-streamed-sog/lod-meta.json"
 FILES = files_of(NAME)
@@ -29,7 +29,7 @@ pytestmark = pytest.mark.filterwarnings("error")  # they would go to standard er
 def levels(data: bytes, files: dict[str, bytes]) -> bool:
     """Whether all levels can be read."""
     try:
-        scene = codec.decode_levels(io.BytesIO(data), beside=beside(files))
+        scene = codec.decode_levels(io.BytesIO(data), open_companion=open_companion(files))
     except FormatError as error:
         assert "\n" not in str(error)
         return False

@@ -235,8 +235,8 @@ def test_the_same_bake_is_skipped(town: Path, tmp_path: Path, capsys: Capture) -
     assert build(*given) == 1
     assert f"{image.parent.name}/{image.name} was changed since it was baked" in capsys.readouterr().err
     assert build(*given, "--overwrite") == 0
-    beside = f"{MANIFEST}.sparklod.json"  # has the dates of the files
-    assert {**files(web), beside: b""} == {**before, beside: b""}
+    open_companion = f"{MANIFEST}.sparklod.json"  # has the dates of the files
+    assert {**files(web), open_companion: b""} == {**before, open_companion: b""}
     written(sky, 40, seed=3)
     capsys.readouterr()
     assert build(*given) == 1

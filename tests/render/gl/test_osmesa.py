@@ -51,7 +51,7 @@ def camera(
     return Camera(look_at(eye, target, (0.1, 1, 0)), width, height, (190.0, 205.0), principal)
 
 
-CAMERAS = {"front": camera((0, 0, 4)), "beside": camera((1.5, -2, 1)), "inside": camera((0.4, 0.2, -0.5))}
+CAMERAS = {"front": camera((0, 0, 4)), "open_companion": camera((1.5, -2, 1)), "inside": camera((0.4, 0.2, -0.5))}
 
 
 def random_shown(
@@ -228,7 +228,7 @@ def test_frames_of_the_same_splats_share_an_upload() -> None:
     renderer = osmesa.OpenGLRenderer()
     first = renderer.draw(shown, CAMERAS["front"], RasterSettings())
     again = ShadedSplats(*(column.copy() for column in _columns(shown)))
-    renderer.draw(again, CAMERAS["beside"], RasterSettings())
+    renderer.draw(again, CAMERAS["open_companion"], RasterSettings())
     assert (renderer.uploads, renderer.sorts) == (1, 2)
     recolored = dataclasses.replace(shown, rgb=shown.rgb[::-1].copy())
     assert np.array_equal(

@@ -97,7 +97,7 @@ def companions(path: Path, sets: Collection[Collection[str]]) -> list[Path]:
             names = [*([] if first is None else [first.name]), *itertools.chain(*sets)]
         else:
             names = list(itertools.chain(*(names for names in sets if path.name in names)))
-        files = _beside(folder / MANIFEST, names)
+        files = _companion(folder / MANIFEST, names)
         if first is not None and first.is_file():
             files += _named_in(first)
         return [file for file in files if file.is_file()]
@@ -117,24 +117,24 @@ def _named_in(path: Path) -> list[Path]:
 
         file.seek(0)
         if head.startswith(rad_header.MAGIC):
-            return _beside(path, rad_header.read_header(file).filenames)
+            return _companion(path, rad_header.read_header(file).filenames)
         if form is not None and form.folders:
-            metas = _beside(path, parse(file.read(MAX_MANIFEST + 1)).names(), folders=True)
+            metas = _companion(path, parse(file.read(MAX_MANIFEST + 1)).names(), folders=True)
             return [*metas, *itertools.chain(*map(_images_of, metas))]
     return _images_of(path)
 
 
 def _images_of(path: Path) -> list[Path]:
     """Return the images that the meta.json of an unpacked SOG names."""
-    from ..codecs.sog.sog_container import MAX_META, names_beside
+    from ..codecs.sog.sog_container import MAX_META, companion_names
 
     if not path.is_file() or path.stat().st_size > MAX_META:
         return []
     data = path.read_bytes()
-    return _beside(path, names_beside(data)) if data.lstrip().startswith(b"{") else []
+    return _companion(path, companion_names(data)) if data.lstrip().startswith(b"{") else []
 
 
-def _beside(path: Path, names: Iterable[str], *, folders: bool = False) -> list[Path]:
+def _companion(path: Path, names: Iterable[str], *, folders: bool = False) -> list[Path]:
     each = dict.fromkeys(names)  # a manifest of strangers may name one file half a million times
     return [path.parent / name for name in each if not leads_away(name, folders=folders)]
 
@@ -151,13 +151,13 @@ def in_folder(folder: Place) -> Place:
     return path
 
 
-def path_beside(first: Path, name: str) -> Path:
+def companion_path(first: Path, name: str) -> Path:
     """Return the path of a file that another names; raise `FormatError` where the name could leave their folder."""
     _check_name(name)
     return first.parent / name
 
 
-def open_beside(first: Place, name: str, *, folders: bool = False) -> BinaryIO:
+def companion_opener(first: Place, name: str, *, folders: bool = False) -> BinaryIO:
     """Open a file that another one names, which may be in folders there if `folders`.
 
     Raises:
