@@ -119,7 +119,7 @@ def test_cuts_are_those_of_a_tree_read_whole(file: Path, budget: int, limit: flo
         one, other = (
             scenes.traversal(settings).cut(view_of(at), budget=budget, smallest=smallest) for scenes in (whole, paged)
         )
-        for name in ("views", "reason", "missing", "least", "stop", "wanted"):
+        for name in ("views", "reason", "missing", "least", "stop", "demand"):
             assert np.array_equal(getattr(one, name), getattr(other, name)), name
         for name in ("node", "limit"):  # whose order is that of the search
             assert np.array_equal(*(getattr(cut, name)[np.argsort(cut.node)] for cut in (one, other))), name
@@ -134,10 +134,10 @@ def test_only_chunks_are_read_that_cuts_need(file: Path) -> None:
     _, paged = both([Instance(file, "a")])
     assert chunks_read(paged) == 1  # the root's
     traversal = paged.traversal(LodSettings(3_000))
-    wanted = np.zeros(len(paged.forest.present()), np.bool_)
+    demand = np.zeros(len(paged.forest.present()), np.bool_)
     for at in (NEAR, NEAR, *around(3).cameras):
-        wanted |= traversal.cut(view_of(at), budget=3_000).wanted > 0
-    assert wanted.sum() <= chunks_read(paged) < len(wanted)
+        demand |= traversal.cut(view_of(at), budget=3_000).demand > 0
+    assert demand.sum() <= chunks_read(paged) < len(demand)
 
 
 @pytest.mark.usefixtures("little_memory")

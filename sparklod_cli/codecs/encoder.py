@@ -90,8 +90,8 @@ class Stored(Protocol):
     def like(self, options: WriteOptions) -> WriteOptions:
         """Return the options, and where they leave a choice open, that of the file."""
 
-    def keeping(self, encoder: Any, kept: NDArray[np.bool_]) -> Encoder:
-        """Return an encoder of as many nodes in the same order that gives (N,) `kept` ones the codes of the file."""
+    def keeping(self, encoder: Any, unchanged: NDArray[np.bool_]) -> Encoder:
+        """Return an encoder of as many nodes in the same order that gives (N,) `unchanged` ones their old codes."""
 
 
 def windows_of(count: int) -> list[slice]:

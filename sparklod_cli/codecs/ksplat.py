@@ -164,10 +164,10 @@ def _centers(section: KsplatSection, part: slice, codes: NDArray[np.uint16]) -> 
     return (codes.astype(np.float32) - np.float32(section.steps)) * section.step + section.middles[bucket]
 
 
-def _read(file: BinaryIO, kind: np.dtype[Any], count: int, what: str) -> NDArray[Any]:
+def _read(file: BinaryIO, kind: np.dtype[Any], count: int, subject: str) -> NDArray[Any]:
     data = file.read(kind.itemsize * count)
     if len(data) < kind.itemsize * count:
-        raise TruncatedError(f"cut short inside {what}")
+        raise TruncatedError(f"cut short inside {subject}")
     return np.frombuffer(data, kind)
 
 

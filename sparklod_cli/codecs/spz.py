@@ -121,13 +121,13 @@ class SpzEncoder(Encoder):
     """Encoder of a file: the result of a window has its part of each stream, by its name.
 
     Attributes:
-        stored: (N, bytes or more) codes of streams by name, see `kept`. Of SH, there may be more coefficients than are
-            written.
-        kept: (N,) nodes that get their codes of `stored`; None for none.
+        stored: (N, bytes or more) codes of streams by name, see `unchanged`. Of SH, there may be more coefficients than
+            are written.
+        unchanged: (N,) nodes that get their codes of `stored`; None for none.
     """
 
     stored: Mapping[str, Bytes] = field(default_factory=dict)
-    kept: NDArray[np.bool_] | None = None
+    unchanged: NDArray[np.bool_] | None = None
 
     @property
     def layout(self) -> Layout:
@@ -153,11 +153,11 @@ class SpzEncoder(Encoder):
                 else:
                     values = np.ascontiguousarray(stream.encode(column_of(some, links, stream)))
                 codes[stream.name][part] = values.view(np.uint8).reshape(-1, stream.size)
-        if self.kept is not None:
+        if self.unchanged is not None:
             here = slice(start, start + len(splats))
-            kept = self.kept[here]
+            unchanged = self.unchanged[here]
             for name, stored in self.stored.items():
-                codes[name][kept] = stored[here][kept, : codes[name].shape[1]]
+                codes[name][unchanged] = stored[here][unchanged, : codes[name].shape[1]]
         return codes
 
     def pieces(self, get: Get, *, threads: int, progress: Progress) -> Iterator[bytes]:
@@ -273,11 +273,11 @@ class StoredSpz:
             return options  # its positions are in no coding that is written
         return like({"version": layout.version, "fractional_bits": layout.fractional_bits}, options)
 
-    def keeping(self, encoder: SpzEncoder, kept: NDArray[np.bool_]) -> SpzEncoder:
+    def keeping(self, encoder: SpzEncoder, unchanged: NDArray[np.bool_]) -> SpzEncoder:
         """Return an encoder of as many nodes that gives some the codes of the file, where its coding is the same."""
         streams = encoder.layout.streams()
         codes = {each.name: self.codes[each.name] for each in streams if self._is_alike(each, encoder.layout)}
-        return dataclasses.replace(encoder, stored=codes, kept=kept)
+        return dataclasses.replace(encoder, stored=codes, unchanged=unchanged)
 
     def _is_alike(self, stream: SpzStream, other: Layout) -> bool:
         """Return True if a layout has a stream of splats in the coding of the file."""

@@ -79,15 +79,15 @@ def rows_between(
     start: int,
     stop: int,
     count: int,
-    what: str = "splats",
+    subject: str = "splats",
 ) -> Iterator[Rows]:
     """Read rows from `start` to `stop`, of `count` that begin at `offset` in a file; blocks and errors as `rows_of`."""
     read = file.reader(offset + start * row_type.itemsize)
-    return rows_of(read, row_type, start, stop, count, what)
+    return rows_of(read, row_type, start, stop, count, subject)
 
 
 def rows_of(
-    read: Read, row_type: np.dtype[Any], start: int, stop: int, count: int, what: str = "splats"
+    read: Read, row_type: np.dtype[Any], start: int, stop: int, count: int, subject: str = "splats"
 ) -> Iterator[Rows]:
     """Read rows from `start` to `stop`, of `count`, in blocks of at least `BLOCK_ROWS` rows and `BLOCK_BYTES` bytes.
 
@@ -100,7 +100,7 @@ def rows_of(
         data = read((part.stop - part.start) * row_type.itemsize)
         whole = len(data) // row_type.itemsize
         if part.start + whole < part.stop:
-            raise TruncatedError(f"cut short after {part.start + whole:,} of {count:,} {what}")
+            raise TruncatedError(f"cut short after {part.start + whole:,} of {count:,} {subject}")
         yield part, np.frombuffer(data, row_type)
 
 

@@ -311,10 +311,10 @@ def _row(name: str, text: str) -> str:
 def _loading(figures: Row) -> str:
     """Return a phrase on the waiting times of a visitor who opens the page in front of the first camera."""
     parts = []
-    for what, name in (("first picture", "first_picture"), ("90 %", "resident_90"), ("all", "resident_all")):
+    for label, name in (("first picture", "first_picture"), ("90 %", "resident_90"), ("all", "resident_all")):
         seconds, size = figures[f"{name}_s"], figures.get(f"{name}_bytes")
         text = "never" if seconds is None else f"after {seconds:.2f} s"
-        parts.append(f"{what} {text}" + (f" and {size_of(size)}" if isinstance(size, int) else ""))
+        parts.append(f"{label} {text}" + (f" and {size_of(size)}" if isinstance(size, int) else ""))
     return ", ".join(parts)
 
 
@@ -325,7 +325,7 @@ def _quantity(quantity: FrameStatistics) -> str:
 
 
 def _moment(moment: Moment) -> str:
-    text, style = MOMENTS[moment.what]
+    text, style = MOMENTS[moment.criterion]
     time = "" if moment.time_s is None else f"{moment.time_s:.3f} s"
     name = f"  {printable(moment.name, WIDTH)}" if moment.name else ""
     return f"{moment.frame:>7,} {time:>11}  {text.format(_said(moment.value, style))}{name}"

@@ -60,16 +60,16 @@ class Tile:
     y: int
 
 
-def check_covered(reference: Image, what: str) -> None:
+def check_covered(reference: Image, subject: str) -> None:
     """Raise a `SparklodError` if the reference of a comparison is empty: its figures would mean nothing.
 
     Args:
         reference: (H, W, 4), the last channel alpha.
-        what: what the picture shows, for the error.
+        subject: what the picture shows, for the error.
     """
     if not (reference[..., 3] > 0).any():
         raise SparklodError(
-            f"{what} covers no pixel, so there is nothing to compare with; check --near and --far, and that cameras"
+            f"{subject} covers no pixel, so there is nothing to compare with; check --near and --far, and that cameras"
             " and scene share their axes (--camera-axes, --world-transform, --up)"
         )
 

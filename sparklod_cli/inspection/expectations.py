@@ -92,9 +92,9 @@ class Expectations:
             for key, (name, sign) in KEYS.items()
             if getattr(self, key) is not None
         ]
-        for name, wanted in self.values.items():
-            ends = [(sign, wanted[end]) for end, sign in (("min", ">="), ("max", "<=")) if _is_range(wanted, end)]
-            found += [Condition.of(name, sign, bound) for sign, bound in ends or [("==", wanted)]]
+        for name, expected in self.values.items():
+            ends = [(sign, expected[end]) for end, sign in (("min", ">="), ("max", "<=")) if _is_range(expected, end)]
+            found += [Condition.of(name, sign, bound) for sign, bound in ends or [("==", expected)]]
         return found + [parse_assertion(text) for text in self.asserts]
 
 
@@ -112,8 +112,8 @@ def parse_assertion(text: str) -> Condition:
     return condition
 
 
-def _is_range(wanted: Any, end: str) -> bool:
-    return isinstance(wanted, dict) and end in wanted
+def _is_range(expected: Any, end: str) -> bool:
+    return isinstance(expected, dict) and end in expected
 
 
 def read(path: Path) -> Expectations:
@@ -152,24 +152,24 @@ def read(path: Path) -> Expectations:
 
 def _flat(table: dict[str, Any], path: str, prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Return expectations by the full names of their fields; in TOML `tree.depth = 2` is a table in a table."""
-    for key, wanted in table.items():
+    for key, expected in table.items():
         name = prefix + key
-        if isinstance(wanted, dict) and wanted and not wanted.keys() & {"min", "max"}:
-            yield from _flat(wanted, path, f"{name}.")
+        if isinstance(expected, dict) and expected and not expected.keys() & {"min", "max"}:
+            yield from _flat(expected, path, f"{name}.")
             continue
-        if isinstance(wanted, dict) and not (wanted and wanted.keys() <= {"min", "max"}):
-            raise ExpectationError(f"{path}: {printable(name, QUOTED)} takes min and max, not {quoted_value(wanted)}")
-        if isinstance(wanted, dict) and not all(map(is_number, wanted.values())):
+        if isinstance(expected, dict) and not (expected and expected.keys() <= {"min", "max"}):
+            raise ExpectationError(f"{path}: {printable(name, QUOTED)} takes min and max, not {quoted_value(expected)}")
+        if isinstance(expected, dict) and not all(map(is_number, expected.values())):
             raise ExpectationError(
-                f"{path}: min and max of {printable(name, QUOTED)} must be numbers, not {quoted_value(wanted)}"
+                f"{path}: min and max of {printable(name, QUOTED)} must be numbers, not {quoted_value(expected)}"
             )
         try:
-            json.dumps(wanted)
+            json.dumps(expected)
         except TypeError:
             raise ExpectationError(
-                f"{path}: {printable(name, QUOTED)} cannot be {quoted_value(wanted)}, no report has such a value"
+                f"{path}: {printable(name, QUOTED)} cannot be {quoted_value(expected)}, no report has such a value"
             ) from None
-        yield name, wanted
+        yield name, expected
 
 
 def _value(plain: dict[str, Any], name: str) -> Any:

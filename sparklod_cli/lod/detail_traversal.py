@@ -100,7 +100,7 @@ class DetailTraversal:
         ]
         choice = choose(distant, max(1, budget - self._fixed), rule)
         there = np.ones(forest.chunks, np.bool_) if resident is None else resident
-        wanted, nodes, missing = np.zeros(forest.chunks, np.float32), [], 0
+        demand, nodes, missing = np.zeros(forest.chunks, np.float32), [], 0
         for at, (instance, levels, distance) in enumerate(zip(self.instances, choice.levels, distances, strict=True)):
             tree = instance.tree
             scene, files, own = forest.scenes[tree], forest.files[tree], slice(*forest.chunk_base[tree : tree + 2])
@@ -112,7 +112,7 @@ class DetailTraversal:
             nodes.append(_splats_of(scene, drawn, environment=around))
             wrong = (drawn != levels) & (levels >= 0)
             missing += int(scene.counts[wrong, levels[wrong]].sum())
-            wanted[own] = np.maximum(wanted[own], np.maximum(priority, np.where(priority > 0, 1e-30, 0)))
+            demand[own] = np.maximum(demand[own], np.maximum(priority, np.where(priority > 0, 1e-30, 0)))
         return TreeCut(
             views=views_of(forest, self.instances, view),
             node=np.concatenate(nodes),
@@ -122,7 +122,7 @@ class DetailTraversal:
             missing=missing,
             least=np.inf,
             stop=None,
-            wanted=wanted,
+            demand=demand,
             seconds=time.perf_counter() - start,
         )
 

@@ -103,11 +103,11 @@ class Forest:
     def read(self, chunks: NDArray[np.bool_]) -> None:
         """Read those of these chunks, (chunks,) bool, that are not in memory."""
 
-    def read_some(self, wanted: NDArray[np.float32], present: NDArray[np.bool_]) -> bool:
+    def read_some(self, demand: NDArray[np.float32], present: NDArray[np.bool_]) -> bool:
         """Read chunks that a cut wants; False if it lacked none.
 
         Args:
-            wanted: (chunks,) float32, of a `TreeCut`.
+            demand: (chunks,) float32, of a `TreeCut`.
             present: (chunks,) bool that it was found with.
         """
         return False
@@ -134,7 +134,7 @@ class TreeCut:
         missing: number of nodes that would be refined if their children were resident, and of roots that are not.
         least: the least limit of a refined node; infinite if none was refined.
         stop: (pixel scale, instance, index) of the node that would have exceeded the budget, or None.
-        wanted: (chunks,) float32, for each chunk of all trees the largest limit of the nodes that are, or should be,
+        demand: (chunks,) float32, for each chunk of all trees the largest limit of the nodes that are, or should be,
             refined and have children in it; 0 if there is none.
         seconds: that it took to find, once its chunks were in memory.
     """
@@ -147,7 +147,7 @@ class TreeCut:
     missing: int
     least: float
     stop: tuple[float, int, int] | None
-    wanted: NDArray[np.float32]
+    demand: NDArray[np.float32]
     seconds: float = 0.0
 
     def __len__(self) -> int:
@@ -162,8 +162,8 @@ class TreeCut:
 
         Those of equal priority are in the order of their numbers; Spark has them in the order that its queue finds.
         """
-        wanted = np.flatnonzero(self.wanted > 0)
-        order: list[int] = wanted[np.argsort(-self.wanted[wanted], kind="stable")].tolist()
+        requested = np.flatnonzero(self.demand > 0)
+        order: list[int] = requested[np.argsort(-self.demand[requested], kind="stable")].tolist()
         return order
 
 
@@ -197,7 +197,7 @@ class Traversal:
             # As long as chunks are not in memory that would be read next, the cut is one of a viewer that lacks them.
             present = self.forest.present()
             cut = self._cut(view, budget, smallest, present)
-            if not self.forest.read_some(cut.wanted, present):
+            if not self.forest.read_some(cut.demand, present):
                 return cut
 
     def _cut(self, view: CutView, budget: int, smallest: float, present: NDArray[np.bool_]) -> TreeCut:
@@ -208,14 +208,14 @@ class Traversal:
         stop = cut_arrays.Stop(np.float32(smallest).view(np.int32), budget)
         room = min(budget, self._most) + 1  # the kernel writes one more before it knows whether that is drawn
         nodes = cut_arrays.CutNodes(np.empty(room, np.uint32), np.empty(room, np.int32), np.empty(room, np.uint16))
-        wanted, memory = np.empty(len(present), np.float32), self._memory
+        demand, memory = np.empty(len(present), np.float32), self._memory
         size = VISITS * budget + CHUNK_NODES
         while True:
             size = min(size, 2 * self._most)  # a node is visited by its threshold, and once more by the queue
             if memory.slots is None or len(memory.slots.node) <= size:
                 memory.slots = _slots(size)
             slots, guess = memory.slots, np.float32(memory.guess)
-            selected, reason, missing, least, last = find_cut(trees, stop, guess, slots, wanted, nodes)
+            selected, reason, missing, least, last = find_cut(trees, stop, guess, slots, demand, nodes)
             if reason != cut_arrays.FULL:
                 break
             size = 2 * len(slots.node)
@@ -230,7 +230,7 @@ class Traversal:
             missing=missing,
             least=float(least),
             stop=None if last < 0 else _node_at(slots, last),
-            wanted=wanted,
+            demand=demand,
             seconds=time.perf_counter() - start,
         )
 

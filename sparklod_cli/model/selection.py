@@ -40,7 +40,7 @@ class SelectionTally:
     first_invalid: int | None = None
 
     @property
-    def kept(self) -> int:
+    def selected(self) -> int:
         """Number of splats that are kept."""
         return self.count - sum(self.dropped.values())
 
@@ -90,8 +90,8 @@ class Selection:
         keep, tally = np.ones(len(splats), np.bool_), SelectionTally()
         parts = blocks_of(len(splats), EXAMINED)
         examined = ordered_map(lambda part: self._examine(splats.take(part)), parts, threads)
-        for part, (kept, more) in zip(parts, examined, strict=True):
-            keep[part], tally = kept, tally.then(more)
+        for part, (selected, more) in zip(parts, examined, strict=True):
+            keep[part], tally = selected, tally.then(more)
         return keep, tally
 
     def _examine(self, splats: Splats) -> tuple[NDArray[np.bool_], SelectionTally]:
@@ -120,7 +120,7 @@ class Selection:
             counts = {kind: count for kind, count in tally.dropped.items() if kind in INVALID}
             text = describe_counts(counts, tally.count, tally.first_invalid)
             raise InvalidSplatsError(f"{text}, add --on-invalid drop to leave them out")
-        if not tally.kept:
+        if not tally.selected:
             raise InvalidSplatsError(f"no splat is left of {tally.count:,} ({describe(tally.dropped)})")
 
     def _inside(self, center: NDArray[np.float32]) -> NDArray[np.bool_]:

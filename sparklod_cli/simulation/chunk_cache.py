@@ -102,7 +102,7 @@ class ChunkCache:
         chunks: the chunks of all trees. Chunks with roots are always wanted, and come first.
 
     Attributes:
-        wanted: the wanted chunks, each once, the most important first.
+        requested: the wanted chunks, each once, the most important first.
         admitted: the first of them, as many as fit; they are never evicted.
 
     Raises:
@@ -118,7 +118,7 @@ class ChunkCache:
         self._roots = frozenset(chunks.roots)
         # In order of eviction: unwanted chunks by last use, then wanted ones, the least important first.
         self._resident: OrderedDict[int, None] = OrderedDict()
-        self.wanted: list[int] = []
+        self.requested: list[int] = []
         self.admitted: list[int] = []
         self._is_admitted: frozenset[int] = frozenset()
 
@@ -138,23 +138,23 @@ class ChunkCache:
         """Return the admitted chunks that are not resident, the most important first."""
         return [chunk for chunk in self.admitted if chunk not in self._resident]
 
-    def want(self, wanted: Iterable[int]) -> None:
+    def want(self, requested: Iterable[int]) -> None:
         """Replace the list of wanted chunks.
 
         Args:
-            wanted: chunks, the most important first. The roots of all trees come before them, in this order,
+            requested: chunks, the most important first. The roots of all trees come before them, in this order,
                 too, whether listed or not.
 
         Raises:
             ValueError: there is no such chunk.
         """
-        named = [int(chunk) for chunk in wanted]
+        named = [int(chunk) for chunk in requested]
         if named and not 0 <= min(named) <= max(named) < len(self._chunks):
             raise ValueError(f"chunks {min(named)} to {max(named)} are wanted, but there are {len(self._chunks)}")
         self._arrange()  # chunks wanted until now count as used until now
         roots = [chunk for chunk in named if chunk in self._roots]
-        self.wanted = list(dict.fromkeys([*roots, *self._chunks.roots, *named]))
-        self.admitted = self.wanted[: self._capacity]
+        self.requested = list(dict.fromkeys([*roots, *self._chunks.roots, *named]))
+        self.admitted = self.requested[: self._capacity]
         self._is_admitted = frozenset(self.admitted)
         self._arrange()
 
@@ -183,6 +183,6 @@ class ChunkCache:
 
     def _arrange(self) -> None:
         """Put the resident chunks in order of eviction."""
-        for chunk in reversed(self.wanted):
+        for chunk in reversed(self.requested):
             if chunk in self._resident:
                 self._resident.move_to_end(chunk)

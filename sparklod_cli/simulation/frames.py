@@ -101,23 +101,23 @@ class Simulation(Viewer):
         self, camera: Camera, ideal: _MeasuredCut, stream: ChunkStream
     ) -> tuple[_MeasuredCut, NDArray[np.bool_], Row]:
         """Return the cut with the resident chunks, these chunks, and the cells of the row that describe chunks."""
-        wanted = ideal.cut.chunks()
+        requested = ideal.cut.chunks()
         instant = self._streaming.network.instant
         if instant:
-            stream.want(wanted)
+            stream.want(requested)
         drawn, resident = ideal, stream.cache.resident()
         # What is drawn of detail levels depends on what was drawn before, as long as files are missing.
-        if not all(chunk in stream.cache for chunk in wanted) or (self.scenes.details and not instant):
+        if not all(chunk in stream.cache for chunk in requested) or (self.scenes.details and not instant):
             drawn = self._find(camera, resident)
         if not instant:
             stream.want(drawn.cut.chunks())  # a viewer discovers chunks through those that it has
         arrived = stream.take_arrivals()
         cells: Row = {
-            "chunks_touched": len(stream.cache.wanted),
+            "chunks_touched": len(stream.cache.requested),
             "chunks_new": len(arrived),
             "bytes_new": stream.take_bytes(),
             "chunks_resident": len(stream.cache),
-            "complete_in_s": None if instant else stream.complete_in(wanted),
+            "complete_in_s": None if instant else stream.complete_in(requested),
         }
         return drawn, resident, cells
 
@@ -136,9 +136,9 @@ class Simulation(Viewer):
             "budget": settings.budget,
             "pixel_scale_limit": settings.limit(camera.fov_y, camera.height),
         }
-        selected, kept, before = (None if None in column else sum(column) for column in zip(*changes, strict=True))
+        selected, retained, before = (None if None in column else sum(column) for column in zip(*changes, strict=True))
         assert selected is not None and before is not None
-        total = where | {"instance": TOTAL} | _shape(drawn.whole, settings.budget) | _change(selected, kept, before)
+        total = where | {"instance": TOTAL} | _shape(drawn.whole, settings.budget) | _change(selected, retained, before)
         total |= {
             "stop_reason": cut.reason,
             "pixel_scale_min": cut.least,
@@ -161,10 +161,10 @@ def _shape(measured: CutStatistics, budget: int) -> Row:
     return shares | vars(measured)
 
 
-def _change(selected: int, kept: int | None, before: int) -> Row:
-    if kept is None:
+def _change(selected: int, retained: int | None, before: int) -> Row:
+    if retained is None:
         return {"added": selected, "removed": 0, "churn": None}
-    added, removed = selected - kept, before - kept
+    added, removed = selected - retained, before - retained
     churn = (added + removed) / (selected + before) if selected + before else 0.0
     return {"added": added, "removed": removed, "churn": churn}
 

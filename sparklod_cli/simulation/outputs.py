@@ -84,13 +84,14 @@ class _ChartData:
 
     def add(self, frame: SimulatedFrame) -> None:
         """Store a frame if it exceeds all earlier frames in one of the criteria."""
-        for what in self.lookout.add(frame.rows[0]):
-            self.frames[what] = frame
+        for criterion in self.lookout.add(frame.rows[0]):
+            self.frames[criterion] = frame
         self.frames.setdefault("first", frame)
 
     def best(self) -> SimulatedFrame:
         """Return the first extreme frame that draws anything, as none does before the first chunk has arrived."""
-        extremes = [self.frames[what] for what in (*(moment.what for moment in self.lookout.moments()), "first")]
+        criteria = [moment.criterion for moment in self.lookout.moments()]
+        extremes = [self.frames[criterion] for criterion in (*criteria, "first")]
         return next((each for each in extremes if len(each.cut)), extremes[0])
 
 
@@ -159,7 +160,7 @@ def _plot(simulation: Simulation, path: CameraPath, target: Path, data: _ChartDa
         path.numbers.index(frame.number),
         "detail level" if simulation.scenes.details else "tree depth",
     )
-    marked = {moment.what: moment.frame for moment in data.lookout.moments()}
+    marked = {moment.criterion: moment.frame for moment in data.lookout.moments()}
     drawn = traversal_chart.plot(data.rows, marked, simulation.scenes.title, scene)
     write_whole(target, [drawn.png], overwrite=overwrite)
     return drawn.note

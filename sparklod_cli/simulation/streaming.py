@@ -71,9 +71,9 @@ class ChunkStream:
             pass
         self.now = to_time
 
-    def want(self, wanted: Iterable[int]) -> None:
+    def want(self, requested: Iterable[int]) -> None:
         """Replace the list of wanted chunks, the most important first, and raise `ValueError`, as `ChunkCache.want`."""
-        self.cache.want(wanted)
+        self.cache.want(requested)
         self._next = 0
         self._request(self.now)
         self.advance(self.now)  # with an instant network everything arrives now
@@ -94,15 +94,15 @@ class ChunkStream:
         self.now = self._since if going else self.now
         return going
 
-    def complete_in(self, wanted: Iterable[int]) -> float | None:
+    def complete_in(self, requested: Iterable[int]) -> float | None:
         """Seconds until all these chunks are resident if no others are requested.
 
         Returns:
             0 if they are resident; None if they do not fit into the cache.
         """
         future = self._copy()
-        future.want(wanted)
-        if len(future.cache.admitted) < len(future.cache.wanted):
+        future.want(requested)
+        if len(future.cache.admitted) < len(future.cache.requested):
             return None
         missing = set(future.cache.missing())
         if not missing:

@@ -50,7 +50,7 @@ class Moment:
     """The frame with the largest value of one of the criteria `MOMENTS`.
 
     Attributes:
-        what: name of the criterion.
+        criterion: name of the criterion.
         frame: its number.
         time_s: seconds on the path.
         name: name of the frame; None if it has none.
@@ -58,7 +58,7 @@ class Moment:
         unit: unit of the value; "limit" is a multiple of the pixel scale limit.
     """
 
-    what: str
+    criterion: str
     frame: int
     time_s: float | None
     name: str | None
@@ -95,7 +95,7 @@ class Summary:
     def as_dict(self) -> dict[str, Any]:
         """As plain lists, dicts and numbers, for JSON; quantities and moments by their names."""
         plain = asdict(self)
-        for group, name in (("quantities", "name"), ("moments", "what")):
+        for group, name in (("quantities", "name"), ("moments", "criterion")):
             plain[group] = {each.pop(name): each for each in plain[group]}
         return plain
 
@@ -177,21 +177,21 @@ class Lookout:
     def add(self, row: Row) -> list[str]:
         """Add the row of the next frame; returns the criteria in which it exceeds all earlier frames."""
         found = []
-        for what, (measure, above, _) in MOMENTS.items():
-            value = None if what == "bytes" and not self._frames else measure(row)
-            if value is not None and value > (self._most[what][0] if what in self._most else above):
-                self._most[what] = value, row
-                found.append(what)
+        for criterion, (measure, above, _) in MOMENTS.items():
+            value = None if criterion == "bytes" and not self._frames else measure(row)
+            if value is not None and value > (self._most[criterion][0] if criterion in self._most else above):
+                self._most[criterion] = value, row
+                found.append(criterion)
         self._frames += 1
         return found
 
     def moments(self) -> list[Moment]:
         """Return the extreme frames so far, in the order of `MOMENTS`."""
         moments = []
-        for what, (_, _, unit) in MOMENTS.items():
-            if what in self._most:
-                value, row = self._most[what]
+        for criterion, (_, _, unit) in MOMENTS.items():
+            if criterion in self._most:
+                value, row = self._most[criterion]
                 frame, name = cast("int", row["frame"]), cast("str | None", row["name"])
                 time = cast("float | None", row["time_s"])
-                moments.append(Moment(what, frame, time, name or None, _rounded(value), unit))
+                moments.append(Moment(criterion, frame, time, name or None, _rounded(value), unit))
         return moments

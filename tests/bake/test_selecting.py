@@ -22,19 +22,19 @@ def test_splats_that_can_be_drawn_are_kept_as_they_are(name: str) -> None:
 def test_a_splat_without_extent_is_dropped_and_counted() -> None:
     splats = random_splats(9)
     splats.scale[4] = 0
-    kept, tally = select(splats, BakeSettings())
-    assert len(kept) == tally.kept == 8
+    selected, tally = select(splats, BakeSettings())
+    assert len(selected) == tally.selected == 8
     assert tally.dropped == {"zero_scale": 1}
 
 
 def test_blocks_have_the_tally_of_the_whole() -> None:
     splats = random_splats(50)
     settings = BakeSettings(selection=Selection(min_opacity=float(np.median(splats.opacity))))
-    kept, tally = select(splats, settings)
-    assert sum(tally.dropped.values()) == 50 - len(kept) > 0
+    selected, tally = select(splats, settings)
+    assert sum(tally.dropped.values()) == 50 - len(selected) > 0
     parts = [select(splats.take(slice(start, start + 20)), settings) for start in (0, 20, 40)]
     assert parts[0][1].then(parts[1][1]).then(parts[2][1]) == tally
-    assert np.array_equal(np.concatenate([part.center for part, _ in parts]), kept.center)
+    assert np.array_equal(np.concatenate([part.center for part, _ in parts]), selected.center)
 
 
 def test_no_splats_are_an_error() -> None:

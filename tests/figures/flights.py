@@ -45,7 +45,7 @@ def marked(rows: list[Row]) -> dict[str, int]:
     lookout = Lookout()
     for row in totals(rows):
         lookout.add(row)
-    return {moment.what: moment.frame for moment in lookout.moments()}
+    return {moment.criterion: moment.frame for moment in lookout.moments()}
 
 
 def plotted(rows: list[Row], title: str = "scene.spz", path_scene: PathScene | None = None) -> Plot:

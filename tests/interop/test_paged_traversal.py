@@ -83,20 +83,20 @@ class Paged:
         self.page_of = np.full(self.forest.chunks, -1)
         self._free = list(range(self.pages))
 
-    def keep(self, wanted: np.ndarray, rng: np.random.Generator) -> None:
+    def keep(self, demand: np.ndarray, rng: np.random.Generator) -> None:
         """Makes exactly these chunks resident, in pages at random."""
         updates = []
-        for chunk in np.flatnonzero(self.resident & ~wanted).tolist():
+        for chunk in np.flatnonzero(self.resident & ~demand).tolist():
             page = int(self.page_of[chunk])
             updates.append(PageUpdate(*self._tree_and_number(chunk), page, None))
             self._free.append(page)
             self.page_of[chunk] = -1
-        for chunk in rng.permutation(np.flatnonzero(wanted & ~self.resident)).tolist():
+        for chunk in rng.permutation(np.flatnonzero(demand & ~self.resident)).tolist():
             page = self._free.pop(int(rng.integers(len(self._free))))
             updates.append(PageUpdate(*self._tree_and_number(chunk), page, self._words(chunk)))
             self.page_of[chunk] = page
         self.spark.update_pages(updates)
-        self.resident = wanted.copy()
+        self.resident = demand.copy()
 
     def _place(self, chunk: int) -> tuple[int, int]:
         """The tree of a chunk, and the number of the chunk in that tree."""
@@ -128,7 +128,7 @@ class Paged:
         assert set(touched) == roots | set(cut.chunks())
         # Of chunks with the same limit, ours come by number, Spark's as its queue finds them.
         beyond = [chunk for chunk in touched if chunk not in roots]
-        limits = cut.wanted[beyond]
+        limits = cut.demand[beyond]
         assert (limits[1:] <= limits[:-1]).all()
         return cut
 
@@ -177,9 +177,9 @@ def test_the_cut_of_random_trees_with_missing_chunks_is_that_of_spark(spark: Spa
     paged = Paged(spark, [tree], pages=11)
     reasons = set()
     for number, camera in enumerate(cameras(live(tree), 20, seed)):
-        wanted = some_chunks(rng, paged.forest)
-        wanted[0] = True
-        paged.keep(wanted, rng)
+        demand = some_chunks(rng, paged.forest)
+        demand[0] = True
+        paged.keep(demand, rng)
         instance = TreeInstance(0, np.eye(4), LOD_SCALES[number % 5], FOVEATIONS[number % len(FOVEATIONS)])
         for budget in (50, 200, 500, 1_000, 3_000):
             for smallest in (0.0, 0.01):
@@ -194,14 +194,14 @@ def test_a_budget_ends_the_cut_at_a_node_whose_children_are_missing(spark: Spark
     paged = Paged(spark, [tree], pages=6)
     ended = 0
     for camera in cameras(live(tree), 6, seed=9):
-        wanted = np.arange(6) != 1 + rng.integers(5)
-        paged.keep(wanted, rng)
+        demand = np.arange(6) != 1 + rng.integers(5)
+        paged.keep(demand, rng)
         for budget in range(2, 90):
             cut = paged.check([TreeInstance()], camera, budget, 0.0)
             if cut.stop is not None:
                 start = int(tree.nodes.tree.child_start[cut.stop[2]])
                 last = start + int(tree.nodes.tree.child_count[cut.stop[2]]) - 1
-                ended += not (wanted[start // CHUNK_NODES] and wanted[last // CHUNK_NODES])
+                ended += not (demand[start // CHUNK_NODES] and demand[last // CHUNK_NODES])
     assert ended > 20
 
 
@@ -229,9 +229,9 @@ def test_the_cut_of_a_baked_scene_with_missing_chunks_is_that_of_spark(spark: Sp
     rng = np.random.default_rng(1)
     reasons = set()
     for number, camera in enumerate(cameras(tree.nodes, 12, seed=1)):
-        wanted = some_chunks(rng, paged.forest)
-        wanted[0] = True
-        paged.keep(wanted, rng)
+        demand = some_chunks(rng, paged.forest)
+        demand[0] = True
+        paged.keep(demand, rng)
         instance = TreeInstance(0, foveation=FOVEATIONS[number % len(FOVEATIONS)])
         reasons |= {paged.check([instance], camera, budget, 0.0).reason for budget in (3_000, 30_000, 300_000)}
     assert reasons >= {"budget", "missing"}

@@ -95,7 +95,7 @@ class Both:
         touched = [int(base[self._ids.index(tree)]) + chunk for tree, chunk in theirs.chunks]
         assert set(touched) == roots | set(cut.chunks())
         beyond = [chunk for chunk in touched if chunk not in roots]
-        if len(set(cut.wanted[beyond])) == len(beyond):
+        if len(set(cut.demand[beyond])) == len(beyond):
             assert beyond == [chunk for chunk in cut.chunks() if chunk not in roots]
         if cut.stop:  # Spark returns the least pixel scale from the root to the node that did not fit
             _, instance, node = cut.stop

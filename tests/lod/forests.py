@@ -78,9 +78,9 @@ def check(case: Case, cut: TreeCut, resident: np.ndarray | None = None, bits: in
     np.testing.assert_array_equal(np.abs(cut.limit), np.array([expected.limit[node] for node in nodes]))
     waits = (cut.limit.view(np.int32) >= 0).tolist()
     assert {node for node, wait in zip(nodes, waits, strict=True) if wait} == expected.waiting
-    wanted = [expected.wanted[chunk] for chunk in range(len(cut.wanted))]
-    assert cut.wanted.tolist() == wanted
-    assert [wanted[chunk] for chunk in cut.chunks()] == sorted(filter(None, wanted), reverse=True)
+    demand = [expected.demand[chunk] for chunk in range(len(cut.demand))]
+    assert cut.demand.tolist() == demand
+    assert [demand[chunk] for chunk in cut.chunks()] == sorted(filter(None, demand), reverse=True)
     of_each = [sorted(node for number, node in nodes if number == each) for each in range(len(case.instances))]
     assert [indices.tolist() for indices in cut.indices()] == of_each
 

@@ -70,14 +70,14 @@ class TestSmallChunks:
         there[found.forest.chunk_base[[instance.tree for instance in case.instances]]] = True
         for _ in range(len(there) + 1):
             cut = case.find(found, there)
-            assert set(cut.chunks()) >= set(np.flatnonzero(cut.wanted > 0))
+            assert set(cut.chunks()) >= set(np.flatnonzero(cut.demand > 0))
             lacking = [chunk for chunk in cut.chunks() if not there[chunk]]
             assert (cut.missing > 0) == bool(lacking)
             if not lacking:
                 break
             there[lacking[0]] = True
         assert [nodes.tolist() for nodes in cut.indices()] == [nodes.tolist() for nodes in whole.indices()]
-        assert cut.wanted.tolist() == whole.wanted.tolist()
+        assert cut.demand.tolist() == whole.demand.tolist()
 
 
 @pytest.mark.parametrize("seed", range(3))

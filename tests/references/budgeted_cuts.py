@@ -64,7 +64,7 @@ class BudgetedCut:
     missing: int = 0
     least: float = math.inf
     stop: tuple | None = None
-    wanted: dict = field(
+    demand: dict = field(
         default_factory=lambda: defaultdict(float)
     )  # the largest limit of a node that wants the chunk, by chunk
 
@@ -114,7 +114,7 @@ def budgeted_cut(
             break
         heapq.heappop(heap)
         for chunk in chunks:
-            cut.wanted[chunk] = max(cut.wanted[chunk], number_of(limit))
+            cut.demand[chunk] = max(cut.demand[chunk], number_of(limit))
         if count and resident:
             cut.least = min(cut.least, number_of(limit))
             for child in range(start, start + count):

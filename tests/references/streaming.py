@@ -19,12 +19,12 @@ class NaiveCache:
 
     def __init__(self, capacity: int | None) -> None:
         self.capacity = math.inf if capacity is None else capacity
-        self.wanted: list[int] = []
+        self.requested: list[int] = []
         self.used: dict[int, tuple[int, float]] = {}
         self.clock = 0
 
-    def want(self, wanted: list[int]) -> None:
-        self.wanted = wanted
+    def want(self, requested: list[int]) -> None:
+        self.requested = requested
         self.use()
 
     def arrive(self, chunk: int) -> int | None:
@@ -38,15 +38,15 @@ class NaiveCache:
 
     def use(self) -> None:
         self.clock += 1
-        for place, chunk in enumerate(self.wanted):
+        for place, chunk in enumerate(self.requested):
             if chunk in self.used:
                 self.used[chunk] = (self.clock, -place)
 
 
-def roots_first(chunks: Chunks, wanted: list[int]) -> list[int]:
+def roots_first(chunks: Chunks, requested: list[int]) -> list[int]:
     """Returns a list of wanted chunks without repetitions, roots first."""
     result: list[int] = []
-    for chunk in [each for each in wanted if each in chunks.roots] + chunks.roots + wanted:
+    for chunk in [each for each in requested if each in chunks.roots] + chunks.roots + requested:
         if chunk not in result:
             result.append(chunk)
     return result
@@ -127,8 +127,8 @@ class Twin:
                 self.cache.arrive(fetch.chunk)
                 self.ask()
 
-    def want(self, wanted: list[int]) -> None:
-        self.cache.want(roots_first(self.chunks, wanted))
+    def want(self, requested: list[int]) -> None:
+        self.cache.want(roots_first(self.chunks, requested))
         self.ask()
 
     def opened(self, tree: int) -> None:
@@ -142,7 +142,7 @@ class Twin:
             self.fetch(chunk)
 
     def ask(self) -> None:
-        for place, chunk in enumerate(self.cache.wanted):
+        for place, chunk in enumerate(self.cache.requested):
             under_way = [fetch.chunk for fetch in self.fetches if fetch.chunk >= 0] + self.waiting
             is_free = place < self.cache.capacity and len(under_way) < self.network.fetchers
             if is_free and chunk not in self.cache.used and chunk not in under_way:

@@ -32,7 +32,7 @@ def test_the_least_recently_used_chunk_is_evicted(data: st.DataObject) -> None:
         absent = [chunk for chunk in range(len(chunks)) if chunk not in cache]
         if absent and data.draw(st.booleans()):
             chunk = data.draw(st.sampled_from(absent))
-            importance = {each: -place for place, each in enumerate(cache.wanted)}
+            importance = {each: -place for place, each in enumerate(cache.requested)}
             before = here(cache)
             evicted = cache.arrive(chunk)
             assert evicted == naive.arrive(chunk)
@@ -41,12 +41,12 @@ def test_the_least_recently_used_chunk_is_evicted(data: st.DataObject) -> None:
             if evicted in importance:  # all that are here are wanted, and it is the least important of them
                 assert importance[evicted] == min(importance[each] for each in before | {chunk})
         else:
-            wanted = data.draw(st.lists(numbers, max_size=10))
-            cache.want(wanted)
+            requested = data.draw(st.lists(numbers, max_size=10))
+            cache.want(requested)
             rooted = True
-            assert cache.wanted == roots_first(chunks, wanted)
-            assert cache.admitted == cache.wanted[:capacity]
-            naive.want(cache.wanted)
+            assert cache.requested == roots_first(chunks, requested)
+            assert cache.admitted == cache.requested[:capacity]
+            naive.want(cache.requested)
         assert here(cache) == set(naive.used)
         assert len(cache) <= naive.capacity
         assert cache.missing() == [chunk for chunk in cache.admitted if chunk not in naive.used]
@@ -74,20 +74,20 @@ def test_a_copy_of_a_cache_is_independent() -> None:
     twin.want([2])
     assert twin.arrive(2) == 1
     assert here(cache) == {0}
-    assert cache.wanted == [0, 1]
+    assert cache.requested == [0, 1]
 
 
 def test_wanted_may_be_an_array() -> None:
     cache = ChunkCache(Chunks([[1, 1, 1]]))
     cache.want(np.array([2, 1], np.uint32))
-    assert cache.wanted == [0, 2, 1]
-    assert all(type(chunk) is int for chunk in cache.wanted)
+    assert cache.requested == [0, 2, 1]
+    assert all(type(chunk) is int for chunk in cache.requested)
 
 
-@pytest.mark.parametrize("wanted", [[3], [-1], [0, 1, 7]])
-def test_a_chunk_that_no_tree_has_cannot_be_wanted(wanted: list[int]) -> None:
+@pytest.mark.parametrize("requested", [[3], [-1], [0, 1, 7]])
+def test_a_chunk_that_no_tree_has_cannot_be_wanted(requested: list[int]) -> None:
     with pytest.raises(ValueError, match="there are 3"):
-        ChunkCache(Chunks([[1, 1], [1]])).want(wanted)
+        ChunkCache(Chunks([[1, 1], [1]])).want(requested)
 
 
 def test_a_cache_smaller_than_the_roots_is_refused() -> None:

@@ -31,11 +31,11 @@ def here(stream: ChunkStream) -> set[int]:
     return set(np.flatnonzero(stream.cache.resident()).tolist())
 
 
-def rest(stream: ChunkStream, wanted: list[int]) -> list[tuple[float, int]]:
+def rest(stream: ChunkStream, requested: list[int]) -> list[tuple[float, int]]:
     """When everything arrives, the camera resting: by what `complete_in` says of one more chunk after the other."""
-    stream.want(wanted)
+    stream.want(requested)
     arrivals = []
-    for chunk in stream.cache.wanted:
+    for chunk in stream.cache.requested:
         twin = stream._copy()
         while chunk not in twin.cache and twin._step(math.inf):
             pass
@@ -54,9 +54,9 @@ def test_a_stream_does_what_its_twin_does(
     stream, twin = ChunkStream(chunks, network, capacity=capacity), Twin(chunks, network, NaiveCache(capacity))
     seen: list[int] = []
     for _ in range(data.draw(st.integers(1, 8))):
-        wanted = data.draw(st.lists(st.integers(0, len(chunks) - 1), max_size=12))
-        stream.want(wanted)
-        twin.want(wanted)
+        requested = data.draw(st.lists(st.integers(0, len(chunks) - 1), max_size=12))
+        stream.want(requested)
+        twin.want(requested)
         time = stream.now + data.draw(st.integers(1, 3000)) / 1009
         twin.advance(Fraction(time))
         assume(not twin.tied)
@@ -66,12 +66,12 @@ def test_a_stream_does_what_its_twin_does(
         assert stream.received == twin.received
         assert here(stream) == set(twin.cache.used)
         assert capacity is None or len(stream.cache) <= capacity
-    complete_in = stream.complete_in(wanted)
-    if capacity is not None and len(twin.cache.wanted) > capacity:
+    complete_in = stream.complete_in(requested)
+    if capacity is not None and len(twin.cache.requested) > capacity:
         assert complete_in is None
     else:
         assert complete_in is not None
-        missing = set(twin.cache.wanted) - set(twin.cache.used)
+        missing = set(twin.cache.requested) - set(twin.cache.used)
         known = len(twin.arrivals)
         twin.advance(twin.now + 1000)
         last = max((time for time, chunk in twin.arrivals[known:] if chunk in missing), default=Fraction(stream.now))
@@ -109,9 +109,9 @@ def test_the_number_of_time_steps_does_not_matter(
     chunks = Chunks(sizes)
     one, many = (ChunkStream(chunks, network, capacity=len(sizes) + 2) for _ in range(2))
     for _ in range(3):
-        wanted = data.draw(st.lists(st.integers(0, len(chunks) - 1), max_size=12))
-        one.want(wanted)
-        many.want(wanted)
+        requested = data.draw(st.lists(st.integers(0, len(chunks) - 1), max_size=12))
+        one.want(requested)
+        many.want(requested)
         start, stop = one.now, one.now + data.draw(st.floats(0.001, 3))
         for time in sorted(data.draw(st.lists(st.floats(start, stop), max_size=20))):
             many.advance(time)
@@ -120,22 +120,22 @@ def test_the_number_of_time_steps_does_not_matter(
         one.advance(stop)
         assert many.take_arrivals() == one.take_arrivals()
         assert here(many) == here(one)
-        assert many.complete_in(wanted) == one.complete_in(wanted)  # to the last bit
+        assert many.complete_in(requested) == one.complete_in(requested)  # to the last bit
 
 
 @given(tree_sizes, networks)
 def test_the_predicted_completion_is_when_all_is_there(sizes: list[list[int]], network: Network) -> None:
     chunks = Chunks(sizes)
     stream = ChunkStream(chunks, network, start=5.0)
-    wanted = list(range(len(chunks)))
-    stream.want(wanted)
-    left = stream.complete_in(wanted)
+    requested = list(range(len(chunks)))
+    stream.want(requested)
+    left = stream.complete_in(requested)
     assert left is not None and left > 0
     stream.advance(5 + left * (1 - 1e-9))
     assert stream.cache.missing()
     stream.advance(5 + left * (1 + 1e-9))
     assert not stream.cache.missing()
-    assert stream.complete_in(wanted) == 0
+    assert stream.complete_in(requested) == 0
 
 
 @given(tree_sizes, networks, st.floats(1, 10))
@@ -145,15 +145,15 @@ def test_with_more_bandwidth_a_resting_camera_waits_no_longer(
     """One fetcher, or one for each chunk, or no latency, or chunks of one size."""
     chunks = Chunks(sizes)
     even = Chunks([[sizes[0][0]] * len(tree) for tree in sizes])
-    wanted = list(range(len(chunks)))
+    requested = list(range(len(chunks)))
     for case, latency, fetchers in (
         (chunks, network.latency, 1),
         (chunks, network.latency, len(chunks)),
         (chunks, 0.0, network.fetchers),
         (even, network.latency, network.fetchers),
     ):
-        slow = ChunkStream(case, Network(network.bandwidth, latency, fetchers)).complete_in(wanted)
-        fast = ChunkStream(case, Network(network.bandwidth * factor, latency, fetchers)).complete_in(wanted)
+        slow = ChunkStream(case, Network(network.bandwidth, latency, fetchers)).complete_in(requested)
+        fast = ChunkStream(case, Network(network.bandwidth * factor, latency, fetchers)).complete_in(requested)
         assert slow is not None and fast is not None
         assert fast <= slow * (1 + 1e-9)
 
@@ -176,11 +176,11 @@ def test_one_fetcher_brings_them_in_order_one_after_the_other(
 ) -> None:
     chunks = Chunks(sizes)
     stream = ChunkStream(chunks, Network(network.bandwidth, network.latency, 1))
-    wanted = data.draw(st.permutations(range(len(chunks))))
-    stream.want(wanted)
-    order = roots_first(chunks, wanted)
+    requested = data.draw(st.permutations(range(len(chunks))))
+    stream.want(requested)
+    order = roots_first(chunks, requested)
     time = np.cumsum([network.latency + chunks.sizes[chunk] / network.bandwidth for chunk in order])
-    assert stream.complete_in(wanted) == pytest.approx(time[-1])
+    assert stream.complete_in(requested) == pytest.approx(time[-1])
     stream.advance(time[-1] * 1.001)
     assert stream.take_arrivals() == order
 
@@ -268,17 +268,17 @@ def test_the_default_network_brings_at_once_what_fits(data: st.DataObject, sizes
         stream.advance(time)
         assert stream.take_arrivals() == []
         before = here(stream)
-        wanted = data.draw(st.lists(st.integers(0, len(chunks) - 1), max_size=12))
-        stream.want(wanted)
-        admitted = roots_first(chunks, wanted)[:capacity]
+        requested = data.draw(st.lists(st.integers(0, len(chunks) - 1), max_size=12))
+        stream.want(requested)
+        admitted = roots_first(chunks, requested)[:capacity]
         assert set(stream.take_arrivals()) == set(admitted) - before
         assert set(admitted) <= here(stream) <= set(admitted) | before
         if capacity is not None:
             assert len(stream.cache) == min(capacity, len(before | set(admitted)))
-        stream.want(wanted)  # nothing goes in and out within a frame
+        stream.want(requested)  # nothing goes in and out within a frame
         assert stream.take_arrivals() == []
-        fits = capacity is None or len(roots_first(chunks, wanted)) <= capacity
-        assert stream.complete_in(wanted) == (0.0 if fits else None)
+        fits = capacity is None or len(roots_first(chunks, requested)) <= capacity
+        assert stream.complete_in(requested) == (0.0 if fits else None)
 
 
 def test_a_stream_refuses_to_go_back_in_time() -> None:

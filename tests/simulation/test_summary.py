@@ -44,10 +44,10 @@ def test_totals_are_sums_over_all_frames() -> None:
 
 def test_the_worst_frames_are_named() -> None:
     rows = flight()
-    moments = {moment.what: moment for moment in summarize(rows).moments}
+    moments = {moment.criterion: moment for moment in summarize(rows).moments}
     assert set(moments) == set(MOMENTS)
-    for what, column in (("churn", "churn"), ("missing", "missing"), ("overdraw", "overdraw_estimate")):
-        moment = moments[what]
+    for criterion, column in (("churn", "churn"), ("missing", "missing"), ("overdraw", "overdraw_estimate")):
+        moment = moments[criterion]
         assert moment.value == max(row[column] for row in rows if row[column] is not None)  # type: ignore[type-var]
         assert rows[moment.frame][column] == moment.value
         assert rows[moment.frame]["time_s"] == moment.time_s

@@ -75,7 +75,7 @@ class InBlocks:
             format=stream.format,
             notes=stream.notes,
             read=stream.count,
-            splats=findings.tally.kept,
+            splats=findings.tally.selected,
             dropped=findings.tally.dropped,
             method=settings.method,
             blocks=job.blocks.count,
@@ -125,10 +125,10 @@ class InBlocks:
             parts = [Findings.from_arrays(each) for each in arrays]
             findings = Findings.merged(parts)
             check_findings(findings, job.settings)
-            selected = tuple(itertools.accumulate((part.tally.kept for part in parts), initial=0))
+            selected = tuple(itertools.accumulate((part.tally.selected for part in parts), initial=0))
             self.job = job = dataclasses.replace(job, selected=selected)
             largest = int(np.sum([np.diff(each["first"]) for each in arrays], axis=0).max())
-            again = cut_into_blocks(findings.sample[:, :3], findings.tally.kept, block_splats)
+            again = cut_into_blocks(findings.sample[:, :3], findings.tally.selected, block_splats)
             if largest <= SLACK * block_splats or job.round + 1 == ROUNDS or again == job.blocks:
                 return findings
             for part, group in itertools.product(range(len(parts)), range(len(job.blocks.groups))):

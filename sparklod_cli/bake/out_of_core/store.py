@@ -324,7 +324,7 @@ class Store:
                 ) from None
 
     @contextlib.contextmanager
-    def _translated(self, what: str) -> Iterator[None]:
+    def _translated(self, action: str) -> Iterator[None]:
         """Turn errors of the system into `ScratchError`."""
         try:
             yield
@@ -336,7 +336,7 @@ class Store:
                     " with --resume, or choose another disk with --scratch-dir"
                 ) from None
             raise ScratchError(
-                f"cannot {what} in the scratch folder {self.folder}: {reason}; choose another one with --scratch-dir"
+                f"cannot {action} in the scratch folder {self.folder}: {reason}; choose another one with --scratch-dir"
             ) from None
 
 

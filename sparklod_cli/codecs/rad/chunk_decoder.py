@@ -86,20 +86,20 @@ class PackedChunk:
         """Return the bytes of a property; raises `FormatError` as `values`."""
         expected = count * row.numbers * SIZES[each.encoding]
         data = self.payload[each.offset : each.offset + each.bytes]
-        what = f"{each.name} of chunk {self.number:,}"
+        subject = f"{each.name} of chunk {self.number:,}"
         if each.compression is not None:
             unpacker = raw_unpacker()
             try:
                 data = unpacker.decompress(data, expected + 1)  # a byte more, which tells what is too long
             except ERRORS:
-                raise FormatError(f"corrupt data in {what}") from None
+                raise FormatError(f"corrupt data in {subject}") from None
             if len(data) == expected and not unpacker.eof:
-                raise TruncatedError(f"{what} is cut short: its compressed data do not end")
+                raise TruncatedError(f"{subject} is cut short: its compressed data do not end")
         if len(data) > expected:
-            raise TooLongError(f"{what} has more than the {expected:,} bytes of {count:,} splats in {each.encoding}")
+            raise TooLongError(f"{subject} has more than the {expected:,} bytes of {count:,} splats in {each.encoding}")
         if len(data) < expected:
             raise TruncatedError(
-                f"{what} has {len(data):,} bytes; {count:,} splats in {each.encoding} take {expected:,}"
+                f"{subject} has {len(data):,} bytes; {count:,} splats in {each.encoding} take {expected:,}"
             )
         return np.frombuffer(data, np.uint8)
 

@@ -119,10 +119,10 @@ class StoredRad:
                 ranges = dataclasses.replace(ranges, **ends)
         return ranges
 
-    def keeping(self, encoder: RadEncoder, kept: NDArray[np.bool_]) -> KeepingEncoder:
+    def keeping(self, encoder: RadEncoder, unchanged: NDArray[np.bool_]) -> KeepingEncoder:
         """Return an encoder of as many nodes that gives some the codes of the file, where its encoding is the same."""
         given = {each.name: getattr(encoder, each.name) for each in dataclasses.fields(RadEncoder)}
-        return KeepingEncoder(**given, stored=self, kept=kept)
+        return KeepingEncoder(**given, stored=self, unchanged=unchanged)
 
     def codes(self, name: str, start: int, stop: int) -> tuple[Property, Bytes] | None:
         """Return a property of some nodes and (n, ...) their codes; None where its coding differs between chunks."""
@@ -157,10 +157,10 @@ def stored(file: BinaryIO, *, open_companion: OpenCompanion | None = None) -> St
 
 @dataclass(frozen=True, eq=False)
 class KeepingEncoder(RadEncoder):
-    """Encoder that gives the (N,) `kept` nodes their `stored` codes."""
+    """Encoder that gives the (N,) `unchanged` nodes their `stored` codes."""
 
     stored: StoredRad | None = None
-    kept: NDArray[np.bool_] = dataclasses.field(default_factory=lambda: np.zeros(0, bool))
+    unchanged: NDArray[np.bool_] = dataclasses.field(default_factory=lambda: np.zeros(0, bool))
 
     def coded(
         self, row: Row, splats: Splats, tree: LodTree | None, labels: NDArray[np.uint32] | None, start: int
@@ -173,8 +173,8 @@ class KeepingEncoder(RadEncoder):
         each, before = found
         low, high = (0.0 if end is None else end for end in (each.min, each.max))
         codes = CODINGS[made.encoding].encode(self.values(row, made.encoding, splats, tree, labels), low, high)
-        flat, kept = _flat(codes, made.encoding, len(splats)), self.kept[start:stop]
-        _by_splat(flat, row, made.encoding)[kept] = before[kept]
+        flat, unchanged = _flat(codes, made.encoding, len(splats)), self.unchanged[start:stop]
+        _by_splat(flat, row, made.encoding)[unchanged] = before[unchanged]
         return CodedProperty(made.encoding, _stored(flat, made.encoding, len(splats)), each.min, each.max)
 
 

@@ -175,18 +175,18 @@ class JsonFields:
 
     Attributes:
         values: the object.
-        what: it is, for errors.
+        subject: what the object describes, for errors.
 
     Raises:
         FormatError: here it is something else than an object; in every method, a value is not of the kind.
     """
 
     values: Any
-    what: str
+    subject: str
 
     def __post_init__(self) -> None:
         if not isinstance(self.values, dict):
-            raise FormatError(f"its {self.what} is not a JSON object")
+            raise FormatError(f"its {self.subject} is not a JSON object")
 
     def has(self, key: str) -> bool:
         """Return True if there is such a key, with a value other than null."""
@@ -214,12 +214,12 @@ class JsonFields:
 
     def inner(self, key: str) -> JsonFields:
         """Return an object."""
-        return JsonFields(self.values.get(key), f"{self.what}'s {key}")
+        return JsonFields(self.values.get(key), f"{self.subject}'s {key}")
 
     def items(self, key: str) -> Iterator[JsonFields]:
         """Return the objects of a list."""
         values = self._get(key, "a list", lambda value: isinstance(value, list))
-        return (JsonFields(value, f"{self.what}'s {key}[{number}]") for number, value in enumerate(values))
+        return (JsonFields(value, f"{self.subject}'s {key}[{number}]") for number, value in enumerate(values))
 
     def _get(self, key: str, kind: str, is_valid: Callable[[Any], bool], default: Any = None) -> Any:
         """Return a valid value, or the default, if there is one, without the key."""
@@ -229,8 +229,8 @@ class JsonFields:
         if is_valid(value):
             return value
         if key not in self.values:
-            raise FormatError(f"its {self.what} has no {key}")
-        raise FormatError(f"its {self.what} has {key} = {quoted_value(value)}, which is not {kind}")
+            raise FormatError(f"its {self.subject} has no {key}")
+        raise FormatError(f"its {self.subject} has {key} = {quoted_value(value)}, which is not {kind}")
 
 
 def _is_whole(value: Any) -> bool:
@@ -366,27 +366,27 @@ def _encoding_fields(encoding: SplatEncoding | None) -> dict[str, float | bool] 
     return None if encoding is None else {key: getattr(encoding, name) for key, name in ENCODING_KEYS.items()}
 
 
-def _read_json(file: BinaryIO, magic: bytes, limit: int, what: str) -> tuple[JsonFields, int, bool]:
+def _read_json(file: BinaryIO, magic: bytes, limit: int, subject: str) -> tuple[JsonFields, int, bool]:
     """Read the JSON after a magic word, how many bytes it takes with its padding, and whether that is zeros."""
     prefix = file.read(PREFIX.size)
     if len(prefix) < PREFIX.size:
-        raise TruncatedError(f"cut short inside the {what}")
+        raise TruncatedError(f"cut short inside the {subject}")
     found, length = PREFIX.unpack(prefix)
     if found == CHUNK_MAGIC != magic:
         raise NotSplatsError("it is one chunk of a RAD file; give the .rad file beside it, which names all chunks")
     if found != magic:
-        raise NotSplatsError(f"no {what}: it begins with {quoted_value(found)}, not {quoted_value(magic)}")
+        raise NotSplatsError(f"no {subject}: it begins with {quoted_value(found)}, not {quoted_value(magic)}")
     if length > limit:
-        raise PromiseError(f"its {what} announces {length:,} bytes of JSON; at most {limit:,} are read")
+        raise PromiseError(f"its {subject} announces {length:,} bytes of JSON; at most {limit:,} are read")
     data = file.read(length)
     pad = file.read(padding(length))
     if len(data) < length or len(pad) < padding(length):
-        raise TruncatedError(f"cut short inside the {what}")
+        raise TruncatedError(f"cut short inside the {subject}")
     try:
         value = parse_json(data)
     except ValueError as error:
-        raise FormatError(f"its {what} is not JSON: {error}") from None
-    fields = JsonFields(value, what)
+        raise FormatError(f"its {subject} is not JSON: {error}") from None
+    fields = JsonFields(value, subject)
     if fields.whole("version") != VERSION:
         raise VersionError(f"RAD version {fields.whole('version')} is unknown, only {VERSION} is read")
     return fields, PREFIX.size + length + len(pad), not any(pad)

@@ -81,28 +81,28 @@ def settled(scene: Scene | Statistics, options: WriteOptions) -> WriteOptions:
         FormatError: there are more splats than the format can number, or centres as float16 do not reach far enough.
     """
     rad = options.rad
-    found = scene if isinstance(scene, Statistics) else Statistics.of_scene(scene, needed(options))
-    if found.count >= 1 << 32:
-        raise FormatError(f"{found.count:,} splats; RAD numbers at most {(1 << 32) - 1:,}")
-    if rad.center in HALF and np.float16(min(found.reach or 0, LARGEST_F16)) >= LARGEST_F16:
+    statistics = scene if isinstance(scene, Statistics) else Statistics.of_scene(scene, needed(options))
+    if statistics.count >= 1 << 32:
+        raise FormatError(f"{statistics.count:,} splats; RAD numbers at most {(1 << 32) - 1:,}")
+    if rad.center in HALF and np.float16(min(statistics.reach or 0, LARGEST_F16)) >= LARGEST_F16:
         raise FormatError(
-            f"coordinates reach {found.reach:.6g}, and {rad.center} holds less than {LARGEST_F16:.0f};"
+            f"coordinates reach {statistics.reach:.6g}, and {rad.center} holds less than {LARGEST_F16:.0f};"
             " choose another encoding of centres, such as f32"
         )
-    ranges = rad.ranges or fitted(found)
+    ranges = rad.ranges or fitted(statistics)
     encodings = {name: getattr(rad, name) for name in OPTIONS}
     chosen = {name: getattr(AUTOMATIC, name) if value == AUTO else value for name, value in encodings.items()}
     if rad.scales == AUTO and ranges.ln_scale_max - ranges.ln_scale_min > WIDE_LOG_RANGE:
         chosen["scales"] = "ln_f16"
     if rad.rgb == AUTO and ranges.rgb_max - ranges.rgb_min > WIDE_RGB_RANGE:
         chosen["rgb"] = "f16"
-    if rad.orientation == AUTO and found.leaf_length is not None and found.leaf_length.quantile(0.5) >= LONG:
+    if rad.orientation == AUTO and statistics.leaf_length is not None and statistics.leaf_length.quantile(0.5) >= LONG:
         chosen["orientation"] = "f16"
     bits = rad.center_bits
     if _rounds(rad):
         # The lowest bytes of rounded float32 are mostly zeros, which take no room.
-        assert found.leaf_scale is not None
-        bits = min(fine_bits(found.leaf_scale), EXACT_BITS)
+        assert statistics.leaf_scale is not None
+        bits = min(fine_bits(statistics.leaf_scale), EXACT_BITS)
     return dataclasses.replace(options, rad=dataclasses.replace(rad, **chosen, center_bits=bits, ranges=ranges))
 
 
@@ -121,7 +121,7 @@ def code_range(row: Row, ranges: SplatEncoding) -> tuple[float, float]:
 
 def held(options: WriteOptions, sh_degree: int) -> list[CodeRange]:
     """Return the values that a file of this SH degree holds with these settled options without clamping them."""
-    rad, found, most = options.rad, [], float(LARGEST_F16)
+    rad, ranges, most = options.rad, [], float(LARGEST_F16)
     for row in PROPERTIES:
         encoding = getattr(rad, row.option) if row.option else ""
         if row.codes or row.degree > sh_degree or row.column == "opacity" or rad.ranges is None:
@@ -131,23 +131,23 @@ def held(options: WriteOptions, sh_degree: int) -> list[CodeRange]:
         if encoding == "ln_0r8":
             half = (high - low) / 508
             ends = math.exp(low - half), math.exp(min(high + half, 88.0))
-            found.append(CodeRange(row.column, *ends, zero=float(SCALE_ZERO)))
+            ranges.append(CodeRange(row.column, *ends, zero=float(SCALE_ZERO)))
         elif encoding in RANGES:
             half = (high - low) / (508 if encoding.startswith("s8") else 510)
-            found.append(CodeRange(row.column, low - half, high + half, numbers, degree=row.degree))
+            ranges.append(CodeRange(row.column, low - half, high + half, numbers, degree=row.degree))
         elif encoding in ("f16", "f16_lebytes"):
-            found.append(CodeRange(row.column, -most, most, numbers, degree=row.degree))
-    return found
+            ranges.append(CodeRange(row.column, -most, most, numbers, degree=row.degree))
+    return ranges
 
 
-def fitted(found: Statistics) -> SplatEncoding:
+def fitted(statistics: Statistics) -> SplatEncoding:
     """Return the ranges that suit splats in any order: what clamping and rounding cost together is least."""
-    rgb_min, rgb_max = _linear_range(found.magnitudes["rgb"])
-    low, high = _log_range(found.magnitudes["scale"])
+    rgb_min, rgb_max = _linear_range(statistics.magnitudes["rgb"])
+    low, high = _log_range(statistics.magnitudes["scale"])
     sh_max = dict.fromkeys(("sh1_max", "sh2_max", "sh3_max"), 1.0)
-    for degree in range(1, found.sh_degree + 1):
-        sh_max[f"sh{degree}_max"] = _largest(found.magnitudes[f"sh{degree}"])
-    return SplatEncoding(rgb_min, rgb_max, low, high, **sh_max, lod_opacity=found.tree)
+    for degree in range(1, statistics.sh_degree + 1):
+        sh_max[f"sh{degree}_max"] = _largest(statistics.magnitudes[f"sh{degree}"])
+    return SplatEncoding(rgb_min, rgb_max, low, high, **sh_max, lod_opacity=statistics.tree)
 
 
 def _outward(value: float, up: bool) -> float:
@@ -161,13 +161,13 @@ def _clamping(counts: NDArray[np.int64], top: float) -> float:
     return float(np.sum(counts[bins] * beyond**2))
 
 
-def _linear_range(found: Magnitudes) -> tuple[float, float]:
+def _linear_range(magnitudes: Magnitudes) -> tuple[float, float]:
     """Return the range of 255 steps with the least squared error, of rounding and of clamping together."""
-    total = max(found.count, 1)
-    below = tops(found.negative, total, -found.lowest, BEYOND)
-    above = np.maximum(tops(found.positive, total, found.highest, BEYOND), 1)
-    lows = {-low: _clamping(found.negative, low) for low in below}
-    highs = {high: _clamping(found.positive, high) for high in above}
+    total = max(magnitudes.count, 1)
+    below = tops(magnitudes.negative, total, -magnitudes.lowest, BEYOND)
+    above = np.maximum(tops(magnitudes.positive, total, magnitudes.highest, BEYOND), 1)
+    lows = {-low: _clamping(magnitudes.negative, low) for low in below}
+    highs = {high: _clamping(magnitudes.positive, high) for high in above}
 
     def error(ends: tuple[float, float]) -> float:
         low, high = ends
@@ -177,10 +177,10 @@ def _linear_range(found: Magnitudes) -> tuple[float, float]:
     return _outward(max(low, -LARGEST_END), False), _outward(min(high, LARGEST_END), True)
 
 
-def _largest(found: Magnitudes) -> float:
+def _largest(magnitudes: Magnitudes) -> float:
     """Return the largest coefficient for 254 steps with the least squared error of rounding and clamping."""
-    total, counts = found.count, found.positive + found.negative
-    most = max(found.highest, -found.lowest)
+    total, counts = magnitudes.count, magnitudes.positive + magnitudes.negative
+    most = max(magnitudes.highest, -magnitudes.lowest)
     if not total:
         return 1.0
 

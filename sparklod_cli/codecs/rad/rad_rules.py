@@ -183,13 +183,13 @@ def _kind_of(header: RadHeader | RadChunkHeader) -> str:
 def _payload(number: int, chunk: RadChunkHeader, payload: int) -> Iterator[RuleViolation]:
     at = 0
     for each in chunk.properties:
-        what = f"property {quoted_value(each.name)} of chunk {number:,}"
+        subject = f"property {quoted_value(each.name)} of chunk {number:,}"
         if each.offset != at:
-            text = f"{what} begins at {each.offset:,}, not at {at:,}, where the one before ends"
+            text = f"{subject} begins at {each.offset:,}, not at {at:,}, where the one before ends"
             yield broken("offsets", text)
         at = each.offset + each.bytes + padding(each.bytes)
         if each.offset + each.bytes > payload:
-            yield broken("sizes", f"{what} ends at {each.offset + each.bytes:,}, of {payload:,} bytes")
+            yield broken("sizes", f"{subject} ends at {each.offset + each.bytes:,}, of {payload:,} bytes")
     if at < payload:
         text = f"the properties of chunk {number:,} end at {at:,}, of {payload:,} bytes"
         yield broken("sizes", text, fatal=False)
@@ -233,23 +233,23 @@ def _belongs(row: Row, header: RadHeader, number: int | None, *, labels: bool) -
     return True
 
 
-def _encodings(each: Property, what: str) -> Iterator[RuleViolation]:
+def _encodings(each: Property, subject: str) -> Iterator[RuleViolation]:
     row = BY_NAME.get(each.name)
     if row is None:
-        yield broken("properties", f"{what} is unknown")
+        yield broken("properties", f"{subject} is unknown")
         return
     if each.compression not in (GZ, None):
-        yield broken("encoding", f"{what} has compression {quoted_value(each.compression)}; only {GZ} is known")
+        yield broken("encoding", f"{subject} has compression {quoted_value(each.compression)}; only {GZ} is known")
     if each.encoding not in row.encodings:
         known = ", ".join(row.encodings)
-        yield broken("encoding", f"{what} is in {quoted_value(each.encoding)}; it may be in {known}")
+        yield broken("encoding", f"{subject} is in {quoted_value(each.encoding)}; it may be in {known}")
     ends = {"min": each.min, "max": each.max}
     for key in RANGES.get(each.encoding, ()):
         value = ends[key]
         if value is None or abs(value) > float(LARGEST):
-            yield broken("encoding", f"{what} is in {each.encoding}, but its {key} is {quoted_value(value)}")
+            yield broken("encoding", f"{subject} is in {each.encoding}, but its {key} is {quoted_value(value)}")
             return
     low = each.min if "min" in RANGES.get(each.encoding, ()) else 0.0
     if each.encoding in RANGES and low is not None and each.max is not None and not low < each.max:
-        text = f"{what} is in {each.encoding}, but its max, {each.max:g}, is not above {low:g}"
+        text = f"{subject} is in {each.encoding}, but its max, {each.max:g}, is not above {low:g}"
         yield broken("encoding", text, fatal=False)

@@ -184,6 +184,7 @@ def _scales(scale: FloatArray, order: Order) -> Texture:
     return Texture({"codebook": _numbers(book)}, [_per_splat(nearest(logs[order], book))])
 
 
+@np.errstate(over="ignore")  # the largest scales have no room above them
 def _grows(scale: FloatArray, logs: FloatArray, book: FloatArray) -> bool:
     """Return True if codes of a book make a splat so much larger that it may leave the bound of its region."""
     for block in blocks_of(len(scale)):

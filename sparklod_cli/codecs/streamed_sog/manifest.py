@@ -224,10 +224,10 @@ def _integer(value: Any, place: str, least: int, most: int) -> int:
     return value
 
 
-def _wrong(place: str, value: Any, wanted: str) -> FormatError:
+def _wrong(place: str, value: Any, expected: str) -> FormatError:
     if value is None:
-        return FormatError(f"{MANIFEST} has no {place}, which must be {wanted}")
-    return FormatError(f"{place} of {MANIFEST} is {quoted_value(value)}, not {wanted}")
+        return FormatError(f"{MANIFEST} has no {place}, which must be {expected}")
+    return FormatError(f"{place} of {MANIFEST} is {quoted_value(value)}, not {expected}")
 
 
 def serialise(manifest: Manifest) -> bytes:

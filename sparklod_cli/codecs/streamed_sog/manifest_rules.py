@@ -323,14 +323,16 @@ def scan_splats(
         steps = np.ptp(texel_codings.sign_log(splats.center), axis=0) / texel_codings.LAST_WORD if len(splats) else 0.0
         for number, level, run in here:
             part = splats.take(slice(run.offset, run.offset + run.count))
-            what = f"{manifest.place(number)} at level {level}"
+            subject = f"{manifest.place(number)} at level {level}"
             bound = manifest.nodes[number].bound
             outside = _outside(part, np.array(bound), steps) if bound is not None and is_box(bound) else 0
             if outside:
-                yield broken("extents", f"{count_of(outside, 'splat')} of {what} lie outside of its bound", fatal=False)
+                yield broken(
+                    "extents", f"{count_of(outside, 'splat')} of {subject} lie outside of its bound", fatal=False
+                )
             descents = _descents(part.center)
             if descents > max(FEW, OUT_OF_ORDER * run.count):
-                text = f"{descents:,} of {count_of(run.count, 'splat')} of {what} come after one that they precede"
+                text = f"{descents:,} of {count_of(run.count, 'splat')} of {subject} come after one that they precede"
                 yield broken("order", text, fatal=False)
         done += chunk.count
         progress("checking", done, total, "splat")

@@ -42,7 +42,7 @@ FIRST_STEP = np.float32(1 / 8)
 
 
 @kernel(Trees, Stop, f4, out(Slots), out(f4[:]), out(CutNodes), nogil=True)
-def find_cut(trees, stop, guess, slots, wanted, cut):
+def find_cut(trees, stop, guess, slots, demand, cut):
     """Refine the node with the largest pixel scale, as long as that is above `stop.smallest` and the budget allows it.
 
     The cut is that of a queue ordered by (pixel scale, instance, index), the greatest first, but it is found by
@@ -58,7 +58,7 @@ def find_cut(trees, stop, guess, slots, wanted, cut):
         stop: `Stop`.
         guess: float32, the first threshold, such as the last cut's, or 0; the cut does not depend on it.
         slots: `Slots`, working memory.
-        wanted: (chunks,) float32 of all trees, filled: the largest limit of the nodes that are, or should be, refined
+        demand: (chunks,) float32 of all trees, filled: the largest limit of the nodes that are, or should be, refined
             and have children in the chunk; 0 if there is none.
         cut: `CutNodes` of more than `stop.budget` nodes, filled.
 
@@ -88,8 +88,8 @@ def find_cut(trees, stop, guess, slots, wanted, cut):
         sum_from_top(slots, low)
         bucket = stopping_bucket(trees, slots, stop.budget, low, np.int64(BUCKETS))
     while True:
-        collected = collect(trees, stop, slots, wanted, cut, bucket)
-        selected, reason, missing, least, last = finish(trees, stop, slots, wanted, cut, bucket, collected)
+        collected = collect(trees, stop, slots, demand, cut, bucket)
+        selected, reason, missing, least, last = finish(trees, stop, slots, demand, cut, bucket, collected)
         if last >= 0 or reason == FULL or bucket == low:
             return selected, reason, missing, least, last
         bucket = stopping_bucket(trees, slots, stop.budget, low, bucket)
@@ -132,7 +132,7 @@ def stopping_bucket(trees, slots, budget, low, below):
 
 
 @kernel(nogil=True)
-def collect(trees, stop, slots, wanted, cut, low):
+def collect(trees, stop, slots, demand, cut, low):
     """Collect the nodes of the cut when all nodes of the buckets above `low` are refined, and none of `low`.
 
     Args:
@@ -148,7 +148,7 @@ def collect(trees, stop, slots, wanted, cut, low):
     smallest = stop.smallest
     node, limit, instance, first, queue, _, heap, _, tally = slots
     runs = tally[RUNS]
-    wanted[:] = 0
+    demand[:] = 0
     for run in range(runs if tally[GAPS] else 0):
         at = queue[run]
         if first[run] == first[run + 1]:  # missing: no longer a leaf where the queue decides, and again one above
@@ -170,10 +170,10 @@ def collect(trees, stop, slots, wanted, cut, low):
             if start == end:
                 record = nodes[view.node_base + node[at]]
                 children = np.int64(record.child_count)
-                request_chunks(wanted, trees, view, np.int64(record.child_start), children, from_bits(bits))
+                request_chunks(demand, trees, view, np.int64(record.child_start), children, from_bits(bits))
                 missing += 1
                 continue
-            request_chunks(wanted, trees, view, np.int64(node[start]), end - start, from_bits(bits))
+            request_chunks(demand, trees, view, np.int64(node[start]), end - start, from_bits(bits))
             least = min(least, bits)
         for at in range(start, end):
             # Branch-free where it cannot be predicted: each node is written to the cut, and stays there if it is drawn.
@@ -190,7 +190,7 @@ def collect(trees, stop, slots, wanted, cut, low):
 
 
 @kernel(nogil=True)
-def finish(trees, stop, slots, wanted, cut, low, collected):
+def finish(trees, stop, slots, demand, cut, low, collected):
     """Add what is drawn of the last bucket to the nodes that `collect` has found.
 
     The nodes of that bucket go through the queue. Those that are there from the start have their own pixel scale as
@@ -254,7 +254,7 @@ def finish(trees, stop, slots, wanted, cut, low, collected):
         heap[0] = heap[length]
         sift_down(node, limit, instance, heap, length)
         if children:
-            request_chunks(wanted, trees, view, start, children, from_bits(path[at]))
+            request_chunks(demand, trees, view, start, children, from_bits(path[at]))
         if children == 0 or not is_resident(trees, view, start, children):
             missing += children > 0
             put(cut, selected, node[at], path[at] | LEAF, instance[at])
