@@ -16,7 +16,7 @@ from fidelity_views import FOV_Y
 from PIL import Image
 
 import sparklod_cli as sparklod
-from sparklod_cli.compare import Pictures, measured
+from sparklod_cli.compare import PicturePair, measured
 from sparklod_cli.images.contact_sheet import sheet
 from sparklod_cli.images.metrics import edges
 from sparklod_cli.images.pixels import eight_bits, over
@@ -58,7 +58,7 @@ def main() -> None:
             tree = build(source, method).tree
             cut = sparklod.cut(tree, camera, budget=arguments.budget, settings=settings, precision="float16")
             images.append(sparklod.render(cut, camera))
-            row = measured(Pictures({}, images[-1], full, edges(full), None))
+            row = measured(PicturePair({}, images[-1], full, edges(full), None))
             figures = f"{row['psnr']:.1f} dB, edges {row['edge_psnr']:.1f} dB, SSIM {row['ssim']:.3f}"
             captions.append(f"{METHODS[method]}, {arguments.budget}: {figures}")
             print(captions[-1], flush=True)

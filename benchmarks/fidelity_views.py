@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import sparklod_cli as sparklod
-from sparklod_cli.compare import Pictures, measured
+from sparklod_cli.compare import PicturePair, measured
 from sparklod_cli.images.metrics import BACKGROUNDS, edges
 from sparklod_cli.tables.columns import Row
 from sparklod_cli.tables.comparison import rows_by_budget
@@ -185,5 +185,5 @@ class FullDetail:
         rows = []
         for number, (camera, full, where) in enumerate(zip(self._cameras, self._pictures, self._edges, strict=True)):
             known: Row = {"frame": number, "time_s": camera.time, "selected": len(scene)}
-            rows.append(measured(Pictures(known, sparklod.render(scene, camera), full, where, None)))
+            rows.append(measured(PicturePair(known, sparklod.render(scene, camera), full, where, None)))
         return Figures.of(rows)

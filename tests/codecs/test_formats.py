@@ -30,9 +30,8 @@ def test_a_codec_has_the_signatures_of_all(form: Format) -> None:
     assert parameters(codec.open_content) == {"source": False}
     assert hasattr(codec, "encode") == hasattr(codec, "settled") == form.writable
     if form.writable:
-        more = {"scratch": True} if form.trees else {}
         written = {"scene": False, "options": False, "threads": True, "progress": True}
-        assert parameters(codec.encode) == written | more
+        assert parameters(codec.encode) == written
         assert parameters(codec.settled) == {"scene": False, "options": False}
     assert hasattr(codec, "encode_files") == (form.unbundled is not None or form.detailed)
     assert hasattr(codec, "decode_levels") == form.detailed

@@ -6,11 +6,13 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from sparklod_cli.support.kernel_cache import SUFFIX
 from tests.conftest import ROOT
+from tests.signals import heed_signals
 
 pytestmark = pytest.mark.slow
 
@@ -163,7 +165,8 @@ def run(folder: Path, script: str, **settings: str) -> None:
         **settings,
     }
     command = [sys.executable, "-c", f"from scripted import *\n{script}"]
-    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=120)
+    ways: dict[str, Any] = {"preexec_fn": heed_signals} if os.name == "posix" else {}
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=120, **ways)
     assert (done.returncode, done.stderr) == (0, "")
 
 

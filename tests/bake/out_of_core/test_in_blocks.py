@@ -90,4 +90,3 @@ def test_quick_makes_the_tree_of_a_bake_in_memory(
             tree = LodTree(expected[1].child_count[window], expected[1].child_start[window])
             same(found.nodes.read(start, stop), (expected[0].take(window), tree))
     assert found.levels == expected[1].depths().max() + 1
-    assert found.nodes.leaves == count
