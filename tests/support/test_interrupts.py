@@ -53,96 +53,67 @@ def test_a_signal_ends_a_compilation_at_once_and_leaves_a_whole_cache(
     assert all(is_whole(path.read_bytes()) for path in kept)
 
 
-#: What imports of C modules do: a `KeyboardInterrupt` inside of them becomes an error of another kind.
-SWALLOW = """
-import os, signal, sys
+#: A run of `inspect` whose reading is replaced by a function of a test.
+SCRIPT = """
+import os, signal, sys, time
 from sparklod_cli import cli
 from sparklod_cli.io import reading
-from sparklod_cli.support import interrupts
-
-def fail(*args, **kwargs):
-    try:
-        os.kill(os.getpid(), signal.SIGHUP)
-        signal.pause()
-    except KeyboardInterrupt:
-        raise {error} from None
-
-reading.opened = fail
-interrupts.handle()
-sys.exit(cli.run(["inspect", "fixtures/one.ply"]))
-"""
-
-
-@pytest.mark.parametrize("error", ["ImportError('numpy')", "OSError(5, 'of a library')", "KeyboardInterrupt"])
-def test_an_error_that_a_library_makes_of_an_interruption_is_one(error: str) -> None:
-    code = SWALLOW.format(error=error)
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, preexec_fn=heed_signals, check=False
-    )
-    assert done.returncode == 130
-    assert "please report" not in done.stderr
-
-
-#: Two signals at once: Python prints an error of the second one, whose handler the first one has reset.
-TWO = """
-import os, signal, sys
-from sparklod_cli import cli
-from sparklod_cli.io import reading
-from sparklod_cli.support import interrupts
-
-def work(*args, **kwargs):
-    signal.pthread_sigmask(signal.SIG_BLOCK, interrupts.ENDING)
-    os.kill(os.getpid(), signal.SIGINT)
-    os.kill(os.getpid(), signal.SIGTERM)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, interrupts.ENDING)
-
+from sparklod_cli.support import interrupts, jit
+{work}
 reading.opened = work
 interrupts.handle()
 sys.exit(cli.run(["inspect", "fixtures/one.ply"]))
 """
 
 
-def test_two_signals_at_once_are_one_interruption() -> None:
-    command = [sys.executable, "-c", TWO]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, preexec_fn=heed_signals, check=False)
-    assert done.returncode == 130
-    assert done.stderr.strip() == "interrupted"
+def run_with(work: str) -> subprocess.CompletedProcess[str]:
+    """Run `inspect` with the Python code of `work`, a function, in place of reading."""
+    command = [sys.executable, "-c", SCRIPT.format(work=work)]
+    return subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, preexec_fn=heed_signals, check=False, timeout=60
+    )
 
+
+#: What imports of C modules do: a `KeyboardInterrupt` inside of them becomes an error of another kind.
+SWALLOW = """
+def work(*args, **kwargs):
+    try:
+        os.kill(os.getpid(), signal.SIGHUP)
+        signal.pause()
+    except KeyboardInterrupt:
+        raise {error} from None
+"""
+
+
+@pytest.mark.parametrize("error", ["ImportError('numpy')", "OSError(5, 'of a library')", "KeyboardInterrupt"])
+def test_an_error_that_a_library_makes_of_an_interruption_is_one(error: str) -> None:
+    done = run_with(SWALLOW.format(error=error))
+    assert done.returncode == 130
+    assert "please report" not in done.stderr
+
+
+#: Two signals at once: Python prints an error of the second one, whose handler the first one has reset.
+TWO = """
+def work(*args, **kwargs):
+    signal.pthread_sigmask(signal.SIG_BLOCK, interrupts.ENDING)
+    os.kill(os.getpid(), signal.SIGINT)
+    os.kill(os.getpid(), signal.SIGTERM)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, interrupts.ENDING)
+"""
 
 #: A library that forgets an interruption, as some do of what an import raises; compilation comes next.
 FORGET = """
-import os, signal, sys
-from sparklod_cli import cli
-from sparklod_cli.io import reading
-from sparklod_cli.support import interrupts, jit
-
-def forget(*args, **kwargs):
+def work(*args, **kwargs):
     try:
         os.kill(os.getpid(), signal.SIGHUP)
         signal.pause()
     except KeyboardInterrupt:
         jit.report_begun("kernel")
     print("went on")
-
-reading.opened = forget
-interrupts.handle()
-sys.exit(cli.run(["inspect", "fixtures/one.ply"]))
 """
-
-
-def test_nothing_is_compiled_after_an_interruption_that_a_library_forgets() -> None:
-    command = [sys.executable, "-c", FORGET]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, preexec_fn=heed_signals, check=False)
-    assert (done.returncode, done.stdout, done.stderr.strip()) == (130, "", "interrupted")
-
 
 #: An object that is interrupted while it is deleted, where Python prints exceptions and goes on.
 LOSE = """
-import os, signal, sys, time
-from sparklod_cli import cli
-from sparklod_cli.io import reading
-from sparklod_cli.support import interrupts
-
 class Deleted:
     def __del__(self):
         os.kill(os.getpid(), signal.SIGHUP)
@@ -152,16 +123,10 @@ def work(*args, **kwargs):
     item = Deleted()
     del item
     time.sleep(60)
-
-reading.opened = work
-interrupts.handle()
-sys.exit(cli.run(["inspect", "fixtures/one.ply"]))
 """
 
 
-def test_an_interruption_that_python_forgets_is_raised_again() -> None:
-    command = [sys.executable, "-c", LOSE]
-    done = subprocess.run(
-        command, cwd=ROOT, capture_output=True, text=True, preexec_fn=heed_signals, check=False, timeout=30
-    )
-    assert (done.returncode, done.stderr.strip()) == (130, "interrupted")
+@pytest.mark.parametrize("work", [TWO, FORGET, LOSE], ids=["two signals", "forgotten", "lost"])
+def test_an_interruption_ends_the_run_whoever_catches_it(work: str) -> None:
+    done = run_with(work)
+    assert (done.returncode, done.stdout, done.stderr.strip()) == (130, "", "interrupted")
