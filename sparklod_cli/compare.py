@@ -96,7 +96,7 @@ class Comparison:
 
         Cells of `popping` are empty where a camera does not follow the one before it (`CameraPath.follows`).
 
-        PicturePair are drawn one after the other, each on all the threads; meanwhile others are measured.
+        Pictures are drawn one after the other, each on all the threads; meanwhile others are measured.
 
         Raises:
             SparklodError: full detail covers no pixel of a frame.

@@ -117,10 +117,10 @@ def _report(console: Console, options: RenderOptions, compared: Compared, about:
     else:
         for line in texts:
             console.say(line)
-    places = (
+    places = [
         f", at a budget of {each.worst['budget']:,}" if at is None and each.worst is not None else ""
         for at, each in zip(about, outcomes, strict=True)
-    )
+    ]
     return report_outcomes(console, outcomes, places)
 
 

@@ -74,7 +74,7 @@ class ReportBlocks:
         count: N splats.
         is_tree: whether they are the nodes of a tree.
         map: called with a function of a block, columns of `Splats` and a number of threads, returns the results in
-            order; may be called again. ReportBlocks in memory have all columns and are processed on that many threads.
+            order; may be called again. Blocks in memory have all columns and are processed on that many threads.
         in_memory: whether several threads may call `map`.
     """
 

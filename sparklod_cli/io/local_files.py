@@ -97,7 +97,7 @@ def companions(path: Path, sets: Collection[Collection[str]]) -> list[Path]:
             names = [*([] if first is None else [first.name]), *itertools.chain(*sets)]
         else:
             names = list(itertools.chain(*(names for names in sets if path.name in names)))
-        files = _companion(folder / MANIFEST, names)
+        files = _companion_paths(folder / MANIFEST, names)
         if first is not None and first.is_file():
             files += _named_in(first)
         return [file for file in files if file.is_file()]
@@ -117,9 +117,9 @@ def _named_in(path: Path) -> list[Path]:
 
         file.seek(0)
         if head.startswith(rad_header.MAGIC):
-            return _companion(path, rad_header.read_header(file).filenames)
+            return _companion_paths(path, rad_header.read_header(file).filenames)
         if form is not None and form.folders:
-            metas = _companion(path, parse(file.read(MAX_MANIFEST + 1)).names(), folders=True)
+            metas = _companion_paths(path, parse(file.read(MAX_MANIFEST + 1)).names(), folders=True)
             return [*metas, *itertools.chain(*map(_images_of, metas))]
     return _images_of(path)
 
@@ -131,10 +131,10 @@ def _images_of(path: Path) -> list[Path]:
     if not path.is_file() or path.stat().st_size > MAX_META:
         return []
     data = path.read_bytes()
-    return _companion(path, companion_names(data)) if data.lstrip().startswith(b"{") else []
+    return _companion_paths(path, companion_names(data)) if data.lstrip().startswith(b"{") else []
 
 
-def _companion(path: Path, names: Iterable[str], *, folders: bool = False) -> list[Path]:
+def _companion_paths(path: Path, names: Iterable[str], *, folders: bool = False) -> list[Path]:
     each = dict.fromkeys(names)  # a manifest of strangers may name one file half a million times
     return [path.parent / name for name in each if not leads_away(name, folders=folders)]
 
@@ -157,7 +157,7 @@ def companion_path(first: Path, name: str) -> Path:
     return first.parent / name
 
 
-def companion_opener(first: Place, name: str, *, folders: bool = False) -> BinaryIO:
+def open_named(first: Place, name: str, *, folders: bool = False) -> BinaryIO:
     """Open a file that another one names, which may be in folders there if `folders`.
 
     Raises:

@@ -19,7 +19,7 @@ from ..model.scene import FileCoding
 from ..model.splats import FloatArray, Splats
 from ..support.errors import UnreadableError
 from ..support.machine import available_memory
-from .local_files import companion_opener, reason_of
+from .local_files import open_named, reason_of
 from .reading import opened
 
 #: Name of the format in `codecs.formats`.
@@ -134,7 +134,7 @@ def read_rad_chunk(path: Path, number: int, *, palette: FloatArray | None = None
         if not 0 <= number < len(header.chunks):
             raise ValueError(f"number is {number}; its chunks are 0 to {len(header.chunks) - 1}")
         entry = header.chunks[number]
-        with file_of(entry, file, functools.partial(companion_opener, path)) as source:
+        with file_of(entry, file, functools.partial(open_named, path)) as source:
             return read_chunk(source, entry, header, palette)
 
 

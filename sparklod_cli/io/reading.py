@@ -19,7 +19,7 @@ from ..support.addresses import Place, size_of
 from ..support.errors import FormatError, UnknownFormatError, UnreadableError
 from ..support.progress import Progress, silent
 from ..support.stdin import DASH, spooled
-from .local_files import companion_opener, in_folder, reason_unreadable
+from .local_files import in_folder, open_named, reason_unreadable
 
 if TYPE_CHECKING:
     from ..codecs.gpu import dump
@@ -117,7 +117,7 @@ def opened(path: Place) -> Iterator[tuple[BinaryIO, Format, dict[str, Any]]]:
                     "it holds arrays for a viewer and no scene; use the file that they were made of, or unpack them in"
                     " Python"
                 )
-            open_companion = functools.partial(companion_opener, path, folders=form.folders)
+            open_companion = functools.partial(open_named, path, folders=form.folders)
             yield file, form, {"open_companion": open_companion} if form.companions else {}
 
 

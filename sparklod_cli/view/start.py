@@ -112,10 +112,10 @@ def _coarse_extent(shown: ShownFile, header: RadHeader) -> Extent:
 
     A cut through the chunk, its nodes that have no children in it, covers the whole scene.
     """
-    open_companion = {Path(key).name: path for key, path in shown.files.items()}
+    companions = {Path(key).name: path for key, path in shown.files.items()}
 
     def opened(name: str) -> BinaryIO:
-        return open_plain(open_companion[name])
+        return open_plain(companions[name])
 
     entry = header.chunks[0]
     with opened(shown.path.name) as file:

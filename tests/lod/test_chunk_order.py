@@ -355,3 +355,27 @@ def test_one_part_is_the_order_of_the_tree(quality_tree: tuple[Splats, LodTree])
     order, _ = order_of(*quality_tree)
     first = tree.child_start[np.flatnonzero(tree.child_count)[sequence]]
     assert np.array_equal(first, order[np.cumsum([1, *families.count[sequence]])[:-1]])
+
+
+def test_an_order_does_not_depend_on_the_one_before(built: tuple[Splats, LodTree]) -> None:
+    """But for ties, of which this tree has none: arranging twice is arranging once."""
+    once = arrange(*built)
+    twice = arrange(*once)
+    assert np.array_equal(once[1].child_start, twice[1].child_start)
+    assert np.array_equal(once[0].center, twice[0].center)
+
+
+def test_parts_are_the_same_whatever_is_looked_at_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    families = random_tree(900, 1)
+    expected = families.parts(70)
+    monkeypatch.setattr("sparklod_cli.lod.chunk_order._ROWS", 16)
+    found = families.parts(70)
+    assert len(found) == len(expected) and all(map(np.array_equal, found, expected))
+
+
+def test_an_order_leaves_its_arguments(quality_tree: tuple[Splats, LodTree]) -> None:
+    families = families_of(*quality_tree)
+    before = [column.copy() for column in families]
+    family_order(*families, most=2_000)
+    for column, values in zip(families, before, strict=True):
+        assert np.array_equal(column, values)

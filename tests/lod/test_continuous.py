@@ -16,7 +16,7 @@ from sparklod_cli.lod.traversal import CutView, Forest, Traversal, TreeInstance
 from sparklod_cli.model.foveation import Cones
 from sparklod_cli.model.gaussian import lod_opacity
 from tests.lod.forests import Case, cases, random_tree, transform
-from tests.references import continuous_cuts
+from tests.references import budgeted_cuts, continuous_cuts
 
 WIDTHS = (1.05, 1.25, 2.0)
 SPARK = Cones(90, 120, 0.4, 0.2)
@@ -194,3 +194,52 @@ def test_fading_is_even_in_d_and_ends_at_the_splat_itself() -> None:
     np.testing.assert_array_equal(faded(opacity, np.zeros(6)), 0)
     for weight in (1e-3, 0.25, 0.5, 0.999, 1 - 1e-9):
         np.testing.assert_allclose(lod_opacity(faded(opacity, np.full(6, weight))), weight * lod_opacity(opacity), 1e-5)
+
+
+@given(cases())
+def test_at_a_threshold_the_cut_is_that_of_all_larger_nodes(case: Case) -> None:
+    """Without a budget, the nodes far above the limit are divided, and none below it."""
+    cut = ContinuousCuts(case.traversal()).cut(case.view, budget=case.most, smallest=0.5, width=1.25)
+    case = Case(case.trees, case.instances, case.view, case.most, 0.5)
+    fine, coarse = case.find(), Case(case.trees, case.instances, case.view, case.most, 0.5 * 1.25).find()
+    drawn = set(zip(cut.instance.tolist(), cut.node.tolist(), strict=True))
+    both = {(int(i), int(n)) for i, n in zip(fine.instance, fine.node, strict=True)} & {
+        (int(i), int(n)) for i, n in zip(coarse.instance, coarse.node, strict=True)
+    }
+    assert both <= drawn
+
+
+def test_a_tiny_step_across_a_threshold_changes_next_to_nothing() -> None:
+    case = some_case(3, foveation=Cones())
+    cuts = ContinuousCuts(case.traversal())
+    far, near = 6.0, 3.0
+    drawn = [
+        {tuple(node) for node in zip(cut.instance.tolist(), cut.node.tolist(), strict=True)}
+        for cut in (case.traversal().cut(view_from((0.3, -0.2, z)), budget=case.budget) for z in (far, near))
+    ]
+    assert drawn[0] != drawn[1]
+    for _ in range(40):  # to where the ordinary cut changes
+        middle = (far + near) / 2
+        ordinary = case.traversal().cut(view_from((0.3, -0.2, middle)), budget=case.budget)
+        same = set(zip(ordinary.instance.tolist(), ordinary.node.tolist(), strict=True)) == drawn[0]
+        far, near = (middle, near) if same else (far, middle)
+    a, b = (
+        np.concatenate(weights_of(case, cuts.cut(view_from((0.3, -0.2, z)), budget=case.budget, width=1.25)))
+        for z in (far, near)
+    )
+    assert np.abs(a - b).max() < 1e-4
+
+
+@given(cases())
+def test_pixel_scales_are_those_of_the_traversal(case: Case) -> None:
+    traversal = case.traversal()
+    views = traversal.cut(case.view, budget=len(case.instances)).views
+    nodes = traversal.forest.nodes
+    for number, view in enumerate(views):
+        some = nodes[view["node_base"] : view["node_base"] + 20]
+        found = np.empty(len(some), np.float32)
+        pixel_scales(some, np.arange(len(some)), views, number, found)
+        expected = [
+            budgeted_cuts.number_of(budgeted_cuts.bits_of(budgeted_cuts.pixel_scale(node, view))) for node in some
+        ]
+        np.testing.assert_array_equal(found, np.array([math.inf if math.isnan(e) else e for e in expected], np.float32))

@@ -27,7 +27,7 @@ from sparklod_cli.lod.kernels.tree_links import find_parents
 from sparklod_cli.model.gaussian import covariance, spark_size
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import DetailScene
-from sparklod_cli.model.splats import Splats
+from sparklod_cli.model.splats import COLUMNS, Splats
 from tests.lod.trees import children, hard_cases, sorted_rows
 from tests.scenes import random_splats
 
@@ -243,3 +243,16 @@ def test_a_plain_splat_covers_as_much(opacity: float) -> None:
     assert plain.scale[1].tolist() == merged.scale[1].tolist()
     for name in ("center", "quat_xyzw", "rgb", "sh"):
         assert getattr(plain, name) is getattr(merged, name)
+
+
+def test_nothing_depends_on_the_run() -> None:
+    nodes, tree = quality.build(random_splats(1_000, sh_degree=1, seed=8))
+    first, second = (make(nodes, tree, DetailSettings(SHARES, 300)) for _ in range(2))
+    for name in COLUMNS:
+        assert getattr(first.splats, name).tobytes() == getattr(second.splats, name).tobytes()
+    assert first.counts.tolist() == second.counts.tolist() and first.children.tolist() == second.children.tolist()
+
+
+def test_splats_that_are_at_most_opaque_stay() -> None:
+    splats = random_splats(50, seed=2)
+    assert with_plain_opacity(splats) is splats

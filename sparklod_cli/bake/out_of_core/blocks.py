@@ -100,9 +100,9 @@ class _Cut:
         self.stages: list[BuildStage] = []
         self.blocks = 0
 
-    def part(self, index: NDArray[np.int64], number: int, region: Region) -> _Part:
+    def part(self, index: NDArray[np.int64], count: int, region: Region) -> _Part:
         """Cut a region, which has these centres of the sample, into at most so many blocks."""
-        split = self._split(index, number) if number > 1 else None
+        split = self._split(index, count) if count > 1 else None
         if split is None:
             self.blocks += 1
             return _Part(~(self.blocks - 1), region)
@@ -110,12 +110,12 @@ class _Cut:
         number = len(self.splits)
         self.splits.append((axis, value, 0, 0))
         below = self.sample[index, axis] < value
-        low = self.part(index[below], number // 2, Region(region.low, _moved(region.high, axis, value)))
-        high = self.part(index[~below], number - number // 2, Region(_moved(region.low, axis, value), region.high))
+        low = self.part(index[below], count // 2, Region(region.low, _moved(region.high, axis, value)))
+        high = self.part(index[~below], count - count // 2, Region(_moved(region.low, axis, value), region.high))
         self.splits[number] = (axis, value, low.side, high.side)
         return _Part(number, region, (low, high))
 
-    def _split(self, index: NDArray[np.int64], number: int) -> tuple[int, float] | None:
+    def _split(self, index: NDArray[np.int64], count: int) -> tuple[int, float] | None:
         """Return the axis, and where to cut it; None where all centres are the same."""
         center = self.sample[index]
         if not len(center):
@@ -125,7 +125,7 @@ class _Cut:
         for axis in sorted(range(3), key=lambda axis: (low[axis] - high[axis], -whole[axis])):
             values = np.sort(center[:, axis])
             if values[0] < values[-1]:
-                value = values[len(values) * (number // 2) // number]
+                value = values[len(values) * (count // 2) // count]
                 return axis, float(max(value, values[np.searchsorted(values, values[0], "right")]))
         return None
 

@@ -39,9 +39,9 @@ SEEN = 0.5
 #: come 6.6 dB closer to their source with 1 than with 0, and scales are off by 1.6 % instead of 1.0 %.
 LARGE = 1.0
 
-#: By how much codes may make a scale larger: a factor, and a share of the splat's largest scale. The bounds of Streamed
-#: SOG's regions leave room for it. Scenes whose scales differ by factors of 1e30 exceed it.
-GROWTH, GROWTH_OF_LARGEST = 4 / 3, 0.01
+#: By how much codes may make a scale larger: a factor, a share of the splat's largest scale, and a length in world
+#: units. The bounds of Streamed SOG's regions leave room for it. Scenes whose scales differ by 1e30 exceed it.
+GROWTH, GROWTH_OF_LARGEST, GROWTH_OF_ALL = 4 / 3, 0.01, 1e-4
 
 #: Fewest codes of a palette where nobody chooses, and the steps in which it grows, as PlayCanvas's writer has them.
 LEAST_CODES = 1024
@@ -189,7 +189,8 @@ def _grows(scale: FloatArray, logs: FloatArray, book: FloatArray) -> bool:
     """Return True if codes of a book make a splat so much larger that it may leave the bound of its region."""
     for block in blocks_of(len(scale)):
         largest = np.max(scale[block], axis=1, keepdims=True)
-        if np.any(np.exp(book)[nearest(logs[block], book)] > GROWTH * scale[block] + GROWTH_OF_LARGEST * largest):
+        most = GROWTH * scale[block] + GROWTH_OF_LARGEST * largest + GROWTH_OF_ALL
+        if np.any(np.exp(book)[nearest(logs[block], book)] > most):
             return True
     return False
 

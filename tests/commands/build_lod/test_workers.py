@@ -22,14 +22,14 @@ def test_scenes_side_by_side_are_those_of_one_after_the_other(tmp_path: Path) ->
     broken = tmp_path / "broken.ply"
     broken.write_bytes(b"ply\nnonsense\nend_header\n")
     inputs = [small[0], broken, ONE, *small[1:]]
-    done = sparklod("build-lod", *inputs, "--output-dir", tmp_path / "open_companion", "--workers", 2, "--json")
+    done = sparklod("build-lod", *inputs, "--output-dir", tmp_path / "beside", "--workers", 2, "--json")
     said = done.stderr.decode()
     assert done.returncode == 1, said
     assert build(*inputs, "--output-dir", tmp_path / "alone") == 1
     made = sorted(path.name for path in (tmp_path / "alone").iterdir())
     assert made == ["one-lod.spz", "small-0-lod.spz", "small-1-lod.spz", "small-2-lod.spz"]
     for name in made:
-        assert (tmp_path / "open_companion" / name).read_bytes() == (tmp_path / "alone" / name).read_bytes()
+        assert (tmp_path / "beside" / name).read_bytes() == (tmp_path / "alone" / name).read_bytes()
     rows = [json.loads(line) for line in done.stdout.splitlines()]
     assert [row["input"] for row in rows] == [str(path) for path in inputs]
     assert ["error" in row for row in rows] == [False, True, False, False, False]

@@ -51,7 +51,7 @@ def camera(
     return Camera(look_at(eye, target, (0.1, 1, 0)), width, height, (190.0, 205.0), principal)
 
 
-CAMERAS = {"front": camera((0, 0, 4)), "open_companion": camera((1.5, -2, 1)), "inside": camera((0.4, 0.2, -0.5))}
+CAMERAS = {"front": camera((0, 0, 4)), "beside": camera((1.5, -2, 1)), "inside": camera((0.4, 0.2, -0.5))}
 
 
 def random_shown(
@@ -228,7 +228,7 @@ def test_frames_of_the_same_splats_share_an_upload() -> None:
     renderer = osmesa.OpenGLRenderer()
     first = renderer.draw(shown, CAMERAS["front"], RasterSettings())
     again = ShadedSplats(*(column.copy() for column in _columns(shown)))
-    renderer.draw(again, CAMERAS["open_companion"], RasterSettings())
+    renderer.draw(again, CAMERAS["beside"], RasterSettings())
     assert (renderer.uploads, renderer.sorts) == (1, 2)
     recolored = dataclasses.replace(shown, rgb=shown.rgb[::-1].copy())
     assert np.array_equal(
@@ -319,3 +319,25 @@ def test_sizes_beyond_opengls_limits_are_refused() -> None:
         osmesa.draw(SPLATS["plausible"], wide, RasterSettings())
     image = osmesa.draw(SPLATS["plausible"], CAMERAS["front"], RasterSettings())
     assert psnr(image, rasterizer.draw(SPLATS["plausible"], CAMERAS["front"], RasterSettings())) >= FLOAT
+
+
+@needs_opengl
+@pytest.mark.parametrize("precision", texture.PRECISIONS)
+def test_the_order_of_the_input_does_not_matter(precision: str) -> None:
+    shown = SPLATS["plausible"]
+    shuffle = np.random.default_rng(1).permutation(len(shown))
+    shuffled = ShadedSplats(
+        **{field.name: getattr(shown, field.name)[shuffle] for field in dataclasses.fields(ShadedSplats)}
+    )
+    images = [osmesa.draw(each, CAMERAS["beside"], RasterSettings(), precision=precision) for each in (shown, shuffled)]
+    assert psnr(*images) >= FLOAT
+
+
+@needs_opengl
+def test_sorting_by_16_bits_hardly_changes_a_picture() -> None:
+    for name in ("plausible", "merged"):
+        images = [
+            osmesa.draw(SPLATS[name], CAMERAS["beside"], RasterSettings(), sorting=sorting)
+            for sorting in settings.SORTINGS
+        ]
+        assert psnr(*images) >= 60
