@@ -215,7 +215,7 @@ GOALS: tuple[Goal, ...] = (
             name=("SH",),
             form="{:.2f} s",
         )
-        for way, most in (("--json", 1.5), ("--json --stats", 3.0), ("--check", 3.0))
+        for way, most in (("--json", 1.5), ("--json --stats", 6.0), ("--check", 3.0))
     ),
     Goal(
         "inspecting",
