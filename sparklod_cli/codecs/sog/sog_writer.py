@@ -179,18 +179,21 @@ def _means(words: codings.Words, low: codings.Wide, high: codings.Wide, order: O
 def _scales(scale: FloatArray, order: Order) -> Texture:
     logs = quantize.encode_log(scale)
     book = codebook(logs, LARGE)
-    if _grows(scale, logs, book):
+    codes = nearest(logs, book)
+    if _grows(scale, codes, book):
         book = even_codebook(logs)
-    return Texture({"codebook": _numbers(book)}, [_per_splat(nearest(logs[order], book))])
+        codes = nearest(logs, book)
+    return Texture({"codebook": _numbers(book)}, [_per_splat(codes[order])])
 
 
 @np.errstate(over="ignore")  # the largest scales have no room above them
-def _grows(scale: FloatArray, logs: FloatArray, book: FloatArray) -> bool:
+def _grows(scale: FloatArray, codes: NDArray[np.uint8], book: FloatArray) -> bool:
     """Return True if codes of a book make a splat so much larger that it may leave the bound of its region."""
+    values = np.exp(book)
     for block in blocks_of(len(scale)):
         largest = np.max(scale[block], axis=1, keepdims=True)
         most = GROWTH * scale[block] + GROWTH_OF_LARGEST * largest + GROWTH_OF_ALL
-        if np.any(np.exp(book)[nearest(logs[block], book)] > most):
+        if np.any(values[codes[block]] > most):
             return True
     return False
 
