@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -256,8 +257,10 @@ def encoder(
 
 
 def rounded(center: FloatArray, bits: int) -> FloatArray:
-    """Round centres to multiples of 2 ** -bits."""
-    return np.ldexp(np.rint(np.ldexp(center.astype(np.float64), bits)), -bits).astype(np.float32)
+    """Round centres to multiples of 2 ** -bits that float32 holds."""
+    most = math.floor(math.ldexp(float(np.finfo(np.float32).max), bits))
+    multiples = np.rint(np.ldexp(center.astype(np.float64), bits)).clip(-most, most)
+    return np.ldexp(multiples, -bits).astype(np.float32)
 
 
 def _alpha(opacity: FloatArray, encoding: str, ranges: SplatEncoding) -> FloatArray:

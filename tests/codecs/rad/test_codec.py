@@ -326,6 +326,14 @@ def test_centres_are_rounded_to_a_fraction_of_a_small_splat_unless_their_encodin
     assert len(written(Scene(splats))) < 0.9 * len(written(Scene(splats), center="f32_lebytes"))
 
 
+def test_centres_near_the_largest_number_stay_finite_when_their_splats_are_as_large() -> None:
+    splats = dataclasses.replace(
+        random_splats(3), center=np.full((3, 3), -3.4e38, np.float32), scale=np.full((3, 3), 1e37, np.float32)
+    )
+    center = read(written(Scene(splats))).splats.center
+    assert np.isfinite(center).all() and (center <= -3.3e38).all()
+
+
 def test_ranges_hold_all_scales_and_most_of_the_rest() -> None:
     splats = random_splats(5000, sh_degree=3)
     splats.rgb[:5000:7] = 2.25
