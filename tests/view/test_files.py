@@ -256,6 +256,12 @@ def test_a_broken_file_is_named(tmp_path: Path) -> None:
         settings_of(path)
 
 
+def test_a_broken_tree_is_refused() -> None:
+    path = FIXTURES / "faults" / "tree-cycle.spz"
+    with pytest.raises(SparklodError, match=f"^{path}: its Level-of-Detail tree is broken: "):
+        settings_of(path)
+
+
 def test_a_name_that_is_no_text_is_shown_escaped(tmp_path: Path) -> None:
     name = os.fsdecode(b"\xff.spz")
     shutil.copy(TREE, tmp_path / name)

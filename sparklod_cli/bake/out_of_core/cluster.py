@@ -170,7 +170,8 @@ def _started(workers: int, threads: int, memory: int | None, scratch: Path | Non
         security = Security.temporary()  # for this cluster alone; workers get the key through pipes
     with contextlib.ExitStack() as stack:
         folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="sparklod-", dir=scratch))
-        stack.enter_context(dask.config.set(OWN_CONFIG))
+        # An argument of LocalCluster reaches its workers only, and the scheduler has a folder, too.
+        stack.enter_context(dask.config.set(OWN_CONFIG | {"temporary-directory": folder}))
         try:
             own = LocalCluster(
                 n_workers=workers,
@@ -179,7 +180,6 @@ def _started(workers: int, threads: int, memory: int | None, scratch: Path | Non
                 security=security,
                 dashboard_address=None,
                 memory_limit=_memory_limit(workers, memory),
-                local_directory=folder,
                 env={"NUMBA_NUM_THREADS": str(threads)},
                 preload=["sparklod_cli.bake.out_of_core.cluster_engine"],
                 scheduler_kwargs={"allowed_failures": LOSSES},

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import os
 import pickle
+import tempfile
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -33,11 +34,13 @@ SAID: list[str] = []
 
 @pytest.fixture(scope="module")
 def engine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ClusterEngine]:
-    scratch = tmp_path_factory.mktemp("workers")
-    with cluster(ClusterSettings(workers=2, threads=2), scratch=scratch, say=SAID.append) as started:
-        assert list(scratch.iterdir())
-        yield started
-    assert not list(scratch.iterdir())
+    scratch, temporary = tmp_path_factory.mktemp("workers"), tmp_path_factory.mktemp("temporary")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tempfile, "tempdir", str(temporary))
+        with cluster(ClusterSettings(workers=2, threads=2), scratch=scratch, say=SAID.append) as started:
+            assert list(scratch.iterdir())
+            yield started
+    assert not list(scratch.iterdir()) and not list(temporary.iterdir())
 
 
 @pytest.fixture
