@@ -13,7 +13,7 @@ import json
 import os
 import sys
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -216,7 +216,7 @@ def _cells(figures: Mapping[str, Any]) -> list[str]:
     return [f"{figures['psnr']:.2f}", "" if edge is None else f"{edge:.2f}", f"{figures['ssim']:.4f}"]
 
 
-def measure(arguments: argparse.Namespace, methods: Sequence[str], made: Path) -> dict[str, Any]:
+def measure(arguments: argparse.Namespace, made: Path) -> dict[str, Any]:
     """Measures all scenes; the JSON is written after each program, so that a long run may end early."""
     record: dict[str, Any] = {
         "machine": machine(),
@@ -226,13 +226,17 @@ def measure(arguments: argparse.Namespace, methods: Sequence[str], made: Path) -
         "budgets": SHARES,
         "scenes": {},
     }
+    reasons = {method: why_skipped(method) for method in arguments.methods}
+    for method, reason in reasons.items():
+        if reason:
+            print(f"{SIMPLIFIERS[method]} is skipped: {reason}", file=sys.stderr)
     run([*SPARKLOD, "warmup"])  # so that no run compiles
     for path in scenes_of(arguments.scenes, made):
         found = record["scenes"].setdefault(path.name, {})
         with tempfile.TemporaryDirectory(prefix="simplify-") as folder:
             drawn = next(sources(path, arguments)).drawn
             comparison = Comparison(drawn, arguments.size, arguments.every, Path(folder), arguments.steps)
-            for method in methods:
+            for method in (method for method, reason in reasons.items() if not reason):
                 try:
                     found[method] = comparison.simplified(method).as_dict()
                 except CommandError as error:  # the others go on
@@ -263,16 +267,10 @@ def main() -> None:
     arguments = parser.parse_args()
     if not (arguments.scenes or arguments.results):
         parser.error("name scenes to measure, or --results to print")
-    methods = []
-    for method in arguments.methods:
-        if reason := why_skipped(method):
-            print(f"{SIMPLIFIERS[method]} is skipped: {reason}", file=sys.stderr)
-        else:
-            methods.append(method)
     found: Table = merged(arguments.results).get("scenes", {})
     if arguments.scenes:
         with tempfile.TemporaryDirectory() as made:
-            for scene, measured in measure(arguments, methods, Path(made))["scenes"].items():
+            for scene, measured in measure(arguments, Path(made))["scenes"].items():
                 found.setdefault(scene, {}).update(measured)
     print(table(found))
     for name, reason in LEFT_OUT.items():
