@@ -92,18 +92,27 @@ def without_sh(scene: sparklod.Scene) -> sparklod.Scene:
 def _sparks(source: Source, builder: str) -> Built:
     """A tree of one of Spark's builders, as its memory holds it."""
     with tempfile.TemporaryDirectory() as folder:
-        program = Path(__file__).with_name("spark_build.mjs")
-        command = ["node", str(program), str(source.path), str(max(source.runs, 1)), builder, folder]
+        command = spark_command(source.path, builder, Path(folder), max(source.runs, 1))
         result = subprocess.run(command, capture_output=True, text=True, check=False)
         if result.returncode:
             raise SystemExit(f"Spark failed on {source.path}: {result.stderr.strip()}")
-        names = ["ext0", "ext1", "lod_tree"]
-        if source.sh:
-            names += [name for name in SH_ARRAYS if Path(folder, f"{name}.u32").is_file()]
-        words = {name: np.fromfile(Path(folder, f"{name}.u32"), np.uint32).reshape(-1, 4) for name in names}
-    tree = sparklod.unpack(words)
-    assert isinstance(tree, sparklod.Tree)
+        tree = spark_tree(Path(folder), sh=source.sh)
     return Built(tree, [json.loads(line)["build"] for line in result.stdout.splitlines()])
+
+
+def spark_command(file: Path, builder: str, folder: Path, runs: int = 1) -> list[str]:
+    """The command that builds a tree with one of Spark's builders, tiny or quality, into a folder."""
+    return ["node", str(Path(__file__).with_name("spark_build.mjs")), str(file), str(runs), builder, str(folder)]
+
+
+def spark_tree(folder: Path, *, sh: bool = False) -> sparklod.Tree:
+    """The tree that `spark_command` left in a folder, with spherical harmonics if it has some and they are drawn."""
+    names = ["ext0", "ext1", "lod_tree"]
+    if sh:
+        names += [name for name in SH_ARRAYS if (folder / f"{name}.u32").is_file()]
+    tree = sparklod.unpack({name: np.fromfile(folder / f"{name}.u32", np.uint32).reshape(-1, 4) for name in names})
+    assert isinstance(tree, sparklod.Tree)
+    return tree
 
 
 def _ours(source: Source, method: str) -> Built:

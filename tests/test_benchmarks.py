@@ -152,3 +152,62 @@ def camera(splats: sparklod.Splats) -> sparklod.Camera:
     """A camera that sees the splats from where the light comes."""
     middle = splats.center.mean(axis=0)
     return sparklod.Camera.look_at(middle + np.array([0.14, -0.24, -0.11]), middle, size=(96, 54))
+
+
+#: A program that is called as NanoGS is: it leaves the first rows of a PLY.
+FIRST_ROWS = """
+import argparse
+parser = argparse.ArgumentParser()
+for name in ("--ply", "-o", "-r"):
+    parser.add_argument(name)
+given = parser.parse_args()
+head, rows = open(given.ply, "rb").read().split(b"end_header\\n", 1)
+count = int(head.split(b"element vertex ")[1].split()[0])
+left = round(count * float(given.r))
+with open(given.o, "wb") as file:
+    file.write(head.replace(b"vertex %d" % count, b"vertex %d" % left) + b"end_header\\n")
+    file.write(rows[: left * (len(rows) // count)])
+"""
+
+
+def test_simplified_scenes_are_measured_as_whole_processes(
+    benchmark_module: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = benchmark_module("bench_simplify")
+    (tmp_path / "simplification.py").write_text(FIRST_ROWS)
+    monkeypatch.setenv("NANOGS_DIR", str(tmp_path))
+    splats = benchmark_module("fine_structure").fine_structure().with_max_sh(0).take(slice(0, 50_000, 20))
+    comparison = bench.Comparison(sparklod.Scene(splats), (64, 36), 6, tmp_path)
+    found = {method: comparison.simplified(method).as_dict() for method in ("quick", "levels", "nanogs")}
+    assert [len(each["seconds"]) for each in found.values()] == [1, 1, 2]
+    assert found["nanogs"]["splats"] == found["quick"]["splats"] == {"10%": 250, "1%": 25}
+    psnr = {method: each["views"]["around"]["10%"]["psnr"] for method, each in found.items()}
+    assert psnr["levels"] > psnr["nanogs"], "merged splats are closer than the first ones"
+    assert all(peak > 1e7 for each in found.values() for peak in each["peak_bytes"])
+
+    text = bench.table({"a.ply": json.loads(json.dumps(found))})
+    assert text.count("\n") == 4
+    assert f"| a.ply | our quick | each | {psnr['quick']:.2f} |" in text
+    assert f"| a.ply | NanoGS | all | {psnr['nanogs']:.2f} |" in text
+    benchmark_module("fidelity_report").put_into(_copy(tmp_path), {"simplify": text})
+
+
+def _copy(folder: Path) -> Path:
+    """A copy of the page about fidelity."""
+    page = folder / "fidelity.md"
+    page.write_text((ROOT / "docs" / "fidelity.md").read_text())
+    return page
+
+
+def test_simplifiers_that_are_missing_are_skipped_with_a_reason(
+    benchmark_module: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = benchmark_module("bench_simplify")
+    assert bench.why_skipped("quality") is None
+    monkeypatch.delenv("NANOGS_DIR", raising=False)
+    assert bench.why_skipped("nanogs") == "NANOGS_DIR is not set; it names a folder with simplification.py"
+    monkeypatch.setenv("NANOGS_DIR", str(tmp_path))
+    assert bench.why_skipped("nanogs") == "NANOGS_DIR has no simplification.py"
+    monkeypatch.setenv("ENGINES_DIR", str(tmp_path))
+    command = bench.peer_command("decimate", Path("a.ply"), Path("b.ply"), "10%")
+    assert list(map(str, command[2:])) == ["-q", "-w", "-g", "cpu", "a.ply", "--decimate", "10%", "b.ply"]

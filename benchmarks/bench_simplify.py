@@ -1,0 +1,283 @@
+"""Compares what simplifies scenes to 10 % and 1 % of their splats: `python benchmarks/bench_simplify.py --help`.
+
+Every program gets the same PLY, without spherical harmonics, and is measured as a process from its start to its end:
+reading, building and writing. Trees are drawn as cuts of so many splats for each camera; the others are one set of
+splats for all cameras. GHAP and V3DG are left out, see `LEFT_OUT`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import os
+import sys
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from bench_fidelity import scenes_of, size_of, sources
+from fidelity_report import NAMES, markdown, merged, put_into
+from fidelity_trees import WAYS, spark_command, spark_tree
+from fidelity_views import SIZE, Figures, FullDetail, cameras_of, count_of, of_tree
+from performance.machine import load, machine
+from performance.process import SPARKLOD, CommandError, Took, run
+from scenes import write_ply
+
+import sparklod_cli as sparklod
+from sparklod_cli.io import read_levels
+
+#: Shares of the splats that are left.
+SHARES = ("10%", "1%")
+
+#: The set of cameras.
+CAMERAS = "around"
+
+#: What simplifies, by what it is called in tables.
+SIMPLIFIERS = NAMES | {"levels": "our levels of Streamed SOG", "nanogs": "NanoGS"}
+
+#: Those that leave one set of splats for all cameras; the others build trees, of which each camera gets a cut.
+SETS = (*WAYS, "nanogs", "levels")
+
+#: Those that take minutes, and are measured only if they are named.
+SLOW = ("refined",)
+
+#: Programs of others: the variable of the environment that names a folder, and what must be there.
+SPLAT_TRANSFORM = "node_modules/@playcanvas/splat-transform/bin/cli.mjs"
+PEERS = {
+    "spark-tiny": ("SPARK_DIR", "node_modules/@sparkjsdev/spark"),
+    "spark-quality": ("SPARK_DIR", "node_modules/@sparkjsdev/spark"),
+    "decimate": ("ENGINES_DIR", SPLAT_TRANSFORM),
+    "decimate-adaptive": ("ENGINES_DIR", SPLAT_TRANSFORM),
+    "nanogs": ("NANOGS_DIR", "simplification.py"),
+}
+
+#: Why some are not measured.
+LEFT_OUT = {
+    "GHAP": "its program is a training run, which needs the photographs of the scene and CUDA",
+    "V3DG": "its builder optimises each level with gsplat and selects CUDA as the only device",
+}
+
+Table = dict[str, dict[str, dict[str, Any]]]
+
+
+@dataclass(frozen=True)
+class Simplified:
+    """What one program made of a scene.
+
+    Attributes:
+        runs: of the program, one for all shares or one for each.
+        figures: by share, how far pictures are from full detail.
+        splats: by share, how many are drawn; at most so many of a cut.
+    """
+
+    runs: list[Took]
+    figures: dict[str, Figures]
+    splats: dict[str, int]
+
+    def as_dict(self) -> dict[str, Any]:
+        """What the JSON has of it; `fidelity_report.merged` adds such records up."""
+        return {
+            "seconds": [took.wall_s for took in self.runs],
+            "cpu_seconds": [took.cpu_s for took in self.runs],
+            "peak_bytes": [took.peak_bytes for took in self.runs],
+            "splats": self.splats,
+            "load": load(),  # over the last minute, with what was measured
+            "views": {CAMERAS: {share: dataclasses.asdict(each) for share, each in self.figures.items()}},
+        }
+
+
+class Comparison:
+    """A scene that is simplified by one program after another.
+
+    Args:
+        drawn: full detail, without spherical harmonics.
+        size: of the pictures, width and height.
+        every: take every so many cameras.
+        folder: for what programs write.
+        steps: of refining; None for the default.
+    """
+
+    def __init__(
+        self, drawn: sparklod.Scene, size: tuple[int, int], every: int, folder: Path, steps: int | None = None
+    ) -> None:
+        self._drawn = drawn
+        self._cameras = cameras_of(CAMERAS, drawn, size)[::every]
+        self._full = FullDetail(drawn, self._cameras)
+        self._folder = folder
+        self._ply = folder / "scene.ply"
+        self._refine = ["--refine", *([] if steps is None else [str(steps)])]
+        write_ply(self._ply, drawn.splats)
+
+    def simplified(self, method: str) -> Simplified:
+        """Runs a method of `SIMPLIFIERS` and measures what it made.
+
+        Raises:
+            CommandError: the program failed.
+        """
+        if method == "levels":
+            return self._levels()
+        if method in SETS:
+            return self._sets(method)
+        return self._tree(method)
+
+    def _tree(self, method: str) -> Simplified:
+        """A tree, of which every camera gets a cut."""
+        if method.startswith("spark-"):
+            took = run(spark_command(self._ply, method.removeprefix("spark-"), self._folder))
+            tree = spark_tree(self._folder)
+        else:
+            refined = method == "refined"
+            file = self._folder / f"{method}.spz"
+            took = self._bake(file, "--method", "quality" if refined else method, *(self._refine if refined else []))
+            tree = sparklod.read(file)
+        assert isinstance(tree, sparklod.Tree)
+        tree = dataclasses.replace(tree, antialiased=self._drawn.antialiased)
+        figures = of_tree(tree, self._drawn, self._cameras, SHARES)
+        return Simplified([took], figures, {share: count_of(share, len(self._drawn)) for share in SHARES})
+
+    def _levels(self) -> Simplified:
+        """Our detail levels, of one bake."""
+        file = self._folder / "levels" / "lod-meta.json"
+        took = self._bake(file, "--levels", ",".join(SHARES))
+        detail = read_levels(file)
+        sets = {share: detail.splats.take(detail.level(level)) for level, share in enumerate(SHARES, 1)}
+        return self._drawn_whole([took], sets)
+
+    def _sets(self, method: str) -> Simplified:
+        """What another program leaves of the splats, run once for each share."""
+        runs, sets = [], {}
+        for share in SHARES:
+            output = self._folder / f"{method}-{share[:-1]}.ply"
+            runs.append(run(peer_command(method, self._ply, output, share)))
+            sets[share] = sparklod.read(output).splats
+        return self._drawn_whole(runs, sets)
+
+    def _drawn_whole(self, runs: list[Took], sets: Mapping[str, sparklod.Splats]) -> Simplified:
+        for share, splats in sets.items():
+            if abs(len(splats) / count_of(share, len(self._drawn)) - 1) > 0.01:
+                raise CommandError(f"{len(splats):,} splats are not {share} of {len(self._drawn):,}")
+        antialiased = self._drawn.antialiased
+        figures = {
+            share: self._full.of_scene(sparklod.Scene(splats, antialiased=antialiased))
+            for share, splats in sets.items()
+        }
+        return Simplified(runs, figures, {share: len(splats) for share, splats in sets.items()})
+
+    def _bake(self, output: Path, *options: str) -> Took:
+        return run([*SPARKLOD, "build-lod", self._ply, "-o", output, "--quiet", *options])
+
+
+def peer_command(method: str, source: Path, output: Path, share: str) -> list[str | Path]:
+    """The command by which another program leaves a share such as "10%" of the splats of a PLY."""
+    program = _program(method)
+    if method == "nanogs":
+        own = program.parent / ".venv" / "bin" / "python"
+        python = own if own.is_file() else Path(sys.executable)
+        return [python, program, "--ply", source, "-o", output, "-r", str(float(share[:-1]) / 100)]
+    return ["node", program, "-q", "-w", "-g", "cpu", source, f"--{method}", share, output]
+
+
+def why_skipped(method: str) -> str | None:
+    """Why a program cannot be run; None if it can."""
+    if method not in PEERS:
+        return None
+    variable, file = PEERS[method]
+    if variable not in os.environ:
+        return f"{variable} is not set; it names a folder with {file}"
+    return None if _program(method).exists() else f"{variable} has no {file}"
+
+
+def _program(method: str) -> Path:
+    variable, file = PEERS[method]
+    return Path(os.environ[variable]).absolute() / file
+
+
+def table(found: Table) -> str:
+    """The table of the page: a row for each scene and program."""
+    rows = []
+    for scene, methods in found.items():
+        for method in SIMPLIFIERS:
+            if method in methods:
+                measured = methods[method]
+                seconds = " + ".join(f"{each:.1f}" for each in measured["seconds"])
+                peak = f"{max(measured['peak_bytes']) / 1e6:,.0f}"
+                cameras = "all" if method in SETS else "each"
+                cells = [cell for share in SHARES for cell in _cells(measured["views"][CAMERAS][share])]
+                rows.append([scene, SIMPLIFIERS[method], cameras, *cells, seconds, peak])
+    figures = [f"{share.replace('%', ' %')}: {name}" for share in SHARES for name in ("PSNR", "edges", "SSIM")]
+    return markdown(["scene", "simplified by", "cameras", *figures, "s", "peak MB"], rows)
+
+
+def _cells(figures: Mapping[str, Any]) -> list[str]:
+    edge = figures["edge_psnr"]
+    return [f"{figures['psnr']:.2f}", "" if edge is None else f"{edge:.2f}", f"{figures['ssim']:.4f}"]
+
+
+def measure(arguments: argparse.Namespace, made: Path) -> dict[str, Any]:
+    """Measures all scenes; the JSON is written after each program, so that a long run may end early."""
+    record: dict[str, Any] = {
+        "machine": machine(),
+        "size": arguments.size,
+        "every": arguments.every,
+        "cameras": [CAMERAS],
+        "budgets": SHARES,
+        "scenes": {},
+    }
+    reasons = {method: why_skipped(method) for method in arguments.methods}
+    for method, reason in reasons.items():
+        if reason:
+            print(f"{SIMPLIFIERS[method]} is skipped: {reason}", file=sys.stderr)
+    run([*SPARKLOD, "warmup"])  # so that no run compiles
+    for path in scenes_of(arguments.scenes, made):
+        found = record["scenes"].setdefault(path.name, {})
+        with tempfile.TemporaryDirectory(prefix="simplify-") as folder:
+            drawn = next(sources(path, arguments)).drawn
+            comparison = Comparison(drawn, arguments.size, arguments.every, Path(folder), arguments.steps)
+            for method in (method for method, reason in reasons.items() if not reason):
+                try:
+                    found[method] = comparison.simplified(method).as_dict()
+                except CommandError as error:  # the others go on
+                    print(f"{path.name}: {SIMPLIFIERS[method]}: {error}", file=sys.stderr, flush=True)
+                    continue
+                psnr = ", ".join(f"{each['psnr']:.2f}" for each in found[method]["views"][CAMERAS].values())
+                print(f"{path.name}: {SIMPLIFIERS[method]}: {psnr} dB", file=sys.stderr, flush=True)
+                if arguments.json:
+                    arguments.json.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+    return record
+
+
+def main() -> None:
+    """Prints a Markdown table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenes", nargs="*", help="those that bench_fidelity.py takes")
+    usual = [method for method in SIMPLIFIERS if method not in SLOW]
+    text = f"by default all but {', '.join(SLOW)}; those whose folder is missing are skipped"
+    parser.add_argument("--methods", nargs="+", choices=SIMPLIFIERS, default=usual, help=text)
+    parser.add_argument("--steps", type=int, help="of refining; by default what suits each tree")
+    parser.add_argument("--every", type=int, default=1, help="take every so many cameras, for a quick run")
+    parser.add_argument("--size", type=size_of, default=SIZE, help="of the pictures (default 960x540)")
+    parser.add_argument("--json", type=Path, help="file for all numbers, with those of each camera")
+    text = "JSONs of earlier runs, whose rows the table has as well; of what was measured twice, the later one counts"
+    parser.add_argument("--results", type=Path, nargs="+", default=[], help=text)
+    parser.add_argument("--docs", type=Path, help="page that gets the table, docs/fidelity.md")
+    parser.set_defaults(runs=0, growth=1.4, sh=False, trees=None)  # of `bench_fidelity.sources`
+    arguments = parser.parse_args()
+    if not (arguments.scenes or arguments.results):
+        parser.error("name scenes to measure, or --results to print")
+    found: Table = merged(arguments.results).get("scenes", {})
+    if arguments.scenes:
+        with tempfile.TemporaryDirectory() as made:
+            for scene, measured in measure(arguments, Path(made))["scenes"].items():
+                found.setdefault(scene, {}).update(measured)
+    print(table(found))
+    for name, reason in LEFT_OUT.items():
+        print(f"\n{name} is left out: {reason}.")
+    if arguments.docs:
+        put_into(arguments.docs, {"simplify": table(found)})
+
+
+if __name__ == "__main__":
+    main()
