@@ -22,6 +22,7 @@ from glossy_knot import glossy_knot
 from performance.machine import machine
 from photo_cloud import loose_cloud, photo_cloud
 from scenes import write_ply
+from thin_scenes import THIN
 
 import sparklod_cli as sparklod
 
@@ -34,6 +35,7 @@ MADE = {
     "glossy-knot": glossy_knot,
     "photo-cloud": photo_cloud,
     "loose-cloud": loose_cloud,
+    **THIN,
 }
 
 BUDGETS = "2%,5%,10%,25%,50%"

@@ -142,7 +142,7 @@ def _chart(rng: np.random.Generator) -> list[Splats]:
     top = height - 0.12
     for line, size in CHART:
         left = (width - len(line) * ADVANCE * size / 6) / 2
-        parts += letters(rng, line, foot + [left, top - size, 0.02], size)
+        parts += letters(rng, line, foot + np.array([left, top - size, 0.02]), size)
         top -= 1.45 * size
     legs = [np.array([[x, y, -0.03] for y in (-0.75, 0, 0.6, 1.5)]) + foot for x in (0.25, width - 0.25)]
     return parts + [strand(rng, leg, 0.03, (0.45, 0.4, 0.34)) for leg in legs]

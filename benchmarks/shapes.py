@@ -1,4 +1,4 @@
-"""Parts of the scenes that we make: strands, letters, layers and a sky. A unit is a metre; y is up here, and down in splats."""
+"""Parts of the scenes that we make: strands, letters and a sky. A unit is a metre; y is up here, and down in splats."""
 
 from __future__ import annotations
 
@@ -105,4 +105,3 @@ def letters(
             points = left + np.array([[x * unit, y * unit, 0] for x, y in stroke])
             parts.append(strand(rng, points, max(0.45 * unit, 0.006), rgb))
     return parts
-

@@ -7,6 +7,7 @@ that training makes. The same seed gives the same splats.
 from __future__ import annotations
 
 import argparse
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -51,9 +52,9 @@ def cables(seed: int = 0) -> Splats:
                 points[:, across] = place + 0.05 * rng.normal()
                 points[:, 1] = high - 0.5 * (1 - (points[:, along] / 6) ** 2) * rng.uniform(0.7, 1.2)
                 parts.append(strand(rng, points, rng.uniform(0.005, 0.01), (0.1, 0.1, 0.12)))
-    for x in (-6, 0, 6):
-        for z in (-6, 0, 6):
-            parts.append(strand(rng, np.array([[x, y, z] for y in np.linspace(0, 3.6, 9)]), 0.06, (0.45, 0.42, 0.4)))
+    for x, z in itertools.product((-6, 0, 6), repeat=2):
+        mast = np.array([[x, y, z] for y in np.linspace(0, 3.6, 9)])
+        parts.append(strand(rng, mast, 0.06, (0.45, 0.42, 0.4)))
     return _shuffled(rng, parts)
 
 

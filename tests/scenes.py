@@ -25,6 +25,17 @@ def random_splats(count: int, *, sh_degree: int = 0, seed: int = 0, extent: floa
     )
 
 
+def single_layer(side: int, *, seed: int = 0) -> Splats:
+    """Return side * side flat, nearly opaque splats that just overlap, in the plane y = 0 from -1 to 1."""
+    rng, count, step = np.random.default_rng(seed), side * side, 2 / (side - 1)
+    x, z = (axis.ravel() for axis in np.meshgrid(*[np.linspace(-1, 1, side)] * 2))
+    center = np.stack([x, 0 * x, z], axis=1) + step * rng.normal(0, 0.1, (count, 3)) * [1, 0.3, 1]
+    scale = step * np.insert(rng.uniform(0.55, 0.75, (count, 2)), 1, 0.1, axis=1)
+    columns = center, scale, np.tile([0, 0, 0, 1], (count, 1)), rng.uniform(0.9, 0.99, count)
+    gray = np.full((count, 3), 0.5), np.zeros((count, 0, 3))
+    return Splats(*(np.ascontiguousarray(column, np.float32) for column in (*columns, *gray)))
+
+
 def splat_columns(count: int, *, sh_degree: int = 0, seed: int = 0) -> dict[str, np.ndarray]:
     """The vertex properties of plausible splats as a 3DGS PLY stores them, for `fixtures.by_hand.ply`; float32."""
     splats = random_splats(count, sh_degree=sh_degree, seed=seed)

@@ -17,7 +17,7 @@ from sparklod_cli.cameras.formats.source import Parsed
 from sparklod_cli.cameras.formats.table import Axes, PathFormat
 from sparklod_cli.cameras.frame import DEFAULT_UP, Settings
 from sparklod_cli.cameras.framing import framing
-from sparklod_cli.cameras.generators import orbit
+from sparklod_cli.cameras.generators import frame_looking, orbit
 from sparklod_cli.cameras.path import cameras_of
 from sparklod_cli.codecs.gpu import lod_tree
 from sparklod_cli.images.metrics import on_background, psnr
@@ -36,7 +36,7 @@ from sparklod_cli.scenes.finder import view_of
 from sparklod_cli.support import jit
 from tests.conftest import real_scene
 from tests.lod.trees import check_tree, children, coincident, parents
-from tests.scenes import random_splats
+from tests.scenes import random_splats, single_layer
 
 GROWTHS = [1.05, 1.4, 2.0]
 
@@ -174,3 +174,18 @@ def test_cuts_of_a_real_scene_are_closer_to_full_detail_than_those_of_the_quick_
     jit.use_threads(256)
     ours, quicks = (fidelity(splats, builder.build(splats), 0.1) for builder in (quality, quick))
     assert ours >= quicks + 1
+
+
+@pytest.mark.parametrize("share", [0.05, 0.1, 0.25])
+def test_coarse_cuts_of_a_single_layer_have_no_cracks(share: float) -> None:
+    splats = single_layer(70)
+    nodes, tree = quality.build(splats)
+    traversal = Traversal(Forest([lod_tree.unpack(lod_tree.pack(nodes, tree, threads=2))]), [TreeInstance()])
+    frame = frame_looking((0, -1.2, -0.6), (0, 0, 0), DEFAULT_UP)
+    settings = Settings(size=(160, 120), fov_y=math.radians(40))
+    camera = cameras_of(Parsed([frame]), PathFormat("", "a view", "", Axes.OPENGL_C2W), settings).cameras[0]
+    cut = traversal.cut(view_of(camera), budget=int(share * len(splats))).indices()[0]
+    middle = np.s_[30:90, 40:120, 3]
+    full, coarse = picture(splats, camera)[middle], picture(nodes.take(cut), camera)[middle]
+    assert full.mean() > 0.95
+    assert full.mean() - coarse.mean() < 0.01

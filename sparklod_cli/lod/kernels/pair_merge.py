@@ -1,7 +1,8 @@
 """Merges pairs of nodes into nodes that cover the union of both.
 
 Coverage is opacity integrated over the plane of projection. The coverage of a union is the sum of the two coverages
-less that of the overlap, and the same holds for first and second moments. The overlap's moments are those of the
+less that of the overlap, and the same holds for first and second moments. Of flat nodes, which lie in layers, a part of
+the overlap counts nevertheless, so that their neighbours overlap, too. The overlap's moments are those of the
 product of the two Gaussians in space. The overlap, and how much the picture of a merged node differs from that of its
 two, are integrals of products of Gaussians on the planes of the three axes.
 """
@@ -17,7 +18,7 @@ from ...support.jit import kernel, prange
 from ...support.jit_types import f4, i8, out, u4
 from .geometry import ellipsoid_area
 from .pair_cost import CENTER, COLOR, COVARIANCE, COVERED, DENSITY, LOG_DET, WEIGHT, WIDTH, log_det
-from .profile import is_needle, profile_of, size_factor
+from .profile import NEEDLE, is_needle, profile_of, size_factor
 
 #: Least semi-axis of a merged node, in the builder's unit, so that it has an area. Chosen.
 SHORTEST = 1e-20
@@ -33,6 +34,18 @@ RIDGE, LEAST_RIDGE = 1e-6, 1e-30
 #: Least trace of a union's covariance, as a share of that of its two nodes without the overlap's part; with less, the
 #: product in space is not where they overlap (docs/decisions/11-quality-builder.md).
 LEAST_UNION = 0.5
+
+#: Overlap that a node in a layer keeps, as a share of its pair's coverage. Without it, nodes of a coarse cut only just
+#: touch, and the background shows between them. Measured (benchmarks/notes/quality-builder.md).
+CLOSING = 0.12
+
+#: Overlaps, as such shares, from which on less is kept, and nothing: splats that overlap as much leave no cracks. Two
+#: opaque equals in one place overlap by a quarter. Measured (benchmarks/notes/quality-builder.md).
+LOOSE, DENSE = 0.15, 0.19
+
+#: A node is in a layer if its shortest axis is no more than the first share of the second one, and in none from the
+#: second share on. Chosen.
+FLAT, ROUND = 0.1, 0.35
 
 #: Pairs that a thread merges one after the other; results do not depend on it. Chosen.
 BLOCK = 256
@@ -69,7 +82,7 @@ def semi_axes(xx, yy, zz, xy, xz, yz):
 
 @kernel()
 def merge_pair(a, b, planes, merged):
-    """Fill the centre, covariance and coverage of the union of two nodes.
+    """Fill the centre, covariance and coverage of the union of two nodes; return their overlap as a share of coverage.
 
     The product of two Gaussians with covariances P and Q at 0 and d is a Gaussian with covariance P - P (P + Q)^-1 P at
     P (P + Q)^-1 d. That of needles side by side, or of flat splats nearly in one plane, may be far away from both,
@@ -83,12 +96,13 @@ def merge_pair(a, b, planes, merged):
     """
     total = np.float64(a[COVERED]) + np.float64(b[COVERED])
     share, other = np.float64(a[COVERED]) / total, np.float64(b[COVERED]) / total
-    hidden = overlap_share(planes, a[DENSITY], b[DENSITY])
+    overlap = hidden = overlap_share(planes, a[DENSITY], b[DENSITY])
     x, y, z = center_of(a)
     u, v, w = center_of(b)
     dx, dy, dz = u - x, v - y, w - z
     pxx, pyy, pzz, pxy, pxz, pyz = covariance_of(a)
     qxx, qyy, qzz, qxy, qxz, qyz = covariance_of(b)
+    merged[COVERED] = total * (1 - hidden)
     trace = pxx + pyy + pzz + qxx + qyy + qzz
     ridge = RIDGE * trace + LEAST_RIDGE
     # (P + Q)^-1 is its adjugate over its determinant, and the gain P (P + Q)^-1.
@@ -110,7 +124,6 @@ def merge_pair(a, b, planes, merged):
     mxx, mxy = share * pxx + other * qxx + mixed * dx * dx, share * pxy + other * qxy + mixed * dx * dy
     myy, mxz = share * pyy + other * qyy + mixed * dy * dy, share * pxz + other * qxz + mixed * dx * dz
     mzz, myz = share * pzz + other * qzz + mixed * dz * dz, share * pyz + other * qyz + mixed * dy * dz
-    merged[COVERED] = total * (1 - hidden)
     if hidden > 0 and max(from_a, from_b) <= reach + trace:
         uxx = without(mxx, pxx - dot(gx, pxx, pxy, pxz), hidden, x, x)
         uyy = without(myy, pyy - dot(gy, pxy, pyy, pyz), hidden, y, y)
@@ -129,6 +142,20 @@ def merge_pair(a, b, planes, merged):
     merged[CENTER] = a[CENTER] + (other * dx - hidden * x / (1 - hidden))
     merged[CENTER + 1] = a[CENTER + 1] + (other * dy - hidden * y / (1 - hidden))
     merged[CENTER + 2] = a[CENTER + 2] + (other * dz - hidden * z / (1 - hidden))
+    return overlap
+
+
+@kernel(inline=True)
+def closing(overlap, large, middle, small):
+    """Return the part of an overlap, as a share of the pair's coverage, that a merged node keeps to close a layer.
+
+    Args:
+        overlap: of `merge_pair`.
+        large, middle, small: semi-axes of the merged node; needles are in no layer.
+    """
+    flat = (ROUND - small / middle) / (ROUND - FLAT) if middle >= NEEDLE * large else 0.0
+    loose = (DENSE - overlap) / (DENSE - LOOSE)
+    return min(CLOSING * min(max(flat, 0.0), 1.0) * min(max(loose, 0.0), 1.0), overlap)
 
 
 @kernel(inline=True)
@@ -188,7 +215,7 @@ def merge_pairs(pairs, made, leaves, rows, row, spare, children, size, error):
             a = rows[first if first < leaves else row[first - leaves]]
             b = rows[second if second < leaves else row[second - leaves]]
             planes = overlaps(a, b)
-            merge_pair(a, b, planes, merged)
+            overlap = merge_pair(a, b, planes, merged)
             weight = np.float64(a[WEIGHT]) + np.float64(b[WEIGHT])
             for channel in range(3):
                 merged[COLOR + channel] = (a[WEIGHT] * a[COLOR + channel] + b[WEIGHT] * b[COLOR + channel]) / weight
@@ -199,6 +226,8 @@ def merge_pairs(pairs, made, leaves, rows, row, spare, children, size, error):
             large, middle, small = semi_axes(
                 np.float64(xx), np.float64(yy), np.float64(zz), np.float64(xy), np.float64(xz), np.float64(yz)
             )
+            covered = np.float64(a[COVERED]) + np.float64(b[COVERED])
+            merged[COVERED] += covered * closing(overlap, large, middle, small)
             merged[DENSITY] = np.float64(merged[COVERED]) / ellipsoid_area(large, middle, small)
             needle = is_needle(large * large, middle * middle, small * small)
             opacity, spread = profile_of(np.float64(merged[DENSITY]), needle)

@@ -122,6 +122,14 @@ def test_splats_that_do_not_overlap_are_merged_by_their_moments() -> None:
     np.testing.assert_allclose(twin.matrix(merged), expected, atol=1e-5 * np.trace(expected))
 
 
+def test_layers_keep_a_part_of_their_overlap_and_what_is_round_long_or_dense_keeps_none() -> None:
+    closing, most = pair_merge.closing, pair_merge.CLOSING
+    assert closing(0.14, 1.0, 0.8, 0.05) == pytest.approx(most)
+    assert closing(0.05, 1.0, 0.8, 0.05) == 0.05  # all of it
+    assert 0 < closing(0.14, 1.0, 0.8, 0.2) < most
+    assert closing(0.14, 1.0, 0.8, 0.4) == closing(0.14, 1.0, 0.1, 0.005) == closing(0.2, 1.0, 0.8, 0.05) == 0
+
+
 @pytest.mark.parametrize("spread", [0.0, 0.5, 3.0])
 def test_a_union_does_not_depend_on_the_order(spread: float) -> None:
     for seed in range(20):
