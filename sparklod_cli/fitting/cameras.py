@@ -15,8 +15,8 @@ from ..cameras.path import CameraPath
 
 Vector = NDArray[np.float64]
 
-#: Pixels of a picture. With 480 x 270, splats that are fitted to few pixels are a little less sharp in many.
-SIZE = (640, 360)
+#: Pixels of a picture. Larger ones gain less in the same time. Measured (benchmarks/notes/refining.md).
+SIZE = (480, 270)
 
 #: Cameras around the scene: their distances in radii, and the share of them that stand near the horizon.
 DISTANCES, NEAR_HORIZON = (0.5, 5.0), 0.5
@@ -32,6 +32,9 @@ FOVS = (35.0, 75.0)
 
 #: Cameras look at a point this far from the middle at most, in radii, and in distances.
 ASIDE_RADII, ASIDE_DISTANCES = 0.4, 0.25
+
+#: Training cameras at most. Their pictures, 1 MB each, are drawn once. Measured (benchmarks/notes/refining.md).
+TRAINING = 300
 
 #: Held-out cameras; of a path, one in so many, and at most so many.
 HELD_OUT, OF_PATH = 16, 8
@@ -117,7 +120,7 @@ def split_path(path: CameraPath) -> tuple[tuple[Camera, ...], tuple[Camera, ...]
     held_out = cameras[every // 2 :: every] or cameras[-1:]
     chosen = set(map(id, held_out))
     training = tuple(camera for camera in cameras if id(camera) not in chosen)
-    return training or cameras, held_out
+    return training[:: max(1, -(-len(training) // TRAINING))] or cameras, held_out
 
 
 def smaller(camera: Camera) -> Camera:

@@ -3,24 +3,30 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from ..cameras.camera import Camera
 from ..model.lod_tree import LodTree
 from ..model.splats import Splats
 from ..render.settings import RasterSettings
 from ..support.parallel import on_threads
 from ..support.progress import Progress, silent
-from .cameras import HELD_OUT, Place, placed, split_path
+from .cameras import HELD_OUT, TRAINING, Place, placed, split_path
 from .nodes import FittedNodes
-from .optimiser import ROUNDS, STAGES, Optimiser, default_steps, rates_at
+from .optimiser import Optimiser, Schedule, default_steps
 from .pictures import FullDetailPicture, Scores, gain, keep_gains, keep_sizes, pictures, scores_of
 from .settings import FitReport, FitSettings, FitStage
 
 #: Near plane at most and far plane at least, in radii of the scene, for scenes of tiny or huge units.
 NEAR, FAR = 0.01, 100.0
+
+#: Shares of the leaves that cuts are drawn of, and the golden ratio, whose multiples spread evenly.
+LEAST_SHARE, MOST_SHARE, GOLDEN = 0.01, 0.7, 0.6180339887498949
+
+#: Least mean gain of a stage of the second half, dB a step; after a smaller one, half of the steps that remain are left
+#: out. Large steps may lose at first and pay later. Chosen.
+FLAT = 3e-5
 
 #: Times that nodes are given their first values for one law after another, until they keep all.
 TRIES = 4
@@ -52,8 +58,8 @@ def fit(
     with on_threads(threads):
         fitting = _Fitting(nodes, tree, settings, threads)
         is_complete = True
-        for number in range(STAGES if fitting.can_gain else 0):
-            if not fitting.run_stage(number, progress, interrupted):
+        while fitting.has_steps:
+            if not fitting.run_stage(progress, interrupted):
                 is_complete = False
                 break
             say(fitting.describe_stage())
@@ -69,65 +75,55 @@ class _Fitting:
         near, far = min(raster.near, NEAR * place.radius), max(raster.far, FAR * place.radius)
         self.nodes = FittedNodes(nodes, tree, RasterSettings(near=near, far=far), threads)
         seeds = np.random.SeedSequence(settings.seed).spawn(3)
-        self._random = np.random.Generator(np.random.PCG64(seeds[2]))
         training, held_out = placed(place, seeds[0]), placed(place, seeds[1])
         if settings.path is not None:
-            of_training, of_held_out = split_path(settings.path)
-            training, held_out = self._shuffled(of_training), iter(of_held_out)
-        self._training, self._rounds = pictures(training, self.nodes), itertools.cycle(ROUNDS)
+            training, held_out = map(iter, split_path(settings.path))
+        steps = default_steps(len(self.nodes.leaves)) if settings.steps is None else settings.steps
         self._held_out = list(itertools.islice(pictures(held_out, self.nodes), HELD_OUT))
-        self._steps = default_steps(len(self.nodes.leaves)) if settings.steps is None else settings.steps
-        self._done = 0
+        can_gain = bool(self._held_out) and self.nodes.merged.size > 0
+        self._training = list(itertools.islice(pictures(training, self.nodes), min(TRAINING, steps) * can_gain))
+        self._schedule = Schedule(steps if self._training else 0)
+        self._examples = self._drawn(np.random.Generator(np.random.PCG64(seeds[2])))
         self._optimiser = Optimiser(self.nodes)
         self._before = self._best = scores_of(self.nodes, self._held_out)
         self._kept = self.nodes.copy()
         self._stages: list[FitStage] = []
 
-    def _shuffled(self, cameras: tuple[Camera, ...]) -> Iterator[Camera]:
-        """Yield cameras without end, each as often as the others; on a path neighbours see nearly the same."""
+    def _drawn(self, random: np.random.Generator) -> Iterator[tuple[FullDetailPicture, float]]:
+        """Yield pictures, each as often as the others, and shares of the leaves, evenly spread over their range."""
+        spread = random.random()
         while True:
-            for at in self._random.permutation(len(cameras)):
-                yield cameras[at]
+            for at in random.permutation(len(self._training)):
+                spread = (spread + GOLDEN) % 1
+                yield self._training[at], LEAST_SHARE * (MOST_SHARE / LEAST_SHARE) ** spread
 
     @property
-    def can_gain(self) -> bool:
-        """True if there is anything to do, and to see."""
-        return self._steps > 0 and bool(self._held_out) and self.nodes.merged.size > 0
+    def has_steps(self) -> bool:
+        """True if there are steps to take."""
+        return self._schedule.remaining > 0
 
-    def run_stage(self, number: int, progress: Progress, interrupted: Callable[[], bool]) -> bool:
+    def run_stage(self, progress: Progress, interrupted: Callable[[], bool]) -> bool:
         """Take the steps of a stage, and keep the nodes if they gained; return False if it was interrupted."""
-        first, last = self._done, self._steps * (number + 1) // STAGES
-        while self._done < last:
-            picture = next(self._training, None)
-            if picture is None:
-                break
-            shares = next(self._rounds).shares(self._random)[: last - self._done]
-            if not self._fit_to(picture, shares, progress, interrupted):
+        schedule = self._schedule
+        steps = schedule.stage_steps
+        for picture, share in itertools.islice(self._examples, steps):
+            if interrupted():
                 return False
+            shown = self._optimiser.step(picture, self.nodes.cut(picture.camera, share), schedule.rates())
+            self.nodes.renew(shown)
+            schedule.advance()
+            progress("refining", schedule.done, schedule.done + schedule.remaining, "step")
         now = scores_of(self.nodes, self._held_out)
         start = self._stages[-1].psnr_after if self._stages else self._before
-        self._stages.append(FitStage(f"fit {number + 1} of {STAGES}", self._done - first, start, now))
+        self._stages.append(FitStage(f"{schedule.done:,} steps", steps, start, now))
+        if schedule.done >= schedule.remaining and gain(self._best, now) < FLAT * steps:
+            schedule.shorten()
         if gain(self._best, now) > 0:
             self._best, self._kept = now, self.nodes.copy()
         return True
 
-    def _fit_to(
-        self, picture: FullDetailPicture, shares: Sequence[float], progress: Progress, interrupted: Callable[[], bool]
-    ) -> bool:
-        """Take a step for cuts of some shares of the leaves; return False if it was interrupted."""
-        shown = []
-        for share in shares:
-            if interrupted():
-                return False
-            cut = self.nodes.cut(picture.camera, share)
-            shown.append(self._optimiser.step(picture, cut, rates_at(self._done / self._steps)))
-            self._done += 1
-            progress("refining", self._done, self._steps, "step")
-        self.nodes.renew(np.unique(np.concatenate(shown)))
-        return True
-
     def describe_stage(self) -> str:
-        """Return what the last stage gained, for display."""
+        """Return what the steps so far gained, for display."""
         stage, before = self._stages[-1], self._before
         changes = (f"{share:.0%} {before[share]:.2f} -> {after:.2f} dB" for share, after in stage.psnr_after.items())
         return f"{stage.name}: {', '.join(changes)}"
@@ -135,9 +131,9 @@ class _Fitting:
     def finish(self, is_complete: bool) -> tuple[Splats, FitReport]:
         """Return the best nodes, those that lost with their first values, and the report."""
         self.nodes.restore(self.nodes.merged, self._kept)
-        after = self._lawful() if self.can_gain else self._before
+        after = self._lawful() if self._stages else self._before
         kept = float(self.nodes.changed()[self.nodes.merged].mean()) if self.nodes.merged.size else 0.0
-        report = FitReport(self._done, tuple(self._stages), self._before, after, kept, is_complete)
+        report = FitReport(self._schedule.done, tuple(self._stages), self._before, after, kept, is_complete)
         return self.nodes.result(), report
 
     def _lawful(self) -> Scores:

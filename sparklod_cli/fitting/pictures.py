@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..cameras.camera import Camera
 from ..images.metrics import on_background, psnr_of
@@ -45,11 +45,11 @@ class FullDetailPicture:
 
     Attributes:
         camera: that sees it.
-        full: (H, W, 4) float32, of full detail.
+        full: (H, W, 4) uint16 of full detail in units of 1 / 65535: colours multiplied by alpha, and alpha.
     """
 
     camera: Camera
-    full: Image
+    full: NDArray[np.uint16]
 
     def errors(self, image: Image) -> tuple[float, float]:
         """Return the mean squared errors of a picture on black and on white."""
@@ -58,12 +58,12 @@ class FullDetailPicture:
         black, white = sums.sum(axis=0) / (image.shape[0] * image.shape[1] * 3)
         return float(black), float(white)
 
-    def gradient(self, image: Image) -> tuple[Image, float]:
-        """Return the derivative of the mean logarithm of `errors`, as in PSNR, and the root mean squared error."""
+    def gradient(self, image: Image) -> Image:
+        """Return the derivative of the mean logarithm of `errors`, as in PSNR."""
         result, pixels = np.empty_like(image), image.shape[0] * image.shape[1] * 3
         errors = [error + LEAST_ERROR for error in self.errors(image)]
         by_image(image, self.full, *(np.float32(1 / (pixels * error)) for error in errors), result)
-        return result, math.sqrt(sum(errors) / 2)
+        return result
 
 
 def pictures(cameras: Iterator[Camera], nodes: FittedNodes) -> Iterator[FullDetailPicture]:
@@ -73,7 +73,7 @@ def pictures(cameras: Iterator[Camera], nodes: FittedNodes) -> Iterator[FullDeta
         full = draw(nodes.visible(nodes.leaves, camera)[1], camera, nodes.raster)
         if full[..., 3].mean() >= COVERED and on_background(full, 0.5).std(axis=(0, 1)).max() >= VARIED:
             misses = 0
-            yield FullDetailPicture(camera, full)
+            yield FullDetailPicture(camera, np.rint(full.clip(0, 1) * 65535).astype(np.uint16))
         misses += 1
         if misses > MOST_MISSES:
             return

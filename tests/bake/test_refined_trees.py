@@ -83,7 +83,8 @@ def test_it_is_a_tree_of_the_same_leaves_and_most_merged_splats_are_new(folder: 
 
 def test_the_report_tells_of_no_budget_that_lost(baked: Baked) -> None:
     assert baked.refine is not None
-    assert baked.refine.steps == REFINE.steps
+    assert REFINE.steps is not None
+    assert REFINE.steps / 2 < baked.refine.steps <= REFINE.steps
     assert baked.refine.is_complete
     assert [*baked.refine.psnr_before] == [*baked.refine.psnr_after] == [*SHARES]
     assert all(baked.refine.psnr_after[share] >= before for share, before in baked.refine.psnr_before.items())

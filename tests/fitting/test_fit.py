@@ -119,7 +119,7 @@ def test_an_interruption_keeps_what_the_finished_stages_gained() -> None:
     )
     assert not report.is_complete
     assert report.steps == len(steps) == STEPS // 2 + 1
-    assert len(report.stages) == len(stages) == optimiser.STAGES // 2
+    assert len(report.stages) == len(stages) == optimiser.STAGES // 2 - 1  # of 14 steps each
     assert report.kept > 0
     assert not same(result, demo()[0])
 
@@ -138,7 +138,8 @@ def test_small_trees_of_both_builders_and_of_any_sh_degree_can_be_fitted(builder
     assert not result.invalid()
     assert same(result.take(tree.is_leaf), nodes.take(tree.is_leaf))
     assert report.is_complete
-    assert report.steps in ((0,) if count == 1 else (6,) if count == 40 else (0, 6))  # two splats cover very little
+    assert (report.steps > 0) >= (count == 40)  # two splats cover very little
+    assert report.steps <= (0 if count == 1 else 6)
 
 
 @pytest.mark.parametrize("unit", [1e-4, 1e6])
@@ -150,8 +151,16 @@ def test_scenes_of_extreme_units_and_with_floaters_gain_too(unit: float) -> None
     scaled = dataclasses.replace(nodes, center=center * np.float32(unit), scale=nodes.scale * np.float32(unit))
     result, report = fit(scaled, tree, FitSettings(steps=STEPS // 2))
     assert not result.invalid()
-    assert report.steps == STEPS // 2
+    assert 0 < report.steps <= STEPS // 2
     assert len(report.psnr_after) == len(SHARES)
+
+
+def test_a_curve_that_is_flat_ends_the_fit_early(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fit_module, "FLAT", 100.0)
+    _, report = fit(*demo(), FitSettings(steps=120))
+    assert [stage.steps for stage in report.stages] == [10] * 8
+    assert report.steps == 80
+    assert report.is_complete
 
 
 def test_spherical_harmonics_are_fitted_too() -> None:
@@ -166,7 +175,7 @@ def test_the_cameras_of_a_path_are_what_a_tree_is_fitted_to() -> None:
     views = [Camera.look_at((0, -1, 2 + at / 4), (0, 0, 0), size=(96, 54)) for at in range(9)]
     path = CameraPath(tuple(views), "a path", (), tuple(range(9)))
     result, report = fit(nodes, tree, FitSettings(steps=STEPS, path=path))
-    assert report.steps == STEPS
+    assert 0 < report.steps <= STEPS
     assert not same(result, fitted()[0])
     assert all(report.psnr_after[share] >= report.psnr_before[share] for share in SHARES)
 

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 import pytest
 
 from sparklod_cli.fitting import cameras
 from sparklod_cli.fitting.cameras import Place, placed
-from sparklod_cli.fitting.kernels.adam import MOST_D, Rates
+from sparklod_cli.fitting.kernels.adam import MOST_D, MOST_GROWTH, Rates
 from sparklod_cli.fitting.nodes import FittedNodes
-from sparklod_cli.fitting.optimiser import LAST, MOST_REACH, RATES, ROUNDS, Optimiser, default_steps, rates_at, reach_of
+from sparklod_cli.fitting.optimiser import LAST, RATES, STAGES, Optimiser, Schedule, default_steps
 from sparklod_cli.fitting.pictures import FullDetailPicture, pictures
 from sparklod_cli.lod import quality
 from sparklod_cli.render.rasterizer import draw
@@ -74,40 +72,46 @@ def test_long_steps_stay_within_bounds(nodes: FittedNodes) -> None:
     now, old, merged = nodes.columns, nodes.old, nodes.merged
     assert not nodes.result().invalid()
     ratio = nodes.sizes(merged) / nodes.sizes(merged, old)
-    assert ratio.max() > 1.1
-    first = reach_of(FittedNodes(nodes.original, nodes.tree, nodes.raster, 1))
-    assert (np.abs(np.log(ratio)) <= np.log(first) + 1e-5).all()
+    assert ratio.max() > 1.05
+    assert (np.abs(np.log(ratio)) <= np.log(MOST_GROWTH) + 1e-5).all()
     assert now.lod_opacity.max() <= MOST_D
     away = np.linalg.norm(now.center - old.center, axis=1)
     assert (away <= 2.001 * old.scale.max(axis=1)).all()
 
 
-def test_the_sizes_of_fine_nodes_may_change_less_than_those_of_coarse_ones(nodes: FittedNodes) -> None:
-    reach, size = reach_of(nodes), nodes.sizes(nodes.merged)
-    order = np.argsort(-size, kind="stable")
-    assert (np.diff(reach[order]) <= 0).all()
-    assert reach[order[0]] == np.float32(MOST_REACH)
-    assert 1 < reach[order[-1]] < 1.2
+def rates_of(schedule: Schedule) -> list[Rates]:
+    found = []
+    while schedule.remaining:
+        found.append(schedule.rates())
+        schedule.advance()
+    return found
 
 
 def test_rates_fall_from_the_first_to_the_last() -> None:
-    rates = np.array([rates_at(share) for share in np.linspace(0, 1, 9)])
+    rates = np.array(rates_of(Schedule(50)))
+    assert len(rates) == 50
     assert np.allclose(rates[0], RATES)
-    assert np.allclose(rates[-1], LAST * np.array(RATES))
     assert (np.diff(rates, axis=0) < 0).all()
+    assert (rates[-1] < 1.1 * LAST * np.array(RATES)).all()
 
 
-def test_the_shares_of_rounds_spread_over_their_range_and_meet() -> None:
-    random = np.random.default_rng(1)
-    for of in ROUNDS:
-        shares = np.array([of.shares(random) for _ in range(200)])
-        assert of.least <= shares.min() and shares.max() <= of.most
-        middle = np.sqrt(of.least * of.most)
-        assert (np.count_nonzero(shares < middle, axis=1) == of.cuts // 2).all()
-    for one, other in itertools.pairwise(ROUNDS):
-        assert one.most == other.least
+def test_a_flat_curve_leaves_out_half_of_the_steps_and_the_rates_fall_to_the_same_end() -> None:
+    schedule = Schedule(120)
+    assert schedule.stage_steps == 120 // STAGES
+    for _ in range(40):
+        schedule.advance()
+    before = schedule.rates()
+    schedule.shorten()
+    assert (schedule.done, schedule.remaining) == (40, 40)
+    assert schedule.rates() == before
+    assert np.allclose(rates_of(schedule)[-1], LAST * np.array(RATES), rtol=0.1)
+    schedule = Schedule(120)
+    for _ in range(111):
+        schedule.advance()
+    schedule.shorten()
+    assert schedule.remaining == 0
 
 
 def test_larger_trees_have_fewer_steps_within_bounds() -> None:
     steps = [default_steps(leaves) for leaves in (1, 100_000, 500_000, 1_000_000, 50_000_000)]
-    assert steps == [6000, 6000, 2400, 1200, 1000]
+    assert steps == [6000, 6000, 6000, 3000, 1000]

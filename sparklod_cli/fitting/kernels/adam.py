@@ -19,9 +19,8 @@ BETA1, BETA2 = f32(0.9), f32(0.99)
 CENTER, SCALE, TURN, OPACITY, COLOR = 0, 3, 6, 9, 10
 FIRST = 13
 
-#: Columns of the second moments, one of each property, SH among them; and of the mean of 1 / squared error of the
-#: pictures that a splat was in.
-SECOND, PRECISION = 7, 6
+#: Columns of the second moments, one of each property, SH among them.
+SECOND = 6
 
 #: Range of D.
 LEAST_D, MOST_D = f32(0.004), f32(5)
@@ -29,6 +28,10 @@ LEAST_D, MOST_D = f32(0.004), f32(5)
 #: Least and largest scale, over that of the old splat; farthest centre, in its largest scales.
 MOST_CHANGE = f32(2)
 FARTHEST = f32(2)
+
+#: Factor that the feature size of a node may change by, either way. Sizes decide which nodes a cut refines, and the
+#: builder chose them well. Measured (benchmarks/notes/refining.md).
+MOST_GROWTH = f32(1.06)
 
 #: Colours stay in this range.
 LEAST_COLOR, MOST_COLOR = f32(-2), f32(4)
@@ -79,20 +82,18 @@ class Gradients(NamedTuple):
     sh: Any
 
 
-@fields(out(f4[:, :]), out(f4[:, :, :]), out(f4[:, :]), out(i4[:]), f4[:])
+@fields(out(f4[:, :]), out(f4[:, :, :]), out(f4[:, :]), out(i4[:]))
 class Moments(NamedTuple):
     """State of Adam for each merged splat.
 
     Attributes:
         first: (S, FIRST) float32. first_sh: (S, K, 3) float32. second: (S, SECOND) float32. count: (S,) int32 steps.
-        reach: (S,) float32, most that the feature size may become of the first one, or the first one of it.
     """
 
     first: Any
     first_sh: Any
     second: Any
     count: Any
-    reach: Any
 
 
 @fields(f4, f4, f4, f4, f4, f4)
@@ -132,8 +133,8 @@ def moved(first, second, slot, column, of_property, gradient, rate, correction):
     return factor * first[slot, column], factor * first[slot, column + 1], factor * first[slot, column + 2]
 
 
-@kernel(out(Columns), Columns, i8[:], i4[:], Gradients, Rates, Moments, f4, parallel=True)
-def step(nodes, old, index, slots, gradients, rates, moments, precision):
+@kernel(out(Columns), Columns, i8[:], i4[:], Gradients, Rates, Moments, parallel=True)
+def step(nodes, old, index, slots, gradients, rates, moments):
     """Move the merged splats that were drawn against their gradients.
 
     Args:
@@ -144,10 +145,9 @@ def step(nodes, old, index, slots, gradients, rates, moments, precision):
         gradients: `Gradients` of the drawn splats.
         rates: `Rates`.
         moments: `Moments`, changed.
-        precision: float32, 1 / squared error of the picture, in errors for which the rates are.
     """
     center, scale, quat, lod_opacity, rgb, sh = nodes
-    first, first_sh, second, count, reach = moments
+    first, first_sh, second, count = moments
     one, two = f32(1), f32(2)
     for i in prange(len(index)):
         node = index[i]
@@ -163,10 +163,7 @@ def step(nodes, old, index, slots, gradients, rates, moments, precision):
             continue
         count[slot] += 1
         t = f32(count[slot])
-        known = one - BETA2**t
-        second[slot, PRECISION] += (one - BETA2) * (precision - second[slot, PRECISION])
-        # Steps are as long as the errors that they are to mend.
-        correction = np.sqrt(known) * np.sqrt(known / second[slot, PRECISION])
+        correction = np.sqrt(one - BETA2**t)
         qx, qy, qz, qw = quat[node, 0], quat[node, 1], quat[node, 2], quat[node, 3]
         r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation_matrix(qx, qy, qz, qw, one)
         # The centre, in the splat's own axes and scales.
@@ -212,7 +209,7 @@ def step(nodes, old, index, slots, gradients, rates, moments, precision):
         change = rates.lod_opacity * correction / (np.sqrt(v) + EPSILON) * first[slot, OPACITY]
         lod_opacity[node] = min(max(d - change * min(d, one), LEAST_D), MOST_D)
         grown = size_of(scale, lod_opacity, node) / max(size_of(old.scale, old.lod_opacity, node), TINY)
-        back = min(max(grown, one / reach[slot]), reach[slot]) / max(grown, TINY)
+        back = min(max(grown, one / MOST_GROWTH), MOST_GROWTH) / max(grown, TINY)
         for c in range(3):
             scale[node, c] *= back
         g = gradients.rgb

@@ -6,11 +6,14 @@ import numpy as np
 
 from ...render.kernels.ellipse import Lens, Limits
 from ...support.jit import kernel, prange
-from ...support.jit_types import b1, f4, f8, i8, out
+from ...support.jit_types import b1, f4, f8, i8, out, u2
 
 f32 = np.float32
 
 ZERO, ONE = f32(0), f32(1)
+
+#: Steps of the values of pictures of full detail, which are held in 16 bits.
+LEVEL = f32(1 / 65535)
 
 
 @kernel(f4[:, :], f4[:], i8[:], f4[:, :], Lens, Limits, out(b1[:]), parallel=True)
@@ -51,30 +54,36 @@ def clipped(value):
     return min(max(value, ZERO), ONE)
 
 
-@kernel(f4[:, :, :], f4[:, :, :], out(f8[:, :]), parallel=True)
+@kernel(inline=True)
+def differences(image, full, y, x, c):
+    """Return the differences of a colour on black and on white."""
+    a, b = image[y, x, c], LEVEL * f32(full[y, x, c])
+    behind, full_behind = ONE - image[y, x, 3], ONE - LEVEL * f32(full[y, x, 3])
+    return clipped(a) - clipped(b), clipped(a + behind) - clipped(b + full_behind)
+
+
+@kernel(f4[:, :, :], u2[:, :, :], out(f8[:, :]), parallel=True)
 def squared_differences(image, full, sums):
     """Fill the sums of squared differences over the pixels of each row.
 
     Args:
-        image, full: (H, W, 4) float32, colours multiplied by alpha, and alpha.
+        image: (H, W, 4) float32, colours multiplied by alpha, and alpha.
+        full: (H, W, 4) uint16, the same in units of `LEVEL`.
         sums: (H, 2) float64, filled: on black and on white.
     """
     height, width = image.shape[:2]
     for y in prange(height):
         black, white = 0.0, 0.0
         for x in range(width):
-            behind, full_behind = ONE - image[y, x, 3], ONE - full[y, x, 3]
             for c in range(3):
-                a, b = image[y, x, c], full[y, x, c]
-                on_black = clipped(a) - clipped(b)
-                on_white = clipped(a + behind) - clipped(b + full_behind)
+                on_black, on_white = differences(image, full, y, x, c)
                 black += on_black * on_black
                 white += on_white * on_white
         sums[y, 0] = black
         sums[y, 1] = white
 
 
-@kernel(f4[:, :, :], f4[:, :, :], f4, f4, out(f4[:, :, :]), parallel=True)
+@kernel(f4[:, :, :], u2[:, :, :], f4, f4, out(f4[:, :, :]), parallel=True)
 def by_image(image, full, on_black, on_white, result):
     """Fill the derivative of half the squared differences on either background, times `on_black` and `on_white`.
 
@@ -88,12 +97,9 @@ def by_image(image, full, on_black, on_white, result):
     height, width = image.shape[:2]
     for y in prange(height):
         for x in range(width):
-            behind, full_behind = ONE - image[y, x, 3], ONE - full[y, x, 3]
             by_alpha = ZERO
             for c in range(3):
-                a, b = image[y, x, c], full[y, x, c]
-                black = on_black * (clipped(a) - clipped(b))
-                white = on_white * (clipped(a + behind) - clipped(b + full_behind))
-                result[y, x, c] = black + white
-                by_alpha -= white
+                black, white = differences(image, full, y, x, c)
+                result[y, x, c] = on_black * black + on_white * white
+                by_alpha -= on_white * white
             result[y, x, 3] = by_alpha
