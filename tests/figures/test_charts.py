@@ -56,11 +56,10 @@ def test_ticks_of_counts_are_integers(most: int, charting: None) -> None:
 
 @pytest.mark.usefixtures("charting")
 class TestCharts:
-    def test_the_same_rows_give_the_same_picture(self) -> None:
-        assert plotted(flight(60)) == plotted(flight(60))
-
-    def test_a_chart_has_its_width(self) -> None:
-        image = pixels(plotted(flight(60)).png)
+    def test_a_chart_has_its_width_and_the_same_rows_give_the_same_picture(self) -> None:
+        made = plotted(flight(60))
+        assert plotted(flight(60)) == made
+        image = pixels(made.png)
         assert image.shape[1] == charts.WIDTH
         assert image.shape[0] > traversal_chart.ROW * len(traversal_chart.PANELS) / 2
 
@@ -90,9 +89,8 @@ class TestCharts:
             other = [each | {name: (each[name] or 0) * (1.1 + at % 7)} for at, each in enumerate(rows)]  # type: ignore[operator]
             assert not np.array_equal(traversal_chart.draw_charts(other, marked(other)), before), name
 
-    @pytest.mark.parametrize("count", [1, 2, 3])
-    def test_a_path_of_few_frames_has_a_chart_of_full_width(self, count: int) -> None:
-        assert pixels(plotted(flight(count)).png).shape[1] == charts.WIDTH
+    def test_a_path_of_one_frame_has_a_chart_of_full_width(self) -> None:
+        assert pixels(plotted(flight(1)).png).shape[1] == charts.WIDTH
 
     @pytest.mark.parametrize(
         "cells",
@@ -109,7 +107,7 @@ class TestCharts:
         rows: list[Row] = [row(frame, **cells) for frame in range(4)]
         assert plotted(rows).note is None
 
-    @pytest.mark.parametrize("title", ["$x", "a\nb", "", "城.spz", "w" * 1000])
+    @pytest.mark.parametrize("title", ["$x\n城.spz", "", "w" * 1000])
     def test_any_name_can_be_a_title(self, title: str) -> None:
         assert plotted(flight(3), title).png
 

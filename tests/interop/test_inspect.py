@@ -171,17 +171,14 @@ def inspected(path: Path, capsys: pytest.CaptureFixture[str], *options: str) -> 
     return code, json.loads(capsys.readouterr().out)
 
 
-@pytest.fixture(params=["sh2.ply", "demo.ply", "biker.ply"])
-def source(request: pytest.FixtureRequest) -> Path:
-    """A scene: a fixture with SH, one without, and a real scene with more nodes than a chunk."""
-    path: Path = FIXTURES / request.param
-    return path if path.exists() else real_scene(request.param)
-
-
-@pytest.mark.parametrize("builder", BUILDERS)
+@pytest.mark.parametrize(
+    "name, builder", [("sh2.ply", "quality"), ("demo.ply", "quality"), ("demo.ply", "quick"), ("biker.ply", "quick")]
+)
 def test_facts_and_findings_of_sparks_trees_are_right(
-    spark: Spark, tmp_path: Path, capsys: pytest.CaptureFixture[str], source: Path, builder: str
+    spark: Spark, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, builder: str
 ) -> None:
+    """A fixture with SH, one without, and a real scene with more nodes than a chunk."""
+    source = FIXTURES / name if (FIXTURES / name).exists() else real_scene(name)
     path = tmp_path / "tree.spz"
     path.write_bytes(b"".join(spz.encode(spark_tree(spark, source, builder), threads=2)))
     code, report = inspected(path, capsys, "--fail-on", "warning")

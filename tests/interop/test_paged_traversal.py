@@ -24,7 +24,7 @@ from sparklod_cli.simulation.frames import Simulation
 from sparklod_cli.simulation.streaming_settings import Network, StreamingSettings
 from tests.conftest import real_scene
 from tests.interop.spark import NODE, PageUpdate, Spark
-from tests.interop.test_traversal import FOV_Y, FOVEATIONS, LOD_SCALES, SPARKS_CONES, Tree, baked, cameras, scene
+from tests.interop.test_traversal import FOV_Y, FOVEATIONS, LOD_SCALES, SPARKS_CONES, Tree, cameras, scene
 from tests.lod.forests import links, transform
 from tests.simulation.paths import around
 
@@ -169,7 +169,7 @@ def some_chunks(rng: np.random.Generator, forest: Forest) -> np.ndarray:
     return rng.random(forest.chunks) < rng.choice([0.2, 0.5, 0.8, 0.95])
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_the_cut_of_random_trees_with_missing_chunks_is_that_of_spark(spark: Spark, seed: int) -> None:
     """Budgets and limits end some of the cuts before chunks are missing, others not at all."""
     rng = np.random.default_rng(seed)
@@ -223,31 +223,16 @@ def test_the_cut_of_several_trees_in_one_page_pool_is_that_of_spark(spark: Spark
                 paged.check(instances, camera, budget, 0.0)
 
 
-def test_the_cut_of_a_baked_scene_with_missing_chunks_is_that_of_spark(spark: Spark) -> None:
-    tree = baked(scene("playbot.sog"))
-    paged = Paged(spark, [tree], pages=16)
-    rng = np.random.default_rng(1)
-    reasons = set()
-    for number, camera in enumerate(cameras(tree.nodes, 12, seed=1)):
-        demand = some_chunks(rng, paged.forest)
-        demand[0] = True
-        paged.keep(demand, rng)
-        instance = TreeInstance(0, foveation=FOVEATIONS[number % len(FOVEATIONS)])
-        reasons |= {paged.check([instance], camera, budget, 0.0).reason for budget in (3_000, 30_000, 300_000)}
-    assert reasons >= {"budget", "missing"}
-
-
-@pytest.mark.parametrize("name", ["biker-spark.rad", "playbot-125k-spark/p-lod.rad"])
-def test_the_cut_of_a_file_of_spark_with_missing_chunks_is_that_of_spark(spark: Spark, name: str) -> None:
-    """Three chunks each, so that all that can be missing are tried."""
-    scene = read_scene(real_scene(f"rad/{name}"))
+def test_the_cut_of_a_file_of_spark_with_missing_chunks_is_that_of_spark(spark: Spark) -> None:
+    """Three chunks, so that all that can be missing are tried."""
+    scene = read_scene(real_scene("rad/biker-spark.rad"))
     assert scene.tree is not None
     tree = Tree.of(lod_tree.pack(scene.splats, scene.tree)["lod_tree"])
     paged = Paged(spark, [tree], pages=4)
     rng = np.random.default_rng(2)
     for number in range(4):
         paged.keep(np.array([True, bool(number & 1), bool(number & 2)]), rng)
-        for camera in cameras(tree.nodes, 5, seed=number):
+        for camera in cameras(tree.nodes, 3, seed=number):
             for budget in (1_000, 20_000, 150_000):
                 paged.check([TreeInstance(0, foveation=SPARKS_CONES)], camera, budget, 0.0)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -22,10 +21,9 @@ from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quick
 from sparklod_cli.model.lod_tree import CHUNK_NODES
 from sparklod_cli.model.scene import Scene
-from sparklod_cli.model.selection import Selection
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.render.settings import RasterSettings
-from tests.conftest import FIXTURES, real_scene
+from tests.conftest import FIXTURES
 from tests.interop.page import Page, Picture, Request
 from tests.interop.pictures import cameras_around
 from tests.scenes import random_splats
@@ -39,14 +37,6 @@ LEAST = 40
 
 #: Where Spark looks for the header first.
 HEAD_BYTES = 65_536
-
-
-@cache
-def tree(name: str) -> Scene:
-    """The tree of a file; of one that has none, the quick one."""
-    path = FIXTURES / name
-    scene = read_scene(path if path.exists() else real_scene(name))
-    return scene if scene.tree else Scene(*quick.build(Selection().apply(scene.splats)[0]))
 
 
 def colourful() -> tuple[Scene, Camera]:
@@ -127,7 +117,7 @@ def check(page: Page, files: Files, expected: Picture, camera: Camera, budget: i
 
 
 def test_a_view_of_a_part_fetches_some_chunks_and_shows_the_picture_of_the_spz(page: Page, tmp_path: Path) -> None:
-    files = Files.of(tree("traverse/town.spz"), tmp_path)
+    files = Files.of(read_scene(FIXTURES / "traverse/town.spz"), tmp_path)
     near = look_at((-4.8, -0.5, 0.3), (-3.8, 0, 0.5), (0, -1, 0))  # at the border of two chunks
     camera = Camera(near, *SIZE, (400, 400), (SIZE[0] / 2, SIZE[1] / 2))
     fetched = check(page, files, drawn(page, files.spz, camera, 2_000, "Ext"), camera, 2_000)
@@ -145,9 +135,3 @@ def test_spherical_harmonics_of_degree_3_are_paged_as_packed_splats(page: Page, 
     files = Files.of(scene, tmp_path, SplatEncoding(lod_opacity=True))
     expected = drawn(page, files.whole, camera, 4_000, "Packed")
     assert check(page, files, expected, camera, 4_000, "Packed") == {0, 1}
-
-
-def test_a_paged_real_scene_shows_the_picture_of_the_spz(page: Page, tmp_path: Path) -> None:
-    scene = tree("biker.ply")
-    files, camera = Files.of(scene, tmp_path), cameras_around(scene.splats.center, *SIZE)[1]
-    check(page, files, drawn(page, files.spz, camera, 20_000, "Ext"), camera, 20_000)

@@ -155,7 +155,7 @@ def facing(backward: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize(
     "name, method, views",
-    [("demo.ply", "quick", 88), ("biker.spz", "quick", 88), ("playbot.sog", "quick", 48), ("demo.ply", "quality", 44)],
+    [("demo.ply", "quick", 44), ("biker.spz", "quick", 22), ("demo.ply", "quality", 22)],
 )
 def test_the_cut_of_one_tree_is_that_of_spark(spark: Spark, name: str, method: str, views: int) -> None:
     tree = baked(scene(name), method)
@@ -173,7 +173,7 @@ def test_the_cut_of_one_tree_is_that_of_spark(spark: Spark, name: str, method: s
 def test_the_cut_of_every_cone_is_that_of_spark(spark: Spark) -> None:
     tree = baked(scene("demo.ply"))
     both = Both(spark, [tree])
-    for camera in cameras(tree.nodes, 12, seed=3):
+    for camera in cameras(tree.nodes, 5, seed=3):
         for foveation in FOVEATIONS:
             cut = both.check([TreeInstance(0, foveation=foveation)], camera, len(tree.words) // 7, 0.0)
             assert (
@@ -192,7 +192,7 @@ def test_the_cut_of_every_budget_is_that_of_spark(spark: Spark) -> None:
         assert (cut.reason == "exhausted") == (budget >= leaves)
 
 
-@pytest.mark.parametrize("names, views", [(["demo.ply"], 40), (["demo.ply", "biker.spz", "playbot.sog"], 20)])
+@pytest.mark.parametrize("names, views", [(["demo.ply"], 20), (["demo.ply", "biker.spz"], 12)])
 def test_the_cut_of_several_instances_is_that_of_spark(spark: Spark, names: list[str], views: int) -> None:
     """Instances of one tree and of several are rotated, scaled and moved; some coincide."""
     trees = [baked(scene(name)) for name in names]
@@ -211,10 +211,9 @@ def test_the_cut_of_several_instances_is_that_of_spark(spark: Spark, names: list
         both.check(instances, camera, BUDGETS[number % 5], LIMITS[number % 3])
 
 
-@pytest.mark.parametrize("name", ["demo.ply", "biker.ply"])
-def test_the_cut_of_a_tree_that_spark_built_is_that_of_spark(spark: Spark, name: str) -> None:
+def test_the_cut_of_a_tree_that_spark_built_is_that_of_spark(spark: Spark) -> None:
     """Spark's builder takes sizes from another coding than ours; the tree is its four words a node."""
-    words = spark.load_words("Packed", scene(name), lod=True)["lodTree"]
+    words = spark.load_words("Packed", scene("demo.ply"), lod=True)["lodTree"]
     tree = Tree.of(words)
     assert (tree.nodes.tree.child_count == words.view(NODE)["child_count"][:, 0]).all()
     both = Both(spark, [tree])
@@ -231,7 +230,7 @@ def test_pixel_scales_are_those_of_spark_bit_for_bit(spark: Spark) -> None:
     nodes["child_count"][0], nodes["child_start"][0] = 2, 1
     both = Both(spark, [Tree.of(words)])
     rng = np.random.default_rng(8)
-    for number in range(600):
+    for number in range(150):
         camera = transform(rng, spread=(0.2, 3.0, 100.0)[number % 3])
         moved = transform(rng, scale=math.exp(rng.normal())) if number % 2 else np.eye(4)
         instance = TreeInstance(0, moved, rng.uniform(0.1, 3), FOVEATIONS[rng.integers(len(FOVEATIONS))])
@@ -241,10 +240,9 @@ def test_pixel_scales_are_those_of_spark_bit_for_bit(spark: Spark) -> None:
         assert len(both.check([instance], camera, 9, float(scale))) == 1
 
 
-@pytest.mark.parametrize("name", ["biker.spz", "playbot.sog"])
-def test_the_chunks_that_are_wanted_are_those_of_spark(spark: Spark, name: str) -> None:
+def test_the_chunks_that_are_wanted_are_those_of_spark(spark: Spark) -> None:
     """Chunks with the largest nodes come first."""
-    tree = baked(scene(name))
+    tree = baked(scene("biker.spz"))
     both = Both(spark, [tree])
     chunks = -(-len(tree.words) // CHUNK_NODES)
     assert chunks > 2

@@ -64,7 +64,7 @@ slow(values, 1)
 
 #: What holds with each threading layer, in a process that finds everything in the cache.
 SCRIPTS = {
-    "errors come through": """
+    "errors, threads and arrays that outlive modules": """
 for number in (3, 4):
     try:
         refuse(number)
@@ -72,16 +72,12 @@ for number in (3, 4):
         assert str(error) == "too many"
     else:
         raise SystemExit("nothing was raised")
-""",
-    "a wrong number of arguments": """
 for arguments in [(), (1, 2)]:
     try:
         refuse(*arguments)
     except TypeError:
         continue
     raise SystemExit("nothing was raised")
-""",
-    "threads are set for each thread": """
 jit.use_threads(1)
 seen = []
 thread = threading.Thread(target=lambda: seen.append(jit.threads_in_use()))
@@ -89,19 +85,6 @@ thread.start(); thread.join()
 assert jit.threads_in_use() == 1 and seen == [2], seen
 jit.use_threads(256)
 assert jit.threads_in_use() == 2
-assert (squares(values) == expected).all()
-""",
-    "arrays outlive the process's modules": "kept = squares(values)[::2]; import builtins; builtins.kept = kept",
-    "a forked process": """
-assert total(values) == values.sum()
-warnings.simplefilter("ignore", DeprecationWarning)  # Python 3.12 advises against forks
-child = os.fork()
-if not child:
-    right = total(values) == values.sum() and (squares(values) == expected).all() and jit.threads_in_use() == 2
-    os._exit(0 if right else 1)
-assert os.waitpid(child, 0)[1] == 0
-""",
-    "many threads at once": """
 right = []
 def call():
     for _ in range(20):
@@ -110,6 +93,17 @@ threads = [threading.Thread(target=call) for _ in range(8)]
 for thread in threads: thread.start()
 for thread in threads: thread.join()
 assert len(right) == 160 and all(right)
+import builtins
+builtins.kept = squares(values)[::2]
+""",
+    "a forked process": """
+assert total(values) == values.sum()
+warnings.simplefilter("ignore", DeprecationWarning)  # Python 3.12 advises against forks
+child = os.fork()
+if not child:
+    right = total(values) == values.sum() and (squares(values) == expected).all() and jit.threads_in_use() == 2
+    os._exit(0 if right else 1)
+assert os.waitpid(child, 0)[1] == 0
 """,
     "a process forked from one that used all threads": """
 assert (squares(values) == expected).all()

@@ -61,7 +61,7 @@ def huge(tmp_path: Path) -> Path:
     return path
 
 
-@pytest.mark.parametrize("source", [(), ("--orbit", "2"), ("--dolly", "--every", "20")])
+@pytest.mark.parametrize("source", [(), ("--dolly", "--every", "20")])
 @pytest.mark.slow
 def test_a_scene_of_any_size_is_compared_as_it_is_drawn(source: tuple[str, ...], huge: Path, capsys: Capture) -> None:
     """Wherever cameras are chosen for the scene, near and far are, too."""
