@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.faults.runs import CHUNKED, DEMO, SMALL, TREE, WRITERS, mounted, said_one_error, sparklod
+from tests.faults.runs import CHUNKED, DEMO, SMALL, TREE, WRITERS, mounted, said_one_error, shell, sparklod
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(sys.platform == "win32", reason="Windows has other file systems")]
 
@@ -72,7 +72,7 @@ def test_what_is_written_before_the_disk_is_full_is_whole(tmp_path: Path) -> Non
 
 
 @needs_full
-@pytest.mark.parametrize("name", ["build-lod", "inspect"])
+@pytest.mark.parametrize("name", ["build-lod", "inspect", "traverse"])
 def test_a_full_device_is_one_error_that_names_it(name: str) -> None:
     arguments, _ = LARGE[name]
     done = sparklod(*arguments, FULL)
@@ -82,7 +82,31 @@ def test_a_full_device_is_one_error_that_names_it(name: str) -> None:
     assert str(FULL) in line
 
 
-@pytest.mark.parametrize("name", ["build-lod in chunks", "traverse"])
+#: Commands that write to standard output.
+PRINTERS = {
+    "build-lod": ["build-lod", SMALL, "-o", "-"],
+    "build-lod --json": ["build-lod", SMALL, "-o", "/dev/null", "--overwrite", "--json"],
+    "traverse": ["traverse", TREE, "--orbit", "3"],
+    "render": ["render", TREE, "--size", "16x12", "-o", "-"],
+    "inspect": ["inspect", TREE],
+    "inspect --json": ["inspect", TREE, "--json"],
+}
+
+
+@needs_full
+@pytest.mark.parametrize("name", PRINTERS)
+def test_a_full_standard_output_is_one_error(name: str) -> None:
+    done = shell('"$@" > /dev/full', *PRINTERS[name])
+    assert done.returncode == 1
+    errors = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
+    assert len(errors) == 1
+    assert "standard output" in errors[0]
+    assert "no space left" in errors[0]
+    assert "Traceback" not in done.stderr
+    assert "Exception ignored" not in done.stderr
+
+
+@pytest.mark.parametrize("name", ["build-lod", "build-lod in chunks", "traverse"])
 def test_a_read_only_folder_is_one_error(name: str, tmp_path: Path) -> None:
     arguments, output = WRITERS.get(name, (CHUNKED, "demo.rad"))
     with mounted(tmp_path / "disk", "size=64k,ro") as disk:

@@ -11,12 +11,13 @@ from pathlib import Path
 
 import pytest
 
-from tests.faults.runs import CHUNKED, ENVIRONMENT, TREE, check_whole, command, sparklod
+from tests.faults.runs import CHUNKED, ENVIRONMENT, TREE, WRITERS, check_whole, command, sparklod
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(sys.platform == "win32", reason="there is no kill -9 on Windows")]
 
 #: Commands with one output, and with many.
 CASES = {
+    "build-lod": [*WRITERS["build-lod"][0], "demo.spz"],
     "build-lod in chunks": [*CHUNKED, "demo.rad"],
     "many cuts": ["traverse", TREE, "--orbit", "200", "--indices-out", "cuts", "-o", "table.csv"],
     "many pictures": ["render", TREE, "--orbit", "40", "--size", "96x64", "-o", "out.%04d.png"],
@@ -38,8 +39,8 @@ def run_again(arguments: list[object], folder: Path) -> None:
             check_whole(path)
 
 
-def test_a_run_killed_at_random_leaves_only_whole_files(tmp_path: Path) -> None:
-    name = "many pictures"
+@pytest.mark.parametrize("name", ["build-lod", "many cuts", "many pictures"])
+def test_a_run_killed_at_random_leaves_only_whole_files(name: str, tmp_path: Path) -> None:
     start = time.perf_counter()
     assert sparklod(*CASES[name], cwd=tmp_path).returncode == 0
     took = time.perf_counter() - start
@@ -69,7 +70,7 @@ def is_writing(process: int, folder: Path) -> bool:
 
 
 @pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="this system does not tell which files are open")
-@pytest.mark.parametrize("name", ["build-lod in chunks", "many cuts"])
+@pytest.mark.parametrize("name", ["build-lod", "build-lod in chunks", "many cuts"])
 def test_a_run_killed_while_it_writes_leaves_only_whole_files(name: str, tmp_path: Path) -> None:
     caught = 0
     for _ in range(4):

@@ -15,7 +15,7 @@ from tests.faults.runs import ENVIRONMENT, TREE, WRITERS, check_whole, said_one_
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(sys.platform == "win32", reason="Windows has no ulimit")]
 
 
-@pytest.mark.parametrize("name", ["build-lod", "render"])
+@pytest.mark.parametrize("name", WRITERS)
 def test_a_limit_of_file_size_is_one_error_or_a_small_file(name: str, tmp_path: Path) -> None:
     arguments, output = WRITERS[name]
     # Without bytecode, because Python 3.11 leaves incomplete .pyc files if it cannot write all of a module.
@@ -30,7 +30,7 @@ def test_a_limit_of_file_size_is_one_error_or_a_small_file(name: str, tmp_path: 
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(("name", "most"), [("build-lod", 10), ("traverse", 16)])
+@pytest.mark.parametrize(("name", "most"), [("build-lod", 10), ("traverse", 16), ("render", 10), ("inspect", 16)])
 def test_too_few_open_files_are_one_error_or_none(name: str, most: int, tmp_path: Path) -> None:
     arguments, output = WRITERS[name]
     done = shell(f'ulimit -n {most}; "$@"', *arguments, tmp_path / output)
@@ -72,9 +72,9 @@ ARRAYS_ON_THEIR_OWN = {**ENVIRONMENT, "MALLOC_ARENA_MAX": "1", "MALLOC_MMAP_THRE
 
 @pytest.fixture(scope="module")
 def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Splats of 16 MB."""
-    rows = np.zeros(500_000, [("center", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
-    rows["center"] = np.arange(500_000)[:, None] % [100, 101, 103]
+    """A million splats, 32 MB."""
+    rows = np.zeros(1_000_000, [("center", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
+    rows["center"] = np.arange(1_000_000)[:, None] % [100, 101, 103]
     rows["scale"], rows["rgba"], rows["quat"] = 0.01, 200, [255, 128, 128, 128]
     path = tmp_path_factory.mktemp("large") / "scene.splat"
     path.write_bytes(rows.tobytes())
@@ -82,11 +82,12 @@ def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="this system does not tell what a process takes")
-@pytest.mark.parametrize("name", ["build-lod", "inspect", "render a picture"])
+@pytest.mark.parametrize("name", ["build-lod", "inspect", "render a scene", "render a picture"])
 def test_too_little_memory_is_one_error_in_every_command(name: str, large: Path, tmp_path: Path) -> None:
     lines: dict[str, list[object]] = {
         "build-lod": ["build-lod", large, "-o", tmp_path / "out.spz"],
         "inspect": ["inspect", large, "--stats", "--json"],
+        "render a scene": ["render", large, "--size", "16x12", "-o", tmp_path / "out.png"],
         "render a picture": ["render", TREE, "--size", "2000x2000", "-o", tmp_path / "out.png"],
     }
     first = [*map(str, lines[name]), "--threads", "1", "-q"]

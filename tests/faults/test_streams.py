@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.faults.runs import DEMO, SMALL, TREE, WRITERS, check_whole, shell, sparklod
+from tests.faults.runs import DEMO, TREE, WRITERS, check_whole, shell, sparklod
+from tests.faults.test_disks import PRINTERS
 
 pytestmark = [
     pytest.mark.slow,
@@ -23,15 +24,11 @@ def nobody_reads() -> int:
     return writing
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [["build-lod", SMALL, "-o", "-"], ["traverse", TREE, "--orbit", "3"], ["inspect", TREE, "--json"]],
-    ids=lambda arguments: arguments[0],
-)
-def test_a_pipe_without_a_reader_is_exit_code_1(arguments: list[object]) -> None:
+@pytest.mark.parametrize("name", PRINTERS)
+def test_a_pipe_without_a_reader_is_exit_code_1(name: str) -> None:
     pipe = nobody_reads()
     try:
-        done = sparklod(*arguments, stdout=pipe, stderr=-1, capture_output=False)
+        done = sparklod(*PRINTERS[name], stdout=pipe, stderr=-1, capture_output=False)
     finally:
         os.close(pipe)
     assert done.returncode == 1
@@ -56,9 +53,19 @@ def test_a_reader_that_stops_early_causes_no_traceback(arguments: list[object]) 
     assert "Exception ignored" not in done.stderr
 
 
+@pytest.mark.parametrize("name", PRINTERS)
+def test_a_closed_standard_output_is_one_error(name: str) -> None:
+    done = shell('"$@" >&-', *PRINTERS[name])
+    assert done.returncode == 1
+    errors = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
+    assert len(errors) == 1
+    assert "standard output is closed" in errors[0]
+    assert "Traceback" not in done.stderr
+
+
 @pytest.mark.parametrize(
     ("name", "closed"),
-    [("build-lod", "<&- >&- 2>&-"), ("traverse", ">&-"), ("render", "2>&-")],
+    [("build-lod", "2>&-"), ("build-lod", "<&- >&- 2>&-"), ("traverse", ">&-"), ("render", ">&- 2>&-")],
 )
 def test_what_is_written_to_a_file_needs_no_streams(name: str, closed: str, tmp_path: Path) -> None:
     arguments, output = WRITERS[name]
