@@ -27,7 +27,7 @@ SIGNS: dict[str, Callable[[Any, Any], bool]] = {
     ">": operator.gt,
 }
 
-TEXT = re.compile(r"\s*(?P<left>[^<>=!]*?)\s*(?P<sign>[<>=!]+)\s*(?P<right>[^<>=!]*?)\s*")
+TEXT = re.compile(r"([^<>=!]*)([<>=!]+)([^<>=!]*)")
 NUMBER = re.compile(
     r"(?P<number>[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,3})?)\s*(?P<unit>%|[kKMG]?(?:i?B)?)"
 )
@@ -84,12 +84,13 @@ def parse_condition(text: str, *, example: str) -> Condition:
     Raises:
         BadAssertionError: it cannot be understood.
     """
-    found = TEXT.fullmatch(text)
-    if not found or not found["left"] or not found["right"]:
+    match = TEXT.fullmatch(text)
+    left, sign, right = (part.strip() for part in match.groups()) if match else ("", "", "")
+    if not left or not right:
         raise BadAssertionError(f"{text!r} is not an assertion like {example!r}")
-    if found["sign"] not in SIGNS:
-        raise BadAssertionError(f"{text!r}: {found['sign']} is not one of {' '.join(SIGNS)}")
-    return Condition(text.strip(), found["left"], found["sign"], _value(text, found["right"]))
+    if sign not in SIGNS:
+        raise BadAssertionError(f"{text!r}: {sign} is not one of {' '.join(SIGNS)}")
+    return Condition(text.strip(), left, sign, _value(text, right))
 
 
 def _value(text: str, right: str) -> Any:

@@ -143,6 +143,11 @@ def test_wrong_assertions_are_refused_with_the_reason(text: str, message: str) -
     assert "\n" not in str(caught.value)
 
 
+def test_a_long_run_of_blanks_is_refused_at_once() -> None:
+    with pytest.raises(BadAssertionError, match="is not an assertion like"):
+        parse(" " * 40_000, COLUMNS)
+
+
 def test_the_worst_frame_is_the_one_farthest_from_the_bound() -> None:
     rows = churns(None, 0.1, 0.9, 0.5)
     assert [asked(text, rows).worst for text in ("churn<0.2", "churn_max<0.2", "churn_p50<0.2")] == [rows[2]] * 3
