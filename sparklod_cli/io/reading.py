@@ -29,18 +29,21 @@ if TYPE_CHECKING:
 ZIP = b"PK\x03\x04"
 
 
-def read_scene(path: Place, *, threads: int = 1, progress: Progress = silent) -> Scene:
+def read_scene(
+    path: Place, *, columns: Collection[str] = COLUMNS, threads: int = 1, progress: Progress = silent
+) -> Scene:
     """Read a splat file of any known format, told by its content, or else by its suffix.
 
     Args:
         path: of a file, or of a folder that holds an unpacked SOG or a Streamed SOG; - is standard input.
+        columns: of the splats that are needed; the others may be 0.
 
     Raises:
         FormatError: it is not a file, empty, of no known format, or broken.
     """
     with opened(path) as (file, form, more):
         content: Content = form.codec().open_content(Source(file, threads=threads, **more))
-        return content.scene(threads=threads, progress=progress)
+        return content.scene(columns=columns, threads=threads, progress=progress)
 
 
 def read_stored(path: Place) -> Stored:

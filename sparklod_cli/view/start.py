@@ -16,8 +16,7 @@ from ..cameras.frame import DEFAULT_FOV_Y, Settings
 from ..cameras.sources import SingleViews, WholeScene
 from ..codecs.rad.rad_header import RadHeader
 from ..codecs.rad.rad_reader import count_leaves, file_of, read_chunk
-from ..codecs.validation import with_valid_tree
-from ..io import examine_scene, read_levels
+from ..io import read_levels, read_scene
 from ..io.local_files import open_plain, reason_of
 from ..model.balls import USED, Balls, balls_of
 from ..model.splats import Splats
@@ -97,7 +96,7 @@ def extent_of(shown: ShownFile, *, threads: int = 1, progress: Progress = silent
             return _coarse_extent(shown, shown.header)
         if shown.spark_type is None:
             return _detail_extent(shown.path, threads, progress)
-        scene = with_valid_tree(examine_scene(shown.path, columns=USED, threads=threads, progress=progress))
+        scene = read_scene(shown.path, columns=USED, threads=threads, progress=progress)
     except SparklodError as error:
         raise type(error)(f"{shown.path}: {error}") from None
     except OSError as error:

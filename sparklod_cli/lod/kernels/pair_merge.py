@@ -102,7 +102,6 @@ def merge_pair(a, b, planes, merged):
     dx, dy, dz = u - x, v - y, w - z
     pxx, pyy, pzz, pxy, pxz, pyz = covariance_of(a)
     qxx, qyy, qzz, qxy, qxz, qyz = covariance_of(b)
-    merged[COVERED] = total * (1 - hidden)
     trace = pxx + pyy + pzz + qxx + qyy + qzz
     ridge = RIDGE * trace + LEAST_RIDGE
     # (P + Q)^-1 is its adjugate over its determinant, and the gain P (P + Q)^-1.
@@ -124,6 +123,7 @@ def merge_pair(a, b, planes, merged):
     mxx, mxy = share * pxx + other * qxx + mixed * dx * dx, share * pxy + other * qxy + mixed * dx * dy
     myy, mxz = share * pyy + other * qyy + mixed * dy * dy, share * pxz + other * qxz + mixed * dx * dz
     mzz, myz = share * pzz + other * qzz + mixed * dz * dz, share * pyz + other * qyz + mixed * dy * dz
+    merged[COVERED] = total * (1 - hidden)
     if hidden > 0 and max(from_a, from_b) <= reach + trace:
         uxx = without(mxx, pxx - dot(gx, pxx, pxy, pxz), hidden, x, x)
         uyy = without(myy, pyy - dot(gy, pxy, pyy, pyz), hidden, y, y)
