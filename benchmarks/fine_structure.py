@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from scenes import write_ply
-from shapes import ADVANCE, from_axis, letters, sky, splats, strand
+from shapes import ADVANCE, from_axis, letters, shuffled, sky, splats, strand
 
 from sparklod_cli import Splats
 
@@ -31,8 +31,7 @@ def fine_structure(seed: int = 0) -> Splats:
     """The scene: about 100,000 splats without spherical harmonics."""
     rng = np.random.default_rng(seed)
     parts = [_ground(rng), sky(rng), _tree(rng), _bush(rng), *_wires(rng), *_fence(rng), *_chart(rng)]
-    scene = Splats.concat(parts)
-    return scene.take(rng.permutation(len(scene)))
+    return shuffled(rng, parts)
 
 
 def _ground(rng: np.random.Generator, count: int = 30_000) -> Splats:

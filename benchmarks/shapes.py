@@ -35,6 +35,12 @@ STROKES: dict[str, tuple[tuple[tuple[float, float], ...], ...]] = {
 ADVANCE = 5.4
 
 
+def shuffled(rng: np.random.Generator, parts: Sequence[Splats]) -> Splats:
+    """All parts in random order, as training leaves splats."""
+    scene = Splats.concat(parts)
+    return scene.take(rng.permutation(len(scene)))
+
+
 def splats(center: Array, scale: Array, quat_xyzw: Array, rgb: Array, opacity: Array) -> Splats:
     """Splats of a world whose y is up."""
     turn = np.array([1.0, -1.0, -1.0])

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 from scenes import write_ply
-from shapes import ADVANCE, Array, from_axis, letters, sky, splats, strand
+from shapes import ADVANCE, Array, from_axis, letters, shuffled, sky, splats, strand
 
 from sparklod_cli import Splats
 
@@ -37,7 +37,7 @@ def foliage_cards(seed: int = 0) -> Splats:
         light = 0.55 + 0.45 * np.abs(normal[:, 1:2]) + 0.12 * rng.normal(size=(count, 1))
         rgb = light * (np.array([0.3, 0.5, 0.16]) + rng.normal(0, 0.05, (count, 3)))
         parts.append(splats(center, scale, from_axis(2, normal), rgb, rng.uniform(0.8, 0.99, count)))
-    return _shuffled(rng, parts)
+    return shuffled(rng, parts)
 
 
 def cables(seed: int = 0) -> Splats:
@@ -55,7 +55,7 @@ def cables(seed: int = 0) -> Splats:
     for x, z in itertools.product((-6, 0, 6), repeat=2):
         mast = np.array([[x, y, z] for y in np.linspace(0, 3.6, 9)])
         parts.append(strand(rng, mast, 0.06, (0.45, 0.42, 0.4)))
-    return _shuffled(rng, parts)
+    return shuffled(rng, parts)
 
 
 def single_floor(seed: int = 0) -> Splats:
@@ -66,11 +66,11 @@ def single_floor(seed: int = 0) -> Splats:
     joint = (np.abs((x / 0.9) % 1 - 0.5) > 0.46) | (np.abs((z / 0.9) % 1 - 0.5) > 0.46)
     rgb = np.where(tile[:, None] > 0, [0.72, 0.68, 0.6], [0.42, 0.36, 0.32]) * (1 - 0.6 * joint[:, None])
     floor = _layer(rng, np.stack([x, np.zeros_like(x), z], axis=1), 1, 18 / 299, rgb)
-    return _shuffled(rng, [sky(rng), floor])
+    return shuffled(rng, [sky(rng), floor])
 
 
 def text_wall(seed: int = 0) -> Splats:
-    """Return lines of letters on a wall of one layer, before a sky: about 80,000 splats."""
+    """Return lines of letters on a wall of one layer, before a sky: about 47,000 splats."""
     rng = np.random.default_rng(seed)
     width, height = 6.0, 3.2
     x, y = (axis.ravel() for axis in np.meshgrid(np.arange(0, width, 0.022), np.arange(0, height, 0.022)))
@@ -83,7 +83,7 @@ def text_wall(seed: int = 0) -> Splats:
             if left + len(line) * ADVANCE * size / 6 < width:
                 parts += letters(rng, line, np.array([left, top - size, 0.02]), size)
         top -= 1.5 * size
-    return _shuffled(rng, parts)
+    return shuffled(rng, parts)
 
 
 def _layer(rng: np.random.Generator, center: Array, axis: int, step: float, rgb: Array) -> Splats:
@@ -95,11 +95,6 @@ def _layer(rng: np.random.Generator, center: Array, axis: int, step: float, rgb:
     quat = from_axis(2, np.tile(np.eye(3)[axis], (count, 1)))
     shade = 1 + 0.03 * rng.normal(size=(count, 1))
     return splats(center + jitter, scale, quat, rgb * shade, rng.uniform(0.9, 0.99, count))
-
-
-def _shuffled(rng: np.random.Generator, parts: list[Splats]) -> Splats:
-    scene = Splats.concat(parts)
-    return scene.take(rng.permutation(len(scene)))
 
 
 #: The scenes by name.
