@@ -24,7 +24,7 @@ def test_reading_loads_no_numba() -> None:
 
 
 def test_every_public_name_exists_and_is_typed() -> None:
-    """The stub names what is there."""
+    """The stub names every public name of the package."""
     for name in sparklod.__all__:
         assert getattr(sparklod, name).__name__ == name
     assert set(sparklod.__all__) <= set(dir(sparklod))

@@ -101,10 +101,10 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str], byt
     return found
 
 
-#: While parts of the input are read, and while blocks are built; `test_a_file_that_...` kills one that joins them.
+#: While parts of the input are read, while blocks are built, and while they are joined.
 @pytest.mark.parametrize(
     ("method", "suffix", "moment"),
-    [("quick", ".rad", 9), ("quality", ".spz", 15)],
+    [("quick", ".rad", 9), ("quality", ".spz", 15), ("quick", ".rad", 23)],
 )
 def test_a_killed_bake_goes_on_and_ends_with_the_same_bytes(
     method: str, suffix: str, moment: int, tmp_path: Path, whole: dict[tuple[str, str], bytes]

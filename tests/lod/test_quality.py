@@ -17,7 +17,7 @@ from sparklod_cli.cameras.formats.source import Parsed
 from sparklod_cli.cameras.formats.table import Axes, PathFormat
 from sparklod_cli.cameras.frame import DEFAULT_UP, Settings
 from sparklod_cli.cameras.framing import framing
-from sparklod_cli.cameras.generators import frame_looking, orbit
+from sparklod_cli.cameras.generators import orbit
 from sparklod_cli.cameras.path import cameras_of
 from sparklod_cli.codecs.gpu import lod_tree
 from sparklod_cli.images.metrics import on_background, psnr
@@ -181,9 +181,7 @@ def test_coarse_cuts_of_a_single_layer_have_no_cracks(share: float) -> None:
     splats = single_layer(70)
     nodes, tree = quality.build(splats)
     traversal = Traversal(Forest([lod_tree.unpack(lod_tree.pack(nodes, tree, threads=2))]), [TreeInstance()])
-    frame = frame_looking((0, -1.2, -0.6), (0, 0, 0), DEFAULT_UP)
-    settings = Settings(size=(160, 120), fov_y=math.radians(40))
-    camera = cameras_of(Parsed([frame]), PathFormat("", "a view", "", Axes.OPENGL_C2W), settings).cameras[0]
+    camera = Camera.look_at((0, -1.2, -0.6), (0, 0, 0), fov_y=40, size=(160, 120))
     cut = traversal.cut(view_of(camera), budget=int(share * len(splats))).indices()[0]
     middle = np.s_[30:90, 40:120, 3]
     full, coarse = picture(splats, camera)[middle], picture(nodes.take(cut), camera)[middle]

@@ -55,7 +55,7 @@ def scene(rng: random.Random) -> Splats:
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([1.1, 1.3, 1.5, 2.0]))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=60, deadline=None)
 @pytest.mark.slow
 def test_the_tree_in_stages_is_the_tree_in_memory(seed: int, base: float) -> None:
     rng = random.Random(seed)
@@ -64,9 +64,9 @@ def test_the_tree_in_stages_is_the_tree_in_memory(seed: int, base: float) -> Non
 
 
 @pytest.mark.parametrize("name", hard_cases())
+@pytest.mark.parametrize("base", [1.1, 2.0])
 @pytest.mark.slow
-def test_so_are_the_trees_of_hard_scenes(name: str) -> None:
-    base = 1.1 if len(name) % 2 else 2.0
+def test_so_are_the_trees_of_hard_scenes(name: str, base: float) -> None:
     splats = hard_cases()[name]
     check(splats, base, random_division(random.Random(name), splats.center, base))
 

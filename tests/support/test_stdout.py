@@ -19,11 +19,15 @@ pytestmark = pytest.mark.slow
 TREE, PLAIN = FIXTURES / "golden" / "tree-v3.spz", FIXTURES / "one.ply"
 PRINTING = [
     ("--help",),
+    ("--version",),
+    ("inspect", "--json-schema"),
+    ("inspect", TREE),
     ("inspect", TREE, TREE, "--json"),
+    ("inspect", TREE, "--field", "splats"),
     ("inspect", TREE, "--histogram", "x"),
     ("inspect", "missing.spz", "--check"),
-    ("traverse", TREE, "--orbit", "3"),
-    ("render", TREE, "--size", "16x12", "-o", "-"),
+    ("traverse", TREE, "--look-at", "0,-1,4:0,0,0"),
+    ("traverse", TREE, "--look-at", "0,-1,4:0,0,0", "--json"),
     ("build-lod", "missing.ply", "--json"),
     ("build-lod", "-o", "-", PLAIN),
 ]
@@ -67,6 +71,12 @@ def test_work_goes_on_without_a_standard_error(tmp_path: Path) -> None:
     assert (tmp_path / "out.spz").exists()
     assert sparklod(("build-lod", tmp_path / "missing.ply"), "2> /dev/full").returncode == 1
     assert sparklod(("build-lod", PLAIN, "--best"), "2> /dev/full").returncode == 2
+
+
+def test_a_reader_that_stops_early_causes_no_message() -> None:
+    done = sparklod(("inspect", *[TREE] * 50), "| head -n 1")
+    assert done.stdout.count("\n") == 1
+    assert done.stderr == ""
 
 
 def test_characters_outside_the_encoding_are_escaped(tmp_path: Path) -> None:

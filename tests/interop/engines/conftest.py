@@ -31,7 +31,7 @@ from tests.interop.engines.browser import Browser
 from tests.interop.engines.splat_transform import SplatTransform
 from tests.interop.pictures import cameras_around
 
-SIZE = 240, 136
+SIZE = 320, 180
 
 
 @dataclass(frozen=True)
@@ -86,20 +86,25 @@ def splat_transform(engines_dir: Path, tmp_path_factory: pytest.TempPathFactory)
 
 @pytest.fixture(scope="session")
 def shot(tmp_path_factory: pytest.TempPathFactory) -> Shot:
-    """The demo scene, in which up, left and front differ, as Streamed SOG with an environment."""
-    return written(dataclasses.replace(detailed(3, WEB), environment=sky()), tmp_path_factory.mktemp("web"), detail=WEB)
+    """The demo scene, in which up, left and front differ, as Streamed SOG."""
+    return written(detailed(), tmp_path_factory.mktemp("web"))
 
 
-#: How the demo scene and a third of it, which browsers draw sooner, are divided into levels, regions and chunks.
+@pytest.fixture(scope="session")
+def shot_with_sky(tmp_path_factory: pytest.TempPathFactory) -> Shot:
+    """The same scene with an environment, which is in its splats."""
+    return written(dataclasses.replace(detailed(), environment=sky()), tmp_path_factory.mktemp("web"))
+
+
+#: How the demo scene is divided into levels, regions and chunks.
 DETAIL = DetailSettings((0.25, 0.05), chunk_splats=8_000, extent=4, min_splats=2_000)
-WEB = DetailSettings((0.25, 0.05), chunk_splats=3_000, extent=4, min_splats=700)
 
 
 @functools.cache
-def detailed(every: int = 1, settings: DetailSettings = DETAIL) -> DetailScene:
-    """Return the demo scene, or every so many of its splats, at several detail levels, with the axis that points up."""
-    splats = read_scene(FIXTURES / "demo.ply").splats.take(slice(0, None, every))
-    return dataclasses.replace(detail_levels.make(*quality.build(splats, 2.0), settings), up="-y")
+def detailed() -> DetailScene:
+    """Return the demo scene at several detail levels, which notes the axis that points up."""
+    scene = detail_levels.make(*quality.build(read_scene(FIXTURES / "demo.ply").splats, 2.0), DETAIL)
+    return dataclasses.replace(scene, up="-y")
 
 
 def sky() -> Splats:
@@ -111,10 +116,10 @@ def sky() -> Splats:
     return Splats(*(np.array(column, np.float32, order="C") for column in columns))
 
 
-def written(scene: DetailScene, folder: Path, size: tuple[int, int] = SIZE, detail: DetailSettings = DETAIL) -> Shot:
+def written(scene: DetailScene, folder: Path, size: tuple[int, int] = SIZE) -> Shot:
     """Write a scene as Streamed SOG, and return it with a camera that sees the demo scene."""
     file = folder / recipes.MANIFEST
-    detail_sink(file, overwrite=False)(codec.encode_files(scene, WriteOptions(), detail))
+    detail_sink(file, overwrite=False)(codec.encode_files(scene, WriteOptions(), DETAIL))
     level = slice(0, int(scene.counts[:, 0].sum()))
     return Shot(file, read_scene(file).splats, cameras_around(scene.splats.center[level], *size)[1])
 
