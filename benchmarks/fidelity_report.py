@@ -1,6 +1,7 @@
-"""Tables and curves of what `bench_fidelity.py` measured.
+"""Tables and curves of the records of `bench_fidelity.py`.
 
-python benchmarks/fidelity_report.py fidelity.json more.json --docs docs/fidelity.md --plot docs/images/fidelity.png
+python benchmarks/fidelity_report.py fidelity.json more.json --docs docs/fidelity.md docs/fidelity-tables.md \
+  --plot docs/images/fidelity.png
 """
 
 from __future__ import annotations
@@ -9,25 +10,22 @@ import argparse
 import json
 import math
 import re
-import statistics
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from fidelity_trees import METHODS, WAYS
+from fidelity_trees import METHODS
 
-#: What scenes that were decimated by splat-transform are called in tables.
-NAMES = METHODS | {way: f"splat-transform --{way}" for way in WAYS}
+#: Our builders and those of Spark that do the same work.
+PAIRS = (("quick", "spark-tiny"), ("quality", "spark-quality"))
 
-#: Ours, and what each is held against.
-PAIRS = (
-    ("quick", "spark-tiny"),
-    ("quality", "spark-quality"),
-    ("refined", "spark-quality"),
-    ("refined", "quality"),
-)
+#: Variants of our quality builder.
+VARIANTS = ("refined", "blocks")
 
-#: What is added to the name of a set of cameras whose pictures have spherical harmonics.
+#: Scenes of thin things, where our quality builder is compared with the better of Spark's two.
+THIN_SCENES = ("fine-structure", "foliage-cards", "single-floor", "cables", "text-wall")
+
+#: Suffix of the names of sets of cameras whose pictures have spherical harmonics.
 WITH_SH = " SH"
 
 #: Line and marker of each method in the plot.
@@ -37,23 +35,21 @@ STYLES = {
     "quick": "C1s-",
     "quality": "C0s-",
     "refined": "C2D-",
-    "decimate": "C3^:",
-    "decimate-adaptive": "C4v:",
 }
 
-#: By scene and method, what `bench_fidelity.Measured.as_dict` has.
-Found = dict[str, dict[str, dict[str, Any]]]
+#: Figures by scene and method, each a `bench_fidelity.Measured` as a dictionary.
+Scenes = dict[str, dict[str, dict[str, Any]]]
 
 Rows = list[list[str]]
 
 
 def line(cells: Sequence[str]) -> None:
-    """Prints a row in Markdown."""
+    """Print a row in Markdown."""
     print(_row(cells), flush=True)
 
 
 def head(cells: Sequence[str]) -> None:
-    """Prints the head of a table in Markdown."""
+    """Print the head of a table in Markdown."""
     print(_head(cells), flush=True)
 
 
@@ -66,7 +62,7 @@ def _head(cells: Sequence[str]) -> str:
 
 
 def markdown(cells: Sequence[str], rows: Rows) -> str:
-    """A table of a head and rows."""
+    """Return a table of a head and rows."""
     return "\n".join([_head(cells), *map(_row, rows)])
 
 
@@ -74,162 +70,189 @@ def _number(value: float | None, form: str = ".2f") -> str:
     return "" if value is None else format(value, form)
 
 
-def _spelt(budgets: Sequence[str]) -> list[str]:
+def _columns(budgets: Sequence[str]) -> list[str]:
     return [budget.replace("%", " %") for budget in budgets]
 
 
-def _of(measured: dict[str, Any], cameras: str, budget: str, name: str) -> float | None:
-    """A figure; None where it was not measured."""
+def _figure(measured: dict[str, Any], cameras: str, budget: str, name: str) -> float | None:
+    """Return a figure; None where it was not measured."""
     value: float | None = measured["views"].get(cameras, {}).get(budget, {}).get(name)
     return value
 
 
-def _measured_from(found: Found, cameras: str) -> Iterator[tuple[str, str, dict[str, Any]]]:
-    """Scene, method and what was measured of it with a set of cameras."""
-    for scene, methods in found.items():
-        for method in NAMES:
-            if method in methods and cameras in methods[method]["views"]:
-                yield scene, method, methods[method]
+def _with(methods: dict[str, dict[str, Any]], cameras: str) -> list[str]:
+    """Return the methods that were measured with a set of cameras."""
+    return [method for method in METHODS if method in methods and cameras in methods[method]["views"]]
 
 
-def builders(found: Found, budgets: Sequence[str], cameras: str) -> str:
-    """PSNR of each tree, its nodes, and how long building it took."""
+def builders(scenes: Scenes, budgets: Sequence[str], cameras: str) -> str:
+    """Return the table of the PSNR of each tree, and of its nodes."""
     rows = []
-    for scene, method, measured in _measured_from(found, cameras):
-        nodes, seconds = measured["nodes"], measured["seconds"]
-        share = f"{nodes / measured['leaves']:.2f}" if nodes else ""
-        psnr = [_number(_of(measured, cameras, budget, "psnr")) for budget in budgets]
-        rows.append([scene, NAMES[method], share, *psnr, f"{statistics.median(seconds):.3f}" if seconds else ""])
-    return markdown(["scene", "builder", "nodes / leaves", *_spelt(budgets), "build s"], rows)
+    for scene, methods in scenes.items():
+        for method in _with(methods, cameras):
+            measured = methods[method]
+            psnr = [_number(_figure(measured, cameras, budget, "psnr")) for budget in budgets]
+            rows.append([scene, METHODS[method], f"{measured['nodes'] / measured['leaves']:.2f}", *psnr])
+    return markdown(["scene", "builder", "nodes / leaves", *_columns(budgets)], rows)
 
 
-def figures(found: Found, budgets: Sequence[str], cameras: str, name: str, form: str) -> str:
-    """One figure of each tree by budget."""
+def figures(scenes: Scenes, budgets: Sequence[str], cameras: str, name: str, form: str = ".2f") -> str:
+    """Return the table of one figure of each tree by budget."""
     rows = [
-        [scene, NAMES[method], *(_number(_of(measured, cameras, budget, name), form) for budget in budgets)]
-        for scene, method, measured in _measured_from(found, cameras)
+        [scene, METHODS[method], *(_number(_figure(methods[method], cameras, each, name), form) for each in budgets)]
+        for scene, methods in scenes.items()
+        for method in _with(methods, cameras)
     ]
-    return markdown(["scene", "builder", *_spelt(budgets)], rows)
+    return markdown(["scene", "builder", *_columns(budgets)], rows)
 
 
 def _gains(
-    methods: dict[str, dict[str, Any]], budgets: Sequence[str], cameras: str
-) -> Iterator[tuple[str, str, list[str]]]:
-    """The methods of each pair, and how much closer the first is at each budget."""
-    for mine, theirs in PAIRS:
-        if all(method in methods and cameras in methods[method]["views"] for method in (mine, theirs)):
-            both = ([_of(methods[method], cameras, budget, "psnr") for budget in budgets] for method in (mine, theirs))
-            gains = ["" if a is None or b is None else f"{a - b:+.2f}" for a, b in zip(*both, strict=True)]
-            yield mine, theirs, gains
+    methods: dict[str, dict[str, Any]],
+    mine: str,
+    theirs: Sequence[str],
+    cameras: str,
+    budgets: Sequence[str],
+    name: str,
+) -> list[str] | None:
+    """Return how much greater a figure of one method is than the best of others at each budget, if it was measured."""
+    if not {mine, *theirs} <= set(_with(methods, cameras)):
+        return None
+    cells = []
+    for budget in budgets:
+        own = _figure(methods[mine], cameras, budget, name)
+        others = [_figure(methods[method], cameras, budget, name) for method in theirs]
+        numbers = [other for other in others if other is not None]
+        cells.append("" if own is None or not numbers else f"{own - max(numbers):+.2f}")
+    return cells
 
 
-def differences(found: Found, budgets: Sequence[str], cameras: str) -> str:
-    """How much closer ours are than what they are held against, and how many times as long that took to build."""
-    rows = []
-    for scene, methods in found.items():
-        for mine, theirs, gains in _gains(methods, budgets, cameras):
-            took = [statistics.median(methods[method]["seconds"] or [0]) for method in (theirs, mine)]
-            ratio = f"{took[0] / took[1]:.2f}x" if all(took) else ""
-            rows.append([scene, f"{NAMES[mine]} - {NAMES[theirs]}", *gains, ratio])
-    return markdown(["scene", "dB", *_spelt(budgets), "their build time / ours"], rows)
-
-
-def other_cameras(found: Found, budgets: Sequence[str], every: Sequence[str]) -> str:
-    """How much closer ours are, from one set of cameras after another."""
+def differences(scenes: Scenes, budgets: Sequence[str], sets: Sequence[str]) -> str:
+    """Return the table of how much closer ours are than Spark's, from one set of cameras after another."""
     rows = [
-        [scene, cameras, f"{NAMES[mine]} - {NAMES[theirs]}", *gains]
-        for scene, methods in found.items()
-        for cameras in every
-        for mine, theirs, gains in _gains(methods, budgets, cameras)
+        [scene, *([cameras] if len(sets) > 1 else []), f"{METHODS[mine]} - {METHODS[theirs]}", *gains]
+        for scene, methods in scenes.items()
+        for cameras in sets
+        for mine, theirs in PAIRS
+        if (gains := _gains(methods, mine, [theirs], cameras, budgets, "psnr"))
     ]
-    return markdown(["scene", "cameras", "dB", *_spelt(budgets)], rows)
+    return markdown(["scene", *(["cameras"] if len(sets) > 1 else []), "dB", *_columns(budgets)], rows)
 
 
-def popping(found: Found, budgets: Sequence[str], paths: Sequence[str]) -> str:
-    """Popping along paths, mean and most."""
+def thin(scenes: Scenes, budgets: Sequence[str], cameras: str) -> str:
+    """Return the table of our quality builder less the better of Spark's, on scenes of thin things."""
+    rows = [
+        [scene, pixels, *gains]
+        for scene, methods in scenes.items()
+        if Path(scene).stem in THIN_SCENES
+        for pixels, name in (("all", "psnr"), ("edges", "edge_psnr"))
+        if (gains := _gains(methods, "quality", ["spark-tiny", "spark-quality"], cameras, budgets, name))
+    ]
+    return markdown(["scene", "pixels", *_columns(budgets)], rows)
+
+
+def variant(scenes: Scenes, budgets: Sequence[str], sets: Sequence[str], method: str) -> str:
+    """Return the table of what a variant of our quality builder gains over it."""
+    rows = [
+        [scene, cameras, pixels, *gains]
+        for scene, methods in scenes.items()
+        for cameras in sets
+        for pixels, name in (("all", "psnr"), ("edges", "edge_psnr"))
+        if (gains := _gains(methods, method, ["quality"], cameras, budgets, name))
+    ]
+    return markdown(["scene", "cameras", "pixels", *_columns(budgets)], rows)
+
+
+def popping(scenes: Scenes, budgets: Sequence[str], paths: Sequence[str]) -> str:
+    """Return the table of popping along paths, mean and most."""
     rows = []
-    for scene, methods in found.items():
-        for method in NAMES:
+    for scene, methods in scenes.items():
+        for method in METHODS:
             if method in methods and any(path in methods[method]["views"] for path in paths):
                 cells = [
-                    " / ".join(_number(_of(methods[method], path, budget, name)) for name in ("popping", "popping_max"))
+                    " / ".join(
+                        _number(_figure(methods[method], path, budget, name)) for name in ("popping", "popping_max")
+                    )
                     for path in paths
                     for budget in budgets
                 ]
-                rows.append([scene, NAMES[method], *cells])
-    return markdown(["scene", "builder", *(f"{path}, {each}" for path in paths for each in _spelt(budgets))], rows)
+                rows.append([scene, METHODS[method], *cells])
+    return markdown(["scene", "builder", *(f"{path}, {each}" for path in paths for each in _columns(budgets))], rows)
 
 
 def tables(record: dict[str, Any]) -> dict[str, str]:
-    """By the name that marks it in the page, each table that something was measured for."""
-    found, budgets, of_paths = record["scenes"], record["budgets"], record["budgets_of_paths"]
-    sets = {name for methods in found.values() for measured in methods.values() for name in measured["views"]}
+    """Return each table that something was measured for, by the name of its mark in a page."""
+    scenes, budgets, of_paths = record["scenes"], record["budgets"], record["budgets_of_paths"]
+    sets = {name for methods in scenes.values() for measured in methods.values() for name in measured["views"]}
     still = [name for name in record["cameras"] if name in sets and name not in record["moving"]]
     moving = [name for name in record["cameras"] if name in sets and name in record["moving"]]
-    told = {}
+    made = {}
     if still:
         first, *others = still
-        told["builders"] = builders(found, budgets, first)
-        told["differences"] = differences(found, budgets, first)
-        told["edges"] = figures(found, budgets, first, "edge_psnr", ".2f")
-        told["ssim"] = figures(found, budgets, first, "ssim", ".4f")
+        made["differences"] = differences(scenes, budgets, [first])
+        made["thin"] = thin(scenes, budgets, first)
+        made |= {method: variant(scenes, budgets, still, method) for method in VARIANTS}
+        made["builders"] = builders(scenes, budgets, first)
+        made["edges"] = figures(scenes, budgets, first, "edge_psnr")
+        made["ssim"] = figures(scenes, budgets, first, "ssim", ".4f")
         if others:
-            told["cameras"] = other_cameras(found, budgets, others)
+            made["cameras"] = differences(scenes, budgets, others)
         if first + WITH_SH in sets:
-            told["sh"] = figures(found, budgets, first + WITH_SH, "psnr", ".2f")
-            told["sh differences"] = other_cameras(found, budgets, [first + WITH_SH])
+            made["sh"] = figures(scenes, budgets, first + WITH_SH, "psnr")
     if moving:
-        told["popping"] = popping(found, of_paths, moving)
-    return told
+        made["popping"] = popping(scenes, of_paths, moving)
+    return {name: table for name, table in made.items() if table.count("\n") > 1}
 
 
-def put_into(page: Path, told: dict[str, str]) -> None:
-    """Puts tables between their marks in a page; a mark without a table keeps what it has.
+def put_into(pages: Sequence[Path], made: dict[str, str]) -> None:
+    """Put tables between their marks in the pages; a mark without a table keeps what it has.
 
     Raises:
         SystemExit: a table has no mark.
     """
-    text = page.read_text(encoding="utf-8")
-    for name, table in told.items():
+    texts = {page: page.read_text(encoding="utf-8") for page in pages}
+    for name, table in made.items():
         marks = re.compile(rf"(?<=<!-- table: {re.escape(name)} -->\n).*?(?=<!-- end of table -->)", re.DOTALL)
-        if not marks.search(text):
-            raise SystemExit(f"{page} has no place for the table {name!r}: <!-- table: {name} --> and its end")
-        text = marks.sub(lambda _, table=table: f"{table}\n", text, count=1)  # type: ignore[misc]
-    page.write_text(text, encoding="utf-8")
+        place = next((page for page, text in texts.items() if marks.search(text)), None)
+        if place is None:
+            names = ", ".join(map(str, pages))
+            raise SystemExit(f"{names}: no place for the table {name!r}: <!-- table: {name} --> and its end")
+        texts[place] = marks.sub(lambda _, table=table: f"{table}\n", texts[place], count=1)  # type: ignore[misc]
+    for page, text in texts.items():
+        page.write_text(text, encoding="utf-8")
 
 
 def merged(files: Sequence[Path]) -> dict[str, Any]:
-    """The records of several runs in one: of what was measured twice, the later run counts."""
+    """Return the records of several runs in one: of what was measured twice, the later run counts."""
     whole: dict[str, Any] = {}
     for file in files:
         record = json.loads(file.read_text(encoding="utf-8"))
-        found = whole.get("scenes", {})
+        scenes = whole.get("scenes", {})
         for scene, methods in record["scenes"].items():
-            mine = found.setdefault(scene, {})
+            mine = scenes.setdefault(scene, {})
             for method, measured in methods.items():
                 views = mine.get(method, {}).get("views", {}) | measured["views"]
                 mine[method] = measured | {"views": views}
         cameras = list(dict.fromkeys([*whole.get("cameras", []), *record["cameras"]]))
-        whole = whole | record | {"scenes": found, "cameras": cameras}
+        whole = whole | record | {"scenes": scenes, "cameras": cameras}
     return whole
 
 
 def plot(file: Path, record: dict[str, Any]) -> None:
-    """Draws PSNR over the share of the leaves, a panel for each scene and a line for each builder."""
+    """Draw PSNR over the share of the leaves, a panel for each scene and a line for each builder."""
     from matplotlib.figure import Figure
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-    found, cameras = record["scenes"], record["cameras"][0]
-    across = math.ceil(math.sqrt(len(found)))
-    down = math.ceil(len(found) / across)
+    scenes, cameras = record["scenes"], record["cameras"][0]
+    across = math.ceil(math.sqrt(len(scenes)))
+    down = math.ceil(len(scenes) / across)
     figure = Figure(figsize=(6 * across, 4 * down), layout="constrained")
-    for number, (scene, methods) in enumerate(found.items(), 1):
+    for number, (scene, methods) in enumerate(scenes.items(), 1):
         axes = figure.add_subplot(down, across, number, title=scene, xlabel="share of the leaves", ylabel="PSNR, dB")
-        for method in NAMES:
+        for method in STYLES:
             views = methods.get(method, {}).get("views", {}).get(cameras, {})
             points = [(float(budget[:-1]), each["psnr"]) for budget, each in views.items() if budget.endswith("%")]
             if points:
-                axes.plot(*zip(*sorted(points), strict=True), STYLES[method], markersize=4, label=NAMES[method])
+                axes.plot(*zip(*sorted(points), strict=True), STYLES[method], markersize=4, label=METHODS[method])
         axes.set_xscale("log")
         axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axes.xaxis.set_major_formatter(FuncFormatter(lambda share, _: f"{share:g} %"))
@@ -239,30 +262,29 @@ def plot(file: Path, record: dict[str, Any]) -> None:
     figure.savefig(file, dpi=100)
 
 
-def report(record: dict[str, Any], docs: Path | None, drawn: Path | None) -> None:
-    """Prints the tables, puts them into a page, and draws the curves."""
-    told = tables(record)
-    print(f"Machine: {record['machine']}. {record['size'][0]} x {record['size'][1]} pixels.")
-    for name, table in told.items():
+def report(record: dict[str, Any], docs: Sequence[Path], curves: Path | None) -> None:
+    """Print the tables, put them into pages, and draw the curves."""
+    made = tables(record)
+    print(f"{record['size'][0]} x {record['size'][1]} pixels.")
+    for name, table in made.items():
         print(f"\n{name}\n\n{table}", flush=True)
     if docs:
-        put_into(docs, told)
-    if drawn:
-        plot(drawn, record)
+        put_into(docs, made)
+    if curves:
+        plot(curves, record)
 
 
 def add_outputs(parser: argparse.ArgumentParser) -> None:
-    """The options that `bench_fidelity.py` has, too."""
-    parser.add_argument("--docs", type=Path, help="page that gets the tables between its marks, docs/fidelity.md")
+    """Add the options that `bench_fidelity.py` has, too."""
+    text = "pages that get the tables between their marks, docs/fidelity.md and docs/fidelity-tables.md"
+    parser.add_argument("--docs", type=Path, nargs="+", default=[], help=text)
     parser.add_argument("--plot", type=Path, help="file for the curves, such as fidelity.png; needs matplotlib")
 
 
 def main() -> None:
-    """Prints the tables of some runs."""
+    """Print the tables of several runs."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument(
-        "results", nargs="+", type=Path, help="what bench_fidelity.py wrote with --json; later ones win"
-    )
+    parser.add_argument("results", nargs="+", type=Path, help="JSONs of bench_fidelity.py; later ones win")
     add_outputs(parser)
     arguments = parser.parse_args()
     report(merged(arguments.results), arguments.docs, arguments.plot)

@@ -104,11 +104,16 @@ MOVING = ("orbit", "dolly")
 
 
 def cameras_of(name: str, scene: sparklod.Scene, size: tuple[int, int] = SIZE) -> list[sparklod.Camera]:
-    """A set of cameras for a scene whose up is -y, a thirtieth of a second after each other."""
+    """Return a set of cameras for a scene whose up is -y, a thirtieth of a second after each other.
+
+    Cameras that see no splat are left out, as some inside an object that stands alone.
+    """
     views = CAMERAS[name](Ball.of(scene))
+    small = [sparklod.Camera.look_at(*view, fov_y=FOV_Y, size=(96, 54)) for view in views]
     return [
-        sparklod.Camera.look_at(eye, target, fov_y=FOV_Y, size=size, time=at / 30)
-        for at, (eye, target) in enumerate(views)
+        sparklod.Camera.look_at(*view, fov_y=FOV_Y, size=size, time=at / 30)
+        for at, (view, camera) in enumerate(zip(views, small, strict=True))
+        if sparklod.render(scene, camera)[..., 3].any()
     ]
 
 
