@@ -8,14 +8,13 @@ from __future__ import annotations
 import argparse
 import io
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from fidelity_report import head, line
+from fidelity_report import markdown, put_into
 from fidelity_views import cameras_of, count_of, difference
-from performance.machine import machine
 from scenes import load
 
 import sparklod_cli as sparklod
@@ -97,8 +96,8 @@ FILES = (
 )
 
 
-def measure(path: Path, method: str, size: tuple[int, int], views: int) -> None:
-    """Prints a row for each way."""
+def measure(path: Path, method: str, size: tuple[int, int], views: int) -> Iterator[list[str]]:
+    """Yield a row for each way."""
     tree = sparklod.build_lod(sparklod.Scene(load(path)), method=method)
     every = cameras_of("around", tree)
     cameras = [resized(camera, size) for camera in every[:: max(1, len(every) // views)]][:views]
@@ -120,7 +119,7 @@ def measure(path: Path, method: str, size: tuple[int, int], views: int) -> None:
                 held = sparklod.Scene(splats.take(one.nodes[0]))
                 decibels.append(difference(sparklod.render(held, camera), full))
             cells.append(f"{np.mean(decibels):.1f} ({min(decibels):.1f})")
-        line([path.name, way.name, f"{written / 1e6:.2f}", *cells])
+        yield [path.name, way.name, f"{written / 1e6:.2f}", *cells]
 
 
 def resized(camera: sparklod.Camera, size: tuple[int, int]) -> sparklod.Camera:
@@ -131,17 +130,25 @@ def resized(camera: sparklod.Camera, size: tuple[int, int]) -> sparklod.Camera:
 
 
 def main() -> None:
-    """Prints a Markdown table."""
+    """Print a Markdown table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("scenes", nargs="+", type=Path, help="splat files")
     parser.add_argument("--method", choices=("quick", "quality"), default="quick", help="our builder")
     parser.add_argument("--size", type=int, nargs=2, default=(1280, 720), metavar=("WIDTH", "HEIGHT"))
     parser.add_argument("--views", type=int, default=4, help="of those that bench_fidelity.py looks from")
+    text = "pages of which one gets the table between its marks, docs/fidelity-tables.md"
+    parser.add_argument("--docs", type=Path, nargs="+", default=[], help=text)
     arguments = parser.parse_args()
-    print(f"Machine: {machine()}. PSNR in dB of cuts from the same cuts without rounding: mean (worst view).\n")
-    head(["scene", "file", "MB", *(f"budget {budget.replace('%', ' %')} of the leaves" for budget in BUDGETS)])
-    for scene in arguments.scenes:
-        measure(scene, arguments.method, tuple(arguments.size), arguments.views)
+    rows = [
+        row
+        for scene in arguments.scenes
+        for row in measure(scene, arguments.method, tuple(arguments.size), arguments.views)
+    ]
+    budgets = (f"{budget.replace('%', ' %')} of the leaves" for budget in BUDGETS)
+    table = markdown(["scene", "file", "MB", *budgets], rows)
+    print(table)
+    if arguments.docs:
+        put_into(arguments.docs, {"rounding": table})
 
 
 if __name__ == "__main__":

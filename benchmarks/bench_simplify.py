@@ -1,4 +1,4 @@
-"""Compares what simplifies scenes to 10 % and 1 % of their splats: `python benchmarks/bench_simplify.py --help`.
+"""Compares programs that simplify scenes: `python benchmarks/bench_simplify.py --help`.
 
 Every program gets the same PLY, without spherical harmonics, and is measured as a process from its start to its end:
 reading, building and writing. Trees are drawn as cuts of so many splats for each camera; the others are one set of
@@ -13,14 +13,14 @@ import json
 import os
 import sys
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bench_fidelity import scenes_of, size_of, sources
-from fidelity_report import NAMES, markdown, merged, put_into
-from fidelity_trees import WAYS, spark_command, spark_tree
+from bench_fidelity import MADE, scenes_of, size_of, sources
+from fidelity_report import markdown, merged, put_into
+from fidelity_trees import METHODS, spark_command, spark_tree
 from fidelity_views import SIZE, Figures, FullDetail, cameras_of, count_of, of_tree
 from performance.machine import load, machine
 from performance.process import SPARKLOD, CommandError, Took, run
@@ -29,19 +29,27 @@ from scenes import write_ply
 import sparklod_cli as sparklod
 from sparklod_cli.io import read_levels
 
-#: Shares of the splats that are left.
-SHARES = ("10%", "1%")
+#: Shares of the splats that are left, and those of the table that has all programs.
+SHARES = ("50%", "25%", "10%", "5%", "1%")
+COMPARED = ("10%", "1%")
 
 #: The set of cameras.
 CAMERAS = "around"
 
-#: What simplifies, by what it is called in tables.
-SIMPLIFIERS = NAMES | {"levels": "our levels of Streamed SOG", "nanogs": "NanoGS"}
+#: Simplifiers that build trees, of which each camera gets a cut, by their names in tables.
+TREES = {method: METHODS[method] for method in ("spark-tiny", "spark-quality", "quick", "quality", "refined")}
 
-#: Those that leave one set of splats for all cameras; the others build trees, of which each camera gets a cut.
-SETS = (*WAYS, "nanogs", "levels")
+#: Simplifiers that leave one set of splats for all cameras.
+SETS = {
+    "decimate": "splat-transform --decimate",
+    "decimate-adaptive": "splat-transform --decimate-adaptive",
+    "nanogs": "NanoGS",
+    "levels": "our levels of Streamed SOG",
+}
 
-#: Those that take minutes, and are measured only if they are named.
+SIMPLIFIERS = TREES | SETS
+
+#: Simplifiers that take minutes, and are measured only if they are named.
 SLOW = ("refined",)
 
 #: Programs of others: the variable of the environment that names a folder, and what must be there.
@@ -60,12 +68,13 @@ LEFT_OUT = {
     "V3DG": "its builder optimises each level with gsplat and selects CUDA as the only device",
 }
 
-Table = dict[str, dict[str, dict[str, Any]]]
+#: Figures by scene and method, each a `Simplified` as a dictionary.
+Scenes = dict[str, dict[str, dict[str, Any]]]
 
 
 @dataclass(frozen=True)
 class Simplified:
-    """What one program made of a scene.
+    """The results of one program for a scene.
 
     Attributes:
         runs: of the program, one for all shares or one for each.
@@ -78,7 +87,7 @@ class Simplified:
     splats: dict[str, int]
 
     def as_dict(self) -> dict[str, Any]:
-        """What the JSON has of it; `fidelity_report.merged` adds such records up."""
+        """Return the record of the JSON; `fidelity_report.merged` adds such records up."""
         return {
             "seconds": [took.wall_s for took in self.runs],
             "cpu_seconds": [took.cpu_s for took in self.runs],
@@ -112,7 +121,7 @@ class Comparison:
         write_ply(self._ply, drawn.splats)
 
     def simplified(self, method: str) -> Simplified:
-        """Runs a method of `SIMPLIFIERS` and measures what it made.
+        """Run a method of `SIMPLIFIERS` and measures what it made.
 
         Raises:
             CommandError: the program failed.
@@ -124,7 +133,7 @@ class Comparison:
         return self._tree(method)
 
     def _tree(self, method: str) -> Simplified:
-        """A tree, of which every camera gets a cut."""
+        """Measure a tree, of which every camera gets a cut."""
         if method.startswith("spark-"):
             took = run(spark_command(self._ply, method.removeprefix("spark-"), self._folder))
             tree = spark_tree(self._folder)
@@ -139,7 +148,7 @@ class Comparison:
         return Simplified([took], figures, {share: count_of(share, len(self._drawn)) for share in SHARES})
 
     def _levels(self) -> Simplified:
-        """Our detail levels, of one bake."""
+        """Measure our detail levels, of one bake."""
         file = self._folder / "levels" / "lod-meta.json"
         took = self._bake(file, "--levels", ",".join(SHARES))
         detail = read_levels(file)
@@ -147,7 +156,7 @@ class Comparison:
         return self._drawn_whole([took], sets)
 
     def _sets(self, method: str) -> Simplified:
-        """What another program leaves of the splats, run once for each share."""
+        """Measure the splats that another program leaves, run once for each share."""
         runs, sets = [], {}
         for share in SHARES:
             output = self._folder / f"{method}-{share[:-1]}.ply"
@@ -171,7 +180,7 @@ class Comparison:
 
 
 def peer_command(method: str, source: Path, output: Path, share: str) -> list[str | Path]:
-    """The command by which another program leaves a share such as "10%" of the splats of a PLY."""
+    """Return the command by which another program leaves a share such as "10%" of the splats of a PLY."""
     program = _program(method)
     if method == "nanogs":
         own = program.parent / ".venv" / "bin" / "python"
@@ -181,7 +190,7 @@ def peer_command(method: str, source: Path, output: Path, share: str) -> list[st
 
 
 def why_skipped(method: str) -> str | None:
-    """Why a program cannot be run; None if it can."""
+    """Return why a program cannot be run; None if it can."""
     if method not in PEERS:
         return None
     variable, file = PEERS[method]
@@ -195,20 +204,43 @@ def _program(method: str) -> Path:
     return Path(os.environ[variable]).absolute() / file
 
 
-def table(found: Table) -> str:
-    """The table of the page: a row for each scene and program."""
+def tables(scenes: Scenes) -> dict[str, str]:
+    """Return the table of all programs on scenes that are not made, and that of the sets at every share."""
+    real = {name: methods for name, methods in scenes.items() if Path(name).stem not in MADE}
+    return {"simplify": comparison_table(real), "sets": sets_table(scenes)}
+
+
+def comparison_table(scenes: Scenes) -> str:
+    """Return the table of all programs: a row for each scene and program."""
     rows = []
-    for scene, methods in found.items():
+    for scene, methods in scenes.items():
         for method in SIMPLIFIERS:
             if method in methods:
                 measured = methods[method]
-                seconds = " + ".join(f"{each:.1f}" for each in measured["seconds"])
+                seconds = dict(zip(SHARES, measured["seconds"], strict=False))
+                runs = COMPARED if len(seconds) == len(SHARES) else SHARES[:1]
                 peak = f"{max(measured['peak_bytes']) / 1e6:,.0f}"
+                cells = [cell for share in COMPARED for cell in _cells(measured["views"][CAMERAS][share])]
                 cameras = "all" if method in SETS else "each"
-                cells = [cell for share in SHARES for cell in _cells(measured["views"][CAMERAS][share])]
-                rows.append([scene, SIMPLIFIERS[method], cameras, *cells, seconds, peak])
-    figures = [f"{share.replace('%', ' %')}: {name}" for share in SHARES for name in ("PSNR", "edges", "SSIM")]
-    return markdown(["scene", "simplified by", "cameras", *figures, "s", "peak MB"], rows)
+                times = " + ".join(f"{seconds[share]:.1f}" for share in runs)
+                rows.append([scene, SIMPLIFIERS[method], cameras, *cells, times, peak])
+    names = [f"{share}: {name}" for share in _columns(COMPARED) for name in ("PSNR", "edges", "SSIM")]
+    return markdown(["scene", "simplified by", "cameras", *names, "s", "peak MB"], rows)
+
+
+def sets_table(scenes: Scenes) -> str:
+    """Return the table of the PSNR of sets for all cameras."""
+    rows = [
+        [scene, SETS[method], *(f"{methods[method]['views'][CAMERAS][share]['psnr']:.2f}" for share in SHARES)]
+        for scene, methods in scenes.items()
+        for method in SETS
+        if method in methods
+    ]
+    return markdown(["scene", "simplified by", *_columns(SHARES)], rows)
+
+
+def _columns(shares: Sequence[str]) -> list[str]:
+    return [share.replace("%", " %") for share in shares]
 
 
 def _cells(figures: Mapping[str, Any]) -> list[str]:
@@ -216,8 +248,8 @@ def _cells(figures: Mapping[str, Any]) -> list[str]:
     return [f"{figures['psnr']:.2f}", "" if edge is None else f"{edge:.2f}", f"{figures['ssim']:.4f}"]
 
 
-def measure(arguments: argparse.Namespace, made: Path) -> dict[str, Any]:
-    """Measures all scenes; the JSON is written after each program, so that a long run may end early."""
+def measure(arguments: argparse.Namespace, scratch: Path) -> dict[str, Any]:
+    """Measure all scenes; the JSON is written after each program, so that a long run may end early."""
     record: dict[str, Any] = {
         "machine": machine(),
         "size": arguments.size,
@@ -231,18 +263,18 @@ def measure(arguments: argparse.Namespace, made: Path) -> dict[str, Any]:
         if reason:
             print(f"{SIMPLIFIERS[method]} is skipped: {reason}", file=sys.stderr)
     run([*SPARKLOD, "warmup"])  # so that no run compiles
-    for path in scenes_of(arguments.scenes, made):
-        found = record["scenes"].setdefault(path.name, {})
+    for path in scenes_of(arguments.scenes, scratch):
+        methods = record["scenes"].setdefault(path.name, {})
         with tempfile.TemporaryDirectory(prefix="simplify-") as folder:
             drawn = next(sources(path, arguments)).drawn
             comparison = Comparison(drawn, arguments.size, arguments.every, Path(folder), arguments.steps)
             for method in (method for method, reason in reasons.items() if not reason):
                 try:
-                    found[method] = comparison.simplified(method).as_dict()
+                    methods[method] = comparison.simplified(method).as_dict()
                 except CommandError as error:  # the others go on
                     print(f"{path.name}: {SIMPLIFIERS[method]}: {error}", file=sys.stderr, flush=True)
                     continue
-                psnr = ", ".join(f"{each['psnr']:.2f}" for each in found[method]["views"][CAMERAS].values())
+                psnr = ", ".join(f"{each['psnr']:.2f}" for each in methods[method]["views"][CAMERAS].values())
                 print(f"{path.name}: {SIMPLIFIERS[method]}: {psnr} dB", file=sys.stderr, flush=True)
                 if arguments.json:
                     arguments.json.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
@@ -250,7 +282,7 @@ def measure(arguments: argparse.Namespace, made: Path) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Prints a Markdown table."""
+    """Print Markdown tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", nargs="*", help="those that bench_fidelity.py takes")
     usual = [method for method in SIMPLIFIERS if method not in SLOW]
@@ -262,21 +294,24 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="file for all numbers, with those of each camera")
     text = "JSONs of earlier runs, whose rows the table has as well; of what was measured twice, the later one counts"
     parser.add_argument("--results", type=Path, nargs="+", default=[], help=text)
-    parser.add_argument("--docs", type=Path, help="page that gets the table, docs/fidelity.md")
-    parser.set_defaults(runs=0, growth=1.4, sh=False, trees=None)  # of `bench_fidelity.sources`
+    text = "pages that get the tables between their marks, docs/fidelity.md and docs/fidelity-tables.md"
+    parser.add_argument("--docs", type=Path, nargs="+", default=[], help=text)
+    parser.set_defaults(growth=1.4, sh=False, trees=None)  # of `bench_fidelity.sources`
     arguments = parser.parse_args()
     if not (arguments.scenes or arguments.results):
         parser.error("name scenes to measure, or --results to print")
-    found: Table = merged(arguments.results).get("scenes", {})
+    scenes: Scenes = merged(arguments.results).get("scenes", {})
     if arguments.scenes:
-        with tempfile.TemporaryDirectory() as made:
-            for scene, measured in measure(arguments, Path(made))["scenes"].items():
-                found.setdefault(scene, {}).update(measured)
-    print(table(found))
+        with tempfile.TemporaryDirectory() as scratch:
+            for scene, methods in measure(arguments, Path(scratch))["scenes"].items():
+                scenes.setdefault(scene, {}).update(methods)
+    made = tables(scenes)
+    for name, table in made.items():
+        print(f"{name}\n\n{table}\n")
     for name, reason in LEFT_OUT.items():
-        print(f"\n{name} is left out: {reason}.")
+        print(f"{name} is left out: {reason}.")
     if arguments.docs:
-        put_into(arguments.docs, {"simplify": table(found)})
+        put_into(arguments.docs, made)
 
 
 if __name__ == "__main__":

@@ -45,7 +45,7 @@ def main() -> None:
     parser.add_argument("--size", type=size_of, default=(560, 315), help="of each picture (default 560x315)")
     parser.add_argument("--steps", type=int, help="of refining; by default what suits the tree")
     parser.add_argument("--trees", type=Path, help="folder that keeps our trees, that of bench_fidelity.py --trees")
-    parser.set_defaults(runs=0, growth=1.4, sh=False)
+    parser.set_defaults(growth=1.4, sh=False)
     arguments = parser.parse_args()
     settings = sparklod.LodSettings(foveation=sparklod.Cones(), pixel_scale_limit=0.0)
     camera = sparklod.Camera.look_at(arguments.eye, arguments.target, fov_y=FOV_Y, size=arguments.size)
@@ -55,7 +55,7 @@ def main() -> None:
         full = sparklod.render(source.drawn, camera)
         images, captions = [full], [f"full detail: {len(source.drawn):,} splats"]
         for method in arguments.methods:
-            tree = build(source, method).tree
+            tree = build(source, method)
             cut = sparklod.cut(tree, camera, budget=arguments.budget, settings=settings, precision="float16")
             images.append(sparklod.render(cut, camera))
             row = measured(PicturePair({}, images[-1], full, edges(full), None))

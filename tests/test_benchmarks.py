@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -71,53 +72,62 @@ FIGURES: dict[str, dict[str, float | None]] = {
 
 
 def record(*cameras: str) -> dict[str, Any]:
-    """What `bench_fidelity.py` writes of two builders of one scene, the second of which has 1 more in every figure."""
-    views = dict.fromkeys(cameras, FIGURES)
-    more = {budget: {name: value and value + 1 for name, value in each.items()} for budget, each in FIGURES.items()}
-    methods = {
-        "spark-quality": {"nodes": 30, "leaves": 20, "seconds": [4.0], "views": views},
-        "quality": {"nodes": 28, "leaves": 20, "seconds": [3.0, 2.0, 1.0], "views": dict.fromkeys(cameras, more)},
-    }
-    settings = {"machine": "a machine", "size": [8, 8], "budgets": ["2%", "5%"], "budgets_of_paths": ["5%"]}
-    return settings | {"cameras": list(cameras), "moving": ["orbit"], "scenes": {"a.ply": methods}}
+    """Return a record of `bench_fidelity.py` of four builders of one scene, each with 1 more in every figure."""
+    methods = {}
+    for gain, (method, nodes) in enumerate(
+        {"spark-tiny": 26, "spark-quality": 30, "quality": 28, "refined": 28}.items()
+    ):
+        figures = {
+            budget: {name: value and value + gain for name, value in each.items()} for budget, each in FIGURES.items()
+        }
+        methods[method] = {"nodes": nodes, "leaves": 20, "views": dict.fromkeys(cameras, figures)}
+    settings = {"size": [8, 8], "budgets": ["2%", "5%"], "budgets_of_paths": ["5%"]}
+    return settings | {"cameras": list(cameras), "moving": ["orbit"], "scenes": {"text-wall.ply": methods}}
 
 
 def test_tables_of_fidelity_say_what_was_measured(benchmark_module: Any) -> None:
-    told = benchmark_module("fidelity_report").tables(record("around", "near", "orbit"))
-    assert set(told) == {"builders", "differences", "edges", "ssim", "cameras", "popping"}
-    assert "| a.ply | Spark quality | 1.50 | 20.00 | 30.00 | 4.000 |" in told["builders"]
-    assert "| a.ply | our quality | 1.40 | 21.00 | 31.00 | 2.000 |" in told["builders"]
-    assert told["differences"].endswith("| a.ply | our quality - Spark quality | +1.00 | +1.00 | 2.00x |")
-    assert "| a.ply | Spark quality |  | 15.00 |" in told["edges"]
-    assert "| a.ply | near | our quality - Spark quality | +1.00 | +1.00 |" in told["cameras"]
-    assert "| a.ply | our quality | 3.00 / 4.00 |" in told["popping"]
+    tables = benchmark_module("fidelity_report").tables(record("around", "near", "orbit"))
+    expected = {"builders", "differences", "thin", "refined", "edges", "ssim", "cameras", "popping"}
+    assert set(tables) == expected, "blocks were not measured"
+    assert "| text-wall.ply | Spark quality | 1.50 | 21.00 | 31.00 |" in tables["builders"]
+    assert "| text-wall.ply | our quality | 1.40 | 22.00 | 32.00 |" in tables["builders"]
+    assert tables["differences"].endswith("| text-wall.ply | our quality - Spark quality | +1.00 | +1.00 |")
+    assert "| text-wall.ply | all | +1.00 | +1.00 |" in tables["thin"], "less the better of two"
+    assert "| text-wall.ply | edges |  | +1.00 |" in tables["thin"]
+    assert "| text-wall.ply | near | edges |  | +1.00 |" in tables["refined"]
+    assert "| text-wall.ply | Spark quality |  | 16.00 |" in tables["edges"]
+    assert "| text-wall.ply | our quality - Spark quality | +1.00 | +1.00 |" in tables["cameras"]
+    assert "| text-wall.ply | our quality | 4.00 / 5.00 |" in tables["popping"]
 
 
 def test_tables_of_fidelity_go_between_their_marks(benchmark_module: Any, tmp_path: Path) -> None:
     report = benchmark_module("fidelity_report")
     page = tmp_path / "page.md"
     page.write_text("before\n<!-- table: ssim -->\nold\n<!-- end of table -->\nafter\n")
-    report.put_into(page, {"ssim": "| new |"})
+    other = tmp_path / "other.md"
+    other.write_text("no table\n")
+    report.put_into([other, page], {"ssim": "| new |"})
+    assert other.read_text() == "no table\n"
     assert page.read_text() == "before\n<!-- table: ssim -->\n| new |\n<!-- end of table -->\nafter\n"
     with pytest.raises(SystemExit, match="no place for the table 'edges'"):
-        report.put_into(page, {"edges": "| new |"})
+        report.put_into([other, page], {"edges": "| new |"})
 
 
-def test_the_page_about_fidelity_has_a_place_for_every_table(benchmark_module: Any, tmp_path: Path) -> None:
+def test_the_pages_about_fidelity_have_a_place_for_every_table(benchmark_module: Any, tmp_path: Path) -> None:
     report = benchmark_module("fidelity_report")
-    page = tmp_path / "fidelity.md"
-    page.write_text((ROOT / "docs" / "fidelity.md").read_text())
-    told = report.tables(record("around", "near", "orbit", "around SH"))
-    assert len(told) == 8
-    report.put_into(page, told)
-    assert all(table in page.read_text() for table in told.values())
+    pages = _copies(tmp_path)
+    tables = report.tables(record("around", "near", "orbit", "around SH"))
+    assert len(tables) == 9
+    report.put_into(pages, tables | {"blocks": "| blocks |", "rounding": "| rounding |"})
+    text = "".join(page.read_text() for page in pages)
+    assert all(table in text for table in tables.values())
 
 
 def test_records_of_several_runs_add_up(benchmark_module: Any, tmp_path: Path) -> None:
     for name, cameras in (("a.json", ("around", "orbit")), ("b.json", ("near",))):
         (tmp_path / name).write_text(json.dumps(record(*cameras)))
     whole = benchmark_module("fidelity_report").merged([tmp_path / "a.json", tmp_path / "b.json"])
-    assert set(whole["scenes"]["a.ply"]["quality"]["views"]) == {"around", "orbit", "near"}
+    assert set(whole["scenes"]["text-wall.ply"]["quality"]["views"]) == {"around", "orbit", "near"}
     assert whole["cameras"] == ["around", "orbit", "near"]
 
 
@@ -179,24 +189,26 @@ def test_simplified_scenes_are_measured_as_whole_processes(
     splats = benchmark_module("fine_structure").fine_structure().with_max_sh(0).take(slice(0, 50_000, 20))
     comparison = bench.Comparison(sparklod.Scene(splats), (64, 36), 6, tmp_path)
     found = {method: comparison.simplified(method).as_dict() for method in ("quick", "levels", "nanogs")}
-    assert [len(each["seconds"]) for each in found.values()] == [1, 1, 2]
-    assert found["nanogs"]["splats"] == found["quick"]["splats"] == {"10%": 250, "1%": 25}
+    assert [len(each["seconds"]) for each in found.values()] == [1, 1, 5]
+    counts = {"50%": 1250, "25%": 625, "10%": 250, "5%": 125, "1%": 25}
+    assert found["nanogs"]["splats"] == found["quick"]["splats"] == counts
     psnr = {method: each["views"]["around"]["10%"]["psnr"] for method, each in found.items()}
     assert psnr["levels"] > psnr["nanogs"], "merged splats are closer than the first ones"
     assert all(peak > 1e7 for each in found.values() for peak in each["peak_bytes"])
 
-    text = bench.table({"a.ply": json.loads(json.dumps(found))})
-    assert text.count("\n") == 4
-    assert f"| a.ply | our quick | each | {psnr['quick']:.2f} |" in text
-    assert f"| a.ply | NanoGS | all | {psnr['nanogs']:.2f} |" in text
-    benchmark_module("fidelity_report").put_into(_copy(tmp_path), {"simplify": text})
+    tables = bench.tables({"a.ply": json.loads(json.dumps(found))})
+    assert tables["simplify"].count("\n") == 4
+    assert f"| a.ply | our quick | each | {psnr['quick']:.2f} |" in tables["simplify"]
+    assert f"| a.ply | NanoGS | all | {psnr['nanogs']:.2f} |" in tables["simplify"]
+    assert tables["sets"].count("\n") == 3, "no cuts"
+    assert "| photo-cloud.ply" not in bench.tables({"photo-cloud.ply": found})["simplify"], "a made scene"
+    benchmark_module("fidelity_report").put_into(_copies(tmp_path), tables)
 
 
-def _copy(folder: Path) -> Path:
-    """A copy of the page about fidelity."""
-    page = folder / "fidelity.md"
-    page.write_text((ROOT / "docs" / "fidelity.md").read_text())
-    return page
+def _copies(folder: Path) -> list[Path]:
+    """Return copies of the pages about fidelity."""
+    names = ("fidelity.md", "fidelity-tables.md")
+    return [Path(shutil.copy(ROOT / "docs" / name, folder / name)) for name in names]
 
 
 def test_simplifiers_that_are_missing_are_skipped_with_a_reason(

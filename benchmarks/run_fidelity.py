@@ -1,0 +1,59 @@
+"""Measures all tables of docs/fidelity.md and docs/fidelity-tables.md, and draws their pictures: three hours.
+
+SPARK_DIR=... ENGINES_DIR=... NANOGS_DIR=... python benchmarks/run_fidelity.py folder-of-scenes --json folder
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+from pathlib import Path
+
+from fidelity_report import THIN_SCENES
+
+HERE = Path(__file__).parent
+DOCS = HERE.parent / "docs"
+PAGES = ["--docs", DOCS / "fidelity.md", DOCS / "fidelity-tables.md"]
+
+#: Scenes of the tables of refining and of blocks.
+VARIANTS_OF = ("biker.ply", "playbot-125k.ply", "meadow.sog")
+
+
+def run(program: str, *arguments: str | Path) -> None:
+    """Run one benchmark.
+
+    Raises:
+        CalledProcessError: it failed.
+    """
+    subprocess.run([sys.executable, HERE / program, *arguments], check=True)
+
+
+def main() -> None:
+    """Run the benchmarks one after another."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenes", type=Path, help="the folder of the real scenes")
+    parser.add_argument("--json", type=Path, required=True, help="folder for the figures of each camera")
+    arguments = parser.parse_args()
+    arguments.json.mkdir(parents=True, exist_ok=True)
+    builders, refined, blocks, simplify = (
+        arguments.json / f"{name}.json" for name in ("builders", "refined", "blocks", "simplify")
+    )
+    variants = [*(arguments.scenes / name for name in VARIANTS_OF), "fine-structure"]
+    real, sets = ["biker.ply", "meadow.sog"], ["photo-cloud", "loose-cloud"]
+    run("bench_simplify.py", *(arguments.scenes / name for name in real), *sets, "--json", simplify, *PAGES)
+    spark = ["--methods", "spark-tiny", "spark-quality", "quick", "quality"]
+    cameras = ["--cameras", "around", "near", "inside", "above", "--popping", "--sh"]
+    made = ["glossy-knot", *THIN_SCENES]
+    run("bench_fidelity.py", arguments.scenes, *made, *spark, *cameras, "--json", builders)
+    run("bench_fidelity.py", *variants, "--methods", "blocks", "--json", blocks)
+    run("bench_fidelity.py", *variants, "--methods", "refined", "--cameras", "around", "inside", "--json", refined)
+    run("fidelity_report.py", refined, blocks, builders, *PAGES, "--plot", DOCS / "images" / "fidelity.png")
+    rounded = ["biker.ply", "playbot-125k.ply", "meadow.sog", "playbot.sog"]
+    run("bench_rad_rounding.py", *(arguments.scenes / name for name in rounded), *PAGES)
+    pictured = ["--methods", "spark-quality", "quick", "quality"]
+    run("fidelity_pictures.py", "fine-structure", DOCS / "images" / "fine-structure.webp", *pictured)
+
+
+if __name__ == "__main__":
+    main()
