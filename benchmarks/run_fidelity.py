@@ -14,7 +14,7 @@ from fidelity_report import THIN_SCENES
 
 HERE = Path(__file__).parent
 DOCS = HERE.parent / "docs"
-PAGES = ["--docs", DOCS / "fidelity.md", DOCS / "fidelity-tables.md"]
+PAGES: list[str | Path] = ["--docs", DOCS / "fidelity.md", DOCS / "fidelity-tables.md"]
 
 #: Scenes of the tables of refining and of blocks.
 VARIANTS_OF = ("biker.ply", "playbot-125k.ply", "meadow.sog")
@@ -39,7 +39,7 @@ def main() -> None:
     builders, refined, blocks, simplify = (
         arguments.json / f"{name}.json" for name in ("builders", "refined", "blocks", "simplify")
     )
-    variants = [*(arguments.scenes / name for name in VARIANTS_OF), "fine-structure"]
+    variants: list[str | Path] = [*(arguments.scenes / name for name in VARIANTS_OF), "fine-structure"]
     real, sets = ["biker.ply", "meadow.sog"], ["photo-cloud", "loose-cloud"]
     run("bench_simplify.py", *(arguments.scenes / name for name in real), *sets, "--json", simplify, *PAGES)
     spark = ["--methods", "spark-tiny", "spark-quality", "quick", "quality"]
