@@ -16,8 +16,8 @@ HERE = Path(__file__).parent
 DOCS = HERE.parent / "docs"
 PAGES: list[str | Path] = ["--docs", DOCS / "fidelity.md", DOCS / "fidelity-tables.md"]
 
-#: Scenes of the tables of refining and of blocks.
-VARIANTS_OF = ("biker.ply", "playbot-125k.ply", "meadow.sog")
+#: Real scenes of the table of refining.
+REFINED = ("biker.ply", "playbot-125k.ply", "meadow.sog")
 
 
 def run(program: str, *arguments: str | Path) -> None:
@@ -39,15 +39,17 @@ def main() -> None:
     builders, refined, blocks, simplify = (
         arguments.json / f"{name}.json" for name in ("builders", "refined", "blocks", "simplify")
     )
-    variants: list[str | Path] = [*(arguments.scenes / name for name in VARIANTS_OF), "fine-structure"]
     real, sets = ["biker.ply", "meadow.sog"], ["photo-cloud", "loose-cloud"]
     run("bench_simplify.py", *(arguments.scenes / name for name in real), *sets, "--json", simplify, *PAGES)
     spark = ["--methods", "spark-tiny", "spark-quality", "quick", "quality"]
     cameras = ["--cameras", "around", "near", "inside", "above", "--popping", "--sh"]
     made = ["glossy-knot", *THIN_SCENES]
     run("bench_fidelity.py", arguments.scenes, *made, *spark, *cameras, "--json", builders)
-    run("bench_fidelity.py", *variants, "--methods", "blocks", "--json", blocks)
-    run("bench_fidelity.py", *variants, "--methods", "refined", "--cameras", "around", "inside", "--json", refined)
+    run(
+        "bench_fidelity.py", arguments.scenes, "fine-structure", "single-floor", "--methods", "blocks", "--json", blocks
+    )
+    few = [*(arguments.scenes / name for name in REFINED), "fine-structure"]
+    run("bench_fidelity.py", *few, "--methods", "refined", "--cameras", "around", "inside", "--json", refined)
     run("fidelity_report.py", refined, blocks, builders, *PAGES, "--plot", DOCS / "images" / "fidelity.png")
     rounded = ["biker.ply", "playbot-125k.ply", "meadow.sog", "playbot.sog"]
     run("bench_rad_rounding.py", *(arguments.scenes / name for name in rounded), *PAGES)

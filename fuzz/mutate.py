@@ -154,6 +154,11 @@ BYTE_CHANGES: tuple[Callable[[Rng, bytearray, bytes, int], None], ...] = (
 )
 
 
+#: Characters at which a text hardly grows any more: lines that are repeated 200 times over and over would take longer to
+#: make than a case may take.
+LONGEST_TEXT = 1 << 20
+
+
 def text_mutated(rng: Rng, text: str) -> str:
     """Makes one to four changes to the words, numbers and lines of a text."""
     for _ in range(int(pick(rng, CHANGES))):
@@ -170,7 +175,8 @@ def text_mutated(rng: Rng, text: str) -> str:
         else:
             lines = text.splitlines(keepends=True) or [""]
             at = int(rng.integers(len(lines)))
-            lines[at : at + 1] = pick(rng, ([], [lines[at]] * 2, [lines[at]] * 200, [lines[at], "\n"]))
+            often = min(200, max(2, LONGEST_TEXT // max(len(lines[at]), 1)))
+            lines[at : at + 1] = pick(rng, ([], [lines[at]] * 2, [lines[at]] * often, [lines[at], "\n"]))
             text = "".join(lines)
     return text
 
