@@ -154,9 +154,9 @@ BYTE_CHANGES: tuple[Callable[[Rng, bytearray, bytes, int], None], ...] = (
 )
 
 
-#: Characters at which a text hardly grows any more: lines that are repeated 200 times over and over would take longer to
+#: Characters from which a line is only doubled: lines that are repeated 200 times again and again would take longer to
 #: make than a case may take.
-LONGEST_TEXT = 1 << 20
+LONGEST_LINE = 1 << 12
 
 
 def text_mutated(rng: Rng, text: str) -> str:
@@ -175,7 +175,7 @@ def text_mutated(rng: Rng, text: str) -> str:
         else:
             lines = text.splitlines(keepends=True) or [""]
             at = int(rng.integers(len(lines)))
-            often = min(200, max(2, LONGEST_TEXT // max(len(lines[at]), 1)))
+            often = 2 if len(lines[at]) > LONGEST_LINE else 200
             lines[at : at + 1] = pick(rng, ([], [lines[at]] * 2, [lines[at]] * often, [lines[at], "\n"]))
             text = "".join(lines)
     return text
