@@ -9,12 +9,14 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from fuzz import runner
 from fuzz.__main__ import main
 from fuzz.case import TARGETS, Case, case_of, target_of, unpacked
 from fuzz.child import Child
+from fuzz.mutate import text_mutated
 from tests import planted
 from tests.conftest import ROOT
 
@@ -128,3 +130,13 @@ def test_no_target_has_only_refused_cases(target: str) -> None:
     assert tally.cases == 5
     assert tally.refused < 5
     assert not tally.found, runner.table([tally])
+
+
+def test_texts_that_are_mutated_again_and_again_stay_of_a_size_that_is_soon_made() -> None:
+    longest = 0
+    for seed in range(200):
+        rng, text = np.random.default_rng(seed), "churn_p95<0.2"
+        for _ in range(8):
+            text = text_mutated(rng, text)
+        longest = max(longest, len(text))
+    assert 4_000 < longest < 1 << 24
