@@ -1,4 +1,4 @@
-"""Measures all tables of docs/fidelity.md and docs/fidelity-tables.md, and draws their pictures: three hours.
+"""Measures all tables of docs/fidelity.md and docs/fidelity-tables.md, and draws their pictures: two hours.
 
 SPARK_DIR=... ENGINES_DIR=... NANOGS_DIR=... python benchmarks/run_fidelity.py folder-of-scenes --json folder
 """
