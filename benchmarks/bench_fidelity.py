@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from fidelity_report import WITH_SH, add_outputs, report
 from fidelity_trees import METHODS, Source, build
-from fidelity_views import CAMERAS, MOVING, OF_PATHS, SIZE, Figures, cameras_of, of_tree
+from fidelity_views import CAMERAS, MOVING, OF_PATHS, SIZE, Figures, cameras_of, of_tree, that_see
 from fine_structure import fine_structure
 from glossy_knot import glossy_knot
 from photo_cloud import loose_cloud, photo_cloud
@@ -72,7 +72,7 @@ def measure(source: Source, arguments: argparse.Namespace) -> Iterator[tuple[str
     sets = {}
     for name in [first] if source.sh else arguments.cameras:
         cameras = cameras_of(name, drawn, arguments.size if name == first else half)
-        sets[name] = cameras[:: 1 if name in MOVING else arguments.every]
+        sets[name] = cameras if name in MOVING else that_see(cameras[:: arguments.every], drawn)
     for method in arguments.methods:
         tree = build(source, method)
         views = {}

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from fidelity_report import markdown, put_into
+from fidelity_report import columns, markdown, put_into
 from fidelity_views import cameras_of, count_of, difference
 from scenes import load
 
@@ -144,7 +144,7 @@ def main() -> None:
         for scene in arguments.scenes
         for row in measure(scene, arguments.method, tuple(arguments.size), arguments.views)
     ]
-    budgets = (f"{budget.replace('%', ' %')} of the leaves" for budget in BUDGETS)
+    budgets = (f"{budget} of the leaves" for budget in columns(BUDGETS))
     table = markdown(["scene", "file", "MB", *budgets], rows)
     print(table)
     if arguments.docs:

@@ -13,13 +13,13 @@ import json
 import os
 import sys
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from bench_fidelity import MADE, scenes_of, size_of, sources
-from fidelity_report import markdown, merged, put_into
+from fidelity_report import columns, markdown, merged, put_into
 from fidelity_trees import METHODS, spark_command, spark_tree
 from fidelity_views import SIZE, Figures, FullDetail, cameras_of, count_of, of_tree
 from performance.machine import load, machine
@@ -224,7 +224,7 @@ def comparison_table(scenes: Scenes) -> str:
                 cameras = "all" if method in SETS else "each"
                 times = " + ".join(f"{seconds[share]:.1f}" for share in runs)
                 rows.append([scene, SIMPLIFIERS[method], cameras, *cells, times, peak])
-    names = [f"{share}: {name}" for share in _columns(COMPARED) for name in ("PSNR", "edges", "SSIM")]
+    names = [f"{share}: {name}" for share in columns(COMPARED) for name in ("PSNR", "edges", "SSIM")]
     return markdown(["scene", "simplified by", "cameras", *names, "s", "peak MB"], rows)
 
 
@@ -236,11 +236,7 @@ def sets_table(scenes: Scenes) -> str:
         for method in SETS
         if method in methods
     ]
-    return markdown(["scene", "simplified by", *_columns(SHARES)], rows)
-
-
-def _columns(shares: Sequence[str]) -> list[str]:
-    return [share.replace("%", " %") for share in shares]
+    return markdown(["scene", "simplified by", *columns(SHARES)], rows)
 
 
 def _cells(figures: Mapping[str, Any]) -> list[str]:

@@ -70,7 +70,8 @@ def _number(value: float | None, form: str = ".2f") -> str:
     return "" if value is None else format(value, form)
 
 
-def _columns(budgets: Sequence[str]) -> list[str]:
+def columns(budgets: Sequence[str]) -> list[str]:
+    """Return the heads of the columns of budgets."""
     return [budget.replace("%", " %") for budget in budgets]
 
 
@@ -93,7 +94,7 @@ def builders(scenes: Scenes, budgets: Sequence[str], cameras: str) -> str:
             measured = methods[method]
             psnr = [_number(_figure(measured, cameras, budget, "psnr")) for budget in budgets]
             rows.append([scene, METHODS[method], f"{measured['nodes'] / measured['leaves']:.2f}", *psnr])
-    return markdown(["scene", "builder", "nodes / leaves", *_columns(budgets)], rows)
+    return markdown(["scene", "builder", "nodes / leaves", *columns(budgets)], rows)
 
 
 def figures(scenes: Scenes, budgets: Sequence[str], cameras: str, name: str, form: str = ".2f") -> str:
@@ -103,7 +104,7 @@ def figures(scenes: Scenes, budgets: Sequence[str], cameras: str, name: str, for
         for scene, methods in scenes.items()
         for method in _with(methods, cameras)
     ]
-    return markdown(["scene", "builder", *_columns(budgets)], rows)
+    return markdown(["scene", "builder", *columns(budgets)], rows)
 
 
 def _gains(
@@ -135,7 +136,7 @@ def differences(scenes: Scenes, budgets: Sequence[str], sets: Sequence[str]) -> 
         for mine, theirs in PAIRS
         if (gains := _gains(methods, mine, [theirs], cameras, budgets, "psnr"))
     ]
-    return markdown(["scene", *(["cameras"] if len(sets) > 1 else []), "dB", *_columns(budgets)], rows)
+    return markdown(["scene", *(["cameras"] if len(sets) > 1 else []), "dB", *columns(budgets)], rows)
 
 
 def thin(scenes: Scenes, budgets: Sequence[str], cameras: str) -> str:
@@ -147,7 +148,7 @@ def thin(scenes: Scenes, budgets: Sequence[str], cameras: str) -> str:
         for pixels, name in (("all", "psnr"), ("edges", "edge_psnr"))
         if (gains := _gains(methods, "quality", ["spark-tiny", "spark-quality"], cameras, budgets, name))
     ]
-    return markdown(["scene", "pixels", *_columns(budgets)], rows)
+    return markdown(["scene", "pixels", *columns(budgets)], rows)
 
 
 def variant(scenes: Scenes, budgets: Sequence[str], sets: Sequence[str], method: str) -> str:
@@ -159,7 +160,7 @@ def variant(scenes: Scenes, budgets: Sequence[str], sets: Sequence[str], method:
         for pixels, name in (("all", "psnr"), ("edges", "edge_psnr"))
         if (gains := _gains(methods, method, ["quality"], cameras, budgets, name))
     ]
-    return markdown(["scene", "cameras", "pixels", *_columns(budgets)], rows)
+    return markdown(["scene", "cameras", "pixels", *columns(budgets)], rows)
 
 
 def popping(scenes: Scenes, budgets: Sequence[str], paths: Sequence[str]) -> str:
@@ -176,7 +177,7 @@ def popping(scenes: Scenes, budgets: Sequence[str], paths: Sequence[str]) -> str
                     for budget in budgets
                 ]
                 rows.append([scene, METHODS[method], *cells])
-    return markdown(["scene", "builder", *(f"{path}, {each}" for path in paths for each in _columns(budgets))], rows)
+    return markdown(["scene", "builder", *(f"{path}, {each}" for path in paths for each in columns(budgets))], rows)
 
 
 def tables(record: dict[str, Any]) -> dict[str, str]:

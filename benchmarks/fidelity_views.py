@@ -104,17 +104,17 @@ MOVING = ("orbit", "dolly")
 
 
 def cameras_of(name: str, scene: sparklod.Scene, size: tuple[int, int] = SIZE) -> list[sparklod.Camera]:
-    """Return a set of cameras for a scene whose up is -y, a thirtieth of a second after each other.
-
-    Cameras that see no splat are left out, as some inside an object that stands alone.
-    """
+    """Return a set of cameras for a scene whose up is -y, a thirtieth of a second after each other."""
     views = CAMERAS[name](Ball.of(scene))
-    small = [sparklod.Camera.look_at(*view, fov_y=FOV_Y, size=(96, 54)) for view in views]
     return [
-        sparklod.Camera.look_at(*view, fov_y=FOV_Y, size=size, time=at / 30)
-        for at, (view, camera) in enumerate(zip(views, small, strict=True))
-        if sparklod.render(scene, camera)[..., 3].any()
+        sparklod.Camera.look_at(eye, target, fov_y=FOV_Y, size=size, time=at / 30)
+        for at, (eye, target) in enumerate(views)
     ]
+
+
+def that_see(cameras: Sequence[sparklod.Camera], scene: sparklod.Scene) -> list[sparklod.Camera]:
+    """Return the cameras whose pictures are not empty: inside an object that stands alone, some are."""
+    return [camera for camera in cameras if sparklod.render(scene, camera)[..., 3].any()]
 
 
 def count_of(budget: str, leaves: int) -> int:

@@ -50,7 +50,7 @@ def main() -> None:
     )
     few = [*(arguments.scenes / name for name in REFINED), "fine-structure"]
     run("bench_fidelity.py", *few, "--methods", "refined", "--cameras", "around", "inside", "--json", refined)
-    run("fidelity_report.py", refined, blocks, builders, *PAGES, "--plot", DOCS / "images" / "fidelity.png")
+    run("fidelity_report.py", builders, blocks, refined, *PAGES, "--plot", DOCS / "images" / "fidelity.png")
     rounded = ["biker.ply", "playbot-125k.ply", "meadow.sog", "playbot.sog"]
     run("bench_rad_rounding.py", *(arguments.scenes / name for name in rounded), *PAGES)
     pictured = ["--methods", "spark-quality", "quick", "quality"]
