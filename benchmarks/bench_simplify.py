@@ -27,7 +27,6 @@ from performance.process import SPARKLOD, CommandError, Took, run
 from scenes import write_ply
 
 import sparklod_cli as sparklod
-from sparklod_cli.io import read_levels
 
 #: Shares of the splats that are left, and those of the table that has all programs.
 SHARES = ("50%", "25%", "10%", "5%", "1%")
@@ -44,7 +43,7 @@ SETS = {
     "decimate": "splat-transform --decimate",
     "decimate-adaptive": "splat-transform --decimate-adaptive",
     "nanogs": "NanoGS",
-    "levels": "our levels of Streamed SOG",
+    "simplify": "our simplify",
 }
 
 SIMPLIFIERS = TREES | SETS
@@ -126,8 +125,6 @@ class Comparison:
         Raises:
             CommandError: the program failed.
         """
-        if method == "levels":
-            return self._levels()
         if method in SETS:
             return self._sets(method)
         return self._tree(method)
@@ -147,20 +144,12 @@ class Comparison:
         figures = of_tree(tree, self._drawn, self._cameras, SHARES)
         return Simplified([took], figures, {share: count_of(share, len(self._drawn)) for share in SHARES})
 
-    def _levels(self) -> Simplified:
-        """Measure our detail levels, of one bake."""
-        file = self._folder / "levels" / "lod-meta.json"
-        took = self._bake(file, "--levels", ",".join(SHARES))
-        detail = read_levels(file)
-        sets = {share: detail.splats.take(detail.level(level)) for level, share in enumerate(SHARES, 1)}
-        return self._drawn_whole([took], sets)
-
     def _sets(self, method: str) -> Simplified:
-        """Measure the splats that another program leaves, run once for each share."""
+        """Measure the splats that a program leaves, run once for each share."""
         runs, sets = [], {}
         for share in SHARES:
             output = self._folder / f"{method}-{share[:-1]}.ply"
-            runs.append(run(peer_command(method, self._ply, output, share)))
+            runs.append(run(set_command(method, self._ply, output, share)))
             sets[share] = sparklod.read(output).splats
         return self._drawn_whole(runs, sets)
 
@@ -179,8 +168,10 @@ class Comparison:
         return run([*SPARKLOD, "build-lod", self._ply, "-o", output, "--quiet", *options])
 
 
-def peer_command(method: str, source: Path, output: Path, share: str) -> list[str | Path]:
-    """Return the command by which another program leaves a share such as "10%" of the splats of a PLY."""
+def set_command(method: str, source: Path, output: Path, share: str) -> list[str | Path]:
+    """Return the command by which a program leaves a share such as "10%" of the splats of a PLY."""
+    if method == "simplify":
+        return [*SPARKLOD, "simplify", source, "--to", share, "-o", output, "--quiet"]
     program = _program(method)
     if method == "nanogs":
         own = program.parent / ".venv" / "bin" / "python"

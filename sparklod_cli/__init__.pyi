@@ -21,6 +21,7 @@ if TYPE_CHECKING:  # mypy then resolves the modules first, which import this one
     from .api.trees import build_lod as build_lod
     from .api.trees import extract_leaves as extract_leaves
     from .api.trees import refine as refine
+    from .api.trees import simplify as simplify
     from .api.views import compare as compare
     from .api.views import cut as cut
     from .api.views import psnr as psnr

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .codecs import clamps
 from .codecs.formats import WRITABLE
+from .codecs.losses import settled_with_losses
 from .codecs.options import WriteOptions
 from .codecs.spz import like
 from .codecs.validation import check_scene
@@ -90,10 +90,8 @@ def extract_leaves(
         check_scene(leaves, threads)
         read_done = time.perf_counter()
         # As they are: their opacities make up for nothing.
-        codec, chosen = form.codec(), dataclasses.replace(like(scene.header, options), covering=False)
-        chosen = codec.settled(leaves, chosen)
-        beyond = clamps.find(leaves.splats, threads, codec.held(chosen, leaves.splats.sh_degree))
-        drops_sh = any(clamp.column == "sh" and clamp.end == 0 for clamp in beyond.ends)
+        chosen = dataclasses.replace(like(scene.header, options), covering=False)
+        chosen, losses = settled_with_losses(leaves, form, chosen, threads)
         size = write(leaves, chosen, threads=threads, progress=progress)
         seconds = {"read": read_done - start, "write": time.perf_counter() - read_done}
     return Extracted(
@@ -104,7 +102,5 @@ def extract_leaves(
         bytes=size,
         seconds={stage: round(value, 4) for stage, value in seconds.items()},
         output_format=form.name,
-        clamped={column: count for column, count in beyond.splats.items() if column != "sh" or not drops_sh},
-        drops_sh=drops_sh,
-        up_lost=leaves.up if form.bare else None,
+        **vars(losses),
     )

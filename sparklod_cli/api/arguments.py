@@ -6,6 +6,7 @@ import contextlib
 import itertools
 import os
 from collections.abc import Iterable, Iterator
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import numpy as np
 
 from ..cameras.camera import Camera
 from ..cameras.path import CameraPath
+from ..lod.budget import LARGEST, Budget, parse_budget
 from ..model.scene import Scene
 from ..support.errors import OutputError
 from ..support.progress import Progress, silent
@@ -64,6 +66,28 @@ def path_like(cameras: CameraPath | Iterable[Camera]) -> CameraPath:
     if any(later.time < earlier.time for earlier, later in itertools.pairwise(every)):
         raise ValueError("the cameras are not in the order of their times")
     return CameraPath(every, "cameras", (), tuple(range(len(every))))
+
+
+#: A count of splats, a share of full detail (a float, 0 to 1), or either as text: "500k", "5%".
+BudgetLike = int | float | str | np.integer[Any] | np.floating[Any]
+
+
+def budget_like(budget: BudgetLike) -> Budget:
+    """Return a budget of splats.
+
+    Raises:
+        TypeError, ValueError: it is none, or is out of its range.
+    """
+    if isinstance(budget, str):
+        return parse_budget(budget)
+    if isinstance(budget, bool) or not isinstance(budget, (int, float, np.integer, np.floating)):
+        raise TypeError(f"the budget is {budget!r}; give a count, a share as a float, or a text such as '5%'")
+    share = isinstance(budget, (float, np.floating))
+    if not 0 < budget <= (1 if share else LARGEST):
+        raise ValueError(f"the budget is {budget}; give a count from 1 to 2^53, or a share of full detail up to 1.0")
+    if share:
+        return Budget(f"{100 * budget:g}%", Fraction(str(budget)), None)
+    return Budget.of_count(int(budget))
 
 
 def file_path(path: Path | str) -> Path:

@@ -7,7 +7,8 @@ from collections.abc import Callable, Iterable
 from ..bake.in_memory import build_tree
 from ..bake.refining import Refined, refined
 from ..bake.selecting import select
-from ..bake.settings import BakeSettings
+from ..bake.settings import BakeSettings, SimplifyGoal
+from ..bake.simplifying import chosen_cut
 from ..cameras.camera import Camera
 from ..cameras.path import CameraPath
 from ..fitting.settings import STEPS, FitSettings
@@ -17,6 +18,7 @@ from ..model.selection import Selection
 from ..support.defaults import (
     DEFAULT_BASE,
     DEFAULT_GROWTH,
+    DETAIL_GROWTH,
     MAX_BASE,
     MAX_GROWTH,
     MAX_SH_DEGREE,
@@ -27,7 +29,7 @@ from ..support.errors import FormatError, memory_errors_translated
 from ..support.parallel import on_threads, thread_count
 from ..support.progress import Progress
 from ..support.setting_fields import Range, whole
-from .arguments import ProgressLike, path_like, progress_callback, scene_like
+from .arguments import BudgetLike, ProgressLike, budget_like, path_like, progress_callback, scene_like
 
 
 def build_lod(
@@ -75,6 +77,56 @@ def build_lod(
         settings.selection.check(tally)
         tree = Tree(*build_tree([leaves], settings, in_chunks=False, progress=callback), scene.antialiased, up=scene.up)
         return tree if fitting is None else refined_tree(tree, fitting, thread_count(threads), callback, None)[0]
+
+
+def simplify(
+    scene: Scene,
+    *,
+    to: BudgetLike | None = None,
+    psnr: float | None = None,
+    cameras: CameraPath | Iterable[Camera] | None = None,
+    max_sh: int = MAX_SH_DEGREE,
+    selection: Selection | None = None,
+    threads: int | None = None,
+    progress: ProgressLike = None,
+) -> Scene:
+    """Return a scene with fewer splats, the same for all cameras: the cut of its quality tree that loses least.
+
+    Opacities are at most 1, so that `write` writes it in every format. The same scene and arguments give the same
+    splats.
+
+    Args:
+        scene: without a tree; or a tree, which is cut as it is.
+        to: a count, a share as a float, or a text such as "100k" or "10%".
+        psnr: in place of `to`: the fewest splats whose pictures have this PSNR against the scene's, in dB.
+        cameras: of these pictures; None for cameras around and inside the scene.
+        max_sh: SH degrees above this are left out.
+        selection: which splats to keep; all that can be drawn, unless given.
+        threads: to work on; None for all processors.
+        progress: called with how much is done.
+
+    Raises:
+        InvalidSplatsError: some splats are invalid and `selection` does not drop them, or none is left.
+        SparklodError: no camera sees anything.
+        ValueError: not exactly one of `to` and `psnr` is given, or a number is out of its range.
+    """
+    goal = SimplifyGoal(None if to is None else budget_like(to), None, psnr)
+    path = None if cameras is None else path_like(cameras).cameras
+    if scene_like(scene).tree is None:
+        scene = build_lod(
+            scene,
+            method="quality",
+            growth=DETAIL_GROWTH,
+            max_sh=max_sh,
+            selection=selection,
+            threads=threads,
+            progress=progress,
+        )
+    elif selection is not None or max_sh != MAX_SH_DEGREE:
+        raise ValueError("selection and max_sh are for scenes without a tree; give the splats that it was built from")
+    with on_threads(threads) as count, progress_callback(progress) as callback, memory_errors_translated():
+        chosen, _ = chosen_cut(scene, goal, bytes_of=len, cameras=path, threads=count, progress=callback)
+        return Scene(chosen.splats, antialiased=scene.antialiased, up=scene.up)
 
 
 def refine(

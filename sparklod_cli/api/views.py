@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,7 +13,6 @@ from ..cameras.path import CameraPath
 from ..codecs.formats import PRECISIONS
 from ..images import metrics
 from ..lod import detail_rule
-from ..lod.budget import LARGEST, Budget, parse_budget
 from ..lod.settings import LodSettings
 from ..model.instances import Instance, names_of
 from ..model.scene import DetailScene, Scene
@@ -29,7 +27,7 @@ from ..support.defaults import BLEND
 from ..support.errors import FormatError, memory_errors_translated
 from ..support.parallel import on_threads, thread_count
 from ..tables.comparison import COLUMNS as OF_COMPARISON
-from .arguments import ProgressLike, camera_like, path_like, progress_callback, viewed_like
+from .arguments import BudgetLike, ProgressLike, budget_like, camera_like, path_like, progress_callback, viewed_like
 from .results import ComparisonTable, Frames
 
 if TYPE_CHECKING:
@@ -37,9 +35,6 @@ if TYPE_CHECKING:
 
 #: A scene, a tree or a scene at several detail levels, or several of them, each with where it stands.
 Viewed = Scene | DetailScene | Instance | Iterable["Scene | DetailScene | Instance"]
-
-#: A count of splats, a share of full detail (a float, 0 to 1), or either as text: "500k", "5%".
-BudgetLike = int | float | str | np.integer[Any] | np.floating[Any]
 
 #: Where a scene keeps what was prepared of it for looking at it once more.
 _PREPARED = "_prepared_scenes"
@@ -194,7 +189,7 @@ def compare(
     with on_threads(threads) as count, progress_callback(progress) as callback, memory_errors_translated():
         scenes = _trees(viewed, count, precision)
         full = None if scene is None else scenes_of(scene, count)
-        given = [_budget(budget) for budget in budgets]
+        given = [budget_like(budget) for budget in budgets]
         lod = settings or LodSettings(pixel_scale_limit=0.0)
         comparison = Comparison(scenes, lod, given, render or RenderSettings(), full=full)
         rows = list(comparison.run(path_like(cameras), threads=count, progress=callback))
@@ -277,22 +272,9 @@ def _lod(
     if settings is None:
         settings = LodSettings(detail_rule.BUDGET) if scenes.details else LodSettings()
     if budget is not None:
-        settings = replace(settings, budget=_budget(budget).of(scenes.leaves))
+        settings = replace(settings, budget=budget_like(budget).of(scenes.leaves))
     if continuous:
         if continuous is not True and not continuous > 1:
             raise ValueError(f"continuous is {continuous}; give a ratio above 1, or True for {BLEND}")
         settings = replace(settings, continuous=BLEND if continuous is True else float(continuous))
     return settings
-
-
-def _budget(budget: BudgetLike) -> Budget:
-    if isinstance(budget, str):
-        return parse_budget(budget)
-    if isinstance(budget, bool) or not isinstance(budget, (int, float, np.integer, np.floating)):
-        raise TypeError(f"the budget is {budget!r}; give a count, a share as a float, or a text such as '5%'")
-    share = isinstance(budget, (float, np.floating))
-    if not 0 < budget <= (1 if share else LARGEST):
-        raise ValueError(f"the budget is {budget}; give a count from 1 to 2^53, or a share of full detail up to 1.0")
-    if share:
-        return Budget(f"{100 * budget:g}%", Fraction(str(budget)), None)
-    return Budget.of_count(int(budget))

@@ -23,8 +23,9 @@ from .sources import Source, placement_of, places_of
 #: Settings that name a file whose content is one of the inputs.
 FILES = ("rgba", "environment", "camera_path")
 
-#: Settings that are no part of a fingerprint: a message, and files whose names do not matter.
-NO_PART = ("unused", *FILES)
+#: Settings that are no part of a fingerprint: a message, what is neither skipped nor resumed, and files whose names do
+#: not matter.
+NO_PART = ("unused", "simplify", *FILES)
 
 #: How the version of the program is called in a fingerprint.
 PROGRAM = "sparklod"

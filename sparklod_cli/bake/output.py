@@ -63,6 +63,13 @@ def output_of(target: Place, settings: BakeSettings, *, overwrite: bool) -> Bake
         from .detail_output import DetailOutput
 
         return DetailOutput(settings.detail, settings.options, detail_sink(target, overwrite=overwrite))
+    if settings.simplify is not None:
+        from .simplifying import SimplifiedOutput
+
+        form = WRITABLE[settings.suffix]
+        write = scene_sink(target, form, chunked=settings.options.rad.chunked, overwrite=overwrite)
+        cameras = SimplifiedOutput.cameras_of(settings)
+        return SimplifiedOutput(form, settings.options, write, settings.simplify, cameras)
     if settings.encoding is not None:
         return ArrayOutput(settings.encoding, settings.raw, sink(target, overwrite=overwrite))
     form, chunked = WRITABLE[settings.suffix], settings.options.rad.chunked
@@ -86,7 +93,10 @@ def output_of_existing_tree(
         FormatError: nobody asked for another format than that of the scene, or for merged splats to be fitted; or for
             something that only splats without a tree can be given.
     """
-    held, plain = scene.format.split()[0], settings.detail is None and settings.encoding is None
+    held, plain = (
+        scene.format.split()[0],
+        settings.detail is None and settings.encoding is None and settings.simplify is None,
+    )
     is_same = plain and WRITABLE[settings.suffix].name == held
     is_same_container = bool(scene.header.get("chunked")) == settings.options.rad.chunked
     converts = settings.converts and settings.encoding is None and not (is_same and is_same_container)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from ..codecs.clamps import Clamp
+from ..codecs.losses import Losses
 from ..codecs.statistics import Statistics
 from ..model.scene import Scene
 from ..model.splats import Splats
@@ -113,12 +114,27 @@ class WrittenDetail:
     environment: int
 
 
+@dataclass(frozen=True)
+class WrittenSet(Losses):
+    """A simplified scene.
+
+    Attributes:
+        splats, share: how many, and their share of full detail.
+        psnr: mean over the cameras and a black and a white background, dB; None where it was not measured.
+    """
+
+    splats: int
+    share: float
+    psnr: float | None
+
+
 @dataclass(frozen=True, kw_only=True)
 class WrittenTree:
     """Result of writing a tree.
 
     Attributes:
-        output_format: "spz", "rad", "rad-chunked", "streamed-sog", or the name of the encoding of arrays.
+        output_format: "spz", "rad", "rad-chunked", "streamed-sog", the name of the encoding of arrays, or the name of
+            the format of a simplified scene.
         bytes: of the output, all of its files.
         version, fractional_bits: of an SPZ output, else None.
         chunks: of a RAD output, else None.
@@ -126,6 +142,7 @@ class WrittenTree:
         sh_codes: the most entries of the SH palette of a RAD output; None without one.
         arrays: shapes of the arrays of another output, in its order.
         detail: of a Streamed SOG, else None.
+        simplified: of a simplified scene, else None.
         clamped: by the column of `Splats`, the number of nodes with a value that the output cannot hold.
         clamps: at which ends, and how far beyond.
     """
@@ -139,6 +156,7 @@ class WrittenTree:
     sh_codes: int | None = None
     arrays: dict[str, tuple[int, ...]] = field(default_factory=dict)
     detail: WrittenDetail | None = None
+    simplified: WrittenSet | None = None
     clamped: dict[str, int] = field(default_factory=dict)
     clamps: tuple[Clamp, ...] = ()
 
@@ -150,7 +168,7 @@ class Baked(WrittenTree):
     Attributes:
         format, read, splats, dropped, method, levels, notes, blocks: as in `BuiltTree`.
         sh_degree, nodes: of the tree.
-        seconds: by stage (read, build, order, refine, arrange, levels, errors, encode, write).
+        seconds: by stage (read, build, order, refine, arrange, levels, errors, simplify, encode, write).
         refine: result of fitting merged splats; None without `--refine`.
         scratch_bytes_written, scratch_bytes_read: in the scratch folder; None in memory.
     """

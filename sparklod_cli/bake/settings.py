@@ -7,6 +7,8 @@ from pathlib import Path
 
 from ..codecs.options import WriteOptions
 from ..fitting.settings import FitSettings
+from ..images.metrics import MOST_PSNR
+from ..lod.budget import Budget
 from ..lod.builders import METHODS
 from ..lod.detail_rule import DetailSettings
 from ..model.selection import Selection
@@ -16,6 +18,32 @@ from ..support.defaults import DEFAULT_BASE, DEFAULT_GROWTH, MAX_SH_DEGREE
 
 #: Suffix of the format that is written unless another one is chosen.
 SPZ = ".spz"
+
+
+@dataclass(frozen=True)
+class SimplifyGoal:
+    """Size or fidelity of a simplified scene. One of the three is not None.
+
+    Attributes:
+        to: so many, or a share of all.
+        max_bytes: the most that fit into a file of this size.
+        psnr: the fewest whose pictures are this close to full detail, dB.
+
+    Raises:
+        ValueError: not exactly one is given, or it is out of its range.
+    """
+
+    to: Budget | None = None
+    max_bytes: int | None = None
+    psnr: float | None = None
+
+    def __post_init__(self) -> None:
+        if sum(each is not None for each in (self.to, self.max_bytes, self.psnr)) != 1:
+            raise ValueError("give one of to, max_bytes and psnr")
+        if self.max_bytes is not None and self.max_bytes < 1:
+            raise ValueError(f"max_bytes is {self.max_bytes}; give 1 or more")
+        if self.psnr is not None and not 0 < self.psnr < MOST_PSNR:
+            raise ValueError(f"psnr is {self.psnr}; give more than 0 and less than {MOST_PSNR:g} dB")
 
 
 @dataclass(frozen=True)
@@ -40,9 +68,10 @@ class BakeSettings:
         environment: of a Streamed SOG, a file whose splats are always drawn; turned and moved as the scene.
         environment_beyond: of a Streamed SOG, splats of the input farther out than this become its environment, see
             `lod.regions.beyond`; in the input's units. None for none.
+        simplify: how many splats a cut of the tree has, to write that without a tree instead.
         refine: how merged splats are fitted to pictures of full detail, its cameras left out; None for not at all.
-        camera_path: a file of training cameras, in the coordinates of the output; None for cameras that are placed
-            around and inside the scene.
+        camera_path: a file of training cameras, or of those by which a PSNR is measured, in the coordinates of the
+            output; None for cameras that are placed around and inside the scene.
         converts: an input that has a tree keeps it, if its format is another one; otherwise it is refused.
         unused: flags of options that were given and mean nothing to an input that has a tree, which is refused then.
     """
@@ -62,6 +91,7 @@ class BakeSettings:
     detail: DetailSettings | None = None
     environment: Path | None = None
     environment_beyond: float | None = None
+    simplify: SimplifyGoal | None = None
     refine: FitSettings | None = None
     camera_path: Path | None = None
     converts: bool = False

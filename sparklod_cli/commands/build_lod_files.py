@@ -261,7 +261,7 @@ def check_formats(ctx: click.Context, outputs: BakedFiles) -> None:
         raise click.UsageError("--format rad-chunked writes several files; name the output, or use --format rad")
     if outputs.encoding:
         refuse(ctx, ("form",), "cannot be used with --encoding")
-        _refuse_others(ctx, "--encoding", hints=False)
+        refuse_others(ctx, "--encoding", hints=False)
     if outputs.form is not None and suffix not in ("", outputs.suffix):
         raise click.UsageError(f"--format {outputs.form} writes {outputs.suffix}, not {suffix}")
     if outputs.output is not None and outputs.form is None:
@@ -275,10 +275,10 @@ def check_formats(ctx: click.Context, outputs: BakedFiles) -> None:
         return
     else:
         _check_tree(suffix)
-    _refuse_others(ctx, WRITABLE[outputs.suffix].name, hints=not outputs.unlod)
+    refuse_others(ctx, WRITABLE[outputs.suffix].name, hints=not outputs.unlod)
 
 
-def _refuse_others(ctx: click.Context, written: str, *, hints: bool = True) -> None:
+def refuse_others(ctx: click.Context, written: str, *, hints: bool = True) -> None:
     """Raise a `click.UsageError` where an option of another format than the one that is written was given."""
     for names, formats, hint in OF_FORMATS:
         if written not in formats and not (written == DETAIL and "SOG" in formats):
@@ -295,7 +295,7 @@ def _check_streamed_sog(ctx: click.Context, outputs: BakedFiles) -> None:
             f"{flag} writes {MANIFEST} and folders beside it, not {outputs.output.name}; name the output"
             f" {outputs.output.parent / outputs.output.stem / MANIFEST}"
         )
-    _refuse_others(ctx, DETAIL, hints=False)
+    refuse_others(ctx, DETAIL, hints=False)
     if is_set(ctx, "environment"):
         refuse(ctx, ("environment_beyond",), "cannot be used with --environment")
 

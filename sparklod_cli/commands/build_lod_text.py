@@ -10,8 +10,9 @@ from ..support.units import format_size
 from .console import Console, count_of, size_of
 
 if TYPE_CHECKING:
-    from ..bake.records import Baked, WrittenDetail
+    from ..bake.records import Baked, WrittenDetail, WrittenSet
     from ..bake.refining import Refined
+    from ..bake.sources import Source
     from ..codecs.clamps import Clamp
     from ..extract_leaves import Extracted
 
@@ -172,18 +173,43 @@ def report_extracted(console: Console, source: Place, target: Place, extracted: 
         f" {count_of(extracted.splats, 'splat')}, SH {extracted.sh_degree}, {size_of(extracted.bytes)},"
         f" {_total(extracted.seconds)}"
     )
-    losses = ["holds no reflections (SH)"] if extracted.drops_sh else []
-    losses += [
-        f"clamps the {COLUMNS[column]} of {100 * count / extracted.splats:.3g} % of the splats"
-        for column, count in extracted.clamped.items()
-        if count >= LEAST_SHARE * extracted.splats
-    ]
-    if losses:
-        console.say(f"  {extracted.output_format} {', and '.join(losses)}")
-    if extracted.up_lost is not None:
-        up = extracted.up_lost
-        console.say(f"  {up} is up, which this format cannot note; give --up={up} to render, traverse and view")
+    _report_losses(console, extracted, extracted.splats, extracted.output_format)
     console.detail(f"  {extracted.format}; {_stages(extracted.seconds)}")
+
+
+def report_simplified(console: Console, source: Source, target: Place, baked: Baked) -> None:
+    """Print a line about the file of a simplified scene, and what it does not hold."""
+    from ..model.selection import describe
+
+    made = baked.simplified
+    assert made is not None
+    measured = "" if made.psnr is None else f", PSNR {made.psnr:.2f} dB"
+    console.say(
+        f"{name_of(source)}  {count_of(baked.splats, 'splat')}, SH {baked.sh_degree}  ->  {_name(target)} "
+        f" {count_of(made.splats, 'splat')} ({100 * made.share:.3g} %){measured}, {size_of(baked.bytes)},"
+        f" {_total(baked.seconds)}"
+    )
+    if baked.dropped:
+        console.say(f"  left out: {describe(baked.dropped)}")
+    for note in baked.notes:
+        console.say(f"  {note}")
+    _report_losses(console, made, made.splats, baked.output_format)
+    console.detail(f"  {baked.format}; {_stages(baked.seconds)}")
+
+
+def _report_losses(console: Console, losses: Extracted | WrittenSet, splats: int, form: str) -> None:
+    """Print what a format without a tree does not hold."""
+    lines = ["holds no reflections (SH)"] if losses.drops_sh else []
+    lines += [
+        f"clamps the {COLUMNS[column]} of {100 * count / splats:.3g} % of the splats"
+        for column, count in losses.clamped.items()
+        if count >= LEAST_SHARE * splats
+    ]
+    if lines:
+        console.say(f"  {form} {', and '.join(lines)}")
+    if losses.up_lost is not None:
+        up = losses.up_lost
+        console.say(f"  {up} is up, which this format cannot note; give --up={up} to render, traverse and view")
 
 
 def _name(target: Place) -> str:

@@ -22,6 +22,8 @@ ALIASES = {
     "convert": "build-lod",
     "lod": "build-lod",
     "unlod": "build-lod --unlod",
+    "decimate": "simplify",
+    "reduce": "simplify",
     "check": "inspect",
     "info": "inspect",
     "report": "inspect",

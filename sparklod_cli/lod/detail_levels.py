@@ -134,30 +134,49 @@ def shares_of(levels: Sequence[float] | None, leaves: int) -> list[float]:
     return shares
 
 
+class RefinementOrder:
+    """The order of losses in which nodes are refined, one for all cuts, so that each refines the coarser ones.
+
+    Losses (see `losses`) do not grow from a node to its children, which are refined after it.
+
+    Args:
+        nodes: M splats, final order.
+
+    Attributes:
+        parent: (M,) int32 parent of each node, -1 of the root.
+        leaves: number of leaves.
+    """
+
+    def __init__(self, nodes: Splats, tree: LodTree) -> None:
+        self.parent, _ = find_parents(tree.child_count, tree.child_start)
+        loss = losses(nodes, tree, self.parent)
+        inner = np.flatnonzero(~tree.is_leaf)
+        order = inner[np.argsort(-loss[inner], kind="stable")]  # parents come first among equals, too
+        self._turn = np.full(len(tree), len(order), np.int64)  # the number of nodes refined before it, leaves after all
+        self._turn[order] = np.arange(len(order))
+        self._turn_of_parent = np.where(self.parent >= 0, self._turn[np.maximum(self.parent, 0)], -1)
+        self._splats = 1 + np.cumsum(tree.child_count[order].astype(np.int64) - 1)
+        self.leaves = len(tree) - len(inner)
+
+    def cut(self, count: int) -> Nodes:
+        """Return the nodes, ascending, of the finest cut of at most `count` splats.
+
+        It has fewer by less than the children of a node; the root alone where `count` is less.
+        """
+        refined = int(np.searchsorted(self._splats, count, side="right"))
+        return np.flatnonzero((self._turn_of_parent < refined) & (self._turn >= refined))
+
+
 def detail_cuts(nodes: Splats, tree: LodTree, shares: Sequence[float]) -> DetailCuts:
     """Return cuts of a tree with shares of its leaves, rounded, never more and less by at most the children of a node.
-
-    Nodes are refined in the order of their losses (see `losses`), which do not grow from a node to its
-    children; one order for all cuts, so that each refines the coarser ones.
 
     Args:
         nodes: M splats, final order.
         shares: of each level after full detail, descending, between 0 and 1.
     """
-    parent, _ = find_parents(tree.child_count, tree.child_start)
-    loss = losses(nodes, tree, parent)
-    inner = np.flatnonzero(~tree.is_leaf)
-    order = inner[np.argsort(-loss[inner], kind="stable")]  # parents come first among equals, too
-    turn = np.full(len(tree), len(order), np.int64)  # the number of nodes refined before it, leaves after all
-    turn[order] = np.arange(len(order))
-    turn_of_parent = np.where(parent >= 0, turn[np.maximum(parent, 0)], -1)
-    splats = 1 + np.cumsum(tree.child_count[order].astype(np.int64) - 1)
-    leaves = len(tree) - len(inner)
-    found = [np.flatnonzero(tree.is_leaf)]
-    for share in shares:
-        refined = int(np.searchsorted(splats, round(share * leaves), side="right"))
-        found.append(np.flatnonzero((turn_of_parent < refined) & (turn >= refined)))
-    return DetailCuts(found, parent)
+    order = RefinementOrder(nodes, tree)
+    cuts = [order.cut(round(share * order.leaves)) for share in shares]
+    return DetailCuts([np.flatnonzero(tree.is_leaf), *cuts], order.parent)
 
 
 @np.errstate(over="ignore", invalid="ignore")  # where splats are as large as numbers are

@@ -29,6 +29,11 @@ INPUTS: dict[str, dict[str, tuple[object, ...]]] = {
         "environment": (PLAIN, "--environment", "X"),
         "camera_path": (PLAIN, "--refine", "--camera-path", "X"),
     },
+    "simplify": {
+        "inputs": ("X", "--to", "50%"),
+        "rgba": (PLAIN, "--to", "50%", "--rgba", "X"),
+        "camera_path": (PLAIN, "--psnr", "30", "--camera-path", "X"),
+    },
     "inspect": {"files": ("X",), "expect": (LOD, "--expect", "X"), "leaves_of": (LOD, "--leaves-of", "X")},
     "traverse": {
         "files": ("X", *LOOK),
@@ -49,6 +54,7 @@ INPUTS: dict[str, dict[str, tuple[object, ...]]] = {
 #: How each command is told to write the file Y, by the parameter that says so.
 OUTPUTS: dict[str, dict[str, tuple[str, ...]]] = {
     "build-lod": {"output": ("-o", "Y")},
+    "simplify": {"output": ("-o", "Y")},
     "inspect": {"plot": ("--plot", "Y"), "html": ("--html", "Y"), "chunks_out": ("--chunks-out", "Y")},
     "traverse": {"output": ("-o", "Y"), "plot": ("--plot", "Y")},
     "render": {"output": ("-o", "Y"), "plot": ("--compare", "--plot", "Y")},
@@ -56,7 +62,7 @@ OUTPUTS: dict[str, dict[str, tuple[str, ...]]] = {
 }
 
 #: Names that the command's outputs can have.
-SUFFIXES = {"build-lod": ".spz", "inspect": ".png", "traverse": ".csv", "render": ".png"}
+SUFFIXES = {"build-lod": ".spz", "simplify": ".spz", "inspect": ".png", "traverse": ".csv", "render": ".png"}
 
 ROWS = [
     (command, given, written)
@@ -202,7 +208,10 @@ def test_devices_are_not_replaced() -> None:
 
 
 #: Parameters that take addresses; tests/commands/build_lod/test_addresses.py has them.
-TAKE_ADDRESSES = {("build-lod", "inputs"), ("build-lod", "output"), ("build-lod", "output_dir")}
+TAKE_ADDRESSES = {
+    *(("build-lod", name) for name in ("inputs", "output", "output_dir")),
+    *(("simplify", name) for name in ("inputs", "output")),
+}
 
 
 @pytest.mark.parametrize("name", ["", "s3://bucket/x.spz", "https://example.org/x.spz"])

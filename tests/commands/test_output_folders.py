@@ -18,6 +18,7 @@ SMALL = ("--size", "8x8")
 #: Options with which each command can write the file Y, by the parameter that names it, and the name of that file.
 WRITTEN: dict[str, dict[str, tuple[tuple[object, ...], str]]] = {
     "build-lod": {"output": ((PLAIN,), "one-lod.spz")},
+    "simplify": {"output": ((PLAIN, "--to", "50%"), "one-small.spz")},
     "inspect": {
         "plot": ((LOD,), "tree-v3.png"),
         "html": ((LOD,), "tree-v3.html"),

@@ -166,6 +166,8 @@ def _as_a_whole(settings: BakeSettings) -> str | None:
         return "--encoding writes arrays as a whole"
     if settings.refine is not None:
         return "--refine fits a whole tree"
+    if settings.simplify is not None:
+        return "a simplified scene is a cut of a whole tree"
     return None if settings.detail is None else "detail levels are made of a whole tree"
 
 

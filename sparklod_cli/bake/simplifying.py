@@ -1,0 +1,251 @@
+"""Simplified scenes: one cut of a tree for all cameras, written without a tree."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..cameras.camera import Camera
+from ..codecs.formats import Format
+from ..codecs.losses import settled_with_losses
+from ..codecs.options import WriteOptions
+from ..images.metrics import BACKGROUNDS, on_background, psnr
+from ..io.writing import Files, SceneSink
+from ..lod.detail_levels import RefinementOrder, with_plain_opacity
+from ..model.instances import Instance
+from ..model.scene import Scene
+from ..render.rasterizer import Image
+from ..support.errors import FormatError, SparklodError
+from ..support.parallel import on_threads
+from ..support.progress import Progress
+from .output import BakeOutput, Encode
+from .records import BuiltTree, Clock, WrittenSet, WrittenTree
+from .settings import BakeSettings, SimplifyGoal
+
+#: Cameras that a PSNR is measured with where nobody names any, and their seed: as many as judge a fitted tree.
+CAMERAS, SEED = 16, 0
+
+#: How far a file may be below the size that was asked for, and how far the splats that hold a PSNR may be above the
+#: fewest, as shares: each further halving costs one more encoding, or pictures of all cameras. Chosen.
+CLOSE_BYTES, CLOSE_COUNT = 0.002, 0.01
+
+#: Encodings at most. Files grow nearly in proportion to their splats, so 3 to 6 do. Chosen.
+MOST_TRIALS = 16
+
+#: Measures a number of a cut of so many splats.
+Measure = Callable[[int], float]
+
+
+def simplified(scene: Scene, order: RefinementOrder, count: int) -> Scene:
+    """Return the finest cut of a tree of at most `count` splats, as splats of opacities of at most 1 without a tree."""
+    return dataclasses.replace(scene, splats=with_plain_opacity(scene.splats.take(order.cut(count))), tree=None)
+
+
+def count_for(
+    goal: SimplifyGoal, leaves: int, *, bytes_of: Measure, psnr_of: Measure, progress: Progress
+) -> tuple[int, float | None]:
+    """Return how many splats a goal asks for, and their PSNR where it asks for one.
+
+    Args:
+        leaves: of full detail.
+        bytes_of, psnr_of: of the cut of a number of splats.
+
+    Raises:
+        FormatError: not even one splat fits.
+    """
+    if goal.to is not None:
+        return min(leaves, goal.to.of(leaves)), None
+    if goal.max_bytes is not None:
+        return _largest(goal.max_bytes, leaves, bytes_of, progress), None
+    assert goal.psnr is not None
+    return _smallest(goal.psnr, leaves, psnr_of, progress)
+
+
+def _largest(most: int, leaves: int, bytes_of: Measure, progress: Progress) -> int:
+    """Return the most splats whose file has at most `most` bytes, or little less, see `CLOSE_BYTES`."""
+    low, high, below, above = 1, leaves, bytes_of(1), bytes_of(leaves)
+    if above <= most:
+        return leaves
+    if below > most:
+        raise FormatError(f"one splat takes {below:,.0f} bytes in this format, more than {most:,}; allow more bytes")
+    for trial in range(MOST_TRIALS):
+        progress("simplifying", trial, MOST_TRIALS, "file")
+        if high - low <= 1 or most - below <= CLOSE_BYTES * most:
+            break
+        # Files are nearly as long as a line says; where that stays at one end, halving gets on.
+        guess = low + (high - low) * (most - below) / (above - below) if trial % 4 < 3 else (low + high) / 2
+        count = min(max(math.floor(guess), low + 1), high - 1)
+        size = bytes_of(count)
+        if size <= most:
+            low, below = count, size
+        else:
+            high, above = count, size
+    return low
+
+
+def _smallest(least: float, leaves: int, psnr_of: Measure, progress: Progress) -> tuple[int, float]:
+    """Return the fewest splats, or little more, whose PSNR is at least `least`, and that."""
+    low, high, best = 0, leaves, psnr_of(leaves)
+    trials = math.ceil(math.log2(max(math.log(max(leaves, 2)) / math.log1p(CLOSE_COUNT), 1)))
+    for trial in range(trials):
+        progress("simplifying", trial, trials, "picture set")
+        count = round(math.sqrt(max(low, 1) * high))
+        if not low < count < high:
+            break
+        found = psnr_of(count)
+        if found >= least:
+            high, best = count, found
+        else:
+            low = count
+    return high, best
+
+
+class Pictures:
+    """Pictures of full detail, with which those of simplified scenes are compared.
+
+    Args:
+        full: splats without a tree.
+        cameras: that see them; None for `CAMERAS` around and inside the scene.
+
+    Raises:
+        SparklodError: no camera sees anything.
+    """
+
+    def __init__(self, full: Scene, cameras: Sequence[Camera] | None, threads: int) -> None:
+        from ..fitting.cameras import Place, placed
+        from ..fitting.pictures import MOST_MISSES, shows_enough
+
+        self._threads = threads
+        many = placed(Place.of(full.splats.center), np.random.SeedSequence(SEED)) if cameras is None else cameras
+        tried = itertools.islice(many, CAMERAS + MOST_MISSES if cameras is None else None)
+        drawn = self._drawn(full, tried)
+        seen = ((camera, image) for camera, image in drawn if shows_enough(image))
+        self._full = list(itertools.islice(seen, CAMERAS if cameras is None else None))
+        if not self._full:
+            raise SparklodError("no camera sees enough to measure a PSNR by; name cameras with --camera-path")
+
+    def _drawn(self, scene: Scene, cameras: Iterable[Camera]) -> Iterable[tuple[Camera, Image]]:
+        from ..render.renderer import Renderer
+        from ..render.settings import RenderSettings
+        from ..scenes.finder import FixedCut
+        from ..scenes.reading import read_scenes
+
+        renderer = Renderer(
+            FixedCut(read_scenes([Instance(scene)], threads=self._threads).full()), RenderSettings(), []
+        )
+        return ((camera, renderer.draw(camera).image) for camera in cameras)
+
+    def psnr(self, scene: Scene) -> float:
+        """Return the mean PSNR of a scene over all cameras and a black and a white background, dB."""
+        drawn = self._drawn(scene, [camera for camera, _ in self._full])
+        return float(
+            np.mean(
+                [
+                    psnr(on_background(image, gray), on_background(full, gray))
+                    for (_, image), (_, full) in zip(drawn, self._full, strict=True)
+                    for gray in BACKGROUNDS.values()
+                ]
+            )
+        )
+
+
+@dataclass(frozen=True)
+class SimplifiedOutput(BakeOutput):
+    """File of a simplified scene.
+
+    Attributes:
+        cameras: for a PSNR; None for cameras that are placed around and inside the scene.
+    """
+
+    form: Format
+    options: WriteOptions
+    sink: SceneSink
+    goal: SimplifyGoal
+    cameras: Sequence[Camera] | None
+
+    @staticmethod
+    def cameras_of(settings: BakeSettings) -> Sequence[Camera] | None:
+        """Return the cameras of the file that settings name; None without one.
+
+        Raises:
+            CameraPathError: they cannot be read.
+        """
+        if settings.camera_path is None:
+            return None
+        from ..cameras.sources import read_path
+
+        return read_path(settings.camera_path).cameras
+
+    def write(self, tree: BuiltTree, encode: Encode, clock: Clock, threads: int, progress: Progress) -> WrittenTree:
+        """Cut the tree and write the cut."""
+        # The opacities of a tree that was read make up for the rounding of its scales already.
+        options = dataclasses.replace(self.options, covering=tree.method is not None)
+        with on_threads(threads):
+            chosen, measured = chosen_cut(
+                tree.scene,
+                self.goal,
+                bytes_of=lambda scene: self._bytes(scene, options, threads),
+                cameras=self.cameras,
+                threads=threads,
+                progress=progress,
+            )
+        settled, losses = settled_with_losses(chosen, self.form, options, threads)
+        clock.end("simplify")
+        size = self.sink(chosen, settled, threads=threads, progress=progress)
+        clock.end("write")
+        count = len(chosen.splats)
+        written = WrittenSet(**vars(losses), splats=count, share=round(count / tree.splats, 6), psnr=measured)
+        return WrittenTree(output_format=self.form.name, bytes=size, simplified=written)
+
+    def _bytes(self, scene: Scene, options: WriteOptions, threads: int) -> int:
+        """Return the size of a file without writing it."""
+        sink = self.sink
+        whole = sink.whole and (lambda pieces: sum(map(len, pieces)))
+        together = sink.together and _length_of
+        counted = dataclasses.replace(sink, whole=whole, together=together)
+        return counted(scene, self.form.codec().settled(scene, options), threads=threads)
+
+
+def _length_of(files: Files) -> int:
+    return sum(sum(map(len, pieces)) for _, pieces in files)
+
+
+def chosen_cut(
+    tree: Scene,
+    goal: SimplifyGoal,
+    *,
+    bytes_of: Callable[[Scene], float],
+    cameras: Sequence[Camera] | None,
+    threads: int,
+    progress: Progress,
+) -> tuple[Scene, float | None]:
+    """Return the cut of a tree that a goal asks for, without a tree, and its PSNR where the goal asks for one.
+
+    Args:
+        bytes_of: size of the file of a scene.
+        cameras: as in `Pictures`.
+
+    Raises:
+        FormatError, SparklodError: see `count_for` and `Pictures`.
+    """
+    assert tree.tree is not None
+    progress("simplifying", 0, 1, "cut")
+    order = RefinementOrder(tree.splats, tree.tree)
+
+    def cut(count: int) -> Scene:
+        return simplified(tree, order, count)
+
+    pictures = None if goal.psnr is None else Pictures(cut(order.leaves), cameras, threads)
+    count, measured = count_for(
+        goal,
+        order.leaves,
+        bytes_of=lambda count: bytes_of(cut(count)),
+        psnr_of=lambda count: 0.0 if pictures is None else pictures.psnr(cut(count)),
+        progress=progress,
+    )
+    return cut(count), measured

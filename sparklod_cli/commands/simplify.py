@@ -1,0 +1,221 @@
+"""`sparklod simplify`: writes a scene with fewer splats, for all cameras."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from ..codecs.formats import WRITABLE, ending_of
+from ..codecs.options import SogOptions, WriteOptions
+from ..lod.budget import Budget, parse_budget
+from ..support.addresses import Place
+from ..support.defaults import DETAIL_GROWTH
+from ..support.setting_fields import Quantity, Range, setting_of, whole
+from ..support.stdin import DASH
+from ..support.units import parse_size
+from .build_lod_files import SPZ, record_of, refuse_others
+from .build_lod_text import report_simplified
+from .option_groups import (
+    COMMON,
+    argument,
+    check_declared,
+    command,
+    flags_set,
+    is_set,
+    option,
+    parameters_of,
+    values_of,
+)
+from .options.baking import (
+    METHOD_OF_DETAIL,
+    PaletteOptions,
+    SelectionOptions,
+    TransformOptions,
+    TreeOptions,
+)
+from .options.common import General, overwrite_flag
+from .paths import (
+    NAMELESS,
+    Folder,
+    InputPath,
+    OutputPath,
+    claim_stdout,
+    keep_apart,
+    require_suffix,
+    stem_of,
+    with_chunks,
+)
+
+if TYPE_CHECKING:
+    from ..bake.settings import BakeSettings, SimplifyGoal
+    from ..bake.sources import Source
+
+EXAMPLES = """\
+  sparklod simplify scene.ply --to 10% -o small.ply
+  sparklod simplify scene.ply --to 100k -o small.spz
+  sparklod simplify scene.ply --max-bytes 8MB -o small.sog     # as many splats as fit
+  sparklod simplify scene.ply --psnr 40 -o small.spz           # as few splats as hold it
+  sparklod simplify scene.ply --psnr 35 --camera-path path.json -o small.ply
+  sparklod simplify tiles/*.ply --to 1M --up -y -o city.sog    # several files as one scene
+  sparklod simplify scene-lod.rad --to 5% -o small.ply         # a cut of the tree that it has
+"""
+
+#: Ways to say how many splats are left, by parameter.
+GOALS = ("to", "max_bytes", "psnr")
+
+
+@dataclass(frozen=True)
+class SimplifiedFiles:
+    """Inputs, the output, and how many splats it has."""
+
+    inputs: tuple[Place, ...] = argument(InputPath(stdin=True, addresses=True), metavar="INPUT...", required=True)
+    to: Budget | None = option(
+        "Number of splats, such as 100k, or share of the INPUT's, such as 10%.",
+        Quantity("N|P%", parse_budget),
+        heading=COMMON,
+    )
+    max_bytes: int | None = option(
+        "Largest size of the file, such as 8MB: as many splats as fit into its format.",
+        Quantity("SIZE", parse_size, whole(1)),
+        heading=COMMON,
+    )
+    psnr: float | None = option(
+        "PSNR in dB that pictures have against the INPUT's, such as 40: as few splats as hold it.",
+        Range(above=0, below=100, unit="DB"),
+        heading=COMMON,
+    )
+    camera_path: Path | None = option(
+        "Cameras that --psnr is measured with, in the coordinates of the output, in any format that render reads."
+        "  [default: cameras around and inside the scene]",
+        InputPath(),
+        heading=COMMON,
+        needs="psnr",
+    )
+    output: Place = option(
+        "Output, whose name tells the format: .ply, .spz, .sog, DIR/meta.json (an unpacked SOG), .rad or .splat, which"
+        " has no SH; DIR/ means DIR/NAME-small.spz, - standard output, as SPZ.",
+        OutputPath(addresses=True),
+        flags=("-o", "--output"),
+        heading=COMMON,
+        required=True,
+    )
+    overwrite: bool = overwrite_flag()
+    max_sh: int = setting_of(TreeOptions, "max_sh")
+
+    @property
+    def suffix(self) -> str:
+        """Ending of the output's name, see `WRITABLE`."""
+        return SPZ if self.output == DASH else ending_of(self.output.name)
+
+    @property
+    def source(self) -> Source:
+        """The input, or all of them as one scene."""
+        from ..bake.sources import Merged
+
+        return self.inputs[0] if len(self.inputs) == 1 else Merged.of(self.inputs)
+
+    @property
+    def goal(self) -> SimplifyGoal:
+        """Size or fidelity of the output."""
+        from ..bake.settings import SimplifyGoal
+
+        return SimplifyGoal(self.to, self.max_bytes, self.psnr)
+
+
+@dataclass(frozen=True)
+class SimplifyOptions:
+    """Options of the command, group by group."""
+
+    files: SimplifiedFiles = field(default_factory=SimplifiedFiles)
+    selection: SelectionOptions = field(default_factory=SelectionOptions)
+    transform: TransformOptions = field(default_factory=TransformOptions)
+    written: WriteOptions = field(default_factory=WriteOptions)
+    palette: PaletteOptions = field(default_factory=PaletteOptions)
+    general: General = field(default_factory=General)
+
+    def settings(self, ctx: click.Context) -> BakeSettings:
+        """Return the settings of the bake whose tree is cut; loads numpy."""
+        from ..bake.settings import BakeSettings
+
+        files, codes = self.files, self.palette.cluster_sh
+        rad = dataclasses.replace(self.written.rad, sh_codes=codes)
+        return BakeSettings(
+            method=METHOD_OF_DETAIL,
+            growth=DETAIL_GROWTH,
+            max_sh=files.max_sh,
+            selection=self.selection.selection(),
+            transform=self.transform.transform(),
+            up=self.transform.up if is_set(ctx, "up") else None,
+            rgba=self.selection.rgba,
+            suffix=files.suffix,
+            options=dataclasses.replace(self.written, rad=rad, sog=SogOptions(codes)),
+            simplify=files.goal,
+            camera_path=files.camera_path,
+            converts=True,
+            unused=tuple(flags_set(ctx, ("max_sh", *parameters_of(SelectionOptions, TransformOptions)))),
+        )
+
+
+HEADINGS = (COMMON, "Selection", "Rotation, scale and position", "File format", "RAD")
+
+
+@command("simplify", SimplifyOptions, examples=EXAMPLES, headings=HEADINGS)
+def simplify(ctx: click.Context, /, **_: Any) -> None:
+    """Write a scene with fewer splats, the same for all cameras.
+
+    Reads all that build-lod reads, builds its quality tree, and writes the cut of it that loses least, without a tree:
+    a file that every viewer of plain splats shows. Several INPUTs become one scene, each where its own coordinates put
+    it; an INPUT of - is standard input. A Level-of-Detail file is cut as it is.
+
+    Give one of --to, --max-bytes and --psnr.
+    """
+    output = ctx.params["output"]
+    if isinstance(output, Folder):
+        if ctx.params["inputs"][0] == DASH:
+            raise click.UsageError(f"--output {output.path}: {NAMELESS}")
+        ctx.params["output"] = output.path / f"{stem_of(ctx.params['inputs'][0])}-small{SPZ}"
+    options = values_of(ctx, SimplifyOptions)
+    files, general = options.files, options.general
+    _check(ctx, files, as_json=general.as_json)
+    with general.console() as console:
+        console.announce_compiling()
+        from ..bake.flow import bake
+
+        baked = bake(
+            files.source,
+            files.output,
+            options.settings(ctx),
+            overwrite=files.overwrite,
+            threads=general.threads,
+            progress=console.progress,
+            say=console.say,
+        )
+        report_simplified(console, files.source, files.output, baked)
+        if general.as_json:
+            record = {**record_of(files.source), "output": str(files.output), **dataclasses.asdict(baked)}
+            click.echo(json.dumps(record))
+
+
+def _check(ctx: click.Context, files: SimplifiedFiles, *, as_json: bool) -> None:
+    """Raise a `click.UsageError` where options contradict each other, or the names of files."""
+    given = flags_set(ctx, GOALS)
+    if len(given) != 1:
+        what = f"{' and '.join(given)} cannot be used together; give" if given else "say how many splats are left: give"
+        raise click.UsageError(f"{what} one of --to, --max-bytes and --psnr")
+    require_suffix("--output", files.output, WRITABLE)
+    if files.suffix not in WRITABLE:
+        raise click.UsageError(f"--output writes {', '.join(WRITABLE)}, not {files.suffix}")
+    check_declared(ctx)
+    form = WRITABLE[files.suffix]
+    keep_apart(ctx, {"output": with_chunks([files.output]) if form.unbundled == files.suffix else [files.output]})
+    claim_stdout(ctx, "output", as_json=as_json, binary=True)
+    if DASH in files.inputs and len(files.inputs) > 1:
+        raise click.UsageError("standard input cannot be merged with files; save it to a file first")
+    if is_set(ctx, "rgba") and len(files.inputs) > 1:
+        raise click.UsageError(f"--rgba takes one input, not {len(files.inputs)}")
+    refuse_others(ctx, form.name, hints=False)

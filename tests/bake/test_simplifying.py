@@ -1,0 +1,126 @@
+"""Simplified scenes: the cut of a tree that a goal asks for, as plain splats."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+import sparklod_cli as sparklod
+from sparklod_cli.bake.settings import SimplifyGoal
+from sparklod_cli.bake.simplifying import CLOSE_BYTES, CLOSE_COUNT, count_for
+from sparklod_cli.lod.budget import parse_budget
+from sparklod_cli.lod.detail_levels import RefinementOrder
+from sparklod_cli.model.lod_tree import LodTree
+from sparklod_cli.support.progress import silent
+from tests.scenes import random_splats
+
+SCENE = sparklod.Scene(random_splats(2000, sh_degree=1), up="-y")
+
+
+@pytest.fixture(scope="module")
+def tree() -> sparklod.Tree:
+    return sparklod.build_lod(SCENE, method="quality", growth=2.0)
+
+
+def never(count: int) -> float:
+    raise AssertionError("it is not measured")
+
+
+def splats_of(goal: SimplifyGoal, leaves: int, measure: Callable[[int], float] = never) -> tuple[int, float | None]:
+    return count_for(goal, leaves, bytes_of=measure, psnr_of=measure, progress=silent)
+
+
+def is_cut(nodes: np.ndarray, tree: LodTree) -> bool:
+    """Each leaf has exactly one of the nodes on its way to the root."""
+    chosen = np.zeros(len(tree), np.int64)
+    chosen[nodes] = 1
+    for node in np.flatnonzero(~tree.is_leaf):  # parents come first
+        start = int(tree.child_start[node])
+        chosen[start : start + int(tree.child_count[node])] += chosen[node]
+    return bool((chosen[tree.is_leaf] == 1).all())
+
+
+def test_each_cut_has_at_most_so_many_splats_and_refines_the_coarser_ones(tree: sparklod.Tree) -> None:
+    order = RefinementOrder(tree.splats, tree.tree)
+    most = int(tree.tree.child_count.max())
+    before: set[int] = set()
+    parent = {node: int(above) for node, above in enumerate(order.parent)}
+    for count in (1, 2, 17, 400, 1999, 2000):
+        nodes = order.cut(count)
+        assert count - most < len(nodes) <= count
+        assert is_cut(nodes, tree.tree)
+        assert all(each in before or parent[each] == -1 or before.isdisjoint({each}) for each in nodes.tolist())
+        before = set(nodes.tolist())
+    np.testing.assert_array_equal(nodes, np.flatnonzero(tree.tree.is_leaf))
+
+
+def test_a_share_and_a_count_mean_the_same() -> None:
+    share, count = (sparklod.simplify(SCENE, to=each) for each in (0.1, 200))
+    assert len(share.splats) == len(count.splats) <= 200
+    np.testing.assert_array_equal(share.splats.center, count.splats.center)
+    assert share.tree is None and share.up == "-y"
+    assert share.splats.opacity.max() <= 1
+    assert len(sparklod.simplify(SCENE, to=10**9).splats) == 2000
+
+
+def test_a_tree_is_cut_as_it_is(tree: sparklod.Tree) -> None:
+    one, two = sparklod.simplify(tree, to=300), sparklod.simplify(SCENE, to=300)
+    np.testing.assert_array_equal(one.splats.center, two.splats.center)
+    with pytest.raises(ValueError, match="selection and max_sh are for scenes without a tree"):
+        sparklod.simplify(tree, to=300, max_sh=0)
+
+
+def test_the_same_splats_for_any_number_of_threads() -> None:
+    one, three = (sparklod.simplify(SCENE, to=0.2, threads=threads) for threads in (1, 3))
+    np.testing.assert_array_equal(one.splats.center, three.splats.center)
+
+
+def test_a_psnr_is_held_by_pictures() -> None:
+    small = sparklod.simplify(SCENE, psnr=30.0)
+    assert 1 < len(small.splats) < 2000
+    smaller = sparklod.simplify(SCENE, psnr=25.0)
+    assert len(smaller.splats) < len(small.splats)
+    cameras = sparklod.orbit(SCENE, count=2, size=(64, 36))
+    assert 1 < len(sparklod.simplify(SCENE, psnr=30.0, cameras=cameras).splats) <= 2000
+
+
+@pytest.mark.parametrize("most", [1000, 34_567, 999_999])
+def test_the_file_is_as_large_as_it_may_be(most: int) -> None:
+    def size(count: int) -> float:
+        return 500 + 12 * count - (count // 7) % 3 + count**0.9
+
+    count, _ = splats_of(SimplifyGoal(max_bytes=most), 100_000, size)
+    assert size(count) <= most < size(count + 1) + CLOSE_BYTES * most
+
+
+def test_a_scene_that_fits_stays_whole() -> None:
+    assert splats_of(SimplifyGoal(max_bytes=10), 10, float) == (10, None)
+
+
+def test_a_file_that_cannot_be_so_small_is_an_error() -> None:
+    with pytest.raises(sparklod.FormatError, match="one splat takes 501 bytes in this format, more than 7; allow more"):
+        splats_of(SimplifyGoal(max_bytes=7), 9000, lambda count: 500.0 + count)
+
+
+def test_the_fewest_splats_hold_a_psnr() -> None:
+    count, psnr = splats_of(SimplifyGoal(psnr=40), 1_000_000, lambda count: 10 * np.log10(count))
+    assert 10_000 <= count <= 10_000 * (1 + 2 * CLOSE_COUNT)
+    assert psnr == pytest.approx(10 * np.log10(count))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        ({}, "give one of to, max_bytes and psnr"),
+        ({"psnr": 3.0, "max_bytes": 1}, "give one of"),
+        ({"psnr": 100.0}, "psnr is 100.0; give more than 0 and less than 100 dB"),
+        ({"psnr": float("nan")}, "psnr is nan"),
+        ({"max_bytes": 0}, "max_bytes is 0; give 1 or more"),
+    ],
+)
+def test_goals_that_are_none_are_refused(arguments: dict[str, float], text: str) -> None:
+    with pytest.raises(ValueError, match=text):
+        SimplifyGoal(**arguments)  # type: ignore[arg-type]
+    assert splats_of(SimplifyGoal(to=parse_budget("1%")), 50) == (1, None)

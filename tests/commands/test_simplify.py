@@ -1,0 +1,129 @@
+"""`sparklod simplify`: every format, every goal, and what is refused."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sparklod_cli.cli import run
+from sparklod_cli.codecs import ply
+from sparklod_cli.codecs.formats import WRITABLE
+from sparklod_cli.io import read_scene
+from sparklod_cli.model.scene import Scene
+from tests.conftest import FIXTURES, Capture
+from tests.scenes import random_splats
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> Path:
+    path = tmp_path / "scene.ply"
+    path.write_bytes(b"".join(ply.encode(Scene(random_splats(1000, sh_degree=1)))))
+    return path
+
+
+def simplify(*arguments: object) -> int:
+    return run(["simplify", *map(str, arguments)])
+
+
+@pytest.mark.parametrize("ending", WRITABLE)
+def test_every_format_gets_the_same_splats(ending: str, source: Path, tmp_path: Path) -> None:
+    target = tmp_path / "out" / (ending if not ending.startswith(".") else f"small{ending}")
+    assert simplify(source, "--to", "10%", "-o", target) == 0
+    scene = read_scene(target)
+    assert scene.tree is None
+    assert 90 < len(scene.splats) <= 100
+    assert simplify(source, "--to", "100", "-o", tmp_path / "exact.ply") == 0
+    exact = np.sort(read_scene(tmp_path / "exact.ply").splats.center, axis=0)
+    np.testing.assert_allclose(np.sort(scene.splats.center, axis=0), exact, atol=0.01)
+
+
+@pytest.mark.parametrize("ending", [".ply", ".spz", ".sog", "meta.json"])
+def test_a_file_is_at_most_so_large(ending: str, source: Path, tmp_path: Path, capsys: Capture) -> None:
+    target = tmp_path / "out" / (ending if not ending.startswith(".") else f"small{ending}")
+    assert simplify(source, "--max-bytes", "16kB", "-o", target, "--json") == 0
+    record = json.loads(capsys.readouterr().out)
+    size = sum(path.stat().st_size for path in target.parent.iterdir())
+    assert 15_000 < size == record["bytes"] <= 16_000
+    assert record["simplified"]["splats"] == len(read_scene(target))
+
+
+def test_a_psnr_is_measured_with_the_cameras_that_are_named(source: Path, tmp_path: Path, capsys: Capture) -> None:
+    cameras = tmp_path / "cameras.csv"
+    cameras.write_text("x,y,z,target_x,target_y,target_z\n0,0,-6,0,0,0\n")
+    target = tmp_path / "small.spz"
+    assert simplify(source, "--psnr", "25", "--camera-path", cameras, "-o", target, "--json") == 0
+    record = json.loads(capsys.readouterr().out)
+    assert record["simplified"]["psnr"] >= 25
+    assert 1 < record["simplified"]["splats"] < 1000
+
+
+def test_one_line_says_what_was_written(source: Path, tmp_path: Path, capsys: Capture) -> None:
+    target = tmp_path / "small.splat"
+    assert simplify(source, "--to", "50%", "-o", target) == 0
+    first, second, *_ = capsys.readouterr().err.splitlines()
+    assert first.startswith(f"{source}  1,000 splats, SH 1  ->  {target}  500 splats (50 %), 16.0 kB, ")
+    assert second.strip().startswith("SPLAT holds no reflections (SH)")
+
+
+def test_several_inputs_are_one_scene(source: Path, tmp_path: Path) -> None:
+    other, target = FIXTURES / "one.ply", tmp_path / "all.ply"
+    assert simplify(source, other, "--to", "100%", "-o", target) == 0
+    assert len(read_scene(target)) == 1001
+
+
+def test_a_tree_is_cut_as_it_is(source: Path, tmp_path: Path, capsys: Capture) -> None:
+    tree, target = tmp_path / "tree.rad", tmp_path / "small.ply"
+    assert run(["build-lod", str(source), "-o", str(tree)]) == 0
+    assert simplify(tree, "--to", "100", "-o", target) == 0
+    assert 90 < len(read_scene(target)) <= 100
+    assert simplify(tree, "--to", "100", "--min-opacity", "0.1", "-o", target, "-f") == 1
+    assert "leave out --min-opacity" in capsys.readouterr().err
+
+
+def test_selection_and_axes_are_those_of_build_lod(source: Path, tmp_path: Path) -> None:
+    target = tmp_path / "small.ply"
+    assert simplify(source, "--to", "100%", "--up", "-y", "--within", "0,0,0,1", "-o", target) == 0
+    scene = read_scene(target)
+    assert scene.up == "y" and 0 < len(scene) < 1000
+    assert np.linalg.norm(scene.splats.center, axis=1).max() <= 1.001
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (("-o", "x.ply"), "say how many splats are left: give one of --to, --max-bytes and --psnr"),
+        (("--to", "1%", "--psnr", "30", "-o", "x.ply"), "--to and --psnr cannot be used together"),
+        (("--to", "ten", "-o", "x.ply"), "'ten' is neither a share such as 5% nor a count"),
+        (("--to", "1%", "-o", "x.npz"), "--output writes .ply"),
+        (("--to", "1%", "-o", "x"), "has no suffix to tell the format"),
+        (("--to", "1%", "-o", "x.ply", "--camera-path", "c.csv"), "--camera-path can only be used with --psnr"),
+        (("--to", "1%", "-o", "x.ply", "--spz-version", "2"), "--spz-version is an option of SPZ, not of PLY"),
+        (("--to", "1%", "-o", "x.ply", "--cluster-sh"), "--cluster-sh is an option of RAD and SOG, not of PLY"),
+        (("--to", "1%", "-o", "-", "--json"), "cannot both go to standard output"),
+        (("-", "--to", "1%", "-o", "x.ply"), "standard input cannot be merged"),
+    ],
+)
+def test_contradictions_are_refused(
+    arguments: tuple[str, ...],
+    text: str,
+    source: Path,
+    tmp_path: Path,
+    capsys: Capture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("c.csv").write_text("x\n")
+    assert simplify(source, *arguments) == 2
+    assert text in " ".join(capsys.readouterr().err.split())
+    assert not list(tmp_path.glob("x*"))
+
+
+def test_an_output_is_replaced_only_if_told(source: Path, tmp_path: Path, capsys: Capture) -> None:
+    target = tmp_path / "small.ply"
+    target.write_bytes(b"precious")
+    assert simplify(source, "--to", "1%", "-o", target) == 1
+    assert "exists, add --overwrite" in capsys.readouterr().err
+    assert target.read_bytes() == b"precious"
