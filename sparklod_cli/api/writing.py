@@ -51,6 +51,7 @@ def write(
     chunked: bool = False,
     rad: RadOptions | None = None,
     sog: SogOptions | None = None,
+    glb_profile: str | None = None,
     encoding: str | None = None,
     detail: DetailSettings | None = None,
     environment: Scene | None = None,
@@ -60,9 +61,9 @@ def write(
     """Write a scene, or a tree, whole or not at all. Nodes keep their order, see `arrange_chunks`.
 
     Args:
-        path: of the file, whose suffix tells the format: .spz or .rad; for a scene without a tree, .ply, .sog or
-            .splat, too. Of several files, it names the first, and all appear or none: meta.json has the images of an
-            unpacked SOG beside it; for a tree, lod-meta.json has the folders of a Streamed SOG.
+        path: of the file, whose suffix tells the format: .spz or .rad; for a scene without a tree, .ply, .sog,
+            .glb or .splat, too. Of several files, it names the first, and all appear or none: meta.json has the images
+            of an unpacked SOG beside it; for a tree, lod-meta.json has the folders of a Streamed SOG.
         scene: what is written.
         overwrite: replace a file that exists.
         spz_version: of SPZ, 2 or 3; None for 3.
@@ -72,6 +73,7 @@ def write(
             appear, or none.
         rad: further options of RAD.
         sog: options of SOG.
+        glb_profile: of GLB, "khronos" (the extension KHR_gaussian_splatting; unless given) or "cesium" (SPZ inside).
         encoding: write the arrays of "packed", "ext", "lodtree" or "texture" as .npz instead, or as the words alone
             where the path ends in .bin or .raw.
         detail: of a Streamed SOG, which regions and detail levels are made of the tree.
@@ -104,6 +106,8 @@ def write(
         raise ValueError(f"{path}: chunked and rad are of RAD; leave them out, or write a .rad")
     if sog is not None and written != "SOG" and not streamed:
         raise ValueError(f"{path}: sog is of SOG; leave it out, or write a .sog")
+    if glb_profile is not None and written != "GLB":
+        raise ValueError(f"{path}: glb_profile is of GLB; leave it out, or write a .glb")
     if (detail is not None or environment is not None) and not streamed:
         raise ValueError(f"{path}: detail and environment are of Streamed SOG; leave them out, or write a {MANIFEST}")
     ranges = rad.ranges if isinstance(rad, RadOptions) else None
@@ -117,6 +121,7 @@ def write(
             raise TypeError(f"{name} is {value!r}; give {'a ' if name == 'ranges' else ''}{kind.__name__}")
     rad = dataclasses.replace(rad or RadOptions(), chunked=chunked or (rad is not None and rad.chunked))
     options = WriteOptions(spz_version, fractional_bits, compression_level, rad, sog or SogOptions())
+    options = options if glb_profile is None else dataclasses.replace(options, glb_profile=glb_profile)
     if not len(scene_like(scene).splats):
         raise InvalidSplatsError(f"{path}: the scene has no splats to write")
     with progress_callback(progress) as callback, memory_errors_translated():

@@ -108,6 +108,7 @@ FORMATS = (
         unbundled="meta.json",
         companions=True,
     ),
+    Format("GLB", "glb.codec", (".glb",), rb"glTF", writable=True),
     Format("KSPLAT", "ksplat", (".ksplat",), rb"\0[\x01-\xff]\0\0"),  # version 0.1 on; as a float it would be denormal
     Format("SPLAT", "splat", (".splat",), None, writable=True, bare=True),
 )

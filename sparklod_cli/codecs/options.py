@@ -29,6 +29,10 @@ SH_CODES = whole(MIN_SH_CODES, MAX_SH_CODES)
 CENTER_BITS = whole(-149, 149)
 
 
+#: Profiles of GLB: attributes as KHR_gaussian_splatting defines them, and SPZ as CesiumJS reads it.
+KHRONOS, CESIUM = PROFILES = ("khronos", "cesium")
+
+
 def _bits(text: str) -> int | None:
     if text != "auto" and not text.isdecimal():
         raise ValueError(f"{text!r} is neither auto nor a whole number")
@@ -125,6 +129,11 @@ class WriteOptions(CheckedSettings):
     sog: SogOptions = field(default_factory=SogOptions)
     sh_bits: int | None = None
     covering: bool = True
+    glb_profile: str = setting(
+        KHRONOS,
+        "GLB with 32-bit floats, as KHR_gaussian_splatting defines it, or with SPZ inside, as CesiumJS reads it.",
+        PROFILES,
+    )
 
 
 #: What is written where nobody chooses.

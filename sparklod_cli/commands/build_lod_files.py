@@ -50,6 +50,7 @@ OF_FORMATS = (
     (("spz_version", "fractional_bits"), ("SPZ",), ""),
     (parameters_of(RadOptions), ("RAD",), "; name the output .rad, or add --format rad"),
     (("compression_level",), ("SPZ", "RAD"), ""),
+    (("glb_profile",), ("GLB",), "; GLB is written by --unlod and simplify"),
     (("cluster_sh",), ("RAD", "SOG"), "; name the output .rad, or add --format rad"),
     (
         parameters_of(DetailSettings, DetailOptions),
@@ -98,7 +99,7 @@ class BakedFiles:
     unlod: bool = flag(
         "Write the leaves of Level-of-Detail files instead: the original splats as the file holds them, rounded, with"
         " opacities that make up for it. As SPZ or, by the name of FILE, .rad, .ply, .sog, DIR/meta.json (an unpacked"
-        " SOG) or .splat, which has no SH.",
+        " SOG), .glb or .splat, which has no SH.",
         heading=COMMON,
     )
     form: str | None = option(

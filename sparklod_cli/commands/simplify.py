@@ -61,6 +61,7 @@ EXAMPLES = """\
   sparklod simplify scene.ply --max-bytes 8MB -o small.sog     # as many splats as fit
   sparklod simplify scene.ply --psnr 40 -o small.spz           # as few splats as hold it
   sparklod simplify scene.ply --psnr 35 --camera-path path.json -o small.ply
+  sparklod simplify scene.ply --to 500k --up -y -o small.glb --glb-profile cesium
   sparklod simplify tiles/*.ply --to 1M --up -y -o city.sog    # several files as one scene
   sparklod simplify scene-lod.rad --to 5% -o small.ply         # a cut of the tree that it has
 """
@@ -97,8 +98,8 @@ class SimplifiedFiles:
         needs="psnr",
     )
     output: Place = option(
-        "Output, whose name tells the format: .ply, .spz, .sog, DIR/meta.json (an unpacked SOG), .rad or .splat, which"
-        " has no SH; DIR/ means DIR/NAME-small.spz, - standard output, as SPZ.",
+        "Output, whose name tells the format: .ply, .spz, .sog, DIR/meta.json (an unpacked SOG), .glb, .rad or .splat,"
+        " which has no SH; DIR/ means DIR/NAME-small.spz, - standard output, as SPZ.",
         OutputPath(addresses=True),
         flags=("-o", "--output"),
         heading=COMMON,

@@ -41,7 +41,7 @@ WRONG: Mapping[str, tuple[str, float]] = {
 Write = Callable[[Path, Scene], object]
 
 #: Every way in which the API writes a scene without a tree.
-PLAIN: dict[str, Write] = dict.fromkeys((".ply", ".splat", ".sog", ".spz", ".rad"), sparklod.write)
+PLAIN: dict[str, Write] = dict.fromkeys((".ply", ".splat", ".sog", ".glb", ".spz", ".rad"), sparklod.write)
 #: And a tree.
 TREES: dict[str, Write] = {
     ".spz": sparklod.write,

@@ -37,7 +37,7 @@ def test_a_scene_is_written_and_read_back(tmp_path: Path, name: str) -> None:
         ("x.sog", {"sog": {"sh_codes": 9}}, TypeError, "sog is {'sh_codes': 9}; give SogOptions"),
         ("x.spz", {"sog": sparklod.SogOptions()}, ValueError, "sog is of SOG; leave it out, or write a .sog"),
         ("x.sog", {"rad": sparklod.RadOptions()}, ValueError, "chunked and rad are of RAD"),
-        ("x.json", {}, sparklod.FormatError, "a scene is written as .ply, .spz, .rad, .sog, meta.json, .splat"),
+        ("x.json", {}, sparklod.FormatError, "a scene is written as .ply, .spz, .rad, .sog, meta.json, .glb, .splat"),
     ],
 )
 def test_wrong_options_are_refused_before_anything_is_written(

@@ -38,6 +38,7 @@ FILES = (
     *(f"golden/sh2-level{level}.ksplat" for level in (0, 1, 2)),
     "golden/sh0.splat",
     "golden/sh1-tree.rad",
+    *(f"golden/{name}.glb" for name in ("sh2", "sh1-quantized", "hand-spz")),
 )
 GZIPPED = tuple(name for name in FILES if name.endswith(".spz") and "v4" not in name)
 ZIPPED = tuple(name for name in FILES if name.endswith(".sog"))
@@ -115,6 +116,8 @@ def header(name: str, data: bytes) -> list[int]:
         return [base + place for base in (0, 4096, 5120, 6144) for place in range(44)]
     if name.endswith(".sog"):  # the end is the directory, which decides
         return [*range(120), *range(len(data) - 400, len(data))]
+    if name.endswith(".glb"):
+        return list(range(28 + struct.unpack_from("<I", data, 12)[0]))
     if name.endswith(".rad"):  # the file's, and that of the first chunk
         return list(range(data.index(b"RADC") + 1200))
     return list(range(len(data) if name.endswith(".json") else min(120, len(data))))
@@ -252,6 +255,7 @@ MAGICS = (
     *(b"\x1f\x8b\x08\0", b"NGSP", b"PK\x03\x04", b'{"means":', b'\n { "version" :2', b'{"lodLevels":'),
     *(b"\0\1\0\0", b"\0\1\0\0\3" + bytes(4091)),
     *(b"RAD0", b"RAD0\40\0\0\0{", b"RADC"),
+    *(b"glTF", b"glTF\2\0\0\0"),
 )
 
 

@@ -47,7 +47,7 @@ def test_a_codec_has_the_signatures_of_all(form: Format) -> None:
 
 def test_one_format_is_written_by_each_suffix() -> None:
     assert sum(len(form.endings) for form in FORMATS if form.writable) == len(WRITABLE)
-    assert set(WRITABLE) == {".ply", ".spz", ".splat", ".rad", ".sog", "meta.json"}
+    assert set(WRITABLE) == {".ply", ".spz", ".splat", ".rad", ".sog", "meta.json", ".glb"}
 
 
 @pytest.mark.parametrize(

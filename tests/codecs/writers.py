@@ -13,12 +13,14 @@ from numpy.typing import NDArray
 from fixtures import (
     by_hand,
     by_hand_compressed_ply,
+    by_hand_glb,
     by_hand_ksplat,
     by_hand_sog,
     by_hand_splat,
     by_hand_streamed_sog,
 )
 from sparklod_cli.codecs import ply, quantize, sh_palette, splat, spz
+from sparklod_cli.codecs.glb import codec as glb
 from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.codecs.sog import codec as sog
 from sparklod_cli.codecs.sog import texel_codings as codings
@@ -313,6 +315,29 @@ SPLAT = {
     ),
 }
 
+# --- GLB --------------------------------------------------------------------------------------------------------------
+
+
+def written_glb(source: Scene, profile: str) -> bytes:
+    return b"".join(glb.encode(source, WriteOptions(glb_profile=profile)))
+
+
+GLB = {
+    "sparklod": Case("GLB", functools.partial(written_glb, profile="khronos"), exact),
+    "sparklod, SPZ": Case(
+        "GLB SPZ 3",
+        functools.partial(written_glb, profile="cesium"),
+        functools.partial(spz_precision, version=3),
+    ),
+    "by hand": Case("GLB", lambda source: by_hand_glb.glb(**linear(source)), exact),
+    "interleaved": Case("GLB", lambda source: by_hand_glb.glb(**linear(source), interleaved=True), exact),
+    "quantized": Case(
+        "GLB",
+        lambda source: by_hand_glb.glb(**linear(source), quantized=True),
+        lambda source: Precision(degrees=0.01, opacity=1.001 / 510),
+    ),
+}
+
 #: Every way to write each format of the table, by its name there.
 WRITERS: dict[str, dict[str, Case]] = {
     "PLY": PLY,
@@ -323,4 +348,5 @@ WRITERS: dict[str, dict[str, Case]] = {
     "KSPLAT": KSPLAT,
     "SPLAT": SPLAT,
     "RAD": RAD,
+    "GLB": GLB,
 }

@@ -1,0 +1,1 @@
+"""Binary glTF with the extension KHR_gaussian_splatting."""
