@@ -44,12 +44,13 @@ SETS = {
     "decimate-adaptive": "splat-transform --decimate-adaptive",
     "nanogs": "NanoGS",
     "simplify": "our simplify",
+    "simplify-refined": "our simplify, refined",
 }
 
 SIMPLIFIERS = TREES | SETS
 
 #: Simplifiers that take minutes, and are measured only if they are named.
-SLOW = ("refined",)
+SLOW = ("refined", "simplify-refined")
 
 #: Programs of others: the variable of the environment that names a folder, and what must be there.
 SPLAT_TRANSFORM = "node_modules/@playcanvas/splat-transform/bin/cli.mjs"
@@ -170,8 +171,9 @@ class Comparison:
 
 def set_command(method: str, source: Path, output: Path, share: str) -> list[str | Path]:
     """Return the command by which a program leaves a share such as "10%" of the splats of a PLY."""
-    if method == "simplify":
-        return [*SPARKLOD, "simplify", source, "--to", share, "-o", output, "--quiet"]
+    if method.startswith("simplify"):
+        refine = ["--refine"] if method.endswith("refined") else []
+        return [*SPARKLOD, "simplify", source, "--to", share, "-o", output, "--quiet", *refine]
     program = _program(method)
     if method == "nanogs":
         own = program.parent / ".venv" / "bin" / "python"

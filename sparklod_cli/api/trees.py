@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Iterable
 
 from ..bake.in_memory import build_tree
 from ..bake.refining import Refined, refined
 from ..bake.selecting import select
 from ..bake.settings import BakeSettings, SimplifyGoal
-from ..bake.simplifying import chosen_cut
+from ..bake.simplifying import Simplifier
 from ..cameras.camera import Camera
 from ..cameras.path import CameraPath
 from ..fitting.settings import STEPS, FitSettings
@@ -84,6 +85,7 @@ def simplify(
     *,
     to: BudgetLike | None = None,
     psnr: float | None = None,
+    refine: bool | int | FitSettings = False,
     cameras: CameraPath | Iterable[Camera] | None = None,
     max_sh: int = MAX_SH_DEGREE,
     selection: Selection | None = None,
@@ -99,6 +101,7 @@ def simplify(
         scene: without a tree; or a tree, which is cut as it is.
         to: a count, a share as a float, or a text such as "100k" or "10%".
         psnr: in place of `to`: the fewest splats whose pictures have this PSNR against the scene's, in dB.
+        refine: fit the splats to pictures of the scene: True, or in how many steps, or how.
         cameras: of these pictures; None for cameras around and inside the scene.
         max_sh: SH degrees above this are left out.
         selection: which splats to keep; all that can be drawn, unless given.
@@ -111,7 +114,9 @@ def simplify(
         ValueError: not exactly one of `to` and `psnr` is given, or a number is out of its range.
     """
     goal = SimplifyGoal(None if to is None else budget_like(to), None, psnr)
-    path = None if cameras is None else path_like(cameras).cameras
+    path, fitting = None if cameras is None else path_like(cameras), fit_settings_of(refine)
+    if fitting is not None and path is not None:
+        fitting = dataclasses.replace(fitting, path=path)
     if scene_like(scene).tree is None:
         scene = build_lod(
             scene,
@@ -125,7 +130,8 @@ def simplify(
     elif selection is not None or max_sh != MAX_SH_DEGREE:
         raise ValueError("selection and max_sh are for scenes without a tree; give the splats that it was built from")
     with on_threads(threads) as count, progress_callback(progress) as callback, memory_errors_translated():
-        chosen, _ = chosen_cut(scene, goal, bytes_of=len, cameras=path, threads=count, progress=callback)
+        simplifier = Simplifier(goal, fitting, None if path is None else path.cameras)
+        chosen = simplifier.choose(scene, bytes_of=len, threads=count, progress=callback).scene
         return Scene(chosen.splats, antialiased=scene.antialiased, up=scene.up)
 
 

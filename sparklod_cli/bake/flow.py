@@ -51,7 +51,7 @@ def bake(
     with memory_errors_translated():
         fitting, resources = fit_settings(settings), resources or Resources()
         overwrite = overwrite or has_published(source, target, settings, resources)  # its own output
-        output, clock = output_of(target, settings, overwrite=overwrite), Clock()
+        output, clock = output_of(target, settings, overwrite=overwrite, say=say), Clock()
         with blocks_for(
             source,
             target,
@@ -67,7 +67,7 @@ def bake(
         ) as blocks:
             work = blocks or InMemory(source, settings, output, clock, threads, progress)
             tree, fit = work.build(), None
-            if fitting is not None:
+            if fitting is not None and settings.simplify is None:  # which fits its one cut
                 tree.nodes, fit = refined(tree.scene, fitting, threads=threads, progress=progress, say=say)
                 clock.end("refine")
             work.order(tree)

@@ -52,7 +52,9 @@ class BakeOutput:
         raise NotImplementedError
 
 
-def output_of(target: Place, settings: BakeSettings, *, overwrite: bool) -> BakeOutput:
+def output_of(
+    target: Place, settings: BakeSettings, *, overwrite: bool, say: Callable[[str], None] = lambda text: None
+) -> BakeOutput:
     """Return the output that settings ask for; fail now if it cannot be written later.
 
     Raises:
@@ -64,12 +66,11 @@ def output_of(target: Place, settings: BakeSettings, *, overwrite: bool) -> Bake
 
         return DetailOutput(settings.detail, settings.options, detail_sink(target, overwrite=overwrite))
     if settings.simplify is not None:
-        from .simplifying import SimplifiedOutput
+        from .simplifying import SimplifiedOutput, Simplifier
 
         form = WRITABLE[settings.suffix]
         write = scene_sink(target, form, chunked=settings.options.rad.chunked, overwrite=overwrite)
-        cameras = SimplifiedOutput.cameras_of(settings)
-        return SimplifiedOutput(form, settings.options, write, settings.simplify, cameras)
+        return SimplifiedOutput(form, settings.options, write, Simplifier.of(settings, say))
     if settings.encoding is not None:
         return ArrayOutput(settings.encoding, settings.raw, sink(target, overwrite=overwrite))
     form, chunked = WRITABLE[settings.suffix], settings.options.rad.chunked

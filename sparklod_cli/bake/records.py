@@ -121,11 +121,13 @@ class WrittenSet(Losses):
     Attributes:
         splats, share: how many, and their share of full detail.
         psnr: mean over the cameras and a black and a white background, dB; None where it was not measured.
+        refine: result of fitting it; None without `--refine`.
     """
 
     splats: int
     share: float
     psnr: float | None
+    refine: Refined | None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..codecs.validation import check_valid
 from ..fitting.settings import FitReport, FitSettings
@@ -45,13 +46,20 @@ def fit_settings(settings: BakeSettings) -> FitSettings | None:
 
 
 def refined(
-    scene: Scene, settings: FitSettings, *, threads: int, progress: Progress, say: Callable[[str], None]
+    scene: Scene,
+    settings: FitSettings,
+    *,
+    fixed: NDArray[np.int64] | None = None,
+    threads: int,
+    progress: Progress,
+    say: Callable[[str], None],
 ) -> tuple[Scene, Refined]:
     """Return a tree whose merged splats are fitted, and what that brought.
 
     A first Ctrl-C ends the fitting early: what the finished stages gained is kept.
 
     Args:
+        fixed: see `fitting.fit.fit`.
         say: told what came of each stage.
 
     Raises:
@@ -68,6 +76,7 @@ def refined(
             scene.splats,
             scene.tree,
             settings,
+            fixed=fixed,
             antialiased=scene.antialiased,
             threads=threads,
             progress=progress,

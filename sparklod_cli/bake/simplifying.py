@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 import math
 from collections.abc import Callable, Iterable, Sequence
@@ -14,8 +15,9 @@ from ..cameras.camera import Camera
 from ..codecs.formats import Format
 from ..codecs.losses import settled_with_losses
 from ..codecs.options import WriteOptions
+from ..fitting.settings import FitSettings
 from ..images.metrics import BACKGROUNDS, on_background, psnr
-from ..io.writing import Files, SceneSink
+from ..io.writing import SceneSink
 from ..lod.detail_levels import RefinementOrder, with_plain_opacity
 from ..model.instances import Instance
 from ..model.scene import Scene
@@ -25,6 +27,7 @@ from ..support.parallel import on_threads
 from ..support.progress import Progress
 from .output import BakeOutput, Encode
 from .records import BuiltTree, Clock, WrittenSet, WrittenTree
+from .refining import Refined, fit_settings, refined
 from .settings import BakeSettings, SimplifyGoal
 
 #: Cameras that a PSNR is measured with where nobody names any, and their seed: as many as judge a fitted tree.
@@ -39,11 +42,6 @@ MOST_TRIALS = 16
 
 #: Measures a number of a cut of so many splats.
 Measure = Callable[[int], float]
-
-
-def simplified(scene: Scene, order: RefinementOrder, count: int) -> Scene:
-    """Return the finest cut of a tree of at most `count` splats, as splats of opacities of at most 1 without a tree."""
-    return dataclasses.replace(scene, splats=with_plain_opacity(scene.splats.take(order.cut(count))), tree=None)
 
 
 def count_for(
@@ -155,97 +153,108 @@ class Pictures:
 
 
 @dataclass(frozen=True)
-class SimplifiedOutput(BakeOutput):
-    """File of a simplified scene.
+class Chosen:
+    """A simplified scene, with its PSNR and how it was fitted, where either was asked for."""
+
+    scene: Scene
+    psnr: float | None
+    refine: Refined | None
+
+
+@dataclass(frozen=True)
+class Simplifier:
+    """Cuts trees as a goal asks for.
 
     Attributes:
+        refine: how the cut is fitted to pictures of full detail, for all cameras; None for not at all.
         cameras: for a PSNR; None for cameras that are placed around and inside the scene.
+        say: called with a line after each stage of fitting.
     """
+
+    goal: SimplifyGoal
+    refine: FitSettings | None = None
+    cameras: Sequence[Camera] | None = None
+    say: Callable[[str], None] = lambda text: None
+
+    @classmethod
+    def of(cls, settings: BakeSettings, say: Callable[[str], None]) -> Simplifier:
+        """Return the one of settings.
+
+        Raises:
+            CameraPathError: the cameras that they name cannot be read.
+        """
+        assert settings.simplify is not None
+        refine, cameras = fit_settings(settings), None
+        if refine is not None and refine.path is not None:
+            cameras = refine.path.cameras
+        elif settings.camera_path is not None:
+            from ..cameras.sources import read_path
+
+            cameras = read_path(settings.camera_path).cameras
+        return cls(settings.simplify, refine, cameras, say)
+
+    def choose(self, tree: Scene, *, bytes_of: Callable[[Scene], float], threads: int, progress: Progress) -> Chosen:
+        """Return the cut of a tree that the goal asks for, fitted if need be, as a scene without a tree.
+
+        Args:
+            bytes_of: size of the file of a scene.
+
+        Raises:
+            FormatError, SparklodError: see `count_for` and `Pictures`.
+            KeyboardInterrupt: see `refining.refined`.
+        """
+        assert tree.tree is not None
+        progress("simplifying", 0, 1, "cut")
+        order = RefinementOrder(tree.splats, tree.tree)
+        tree = dataclasses.replace(tree, splats=with_plain_opacity(tree.splats))
+
+        def cut(count: int) -> Scene:
+            return dataclasses.replace(tree, splats=tree.splats.take(order.cut(count)), tree=None)
+
+        pictures = None if self.goal.psnr is None else Pictures(cut(order.leaves), self.cameras, threads)
+        count, measured = count_for(
+            self.goal,
+            order.leaves,
+            bytes_of=lambda count: bytes_of(cut(count)),
+            psnr_of=lambda count: 0.0 if pictures is None else pictures.psnr(cut(count)),
+            progress=progress,
+        )
+        if self.refine is None:
+            return Chosen(cut(count), measured, None)
+        fixed = order.cut(count)
+        fitted, report = refined(tree, self.refine, fixed=fixed, threads=threads, progress=progress, say=self.say)
+        chosen = dataclasses.replace(fitted, splats=fitted.splats.take(fixed), tree=None)
+        return Chosen(chosen, None if pictures is None else pictures.psnr(chosen), report)
+
+
+@dataclass(frozen=True)
+class SimplifiedOutput(BakeOutput):
+    """File of a simplified scene."""
 
     form: Format
     options: WriteOptions
     sink: SceneSink
-    goal: SimplifyGoal
-    cameras: Sequence[Camera] | None
-
-    @staticmethod
-    def cameras_of(settings: BakeSettings) -> Sequence[Camera] | None:
-        """Return the cameras of the file that settings name; None without one.
-
-        Raises:
-            CameraPathError: they cannot be read.
-        """
-        if settings.camera_path is None:
-            return None
-        from ..cameras.sources import read_path
-
-        return read_path(settings.camera_path).cameras
+    simplifier: Simplifier
 
     def write(self, tree: BuiltTree, encode: Encode, clock: Clock, threads: int, progress: Progress) -> WrittenTree:
         """Cut the tree and write the cut."""
         # The opacities of a tree that was read make up for the rounding of its scales already.
         options = dataclasses.replace(self.options, covering=tree.method is not None)
         with on_threads(threads):
-            chosen, measured = chosen_cut(
-                tree.scene,
-                self.goal,
-                bytes_of=lambda scene: self._bytes(scene, options, threads),
-                cameras=self.cameras,
-                threads=threads,
-                progress=progress,
-            )
-        settled, losses = settled_with_losses(chosen, self.form, options, threads)
+            bytes_of = functools.partial(self._bytes, options=options, threads=threads)
+            chosen = self.simplifier.choose(tree.scene, bytes_of=bytes_of, threads=threads, progress=progress)
+        settled, losses = settled_with_losses(chosen.scene, self.form, options, threads)
         clock.end("simplify")
-        size = self.sink(chosen, settled, threads=threads, progress=progress)
+        size = self.sink(chosen.scene, settled, threads=threads, progress=progress)
         clock.end("write")
-        count = len(chosen.splats)
-        written = WrittenSet(**vars(losses), splats=count, share=round(count / tree.splats, 6), psnr=measured)
-        return WrittenTree(output_format=self.form.name, bytes=size, simplified=written)
+        count = len(chosen.scene)
+        share = round(count / tree.splats, 6)
+        made = WrittenSet(**vars(losses), splats=count, share=share, psnr=chosen.psnr, refine=chosen.refine)
+        return WrittenTree(output_format=self.form.name, bytes=size, simplified=made)
 
-    def _bytes(self, scene: Scene, options: WriteOptions, threads: int) -> int:
+    def _bytes(self, scene: Scene, *, options: WriteOptions, threads: int) -> int:
         """Return the size of a file without writing it."""
-        sink = self.sink
-        whole = sink.whole and (lambda pieces: sum(map(len, pieces)))
-        together = sink.together and _length_of
-        counted = dataclasses.replace(sink, whole=whole, together=together)
+        whole = self.sink.whole and (lambda pieces: sum(map(len, pieces)))
+        together = self.sink.together and (lambda files: sum(sum(map(len, pieces)) for _, pieces in files))
+        counted = dataclasses.replace(self.sink, whole=whole, together=together)
         return counted(scene, self.form.codec().settled(scene, options), threads=threads)
-
-
-def _length_of(files: Files) -> int:
-    return sum(sum(map(len, pieces)) for _, pieces in files)
-
-
-def chosen_cut(
-    tree: Scene,
-    goal: SimplifyGoal,
-    *,
-    bytes_of: Callable[[Scene], float],
-    cameras: Sequence[Camera] | None,
-    threads: int,
-    progress: Progress,
-) -> tuple[Scene, float | None]:
-    """Return the cut of a tree that a goal asks for, without a tree, and its PSNR where the goal asks for one.
-
-    Args:
-        bytes_of: size of the file of a scene.
-        cameras: as in `Pictures`.
-
-    Raises:
-        FormatError, SparklodError: see `count_for` and `Pictures`.
-    """
-    assert tree.tree is not None
-    progress("simplifying", 0, 1, "cut")
-    order = RefinementOrder(tree.splats, tree.tree)
-
-    def cut(count: int) -> Scene:
-        return simplified(tree, order, count)
-
-    pictures = None if goal.psnr is None else Pictures(cut(order.leaves), cameras, threads)
-    count, measured = count_for(
-        goal,
-        order.leaves,
-        bytes_of=lambda count: bytes_of(cut(count)),
-        psnr_of=lambda count: 0.0 if pictures is None else pictures.psnr(cut(count)),
-        progress=progress,
-    )
-    return cut(count), measured

@@ -189,6 +189,8 @@ def report_simplified(console: Console, source: Source, target: Place, baked: Ba
         f" {count_of(made.splats, 'splat')} ({100 * made.share:.3g} %){measured}, {size_of(baked.bytes)},"
         f" {_total(baked.seconds)}"
     )
+    if made.refine is not None:
+        console.say(f"  {_refined(made.refine)}")
     if baked.dropped:
         console.say(f"  left out: {describe(baked.dropped)}")
     for note in baked.notes:

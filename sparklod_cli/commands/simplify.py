@@ -12,6 +12,7 @@ import click
 
 from ..codecs.formats import WRITABLE, ending_of
 from ..codecs.options import SogOptions, WriteOptions
+from ..fitting.settings import STEPS, FitSettings
 from ..lod.budget import Budget, parse_budget
 from ..support.addresses import Place
 from ..support.defaults import DETAIL_GROWTH
@@ -32,9 +33,12 @@ from .option_groups import (
     values_of,
 )
 from .options.baking import (
+    BY_SIZE,
+    EXAMPLE_STEPS,
     METHOD_OF_DETAIL,
     PaletteOptions,
     SelectionOptions,
+    Steps,
     TransformOptions,
     TreeOptions,
 )
@@ -60,6 +64,7 @@ EXAMPLES = """\
   sparklod simplify scene.ply --to 100k -o small.spz
   sparklod simplify scene.ply --max-bytes 8MB -o small.sog     # as many splats as fit
   sparklod simplify scene.ply --psnr 40 -o small.spz           # as few splats as hold it
+  sparklod simplify scene.ply --to 1% --refine -o small.ply    # closer to the scene, in minutes
   sparklod simplify scene.ply --psnr 35 --camera-path path.json -o small.ply
   sparklod simplify scene.ply --to 500k --up -y -o small.glb --glb-profile cesium
   sparklod simplify tiles/*.ply --to 1M --up -y -o city.sog    # several files as one scene
@@ -91,12 +96,21 @@ class SimplifiedFiles:
         heading=COMMON,
     )
     camera_path: Path | None = option(
-        "Cameras that --psnr is measured with, in the coordinates of the output, in any format that render reads."
-        "  [default: cameras around and inside the scene]",
+        "Cameras that --psnr is measured with and --refine fits for, in the coordinates of the output, in any format that"
+        " render reads.  [default: cameras around and inside the scene]",
         InputPath(),
         heading=COMMON,
-        needs="psnr",
     )
+    refine: int | None = option(
+        "Fit the merged splats to pictures of the INPUT, in STEPS pictures: a minute or more, for some dB."
+        "  [default, without STEPS: by the size of the scene]",
+        Steps(STEPS, placeholder="STEPS", example=EXAMPLE_STEPS),
+        is_flag=False,
+        flag_value=BY_SIZE,
+        heading=COMMON,
+        excludes=("max_bytes",),
+    )
+    seed: int = setting_of(FitSettings, "seed")
     output: Place = option(
         "Output, whose name tells the format: .ply, .spz, .sog, DIR/meta.json (an unpacked SOG), .glb, .rad or .splat,"
         " which has no SH; DIR/ means DIR/NAME-small.spz, - standard output, as SPZ.",
@@ -156,6 +170,7 @@ class SimplifyOptions:
             suffix=files.suffix,
             options=dataclasses.replace(self.written, rad=rad, sog=SogOptions(codes)),
             simplify=files.goal,
+            refine=None if files.refine is None else FitSettings(steps=files.refine or None, seed=files.seed),
             camera_path=files.camera_path,
             converts=True,
             unused=tuple(flags_set(ctx, ("max_sh", *parameters_of(SelectionOptions, TransformOptions)))),
@@ -212,6 +227,8 @@ def _check(ctx: click.Context, files: SimplifiedFiles, *, as_json: bool) -> None
     if files.suffix not in WRITABLE:
         raise click.UsageError(f"--output writes {', '.join(WRITABLE)}, not {files.suffix}")
     check_declared(ctx)
+    if files.camera_path is not None and files.psnr is None and files.refine is None:
+        raise click.UsageError("--camera-path can only be used with --psnr or --refine")
     form = WRITABLE[files.suffix]
     keep_apart(ctx, {"output": with_chunks([files.output]) if form.unbundled == files.suffix else [files.output]})
     claim_stdout(ctx, "output", as_json=as_json, binary=True)

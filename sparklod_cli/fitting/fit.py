@@ -13,7 +13,7 @@ from ..render.settings import RasterSettings
 from ..support.parallel import on_threads
 from ..support.progress import Progress, silent
 from .cameras import HELD_OUT, TRAINING, Place, placed, split_path
-from .nodes import FittedNodes
+from .nodes import FittedNodes, FittedSet, Index
 from .optimiser import Optimiser, Schedule, default_steps
 from .pictures import FullDetailPicture, Scores, gain, keep_gains, keep_sizes, pictures, scores_of
 from .settings import FitReport, FitSettings, FitStage
@@ -37,6 +37,7 @@ def fit(
     tree: LodTree,
     settings: FitSettings,
     *,
+    fixed: Index | None = None,
     antialiased: bool = False,
     threads: int = 1,
     progress: Progress = silent,
@@ -48,6 +49,8 @@ def fit(
     Args:
         nodes: N nodes in final order.
         tree: of them; it stays as it is, and so do the leaves, bit for bit.
+        fixed: indices of one cut, ascending, whose nodes alone are fitted, for all cameras; no node has an opacity above
+            1, and none gets one. None for the cuts that Spark draws.
         antialiased: of the scene; splats are drawn the same either way, as Spark draws them.
         say: called with a line of text after each stage.
         interrupted: asked between steps; when it returns True, what the finished stages gained is returned.
@@ -56,7 +59,7 @@ def fit(
         N nodes, and what fitting brought: at none of `settings.SHARES` less than before on the held-out cameras.
     """
     with on_threads(threads):
-        fitting = _Fitting(nodes, tree, settings, threads)
+        fitting = _Fitting(nodes, tree, settings, fixed, threads)
         is_complete = True
         while fitting.has_steps:
             if not fitting.run_stage(progress, interrupted):
@@ -69,11 +72,14 @@ def fit(
 class _Fitting:
     """State of a fit."""
 
-    def __init__(self, nodes: Splats, tree: LodTree, settings: FitSettings, threads: int) -> None:
+    def __init__(self, nodes: Splats, tree: LodTree, settings: FitSettings, fixed: Index | None, threads: int) -> None:
         place = Place.of(nodes.center[tree.is_leaf])
         raster = RasterSettings()
         near, far = min(raster.near, NEAR * place.radius), max(raster.far, FAR * place.radius)
-        self.nodes = FittedNodes(nodes, tree, RasterSettings(near=near, far=far), threads)
+        raster = RasterSettings(near=near, far=far)
+        self.nodes = FittedNodes(nodes, tree, raster, threads)
+        if fixed is not None:
+            self.nodes = FittedSet(nodes, tree, fixed, raster, threads)
         seeds = np.random.SeedSequence(settings.seed).spawn(3)
         training, held_out = placed(place, seeds[0]), placed(place, seeds[1])
         if settings.path is not None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,6 +22,7 @@ from ..render.shading import ShadedSplats
 from ..scenes.loaded_scene import nodes_of
 from .kernels.adam import Columns
 from .kernels.view import mark_seen
+from .settings import SHARES
 
 Index = NDArray[np.int64]
 
@@ -35,7 +38,10 @@ class FittedNodes:
         old: the columns as they were at first.
         leaves: indices of full detail, ascending.
         merged: indices of the nodes that may change, ascending.
+        shares: of the leaves, of the cuts that nodes are judged by.
     """
+
+    shares: Sequence[float] = SHARES
 
     def __init__(self, nodes: Splats, tree: LodTree, raster: RasterSettings, threads: int) -> None:
         self.original, self.tree, self.raster = nodes, tree, raster
@@ -112,6 +118,30 @@ class FittedNodes:
             now.lod_opacity == self.old.lod_opacity, self.original.opacity, linear_opacity(now.lod_opacity)
         )
         return Splats(now.center, now.scale, now.quat_xyzw, opacity, now.rgb, now.sh)
+
+
+class FittedSet(FittedNodes):
+    """The nodes of one cut for all cameras while they change; none gets an opacity above 1.
+
+    Args:
+        nodes: of the tree, with opacities of at most 1.
+        fixed: indices of the cut, ascending.
+    """
+
+    def __init__(self, nodes: Splats, tree: LodTree, fixed: Index, raster: RasterSettings, threads: int) -> None:
+        super().__init__(nodes, tree, raster, threads)
+        self._fixed = fixed
+        self.merged = np.intersect1d(fixed, self.merged)
+        self.shares = (len(fixed) / len(self.leaves),)
+
+    def cut(self, camera: Camera, share: float) -> Index:
+        """Return the cut, whatever the camera and the share."""
+        return self._fixed
+
+    def renew(self, index: Index) -> None:
+        """Limit the opacities of the nodes, which the optimiser takes for those of a tree."""
+        self.columns.lod_opacity[index] = np.minimum(self.columns.lod_opacity[index], 1)
+        super().renew(index)
 
 
 def _copied(columns: Columns) -> Columns:

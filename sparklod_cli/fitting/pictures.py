@@ -17,7 +17,6 @@ from ..render.rasterizer import Image, draw
 from .kernels.adam import Columns
 from .kernels.view import by_image, squared_differences
 from .nodes import FittedNodes, Index
-from .settings import SHARES
 
 #: Least mean alpha of a picture, and least standard deviation of its colours over grey: else there is nothing to see.
 COVERED, VARIED = 0.02, 0.01
@@ -87,7 +86,7 @@ def shows_enough(image: Image) -> bool:
 def scores_of(nodes: FittedNodes, held_out: Sequence[FullDetailPicture]) -> Scores:
     """Return the means over held-out pictures and a black and a white background; empty without pictures."""
     scores: Scores = {}
-    for share in SHARES if held_out else ():
+    for share in nodes.shares if held_out else ():
         psnr: list[float] = []
         for picture in held_out:
             _, shaded = nodes.visible(nodes.cut(picture.camera, share), picture.camera)
@@ -139,7 +138,7 @@ def keep_gains(nodes: FittedNodes, held_out: Sequence[FullDetailPicture], before
     """Halve changes of the nodes that cuts of a share draw, while one scores less than before; return the scores."""
     for _ in range(HALVES):
         now = scores_of(nodes, held_out)
-        worst = min(SHARES, key=lambda share: now[share] - before[share])
+        worst = min(before, key=lambda share: now[share] - before[share])
         if not now[worst] < before[worst]:
             return now
         drawn = [nodes.cut(picture.camera, worst) for picture in held_out]

@@ -86,6 +86,17 @@ def test_a_psnr_is_held_by_pictures() -> None:
     assert 1 < len(sparklod.simplify(SCENE, psnr=30.0, cameras=cameras).splats) <= 2000
 
 
+def test_fitting_comes_closer_and_is_the_same_for_any_number_of_threads() -> None:
+    plain = sparklod.simplify(SCENE, to=0.05)
+    one, two = (sparklod.simplify(SCENE, to=0.05, refine=30, threads=threads) for threads in (1, 2))
+    np.testing.assert_array_equal(one.splats.center, two.splats.center)
+    assert one.splats.opacity.max() <= 1
+    camera = sparklod.Camera.look_at((0, 0, -8), (0, 0, 0), size=(64, 48))
+    full = sparklod.render(SCENE, camera)
+    before, after = (sparklod.psnr(sparklod.render(each, camera), full) for each in (plain, one))
+    assert after > before
+
+
 @pytest.mark.parametrize("most", [1000, 34_567, 999_999])
 def test_the_file_is_as_large_as_it_may_be(most: int) -> None:
     def size(count: int) -> float:

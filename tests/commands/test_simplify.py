@@ -60,6 +60,20 @@ def test_a_psnr_is_measured_with_the_cameras_that_are_named(source: Path, tmp_pa
     assert 1 < record["simplified"]["splats"] < 1000
 
 
+def test_refine_fits_the_set_and_keeps_plain_opacities(source: Path, tmp_path: Path, capsys: Capture) -> None:
+    plain, fitted = tmp_path / "plain.ply", tmp_path / "fitted.ply"
+    assert simplify(source, "--to", "10%", "-o", plain) == 0
+    capsys.readouterr()
+    assert simplify(source, "--to", "10%", "--refine", "40", "-o", fitted, "--json") == 0
+    report = json.loads(capsys.readouterr().out)["simplified"]["refine"]
+    (share,) = report["psnr_before"]
+    assert report["psnr_after"][share] > report["psnr_before"][share] + 0.1
+    one, two = read_scene(plain), read_scene(fitted)
+    assert len(one) == len(two)
+    assert two.splats.opacity.max() <= 1
+    assert (one.splats.rgb != two.splats.rgb).any()
+
+
 def test_one_line_says_what_was_written(source: Path, tmp_path: Path, capsys: Capture) -> None:
     target = tmp_path / "small.splat"
     assert simplify(source, "--to", "50%", "-o", target) == 0
@@ -99,7 +113,11 @@ def test_selection_and_axes_are_those_of_build_lod(source: Path, tmp_path: Path)
         (("--to", "ten", "-o", "x.ply"), "'ten' is neither a share such as 5% nor a count"),
         (("--to", "1%", "-o", "x.npz"), "--output writes .ply"),
         (("--to", "1%", "-o", "x"), "has no suffix to tell the format"),
-        (("--to", "1%", "-o", "x.ply", "--camera-path", "c.csv"), "--camera-path can only be used with --psnr"),
+        (
+            ("--to", "1%", "-o", "x.ply", "--camera-path", "c.csv"),
+            "--camera-path can only be used with --psnr or --refine",
+        ),
+        (("--max-bytes", "1MB", "-o", "x.ply", "--refine"), "--max-bytes cannot be used with --refine"),
         (("--to", "1%", "-o", "x.ply", "--spz-version", "2"), "--spz-version is an option of SPZ, not of PLY"),
         (("--to", "1%", "-o", "x.ply", "--cluster-sh"), "--cluster-sh is an option of RAD and SOG, not of PLY"),
         (("--to", "1%", "-o", "-", "--json"), "cannot both go to standard output"),

@@ -201,7 +201,7 @@ class DetailOptions:
 BY_SIZE, EXAMPLE_STEPS = "default", 2000
 
 
-class _Steps(OptionalNumber):
+class Steps(OptionalNumber):
     """A number of steps, or `BY_SIZE`, which becomes 0."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
@@ -218,7 +218,7 @@ class RefineOptions:
         "Fit merged splats to pictures of full detail, in STEPS pictures of cuts: minutes, for cuts that come closer to"
         " it. The leaves stay as they are, and so does the tree of a Level-of-Detail file. Ctrl-C ends it early and"
         " keeps what was gained.  [default, without STEPS: by the size of the tree]",
-        _Steps(STEPS, placeholder="STEPS", example=EXAMPLE_STEPS),
+        Steps(STEPS, placeholder="STEPS", example=EXAMPLE_STEPS),
         is_flag=False,
         flag_value=BY_SIZE,
     )
