@@ -14,6 +14,7 @@ from ..codecs.formats import WRITABLE, ending_of
 from ..codecs.options import SogOptions, WriteOptions
 from ..fitting.settings import STEPS, FitSettings
 from ..lod.budget import Budget, parse_budget
+from ..support import interrupts
 from ..support.addresses import Place
 from ..support.defaults import DETAIL_GROWTH
 from ..support.setting_fields import Quantity, Range, setting_of, whole
@@ -21,6 +22,7 @@ from ..support.stdin import DASH
 from ..support.units import parse_size
 from .build_lod_files import SPZ, record_of, refuse_others
 from .build_lod_text import report_simplified
+from .console import say
 from .option_groups import (
     COMMON,
     argument,
@@ -96,8 +98,8 @@ class SimplifiedFiles:
         heading=COMMON,
     )
     camera_path: Path | None = option(
-        "Cameras that --psnr is measured with and --refine fits for, in the coordinates of the output, in any format that"
-        " render reads.  [default: cameras around and inside the scene]",
+        "Cameras that --psnr is measured with and --refine fits for, in the coordinates of the output, in any format"
+        " that render reads.  [default: cameras around and inside the scene]",
         InputPath(),
         heading=COMMON,
     )
@@ -215,6 +217,10 @@ def simplify(ctx: click.Context, /, **_: Any) -> None:
         if general.as_json:
             record = {**record_of(files.source), "output": str(files.output), **dataclasses.asdict(baked)}
             click.echo(json.dumps(record))
+        if interrupts.came():  # while the set was fitted, which ended early then
+            console.clear()
+            say("interrupted")
+            ctx.exit(interrupts.INTERRUPTED)
 
 
 def _check(ctx: click.Context, files: SimplifiedFiles, *, as_json: bool) -> None:

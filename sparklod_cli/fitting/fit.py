@@ -49,8 +49,8 @@ def fit(
     Args:
         nodes: N nodes in final order.
         tree: of them; it stays as it is, and so do the leaves, bit for bit.
-        fixed: indices of one cut, ascending, whose nodes alone are fitted, for all cameras; no node has an opacity above
-            1, and none gets one. None for the cuts that Spark draws.
+        fixed: indices of one cut, ascending, whose nodes alone are fitted, for all cameras; no node has an opacity
+            above 1, and none gets one. None for the cuts that Spark draws.
         antialiased: of the scene; splats are drawn the same either way, as Spark draws them.
         say: called with a line of text after each stage.
         interrupted: asked between steps; when it returns True, what the finished stages gained is returned.
