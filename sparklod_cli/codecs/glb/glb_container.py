@@ -28,7 +28,7 @@ JSON, BIN = b"JSON", b"BIN\0"
 LARGEST = (1 << 32) - 1
 
 #: Largest JSON chunk, bytes. That of splats takes some thousands; the meshes beside them may take more.
-MAX_JSON = 1 << 26
+MAX_JSON = 1 << 22
 
 #: Component types: their numpy types.
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}

@@ -25,6 +25,9 @@ TURNS = {
     "-x": (0.0, 0.0, -HALF, HALF),
 }
 
+#: Most nodes from the root to the splats; scenes of editors have some tens. Chosen.
+DEEPEST = 256
+
 #: How far axes of a node may be from right angles, and from one length, as a share: float32 leaves 1e-7. Chosen.
 SKEW = 1e-5
 
@@ -46,13 +49,13 @@ def placement_of(file: GlbFile, mesh: int) -> Transform:
             if isinstance(child, int):
                 parent[child] = number
     matrix, at = np.eye(4), having[0] if having else None
-    for _ in range(len(nodes)):
+    for _ in range(DEEPEST):
         if at is None:
             break
         matrix = _matrix(nodes[at]) @ matrix
         at = parent.get(at)
     if at is not None:
-        raise FormatError("its nodes are linked in a circle")
+        raise FormatError(f"its nodes are linked in a circle, or more than {DEEPEST} deep")
     return _transform(matrix)
 
 
