@@ -21,6 +21,8 @@ HERE = Path(__file__).parent
 
 #: From the axes of PLY files, y down, to those of the pages of PlayCanvas, y up: half a turn about z.
 TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
+#: To those of glTF: half a turn about x.
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 #: To those of Babylon.js, whose axes are left-handed with y up.
 MIRROR = np.diag([1.0, -1.0, 1.0])
 #: Planes between which splats are drawn, world units.
@@ -87,6 +89,13 @@ class Browser:
         view = {"viewToWorld": pose, "fovy": math.degrees(camera.fov_y), "near": NEAR, "far": FAR}
         html = recipes.page(recipes.PLAYCANVAS, file.name)
         return self._show(html, "playcanvas.js", file, camera, view | {"settings": dict(settings)})
+
+    def playcanvas_glb(self, file: Path, camera: Camera) -> Shown:
+        """What PlayCanvas's engine shows of a GLB whose root node turns -y up."""
+        pose = (FLIP @ camera.camera_to_world).T.ravel().tolist()
+        view = {"viewToWorld": pose, "fovy": math.degrees(camera.fov_y), "near": NEAR, "far": FAR}
+        html = recipes.playcanvas_of_glb(file.name)
+        return self._show(html, "playcanvas.js", file, camera, view | {"settings": dict(ALIKE)})
 
     def supersplat(self, file: Path, camera: Camera) -> Shown:
         """What SuperSplat's viewer shows; its field of view is that of the picture's longer side."""

@@ -13,7 +13,7 @@ PLAYCANVAS, SUPERSPLAT, BABYLON = "PlayCanvas", "SuperSplat's viewer", "Babylon.
 #: Headings in docs/spark.md: of its page, and of the lines that change where a tree is streamed.
 SPARK, STREAMED = "A page", "Streamed"
 #: Names of the scene in the pages.
-MANIFEST, SOG, TREE, RAD = "lod-meta.json", "scene.sog", "scene-lod.spz", "scene-lod.rad"
+MANIFEST, SOG, GLB, TREE, RAD = "lod-meta.json", "scene.sog", "scene.glb", "scene-lod.spz", "scene-lod.rad"
 
 
 @cache
@@ -28,6 +28,14 @@ def page(heading: str, name: str = MANIFEST) -> str:
     """The page of a section, for a scene of another name."""
     (html,) = blocks(heading, "html")
     return replaced(html, {MANIFEST: name})
+
+
+def playcanvas_of_glb(name: str = GLB) -> str:
+    """The page of PlayCanvas, in which the lines for a GLB take the place of those of a Streamed SOG."""
+    html = page(PLAYCANVAS)
+    (lines,) = blocks(PLAYCANVAS, "js", "gltf.md")
+    start, end = html.index("  const asset ="), html.index("  const camera =")
+    return replaced(html[:start] + lines + "\n" + html[end:], {GLB: name})
 
 
 def babylon_of_one_file(name: str = SOG) -> str:

@@ -71,6 +71,14 @@ def test_playcanvas_shows_sog(
     assert shown.frames == [len(shot.splats)]
 
 
+def test_playcanvas_shows_glb_upright(browser: Browser, shot: Shot, ours: NDArray[np.float32], tmp_path: Path) -> None:
+    file = tmp_path / recipes.GLB
+    sparklod_cli.write(file, Scene(shot.splats, up="-y"))
+    shown = browser.playcanvas_glb(file, shot.camera)
+    check(shown, ours, PLAYCANVAS)
+    assert shown.frames == [len(shot.splats)]
+
+
 def test_supersplat_shows_it_upright(browser: Browser, shot: Shot, ours: NDArray[np.float32]) -> None:
     shown = browser.supersplat(shot.file, shot.camera)
     check(shown, ours, OTHERS)
