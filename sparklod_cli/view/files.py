@@ -147,6 +147,8 @@ def _shown(path: Path, folder: str) -> ShownFile:
     form = sniff(head, path.suffix)
     if form is None:
         raise UnknownFormatError(f"not a splat file that sparklod reads ({', '.join(form.name for form in FORMATS)})")
+    if not form.detailed and form.name not in SPARK_TYPES:
+        raise NotSplatsError(f"Spark does not read {form.name}; bake it first with sparklod build-lod")
     name = f"{folder}/{path.name}"
     files = {name: path.resolve()}
     if form.detailed:

@@ -269,3 +269,8 @@ def test_a_name_that_is_no_text_is_shown_escaped(tmp_path: Path) -> None:
     assert rb"<title>\xff.spz" in bytes(resources["index.html"])  # type: ignore[arg-type]
     (file,) = settings_of(tmp_path / name)["files"]
     assert (file["name"], file["url"]) == (r"\xff.spz", "data/0/%FF.spz")
+
+
+def test_a_format_that_no_engine_of_the_page_reads_is_refused() -> None:
+    with pytest.raises(FormatError, match=r"sh2\.glb: Spark does not read GLB; bake it first with sparklod build-lod"):
+        shown_files([GOLDEN / "sh2.glb"])
