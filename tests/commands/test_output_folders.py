@@ -79,7 +79,7 @@ def test_a_name_without_suffix_is_refused_with_a_hint(command: str, name: str, t
     [
         ((), ".spz, .rad, /lod-meta.json"),
         (("--refine",), ".spz, .rad, /lod-meta.json"),
-        (("--unlod",), ".ply, .spz, .rad, .sog, /meta.json, .splat"),
+        (("--unlod",), ".ply, .spz, .rad, .sog, /meta.json, .glb, .splat"),
         (("--encoding", "ext"), ".npz, .bin, .raw"),
     ],
 )
