@@ -87,7 +87,7 @@ def tops(counts: NDArray[np.int64], total: int, most: float, beyond: NDArray[np.
 
 
 #: Where the binades of float32 begin, those of subnormal numbers, too; what is below the first is 0. Last is infinity.
-ENDS = np.append(np.ldexp(np.float32(1), np.arange(-149, 128)), np.float32(np.inf))
+ENDS = np.append(np.ldexp(np.float32(1), np.arange(-149, 128, dtype=np.int32)), np.float32(np.inf))
 
 #: Values that are sorted at a time.
 _SORTED_ROWS = 1 << 18
