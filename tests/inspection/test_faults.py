@@ -13,6 +13,7 @@ import pytest
 from fixtures import by_hand
 from sparklod_cli.cli import run
 from sparklod_cli.codecs.compression import PIECE
+from sparklod_cli.codecs.formats import FORMATS
 from sparklod_cli.commands.inspect_text import lines
 from sparklod_cli.inspection.findings import CODES, ERROR
 from sparklod_cli.inspection.report import Report, ReportSettings, inspect
@@ -205,6 +206,7 @@ ODD = {
     "golden/hand-v1.spz": {"values.invisible", "values.scale-clamped"},
     "golden/hand-v2.spz": {"values.invisible", "values.scale-clamped", "values.center-clamped"},
     "golden/hand-v3.spz": {"values.invisible", "values.scale-clamped", "values.center-clamped"},
+    "golden/hand-spz.glb": {"values.invisible", "values.scale-clamped", "values.center-clamped"},
     "golden/hand-v4.spz": {"values.invisible", "values.scale-clamped", "values.center-clamped"},
     "golden/hand-v4-sh4.spz": {
         *("values.invisible", "values.scale-clamped", "values.center-clamped", "container.left-out"),
@@ -218,7 +220,7 @@ ODD = {
     "golden/tree-v2.spz": {"values.invisible"},
     "golden/tree-v3.spz": {"values.invisible"},
 }
-SUFFIXES = (".ply", ".spz", ".rad", ".sog", ".json", ".ksplat", ".splat")
+SUFFIXES = {suffix for form in FORMATS for suffix in form.suffixes}
 GOOD = sorted(
     path.relative_to(FIXTURES).as_posix()
     for path in FIXTURES.rglob("*")
