@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any, Protocol, Self
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,9 @@ from ..support.parallel import blocks_of, ordered_map
 from ..support.progress import Progress
 from . import clamps
 from .options import WriteOptions
+
+if TYPE_CHECKING:  # Python 3.10 has none
+    from typing import Self
 
 #: The result of a window: arrays by name.
 Encoded = dict[str, NDArray[Any]]

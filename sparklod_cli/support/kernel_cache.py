@@ -111,13 +111,18 @@ def _machine() -> str:
     import numba
     from llvmlite import binding
 
-    try:
-        features = binding.get_host_cpu_features().flatten()
-    except RuntimeError:  # LLVM does not know them, and numba does not use them
-        features = ""
-    variables = {name: value for name, value in os.environ.items() if name.startswith("NUMBA_") and name not in NEUTRAL}
+    # A processor that is named replaces the one of this machine, as in numba's code generator, so that an image can be
+    # built on one machine and run on others: NUMBA_CPU_NAME=x86-64-v3 with NUMBA_CPU_FEATURES empty.
+    name = numba.config.CPU_NAME or binding.get_host_cpu_name()
+    features = numba.config.CPU_FEATURES
+    if features is None:
+        try:
+            features = binding.get_host_cpu_features().flatten()
+        except RuntimeError:  # LLVM does not know them, and numba does not use them
+            features = ""
+    variables = {key: value for key, value in os.environ.items() if key.startswith("NUMBA_") and key not in NEUTRAL}
     settings = SETTINGS.read_bytes() if SETTINGS.is_file() else b""
-    host = binding.get_process_triple(), binding.get_host_cpu_name(), features
+    host = binding.get_process_triple(), name, features
     return _digest(host, sorted(variables.items()), settings, numba.__version__, sys.version)
 
 

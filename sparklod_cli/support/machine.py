@@ -90,5 +90,5 @@ def release_memory() -> None:
     """Return freed memory to the system, which the C library keeps for what comes: glibc's does so by up to 200 MB."""
     import ctypes  # which most commands do without
 
-    with contextlib.suppress(AttributeError, OSError):  # another C library
+    with contextlib.suppress(AttributeError, OSError, TypeError):  # another C library; Windows has no name for it
         ctypes.CDLL(None).malloc_trim(0)

@@ -74,6 +74,26 @@ def test_code_compiled_for_another_processor_is_not_used(cache: Cache) -> None:
         assert (other.stdout.strip() == start) == same
 
 
+def test_code_for_a_named_processor_is_used_on_every_machine() -> None:
+    code = """
+import sys
+from llvmlite import binding
+if len(sys.argv) > 1:
+    binding.get_host_cpu_name = lambda: sys.argv[1]
+    binding.get_host_cpu_features = lambda: binding.FeatureMap({sys.argv[1]: True})
+from sparklod_cli.support import fast_math, kernel_cache
+print(kernel_cache.start_of(fast_math.exp2.py_func))
+"""
+
+    def start(*machine: str, **variables: str) -> str:
+        command, environment = [sys.executable, "-c", code, *machine], {**os.environ, **variables}
+        return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True).stdout
+
+    named = {"NUMBA_CPU_NAME": "x86-64-v3", "NUMBA_CPU_FEATURES": ""}
+    assert start(**named) == start("another", **named) != start("another")
+    assert start() != start("another")
+
+
 def test_settings_in_a_file_for_numba_count(tmp_path: Path) -> None:
     code = """
 from pathlib import Path

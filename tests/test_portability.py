@@ -1,0 +1,117 @@
+"""What systems other than Linux lack has another way: locks, unnamed files, affinity, positioned reads, UTF-8."""
+
+from __future__ import annotations
+
+import ast
+import ctypes
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import sparklod_cli
+from sparklod_cli.support import machine, parallel
+from tests.conftest import FIXTURES, ROOT
+
+PACKAGE = Path(sparklod_cli.__file__).parent
+
+#: Runs the command line without what Windows lacks. The standard library needs the name of the system and O_NONBLOCK.
+PROGRAM = """
+import ctypes, os, signal, sys
+for name in ("O_TMPFILE", "O_CLOEXEC", "O_NOFOLLOW", "O_DIRECTORY", "fchmod", "fork", "geteuid", "getuid", "killpg",
+             "pread", "pwrite", "posix_fadvise", "register_at_fork", "sched_getaffinity", "statvfs", "sysconf"):
+    if hasattr(os, name):
+        delattr(os, name)
+for name in ("SIGHUP", "SIGKILL", "pthread_kill", "pthread_sigmask"):
+    delattr(signal, name)
+for name in ("fcntl", "grp", "pwd", "resource", "termios"):
+    sys.modules[name] = None
+from sparklod_cli.cli import run
+sys.exit(run(sys.argv[1:]))
+"""
+
+#: Names of Python 3.11 and later that a module must not import when it runs, by the module that has them.
+NEWER = {
+    "asyncio": {"TaskGroup", "timeout"},
+    "contextlib": {"chdir"},
+    "datetime": {"UTC"},
+    "enum": {"ReprEnum", "StrEnum"},
+    "itertools": {"batched"},
+    "typing": {"LiteralString", "Never", "NotRequired", "Required", "Self", "Unpack", "assert_never", "override"},
+}
+
+
+def elsewhere(*arguments: object, encoding: str = "cp1252") -> subprocess.CompletedProcess[bytes]:
+    environment = os.environ | {"PYTHONIOENCODING": encoding, "PYTHONPATH": str(ROOT), "PYTHONUTF8": "0"}
+    command = [sys.executable, "-c", PROGRAM, *map(str, arguments)]
+    return subprocess.run(command, env=environment, capture_output=True, timeout=300, check=False)
+
+
+@pytest.mark.parametrize("output", ["out.spz", "out.rad", "set/lod-meta.json"])
+def test_bakes_do_without_what_windows_lacks(output: str, tmp_path: Path) -> None:
+    target = tmp_path / output
+    for more in ((), ("--overwrite",)):
+        done = elsewhere("build-lod", FIXTURES / "sh1.ply", "-o", target, *more)
+        assert done.returncode == 0, done.stderr.decode()
+    assert elsewhere("inspect", target, "--check").returncode == 0
+    assert elsewhere("build-lod", FIXTURES / "sh1.ply", "-o", target).returncode == 1  # it exists
+    assert not list(tmp_path.rglob(".*"))
+
+
+def test_bakes_out_of_core_do_without_it_too(tmp_path: Path) -> None:
+    target = tmp_path / "out.rad"
+    done = elsewhere("build-lod", FIXTURES / "demo.ply", "-o", target, "--memory", "3M", "-v")
+    assert done.returncode == 0, done.stderr.decode()
+    assert b"out of core" in done.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["out.rad"]
+
+
+def test_consoles_without_utf8_show_escapes(tmp_path: Path) -> None:
+    scene = tmp_path / "caf\u00e9 \u96ea.ply"
+    scene.write_bytes((FIXTURES / "sh1.ply").read_bytes())
+    done = elsewhere("inspect", scene)
+    assert done.returncode == 0, done.stderr
+    assert "caf\u00e9 \\u96ea.ply" in done.stdout.decode("cp1252")
+    done = elsewhere("build-lod", scene, "-o", tmp_path / "\u96ea" / "out.txt")
+    assert done.returncode == 2
+    assert "Traceback" not in done.stderr.decode("cp1252")
+
+
+def test_all_processors_are_used_where_no_affinity_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(os, "sched_getaffinity", raising=False)
+    monkeypatch.setattr(os, "cpu_count", lambda: 5)
+    assert parallel.processors() == 5
+
+
+def test_memory_is_unknown_where_nothing_tells_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(machine, "_text", lambda path: None)
+    monkeypatch.delattr(os, "sysconf", raising=False)
+    assert (machine.total_memory(), machine.available_memory()) == (None, None)
+
+
+def test_memory_is_released_where_the_c_library_can(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(name: Any) -> None:
+        raise TypeError("bad argument type for built-in operation")  # of Windows, for None
+
+    monkeypatch.setattr(ctypes, "CDLL", refuse)
+    machine.release_memory()
+
+
+def imported(path: Path) -> set[str]:
+    """Return the names that a module imports when it runs, and their modules: "typing.Self"."""
+    module = ast.parse(path.read_text("utf-8"))
+    nodes = list(ast.walk(module))
+    for node in nodes:
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+            node.body.clear()
+    froms = [node for node in ast.walk(module) if isinstance(node, ast.ImportFrom) and not node.level]
+    return {f"{node.module}.{alias.name}" for node in froms for alias in node.names}
+
+
+def test_modules_import_what_python_3_10_has() -> None:
+    newer = {f"{module}.{name}" for module, names in NEWER.items() for name in names}
+    found = {path.relative_to(PACKAGE).as_posix(): imported(path) & newer for path in PACKAGE.rglob("*.py")}
+    assert {path: names for path, names in found.items() if names} == {}
