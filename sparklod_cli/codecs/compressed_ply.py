@@ -71,7 +71,7 @@ def open_content(source: Source) -> Content:
     facts = {"chunks": header.count("chunk"), "color_bounds": int(bounds["color"] is not None)}
     facts["trailing_bytes"] = trailing
     kept = min(degree, MAX_SH_DEGREE)
-    return Content(count, kept, "compressed PLY", fill, notes=notes_on_degree(degree), header=facts)
+    return Content(count, kept, "compressed PLY", fill, header.mode == "mip", notes_on_degree(degree), facts)
 
 
 decode = decoder(open_content)

@@ -44,6 +44,11 @@ COLUMNS: tuple[tuple[str, tuple[str, ...], Coding, Coding], ...] = (
 )
 REQUIRED = tuple(name for _, names, _, _ in COLUMNS for name in names)
 
+#: The scale that disks (2D Gaussian Splatting) lack or do not use, across their plane, and what they get in its place,
+#: over the smaller of their two scales: less than a pixel wherever a disk is smaller than a picture, and above 0, which
+#: formats of logarithms do not hold. Chosen.
+ACROSS, THIN = "scale_2", np.float32(1e-3)
+
 
 def open_content(source: Source) -> Content:
     """Open a PLY file. An ascii file is unpacked to `scratch`, as binary rows.
@@ -58,7 +63,8 @@ def open_content(source: Source) -> Content:
     facts = {"properties": len(_row_type(header).names or ()), "ascii": int(header.text)}
     facts |= {"big_endian": int(header.byte_order == ">"), "trailing_bytes": header.check_size(size)}
     degree, count = degree_of(coefficients), header.count("vertex")
-    unpack = _unpacking(_row_type(header), coefficients)
+    disks = _are_disks(header)
+    unpack = _unpacking(_row_type(header), coefficients, disks=disks)
     rows = _rows(file, header, source.scratch)
 
     def fill(target: Target, threads: int, progress: Progress) -> None:
@@ -67,16 +73,25 @@ def open_content(source: Source) -> Content:
 
     noted = read_comment(header.note)
     notes = notes_on_degree(degree) + noted.problems
-    return Content(count, min(degree, MAX_SH_DEGREE), "PLY", fill, notes=notes, header=facts, up=noted.up)
+    notes += ("its disks (2D Gaussian Splatting) are read as splats a thousandth as thick",) if disks else ()
+    return Content(count, min(degree, MAX_SH_DEGREE), "PLY", fill, header.mode == "mip", notes, facts, noted.up)
 
 
 decode = decoder(open_content)
 
 
-def _unpacking(row_type: np.dtype[Any], coefficients: int) -> Callable[[NDArray[Any], Splats], None]:
+def _are_disks(header: PlyHeader) -> bool:
+    """Return True for splats of 2D Gaussian Splatting, which have two scales, or a third that does not count."""
+    return header.mode == "2dgs" or ACROSS not in (_row_type(header).names or ())
+
+
+def _unpacking(row_type: np.dtype[Any], coefficients: int, *, disks: bool) -> Callable[[NDArray[Any], Splats], None]:
     """Return the function that fills the columns of splats from rows."""
     names = list(row_type.names or ())
-    places = {column: _run([names.index(name) for name in parts]) for column, parts, _, _ in COLUMNS}
+    places = {
+        column: _run([names.index(name) for name in parts if not (disks and name == ACROSS)])
+        for column, parts, _, _ in COLUMNS
+    }
     rest = _run([names.index(f"f_rest_{index}") for index in range(3 * coefficients)])  # all of red's come first
 
     # Converters write infinite logits and logarithms for an opacity of 0 or 1 and a scale of 0.
@@ -85,7 +100,11 @@ def _unpacking(row_type: np.dtype[Any], coefficients: int) -> Callable[[NDArray[
         matrix = _matrix(rows)
         for column, _, decode_column, _ in COLUMNS:
             out = getattr(splats, column)
+            if disks and column == "scale":
+                out = out[:, :2]
             out[...] = decode_column(matrix[:, places[column]]).reshape(out.shape)
+        if disks:
+            splats.scale[:, 2] = THIN * splats.scale[:, :2].min(axis=1)
         sh = matrix[:, rest].reshape(len(rows), 3, coefficients)
         splats.sh[:] = sh[:, :, : splats.sh.shape[1]].transpose(0, 2, 1)
 
@@ -116,7 +135,7 @@ def _checked_coefficients(header: PlyHeader) -> int:
         raise NotSplatsError("its PLY header has no element vertex")
     have = _row_type(header).names or ()
     missing = [name for name in REQUIRED if name not in have]
-    if missing:
+    if missing and missing != [ACROSS]:
         what = "a point cloud or a mesh, not Gaussian splats" if "x" in have else "not Gaussian splats"
         raise NotSplatsError(f"{what}: its vertices have no {', '.join(missing)}")
     rest = sum(1 for name in have if re.fullmatch(r"f_rest_\d+", name))
@@ -203,6 +222,7 @@ def encode(
     row_type = np.dtype([(name, "<f4") for name in _inria_properties(splats.sh.shape[1])])
     lines = ["ply", "format binary_little_endian 1.0"]
     lines += [] if scene.up is None else [f"comment {comment_of(up=scene.up)}"]
+    lines += ["comment SplatRenderMode: mip"] if scene.antialiased else []
     lines += [f"element vertex {len(splats)}"]
     lines += [f"property float {name}" for name in row_type.names or ()]
     yield "".join(f"{line}\n" for line in [*lines, "end_header"]).encode()

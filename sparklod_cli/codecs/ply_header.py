@@ -18,6 +18,10 @@ MAX_HEADER = 1 << 20
 #: Most digits of a count: Python refuses to convert numbers of several thousand digits.
 MAX_DIGITS = 100
 
+#: Comments of trainers in lower case, and the mode of `PlyHeader` that each means.
+MODES = {f"splatrendermode: {mode}".encode(): mode for mode in ("mip", "2dgs", "default")}
+MODES |= {b"antialiased 1": "mip", b"antialiased 0": "default"}
+
 
 @dataclass(frozen=True)
 class PlyHeader:
@@ -29,6 +33,8 @@ class PlyHeader:
         byte_order: "<" or ">" of binary data.
         size: bytes of the header.
         note: the first comment that is a JSON object; empty without one.
+        mode: how trainers say that the splats are drawn, "mip" (with the opacity compensation of Mip-Splatting), "2dgs"
+            (as disks) or "default"; Brush's last comment "SplatRenderMode: MODE" or Postshot's "antialiased 0|1".
     """
 
     elements: dict[str, tuple[PlyElement, int]]
@@ -36,6 +42,7 @@ class PlyHeader:
     byte_order: str
     size: int
     note: bytes = b""
+    mode: str = "default"
 
     def count(self, name: str) -> int:
         """Return the rows of an element; 0 if there is none of this name."""
@@ -97,7 +104,7 @@ def read_header(file: BinaryIO) -> PlyHeader:
             raise TruncatedError("the PLY header does not end")
     # plyfile gets the header without comments, which may be in any encoding, and with counts of 0: otherwise it would
     # read all the data, and text value by value.
-    lines, counts, note = [], [], b""
+    lines, counts, note, mode = [], [], b"", "default"
     for words in map(bytes.split, text.splitlines()):
         if words[:1] == [b"element"]:
             if len(words) != 3 or not words[2].isdigit():
@@ -108,6 +115,8 @@ def read_header(file: BinaryIO) -> PlyHeader:
             words[2] = b"0"
         if words[:1] == [b"comment"] and words[1:] and words[1].startswith(b"{"):
             note = note or b" ".join(words[1:])
+        if words[:1] == [b"comment"]:
+            mode = MODES.get(b" ".join(words[1:]).lower(), mode)
         if words and words[0] not in (b"comment", b"obj_info"):
             lines.append(b" ".join(words))
     try:
@@ -115,7 +124,7 @@ def read_header(file: BinaryIO) -> PlyHeader:
     except (PlyParseError, ValueError) as error:
         raise FormatError(f"bad PLY header: {quoted(error)}") from None
     elements = {element.name: (element, count) for element, count in zip(parsed, counts, strict=True)}
-    return PlyHeader(elements, parsed.text, parsed.byte_order, len(text), note)
+    return PlyHeader(elements, parsed.text, parsed.byte_order, len(text), note, mode)
 
 
 def offset_of(file: BinaryIO, header: PlyHeader, name: str) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import math
 import re
@@ -187,7 +188,7 @@ def test_a_quaternion_of_zeros_in_ply_is_not_a_number() -> None:
 
 
 def test_the_table_names_what_is_required() -> None:
-    for name in ply.REQUIRED:
+    for name in set(ply.REQUIRED) - {ply.ACROSS}:
         given = columns()
         del given[name]
         with pytest.raises(FormatError, match=rf"not Gaussian splats: its vertices have no {name}$"):
@@ -245,6 +246,56 @@ def test_comments_may_be_in_any_encoding() -> None:
     plain = by_hand.ply(columns())
     comments = b"\ncomment by J\xfcrgen, element vertex 3\nobj_info \xff\xfe\nelement vertex"
     assert_same(decode(plain.replace(b"\nelement vertex", comments, 1)), decode(plain))
+
+
+def with_comments(*comments: str) -> bytes:
+    lines = "".join(f"comment {comment}\n" for comment in comments)
+    return edited("element vertex", f"{lines}element vertex")
+
+
+@pytest.mark.parametrize(
+    ("comments", "antialiased"),
+    [
+        (("Exported from Brush", "SH degree: 0", "SplatRenderMode: mip"), True),
+        (("SPLATRENDERMODE:  MIP ",), True),
+        (("antialiased 1",), True),
+        (("SplatRenderMode: default", "antialiased 1"), True),
+        (("antialiased 1", "SplatRenderMode: default"), False),
+        (("antialiased 0",), False),
+        (("SplatRenderMode: none that is known",), False),
+        (("it is antialiased 1",), False),
+        ((), False),
+    ],
+)
+def test_comments_of_trainers_tell_antialiased_splats(comments: tuple[str, ...], antialiased: bool) -> None:
+    scene = decode(with_comments(*comments))
+    assert scene.antialiased is antialiased and not scene.notes
+    assert_same(dataclasses.replace(scene, antialiased=False), decode(by_hand.ply(columns())))
+
+
+def test_antialiased_splats_are_written_as_brush_does() -> None:
+    scene = dataclasses.replace(decode(by_hand.ply(columns())), antialiased=True)
+    data = b"".join(ply.encode(scene))
+    assert b"\ncomment SplatRenderMode: mip\n" in data
+    assert decode(data).antialiased
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_disks_get_a_thin_third_scale(text: bool) -> None:
+    given = columns()
+    whole = decode(by_hand.ply(given, text=text)).splats
+    by_comment = edited(
+        "element vertex", "comment SplatRenderMode: 2dgs\nelement vertex", by_hand.ply(given, text=text)
+    )
+    del given["scale_2"]
+    for data in (by_hand.ply(given, text=text), by_comment):
+        scene = decode(data)
+        splats = scene.splats
+        assert scene.notes and not scene.antialiased
+        assert np.array_equal(splats.scale[:, :2], whole.scale[:, :2])
+        assert np.allclose(splats.scale[:, 2], splats.scale[:, :2].min(axis=1) / 1000)
+        for name in ("center", "quat_xyzw", "opacity", "rgb", "sh"):
+            assert np.array_equal(getattr(splats, name), getattr(whole, name))
 
 
 @pytest.mark.parametrize("count", ["5_0", "+5", "-5", "0x5", "5.0", "five", "", "5 5"])

@@ -186,10 +186,9 @@ def _plain_content(file: GlbFile, primitive: dict[str, Any], source: Source) -> 
         @np.errstate(over="ignore", invalid="ignore")  # whether numbers are valid is for others to say
         def read(item: tuple[slice, Attribute, Accessor]) -> slice:
             part, attribute, accessor = item
-            if attribute.column in target.columns:
-                out = attribute.part_of(target.splats)[part]
-                values = accessor.read(positioned, target.start + part.start, target.start + part.stop)
-                out[...] = attribute.decode(values).reshape(out.shape)
+            out = attribute.part_of(target.splats)[part]
+            values = accessor.read(positioned, target.start + part.start, target.start + part.stop)
+            out[...] = attribute.decode(values).reshape(out.shape)
             return part
 
         items = [(part, *each) for part in parts for each in accessors]

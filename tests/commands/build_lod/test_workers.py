@@ -33,8 +33,9 @@ def test_scenes_side_by_side_are_those_of_one_after_the_other(tmp_path: Path) ->
     rows = [json.loads(line) for line in done.stdout.splitlines()]
     assert [row["input"] for row in rows] == [str(path) for path in inputs]
     assert ["error" in row for row in rows] == [False, True, False, False, False]
-    assert f"error: {broken}: bad PLY header" in said.splitlines()[1]
-    assert len(said.splitlines()) == 5, said
+    lines = [line for line in said.splitlines() if not line.startswith("baking: ")]  # the progress of a slow machine
+    assert f"error: {broken}: bad PLY header" in lines[1]
+    assert len(lines) == 5, said
 
 
 @pytest.mark.parametrize(
