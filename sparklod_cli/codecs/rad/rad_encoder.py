@@ -258,9 +258,8 @@ def encoder(
 
 def rounded(center: FloatArray, bits: int) -> FloatArray:
     """Round centres to multiples of 2 ** -bits that float32 holds."""
-    most = float(
-        math.floor(math.ldexp(float(np.finfo(np.float32).max), bits))
-    )  # numpy 1 makes objects of large integers
+    # A float, as numpy 1 makes objects of large integers.
+    most = float(math.floor(math.ldexp(float(np.finfo(np.float32).max), bits)))
     multiples = np.rint(np.ldexp(center.astype(np.float64), bits)).clip(-most, most)
     return np.ldexp(multiples, -bits).astype(np.float32)
 
