@@ -139,10 +139,62 @@ def test_the_workflow_stops_at_leaves_of_another_original(project: Path, web: Pa
     assert "file=web/sh0-lod.spz,title=expect.leaves::" in done.stdout
 
 
+# --- The action -------------------------------------------------------------------------------------------------------
+
+
+def run_action(shell: Shell, **more: str) -> subprocess.CompletedProcess[str]:
+    """The body of the action with the page's inputs, as GitHub calls it."""
+    inputs = {name.upper(): value for name, value in ACTION.items() if name in ("scenes", "options", "checks")} | more
+    words = [f"{name}={shlex.quote(value)}" for name, value in {**inputs, "GITHUB_OUTPUT": "out"}.items()]
+    return shell(
+        " ".join([*words, f"PYTHON={shlex.quote(sys.executable)}", shlex.quote(str(ROOT / "action" / "check"))])
+    )
+
+
+def test_the_action_bakes_checks_and_reports(project: Path, shell: Shell) -> None:
+    done = run_action(shell)
+    assert done.returncode == 0, done.stderr
+    assert not re.search("^::(error|warning)", done.stdout, re.MULTILINE)
+    assert (project / "out").read_text() == "report=web/report.jsonl\n"
+    reports = [json.loads(line) for line in (project / "web" / "report.jsonl").read_text().splitlines()]
+    assert [report["file"] for report in reports] == ["web/demo-lod.spz", "web/sh0-lod.spz"]
+    assert (project / "summary.md").read_text().count("leaves") >= 2
+
+
+def test_the_action_looks_at_all_files_before_it_fails(project: Path, shell: Shell) -> None:
+    done = run_action(shell, CHECKS="--check --max-bytes 1000")
+    assert done.returncode == 3
+    assert re.findall(r"^::error file=web/(\w+)-lod\.spz,title=expect\.bytes::", done.stdout, re.MULTILINE) == [
+        "demo",
+        "sh0",
+    ]
+    assert len((project / "web" / "report.jsonl").read_text().splitlines()) == 2
+
+
+def test_the_action_refuses_patterns_without_files_and_runs_no_names(project: Path, shell: Shell) -> None:
+    done = run_action(shell, SCENES="scans/*.ply")
+    assert (done.returncode, done.stderr) == (1, "no file matches scans/*.ply\n")
+    odd = project / "odd"
+    odd.mkdir()
+    shutil.copy(FIXTURES / "sh0.ply", odd / "$(touch run); a b.ply")
+    assert run_action(shell, SCENES="odd/*.ply", OPTIONS="--up -y", COMPARE="false").returncode == 0
+    assert not (project / "run").exists()
+
+
+def test_the_action_has_the_inputs_that_its_body_reads() -> None:
+    action = (ROOT / "action.yml").read_text("utf-8")
+    inputs = re.findall(r"^  ([\w-]+):$", action.partition("\noutputs:")[0], re.MULTILINE)
+    assert set(ACTION) - {"uses", "with"} <= set(inputs)
+    body = (ROOT / "action" / "check").read_text("utf-8")
+    for name in set(inputs) - {"python-version"}:
+        assert f"${{{{ inputs.{name} }}}}" in action
+        assert f"${{{name.replace('-', '_').upper()}" in body
+
+
 # --- pre-commit -------------------------------------------------------------------------------------------------------
 
 OURS = settings(HOOKS)
-THEIRS, LOCAL = map(settings, blocks(CI, "yaml")[1:])
+ACTION, THEIRS, LOCAL = map(settings, blocks(CI, "yaml")[1:])
 
 
 def test_hooks_name_what_there_is() -> None:

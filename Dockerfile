@@ -1,0 +1,25 @@
+# sparklod with all kernels compiled, for every processor of a level:
+#
+#   docker build -t sparklod .                          # x86-64-v3: processors with AVX2, since about 2013 to 2015
+#   docker build -t sparklod --build-arg CPU=generic .  # any, also arm64
+#   docker run --rm --user "$(id -u):$(id -g)" -v "$PWD:/data" sparklod build-lod scene.ply
+#
+# What takes long is container/install, which runs outside of containers, too; the image itself has not been built yet.
+ARG PYTHON=3.12
+FROM python:${PYTHON}-slim AS build
+ARG CPU=x86-64-v3
+COPY . /src
+RUN /src/container/install /src /opt/sparklod "$CPU"
+
+FROM python:${PYTHON}-slim
+ARG CPU=x86-64-v3
+RUN apt-get update \
+    && apt-get install -y --no-install-recommends libgomp1 \
+    && rm -rf /var/lib/apt/lists/* \
+    && useradd --create-home sparklod
+COPY --from=build /opt/sparklod /opt/sparklod
+# numba compiles for the named processor, not for the one that runs it; empty features are those that the name implies.
+ENV PATH=/opt/sparklod/bin:$PATH NUMBA_CPU_NAME=$CPU NUMBA_CPU_FEATURES= NUMBA_CACHE_DIR=/opt/sparklod/kernels
+USER sparklod
+WORKDIR /data
+ENTRYPOINT ["sparklod"]
