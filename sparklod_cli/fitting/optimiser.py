@@ -19,7 +19,7 @@ STAGES = 12
 RATES, LAST = Rates(0.006, 0.012, 0.003, 0.006, 0.006, 0.0012), 0.02
 
 #: Steps unless given: the most, the least, and their number times that of the leaves. Chosen.
-MOST_BY_DEFAULT, LEAST_BY_DEFAULT, WORK = 6000, 1000, 3_000_000_000
+MOST_BY_DEFAULT, LEAST_BY_DEFAULT, WORK = 12_000, 1000, 3_000_000_000
 
 
 class Optimiser:

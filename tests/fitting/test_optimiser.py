@@ -114,4 +114,4 @@ def test_a_flat_curve_leaves_out_half_of_the_steps_and_the_rates_fall_to_the_sam
 
 def test_larger_trees_have_fewer_steps_within_bounds() -> None:
     steps = [default_steps(leaves) for leaves in (1, 100_000, 500_000, 1_000_000, 50_000_000)]
-    assert steps == [6000, 6000, 6000, 3000, 1000]
+    assert steps == [12_000, 12_000, 6000, 3000, 1000]
