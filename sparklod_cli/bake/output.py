@@ -94,10 +94,8 @@ def output_of_existing_tree(
         FormatError: nobody asked for another format than that of the scene, or for merged splats to be fitted; or for
             something that only splats without a tree can be given.
     """
-    held, plain = (
-        scene.format.split()[0],
-        settings.detail is None and settings.encoding is None and settings.simplify is None,
-    )
+    held = scene.format.split()[0]
+    plain = settings.detail is None and settings.encoding is None and settings.simplify is None
     is_same = plain and WRITABLE[settings.suffix].name == held
     is_same_container = bool(scene.header.get("chunked")) == settings.options.rad.chunked
     converts = settings.converts and settings.encoding is None and not (is_same and is_same_container)

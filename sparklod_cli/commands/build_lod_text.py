@@ -55,20 +55,13 @@ LEAST_SHARE = 0.001
 
 def report_baked(console: Console, source: Place, target: Place, baked: Baked) -> None:
     """Print a line about the file, and one for each thing that a person should know."""
-    from ..model.selection import describe
-
     console.say(
         f"{name_of(source)}  {count_of(baked.splats, 'splat')}, SH {baked.sh_degree}  ->  {_name(target)} "
         f" {_contents(baked)}, {size_of(baked.bytes)}, {_total(baked.seconds)}"
     )
     if baked.detail is not None and len(baked.detail.levels) > 1:
         console.say(f"  {_levels(baked.detail)}")
-    if baked.refine is not None:
-        console.say(f"  {_refined(baked.refine)}")
-    if baked.dropped:
-        console.say(f"  left out: {describe(baked.dropped)}")
-    for note in baked.notes:
-        console.say(f"  {note}")
+    _report_tree(console, baked, baked.refine)
     consequences = _consequences(baked)
     if consequences:
         console.say(f"  {consequences}")
@@ -80,6 +73,18 @@ def report_baked(console: Console, source: Place, target: Place, baked: Baked) -
     if baked.blocks is not None:
         written, read = (format_size(size or 0) for size in (baked.scratch_bytes_written, baked.scratch_bytes_read))
         console.detail(f"  out of core in {count_of(baked.blocks, 'block')}; scratch: {written} written, {read} read")
+
+
+def _report_tree(console: Console, baked: Baked, refine: Refined | None) -> None:
+    """Print how a tree or its cut was fitted, which splats were left out, and the notes."""
+    from ..model.selection import describe
+
+    if refine is not None:
+        console.say(f"  {_refined(refine)}")
+    if baked.dropped:
+        console.say(f"  left out: {describe(baked.dropped)}")
+    for note in baked.notes:
+        console.say(f"  {note}")
 
 
 def _contents(baked: Baked) -> str:
@@ -179,8 +184,6 @@ def report_extracted(console: Console, source: Place, target: Place, extracted: 
 
 def report_simplified(console: Console, source: Source, target: Place, baked: Baked) -> None:
     """Print a line about the file of a simplified scene, and what it does not hold."""
-    from ..model.selection import describe
-
     made = baked.simplified
     assert made is not None
     measured = "" if made.psnr is None else f", PSNR {made.psnr:.2f} dB"
@@ -189,12 +192,7 @@ def report_simplified(console: Console, source: Source, target: Place, baked: Ba
         f" {count_of(made.splats, 'splat')} ({100 * made.share:.3g} %){measured}, {size_of(baked.bytes)},"
         f" {_total(baked.seconds)}"
     )
-    if made.refine is not None:
-        console.say(f"  {_refined(made.refine)}")
-    if baked.dropped:
-        console.say(f"  left out: {describe(baked.dropped)}")
-    for note in baked.notes:
-        console.say(f"  {note}")
+    _report_tree(console, baked, made.refine)
     _report_losses(console, made, made.splats, baked.output_format)
     console.detail(f"  {baked.format}; {_stages(baked.seconds)}")
 

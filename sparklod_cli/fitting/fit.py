@@ -77,9 +77,11 @@ class _Fitting:
         raster = RasterSettings()
         near, far = min(raster.near, NEAR * place.radius), max(raster.far, FAR * place.radius)
         raster = RasterSettings(near=near, far=far)
-        self.nodes = FittedNodes(nodes, tree, raster, threads)
-        if fixed is not None:
-            self.nodes = FittedSet(nodes, tree, fixed, raster, threads)
+        self.nodes = (
+            FittedNodes(nodes, tree, raster, threads)
+            if fixed is None
+            else FittedSet(nodes, tree, fixed, raster, threads)
+        )
         seeds = np.random.SeedSequence(settings.seed).spawn(3)
         training, held_out = placed(place, seeds[0]), placed(place, seeds[1])
         if settings.path is not None:
