@@ -70,10 +70,9 @@ def _options(kind: type[Any], heading: str) -> Iterator[Callable[[Any], Any]]:
             attributes = {"type": click_type(declared.kind), "metavar": unit} | attributes
         if "[default" in declared.help:
             attributes["show_default"] = False
-        default = () if attributes.get("multiple") else field.default
-        yield click.option(
-            *flags, name, cls=Option, declared=declared, default=default, help=declared.help, **attributes
-        )
+        if not attributes.get("required"):  # click 8.3 and later take a default of None for a value
+            attributes["default"] = () if attributes.get("multiple") else field.default
+        yield click.option(*flags, name, cls=Option, declared=declared, help=declared.help, **attributes)
 
 
 def values_of(ctx: click.Context, kind: type[Group]) -> Group:

@@ -108,6 +108,7 @@ def test_selection_and_axes_are_those_of_build_lod(source: Path, tmp_path: Path)
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
+        (("--to", "1%"), "Missing option '-o' / '--output'"),
         (("-o", "x.ply"), "say how many splats are left: give one of --to, --max-bytes and --psnr"),
         (("--to", "1%", "--psnr", "30", "-o", "x.ply"), "--to and --psnr cannot be used together"),
         (("--to", "ten", "-o", "x.ply"), "'ten' is neither a share such as 5% nor a count"),
