@@ -50,6 +50,7 @@ VALUES: dict[str, Sequence[str]] = {
     "fps": ("30", "10", "1e-6", "0.001", "1e6", "0", "inf"),
     "threads": ("1", "2", "0", "257"),
     "jobs": ("1", "2", "0"),
+    "workers": ("1", "2", "0"),
     "backend": ("numba", "numba", "none"),
     "budget": ("1", "10", "5%", "5%,10", "500k", "0", "-1", "1e3", "10,10", "101%"),
     "view": ("0,0,5:0,0,0", "0,0,0:0,0,0", "1e38,0,0:0,0,0", "0,1e-30,0:0,0,0", "0,0,5", "nan,0,0:0,0,0"),
@@ -75,6 +76,9 @@ VALUES: dict[str, Sequence[str]] = {
     "indices_out": FOLDERS,
 }
 VALUES |= {"look_at": VALUES["view"]}
+
+#: Options that get no other values than these.
+SMALL = ("size", "orbit", "threads", "jobs", "workers")
 
 #: Values to try for all other options.
 NUMBERS = (
@@ -134,7 +138,7 @@ def _option(rng: Rng, option: click.Option) -> list[str]:
     if isinstance(option.type, click.Choice) and rng.integers(10):
         return [name, str(pick(rng, list(option.type.choices)))] if option.name != "backend" else [name, "numba"]
     values = VALUES.get(option.name or "", NUMBERS)
-    return [name, pick(rng, values if rng.integers(10) or option.name in ("size", "orbit", "threads") else NUMBERS)]
+    return [name, pick(rng, values if rng.integers(10) or option.name in SMALL else NUMBERS)]
 
 
 def check(case: Case, folder: Path) -> None:

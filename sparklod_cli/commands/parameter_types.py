@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from ..support.setting_fields import Quantity, Range
+from ..support.setting_fields import MOST_WHOLE, Quantity, Range
 
 COLORS: dict[str, tuple[float, ...] | None] = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "transparent": None}
 
@@ -26,11 +26,21 @@ def click_type(kind: Any) -> click.ParamType | None:
 
 
 def _range_type(kind: Range) -> click.ParamType:
-    base: type[Any] = click.IntRange if kind.whole else Real
+    base: type[Any] = Whole if kind.whole else Real
     least, most = (kind.least, kind.above), (kind.most, kind.below)
     low, high = (next((end for end in ends if end is not None), None) for ends in (least, most))
     result: click.ParamType = base(low, high, min_open=kind.above is not None, max_open=kind.below is not None)
     return result
+
+
+class Whole(click.IntRange):
+    """An integer of a range; unlike its base it takes none that arrays cannot hold."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        number: int = super().convert(value, param, ctx)
+        if abs(number) > MOST_WHOLE:
+            self.fail(f"a number of {len(str(abs(number)))} digits is too large", param, ctx)
+        return number
 
 
 class Real(click.FloatRange):

@@ -16,6 +16,10 @@ from typing import Any
 SETTING = "setting"
 
 
+#: Largest integer that arrays hold.
+MOST_WHOLE = (1 << 63) - 1
+
+
 @dataclass(frozen=True)
 class Range:
     """Range of a number.
@@ -53,7 +57,9 @@ class Range:
         """Raise TypeError unless a value is a number, and ValueError unless it is in the range; both name it."""
         if isinstance(value, bool) or not isinstance(value, numbers.Integral if self.whole else numbers.Real):
             raise TypeError(f"{name} is {value!r}; give a {'whole ' * self.whole}number, {self}")
-        if float(value) not in self:
+        if self.whole and abs(value) > MOST_WHOLE:
+            raise ValueError(f"{name} is a number of {len(str(abs(value)))} digits, which is too large")
+        if value not in self:
             raise ValueError(f"{name} is {value}; give {self}")
 
 

@@ -52,7 +52,7 @@ def outside(kind: Any) -> list[Any]:
         return []
     ends = [(bounds.least, -1), (bounds.most, 1), (bounds.above, 0), (bounds.below, 0)]
     beyond = [end + (step if abs(end) < 2**53 else step * abs(end)) for end, step in ends if end is not None]
-    return [*beyond, *([] if bounds.whole else [math.nan])]
+    return [*beyond, 10**400 if bounds.whole else math.nan]
 
 
 @pytest.mark.parametrize(("command", "option"), options())
