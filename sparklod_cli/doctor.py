@@ -35,6 +35,7 @@ INTERNAL_EXTRAS = ("dev", "docs", "test")
 PURPOSES = {
     "cloud": "files at addresses such as s3://bucket/scan.ply",
     "cluster": "build-lod on several processes or machines",
+    "cuda": "pictures and --refine on NVIDIA cards",
     "parquet": "Parquet tables",
     "render": "figures, charts, and the backends osmesa and open3d of render",
     "video": ".mp4 animations",

@@ -44,6 +44,7 @@ BACKENDS = {
     backend.name: backend
     for backend in (
         Backend("numba", ".rasterizer"),
+        Backend("cuda", ".cuda.rasterizer"),
         Backend("osmesa", ".gl.osmesa"),
         Backend("open3d", ".open3d.backend"),
     )

@@ -93,7 +93,8 @@ class RenderSettings(CheckedSettings):
     )
     backend: str = setting(
         "numba",
-        "Renderer: numba is the reference, osmesa is OpenGL in software, open3d is a quick look.",
+        "Renderer: numba is the reference, cuda draws the same on an NVIDIA card, osmesa is OpenGL in software, open3d"
+        " is a quick look.",
         tuple(BACKENDS),
     )
     color_by: str | None = setting(

@@ -1,0 +1,140 @@
+"""The card: whether there is one that can be used, and arrays and sums on it."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...support.optional import optional_import
+from ..backends import BackendError
+
+#: An array on the card, as numba has it.
+CardArray = Any
+
+#: Oldest driver, by the version of CUDA that it supports: that of the libraries in the extra `cuda`.
+LEAST_DRIVER = (12, 0)
+
+#: Oldest compute capability that CUDA 12 compiles for.
+LEAST_CAPABILITY = (5, 0)
+
+
+@dataclass(frozen=True)
+class Card:
+    """A card.
+
+    Attributes:
+        name: for display. memory, free: bytes.
+        driver: version of CUDA that its driver supports.
+        sorter: "cupy", or "numpy" where arrays are sorted by the processor, which is slow.
+    """
+
+    name: str
+    memory: int
+    free: int
+    driver: tuple[int, int]
+    sorter: str
+
+    def __str__(self) -> str:
+        return f"{self.name} ({self.memory / 1e9:.0f} GB, CUDA {self.driver[0]}.{self.driver[1]})"
+
+
+def find_card() -> Card:
+    """Return the card that numba uses.
+
+    Raises:
+        BackendError: there is none, or it cannot be used; in one line that says why.
+    """
+    with optional_import("the device cuda takes numba-cuda", "cuda", BackendError):
+        from numba import cuda
+    from ...support.jit_cuda import SIMULATED
+
+    if SIMULATED:
+        return Card("numba's simulator", 0, 0, LEAST_DRIVER, "numpy")
+    try:
+        driver = tuple(cuda.current_context().device.compute_capability), cuda.cudadrv.driver.driver.get_version()
+    except Exception as error:  # numba has no common class for what a driver may lack
+        lines = str(error).split()
+        raise BackendError(f"no usable NVIDIA card and driver ({' '.join(lines)})") from None
+    capability, version = driver
+    if tuple(version) < LEAST_DRIVER:
+        raise BackendError(f"the NVIDIA driver supports CUDA {version[0]}.{version[1]}; install one for CUDA 12")
+    if capability < LEAST_CAPABILITY:
+        raise BackendError(f"the NVIDIA card has compute capability {capability[0]}.{capability[1]}; it takes 5.0")
+    if not cuda.is_available():
+        with optional_import("the device cuda takes NVVM, which compiles its kernels", "cuda", BackendError):
+            raise ImportError("NVVM is missing")
+    context = cuda.current_context()
+    name = context.device.name
+    free, total = context.get_memory_info()
+    return Card(name.decode() if isinstance(name, bytes) else name, total, free, tuple(version), _sorter())
+
+
+def _sorter() -> str:
+    return "cupy" if importlib.util.find_spec("cupy") else "numpy"
+
+
+@contextlib.contextmanager
+def card_errors() -> Iterator[None]:
+    """Turn errors of the card inside, such as memory that does not suffice, into `BackendError`."""
+    try:
+        yield
+    except BackendError:
+        raise
+    except Exception as error:
+        kind = type(error).__name__
+        if "OUT_OF_MEMORY" in str(error) or kind == "OutOfMemoryError":
+            raise BackendError("the card has too little memory; use --device cpu, or fewer splats or pixels") from None
+        if kind in ("CudaAPIError", "CudaDriverError", "CudaSupportError", "CUDARuntimeError", "NvvmError"):
+            raise BackendError(f"the card failed ({' '.join(str(error).split())}); use --device cpu") from None
+        raise
+
+
+def to_card(array: NDArray[Any]) -> CardArray:
+    """Copy a C-contiguous array to the card."""
+    from numba import cuda
+
+    return cuda.to_device(np.ascontiguousarray(array))
+
+
+def on_card(shape: int | tuple[int, ...], dtype: Any = np.float32) -> CardArray:
+    """Return an array on the card whose values are undefined."""
+    from numba import cuda
+
+    return cuda.device_array(shape, dtype)
+
+
+def sort(array: CardArray) -> None:
+    """Sort a uint64 array on the card in place."""
+    if not _use_cupy():
+        array.copy_to_device(np.sort(array.copy_to_host()))
+        return
+    import cupy
+
+    cupy.asarray(array).sort()
+
+
+def add_up(array: CardArray) -> int:
+    """Replace an int64 array on the card by its running sums; return the last."""
+    if not array.shape[0]:
+        return 0
+    if not _use_cupy():
+        sums = np.cumsum(array.copy_to_host())
+        array.copy_to_device(sums)
+        return int(sums[-1])
+    import cupy
+
+    view = cupy.asarray(array)
+    cupy.cumsum(view, out=view)
+    return int(view[-1])
+
+
+def _use_cupy() -> bool:
+    from ...support.jit_cuda import SIMULATED
+
+    return not SIMULATED and _sorter() == "cupy"

@@ -1,0 +1,131 @@
+"""Pictures drawn on a card: `CardSplats` are uploaded once, and drawn for many cameras."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...cameras.camera import Camera
+from ...model.falloff import MIN_ALPHA
+from ...model.sh import COEFFICIENTS
+from .. import rasterizer
+from ..rasterizer import Image
+from ..settings import RasterSettings
+from ..shading import ShadedSplats
+from . import forward
+from .card import CardArray, add_up, card_errors, find_card, on_card, sort, to_card
+
+
+@dataclass(frozen=True)
+class CardSplats:
+    """N splats on the card, float32.
+
+    Attributes:
+        center: (N, 3). scale: (N, 3). quat_xyzw: (N, 4). lod_opacity: (N,). rgb: (N, 3). sh: (N, K, 3).
+        colors: (N, 3), working memory: colours that the last camera saw.
+    """
+
+    center: CardArray
+    scale: CardArray
+    quat_xyzw: CardArray
+    lod_opacity: CardArray
+    rgb: CardArray
+    sh: CardArray
+    colors: CardArray
+
+    @classmethod
+    def of(cls, *columns: NDArray[np.float32]) -> CardSplats:
+        """Copy columns, in the order of the attributes, to the card."""
+        return cls(*map(to_card, columns), on_card(columns[4].shape))
+
+    @property
+    def degree(self) -> int:
+        """Degree of the spherical harmonics."""
+        return COEFFICIENTS.index(self.sh.shape[1])
+
+
+@dataclass(frozen=True)
+class CardView:
+    """A camera and raster settings on the card.
+
+    Attributes:
+        eye: (3,). matrix: (3, 4). view: (`forward.VIEW`,). See `forward.project`.
+    """
+
+    camera: Camera
+    settings: RasterSettings
+    eye: CardArray
+    matrix: CardArray
+    view: CardArray
+
+    @classmethod
+    def of(cls, camera: Camera, settings: RasterSettings) -> CardView:
+        """Copy a camera to the card."""
+        nothing = ShadedSplats(*(np.empty((0, 3), np.float32),) * 5)
+        _, matrix, lens, limits = rasterizer.arguments(nothing, camera, settings)
+        eye = camera.position.astype(np.float32)
+        return cls(camera, settings, to_card(eye), to_card(matrix), to_card(np.array([*lens, *limits], np.float32)))
+
+
+@dataclass(frozen=True)
+class CardPicture:
+    """A picture on the card, of M splats, and how it was drawn.
+
+    Attributes:
+        image: (height, width, 4) float32.
+        index: (M,) int32, which splats. screen, keys, boxes, count: of `forward.project`, the keys sorted.
+        ends: (M,) int64, running sums of the tiles of splats in the order of `keys`.
+        start: (T + 1,) int64, where in `pairs` tiles begin. pairs: (total,) uint64, of `forward.list_pairs`.
+    """
+
+    image: CardArray
+    index: CardArray
+    screen: CardArray
+    keys: CardArray
+    boxes: CardArray
+    count: CardArray
+    ends: CardArray
+    start: CardArray
+    pairs: CardArray
+
+
+def draw_on_card(splats: CardSplats, index: CardArray, view: CardView) -> CardPicture:
+    """Draw the splats of an index, (M,) int32, on the card."""
+    camera, settings = view.camera, view.settings
+    across, down = rasterizer.tiles_across(camera)
+    number = index.shape[0]
+    screen, boxes = on_card((number, forward.COLUMNS)), on_card((number, 4), np.int16)
+    keys, count, ends = on_card(number, np.uint64), on_card(number, np.int32), on_card(number, np.int64)
+    columns = splats.center, splats.scale, splats.quat_xyzw, splats.lod_opacity, splats.rgb, splats.sh
+    camera_on_card = view.eye, view.matrix, view.view, settings.sort == "radial"
+    results = splats.colors, screen, keys, boxes, count
+    forward.project.for_each(number, *columns, splats.degree, index, *camera_on_card, *results)
+    sort(keys)
+    forward.count_in_order.for_each(number, keys, count, ends)
+    pairs = on_card(add_up(ends), np.uint64)
+    start = to_card(np.zeros(across * down + 1, np.int64))
+    forward.list_pairs.for_each(number, keys, boxes, ends, across, pairs)
+    sort(pairs)
+    forward.find_starts.for_each(pairs.shape[0], pairs, start)
+    image = on_card((camera.height, camera.width, 4))
+    is_design = settings.profile == "shifted"
+    drawn = screen, keys, start, pairs, across, is_design, np.float32(MIN_ALPHA), image
+    forward.blend.launch(across * down, forward.PIXELS, *drawn)
+    return CardPicture(image, index, screen, keys, boxes, count, ends, start, pairs)
+
+
+def draw(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> Image:
+    """Draw what a camera sees, as `rasterizer.draw` does, on the card.
+
+    Raises:
+        BackendError: there is no card that can be used, or its memory does not suffice.
+    """
+    find_card()
+    with card_errors():
+        no_sh = np.empty((len(splats), 0, 3), np.float32)
+        uploaded = CardSplats.of(splats.center, splats.scale, splats.quat_xyzw, splats.lod_opacity, splats.rgb, no_sh)
+        every = to_card(np.arange(len(splats), dtype=np.int32))
+        image: Image = draw_on_card(uploaded, every, CardView.of(camera, settings)).image.copy_to_host()
+    return image

@@ -1,0 +1,42 @@
+"""The kernels for NVIDIA cards, without one: their tests in numba's simulator, and their compilation to PTX."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from tests.cards import SIMULATE
+
+FOLDERS = ("tests/render/cuda",)
+
+#: Seconds, far above what either takes.
+PATIENCE = 500
+
+
+def run(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, *arguments],
+        env=os.environ | environment,
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+        check=False,
+    )
+
+
+def test_kernels_pass_in_the_simulator() -> None:
+    found = run("-m", "pytest", "-q", "-p", "no:cacheprovider", "-n", "0", "-m", "cuda", *FOLDERS, **{SIMULATE: "1"})
+    assert found.returncode == 0, found.stdout[-4000:] + found.stderr[-2000:]
+    assert "skipped" not in found.stdout.splitlines()[-1], found.stdout
+
+
+def test_kernels_compile_for_a_card() -> None:
+    from tests.render.cuda.compile_kernels import MISSING
+
+    found = run("-m", "tests.render.cuda.compile_kernels", **{SIMULATE: "0"})
+    if found.returncode == MISSING:
+        pytest.skip(found.stdout.strip())
+    assert found.returncode == 0, found.stdout[-1000:] + found.stderr[-4000:]
