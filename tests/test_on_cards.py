@@ -10,7 +10,7 @@ import pytest
 
 from tests.cards import SIMULATE
 
-FOLDERS = ("tests/render/cuda",)
+FOLDERS = "tests/render/cuda", "tests/fitting/cuda"
 
 #: Seconds, far above what either takes.
 PATIENCE = 500

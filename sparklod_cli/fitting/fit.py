@@ -9,6 +9,8 @@ import numpy as np
 
 from ..model.lod_tree import LodTree
 from ..model.splats import Splats
+from ..render.backends import BackendError
+from ..render.devices import uses_card
 from ..render.settings import RasterSettings
 from ..support.parallel import on_threads
 from ..support.progress import Progress, silent
@@ -55,11 +57,14 @@ def fit(
         say: called with a line of text after each stage.
         interrupted: asked between steps; when it returns True, what the finished stages gained is returned.
 
+    Raises:
+        BackendError: `settings.device` is a card that there is not, or its memory does not suffice.
+
     Returns:
         N nodes, and what fitting brought: at none of `settings.SHARES` less than before on the held-out cameras.
     """
     with on_threads(threads):
-        fitting = _Fitting(nodes, tree, settings, fixed, threads)
+        fitting = _Fitting(nodes, tree, settings, fixed, threads, say)
         is_complete = True
         while fitting.has_steps:
             if not fitting.run_stage(progress, interrupted):
@@ -72,7 +77,15 @@ def fit(
 class _Fitting:
     """State of a fit."""
 
-    def __init__(self, nodes: Splats, tree: LodTree, settings: FitSettings, fixed: Index | None, threads: int) -> None:
+    def __init__(
+        self,
+        nodes: Splats,
+        tree: LodTree,
+        settings: FitSettings,
+        fixed: Index | None,
+        threads: int,
+        say: Callable[[str], None],
+    ) -> None:
         place = Place.of(nodes.center[tree.is_leaf])
         raster = RasterSettings()
         near, far = min(raster.near, NEAR * place.radius), max(raster.far, FAR * place.radius)
@@ -92,7 +105,7 @@ class _Fitting:
         self._training = list(itertools.islice(pictures(training, self.nodes), min(TRAINING, steps) * can_gain))
         self._schedule = Schedule(steps if self._training else 0)
         self._examples = self._drawn(np.random.Generator(np.random.PCG64(seeds[2])))
-        self._optimiser = Optimiser(self.nodes)
+        self._optimiser = _optimiser_on(settings.device, self.nodes, say)
         self._before = self._best = scores_of(self.nodes, self._held_out)
         self._kept = self.nodes.copy()
         self._stages: list[FitStage] = []
@@ -117,10 +130,10 @@ class _Fitting:
         for picture, share in itertools.islice(self._examples, steps):
             if interrupted():
                 return False
-            shown = self._optimiser.step(picture, self.nodes.cut(picture.camera, share), schedule.rates())
-            self.nodes.renew(shown)
+            self._optimiser.step(picture, self.nodes.cut(picture.camera, share), schedule.rates())
             schedule.advance()
             progress("refining", schedule.done, schedule.done + schedule.remaining, "step")
+        self._optimiser.synchronize()
         now = scores_of(self.nodes, self._held_out)
         start = self._stages[-1].psnr_after if self._stages else self._before
         self._stages.append(FitStage(f"{schedule.done:,} steps", steps, start, now))
@@ -153,3 +166,18 @@ class _Fitting:
                 return after
         self.nodes.restore(self.nodes.merged)
         return self._before
+
+
+def _optimiser_on(device: str, nodes: FittedNodes, say: Callable[[str], None]) -> Optimiser:
+    """Return the optimiser of a device; with "auto" that of the processor if the card has too little memory."""
+    if not uses_card(device, say):
+        return Optimiser(nodes)
+    from .cuda.optimiser import CardOptimiser
+
+    try:
+        return CardOptimiser(nodes)
+    except BackendError as error:
+        if device == "cuda":
+            raise
+        say(f"uses the processor: {error}")
+        return Optimiser(nodes)

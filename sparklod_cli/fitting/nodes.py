@@ -20,7 +20,7 @@ from ..render.kernels.shade import add_sh
 from ..render.settings import RasterSettings
 from ..render.shading import ShadedSplats
 from ..scenes.loaded_scene import nodes_of
-from .kernels.adam import Columns
+from .kernels.adam import MOST_D, Columns
 from .kernels.view import mark_seen
 from .settings import SHARES
 
@@ -39,9 +39,11 @@ class FittedNodes:
         leaves: indices of full detail, ascending.
         merged: indices of the nodes that may change, ascending.
         shares: of the leaves, of the cuts that nodes are judged by.
+        most_d: largest D that fitting gives a node.
     """
 
     shares: Sequence[float] = SHARES
+    most_d: float = float(MOST_D)
 
     def __init__(self, nodes: Splats, tree: LodTree, raster: RasterSettings, threads: int) -> None:
         self.original, self.tree, self.raster = nodes, tree, raster
@@ -73,13 +75,16 @@ class FittedNodes:
         np.maximum(found.rgb, 0, out=found.rgb)
         return seen, ShadedSplats(found.center, found.scale, found.quat_xyzw, found.lod_opacity, found.rgb)
 
-    @np.errstate(over="ignore")  # what float16 cannot hold is infinite, as in Spark
     def renew(self, index: Index) -> None:
         """Update the nodes that cuts are found with."""
+        self.place(index, self.columns.center[index], self.sizes(index))
+
+    @np.errstate(over="ignore")  # what float16 cannot hold is infinite, as in Spark
+    def place(self, index: Index, center: FloatArray, sizes: FloatArray) -> None:
+        """Set centres, (M, 3), and feature sizes of the nodes that cuts are found with."""
         rows = self._forest.nodes
-        center = self.columns.center[index].astype(np.float16)
-        rows["x"][index], rows["y"][index], rows["z"][index] = center.T
-        rows["size"][index] = self.sizes(index).astype(np.float16)
+        rows["x"][index], rows["y"][index], rows["z"][index] = center.astype(np.float16).T
+        rows["size"][index] = sizes.astype(np.float16)
 
     def sizes(self, index: Index, columns: Columns | None = None) -> FloatArray:
         """Return feature sizes of some nodes as they are now, or by other columns; see `gaussian.spark_size`."""
@@ -128,6 +133,8 @@ class FittedSet(FittedNodes):
         fixed: indices of the cut, ascending.
     """
 
+    most_d = 1.0
+
     def __init__(self, nodes: Splats, tree: LodTree, fixed: Index, raster: RasterSettings, threads: int) -> None:
         super().__init__(nodes, tree, raster, threads)
         self._fixed = fixed
@@ -140,7 +147,7 @@ class FittedSet(FittedNodes):
 
     def renew(self, index: Index) -> None:
         """Limit the opacities of the nodes, which the optimiser takes for those of a tree."""
-        self.columns.lod_opacity[index] = np.minimum(self.columns.lod_opacity[index], 1)
+        self.columns.lod_opacity[index] = np.minimum(self.columns.lod_opacity[index], self.most_d)
         super().renew(index)
 
 

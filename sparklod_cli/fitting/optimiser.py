@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..render import gradients
 from .kernels import adam
@@ -28,8 +29,7 @@ class Optimiser:
     def __init__(self, nodes: FittedNodes) -> None:
         self.nodes = nodes
         count, terms = len(nodes.merged), nodes.columns.sh.shape[1]
-        self._slots = np.full(len(nodes.tree), -1, np.int32)
-        self._slots[nodes.merged] = np.arange(count, dtype=np.int32)
+        self._slots = slots_of(nodes)
         self._moments = adam.Moments(
             np.zeros((count, adam.FIRST), np.float32),
             np.zeros((count, terms, 3), np.float32),
@@ -38,7 +38,7 @@ class Optimiser:
         )
 
     def step(self, picture: FullDetailPicture, index: Index, rates: adam.Rates) -> Index:
-        """Take one step for a picture of a cut; return the nodes that it showed."""
+        """Take one step for a picture of a cut, and renew the nodes that it showed; return them."""
         nodes, camera = self.nodes, picture.camera
         seen, shaded = nodes.visible(index, camera)
         drawing = gradients.draw(shaded, camera, nodes.raster)
@@ -49,7 +49,18 @@ class Optimiser:
         columns = adam.Gradients(*map(np.ascontiguousarray, derivatives))
         rates = adam.Rates(*map(np.float32, rates))
         adam.step(nodes.columns, nodes.old, seen, self._slots, columns, rates, self._moments)
+        nodes.renew(seen)
         return seen
+
+    def synchronize(self) -> None:
+        """Bring the columns of the nodes up to date; here they always are."""
+
+
+def slots_of(nodes: FittedNodes) -> NDArray[np.int32]:
+    """Return the row of each node in `Moments`, -1 for those that do not change."""
+    slots = np.full(len(nodes.tree), -1, np.int32)
+    slots[nodes.merged] = np.arange(len(nodes.merged), dtype=np.int32)
+    return slots
 
 
 class Schedule:

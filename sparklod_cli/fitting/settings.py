@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from ..render.devices import DEVICES
 from ..support.setting_fields import CheckedSettings, setting, whole
 
 if TYPE_CHECKING:
@@ -33,6 +34,12 @@ class FitSettings(CheckedSettings):
     )
     seed: int = setting(0, "Seed of the cameras and budgets that --refine draws at random.", SEED, needs="refine")
     path: CameraPath | None = None
+    device: str = setting(
+        "cpu",
+        "What --refine computes with: an NVIDIA card if there is one (auto), the processor, or a card (cuda).",
+        DEVICES,
+        needs="refine",
+    )
 
 
 @dataclass(frozen=True)

@@ -41,7 +41,7 @@ class CudaKernel:
     """
 
     def __init__(self, function: Callable[..., Any], declared: Sequence[Any]) -> None:
-        functools.update_wrapper(self, function)
+        self.__doc__, self.__name__ = function.__doc__, function.__name__
         self.py_func, self.declared = function, declared
 
     @functools.cached_property

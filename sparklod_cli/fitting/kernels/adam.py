@@ -133,6 +133,98 @@ def moved(first, second, slot, column, of_property, gradient, rate, correction):
     return factor * first[slot, column], factor * first[slot, column + 1], factor * first[slot, column + 2]
 
 
+@kernel(inline=True)
+def step_of(i, nodes, old, index, slots, gradients, rates, moments):
+    """Move the node of drawn splat `i`; see `step`."""
+    center, scale, quat, lod_opacity, rgb, sh = nodes
+    first, first_sh, second, count = moments
+    one, two = f32(1), f32(2)
+    node = index[i]
+    slot = slots[node]
+    if slot < 0:
+        return
+    g = gradients.center
+    gx, gy, gz = g[i, 0], g[i, 1], g[i, 2]
+    seen = abs(gx) + abs(gy) + abs(gz) + abs(gradients.lod_opacity[i])
+    for c in range(3):
+        seen += abs(gradients.rgb[i, c])
+    if not (seen > 0 and seen < f32(1e30)):
+        return
+    count[slot] += 1
+    t = f32(count[slot])
+    correction = np.sqrt(one - BETA2**t)
+    qx, qy, qz, qw = quat[node, 0], quat[node, 1], quat[node, 2], quat[node, 3]
+    r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation_matrix(qx, qy, qz, qw, one)
+    # The centre, in the splat's own axes and scales.
+    sx, sy, sz = scale[node, 0], scale[node, 1], scale[node, 2]
+    least = THIN * (sx + sy + sz) / f32(3)
+    ex, ey, ez = max(sx, least), max(sy, least), max(sz, least)
+    local = (
+        (r00 * gx + r10 * gy + r20 * gz) * ex,
+        (r01 * gx + r11 * gy + r21 * gz) * ey,
+        (r02 * gx + r12 * gy + r22 * gz) * ez,
+    )
+    mx, my, mz = moved(first, second, slot, CENTER, 0, local, rates.center, correction)
+    mx, my, mz = mx * ex, my * ey, mz * ez
+    x = center[node, 0] + (r00 * mx + r01 * my + r02 * mz) - old.center[node, 0]
+    y = center[node, 1] + (r10 * mx + r11 * my + r12 * mz) - old.center[node, 1]
+    z = center[node, 2] + (r20 * mx + r21 * my + r22 * mz) - old.center[node, 2]
+    away = np.sqrt(x * x + y * y + z * z)
+    most = FARTHEST * max(old.scale[node, 0], old.scale[node, 1], old.scale[node, 2])
+    back = min(one, most / max(away, TINY))
+    center[node, 0] = old.center[node, 0] + back * x
+    center[node, 1] = old.center[node, 1] + back * y
+    center[node, 2] = old.center[node, 2] + back * z
+    g = gradients.log_scale
+    longer = moved(first, second, slot, SCALE, 1, (g[i, 0], g[i, 1], g[i, 2]), rates.log_scale, correction)
+    for c in range(3):
+        was = old.scale[node, c]
+        scale[node, c] = min(max(scale[node, c] * np.exp(longer[c]), was / MOST_CHANGE), was * MOST_CHANGE)
+    g = gradients.turn
+    ax, ay, az = moved(first, second, slot, TURN, 2, (g[i, 0], g[i, 1], g[i, 2]), rates.turn, correction)
+    ax, ay, az = ax / two, ay / two, az / two
+    # q * (a, 1), normalized, is q * exp(a) to second order.
+    px = qw * ax + qx + qy * az - qz * ay
+    py = qw * ay - qx * az + qy + qz * ax
+    pz = qw * az + qx * ay - qy * ax + qz
+    pw = qw - qx * ax - qy * ay - qz * az
+    length = np.sqrt(px * px + py * py + pz * pz + pw * pw)
+    quat[node, 0], quat[node, 1], quat[node, 2], quat[node, 3] = px / length, py / length, pz / length, pw / length
+    d, gd = lod_opacity[node], gradients.lod_opacity[i]
+    v = second[slot, 3]
+    v += (one - BETA2) * (gd * gd - v)
+    second[slot, 3] = v
+    first[slot, OPACITY] += (one - BETA1) * (gd - first[slot, OPACITY])
+    change = rates.lod_opacity * correction / (np.sqrt(v) + EPSILON) * first[slot, OPACITY]
+    lod_opacity[node] = min(max(d - change * min(d, one), LEAST_D), MOST_D)
+    grown = size_of(scale, lod_opacity, node) / max(size_of(old.scale, old.lod_opacity, node), TINY)
+    back = min(max(grown, one / MOST_GROWTH), MOST_GROWTH) / max(grown, TINY)
+    for c in range(3):
+        scale[node, c] *= back
+    g = gradients.rgb
+    turned = moved(first, second, slot, COLOR, 4, (g[i, 0], g[i, 1], g[i, 2]), rates.rgb, correction)
+    for c in range(3):
+        was = old.rgb[node, c]
+        rgb[node, c] = min(max(rgb[node, c] + turned[c], min(LEAST_COLOR, was)), max(MOST_COLOR, was))
+    terms = sh.shape[1]
+    if terms:
+        total = f32(0)
+        for k in range(terms):
+            for c in range(3):
+                g_sh = gradients.sh[i, k, c]
+                total += g_sh * g_sh
+                first_sh[slot, k, c] += (one - BETA1) * (g_sh - first_sh[slot, k, c])
+        v = second[slot, 5]
+        v += (one - BETA2) * (total / f32(3 * terms) - v)
+        second[slot, 5] = v
+        factor = rates.sh * correction / (np.sqrt(v) + EPSILON)
+        for k in range(terms):
+            for c in range(3):
+                value = sh[node, k, c] - factor * first_sh[slot, k, c]
+                was = old.sh[node, k, c]
+                sh[node, k, c] = min(max(value, min(LEAST_COLOR, was)), max(MOST_COLOR, was))
+
+
 @kernel(out(Columns), Columns, i8[:], i4[:], Gradients, Rates, Moments, parallel=True)
 def step(nodes, old, index, slots, gradients, rates, moments):
     """Move the merged splats that were drawn against their gradients.
@@ -146,91 +238,5 @@ def step(nodes, old, index, slots, gradients, rates, moments):
         rates: `Rates`.
         moments: `Moments`, changed.
     """
-    center, scale, quat, lod_opacity, rgb, sh = nodes
-    first, first_sh, second, count = moments
-    one, two = f32(1), f32(2)
     for i in prange(len(index)):
-        node = index[i]
-        slot = slots[node]
-        if slot < 0:
-            continue
-        g = gradients.center
-        gx, gy, gz = g[i, 0], g[i, 1], g[i, 2]
-        seen = abs(gx) + abs(gy) + abs(gz) + abs(gradients.lod_opacity[i])
-        for c in range(3):
-            seen += abs(gradients.rgb[i, c])
-        if not (seen > 0 and seen < f32(1e30)):
-            continue
-        count[slot] += 1
-        t = f32(count[slot])
-        correction = np.sqrt(one - BETA2**t)
-        qx, qy, qz, qw = quat[node, 0], quat[node, 1], quat[node, 2], quat[node, 3]
-        r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation_matrix(qx, qy, qz, qw, one)
-        # The centre, in the splat's own axes and scales.
-        sx, sy, sz = scale[node, 0], scale[node, 1], scale[node, 2]
-        least = THIN * (sx + sy + sz) / f32(3)
-        ex, ey, ez = max(sx, least), max(sy, least), max(sz, least)
-        local = (
-            (r00 * gx + r10 * gy + r20 * gz) * ex,
-            (r01 * gx + r11 * gy + r21 * gz) * ey,
-            (r02 * gx + r12 * gy + r22 * gz) * ez,
-        )
-        mx, my, mz = moved(first, second, slot, CENTER, 0, local, rates.center, correction)
-        mx, my, mz = mx * ex, my * ey, mz * ez
-        x = center[node, 0] + (r00 * mx + r01 * my + r02 * mz) - old.center[node, 0]
-        y = center[node, 1] + (r10 * mx + r11 * my + r12 * mz) - old.center[node, 1]
-        z = center[node, 2] + (r20 * mx + r21 * my + r22 * mz) - old.center[node, 2]
-        away = np.sqrt(x * x + y * y + z * z)
-        most = FARTHEST * max(old.scale[node, 0], old.scale[node, 1], old.scale[node, 2])
-        back = min(one, most / max(away, TINY))
-        center[node, 0] = old.center[node, 0] + back * x
-        center[node, 1] = old.center[node, 1] + back * y
-        center[node, 2] = old.center[node, 2] + back * z
-        g = gradients.log_scale
-        longer = moved(first, second, slot, SCALE, 1, (g[i, 0], g[i, 1], g[i, 2]), rates.log_scale, correction)
-        for c in range(3):
-            was = old.scale[node, c]
-            scale[node, c] = min(max(scale[node, c] * np.exp(longer[c]), was / MOST_CHANGE), was * MOST_CHANGE)
-        g = gradients.turn
-        ax, ay, az = moved(first, second, slot, TURN, 2, (g[i, 0], g[i, 1], g[i, 2]), rates.turn, correction)
-        ax, ay, az = ax / two, ay / two, az / two
-        # q * (a, 1), normalized, is q * exp(a) to second order.
-        px = qw * ax + qx + qy * az - qz * ay
-        py = qw * ay - qx * az + qy + qz * ax
-        pz = qw * az + qx * ay - qy * ax + qz
-        pw = qw - qx * ax - qy * ay - qz * az
-        length = np.sqrt(px * px + py * py + pz * pz + pw * pw)
-        quat[node, 0], quat[node, 1], quat[node, 2], quat[node, 3] = px / length, py / length, pz / length, pw / length
-        d, gd = lod_opacity[node], gradients.lod_opacity[i]
-        v = second[slot, 3]
-        v += (one - BETA2) * (gd * gd - v)
-        second[slot, 3] = v
-        first[slot, OPACITY] += (one - BETA1) * (gd - first[slot, OPACITY])
-        change = rates.lod_opacity * correction / (np.sqrt(v) + EPSILON) * first[slot, OPACITY]
-        lod_opacity[node] = min(max(d - change * min(d, one), LEAST_D), MOST_D)
-        grown = size_of(scale, lod_opacity, node) / max(size_of(old.scale, old.lod_opacity, node), TINY)
-        back = min(max(grown, one / MOST_GROWTH), MOST_GROWTH) / max(grown, TINY)
-        for c in range(3):
-            scale[node, c] *= back
-        g = gradients.rgb
-        turned = moved(first, second, slot, COLOR, 4, (g[i, 0], g[i, 1], g[i, 2]), rates.rgb, correction)
-        for c in range(3):
-            was = old.rgb[node, c]
-            rgb[node, c] = min(max(rgb[node, c] + turned[c], min(LEAST_COLOR, was)), max(MOST_COLOR, was))
-        terms = sh.shape[1]
-        if terms:
-            total = f32(0)
-            for k in range(terms):
-                for c in range(3):
-                    g_sh = gradients.sh[i, k, c]
-                    total += g_sh * g_sh
-                    first_sh[slot, k, c] += (one - BETA1) * (g_sh - first_sh[slot, k, c])
-            v = second[slot, 5]
-            v += (one - BETA2) * (total / f32(3 * terms) - v)
-            second[slot, 5] = v
-            factor = rates.sh * correction / (np.sqrt(v) + EPSILON)
-            for k in range(terms):
-                for c in range(3):
-                    value = sh[node, k, c] - factor * first_sh[slot, k, c]
-                    was = old.sh[node, k, c]
-                    sh[node, k, c] = min(max(value, min(LEAST_COLOR, was)), max(MOST_COLOR, was))
+        step_of(i, nodes, old, index, slots, gradients, rates, moments)

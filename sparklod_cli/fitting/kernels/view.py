@@ -83,6 +83,17 @@ def squared_differences(image, full, sums):
         sums[y, 1] = white
 
 
+@kernel(inline=True)
+def by_pixel(image, full, y, x, on_black, on_white, result):
+    """Fill the derivatives by a pixel; see `by_image`."""
+    by_alpha = ZERO
+    for c in range(3):
+        black, white = differences(image, full, y, x, c)
+        result[y, x, c] = on_black * black + on_white * white
+        by_alpha -= on_white * white
+    result[y, x, 3] = by_alpha
+
+
 @kernel(f4[:, :, :], u2[:, :, :], f4, f4, out(f4[:, :, :]), parallel=True)
 def by_image(image, full, on_black, on_white, result):
     """Fill the derivative of half the squared differences on either background, times `on_black` and `on_white`.
@@ -97,9 +108,4 @@ def by_image(image, full, on_black, on_white, result):
     height, width = image.shape[:2]
     for y in prange(height):
         for x in range(width):
-            by_alpha = ZERO
-            for c in range(3):
-                black, white = differences(image, full, y, x, c)
-                result[y, x, c] = on_black * black + on_white * white
-                by_alpha -= on_white * white
-            result[y, x, 3] = by_alpha
+            by_pixel(image, full, y, x, on_black, on_white, result)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -107,6 +108,24 @@ def on_card(shape: int | tuple[int, ...], dtype: Any = np.float32) -> CardArray:
     from numba import cuda
 
     return cuda.device_array(shape, dtype)
+
+
+class CardMemory:
+    """Arrays on the card that are used again for every picture, as allocating them would take longer than drawing."""
+
+    def __init__(self) -> None:
+        self._flat: dict[str, CardArray] = {}
+
+    def array(self, name: str, shape: int | tuple[int, ...], dtype: Any = np.float32) -> CardArray:
+        """Return an array of undefined values; the next one of that name overwrites it."""
+        shape = shape if isinstance(shape, tuple) else (shape,)
+        size = math.prod(shape)
+        if not size:
+            return on_card(shape, dtype)
+        if name not in self._flat or self._flat[name].shape[0] < size:
+            self._flat.pop(name, None)  # before the larger one is allocated
+            self._flat[name] = on_card(size + size // 4, dtype)
+        return self._flat[name][:size].reshape(shape)
 
 
 def sort(array: CardArray) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,11 +11,12 @@ from ...cameras.camera import Camera
 from ...model.falloff import MIN_ALPHA
 from ...model.sh import COEFFICIENTS
 from .. import rasterizer
+from ..kernels.project import COLUMNS
 from ..rasterizer import Image
 from ..settings import RasterSettings
 from ..shading import ShadedSplats
 from . import forward
-from .card import CardArray, add_up, card_errors, find_card, on_card, sort, to_card
+from .card import CardArray, CardMemory, add_up, card_errors, find_card, on_card, sort, to_card
 
 
 @dataclass(frozen=True)
@@ -25,6 +26,7 @@ class CardSplats:
     Attributes:
         center: (N, 3). scale: (N, 3). quat_xyzw: (N, 4). lod_opacity: (N,). rgb: (N, 3). sh: (N, K, 3).
         colors: (N, 3), working memory: colours that the last camera saw.
+        memory: other working memory, which the next picture overwrites.
     """
 
     center: CardArray
@@ -34,11 +36,13 @@ class CardSplats:
     rgb: CardArray
     sh: CardArray
     colors: CardArray
+    memory: CardMemory = field(default_factory=CardMemory)
 
     @classmethod
     def of(cls, *columns: NDArray[np.float32]) -> CardSplats:
         """Copy columns, in the order of the attributes, to the card."""
-        return cls(*map(to_card, columns), on_card(columns[4].shape))
+        center, scale, quat, lod_opacity, rgb, sh = map(to_card, columns)
+        return cls(center, scale, quat, lod_opacity, rgb, sh, on_card(columns[4].shape))
 
     @property
     def degree(self) -> int:
@@ -71,7 +75,7 @@ class CardView:
 
 @dataclass(frozen=True)
 class CardPicture:
-    """A picture on the card, of M splats, and how it was drawn.
+    """A picture on the card, of M splats, and how it was drawn; the next one of the same splats overwrites it.
 
     Attributes:
         image: (height, width, 4) float32.
@@ -95,21 +99,24 @@ def draw_on_card(splats: CardSplats, index: CardArray, view: CardView) -> CardPi
     """Draw the splats of an index, (M,) int32, on the card."""
     camera, settings = view.camera, view.settings
     across, down = rasterizer.tiles_across(camera)
-    number = index.shape[0]
-    screen, boxes = on_card((number, forward.COLUMNS)), on_card((number, 4), np.int16)
-    keys, count, ends = on_card(number, np.uint64), on_card(number, np.int32), on_card(number, np.int64)
+    number, new = index.shape[0], splats.memory.array
+    screen, boxes = new("screen", (number, COLUMNS)), new("boxes", (number, 4), np.int16)
+    keys, count = new("keys", number, np.uint64), new("count", number, np.int32)
+    ends = new("ends", number, np.int64)
     columns = splats.center, splats.scale, splats.quat_xyzw, splats.lod_opacity, splats.rgb, splats.sh
     camera_on_card = view.eye, view.matrix, view.view, settings.sort == "radial"
     results = splats.colors, screen, keys, boxes, count
     forward.project.for_each(number, *columns, splats.degree, index, *camera_on_card, *results)
     sort(keys)
     forward.count_in_order.for_each(number, keys, count, ends)
-    pairs = on_card(add_up(ends), np.uint64)
-    start = to_card(np.zeros(across * down + 1, np.int64))
+    pairs = new("pairs", add_up(ends), np.uint64)
+    start = new("start", across * down + 1, np.int64)
+    if not pairs.shape[0]:
+        start.copy_to_device(np.zeros(start.shape, np.int64))
     forward.list_pairs.for_each(number, keys, boxes, ends, across, pairs)
     sort(pairs)
     forward.find_starts.for_each(pairs.shape[0], pairs, start)
-    image = on_card((camera.height, camera.width, 4))
+    image = new("image", (camera.height, camera.width, 4))
     is_design = settings.profile == "shifted"
     drawn = screen, keys, start, pairs, across, is_design, np.float32(MIN_ALPHA), image
     forward.blend.launch(across * down, forward.PIXELS, *drawn)

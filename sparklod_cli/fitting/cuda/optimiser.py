@@ -1,0 +1,103 @@
+"""`CardOptimiser`: steps on a card, where the nodes, their moments and the pictures of full detail lie."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...render.cuda.card import CardArray, card_errors, on_card, to_card
+from ...render.cuda.gradients import gradients_on_card
+from ...render.cuda.rasterizer import CardPicture, CardSplats, CardView, draw_on_card
+from ..kernels import adam
+from ..nodes import FittedNodes, Index
+from ..optimiser import Optimiser, slots_of
+from ..pictures import LEAST_ERROR, FullDetailPicture
+from . import kernels
+
+
+@dataclass(frozen=True)
+class _CardExample:
+    """A camera and its picture of full detail on the card."""
+
+    picture: FullDetailPicture
+    view: CardView
+    full: CardArray
+
+
+class CardOptimiser(Optimiser):
+    """Adam on a card for the merged splats of a tree.
+
+    The columns of the nodes in memory are those of the last `synchronize`.
+
+    Raises:
+        BackendError: the memory of the card does not suffice.
+    """
+
+    def __init__(self, nodes: FittedNodes) -> None:
+        self.nodes = nodes
+        count, terms = len(nodes.merged), nodes.columns.sh.shape[1]
+        with card_errors():
+            self._now = CardSplats.of(*nodes.columns)
+            self._old = tuple(map(to_card, nodes.old))
+            self._slots = to_card(slots_of(nodes))
+            shapes = (count, adam.FIRST), (count, terms, 3), (count, adam.SECOND)
+            moments = (*(np.zeros(shape, np.float32) for shape in shapes), np.zeros(count, np.int32))
+            self._moments = adam.Moments(*map(to_card, moments))
+            self._rates = on_card(len(adam.Rates._fields))
+        # By identity: those of a fit live as long as it does.
+        self._examples: dict[int, _CardExample] = {}
+
+    def step(self, picture: FullDetailPicture, index: Index, rates: adam.Rates) -> Index:
+        """Take one step for a picture of a cut, and renew the nodes of the cut; return them."""
+        with card_errors():
+            example = self._example(picture)
+            drawn = self._index(index)
+            seen = draw_on_card(self._now, drawn, example.view)
+            gradients = gradients_on_card(self._now, seen, example.view, self._by_image(seen, example))
+            moved = self._move(drawn, example.view, gradients, rates)
+        self.nodes.place(index, moved[:, :3], moved[:, 3])
+        return index
+
+    def _example(self, picture: FullDetailPicture) -> _CardExample:
+        """Return a picture on the card, uploaded when it is first used."""
+        if id(picture) not in self._examples:
+            view = CardView.of(picture.camera, self.nodes.raster)
+            self._examples[id(picture)] = _CardExample(picture, view, to_card(picture.full))
+        return self._examples[id(picture)]
+
+    def _index(self, index: Index) -> CardArray:
+        uploaded = self._now.memory.array("index", len(index), np.int32)
+        if len(index):
+            uploaded.copy_to_device(index.astype(np.int32))
+        return uploaded
+
+    def _by_image(self, seen: CardPicture, example: _CardExample) -> CardArray:
+        """Return the derivative of the mean logarithm of the errors; see `FullDetailPicture.gradient`."""
+        new, (height, width, _) = self._now.memory.array, seen.image.shape
+        sums, weights = new("errors", (height, 2), np.float64), new("weights", 2)
+        result = new("by image", seen.image.shape)
+        kernels.squared_differences.launch(height, kernels.ROW_THREADS, seen.image, example.full, sums)
+        kernels.weigh_backgrounds.launch(1, 32, sums, float(height * width * 3), LEAST_ERROR, weights)
+        kernels.by_image.for_each(height * width, seen.image, example.full, weights, result)
+        return result
+
+    def _move(self, index: CardArray, view: CardView, gradients: CardArray, rates: adam.Rates) -> np.ndarray:
+        """Move the drawn nodes; return (M, 4) their centres and feature sizes."""
+        now, new, number = self._now, self._now.memory.array, index.shape[0]
+        by_color, moved = new("by color", (number, 3)), new("moved", (number, 4))
+        by_coefficients = new("by coefficients", (number, *now.sh.shape[1:]))
+        derivatives = gradients, by_color, by_coefficients
+        kernels.by_sh.for_each(number, now.center, index, view.eye, now.colors, *derivatives)
+        self._rates.copy_to_device(np.array(rates, np.float32))
+        columns = now.center, now.scale, now.quat_xyzw, now.lod_opacity, now.rgb, now.sh
+        state = self._rates, np.float32(self.nodes.most_d), *self._moments, moved
+        kernels.step.for_each(number, *columns, *self._old, index, self._slots, *derivatives, *state)
+        return moved.copy_to_host()
+
+    def synchronize(self) -> None:
+        """Copy the columns of the nodes from the card."""
+        with card_errors():
+            for name, column in self.nodes.columns._asdict().items():
+                if column.size:
+                    column[...] = getattr(self._now, name).copy_to_host()
