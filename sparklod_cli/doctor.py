@@ -50,6 +50,9 @@ LITTLE_MEMORY = 1 << 30
 #: What `_print_kernels` is called by, in a process of its own.
 KERNELS = f"import {__name__} as doctor; doctor._print_kernels()"
 
+#: Prints the card, its driver and the versions of what compiles for it, or exits with the reason why there is none.
+CARD = "from sparklod_cli.render.cuda.card import print_card; print_card()"
+
 #: Prints the encoder of videos.
 FFMPEG = "import imageio_ffmpeg; print(imageio_ffmpeg.get_ffmpeg_exe())"
 
@@ -83,6 +86,7 @@ def check_all(begun: Callable[[str], None] = lambda name: None) -> list[Check]:
         ("extras", _extras),
         ("OpenGL", _opengl),
         ("Open3D", _open3d),
+        ("NVIDIA card", _card),
         ("ffmpeg", _ffmpeg),
         ("Node and Chromium", _programs),
     ]
@@ -242,6 +246,19 @@ def _open3d() -> Iterator[Check]:
         reason = f"it has crashed: {_last_line(err, code)}"
     advice = f"on Debian and Ubuntu: apt install {PACKAGES}   # render --backend open3d draws with it" if reason else ""
     yield Check("Open3D", "note" if reason else "ok", reason or "draws", advice)
+
+
+def _card() -> Iterator[Check]:
+    if not _is_installed("numba-cuda"):
+        has_driver = shutil.which("nvidia-smi") is not None
+        advice = install_hint("cuda") if has_driver else ""
+        yield Check("NVIDIA card", "note" if has_driver else "ok", "not looked for without numba-cuda", advice)
+        return
+    code, out, err = _run(program_command(CARD))
+    if code:
+        yield Check("NVIDIA card", "note", _last_line(err, code))
+    else:
+        yield Check("NVIDIA card", "ok", out.strip())
 
 
 def _ffmpeg() -> Iterator[Check]:

@@ -26,7 +26,8 @@ def _why_not() -> str:
     return ""
 
 
-_missing = _why_not()
+#: Why kernels cannot run in this process; empty if they can.
+MISSING = _why_not()
 
 #: Marks of modules whose tests run kernels on a card.
-MARKS = [pytest.mark.cuda, pytest.mark.skipif(bool(_missing), reason=_missing)]
+MARKS = [pytest.mark.cuda, pytest.mark.skipif(bool(MISSING), reason=MISSING)]

@@ -141,6 +141,7 @@ def refine(
     steps: int | None = None,
     seed: int = 0,
     cameras: CameraPath | Iterable[Camera] | None = None,
+    device: str = "cpu",
     threads: int | None = None,
     progress: ProgressLike = None,
     say: Callable[[str], None] | None = None,
@@ -155,6 +156,8 @@ def refine(
         steps: pictures of cuts that are drawn and compared; None for a number that suits the size of the tree.
         seed: of the cameras and budgets that are drawn at random.
         cameras: those for which it is fitted; None for cameras around and inside the scene.
+        device: "cpu", "cuda" for an NVIDIA card, or "auto" for one if there is one. On a card the result is another
+            one, but the same every time.
         threads: to work on; None for all processors.
         progress: called with how much is done.
         say: called with a line of text after each stage.
@@ -165,12 +168,13 @@ def refine(
     Raises:
         FormatError: the scene has no tree.
         InvalidSplatsError: a node has numbers that no splat has.
-        ValueError: a number is out of its range, or there are no cameras.
+        ValueError: a number is out of its range, there are no cameras, or no such device.
+        BackendError: there is no card that can be used.
         OutOfMemoryError: it does not fit into memory.
     """
     if scene_like(tree).tree is None:
         raise FormatError("the scene has no Level-of-Detail tree; build_lod makes one")
-    settings = FitSettings(steps, seed, None if cameras is None else path_like(cameras))
+    settings = FitSettings(steps, seed, None if cameras is None else path_like(cameras), device)
     with progress_callback(progress) as callback, memory_errors_translated():
         return refined_tree(tree, settings, thread_count(threads), callback, say)
 

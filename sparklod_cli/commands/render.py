@@ -137,7 +137,7 @@ def _draw(ctx: click.Context, options: RenderOptions) -> None:
                 viewed_files(options, instances, console),
                 budget,
                 options.cut.settings(),
-                look.settings(),
+                look.settings(console.say),
                 place,
                 fit_planes=fit_planes(ctx),
                 through=look.through,

@@ -55,7 +55,7 @@ def compare(ctx: click.Context, options: RenderOptions) -> int:
                 viewed_files(options, instances, console),
                 budgets,
                 _limited(options),
-                dataclasses.replace(options.appearance.settings(), max_sh=options.comparison.max_sh),
+                dataclasses.replace(options.appearance.settings(console.say), max_sh=options.comparison.max_sh),
                 table,
                 fit_planes=fit_planes(ctx),
                 asserts=asserts,

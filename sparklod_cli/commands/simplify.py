@@ -113,6 +113,7 @@ class SimplifiedFiles:
         excludes=("max_bytes",),
     )
     seed: int = setting_of(FitSettings, "seed")
+    device: str = setting_of(FitSettings, "device")
     output: Place = option(
         "Output, whose name tells the format: .ply, .spz, .sog, DIR/meta.json (an unpacked SOG), .glb, .rad or .splat,"
         " which has no SH; DIR/ means DIR/NAME-small.spz, - standard output, as SPZ.",
@@ -172,7 +173,9 @@ class SimplifyOptions:
             suffix=files.suffix,
             options=dataclasses.replace(self.written, rad=rad, sog=SogOptions(codes)),
             simplify=files.goal,
-            refine=None if files.refine is None else FitSettings(steps=files.refine or None, seed=files.seed),
+            refine=None
+            if files.refine is None
+            else FitSettings(steps=files.refine or None, seed=files.seed, device=files.device),
             camera_path=files.camera_path,
             converts=True,
             unused=tuple(flags_set(ctx, ("max_sh", *parameters_of(SelectionOptions, TransformOptions)))),

@@ -36,7 +36,8 @@ class FitSettings(CheckedSettings):
     path: CameraPath | None = None
     device: str = setting(
         "cpu",
-        "What --refine computes with: an NVIDIA card if there is one (auto), the processor, or a card (cuda).",
+        "What --refine computes with: an NVIDIA card if there is one (auto), the processor, or a card (cuda)."
+        " Cards are tested in a simulator only.",
         DEVICES,
         needs="refine",
     )

@@ -93,8 +93,8 @@ class RenderSettings(CheckedSettings):
     )
     backend: str = setting(
         "numba",
-        "Renderer: numba is the reference, cuda draws the same on an NVIDIA card, osmesa is OpenGL in software, open3d"
-        " is a quick look.",
+        "Renderer: numba is the reference, cuda is its kernels on an NVIDIA card (tested in a simulator only), osmesa"
+        " is OpenGL in software, open3d is a quick look.",
         tuple(BACKENDS),
     )
     color_by: str | None = setting(

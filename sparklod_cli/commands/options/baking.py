@@ -229,10 +229,13 @@ class RefineOptions:
         needs="refine",
     )
     seed: int = setting_of(FitSettings, "seed")
+    device: str = setting_of(FitSettings, "device")
 
     def settings(self) -> FitSettings | None:
         """Return how merged splats are fitted; None without --refine."""
-        return None if self.refine is None else FitSettings(steps=self.refine or None, seed=self.seed)
+        if self.refine is None:
+            return None
+        return FitSettings(steps=self.refine or None, seed=self.seed, device=self.device)
 
 
 def _memory(text: str) -> int:

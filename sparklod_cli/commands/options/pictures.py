@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
@@ -12,6 +12,7 @@ import click
 
 from ...codecs.rounding import ROUND_TRIPS
 from ...images.defaults import JPEG_QUALITY, MOVING, STILL, THUMBNAIL_SIZE, THUMBNAIL_SUPERSAMPLE
+from ...render.devices import DEVICES, uses_card
 from ...render.settings import OF_PIXELS, SORTINGS, RenderSettings
 from ...support import defaults
 from ...support.setting_fields import Range, whole
@@ -66,6 +67,12 @@ class Appearance:
     )
     alpha: bool = flag("Keep alpha, as --background transparent does.")
     render: RenderSettings = field(default_factory=RenderSettings)
+    device: str = option(
+        "What the backend numba draws with: an NVIDIA card if there is one (auto), the processor, or a card (cuda)."
+        " Cards are tested in a simulator only.",
+        DEVICES,
+        "cpu",
+    )
     no_bar: bool = flag("Leave out the colour bar of --color-by or --diff.")
     through: str | None = option(
         "Draw splats as Spark's PackedSplats or ExtSplats, SPZ or RAD round them; cuts stay those of the file."
@@ -91,11 +98,13 @@ class Appearance:
         if not raster.near < raster.far:
             raise click.UsageError(f"--near {raster.near:g} must be less than --far {raster.far:g}")
         if render.style != "splats":
-            exclude(ctx, ["backend"], f"--style {render.style}, which every picture gets from one renderer")
+            exclude(ctx, ["backend", "device"], f"--style {render.style}, which every picture gets from one renderer")
         exclude(ctx, UNSTYLED.get(render.style, ()), f"--style {render.style}")
         exclude(ctx, UNKNOWN_TO.get(render.backend, ()), f"--backend {render.backend}")
+        if render.backend != "numba":
+            exclude(ctx, ["device"], f"--backend {render.backend}")
         if render.color_by == "overdraw":
-            exclude(ctx, ["sort", "style", "backend"], "--color-by overdraw, which counts splats")
+            exclude(ctx, ["sort", "style", "backend", "device"], "--color-by overdraw, which counts splats")
         if is_set(ctx, "background") and self.background is not None:
             exclude(ctx, ["alpha"], "--background, which fills what is transparent")
 
@@ -116,11 +125,17 @@ class Appearance:
             raise click.UsageError(f".{form} has no alpha; write .png or .webp, or name a --background such as black")
         return None if self.keeps_alpha or (form == "npy" and not is_set(ctx, "background")) else self.background
 
-    def settings(self) -> RenderSettings:
-        """Return the settings of pictures, with the options of the backend."""
+    def settings(self, say: Callable[[str], None]) -> RenderSettings:
+        """Return the settings of pictures, with the options of the backend; say which device draws, if it is chosen.
+
+        Raises:
+            BackendError: a card is asked for, and there is none that can be used.
+        """
         options = {"sorting": self.sorting, "throttle": self.sort_throttle}
         known = {name: value for name, value in options.items() if value is not None}
-        return dataclasses.replace(self.render, options=known)
+        on_card = self.render.backend == "numba" and uses_card(self.device, say)
+        backend = "cuda" if on_card else self.render.backend
+        return dataclasses.replace(self.render, backend=backend, options=known)
 
     def of_pictures(self) -> tuple[str, ...]:
         """Return the options that cannot be used with a file of numbers, by what its numbers are."""

@@ -80,6 +80,18 @@ def _sorter() -> str:
     return "cupy" if importlib.util.find_spec("cupy") else "numpy"
 
 
+def print_card() -> None:
+    """Print the card and versions of packages; exit with the reason if there is none that can be used."""
+    from importlib import metadata
+
+    try:
+        card = find_card()
+    except BackendError as error:
+        raise SystemExit(str(error)) from None
+    versions = [f"{name} {metadata.version(name)}" for name in ("numba", "numba-cuda")]
+    print(f"{card}, {card.free / 1e9:.1f} GB are free; {', '.join(versions)}; arrays are sorted by {card.sorter}")
+
+
 @contextlib.contextmanager
 def card_errors() -> Iterator[None]:
     """Turn errors of the card inside, such as memory that does not suffice, into `BackendError`."""

@@ -111,7 +111,7 @@ GIVEN: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 AWAY = 1000.0
 
 #: Options that change how work is done, or what is said, and nothing that comes out.
-OF_WORK = {"overwrite", "jobs", "threads", "quiet", "verbose", "as_json"}
+OF_WORK = {"device", "overwrite", "jobs", "threads", "quiet", "verbose", "as_json"}
 
 MODES: dict[str, tuple[str, ...]] = {
     "a still": (*AT, "-o", "out.png"),

@@ -1,0 +1,75 @@
+"""Devices are chosen, and what is wrong with a card is one line; on machines without one."""
+
+from __future__ import annotations
+
+import importlib.util
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from sparklod_cli.cli import run
+from sparklod_cli.fitting.settings import FitSettings
+from sparklod_cli.render.backends import BackendError
+from sparklod_cli.render.devices import DEVICES, uses_card
+from tests.cards import MISSING
+from tests.conftest import FIXTURES, Capture
+
+pytestmark = pytest.mark.skipif(not MISSING, reason="there is a card")
+
+#: Draws by the processor, and prints the modules that only a card needs.
+DRAW = """
+import sys
+from sparklod_cli.cli import run
+assert run(["render", sys.argv[1], "--size", "16x16", "-o", sys.argv[2], "-q"]) == 0
+print([name for name in sys.modules if "jit_cuda" in name or "render.cuda" in name or name == "cupy"])
+"""
+
+
+def test_the_processor_is_used_unless_a_card_is_asked_for() -> None:
+    assert not uses_card("cpu")
+    assert FitSettings().device == "cpu"
+    with pytest.raises(ValueError, match="device"):
+        FitSettings(device="gpu")
+
+
+def test_auto_is_the_processor_without_a_card(monkeypatch: pytest.MonkeyPatch) -> None:
+    said: list[str] = []
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    assert not uses_card("auto", said.append)
+    assert not said  # the extra is not installed
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
+    assert not uses_card("auto", said.append)
+    assert len(said) == 1
+    assert said[0].startswith("uses the processor: ")
+
+
+def test_a_card_that_is_not_there_is_one_line() -> None:
+    with pytest.raises(BackendError) as error:
+        uses_card("cuda")
+    assert "\n" not in str(error.value)
+
+
+def test_what_the_extra_brings_is_named_where_it_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    import numba
+
+    monkeypatch.delattr(numba, "cuda", raising=False)
+    monkeypatch.setitem(sys.modules, "numba.cuda", None)
+    with pytest.raises(BackendError, match=r"takes numba-cuda: .*install"):
+        uses_card("cuda")
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_commands_take_a_device(device: str, tmp_path: Path, capsys: Capture) -> None:
+    output, file = tmp_path / "out.png", str(FIXTURES / "sh1.ply")
+    status = run(["render", file, "--size", "16x16", "--device", device, "-o", str(output), "-q"])
+    assert status == (device == "cuda")
+    assert output.exists() == (device != "cuda")
+    assert len(capsys.readouterr().err.splitlines()) == (device == "cuda")
+
+
+def test_nothing_of_a_card_is_imported_without_one(tmp_path: Path) -> None:
+    arguments = [sys.executable, "-c", DRAW, str(FIXTURES / "sh1.ply"), str(tmp_path / "out.png")]
+    found = subprocess.run(arguments, capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "[]"
