@@ -101,7 +101,7 @@ def test_fitting_comes_closer_and_is_the_same_for_any_number_of_threads() -> Non
 
 
 def test_leaves_of_a_set_are_fitted_too_and_sizes_change_more_than_those_of_a_tree(tree: sparklod.Tree) -> None:
-    plain, fitted = (sparklod.simplify(tree, to=0.3, refine=steps).splats for steps in (None, 60))
+    plain, fitted = sparklod.simplify(tree, to=0.3).splats, sparklod.simplify(tree, to=0.3, refine=60).splats
     leaves = tree.splats.center[tree.tree.is_leaf]
     is_leaf = (plain.center[:, None] == leaves).all(axis=2).any(axis=1)
     assert 100 < is_leaf.sum() < len(plain)
