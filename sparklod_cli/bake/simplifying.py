@@ -107,7 +107,7 @@ def _smallest(least: float, leaves: int, psnr_of: Measure, progress: Progress) -
 
 
 class Fidelity:
-    """How close cuts of a tree are to its leaves, in pictures.
+    """PSNR of cuts of a tree against its leaves, by pictures.
 
     Args:
         tree: with opacities of at most 1.
