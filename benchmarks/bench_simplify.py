@@ -211,7 +211,7 @@ def comparison_table(scenes: Scenes) -> str:
             if method in methods:
                 measured = methods[method]
                 seconds = dict(zip(measured["splats"], measured["seconds"], strict=False))
-                runs = COMPARED if len(seconds) > 1 else SHARES[:1]
+                runs = COMPARED if len(seconds) > 1 else seconds
                 peak = f"{max(measured['peak_bytes']) / 1e6:,.0f}"
                 cells = [cell for share in COMPARED for cell in _cells(measured["views"][CAMERAS][share])]
                 cameras = "all" if method in SETS else "each"

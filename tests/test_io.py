@@ -29,7 +29,10 @@ def test_the_content_decides_the_format_whatever_the_suffix(kind: str, suffix: s
     ("content", "reason"),
     [
         (b"", "the file is empty"),
-        (b"x", r"not a splat file that sparklod reads \(.*PLY, SPZ, RAD, Streamed SOG, SOG, GLB, KSPLAT, SPLAT\)"),
+        (
+            b"x",
+            r"not a splat file that sparklod reads \(.*, Streamed SOG, checkpoint, SOG, GLB, KSPLAT, SPLAT\)",
+        ),
         (b"plywood\n" * 99, "not a splat file"),
         (b"PLY\nformat ascii 1.0\n", "not a splat file"),
         (b"ply", "not a splat file"),

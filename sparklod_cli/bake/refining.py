@@ -95,11 +95,9 @@ def refined(
 
 
 def _within(nodes: Splats, scene: Scene) -> Splats:
-    """Return nodes whose merged splats stay in the box of all centres before.
+    """Return nodes that stay in the box of all centres before.
 
     A format that holds these with some number of bits then still does; with another one, leaves would move.
     """
-    assert scene.tree is not None
-    center, inner, before = nodes.center.copy(), ~scene.tree.is_leaf, scene.splats.center
-    center[inner] = np.clip(center[inner], before.min(axis=0), before.max(axis=0))
-    return dataclasses.replace(nodes, center=center)
+    before = scene.splats.center
+    return dataclasses.replace(nodes, center=nodes.center.clip(before.min(axis=0), before.max(axis=0)))

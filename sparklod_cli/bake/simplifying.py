@@ -6,22 +6,22 @@ import dataclasses
 import functools
 import itertools
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..cameras.camera import Camera
 from ..codecs.formats import Format
 from ..codecs.losses import settled_with_losses
 from ..codecs.options import WriteOptions
 from ..fitting.settings import FitSettings
-from ..images.metrics import BACKGROUNDS, on_background, psnr
 from ..io.writing import SceneSink
 from ..lod.detail_levels import RefinementOrder, with_plain_opacity
-from ..model.instances import Instance
 from ..model.scene import Scene
-from ..render.rasterizer import Image
+from ..model.splats import Splats
 from ..support.errors import FormatError, SparklodError
 from ..support.parallel import on_threads
 from ..support.progress import Progress
@@ -29,6 +29,9 @@ from .output import BakeOutput, Encode
 from .records import BuiltTree, Clock, WrittenSet, WrittenTree
 from .refining import Refined, fit_settings, refined
 from .settings import BakeSettings, SimplifyGoal
+
+if TYPE_CHECKING:
+    from ..fitting.nodes import FittedSet
 
 #: Cameras that a PSNR is measured with where nobody names any, and their seed: as many as judge a fitted tree.
 CAMERAS, SEED = 16, 0
@@ -103,53 +106,42 @@ def _smallest(least: float, leaves: int, psnr_of: Measure, progress: Progress) -
     return high, best
 
 
-class Pictures:
-    """Pictures of full detail, with which those of simplified scenes are compared.
+class Fidelity:
+    """PSNR of cuts of a tree against its leaves, by pictures.
 
     Args:
-        full: splats without a tree.
-        cameras: that see them; None for `CAMERAS` around and inside the scene.
+        tree: with opacities of at most 1.
+        cameras: that see it; None for `CAMERAS` around and inside the scene.
 
     Raises:
         SparklodError: no camera sees anything.
     """
 
-    def __init__(self, full: Scene, cameras: Sequence[Camera] | None, threads: int) -> None:
+    def __init__(self, tree: Scene, cameras: Sequence[Camera] | None, threads: int) -> None:
         from ..fitting.cameras import Place, placed
-        from ..fitting.pictures import MOST_MISSES, shows_enough
+        from ..fitting.fit import raster_for
+        from ..fitting.pictures import pictures
 
-        self._threads = threads
-        many = placed(Place.of(full.splats.center), np.random.SeedSequence(SEED)) if cameras is None else cameras
-        tried = itertools.islice(many, CAMERAS + MOST_MISSES if cameras is None else None)
-        drawn = self._drawn(full, tried)
-        seen = ((camera, image) for camera, image in drawn if shows_enough(image))
-        self._full = list(itertools.islice(seen, CAMERAS if cameras is None else None))
-        if not self._full:
+        assert tree.tree is not None
+        self._tree, self._threads = tree.tree, threads
+        place = Place.of(tree.splats.center[tree.tree.is_leaf])
+        self._raster = raster_for(place)
+        nodes = self._set(tree.splats, np.flatnonzero(tree.tree.is_leaf))
+        many = placed(place, np.random.SeedSequence(SEED)) if cameras is None else iter(cameras)
+        self._pictures = list(itertools.islice(pictures(many, nodes), CAMERAS if cameras is None else None))
+        if not self._pictures:
             raise SparklodError("no camera sees enough to measure a PSNR by; name cameras with --camera-path")
 
-    def _drawn(self, scene: Scene, cameras: Iterable[Camera]) -> Iterable[tuple[Camera, Image]]:
-        from ..render.renderer import Renderer
-        from ..render.settings import RenderSettings
-        from ..scenes.finder import FixedCut
-        from ..scenes.reading import read_scenes
+    def psnr(self, nodes: Splats, cut: NDArray[np.int64]) -> float:
+        """Return the mean PSNR of a cut, ascending, over all cameras and a black and a white background, dB."""
+        from ..fitting.pictures import mean_psnr
 
-        renderer = Renderer(
-            FixedCut(read_scenes([Instance(scene)], threads=self._threads).full()), RenderSettings(), []
-        )
-        return ((camera, renderer.draw(camera).image) for camera in cameras)
+        return mean_psnr(self._set(nodes, cut), 1, self._pictures)
 
-    def psnr(self, scene: Scene) -> float:
-        """Return the mean PSNR of a scene over all cameras and a black and a white background, dB."""
-        drawn = self._drawn(scene, [camera for camera, _ in self._full])
-        return float(
-            np.mean(
-                [
-                    psnr(on_background(image, gray), on_background(full, gray))
-                    for (_, image), (_, full) in zip(drawn, self._full, strict=True)
-                    for gray in BACKGROUNDS.values()
-                ]
-            )
-        )
+    def _set(self, nodes: Splats, cut: NDArray[np.int64]) -> FittedSet:
+        from ..fitting.nodes import FittedSet
+
+        return FittedSet(nodes, self._tree, cut, self._raster, self._threads)
 
 
 @dataclass(frozen=True)
@@ -200,7 +192,7 @@ class Simplifier:
             bytes_of: size of the file of a scene.
 
         Raises:
-            FormatError, SparklodError: see `count_for` and `Pictures`.
+            FormatError, SparklodError: see `count_for` and `Fidelity`.
             KeyboardInterrupt: see `refining.refined`.
         """
         assert tree.tree is not None
@@ -211,20 +203,20 @@ class Simplifier:
         def cut(count: int) -> Scene:
             return dataclasses.replace(tree, splats=tree.splats.take(order.cut(count)), tree=None)
 
-        pictures = None if self.goal.psnr is None else Pictures(cut(order.leaves), self.cameras, threads)
+        fidelity = None if self.goal.psnr is None else Fidelity(tree, self.cameras, threads)
         count, measured = count_for(
             self.goal,
             order.leaves,
             bytes_of=lambda count: bytes_of(cut(count)),
-            psnr_of=lambda count: 0.0 if pictures is None else pictures.psnr(cut(count)),
+            psnr_of=lambda count: 0.0 if fidelity is None else fidelity.psnr(tree.splats, order.cut(count)),
             progress=progress,
         )
         if self.refine is None:
             return Chosen(cut(count), measured, None)
         fixed = order.cut(count)
         fitted, report = refined(tree, self.refine, fixed=fixed, threads=threads, progress=progress, say=self.say)
-        chosen = dataclasses.replace(fitted, splats=fitted.splats.take(fixed), tree=None)
-        return Chosen(chosen, None if pictures is None else pictures.psnr(chosen), report)
+        measured = None if fidelity is None else fidelity.psnr(fitted.splats, fixed)
+        return Chosen(dataclasses.replace(fitted, splats=fitted.splats.take(fixed), tree=None), measured, report)
 
 
 @dataclass(frozen=True)

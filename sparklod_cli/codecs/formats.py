@@ -98,6 +98,8 @@ FORMATS = (
         folders=True,
         detailed=True,
     ),
+    # A zip that begins with NAME/data.pkl; SOG is a zip, too.
+    Format("checkpoint", "checkpoint", (".pt", ".ckpt"), rb"PK\x03\x04.{26}[^/]{1,200}/data\.pkl"),
     # A zip, or its meta.json unpacked.
     Format(
         "SOG",

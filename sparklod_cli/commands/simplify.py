@@ -104,7 +104,7 @@ class SimplifiedFiles:
         heading=COMMON,
     )
     refine: int | None = option(
-        "Fit the merged splats to pictures of the INPUT, in STEPS pictures: a minute or more, for some dB."
+        "Fit the splats to pictures of the INPUT, in STEPS pictures: a minute or more, for some dB."
         "  [default, without STEPS: by the size of the scene]",
         Steps(STEPS, placeholder="STEPS", example=EXAMPLE_STEPS),
         is_flag=False,

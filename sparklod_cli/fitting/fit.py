@@ -50,9 +50,9 @@ def fit(
 
     Args:
         nodes: N nodes in final order.
-        tree: of them; it stays as it is, and so do the leaves, bit for bit.
-        fixed: indices of one cut, ascending, whose nodes alone are fitted, for all cameras; no node has an opacity
-            above 1, and none gets one. None for the cuts that Spark draws.
+        tree: of them; it stays as it is, and so do the leaves, bit for bit, unless `fixed` has them.
+        fixed: indices of one cut, ascending, whose nodes alone are fitted, leaves too, for all cameras; no node has an
+            opacity above 1, and none gets one. None for the cuts that Spark draws.
         antialiased: of the scene; splats are drawn the same either way, as Spark draws them.
         say: called with a line of text after each stage.
         interrupted: asked between steps; when it returns True, what the finished stages gained is returned.
@@ -74,6 +74,12 @@ def fit(
         return fitting.finish(is_complete)
 
 
+def raster_for(place: Place) -> RasterSettings:
+    """Return the settings that the pictures of a scene are drawn with."""
+    raster = RasterSettings()
+    return RasterSettings(near=min(raster.near, NEAR * place.radius), far=max(raster.far, FAR * place.radius))
+
+
 class _Fitting:
     """State of a fit."""
 
@@ -87,9 +93,7 @@ class _Fitting:
         say: Callable[[str], None],
     ) -> None:
         place = Place.of(nodes.center[tree.is_leaf])
-        raster = RasterSettings()
-        near, far = min(raster.near, NEAR * place.radius), max(raster.far, FAR * place.radius)
-        raster = RasterSettings(near=near, far=far)
+        raster = raster_for(place)
         self.nodes = (
             FittedNodes(nodes, tree, raster, threads)
             if fixed is None
@@ -101,7 +105,7 @@ class _Fitting:
             training, held_out = map(iter, split_path(settings.path))
         steps = default_steps(len(self.nodes.leaves)) if settings.steps is None else settings.steps
         self._held_out = list(itertools.islice(pictures(held_out, self.nodes), HELD_OUT))
-        can_gain = bool(self._held_out) and self.nodes.merged.size > 0
+        can_gain = bool(self._held_out) and self.nodes.fitted.size > 0
         self._training = list(itertools.islice(pictures(training, self.nodes), min(TRAINING, steps) * can_gain))
         self._schedule = Schedule(steps if self._training else 0)
         self._examples = self._drawn(np.random.Generator(np.random.PCG64(seeds[2])))
@@ -151,9 +155,9 @@ class _Fitting:
 
     def finish(self, is_complete: bool) -> tuple[Splats, FitReport]:
         """Return the best nodes, those that lost with their first values, and the report."""
-        self.nodes.restore(self.nodes.merged, self._kept)
+        self.nodes.restore(self.nodes.fitted, self._kept)
         after = self._lawful() if self._stages else self._before
-        kept = float(self.nodes.changed()[self.nodes.merged].mean()) if self.nodes.merged.size else 0.0
+        kept = float(self.nodes.changed()[self.nodes.fitted].mean()) if self.nodes.fitted.size else 0.0
         report = FitReport(self._schedule.done, tuple(self._stages), self._before, after, kept, is_complete)
         return self.nodes.result(), report
 
@@ -164,7 +168,7 @@ class _Fitting:
             after = keep_gains(self.nodes, self._held_out, self._before)
             if not keep_sizes(self.nodes):
                 return after
-        self.nodes.restore(self.nodes.merged)
+        self.nodes.restore(self.nodes.fitted)
         return self._before
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -37,7 +38,7 @@ class FittedNodes:
         columns: of the nodes, as they are now; changed in place.
         old: the columns as they were at first.
         leaves: indices of full detail, ascending.
-        merged: indices of the nodes that may change, ascending.
+        fitted: indices of the nodes that may change, ascending: the merged splats.
         shares: of the leaves, of the cuts that nodes are judged by.
         most_d: largest D that fitting gives a node.
     """
@@ -45,13 +46,21 @@ class FittedNodes:
     shares: Sequence[float] = SHARES
     most_d: float = float(MOST_D)
 
+    #: Factor that feature sizes may change by, either way. They decide which nodes a cut refines, and the builder chose
+    #: them well. Measured (benchmarks/notes/refining.md).
+    most_growth = 1.06
+
+    #: Least feature size of a node, over the mean of its children's, weighted by opacity times surface. `inspect
+    #: --check` warns below a third, also after rounding to the steps of a format.
+    least_ratio = 0.38
+
     def __init__(self, nodes: Splats, tree: LodTree, raster: RasterSettings, threads: int) -> None:
         self.original, self.tree, self.raster = nodes, tree, raster
         d = lod_opacity(nodes.opacity)
         self.old = Columns(nodes.center, nodes.scale, nodes.quat_xyzw, d, nodes.rgb, nodes.sh)
         self.columns = _copied(self.old)
         self.leaves: Index = np.flatnonzero(tree.is_leaf)
-        self.merged: Index = np.flatnonzero(~tree.is_leaf)
+        self.fitted: Index = np.flatnonzero(~tree.is_leaf)
         self._forest = Forest([nodes_of(nodes, tree, PLAIN, precision="float16", threads=threads)])
         self._traversal = Traversal(self._forest, [TreeInstance(foveation=Cones())])
 
@@ -126,7 +135,7 @@ class FittedNodes:
 
 
 class FittedSet(FittedNodes):
-    """The nodes of one cut for all cameras while they change; none gets an opacity above 1.
+    """The nodes of one cut for all cameras while they change, leaves too; none gets an opacity above 1.
 
     Args:
         nodes: of the tree, with opacities of at most 1.
@@ -135,10 +144,13 @@ class FittedSet(FittedNodes):
 
     most_d = 1.0
 
+    #: No camera chooses among the nodes by their sizes; single scales are limited, see `adam.MOST_CHANGE`.
+    most_growth, least_ratio = math.inf, 0.0
+
     def __init__(self, nodes: Splats, tree: LodTree, fixed: Index, raster: RasterSettings, threads: int) -> None:
         super().__init__(nodes, tree, raster, threads)
         self._fixed = fixed
-        self.merged = np.intersect1d(fixed, self.merged)
+        self.fitted = fixed[: None if (~tree.is_leaf[fixed]).any() else 0]  # leaves alone are full detail
         self.shares = (len(fixed) / len(self.leaves),)
 
     def cut(self, camera: Camera, share: float) -> Index:

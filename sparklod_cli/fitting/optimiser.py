@@ -28,7 +28,7 @@ class Optimiser:
 
     def __init__(self, nodes: FittedNodes) -> None:
         self.nodes = nodes
-        count, terms = len(nodes.merged), nodes.columns.sh.shape[1]
+        count, terms = len(nodes.fitted), nodes.columns.sh.shape[1]
         self._slots = slots_of(nodes)
         self._moments = adam.Moments(
             np.zeros((count, adam.FIRST), np.float32),
@@ -48,7 +48,8 @@ class Optimiser:
         derivatives = found.center, found.log_scale, found.turn, found.lod_opacity, rgb, sh
         columns = adam.Gradients(*map(np.ascontiguousarray, derivatives))
         rates = adam.Rates(*map(np.float32, rates))
-        adam.step(nodes.columns, nodes.old, seen, self._slots, columns, rates, self._moments)
+        growth = np.float32(nodes.most_growth)
+        adam.step(nodes.columns, nodes.old, seen, self._slots, columns, rates, self._moments, growth)
         nodes.renew(seen)
         return seen
 
@@ -59,7 +60,7 @@ class Optimiser:
 def slots_of(nodes: FittedNodes) -> NDArray[np.int32]:
     """Return the row of each node in `Moments`, -1 for those that do not change."""
     slots = np.full(len(nodes.tree), -1, np.int32)
-    slots[nodes.merged] = np.arange(len(nodes.merged), dtype=np.int32)
+    slots[nodes.fitted] = np.arange(len(nodes.fitted), dtype=np.int32)
     return slots
 
 

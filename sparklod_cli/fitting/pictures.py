@@ -30,10 +30,6 @@ MOST_MISSES = 64
 #: Share of the leaves -> mean PSNR, dB.
 Scores = dict[float, float]
 
-#: Least feature size of a node, over the mean of its children's, weighted by opacity times surface. `inspect --check`
-#: warns below a third, also after rounding to the steps of a format.
-LEAST_RATIO = 0.38
-
 #: Times that half of what was changed is taken back, before all is.
 HALVES = 12
 
@@ -85,14 +81,16 @@ def shows_enough(image: Image) -> bool:
 
 def scores_of(nodes: FittedNodes, held_out: Sequence[FullDetailPicture]) -> Scores:
     """Return the means over held-out pictures and a black and a white background; empty without pictures."""
-    scores: Scores = {}
-    for share in nodes.shares if held_out else ():
-        psnr: list[float] = []
-        for picture in held_out:
-            _, shaded = nodes.visible(nodes.cut(picture.camera, share), picture.camera)
-            psnr += map(psnr_of, picture.errors(draw(shaded, picture.camera, nodes.raster)))
-        scores[share] = float(np.mean(psnr))
-    return scores
+    return {share: mean_psnr(nodes, share, held_out) for share in (nodes.shares if held_out else ())}
+
+
+def mean_psnr(nodes: FittedNodes, share: float, compared: Sequence[FullDetailPicture]) -> float:
+    """Return the mean PSNR of cuts of a share of the leaves over pictures and a black and a white background, dB."""
+    psnr: list[float] = []
+    for picture in compared:
+        _, shaded = nodes.visible(nodes.cut(picture.camera, share), picture.camera)
+        psnr += map(psnr_of, picture.errors(draw(shaded, picture.camera, nodes.raster)))
+    return float(np.mean(psnr))
 
 
 def gain(before: Scores, after: Scores) -> float:
@@ -110,7 +108,7 @@ def keep_sizes(nodes: FittedNodes) -> bool:
     at_first = _ratios(nodes.old, nodes, parent)
     restored = np.zeros(len(parent), np.bool_)
     while True:
-        small = _ratios(nodes.columns, nodes, parent) < np.minimum(LEAST_RATIO, at_first)
+        small = _ratios(nodes.columns, nodes, parent) < np.minimum(nodes.least_ratio, at_first)
         if not small.any():
             break
         # Where the node itself has its first values already, its children have grown.
@@ -142,6 +140,6 @@ def keep_gains(nodes: FittedNodes, held_out: Sequence[FullDetailPicture], before
         if not now[worst] < before[worst]:
             return now
         drawn = [nodes.cut(picture.camera, worst) for picture in held_out]
-        nodes.halve(np.intersect1d(np.unique(np.concatenate(drawn)), nodes.merged))
-    nodes.restore(nodes.merged)
+        nodes.halve(np.intersect1d(np.unique(np.concatenate(drawn)), nodes.fitted))
+    nodes.restore(nodes.fitted)
     return before

@@ -57,9 +57,10 @@ class Range:
         """Raise TypeError unless a value is a number, and ValueError unless it is in the range; both name it."""
         if isinstance(value, bool) or not isinstance(value, numbers.Integral if self.whole else numbers.Real):
             raise TypeError(f"{name} is {value!r}; give a {'whole ' * self.whole}number, {self}")
-        if self.whole and abs(value) > MOST_WHOLE:
-            raise ValueError(f"{name} is a number of {len(str(abs(value)))} digits, which is too large")
-        if value not in self:
+        number: Any = value  # abstract numbers have no operators for mypy
+        if self.whole and abs(number) > MOST_WHOLE:
+            raise ValueError(f"{name} is a number of {len(str(abs(number)))} digits, which is too large")
+        if number not in self:
             raise ValueError(f"{name} is {value}; give {self}")
 
 

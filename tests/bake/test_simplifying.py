@@ -10,6 +10,7 @@ import pytest
 import sparklod_cli as sparklod
 from sparklod_cli.bake.settings import SimplifyGoal
 from sparklod_cli.bake.simplifying import CLOSE_BYTES, CLOSE_COUNT, count_for
+from sparklod_cli.fitting.nodes import FittedNodes
 from sparklod_cli.lod.budget import parse_budget
 from sparklod_cli.lod.detail_levels import RefinementOrder
 from sparklod_cli.model.lod_tree import LodTree
@@ -97,6 +98,21 @@ def test_fitting_comes_closer_and_is_the_same_for_any_number_of_threads() -> Non
     full = sparklod.render(SCENE, camera)
     before, after = (sparklod.psnr(sparklod.render(each, camera), full) for each in (plain, one))
     assert after > before
+
+
+def test_leaves_of_a_set_are_fitted_too_and_sizes_change_more_than_those_of_a_tree(tree: sparklod.Tree) -> None:
+    plain, fitted = sparklod.simplify(tree, to=0.3).splats, sparklod.simplify(tree, to=0.3, refine=60).splats
+    leaves = tree.splats.center[tree.tree.is_leaf]
+    is_leaf = (plain.center[:, None] == leaves).all(axis=2).any(axis=1)
+    assert 100 < is_leaf.sum() < len(plain)
+    assert (fitted.rgb != plain.rgb).any(axis=1)[is_leaf].any()
+    growth = fitted.scale.mean(axis=1) / plain.scale.mean(axis=1)
+    assert growth.max() > 1.1 > FittedNodes.most_growth
+
+
+def test_fitting_leaves_a_scene_as_it_is_where_nothing_is_merged() -> None:
+    whole = sparklod.simplify(SCENE, to=1.0, refine=30).splats
+    np.testing.assert_array_equal(np.sort(whole.rgb, axis=0), np.sort(SCENE.splats.rgb, axis=0))
 
 
 @pytest.mark.parametrize("most", [1000, 34_567, 999_999])

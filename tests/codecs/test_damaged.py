@@ -37,6 +37,7 @@ FILES = (
     "golden/sh1-streamed-sog/lod-meta.json",
     *(f"golden/sh2-level{level}.ksplat" for level in (0, 1, 2)),
     "golden/sh0.splat",
+    *("golden/sh2-gsplat.pt", "golden/sh1-nerfstudio.ckpt"),
     "golden/sh1-tree.rad",
     *(f"golden/{name}.glb" for name in ("sh2", "sh1-quantized", "hand-spz")),
 )

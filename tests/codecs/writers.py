@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from fixtures import (
     by_hand,
+    by_hand_checkpoint,
     by_hand_compressed_ply,
     by_hand_glb,
     by_hand_ksplat,
@@ -338,6 +339,22 @@ GLB = {
     ),
 }
 
+# --- Checkpoints ------------------------------------------------------------------------------------------------------
+
+CHECKPOINT = {
+    name: Case(
+        "checkpoint",
+        lambda source, ways=ways: by_hand_checkpoint.checkpoint(**linear(source), **ways),
+        exact,
+    )
+    for name, ways in {
+        "gsplat": {},
+        "gsplat, float64": {"number": "<f8"},
+        "nerfstudio": {"program": "nerfstudio"},
+        "nerfstudio, old": {"program": "nerfstudio", "prefix": "_model."},
+    }.items()
+}
+
 #: Every way to write each format of the table, by its name there.
 WRITERS: dict[str, dict[str, Case]] = {
     "PLY": PLY,
@@ -349,4 +366,5 @@ WRITERS: dict[str, dict[str, Case]] = {
     "SPLAT": SPLAT,
     "RAD": RAD,
     "GLB": GLB,
+    "checkpoint": CHECKPOINT,
 }

@@ -7,7 +7,7 @@ import pytest
 
 from sparklod_cli.fitting import cameras
 from sparklod_cli.fitting.cameras import Place, placed
-from sparklod_cli.fitting.kernels.adam import MOST_D, MOST_GROWTH, Rates
+from sparklod_cli.fitting.kernels.adam import MOST_D, Rates
 from sparklod_cli.fitting.nodes import FittedNodes
 from sparklod_cli.fitting.optimiser import LAST, RATES, STAGES, Optimiser, Schedule, default_steps
 from sparklod_cli.fitting.pictures import FullDetailPicture, pictures
@@ -61,7 +61,7 @@ def test_only_merged_splats_that_a_picture_shows_move(nodes: FittedNodes) -> Non
     shown = Optimiser(nodes).step(picture, cut, RATES)
     moved = np.flatnonzero(nodes.changed())
     assert moved.size > 50
-    assert np.isin(moved, np.intersect1d(shown, nodes.merged)).all()
+    assert np.isin(moved, np.intersect1d(shown, nodes.fitted)).all()
     assert nodes.tree.is_leaf[shown].any()
 
 
@@ -69,11 +69,11 @@ def test_long_steps_stay_within_bounds(nodes: FittedNodes) -> None:
     picture, optimiser = picture_of(nodes), Optimiser(nodes)
     for share in (0.02, 0.1, 0.3) * 4:
         optimiser.step(picture, nodes.cut(picture.camera, share), Rates(*(3.0,) * len(RATES)))
-    now, old, merged = nodes.columns, nodes.old, nodes.merged
+    now, old, merged = nodes.columns, nodes.old, nodes.fitted
     assert not nodes.result().invalid()
     ratio = nodes.sizes(merged) / nodes.sizes(merged, old)
     assert ratio.max() > 1.05
-    assert (np.abs(np.log(ratio)) <= np.log(MOST_GROWTH) + 1e-5).all()
+    assert (np.abs(np.log(ratio)) <= np.log(nodes.most_growth) + 1e-5).all()
     assert now.lod_opacity.max() <= MOST_D
     away = np.linalg.norm(now.center - old.center, axis=1)
     assert (away <= 2.001 * old.scale.max(axis=1)).all()

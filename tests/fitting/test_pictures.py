@@ -28,20 +28,20 @@ def faults(nodes: FittedNodes) -> list[str]:
 
 def test_nodes_that_shrank_below_their_children_get_their_first_values() -> None:
     nodes = some()
-    shrunk = nodes.merged[::7]
+    shrunk = nodes.fitted[::7]
     nodes.columns.scale[shrunk] /= 4
-    nodes.columns.rgb[nodes.merged] += 0.01
+    nodes.columns.rgb[nodes.fitted] += 0.01
     assert faults(nodes) == ["tree.size"]
     assert keep_sizes(nodes)
     assert faults(nodes) == []
     back = ~nodes.changed()
     assert back[shrunk].any()
-    assert not back[np.setdiff1d(nodes.merged, shrunk)].any()
+    assert not back[np.setdiff1d(nodes.fitted, shrunk)].any()
 
 
 def test_children_that_outgrew_a_node_get_their_first_values() -> None:
     nodes = some()
-    deep = nodes.merged[nodes.tree.depths()[nodes.merged] >= 4]
+    deep = nodes.fitted[nodes.tree.depths()[nodes.fitted] >= 4]
     nodes.columns.scale[deep] *= 8
     assert "tree.size" in faults(nodes)
     assert keep_sizes(nodes)
@@ -50,9 +50,9 @@ def test_children_that_outgrew_a_node_get_their_first_values() -> None:
 
 def test_sizes_that_keep_the_law_stay() -> None:
     nodes = some()
-    nodes.columns.scale[nodes.merged] *= 1.05
+    nodes.columns.scale[nodes.fitted] *= 1.05
     assert not keep_sizes(nodes)
-    assert nodes.changed()[nodes.merged].all()
+    assert nodes.changed()[nodes.fitted].all()
 
 
 def test_the_nodes_of_a_budget_that_lost_get_their_first_values_and_no_budget_loses() -> None:
@@ -61,7 +61,7 @@ def test_the_nodes_of_a_budget_that_lost_get_their_first_values_and_no_budget_lo
     held_out = list(itertools.islice(pictures(cameras, nodes), 3))
     before = scores_of(nodes, held_out)
     coarse = np.unique(np.concatenate([nodes.cut(picture.camera, SHARES[0]) for picture in held_out]))
-    coarse = np.intersect1d(coarse, nodes.merged)
+    coarse = np.intersect1d(coarse, nodes.fitted)
     nodes.columns.rgb[coarse] += 0.3
     after = keep_gains(nodes, held_out, before)
     assert all(after[share] >= before[share] for share in SHARES)
@@ -73,6 +73,6 @@ def test_what_gained_stays() -> None:
     cameras = placed(Place.of(nodes.old.center[nodes.leaves]), np.random.SeedSequence(1))
     held_out = list(itertools.islice(pictures(cameras, nodes), 3))
     worse = {share: value - 1 for share, value in scores_of(nodes, held_out).items()}
-    nodes.columns.rgb[nodes.merged] += 1e-4
+    nodes.columns.rgb[nodes.fitted] += 1e-4
     keep_gains(nodes, held_out, worse)
-    assert nodes.changed()[nodes.merged].all()
+    assert nodes.changed()[nodes.fitted].all()

@@ -86,7 +86,7 @@ _COLUMNS = f4[:, :], f4[:, :], f4[:, :], f4[:], f4[:, :], f4[:, :, :]
 @cuda_kernel(
     *map(out, _COLUMNS),
     *_COLUMNS,
-    *(i4[:], i4[:], f4[:, :], f4[:, :], f4[:, :, :], f4[:], f4),
+    *(i4[:], i4[:], f4[:, :], f4[:, :], f4[:, :, :], f4[:], f4, f4),
     *(out(f4[:, :]), out(f4[:, :, :]), out(f4[:, :]), out(i4[:]), out(f4[:, :])),
 )
 def step(
@@ -109,6 +109,7 @@ def step(
     by_coefficients,
     rates,
     most_d,
+    most_growth,
     first,
     first_sh,
     second,
@@ -121,7 +122,7 @@ def step(
         center to sh, old_center to old_sh: columns of N nodes, as they are now, and as they were at first.
         index: (M,) drawn nodes. slots: (N,) rows in the moments, -1 for leaves.
         gradients: (M, GRADIENT_COLUMNS). by_color, by_coefficients: of `by_sh`.
-        rates: (6,) numbers of `Rates`. most_d: largest D.
+        rates: (6,) numbers of `Rates`. most_d: largest D. most_growth: see `kernels.adam.step`.
         first, first_sh, second, count: of `Moments`.
         moved: (M, 4) filled with centre and feature size of each node.
     """
@@ -139,7 +140,7 @@ def step(
         by_coefficients,
     )
     steps = Rates(rates[0], rates[1], rates[2], rates[3], rates[4], rates[5])
-    step_of(i, now, old, index, slots, derivatives, steps, Moments(first, first_sh, second, count))
+    step_of(i, now, old, index, slots, derivatives, steps, Moments(first, first_sh, second, count), most_growth)
     node = index[i]
     d = min(lod_opacity[node], most_d)
     if slots[node] >= 0:

@@ -29,10 +29,6 @@ LEAST_D, MOST_D = f32(0.004), f32(5)
 MOST_CHANGE = f32(2)
 FARTHEST = f32(2)
 
-#: Factor that the feature size of a node may change by, either way. Sizes decide which nodes a cut refines, and the
-#: builder chose them well. Measured (benchmarks/notes/refining.md).
-MOST_GROWTH = f32(1.06)
-
 #: Colours stay in this range.
 LEAST_COLOR, MOST_COLOR = f32(-2), f32(4)
 
@@ -134,7 +130,7 @@ def moved(first, second, slot, column, of_property, gradient, rate, correction):
 
 
 @kernel(inline=True)
-def step_of(i, nodes, old, index, slots, gradients, rates, moments):
+def step_of(i, nodes, old, index, slots, gradients, rates, moments, most_growth):
     """Move the node of drawn splat `i`; see `step`."""
     center, scale, quat, lod_opacity, rgb, sh = nodes
     first, first_sh, second, count = moments
@@ -198,7 +194,7 @@ def step_of(i, nodes, old, index, slots, gradients, rates, moments):
     change = rates.lod_opacity * correction / (np.sqrt(v) + EPSILON) * first[slot, OPACITY]
     lod_opacity[node] = min(max(d - change * min(d, one), LEAST_D), MOST_D)
     grown = size_of(scale, lod_opacity, node) / max(size_of(old.scale, old.lod_opacity, node), TINY)
-    back = min(max(grown, one / MOST_GROWTH), MOST_GROWTH) / max(grown, TINY)
+    back = min(max(grown, one / most_growth), most_growth) / max(grown, TINY)
     for c in range(3):
         scale[node, c] *= back
     g = gradients.rgb
@@ -225,8 +221,8 @@ def step_of(i, nodes, old, index, slots, gradients, rates, moments):
                 sh[node, k, c] = min(max(value, min(LEAST_COLOR, was)), max(MOST_COLOR, was))
 
 
-@kernel(out(Columns), Columns, i8[:], i4[:], Gradients, Rates, Moments, parallel=True)
-def step(nodes, old, index, slots, gradients, rates, moments):
+@kernel(out(Columns), Columns, i8[:], i4[:], Gradients, Rates, Moments, f4, parallel=True)
+def step(nodes, old, index, slots, gradients, rates, moments, most_growth):
     """Move the merged splats that were drawn against their gradients.
 
     Args:
@@ -237,6 +233,7 @@ def step(nodes, old, index, slots, gradients, rates, moments):
         gradients: `Gradients` of the drawn splats.
         rates: `Rates`.
         moments: `Moments`, changed.
+        most_growth: factor that the feature size of a splat may change by, either way; see `size_of`.
     """
     for i in prange(len(index)):
-        step_of(i, nodes, old, index, slots, gradients, rates, moments)
+        step_of(i, nodes, old, index, slots, gradients, rates, moments, most_growth)

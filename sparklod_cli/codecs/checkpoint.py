@@ -1,0 +1,210 @@
+"""Checkpoints of gsplat and nerfstudio (.pt, .ckpt): zips of PyTorch, read without PyTorch.
+
+A zip has `NAME/data.pkl`, a pickle that describes tensors, and `NAME/data/KEY`, their numbers. Facts: `torch.save`,
+`examples/simple_trainer.py` of gsplat, `splatfacto.py` of nerfstudio.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from ..model.gaussian import normalized_quat
+from ..model.sh import COEFFICIENTS
+from ..model.splats import FloatArray, Splats
+from ..support.errors import FormatError, NotSplatsError, TruncatedError
+from ..support.parallel import blocks_of, ordered_map
+from ..support.progress import Progress
+from ..support.untrusted import quoted_value
+from . import quantize
+from .content import Content, Source, Target, decoder
+from .stream import Positioned
+from .tensor_pickle import Tensor, unpickled
+
+#: Bytes of data.pkl at most. That of nerfstudio, with the state of its optimisers, has some 50,000. Chosen.
+MOST_PICKLE = 1 << 24
+
+#: Bytes of a member's local header before its name, and of its fields with the lengths of the name and of what follows.
+LOCAL_HEADER, LENGTHS = 30, slice(26, 30)
+
+#: Where nerfstudio has the tensors in "pipeline", the newest first.
+PREFIXES = ("_model.gauss_params.", "_model.")
+
+
+@dataclass(frozen=True)
+class TensorColumn:
+    """A tensor of the checkpoint, and the column that it fills.
+
+    Attributes:
+        names: those of gsplat and of nerfstudio.
+        column: of `Splats`.
+        width: numbers of a splat; None for three for each coefficient of SH.
+        decode: from its values to those of the column.
+    """
+
+    names: tuple[str, str]
+    column: str
+    width: int | None
+    decode: Callable[[FloatArray], FloatArray]
+
+
+def _quat_of_wxyz(wxyz: FloatArray) -> FloatArray:
+    return normalized_quat(wxyz)[:, [1, 2, 3, 0]]
+
+
+#: The tensors of every checkpoint: scales are logarithms, opacities logits, rotations not normalized.
+COLUMNS = (
+    TensorColumn(("means", "means"), "center", 3, np.asarray),
+    TensorColumn(("scales", "scales"), "scale", 3, quantize.decode_log),
+    TensorColumn(("quats", "quats"), "quat_xyzw", 4, _quat_of_wxyz),
+    TensorColumn(("opacities", "opacities"), "opacity", 1, quantize.decode_logit),
+    TensorColumn(("sh0", "features_dc"), "rgb", 3, quantize.decode_dc),
+    TensorColumn(("shN", "features_rest"), "sh", None, np.asarray),
+)
+
+
+@dataclass(frozen=True)
+class _StoredColumn:
+    """Values of a column in the file: `type` has those of a splat, of which the first is at `offset`."""
+
+    of: TensorColumn
+    type: np.dtype[Any]
+    offset: int
+
+    def read(self, file: Positioned, start: int, stop: int) -> FloatArray:
+        """Return the values of some splats, as float32."""
+        size = (stop - start) * self.type.itemsize
+        data = file.read(self.offset + start * self.type.itemsize, size)
+        if len(data) < size:
+            raise TruncatedError(f"cut short inside its tensor {self.of.names[0]}")
+        values: FloatArray = np.frombuffer(data, self.type.base).astype(np.float32)
+        return values.reshape(stop - start, -1)
+
+
+def open_content(source: Source) -> Content:
+    """Open a checkpoint of gsplat or of nerfstudio's splatfacto.
+
+    Raises:
+        FormatError: the file is cut short or corrupt, has no splats, or tensors of other shapes or types.
+    """
+    archive = _TensorArchive(source.file)
+    tensors, program = _tensors_of(archive.root())
+    missing = [each.names[program] for each in COLUMNS if each.names[program] not in tensors]
+    if missing:
+        raise FormatError(f"its splats have no {', '.join(missing)}, as trainings with another colour model")
+    count = tensors[COLUMNS[0].names[program]].size[:1]
+    stored = []
+    for each in COLUMNS:
+        name = each.names[program]
+        tensor = tensors[name]
+        values = int(np.prod(tensor.size[1:], dtype=np.float64)) if tensor.size else 0
+        widths = [each.width] if each.width else [3 * terms for terms in COEFFICIENTS]
+        if tensor.size[:1] != count or values not in widths:
+            raise FormatError(f"its tensor {name} has the shape {tensor.size}, which is not one of splats")
+        stored.append(_StoredColumn(each, np.dtype((tensor.type, (values,))), archive.offset_of(name, tensor)))
+    degree = COEFFICIENTS.index(values // 3)
+    positioned = Positioned(source.file)
+    # Without SH nerfstudio trains logits of colours.
+    decode_plain = quantize.decode_logit if program and not degree else None
+
+    @np.errstate(over="ignore", invalid="ignore")  # whether numbers are valid is for others to say
+    def fill_part(part: slice, start: int, splats: Splats) -> None:
+        for each in stored:
+            out = getattr(splats, each.of.column)[part]
+            decode = decode_plain if decode_plain and each.of.column == "rgb" else each.of.decode
+            out[...] = decode(each.read(positioned, start + part.start, start + part.stop)).reshape(out.shape)
+
+    def fill(target: Target, threads: int, progress: Progress) -> None:
+        def read(part: slice) -> slice:
+            fill_part(part, target.start, target.splats)
+            return part
+
+        for part in ordered_map(read, blocks_of(len(target.splats)), threads):
+            progress("reading", part.stop, len(target.splats), "splat")
+
+    return Content(count[0], degree, "checkpoint", fill)
+
+
+decode = decoder(open_content)
+
+
+def _tensors_of(root: Any) -> tuple[Mapping[str, Tensor], int]:
+    """Return the tensors of the splats by their names, and which of the programs in `COLUMNS` they are of."""
+    splats, pipeline = (root.get(key) if isinstance(root, dict) else None for key in ("splats", "pipeline"))
+    if isinstance(splats, dict):
+        return {name: each for name, each in splats.items() if isinstance(each, Tensor)}, 0
+    entries = pipeline if isinstance(pipeline, dict) else {}
+    named = {str(name): each for name, each in entries.items() if isinstance(each, Tensor)}
+    for prefix in PREFIXES:
+        found = {name.removeprefix(prefix): each for name, each in named.items() if name.startswith(prefix)}
+        if "means" in found:
+            return found, 1
+    raise NotSplatsError("a checkpoint of PyTorch without splats of gsplat (splats) or nerfstudio (pipeline)")
+
+
+class _TensorArchive:
+    """The zip of a checkpoint.
+
+    Raises:
+        FormatError: it is no zip.
+    """
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        try:
+            self._zip = zipfile.ZipFile(file)
+            self._names = set(self._zip.namelist())
+        except (zipfile.BadZipFile, ValueError, NotImplementedError, EOFError, OSError) as error:
+            raise FormatError("cut short or corrupt: no zip") from error
+        self._folder = next((name[: -len("data.pkl")] for name in self._names if name.endswith("/data.pkl")), "")
+
+    def _member(self, name: str) -> zipfile.ZipInfo:
+        if self._folder + name not in self._names:
+            raise FormatError(f"corrupt: its zip has no {quoted_value(name)}")
+        member = self._zip.getinfo(self._folder + name)
+        if member.compress_type != zipfile.ZIP_STORED or member.flag_bits & 1:
+            raise FormatError(f"its {quoted_value(name)} is compressed or encrypted, as PyTorch writes none")
+        return member
+
+    def _offset(self, member: zipfile.ZipInfo) -> int:
+        """Return where the bytes of a member begin."""
+        self._file.seek(member.header_offset)
+        header = self._file.read(LOCAL_HEADER)
+        if len(header) < LOCAL_HEADER or not header.startswith(b"PK\x03\x04"):
+            raise TruncatedError("cut short, or corrupt: a member of its zip does not begin where it should")
+        return member.header_offset + LOCAL_HEADER + int(np.frombuffer(header[LENGTHS], "<u2").sum(dtype=np.int64))
+
+    def _read(self, name: str, most: int) -> bytes:
+        member = self._member(name)
+        if member.file_size > most:
+            raise FormatError(f"its {quoted_value(name)} has {member.file_size:,} bytes, more than {most:,}")
+        self._file.seek(self._offset(member))
+        data = self._file.read(member.file_size)
+        if len(data) < member.file_size:
+            raise TruncatedError(f"cut short inside {quoted_value(name)}")
+        return data
+
+    def root(self) -> Any:
+        """Return the object of the pickle, of dicts, lists, plain values and tensors."""
+        if self._folder + "byteorder" in self._names and self._read("byteorder", 16) != b"little":
+            raise FormatError("its numbers are big-endian, which is not read")
+        return unpickled(self._read("data.pkl", MOST_PICKLE))
+
+    def offset_of(self, name: str, tensor: Tensor) -> int:
+        """Return where the values of a tensor begin in the file.
+
+        Raises:
+            FormatError: they are not there, not in order, or no floating-point numbers.
+        """
+        if tensor.type is None:
+            raise FormatError(f"its tensor {name} has no numbers of 16, 32 or 64 bits with a point")
+        member, values = self._member(f"data/{tensor.key}"), int(np.prod(tensor.size, dtype=np.float64))
+        if not tensor.is_contiguous:
+            raise FormatError(f"the values of its tensor {name} are not in order; save it with .contiguous()")
+        if tensor.first < 0 or (tensor.first + values) * tensor.type.itemsize > member.file_size:
+            raise TruncatedError(f"cut short, or corrupt: its tensor {name} announces {values:,} values")
+        return self._offset(member) + tensor.first * tensor.type.itemsize

@@ -1,0 +1,182 @@
+"""Pickles that describe tensors of PyTorch, read as data: nothing that they name is imported or called."""
+
+from __future__ import annotations
+
+import pickletools
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..support.errors import FormatError
+
+#: Types of numbers by PyTorch's names of storages.
+STORAGES: dict[str, np.dtype[Any]] = {
+    "torch FloatStorage": np.dtype("<f4"),
+    "torch DoubleStorage": np.dtype("<f8"),
+    "torch HalfStorage": np.dtype("<f2"),
+}
+
+#: Opcodes that push their argument, and that push a constant or an empty container.
+VALUES = {
+    *("BININT", "BININT1", "BININT2", "LONG1", "LONG4", "BINFLOAT", "BINUNICODE", "SHORT_BINUNICODE"),
+    *("BINUNICODE8", "BINSTRING", "SHORT_BINSTRING", "BINBYTES", "SHORT_BINBYTES", "BINBYTES8"),
+}
+CONSTANTS = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False, "EMPTY_TUPLE": (), "EMPTY_SET": None}
+
+#: Opcodes that make a tuple of so many values.
+TUPLES = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
+
+IGNORED = {"PROTO", "FRAME", "BUILD"}
+PUTS, GETS = {"BINPUT", "LONG_BINPUT"}, {"BINGET", "LONG_BINGET"}
+
+
+@dataclass(frozen=True)
+class Tensor:
+    """Description of a tensor.
+
+    Attributes:
+        type: of its numbers; None for other ones than `STORAGES` has.
+        key: of its storage.
+        first: index of its first number in the storage.
+        size, stride: of each axis, in numbers.
+    """
+
+    type: np.dtype[Any] | None
+    key: str
+    first: int
+    size: tuple[int, ...]
+    stride: tuple[int, ...]
+
+    @property
+    def is_contiguous(self) -> bool:
+        """True if its numbers are in the order of its axes, without gaps."""
+        expected = 1
+        for size, stride in zip(reversed(self.size), reversed(self.stride), strict=True):
+            if size != 1 and stride != expected:
+                return 0 in self.size
+            expected *= size
+        return True
+
+
+@dataclass(frozen=True)
+class _Global:
+    """A function or class that the pickle names: module and name."""
+
+    name: str
+
+
+def unpickled(data: bytes) -> Any:
+    """Return the object of a pickle: dicts, lists, tuples, plain values, tensors; other objects become None.
+
+    Entries of dicts whose keys are no texts or integers are left out.
+
+    Raises:
+        FormatError: the pickle is corrupt, or has opcodes that PyTorch does not write.
+    """
+    machine = _Machine()
+    try:
+        for opcode, argument, _ in pickletools.genops(data):
+            if opcode.name == "STOP":
+                return machine.stack.pop()
+            machine.run(opcode.name, argument)
+    except (IndexError, KeyError, TypeError, ValueError, OverflowError) as error:
+        raise FormatError("corrupt: its pickle cannot be read") from error
+    raise FormatError("corrupt: its pickle has no end")
+
+
+class _Machine:
+    """Stack machine of pickles (PEP 307) that builds data only."""
+
+    def __init__(self) -> None:
+        self.stack: list[Any] = []
+        self._marks: list[int] = []
+        self._memo: dict[int, Any] = {}
+
+    def run(self, opcode: str, argument: Any) -> None:
+        """Carry out one opcode."""
+        stack = self.stack
+        if opcode in VALUES:
+            stack.append(argument)
+        elif opcode in CONSTANTS:
+            stack.append(CONSTANTS[opcode])
+        elif opcode == "EMPTY_DICT":
+            stack.append({})
+        elif opcode == "EMPTY_LIST":
+            stack.append([])
+        elif opcode == "MARK":
+            self._marks.append(len(stack))
+        elif opcode in TUPLES:
+            stack.append(tuple(self._popped(TUPLES[opcode])))
+        elif opcode == "TUPLE":
+            stack.append(tuple(self._since_mark()))
+        elif opcode in PUTS:
+            self._memo[argument] = stack[-1]
+        elif opcode == "MEMOIZE":
+            self._memo[len(self._memo)] = stack[-1]
+        elif opcode in GETS:
+            stack.append(self._memo[argument])
+        elif opcode == "GLOBAL":
+            stack.append(_Global(argument))
+        elif opcode == "STACK_GLOBAL":
+            stack.append(_Global(" ".join(map(str, self._popped(2)))))
+        elif opcode == "BINPERSID":
+            stack.append(_storage(stack.pop()))
+        elif opcode in ("REDUCE", "NEWOBJ"):
+            stack.append(_called(*self._popped(2)))
+        elif opcode in ("SETITEM", "APPEND"):
+            values = self._popped(2 if opcode == "SETITEM" else 1)
+            _extend(stack[-1], values)
+        elif opcode in ("SETITEMS", "APPENDS", "ADDITEMS"):
+            values = self._since_mark()
+            _extend(stack[-1], values)
+        elif opcode not in IGNORED:
+            raise FormatError(f"its pickle has the opcode {opcode}, which PyTorch does not write")
+        if opcode == "BUILD":
+            stack.pop()  # the state of an object
+
+    def _popped(self, count: int) -> list[Any]:
+        if len(self.stack) < count:
+            raise IndexError
+        values = self.stack[-count:]
+        del self.stack[-count:]
+        return values
+
+    def _since_mark(self) -> list[Any]:
+        mark = self._marks.pop()
+        values = self.stack[mark:]
+        del self.stack[mark:]
+        return values
+
+
+def _extend(container: Any, values: list[Any]) -> None:
+    """Add values to a list, and keys and values in turn to a dict."""
+    if isinstance(container, list):
+        container.extend(values)
+    elif isinstance(container, dict):
+        pairs = zip(values[::2], values[1::2], strict=True)
+        container.update((key, value) for key, value in pairs if isinstance(key, (str, int)))
+
+
+def _storage(pid: Any) -> tuple[np.dtype[Any] | None, str] | None:
+    """Return type and key of the storage that a persistent identifier names."""
+    if not (isinstance(pid, tuple) and len(pid) >= 3 and pid[0] == "storage" and isinstance(pid[1], _Global)):
+        return None
+    return STORAGES.get(pid[1].name), str(pid[2])
+
+
+def _called(function: Any, arguments: Any) -> Any:
+    """Return what a call that the pickle describes makes, if it is a tensor or a dict; None for all else."""
+    name = function.name if isinstance(function, _Global) else ""
+    if name == "collections OrderedDict":
+        return {}
+    if name == "torch._utils _rebuild_parameter":
+        return arguments[0]
+    if name != "torch._utils _rebuild_tensor_v2":
+        return None
+    storage, first, size, stride = arguments[:4]
+    numbers = (first, *size, *stride)
+    if storage is None or len(size) != len(stride) or not all(isinstance(each, int) and each >= 0 for each in numbers):
+        raise ValueError
+    kind, key = storage
+    return Tensor(kind, key, first, tuple(size), tuple(stride))
