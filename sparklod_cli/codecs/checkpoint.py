@@ -172,7 +172,7 @@ class _TensorArchive:
 
     def _offset(self, member: zipfile.ZipInfo) -> int:
         """Return where the bytes of a member begin."""
-        self._file.seek(member.header_offset)
+        self._file.seek(max(member.header_offset, 0))  # a damaged directory gives negative ones
         header = self._file.read(LOCAL_HEADER)
         if len(header) < LOCAL_HEADER or not header.startswith(b"PK\x03\x04"):
             raise TruncatedError("cut short, or corrupt: a member of its zip does not begin where it should")

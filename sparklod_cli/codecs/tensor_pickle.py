@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickletools
+import warnings
 from dataclasses import dataclass
 from typing import Any
 
@@ -76,10 +77,12 @@ def unpickled(data: bytes) -> Any:
     """
     machine = _Machine()
     try:
-        for opcode, argument, _ in pickletools.genops(data):
-            if opcode.name == "STOP":
-                return machine.stack.pop()
-            machine.run(opcode.name, argument)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # about strange escapes in texts
+            for opcode, argument, _ in pickletools.genops(data):
+                if opcode.name == "STOP":
+                    return machine.stack.pop()
+                machine.run(opcode.name, argument)
     except (IndexError, KeyError, TypeError, ValueError, OverflowError) as error:
         raise FormatError("corrupt: its pickle cannot be read") from error
     raise FormatError("corrupt: its pickle has no end")
