@@ -27,12 +27,14 @@ def run(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]
     )
 
 
+@pytest.mark.slow
 def test_kernels_pass_in_the_simulator() -> None:
     found = run("-m", "pytest", "-q", "-p", "no:cacheprovider", "-n", "0", "-m", "cuda", *FOLDERS, **{SIMULATE: "1"})
     assert found.returncode == 0, found.stdout[-4000:] + found.stderr[-2000:]
     assert "skipped" not in found.stdout.splitlines()[-1], found.stdout
 
 
+@pytest.mark.slow
 def test_kernels_compile_for_a_card() -> None:
     from tests.render.cuda.compile_kernels import MISSING
 
