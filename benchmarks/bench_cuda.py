@@ -1,4 +1,4 @@
-"""Times pictures and steps of refining on an NVIDIA card and on the processor: `python benchmarks/bench_cuda.py --help`.
+"""Times an NVIDIA card and the processor, pictures and steps of refining: `python benchmarks/bench_cuda.py --help`.
 
 Prints a Markdown table. Pictures are of splats that lie on the card; a step is one of `--refine`, its cut included.
 The first call of each compiles, and is not counted.
