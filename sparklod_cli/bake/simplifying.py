@@ -8,7 +8,6 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,9 +28,6 @@ from .output import BakeOutput, Encode
 from .records import BuiltTree, Clock, WrittenSet, WrittenTree
 from .refining import Refined, fit_settings, refined
 from .settings import BakeSettings, SimplifyGoal
-
-if TYPE_CHECKING:
-    from ..fitting.nodes import FittedSet
 
 #: Cameras that a PSNR is measured with where nobody names any, and their seed: as many as judge a fitted tree.
 CAMERAS, SEED = 16, 0
@@ -120,28 +116,29 @@ class Fidelity:
     def __init__(self, tree: Scene, cameras: Sequence[Camera] | None, threads: int) -> None:
         from ..fitting.cameras import Place, placed
         from ..fitting.fit import raster_for
+        from ..fitting.nodes import FittedNodes
         from ..fitting.pictures import pictures
 
         assert tree.tree is not None
-        self._tree, self._threads = tree.tree, threads
         place = Place.of(tree.splats.center[tree.tree.is_leaf])
-        self._raster = raster_for(place)
-        nodes = self._set(tree.splats, np.flatnonzero(tree.tree.is_leaf))
+        self._nodes = FittedNodes(tree.splats, tree.tree, raster_for(place), threads)
         many = placed(place, np.random.SeedSequence(SEED)) if cameras is None else iter(cameras)
-        self._pictures = list(itertools.islice(pictures(many, nodes), CAMERAS if cameras is None else None))
+        self._pictures = list(itertools.islice(pictures(many, self._nodes), CAMERAS if cameras is None else None))
         if not self._pictures:
             raise SparklodError("no camera sees enough to measure a PSNR by; name cameras with --camera-path")
 
-    def psnr(self, nodes: Splats, cut: NDArray[np.int64]) -> float:
+    def psnr(self, cut: NDArray[np.int64]) -> float:
         """Return the mean PSNR of a cut, ascending, over all cameras and a black and a white background, dB."""
         from ..fitting.pictures import mean_psnr
 
-        return mean_psnr(self._set(nodes, cut), 1, self._pictures)
+        return mean_psnr(self._nodes, lambda camera: cut, self._pictures)
 
-    def _set(self, nodes: Splats, cut: NDArray[np.int64]) -> FittedSet:
-        from ..fitting.nodes import FittedSet
+    def fitted(self, cut: NDArray[np.int64], nodes: Splats) -> float:
+        """Return the mean PSNR of a cut of the tree with other nodes, dB; later ones are measured with them, too."""
+        from ..fitting.nodes import columns_of
 
-        return FittedSet(nodes, self._tree, cut, self._raster, self._threads)
+        self._nodes.restore(cut, columns_of(nodes))
+        return self.psnr(cut)
 
 
 @dataclass(frozen=True)
@@ -208,14 +205,14 @@ class Simplifier:
             self.goal,
             order.leaves,
             bytes_of=lambda count: bytes_of(cut(count)),
-            psnr_of=lambda count: 0.0 if fidelity is None else fidelity.psnr(tree.splats, order.cut(count)),
+            psnr_of=lambda count: 0.0 if fidelity is None else fidelity.psnr(order.cut(count)),
             progress=progress,
         )
         if self.refine is None:
             return Chosen(cut(count), measured, None)
         fixed = order.cut(count)
         fitted, report = refined(tree, self.refine, fixed=fixed, threads=threads, progress=progress, say=self.say)
-        measured = None if fidelity is None else fidelity.psnr(fitted.splats, fixed)
+        measured = None if fidelity is None else fidelity.fitted(fixed, fitted.splats)
         return Chosen(dataclasses.replace(fitted, splats=fitted.splats.take(fixed), tree=None), measured, report)
 
 

@@ -15,11 +15,11 @@ import numpy as np
 
 from ..model.gaussian import normalized_quat
 from ..model.sh import COEFFICIENTS
-from ..model.splats import FloatArray, Splats
+from ..model.splats import FloatArray
 from ..support.errors import FormatError, NotSplatsError, TruncatedError
 from ..support.parallel import blocks_of, ordered_map
 from ..support.progress import Progress
-from ..support.untrusted import quoted_value
+from ..support.untrusted import ZIP_ERRORS, quoted, quoted_value
 from . import quantize
 from .content import Content, Source, Target, decoder
 from .stream import Positioned
@@ -111,16 +111,14 @@ def open_content(source: Source) -> Content:
     # Without SH nerfstudio trains logits of colours.
     decode_plain = quantize.decode_logit if program and not degree else None
 
-    @np.errstate(over="ignore", invalid="ignore")  # whether numbers are valid is for others to say
-    def fill_part(part: slice, start: int, splats: Splats) -> None:
-        for each in stored:
-            out = getattr(splats, each.of.column)[part]
-            decode = decode_plain if decode_plain and each.of.column == "rgb" else each.of.decode
-            out[...] = decode(each.read(positioned, start + part.start, start + part.stop)).reshape(out.shape)
-
     def fill(target: Target, threads: int, progress: Progress) -> None:
+        @np.errstate(over="ignore", invalid="ignore")  # whether numbers are valid is for others to say
         def read(part: slice) -> slice:
-            fill_part(part, target.start, target.splats)
+            for each in stored:
+                out = getattr(target.splats, each.of.column)[part]
+                decode = decode_plain if decode_plain and each.of.column == "rgb" else each.of.decode
+                values = each.read(positioned, target.start + part.start, target.start + part.stop)
+                out[...] = decode(values).reshape(out.shape)
             return part
 
         for part in ordered_map(read, blocks_of(len(target.splats)), threads):
@@ -158,8 +156,8 @@ class _TensorArchive:
         try:
             self._zip = zipfile.ZipFile(file)
             self._names = set(self._zip.namelist())
-        except (zipfile.BadZipFile, ValueError, NotImplementedError, EOFError, OSError) as error:
-            raise FormatError("cut short or corrupt: no zip") from error
+        except ZIP_ERRORS as error:
+            raise FormatError(f"not a complete zip archive: {quoted(error)}") from None
         self._folder = next((name[: -len("data.pkl")] for name in self._names if name.endswith("/data.pkl")), "")
 
     def _member(self, name: str) -> zipfile.ZipInfo:
@@ -182,11 +180,10 @@ class _TensorArchive:
         member = self._member(name)
         if member.file_size > most:
             raise FormatError(f"its {quoted_value(name)} has {member.file_size:,} bytes, more than {most:,}")
-        self._file.seek(self._offset(member))
-        data = self._file.read(member.file_size)
-        if len(data) < member.file_size:
-            raise TruncatedError(f"cut short inside {quoted_value(name)}")
-        return data
+        try:
+            return self._zip.read(member)
+        except ZIP_ERRORS as error:
+            raise FormatError(f"{quoted_value(name)} cannot be read: {quoted(error)}") from None
 
     def root(self) -> Any:
         """Return the object of the pickle, of dicts, lists, plain values and tensors."""

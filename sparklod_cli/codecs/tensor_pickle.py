@@ -28,7 +28,7 @@ CONSTANTS = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False, "EMPTY_TUPLE": ()
 #: Opcodes that make a tuple of so many values.
 TUPLES = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
 
-IGNORED = {"PROTO", "FRAME", "BUILD"}
+IGNORED = {"PROTO", "FRAME"}
 PUTS, GETS = {"BINPUT", "LONG_BINPUT"}, {"BINGET", "LONG_BINGET"}
 
 
@@ -133,10 +133,10 @@ class _Machine:
         elif opcode in ("SETITEMS", "APPENDS", "ADDITEMS"):
             values = self._since_mark()
             _extend(stack[-1], values)
+        elif opcode == "BUILD":
+            stack.pop()  # the state of an object
         elif opcode not in IGNORED:
             raise FormatError(f"its pickle has the opcode {opcode}, which PyTorch does not write")
-        if opcode == "BUILD":
-            stack.pop()  # the state of an object
 
     def _popped(self, count: int) -> list[Any]:
         if len(self.stack) < count:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -21,7 +20,7 @@ from ..render.kernels.shade import add_sh
 from ..render.settings import RasterSettings
 from ..render.shading import ShadedSplats
 from ..scenes.loaded_scene import nodes_of
-from .kernels.adam import MOST_D, Columns
+from .kernels.adam import MOST_D, Columns, FitBounds
 from .kernels.view import mark_seen
 from .settings import SHARES
 
@@ -40,15 +39,13 @@ class FittedNodes:
         leaves: indices of full detail, ascending.
         fitted: indices of the nodes that may change, ascending: the merged splats.
         shares: of the leaves, of the cuts that nodes are judged by.
-        most_d: largest D that fitting gives a node.
     """
 
     shares: Sequence[float] = SHARES
-    most_d: float = float(MOST_D)
 
-    #: Factor that feature sizes may change by, either way. They decide which nodes a cut refines, and the builder chose
-    #: them well. Measured (benchmarks/notes/refining.md).
-    most_growth = 1.06
+    #: Bounds of what fitting changes. Feature sizes decide which nodes a cut refines, and the builder chose them well.
+    #: Measured (benchmarks/notes/refining.md).
+    bounds = FitBounds(MOST_D, np.float32(1.06))
 
     #: Least feature size of a node, over the mean of its children's, weighted by opacity times surface. `inspect
     #: --check` warns below a third, also after rounding to the steps of a format.
@@ -56,8 +53,7 @@ class FittedNodes:
 
     def __init__(self, nodes: Splats, tree: LodTree, raster: RasterSettings, threads: int) -> None:
         self.original, self.tree, self.raster = nodes, tree, raster
-        d = lod_opacity(nodes.opacity)
-        self.old = Columns(nodes.center, nodes.scale, nodes.quat_xyzw, d, nodes.rgb, nodes.sh)
+        self.old = columns_of(nodes)
         self.columns = _copied(self.old)
         self.leaves: Index = np.flatnonzero(tree.is_leaf)
         self.fitted: Index = np.flatnonzero(~tree.is_leaf)
@@ -142,10 +138,8 @@ class FittedSet(FittedNodes):
         fixed: indices of the cut, ascending.
     """
 
-    most_d = 1.0
-
     #: No camera chooses among the nodes by their sizes; single scales are limited, see `adam.MOST_CHANGE`.
-    most_growth, least_ratio = math.inf, 0.0
+    bounds, least_ratio = FitBounds(np.float32(1), np.float32(np.inf)), 0.0
 
     def __init__(self, nodes: Splats, tree: LodTree, fixed: Index, raster: RasterSettings, threads: int) -> None:
         super().__init__(nodes, tree, raster, threads)
@@ -157,10 +151,10 @@ class FittedSet(FittedNodes):
         """Return the cut, whatever the camera and the share."""
         return self._fixed
 
-    def renew(self, index: Index) -> None:
-        """Limit the opacities of the nodes, which the optimiser takes for those of a tree."""
-        self.columns.lod_opacity[index] = np.minimum(self.columns.lod_opacity[index], self.most_d)
-        super().renew(index)
+
+def columns_of(nodes: Splats) -> Columns:
+    """Return the columns of nodes as they are fitted."""
+    return Columns(nodes.center, nodes.scale, nodes.quat_xyzw, lod_opacity(nodes.opacity), nodes.rgb, nodes.sh)
 
 
 def _copied(columns: Columns) -> Columns:

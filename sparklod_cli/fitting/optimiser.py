@@ -48,8 +48,7 @@ class Optimiser:
         derivatives = found.center, found.log_scale, found.turn, found.lod_opacity, rgb, sh
         columns = adam.Gradients(*map(np.ascontiguousarray, derivatives))
         rates = adam.Rates(*map(np.float32, rates))
-        growth = np.float32(nodes.most_growth)
-        adam.step(nodes.columns, nodes.old, seen, self._slots, columns, rates, self._moments, growth)
+        adam.step(nodes.columns, nodes.old, seen, self._slots, columns, rates, self._moments, nodes.bounds)
         nodes.renew(seen)
         return seen
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import functools
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -81,14 +82,17 @@ def shows_enough(image: Image) -> bool:
 
 def scores_of(nodes: FittedNodes, held_out: Sequence[FullDetailPicture]) -> Scores:
     """Return the means over held-out pictures and a black and a white background; empty without pictures."""
-    return {share: mean_psnr(nodes, share, held_out) for share in (nodes.shares if held_out else ())}
+    return {
+        share: mean_psnr(nodes, functools.partial(nodes.cut, share=share), held_out)
+        for share in (nodes.shares if held_out else ())
+    }
 
 
-def mean_psnr(nodes: FittedNodes, share: float, compared: Sequence[FullDetailPicture]) -> float:
-    """Return the mean PSNR of cuts of a share of the leaves over pictures and a black and a white background, dB."""
+def mean_psnr(nodes: FittedNodes, cut: Callable[[Camera], Index], compared: Sequence[FullDetailPicture]) -> float:
+    """Return the mean PSNR of a camera's cuts over pictures and a black and a white background, dB."""
     psnr: list[float] = []
     for picture in compared:
-        _, shaded = nodes.visible(nodes.cut(picture.camera, share), picture.camera)
+        _, shaded = nodes.visible(cut(picture.camera), picture.camera)
         psnr += map(psnr_of, picture.errors(draw(shaded, picture.camera, nodes.raster)))
     return float(np.mean(psnr))
 

@@ -64,7 +64,7 @@ class FitReport:
 
     Attributes:
         psnr_before, psnr_after: share of the leaves -> mean PSNR in dB of the held-out cameras.
-        kept: share of the merged splats that have new values.
+        kept: share of the splats fitted that have new values.
         is_complete: False if it was interrupted.
     """
 

@@ -107,7 +107,7 @@ def test_leaves_of_a_set_are_fitted_too_and_sizes_change_more_than_those_of_a_tr
     assert 100 < is_leaf.sum() < len(plain)
     assert (fitted.rgb != plain.rgb).any(axis=1)[is_leaf].any()
     growth = fitted.scale.mean(axis=1) / plain.scale.mean(axis=1)
-    assert growth.max() > 1.1 > FittedNodes.most_growth
+    assert growth.max() > 1.1 > FittedNodes.bounds.most_growth
 
 
 def test_fitting_leaves_a_scene_as_it_is_where_nothing_is_merged() -> None:

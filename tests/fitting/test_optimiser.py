@@ -73,7 +73,7 @@ def test_long_steps_stay_within_bounds(nodes: FittedNodes) -> None:
     assert not nodes.result().invalid()
     ratio = nodes.sizes(merged) / nodes.sizes(merged, old)
     assert ratio.max() > 1.05
-    assert (np.abs(np.log(ratio)) <= np.log(nodes.most_growth) + 1e-5).all()
+    assert (np.abs(np.log(ratio)) <= np.log(nodes.bounds.most_growth) + 1e-5).all()
     assert now.lod_opacity.max() <= MOST_D
     away = np.linalg.norm(now.center - old.center, axis=1)
     assert (away <= 2.001 * old.scale.max(axis=1)).all()

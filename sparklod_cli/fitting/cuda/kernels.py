@@ -9,7 +9,7 @@ from ...render.kernels.backward import CENTER, LOD_OPACITY, LOG_SCALE, RGB, TURN
 from ...render.kernels.shade import sh_gradient_of
 from ...support.jit_cuda import cuda_kernel
 from ...support.jit_types import f4, f8, i4, out, u2
-from ..kernels.adam import SIZE_PER_D, Columns, Gradients, Moments, Rates, step_of
+from ..kernels.adam import Columns, FitBounds, Gradients, Moments, Rates, size_of, step_of
 from ..kernels.view import by_pixel, differences
 
 f32, f64 = np.float32, np.float64
@@ -122,7 +122,7 @@ def step(
         center to sh, old_center to old_sh: columns of N nodes, as they are now, and as they were at first.
         index: (M,) drawn nodes. slots: (N,) rows in the moments, -1 for leaves.
         gradients: (M, GRADIENT_COLUMNS). by_color, by_coefficients: of `by_sh`.
-        rates: (6,) numbers of `Rates`. most_d: largest D. most_growth: see `kernels.adam.step`.
+        rates: (6,) numbers of `Rates`. most_d, most_growth: of `FitBounds`.
         first, first_sh, second, count: of `Moments`.
         moved: (M, 4) filled with centre and feature size of each node.
     """
@@ -140,12 +140,9 @@ def step(
         by_coefficients,
     )
     steps = Rates(rates[0], rates[1], rates[2], rates[3], rates[4], rates[5])
-    step_of(i, now, old, index, slots, derivatives, steps, Moments(first, first_sh, second, count), most_growth)
+    moments, bounds = Moments(first, first_sh, second, count), FitBounds(most_d, most_growth)
+    step_of(i, now, old, index, slots, derivatives, steps, moments, bounds)
     node = index[i]
-    d = min(lod_opacity[node], most_d)
-    if slots[node] >= 0:
-        lod_opacity[node] = d
-    mean = (scale[node, 0] + scale[node, 1] + scale[node, 2]) / f32(3)
     for axis in range(3):
         moved[i, axis] = center[node, axis]
-    moved[i, 3] = (f32(1) + SIZE_PER_D * max(d - f32(1), f32(0))) * f32(2) * mean
+    moved[i, 3] = size_of(scale, lod_opacity, node) * f32(2) / f32(3)

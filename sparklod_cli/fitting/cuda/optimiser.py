@@ -91,7 +91,7 @@ class CardOptimiser(Optimiser):
         kernels.by_sh.for_each(number, now.center, index, view.eye, now.colors, *derivatives)
         self._rates.copy_to_device(np.array(rates, np.float32))
         columns = now.center, now.scale, now.quat_xyzw, now.lod_opacity, now.rgb, now.sh
-        state = self._rates, np.float32(self.nodes.most_d), np.float32(self.nodes.most_growth), *self._moments, moved
+        state = self._rates, *self.nodes.bounds, *self._moments, moved
         kernels.step.for_each(number, *columns, *self._old, index, self._slots, *derivatives, *state)
         return moved.copy_to_host()
 

@@ -22,7 +22,7 @@ FIRST = 13
 #: Columns of the second moments, one of each property, SH among them.
 SECOND = 6
 
-#: Range of D.
+#: Range of D in trees.
 LEAST_D, MOST_D = f32(0.004), f32(5)
 
 #: Least and largest scale, over that of the old splat; farthest centre, in its largest scales.
@@ -108,6 +108,19 @@ class Rates(NamedTuple):
     sh: Any
 
 
+@fields(f4, f4)
+class FitBounds(NamedTuple):
+    """Bounds of the splats that change, float32.
+
+    Attributes:
+        most_d: largest D.
+        most_growth: factor that the feature size may change by, either way; see `size_of`.
+    """
+
+    most_d: Any
+    most_growth: Any
+
+
 @kernel(inline=True)
 def size_of(scale, lod_opacity, node):
     """Return three halves of a node's feature size; see `gaussian.spark_size`."""
@@ -130,7 +143,7 @@ def moved(first, second, slot, column, of_property, gradient, rate, correction):
 
 
 @kernel(inline=True)
-def step_of(i, nodes, old, index, slots, gradients, rates, moments, most_growth):
+def step_of(i, nodes, old, index, slots, gradients, rates, moments, bounds):
     """Move the node of drawn splat `i`; see `step`."""
     center, scale, quat, lod_opacity, rgb, sh = nodes
     first, first_sh, second, count = moments
@@ -192,9 +205,9 @@ def step_of(i, nodes, old, index, slots, gradients, rates, moments, most_growth)
     second[slot, 3] = v
     first[slot, OPACITY] += (one - BETA1) * (gd - first[slot, OPACITY])
     change = rates.lod_opacity * correction / (np.sqrt(v) + EPSILON) * first[slot, OPACITY]
-    lod_opacity[node] = min(max(d - change * min(d, one), LEAST_D), MOST_D)
+    lod_opacity[node] = min(max(d - change * min(d, one), LEAST_D), bounds.most_d)
     grown = size_of(scale, lod_opacity, node) / max(size_of(old.scale, old.lod_opacity, node), TINY)
-    back = min(max(grown, one / most_growth), most_growth) / max(grown, TINY)
+    back = min(max(grown, one / bounds.most_growth), bounds.most_growth) / max(grown, TINY)
     for c in range(3):
         scale[node, c] *= back
     g = gradients.rgb
@@ -221,8 +234,8 @@ def step_of(i, nodes, old, index, slots, gradients, rates, moments, most_growth)
                 sh[node, k, c] = min(max(value, min(LEAST_COLOR, was)), max(MOST_COLOR, was))
 
 
-@kernel(out(Columns), Columns, i8[:], i4[:], Gradients, Rates, Moments, f4, parallel=True)
-def step(nodes, old, index, slots, gradients, rates, moments, most_growth):
+@kernel(out(Columns), Columns, i8[:], i4[:], Gradients, Rates, Moments, FitBounds, parallel=True)
+def step(nodes, old, index, slots, gradients, rates, moments, bounds):
     """Move the merged splats that were drawn against their gradients.
 
     Args:
@@ -233,7 +246,7 @@ def step(nodes, old, index, slots, gradients, rates, moments, most_growth):
         gradients: `Gradients` of the drawn splats.
         rates: `Rates`.
         moments: `Moments`, changed.
-        most_growth: factor that the feature size of a splat may change by, either way; see `size_of`.
+        bounds: `FitBounds`.
     """
     for i in prange(len(index)):
-        step_of(i, nodes, old, index, slots, gradients, rates, moments, most_growth)
+        step_of(i, nodes, old, index, slots, gradients, rates, moments, bounds)

@@ -75,7 +75,7 @@ def test_steps_are_those_of_the_processor_and_the_same_twice(kind: str) -> None:
         assert np.quantile(np.abs(now - expected), 0.98) < MOST * change, name
     every = np.arange(len(reference.tree))
     assert np.allclose(found[0].sizes(every), reference.sizes(every), rtol=1e-3)
-    assert found[0].columns.lod_opacity.max() <= reference.most_d
+    assert found[0].columns.lod_opacity.max() <= reference.bounds.most_d
 
 
 def test_a_fit_on_a_card_gains() -> None:
