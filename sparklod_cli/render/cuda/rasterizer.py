@@ -130,7 +130,7 @@ def draw(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> Imag
         BackendError: there is no card that can be used, or its memory does not suffice.
     """
     find_card()
-    with card_errors():
+    with card_errors(len(splats)):
         no_sh = np.empty((len(splats), 0, 3), np.float32)
         uploaded = CardSplats.of(splats.center, splats.scale, splats.quat_xyzw, splats.lod_opacity, splats.rgb, no_sh)
         every = to_card(np.arange(len(splats), dtype=np.int32))
