@@ -170,7 +170,8 @@ class _Fitting:
         """Yield pictures and cuts, which threads find ahead; the nodes are placed when the last step is taken.
 
         Cuts of AHEAD steps are found while the AHEAD steps before them are taken, from the nodes as they were before
-        these. So they depend on neither the time that they take nor the number of threads.
+        these; those of the first steps of a stage from the nodes at its start. So they depend on neither the time that
+        they take nor the number of threads.
         """
         with ThreadPoolExecutor(self._threads) as pool:
             following = self._begin_cuts(pool, examples)

@@ -49,6 +49,8 @@ def fitted(device: str, said: list[str]) -> tuple[Splats, FitReport]:
 @pytest.fixture(autouse=True)
 def failing_card(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cameras, "SIZE", (64, 36))
+    monkeypatch.setattr(fit_module, "TRAINING", 4)
+    monkeypatch.setattr(fit_module, "HELD_OUT", 2)
     monkeypatch.setattr(fit_module, "_optimiser_on", optimiser_on)
 
 

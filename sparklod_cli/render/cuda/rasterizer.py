@@ -55,7 +55,7 @@ class CardView:
     """A camera and raster settings on the card.
 
     Attributes:
-        eye: (3,). matrix: (3, 4). view: (`forward.VIEW`,). See `forward.project`.
+        eye: (3,). matrix: (3, 4). view: numbers of `Lens` and `Limits`. See `forward.project`.
     """
 
     camera: Camera
