@@ -28,7 +28,7 @@ NEAR, FAR = 0.01, 100.0
 #: Shares of the leaves that cuts are drawn of, and the golden ratio, whose multiples spread evenly.
 LEAST_SHARE, MOST_SHARE, GOLDEN = 0.01, 0.7, 0.6180339887498949
 
-#: Steps whose cuts are found while as many steps before them are taken. Measured (benchmarks/notes/refining.md).
+#: Steps whose cuts are found while as many steps before them are taken. Measured (benchmarks/notes/cuts-ahead.md).
 AHEAD = 8
 
 #: Least mean gain of a stage of the second half, dB a step; after a smaller one, half of the steps that remain are left

@@ -79,7 +79,7 @@ def test_too_little_memory_is_one_line_with_the_splats_that_fit(monkeypatch: pyt
     for size, fits in ((4.1e9, "990,000"), (14e9, "500,000")):
         with pytest.raises(BackendError) as error, card_errors(1_000_000):
             on_card(int(size / 4))
-        assert str(error.value) == f"the card has too little memory for 1,000,000 splats; about {fits} fit"
+        assert str(error.value).startswith(f"the card has too little memory for 1,000,000 splats; about {fits} fit, or")
     with pytest.raises(BackendError, match="; fewer fit"), card_errors(5):
         raise type("OutOfMemoryError", (Exception,), {})  # of cupy
 

@@ -125,9 +125,10 @@ def card_errors(splats: int) -> Iterator[None]:
         if isinstance(error, _TooLargeError) or _is_of_memory(error):
             share = getattr(error, "share", None)
             fit = "fewer" if share is None else f"about {float(f'{splats * share:.2g}'):,.0f}"
-            raise BackendError(f"the card has too little memory for {splats:,} splats; {fit} fit") from None
+            advice = f"{fit} fit, or use --device cpu"
+            raise BackendError(f"the card has too little memory for {splats:,} splats; {advice}") from None
         if kind in ("CudaAPIError", "CudaDriverError", "CudaSupportError", "CUDARuntimeError", "NvvmError"):
-            raise BackendError(f"the card failed ({' '.join(str(error).split())})") from None
+            raise BackendError(f"the card failed ({' '.join(str(error).split())}); use --device cpu") from None
         raise
 
 
