@@ -55,9 +55,6 @@ def say_error(text: str) -> None:
 def say_usage_error(error: click.ClickException) -> None:
     """Print the usage of the command, how to get its help, and in the last line what is wrong."""
     ctx = error.ctx if isinstance(error, click.UsageError) else None
-    if isinstance(error, getattr(click.exceptions, "NoArgsIsHelpError", ())) and ctx is not None:  # since click 8.2
-        _echo(ctx.get_help())
-        return
     if ctx is not None:
         _echo(f"{ctx.get_usage()}\nTry '{ctx.command_path} --help'.\n")
     text = error.format_message()
@@ -67,11 +64,21 @@ def say_usage_error(error: click.ClickException) -> None:
 
 
 def _meant(error: click.NoSuchOption) -> str:
-    """Return a hint at the option with a similar name, or with a value of that name (--quality)."""
-    value = error.option_name.lstrip("-")
-    for param in error.ctx.command.params if error.ctx is not None else ():
-        if isinstance(param.type, click.Choice) and value in param.type.choices:
-            return f"; did you mean {param.opts[0]} {value}?"
+    """Return a hint at a value of that name (--quality), at the commands that have the option, or at a similar one."""
+    ctx, flag = error.ctx, error.option_name
+    if ctx is None:
+        return ""
+    for param in ctx.command.params:
+        if isinstance(param.type, click.Choice) and flag.lstrip("-") in param.type.choices:
+            return f"; did you mean {param.opts[0]} {flag.lstrip('-')}?"
+    root = ctx.find_root()
+    assert isinstance(root.command, click.Group)
+    others = {name: root.command.get_command(root, name) for name in root.command.list_commands(root)}
+    having = [name for name, other in others.items() if other and any(flag in param.opts for param in other.params)]
+    if having and ctx is root:
+        return f"; options of a command follow its name, as in sparklod {having[0]} {flag}"
+    if having:
+        return f"; {', '.join(having)} {'have' if having[1:] else 'has'} it"
     return f"; did you mean {error.possibilities[0]}?" if error.possibilities else ""
 
 

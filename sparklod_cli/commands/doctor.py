@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
 EXAMPLES = """\
   sparklod doctor
-  sparklod doctor --quiet || exit 1                       # in CI
-  sparklod doctor --json > doctor.json                    # to attach to a report
+  sparklod doctor --quiet || exit 1      # in CI
+  sparklod doctor --json > doctor.json   # to attach to a report
 """
 
 

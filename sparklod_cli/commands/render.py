@@ -31,14 +31,19 @@ if TYPE_CHECKING:
 EXAMPLES = """\
   sparklod render scene-lod.spz --budget 500k --size 1280x720 -o preview.png
   sparklod render scene.ply --thumbnail
-  sparklod render scene.ply --look-at 0,-1,4:0,0,0 --supersample 2 --alpha -o view.webp
-  sparklod render scene-lod.spz --view 0,-1,4:0,0,0 --view 4,-1,0:0,0,0 -o sheet.png
-  sparklod render scene-lod.spz --orbit 120 -o orbit.mp4             # or .webm, .gif, .webp
-  sparklod render scene-lod.spz --camera-path path.json -o 'frames/out.%04d.png' --jobs 4
+  sparklod render scene.ply --look-at 0,-1,4:0,0,0 --alpha -o view.webp
+  sparklod render scene-lod.spz --orbit 120 -o orbit.mp4    # or .webm, .gif
   sparklod render scene-lod.spz --budget 5% --color-by level -o levels.png
-  sparklod render scene-lod.rad --after 1s --bandwidth 20Mbit --latency 60ms -o after-1s.png
-  sparklod render scene-lod.spz --full --through packed --diff scene-lod.spz -o rounding.png
-  sparklod render scene-lod.spz --orbit 6 --compare --budget 5%,25% --assert '25%:psnr>30'   # exit status 3
+  sparklod render scene-lod.spz \\
+    --view 0,-1,4:0,0,0 --view 4,-1,0:0,0,0 -o sheet.png
+  sparklod render scene-lod.spz --camera-path path.json \\
+    --jobs 4 -o 'frames/out.%04d.png'
+  sparklod render scene-lod.rad \\
+    --after 1s --bandwidth 20Mbit --latency 60ms -o after-1s.png
+  sparklod render scene-lod.spz \\
+    --full --through packed --diff scene-lod.spz -o rounding.png
+  sparklod render scene-lod.spz --orbit 6 --compare \\
+    --budget 5%,25% --assert '25%:psnr>30'                  # exit status 3
 """
 
 HEADINGS = (

@@ -46,12 +46,16 @@ if TYPE_CHECKING:
 LEAST_IN_FRONT = 0.05
 
 EXAMPLES = """\
-  sparklod traverse scene-lod.spz --budget 500k            # an orbit; the summary, or CSV into a pipe
-  sparklod traverse scene-lod.spz --camera-path path.json -o frames.csv --summary
-  sparklod traverse scene-lod.spz --preset quest --assert 'churn_p95<0.2'    # exit status 3
-  sparklod traverse scene-lod.spz --dolly --bandwidth 20Mbit --latency 60ms --plot path.png
-  sparklod traverse --scene city.json --keyframes '0,-2,9:0,0,0 9,-2,0:0,0,0' --per-instance
-  sparklod traverse scene-lod.spz --look-at 0,-1,4:0,0,0 --indices-out cuts --padded
+  sparklod traverse scene-lod.spz --budget 500k    # an orbit
+  sparklod traverse scene-lod.spz --camera-path path.json -o frames.csv
+  sparklod traverse scene-lod.spz --assert 'churn_p95<0.2'    # exit status 3
+  sparklod traverse scene-lod.spz --dolly --bandwidth 20Mbit --plot path.png
+  sparklod traverse scene-lod.spz --preset quest --json
+  sparklod traverse scene-lod.rad --bandwidth 20Mbit --latency 60ms
+  sparklod traverse --scene city.json \\
+    --keyframes '0,-2,9:0,0,0 9,-2,0:0,0,0' --per-instance
+  sparklod traverse scene-lod.spz \\
+    --look-at 0,-1,4:0,0,0 --indices-out cuts --padded
 """
 
 #: Options that say what is in the table.

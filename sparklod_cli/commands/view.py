@@ -27,13 +27,13 @@ if TYPE_CHECKING:
 
 EXAMPLES = """\
   sparklod view scene-lod.rad
-  sparklod view web/lod-meta.json                         # in PlayCanvas
+  sparklod view web/lod-meta.json                    # in PlayCanvas
   sparklod view scene-lod.spz --look-at 0,-1,4:0,0,0 --budget 500k
-  sparklod view quick-lod.spz quality-lod.spz             # both, with a box for each
+  sparklod view quick-lod.spz quality-lod.spz        # a box for each
   sparklod view scene-lod.rad --camera-path path.json
   npm install --prefix ~/spark @sparkjsdev/spark@2.2.0 three@0.187.0
-  sparklod view scene-lod.rad --spark-dir ~/spark         # without a network
-  sparklod view scene-lod.rad --export site               # for any web server
+  sparklod view scene-lod.rad --spark-dir ~/spark    # without a network
+  sparklod view scene-lod.rad --export site          # for any web server
 """
 
 

@@ -15,9 +15,9 @@ from .option_groups import command, option, values_of
 from .options.common import Messages, processors_to_use, verbose_flag
 
 EXAMPLES = """\
-  sparklod warmup                                  # once, after pip install
-  RUN pip install ./sparklod && sparklod warmup    # in a Dockerfile
-  NUMBA_CACHE_DIR=.cache/numba sparklod warmup     # in CI, with that folder cached
+  sparklod warmup                                # once, after pip install
+  RUN pip install ./sparklod && sparklod warmup  # in a Dockerfile
+  NUMBA_CACHE_DIR=.cache/numba sparklod warmup   # in CI, with a cached folder
 """
 
 

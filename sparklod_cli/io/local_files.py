@@ -21,7 +21,7 @@ from ..support.untrusted import quoted_value
 MOST_NAMES = 10_000
 
 #: How similar two names are that may be meant by one another, as `difflib` measures it: a letter or two differ.
-SIMILAR = 0.8
+SIMILAR = 0.75
 
 
 def is_file_name(text: str) -> bool:
