@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -76,7 +76,7 @@ class _Formatter(click.HelpFormatter):
     def write_text(self, text: str) -> None:
         super().write_text(text.replace("-", self.HYPHEN))
 
-    def write_dl(self, rows: Sequence[tuple[str, str]], *arguments: Any, **attributes: Any) -> None:
+    def write_dl(self, rows: Iterable[tuple[str, str]], *arguments: Any, **attributes: Any) -> None:
         super().write_dl([(term, text.replace("-", self.HYPHEN)) for term, text in rows], *arguments, **attributes)
 
     def getvalue(self) -> str:
@@ -89,7 +89,7 @@ class Command(click.Command):
     `--help` of a command with many options lists those under `COMMON`, in a sentence each; `--help-all` lists all.
 
     Args:
-        examples: lines with a command each, the most useful ones first; one that goes on in the next line ends in \\.
+        examples: lines with a command each, the most useful ones first. A command may take several lines.
         headings: the order of the headings; those that are not named follow in the order of their first options, and
             `GENERAL` is the last one.
     """

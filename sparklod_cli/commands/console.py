@@ -19,6 +19,9 @@ from ..support.stdout import silence
 from ..support.units import count_of as count_of
 from ..support.units import format_size
 
+#: Columns of reports for people, of the names that their rows begin with, and by which messages go on indented.
+WIDTH, NAMES, INDENT = 80, 13, 4
+
 #: Seconds between two lines of progress where standard error is a log.
 LOG_INTERVAL = 10
 
@@ -33,6 +36,31 @@ class Verbosity:
 def size_of(size: int) -> str:
     """Return an amount of bytes for display, such as "2.9 MB"."""
     return f"{size / 1e6:.1f} MB" if size >= 1e5 else f"{size / 1e3:.1f} kB"
+
+
+def rows(name: str, text: str) -> list[str]:
+    """Return the lines of a row of a report: a name and a text, which goes on below where it is longer than a line."""
+    return _wrapped(f"  {name:<{NAMES - 3}} {printable(text, MOST)}".rstrip(), WIDTH, NAMES)
+
+
+def _wrapped(line: str, width: int, indent: int) -> list[str]:
+    """Return a line, or those that it is broken into between words, though not after a number or a colon."""
+    if len(line) <= width:
+        return [line]
+    import re
+    import textwrap
+
+    joined = re.sub(r"(?<=[\d:]) (?=\S)", "\N{NO-BREAK SPACE}", line)
+    broken = textwrap.wrap(joined, width, subsequent_indent=" " * indent, break_on_hyphens=False)
+    return [part.replace("\N{NO-BREAK SPACE}", " ") for part in broken]
+
+
+def _columns() -> int | None:
+    """Return the columns of the terminal that standard error is; None where it is none."""
+    try:
+        return os.get_terminal_size(sys.stderr.fileno()).columns or None
+    except (AttributeError, OSError, ValueError):  # it is closed, redirected, or no file
+        return None
 
 
 def is_terminal(stream: TextIO | None) -> bool:
@@ -138,9 +166,12 @@ class Console:
         say_error(text)
 
     def say(self, text: str) -> None:
+        """Print a line; on a terminal, one that is too long is broken between words."""
         if not self._quiet:
             self.clear()
-            say(text)
+            line, width = printable(text, MOST), _columns()
+            for part in [line] if width is None else _wrapped(line, max(width, 2 * INDENT), INDENT):
+                _echo(part)
 
     def detail(self, text: str) -> None:
         """Print a line with `--verbose` only."""
