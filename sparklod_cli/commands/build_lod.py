@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,7 +19,7 @@ from ..support.printable import MOST, shortened
 from ..support.stdin import DASH, name_of
 from .build_lod_files import FORMS, VERIFY, BakedFiles, check_formats, check_inputs, record_of
 from .build_lod_text import report_baked, report_extracted
-from .console import Console, say
+from .console import Console, print_json, say
 from .option_groups import COMMON, check_declared, command, exclude, flags_set, is_set, parameters_of, values_of
 from .options.baking import (
     OF_TREES,
@@ -173,7 +172,7 @@ def build_lod(ctx: click.Context, /, **_: Any) -> None:
                 report(console, source, target, outcome)
                 record = {**record_of(source), "output": str(target), **dataclasses.asdict(outcome)}
             if general.as_json:
-                click.echo(json.dumps(record))
+                print_json(record)
             if interrupts.came():  # while merged splats were fitted, which ended early then
                 console.clear()
                 say("interrupted")

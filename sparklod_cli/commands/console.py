@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import sys
 from collections.abc import Iterable, Iterator
@@ -21,6 +22,9 @@ from ..support.units import format_size
 
 #: Columns of reports for people, of the names that their rows begin with, and by which messages go on indented.
 WIDTH, NAMES, INDENT = 80, 13, 4
+
+#: Version of the fields that commands print with --json, but for inspect, whose report has a schema of its own.
+JSON_VERSION = 1
 
 #: Seconds between two lines of progress where standard error is a log.
 LOG_INTERVAL = 10
@@ -71,6 +75,11 @@ def is_terminal(stream: TextIO | None) -> bool:
 def say(text: str) -> None:
     """Print one line on standard error unless that is closed, shortened and without control characters."""
     _echo(printable(text, MOST))
+
+
+def print_json(record: dict[str, Any], *, indent: int | None = None) -> None:
+    """Print the result of a command on standard output as one JSON object, which begins with the schema version."""
+    click.echo(json.dumps({"schema_version": JSON_VERSION} | record, indent=indent, allow_nan=False))
 
 
 def say_error(text: str) -> None:

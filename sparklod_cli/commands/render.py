@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ..images.defaults import THUMBNAIL_SIZE, THUMBNAIL_SUPERSAMPLE
-from .console import Console, count_of, size_of
+from .console import Console, count_of, print_json, size_of
 from .option_groups import COMMON, check_declared, command, exclude, flags_set, values_of
 from .options.cameras import PictureCameras
 from .options.common import General, json_flag
@@ -239,7 +238,7 @@ def _report(console: Console, drawn: DrawnPath, seconds: float, *, as_json: bool
             "frames": written.frames,
             "seconds": round(seconds, 3),
         }
-        click.echo(json.dumps(whole if written.gain is None else whole | {"gain": written.gain}, allow_nan=False))
+        print_json(whole if written.gain is None else whole | {"gain": written.gain})
     name = "standard output" if output.name is None else output.name
     console.say(f"{name}  {_describe(written)}, {seconds:.2f} s")
     console.detail(

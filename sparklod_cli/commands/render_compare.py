@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import sys
 import time
 from collections.abc import Iterable, Iterator, Sequence
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from ..support.stdin import DASH
-from .console import Console, count_of, for_screen, is_terminal
+from .console import Console, count_of, for_screen, is_terminal, print_json
 from .options.common import report_outcomes, table_form
 from .options.cut import check_scenes, viewed_files
 from .paths import Folder, keep_apart
@@ -110,7 +109,7 @@ def _report(console: Console, options: RenderOptions, compared: Compared, about:
         figures = [each.as_dict() for each in summary]
         frames = len(compared.path.cameras)
         whole = {"frames": frames, "leaves": compared.leaves, "budgets": figures, "asserts": asserts}
-        click.echo(json.dumps(whole, allow_nan=False))
+        print_json(whole)
     texts = lines(summary, compared.path, compared.leaves)
     if _on_screen(options):
         click.echo("\n".join(texts))

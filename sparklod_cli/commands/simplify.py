@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,7 +21,7 @@ from ..support.stdin import DASH
 from ..support.units import parse_size
 from .build_lod_files import SPZ, record_of, refuse_others
 from .build_lod_text import report_simplified
-from .console import say
+from .console import print_json, say
 from .option_groups import (
     COMMON,
     argument,
@@ -218,7 +217,7 @@ def simplify(ctx: click.Context, /, **_: Any) -> None:
         report_simplified(console, files.source, files.output, baked)
         if general.as_json:
             record = {**record_of(files.source), "output": str(files.output), **dataclasses.asdict(baked)}
-            click.echo(json.dumps(record))
+            print_json(record)
         if interrupts.came():  # while the set was fitted, which ended early then
             console.clear()
             say("interrupted")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 from collections.abc import Iterator
@@ -16,7 +15,7 @@ from ..simulation.streaming_settings import StreamingSettings
 from ..support.printable import printable
 from ..support.stdin import DASH
 from ..tables.files import FORMS
-from .console import WIDTH, Console, count_of, for_screen, is_terminal, rows, size_of
+from .console import WIDTH, Console, count_of, for_screen, is_terminal, print_json, rows, size_of
 from .option_groups import COMMON, check_declared, command, exclude, flag, option, refuse, values_of
 from .options.cameras import Cameras
 from .options.common import (
@@ -236,7 +235,7 @@ def _report(console: Console, traversed: Traversed, summary: bool | None, *, as_
     whole, outcomes = traversed.summary, traversed.outcomes
     if as_json:
         asserts = [each.as_dict() for each in outcomes]
-        click.echo(json.dumps(whole.as_dict() | {"asserts": asserts}, allow_nan=False))
+        print_json(whole.as_dict() | {"asserts": asserts})
     if on_stdout and summary is not False:
         click.echo("\n".join(lines(whole)))
     elif summary or (summary is None and is_terminal(sys.stderr)):

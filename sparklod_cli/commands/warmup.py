@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from dataclasses import dataclass
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 import click
 
 from ..support.setting_fields import whole
-from .console import count_of
+from .console import count_of, print_json
 from .option_groups import command, option, values_of
 from .options.common import Messages, processors_to_use, verbose_flag
 
@@ -56,4 +55,4 @@ def warmup(ctx: click.Context, /, **_: Any) -> None:
             else f"all kernels are in {jit.CACHE_FOLDER}"
         )
         if options.as_json:
-            click.echo(json.dumps({"compiled": compiled, "seconds": round(seconds, 2), "cache": str(jit.CACHE_FOLDER)}))
+            print_json({"compiled": compiled, "seconds": round(seconds, 2), "cache": str(jit.CACHE_FOLDER)})

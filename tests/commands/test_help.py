@@ -37,8 +37,9 @@ def help_flag(name: str) -> str:
 
 
 def listed(text: str) -> list[str]:
-    """The options that a help text lists, by their last names."""
-    return re.findall(r"^  (?:-\w, )?(?:--[\w-]+ / )?(--[\w-]+)(?![\w-])", text, re.MULTILINE)
+    """The options that a help text lists below its first heading, by their last names."""
+    _, _, options = text.partition(":\n")
+    return re.findall(r"^  (?:-\w, )?(?:--[\w-]+ / )?(--[\w-]+)(?![\w-])", options, re.MULTILINE)
 
 
 @pytest.mark.parametrize("name", COMMAND_NAMES)
