@@ -47,8 +47,8 @@ TASKS = {
 
 EPILOG = """
 \b
-Exit status: 0 done, 1 something failed, 2 wrong usage, 3 a check did not hold,
-130 interrupted. Shell completion: sparklod completion --install.
+Exit status: 0 done, 1 something failed, 2 wrong usage, 3 a check did not
+hold, 130 interrupted. Shell completion: sparklod completion --install.
 """
 
 

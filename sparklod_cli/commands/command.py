@@ -25,7 +25,7 @@ MOST_LISTED, FEW_PARAGRAPHS, FEW_EXAMPLES = 12, 2, 5
 HELP = {"--help", "--help-all"}
 
 #: Columns of the longest option that has its help beside it, not below.
-TERM = 24
+TERM_WIDTH = 24
 
 #: What else people type, and what they mean by it.
 ALIASES = {
@@ -86,7 +86,7 @@ class _Formatter(click.HelpFormatter):
 class Command(click.Command):
     """A command whose help lists options under headings, and ends with examples.
 
-    `--help` of a command with many options lists those under `COMMON`, in a sentence each; `--help-all` lists all.
+    `--help` lists the options under `COMMON`, in a sentence each, if the command has many; `--help-all` lists all.
 
     Args:
         examples: lines with a command each, the most useful ones first. A command may take several lines.
@@ -100,12 +100,10 @@ class Command(click.Command):
         super().__init__(*arguments, **attributes)
         self.examples = examples.splitlines()
         self.headings = headings
-        if len(self.params) > MOST_LISTED:
-            text = "Print the help of all options, and more examples."
-            whole = click.Option(
-                ["--help-all"], is_flag=True, is_eager=True, expose_value=False, callback=_print_help_all, help=text
-            )
-            self.params.append(whole)
+        self.abridged = len(self.params) > MOST_LISTED
+        how: dict[str, Any] = {"is_flag": True, "is_eager": True, "expose_value": False, "callback": _print_help_all}
+        text = "Print the help of all options, and more examples."
+        self.params.append(click.Option(["--help-all"], help=text, hidden=not self.abridged, **how))
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         options = [param for param in self.params if isinstance(param, Option) and param.bare is not None]
@@ -131,7 +129,7 @@ class Command(click.Command):
 
     def get_help(self, ctx: click.Context, *, whole: bool = False) -> str:
         """Return the help; with `whole`, that of all options."""
-        whole = whole or len(self.params) <= MOST_LISTED
+        whole = whole or not self.abridged
         formatter = _Formatter(width=ctx.terminal_width, max_width=ctx.max_content_width)
         self.format_usage(ctx, formatter)
         paragraphs = inspect.cleandoc(self.help or "").split("\n\n")
@@ -141,7 +139,7 @@ class Command(click.Command):
         for heading, params in self.by_heading(ctx, whole=whole).items():
             rows = [record for param in params if (record := param.get_help_record(ctx))]
             with formatter.section(heading):
-                formatter.write_dl(rows if whole else [(term, _brief(text)) for term, text in rows], col_max=TERM)
+                formatter.write_dl(rows if whole else [(term, _brief(text)) for term, text in rows], col_max=TERM_WIDTH)
         if self.examples:
             with formatter.section("Examples"):
                 formatter.write("".join(f"{line}\n" for line in self.examples[: None if whole else FEW_EXAMPLES]))

@@ -11,7 +11,7 @@ import click
 import pytest
 
 from sparklod_cli.cli import COMMANDS, TASKS, cli, run
-from sparklod_cli.commands.command import ALIASES, COMMON, FEW_EXAMPLES, GENERAL, MOST_LISTED, Command
+from sparklod_cli.commands.command import ALIASES, COMMON, FEW_EXAMPLES, GENERAL, Command
 from tests.conftest import FIXTURES, ROOT, Capture
 
 COMMAND_NAMES = [name for name in COMMANDS if name != "help"]
@@ -31,11 +31,6 @@ def printed(*arguments: str, capsys: Capture) -> str:
     return capsys.readouterr().out
 
 
-def help_flag(name: str) -> str:
-    """The option that lists all options."""
-    return "--help-all" if len(command_of(name).params) > MOST_LISTED else "--help"
-
-
 def listed(text: str) -> list[str]:
     """The options that a help text lists below its first heading, by their last names."""
     _, _, options = text.partition(":\n")
@@ -47,9 +42,10 @@ def test_each_option_stands_under_one_heading(name: str, capsys: Capture) -> Non
     command = command_of(name)
     headings = command.by_heading(click.Context(command))
     params = [param for params in headings.values() for param in params]
-    options = [param for param in command.get_params(click.Context(command)) if isinstance(param, click.Option)]
+    params_of_all = command.get_params(click.Context(command))
+    options = [param for param in params_of_all if isinstance(param, click.Option) and not param.hidden]
     assert sorted(map(id, params)) == sorted(map(id, options))
-    text = printed(name, help_flag(name), capsys=capsys)
+    text = printed(name, "--help-all", capsys=capsys)
     for heading in headings:
         assert f"\n{heading}:\n" in text
     text = text[text.index(f"\n{next(iter(headings))}:\n") :]  # after the words about the command
@@ -62,8 +58,9 @@ def test_each_option_stands_under_one_heading(name: str, capsys: Capture) -> Non
 def test_help_lists_the_few_options_that_most_people_need(name: str, capsys: Capture) -> None:
     command = command_of(name)
     text = printed(name, "--help", capsys=capsys)
-    if help_flag(name) == "--help":
+    if not command.abridged:
         assert len(listed(text)) <= MOST
+        assert text == printed(name, "--help-all", capsys=capsys)
         return
     common = command.by_heading(click.Context(command))[COMMON]
     shown = [*(param.opts[-1] for param in common), "--help-all", "--help"]
@@ -73,13 +70,16 @@ def test_help_lists_the_few_options_that_most_people_need(name: str, capsys: Cap
     assert not any(line.endswith("\\") for line in command.examples[:FEW_EXAMPLES])  # each is whole
 
 
-@pytest.mark.parametrize("name", COMMANDS)
-def test_help_fits_the_narrowest_terminal(name: str, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    "arguments", [("--help",), *((name, flag) for name in COMMAND_NAMES for flag in ("--help", "--help-all"))]
+)
+def test_help_fits_the_narrowest_terminal(
+    arguments: tuple[str, ...], capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("COLUMNS", str(COLUMNS))
-    for flag in {"--help", *([help_flag(name)] if name in COMMAND_NAMES else ())}:
-        for line in printed(name, flag, capsys=capsys).splitlines():
-            assert len(line) <= COLUMNS, line
-            assert not re.search(r"[\w-]-$", line), line  # which is broken within a word
+    for line in printed(*arguments, capsys=capsys).splitlines():
+        assert len(line) <= COLUMNS, line
+        assert not re.search(r"[\w-]-$", line), line  # which is broken within a word
 
 
 def test_brief_help_of_an_option_is_its_first_sentence_and_its_first_default(capsys: Capture) -> None:

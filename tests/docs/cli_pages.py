@@ -29,8 +29,8 @@ INDEX = """\
 {rows}
 
 Data goes to standard output, messages to standard error. Outputs appear whole or not at all, and existing ones are
-replaced only with `--overwrite`. [Installation](../install.md#shell-completion) has shell completion. These pages have all options, as `--help-all` prints
-them; `--help` lists those that most people need.
+replaced only with `--overwrite`. [Installation](../install.md#shell-completion) has shell completion. These pages have
+all options, as `--help-all` prints them; `--help` lists those that most people need.
 """
 
 PAGE = """\
