@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -102,6 +103,19 @@ def test_the_help_of_a_command_can_be_had_by_help(name: str, capsys: Capture) ->
 def test_help_ends_with_examples(name: str, capsys: Capture) -> None:
     _, _, examples = printed(name, "--help", capsys=capsys).partition("Examples:\n")
     assert f"  sparklod {name}" in examples
+
+
+@pytest.mark.parametrize("name", COMMAND_NAMES)
+def test_examples_are_command_lines(name: str) -> None:
+    command = command_of(name)
+    for line in "\n".join(command.examples).replace("\\\n", " ").splitlines():
+        words = shlex.split(line, comments=True)
+        if "sparklod" not in words:  # but in a substitution, or not at all
+            continue
+        called, *arguments = words[words.index("sparklod") + 1 :]
+        end = next((at for at, word in enumerate(arguments) if word in ("|", "||", ">")), None)
+        assert called == name
+        command.make_context(name, arguments[:end])
 
 
 def test_without_a_command_the_program_shows_tasks(capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
