@@ -15,8 +15,6 @@ from sparklod_cli.cli import run
 from sparklod_cli.commands.completion import SHELLS
 from tests.conftest import ROOT, Capture
 
-pty = pytest.importorskip("pty", reason="the system has no pseudo-terminals")
-
 
 @pytest.fixture
 def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
@@ -68,8 +66,10 @@ def test_settings_that_cannot_be_changed_are_an_error(home: Path, capsys: Captur
     assert capsys.readouterr().err == f"error: {home / '.bashrc'}: cannot be changed: is a directory\n"
 
 
-@pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
+@pytest.mark.skipif(os.name != "posix" or shutil.which("bash") is None, reason="needs bash and pseudo-terminals")
 def test_bash_completes_commands_options_and_files(home: Path, command: Path) -> None:
+    import pty  # which Windows does not have
+
     bash = shutil.which("bash")
     assert bash is not None
     assert run(["completion", "bash", "--install"]) == 0
