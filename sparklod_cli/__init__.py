@@ -16,7 +16,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 #: Module of each public name, as `__init__.pyi` has it. It is imported when the name is first used (PEP 562), so that
 #: importing the package loads neither numpy nor numba.

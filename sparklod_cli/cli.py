@@ -31,13 +31,24 @@ COMMANDS = {
     "view": "Show splat files in Spark, in a browser.",
     "warmup": "Compile all kernels ahead of the first run.",
     "doctor": "Check the installation, and say what to do.",
+    "completion": "Complete commands, options and file names in a shell.",
     "help": "Print the help of a command.",
+}
+
+#: What people come to do, and the command for it; the commands can be run one after the other.
+TASKS = {
+    "Bake a scene for the web": "sparklod build-lod scene.ply",
+    "Look at it in a browser": "sparklod view scene-lod.spz",
+    "Make a scene smaller": "sparklod simplify scene.ply --to 10% -o small.ply",
+    "Draw a picture of it": "sparklod render scene-lod.spz -o scene.png",
+    "Check a file": "sparklod inspect scene-lod.spz --check",
+    "See what viewers load": "sparklod traverse scene-lod.spz --budget 500k",
 }
 
 EPILOG = """
 \b
-Exit status: 0 done, 1 something failed, 2 wrong usage, 3 a check did not hold, 130 interrupted.
-Shell completion: eval "$(_SPARKLOD_COMPLETE=bash_source sparklod)", or zsh_source, fish_source.
+Exit status: 0 done, 1 something failed, 2 wrong usage, 3 a check did not
+hold, 130 interrupted. Shell completion: sparklod completion --install.
 """
 
 
@@ -55,10 +66,23 @@ class Sparklod(Group):
             raise _EndOfFileError from error
 
 
-@click.group(cls=Sparklod, rows=COMMANDS, epilog=EPILOG, context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(
+    cls=Sparklod,
+    rows=COMMANDS,
+    epilog=EPILOG,
+    invoke_without_command=True,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
 @click.version_option(__version__, package_name="sparklod")
-def cli() -> None:
+@click.pass_context
+def cli(ctx: click.Context) -> None:
     """Bake Level-of-Detail trees for 3D Gaussian splat scenes."""
+    if ctx.invoked_subcommand is None:
+        rows = [f"  {task:<26}{command}" for task, command in TASKS.items()]
+        title = "Level-of-Detail trees for 3D Gaussian splat scenes. What do you want to do?"
+        for line in (title, "", *rows, "", "sparklod COMMAND --help has the options, sparklod --help all commands."):
+            say(line)
+        ctx.exit(2)
 
 
 def run(arguments: list[str] | None = None) -> int:

@@ -22,6 +22,7 @@ TREE = str(FIXTURES / "golden" / "tree-v3.spz")
         (["view", "X"], "wbe-lod", "web-lod"),
         (["traverse", TREE, "--camera-path", "X"], "paht.json", "path.json"),
         (["inspect", TREE, "--expect", "X"], "pth.json", "path.json"),
+        (["inspect", "X"], "scene.spz", "scene.ply"),
         (["build-lod", "scene.ply", "--rgba", "X"], "pth.json", "path.json"),
     ],
 )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,7 +19,7 @@ from ..support.printable import MOST, shortened
 from ..support.stdin import DASH, name_of
 from .build_lod_files import FORMS, VERIFY, BakedFiles, check_formats, check_inputs, record_of
 from .build_lod_text import report_baked, report_extracted
-from .console import Console, say
+from .console import Console, print_json, say
 from .option_groups import COMMON, check_declared, command, exclude, flags_set, is_set, parameters_of, values_of
 from .options.baking import (
     OF_TREES,
@@ -49,27 +48,28 @@ if TYPE_CHECKING:
     Make = Callable[[Sequence[tuple[Source, Place]]], Iterator[Outcome | SparklodError]]
 
 EXAMPLES = """\
-  sparklod build-lod scene.ply                          # writes scene-lod.spz
-  sparklod build-lod scene.ply --up -y                  # y up, as viewers want it
-  sparklod build-lod scene.ply --method quality         # for publishing
-  sparklod build-lod scene.ply --method quality --refine    # the closest to full detail, in minutes
+  sparklod build-lod scene.ply                     # writes scene-lod.spz
+  sparklod build-lod scene.ply --up -y             # y up, as viewers want it
+  sparklod build-lod scene.ply --method quality    # for publishing
+  sparklod build-lod scene.ply --format rad        # which Spark streams
   sparklod build-lod scans/*.ply --output-dir web -f --skip-existing
+  sparklod build-lod scene.ply --method quality --refine      # in minutes
+  sparklod build-lod scene.ply -o web/scene.rad --cluster-sh
+  sparklod build-lod scene.ply -o web/lod-meta.json           # for PlayCanvas
+  sparklod build-lod scene.ply --format streamed-sog --levels 50%,25%,10%
+  sparklod build-lod scene.ply --within 0,1,0,25 --min-opacity 0.02
+  sparklod build-lod scene.ply --json | jq .nodes
+  sparklod build-lod scene.sog --encoding ext      # writes scene-lod.npz
+  sparklod build-lod scene-lod.spz --format rad    # the same tree
+  sparklod build-lod scene-lod.spz --refine        # the same tree, fitted
+  sparklod build-lod scene-lod.spz --unlod -o scene.ply
+  sparklod build-lod scene-lod.spz --unlod -o scene.sog       # for PlayCanvas
   sparklod build-lod scans/*.ply --output-dir web --workers 4
   sparklod build-lod tiles/*.ply --merge -o city-lod.rad
   sparklod build-lod city.ply -o city-lod.rad --memory 4G --scratch-dir /fast
-  sparklod build-lod s3://bucket/city.ply --scheduler tcp://host:8786 --scratch-dir s3://bucket/scratch
-  cat scene.ply | sparklod build-lod - -o - | aws s3 cp - s3://bucket/scene-lod.spz
-  sparklod build-lod scene.ply --within 0,1,0,25 --min-opacity 0.02
-  sparklod build-lod scene.ply --json | jq .nodes
-  sparklod build-lod scene.ply --format rad             # scene-lod.rad, which Spark streams
-  sparklod build-lod scene.ply -o web/scene.rad --cluster-sh
-  sparklod build-lod scene-lod.spz --format rad         # the same tree in the other format
-  sparklod build-lod scene-lod.spz --refine             # the same tree, fitted: scene-lod-refined.spz
-  sparklod build-lod scene.ply -o web/lod-meta.json     # Streamed SOG, which PlayCanvas streams
-  sparklod build-lod scene.ply --format streamed-sog --levels 50%,25%,10%    # scene-lod/lod-meta.json
-  sparklod build-lod scene.sog --encoding ext           # writes scene-lod.npz
-  sparklod build-lod scene-lod.spz --unlod -o scene.ply
-  sparklod build-lod scene-lod.spz --unlod -o scene.sog # for PlayCanvas
+  sparklod build-lod s3://bucket/city.ply \\
+    --scheduler tcp://host:8786 --scratch-dir s3://bucket/scratch
+  cat scene.ply | sparklod build-lod - -o - | aws s3 cp - s3://bucket/lod.spz
 """
 
 
@@ -172,7 +172,7 @@ def build_lod(ctx: click.Context, /, **_: Any) -> None:
                 report(console, source, target, outcome)
                 record = {**record_of(source), "output": str(target), **dataclasses.asdict(outcome)}
             if general.as_json:
-                click.echo(json.dumps(record))
+                print_json(record)
             if interrupts.came():  # while merged splats were fitted, which ended early then
                 console.clear()
                 say("interrupted")

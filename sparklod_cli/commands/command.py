@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import inspect
+import os
+import re
+from collections.abc import Iterable, Sequence
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +17,15 @@ if TYPE_CHECKING:
 
 #: Headings that several commands have: of what most people need, and of what every command has.
 COMMON, GENERAL = "Common options", "General"
+
+#: Most options of a command whose `--help` lists them all, and what that of other commands has of its help.
+MOST_LISTED, FEW_PARAGRAPHS, FEW_EXAMPLES = 12, 2, 5
+
+#: Options that print help.
+HELP = {"--help", "--help-all"}
+
+#: Columns of the longest option that has its help beside it, not below.
+TERM_WIDTH = 24
 
 #: What else people type, and what they mean by it.
 ALIASES = {
@@ -55,17 +67,43 @@ class Option(click.Option):
         self.declared, self.heading, self.bare = declared, heading, bare
 
 
+class _Formatter(click.HelpFormatter):
+    """A formatter that breaks lines between words only, never within --an-option."""
+
+    #: Hyphen in place of "-" at which no line ends, until the text is complete.
+    HYPHEN = "\u2011"
+
+    def write_text(self, text: str) -> None:
+        super().write_text(text.replace("-", self.HYPHEN))
+
+    def write_dl(self, rows: Iterable[tuple[str, str]], *arguments: Any, **attributes: Any) -> None:
+        super().write_dl([(term, text.replace("-", self.HYPHEN)) for term, text in rows], *arguments, **attributes)
+
+    def getvalue(self) -> str:
+        return super().getvalue().replace(self.HYPHEN, "-")
+
+
 class Command(click.Command):
-    """A command whose `--help` lists options under headings.
+    """A command whose help lists options under headings, and ends with examples.
+
+    `--help` lists the options under `COMMON`, in a sentence each, if the command has many; `--help-all` lists all.
 
     Args:
+        examples: lines with a command each, the most useful ones first. A command may take several lines.
         headings: the order of the headings; those that are not named follow in the order of their first options, and
             `GENERAL` is the last one.
     """
 
-    def __init__(self, *arguments: Any, headings: Sequence[str] = (COMMON,), **attributes: Any) -> None:
+    def __init__(
+        self, *arguments: Any, examples: str = "", headings: Sequence[str] = (COMMON,), **attributes: Any
+    ) -> None:
         super().__init__(*arguments, **attributes)
+        self.examples = examples.splitlines()
         self.headings = headings
+        self.abridged = len(self.params) > MOST_LISTED
+        how: dict[str, Any] = {"is_flag": True, "is_eager": True, "expose_value": False, "callback": _print_help_all}
+        text = "Print the help of all options, and more examples."
+        self.params.append(click.Option(["--help-all"], help=text, hidden=not self.abridged, **how))
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         options = [param for param in self.params if isinstance(param, Option) and param.bare is not None]
@@ -73,20 +111,57 @@ class Command(click.Command):
         end = args.index("--") if "--" in args else len(args)
         return super().parse_args(ctx, [*(bare.get(arg, arg) for arg in args[:end]), *args[end:]])
 
-    def by_heading(self, ctx: click.Context) -> dict[str, list[click.Parameter]]:
-        """Return the options that `--help` lists, by heading, in the order of both."""
+    def by_heading(self, ctx: click.Context, *, whole: bool = True) -> dict[str, list[click.Parameter]]:
+        """Return the options that the help lists, by heading, in the order of both.
+
+        Args:
+            whole: all; else the common ones and those that print help.
+        """
+        params = [param for param in self.get_params(ctx) if isinstance(param, click.Option) and not param.hidden]
+        if not whole:
+            params = [each for each in params if _heading(each) == COMMON or HELP.intersection(each.opts)]
         listed: dict[str, list[click.Parameter]] = {heading: [] for heading in self.headings}
         last: list[click.Parameter] = []
-        for param in self.get_params(ctx):
-            if isinstance(param, click.Option) and not param.hidden:
-                heading = getattr(param, "heading", GENERAL)
-                (last if heading == GENERAL else listed.setdefault(heading, [])).append(param)
+        for param in params:
+            heading = _heading(param)
+            (last if heading == GENERAL else listed.setdefault(heading, [])).append(param)
         return {heading: params for heading, params in (*listed.items(), (GENERAL, last)) if params}
 
-    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        for heading, params in self.by_heading(ctx).items():
+    def get_help(self, ctx: click.Context, *, whole: bool = False) -> str:
+        """Return the help; with `whole`, that of all options."""
+        whole = whole or not self.abridged
+        formatter = _Formatter(width=ctx.terminal_width, max_width=ctx.max_content_width)
+        self.format_usage(ctx, formatter)
+        paragraphs = inspect.cleandoc(self.help or "").split("\n\n")
+        formatter.write_paragraph()
+        with formatter.indentation():
+            formatter.write_text("\n\n".join(paragraphs if whole else paragraphs[:FEW_PARAGRAPHS]))
+        for heading, params in self.by_heading(ctx, whole=whole).items():
+            rows = [record for param in params if (record := param.get_help_record(ctx))]
             with formatter.section(heading):
-                formatter.write_dl([record for param in params if (record := param.get_help_record(ctx))])
+                formatter.write_dl(rows if whole else [(term, _brief(text)) for term, text in rows], col_max=TERM_WIDTH)
+        if self.examples:
+            with formatter.section("Examples"):
+                formatter.write("".join(f"{line}\n" for line in self.examples[: None if whole else FEW_EXAMPLES]))
+        return formatter.getvalue().rstrip("\n")
+
+
+def _brief(text: str) -> str:
+    """Return the first sentence of the help of an option, and its default as far as a semicolon."""
+    about, _, default = text.partition("  [")
+    sentence = about.split(". ")[0].rstrip(".") + "."
+    return f"{sentence}  [{re.split('[];]', default)[0]}]" if default else sentence
+
+
+def _heading(param: click.Parameter) -> str:
+    return getattr(param, "heading", GENERAL)
+
+
+def _print_help_all(ctx: click.Context, param: click.Parameter, value: bool) -> None:
+    if value and not ctx.resilient_parsing:
+        assert isinstance(ctx.command, Command)
+        click.echo(ctx.command.get_help(ctx, whole=True))
+        ctx.exit()
 
 
 class Group(click.Group):
@@ -122,7 +197,12 @@ class Group(click.Group):
 
     def unknown(self, name: str) -> str:
         """Return the error for an unknown command, with the command that was probably meant, or all of them."""
-        meant = near_command(name, list(self.rows))
+        if os.path.isfile(name):  # noqa: PTH113
+            import shlex  # needed after a mistake only
+
+            meant: str | None = f"build-lod {shlex.quote(name)}"
+        else:
+            meant = near_command(name, list(self.rows))
         hint = f"did you mean {meant}?" if meant else f"the commands are {', '.join(self.rows)}"
         return f"there is no command {name!r}; {hint}"
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import sys
 from collections.abc import Iterable, Iterator
@@ -18,6 +19,12 @@ from ..support.printable import MOST, printable
 from ..support.stdout import silence
 from ..support.units import count_of as count_of
 from ..support.units import format_size
+
+#: Columns of reports for people, of the names that their rows begin with, and by which messages go on indented.
+WIDTH, NAMES, INDENT = 80, 13, 4
+
+#: Version of the fields that commands print with --json, but for inspect, whose report has a schema of its own.
+JSON_VERSION = 1
 
 #: Seconds between two lines of progress where standard error is a log.
 LOG_INTERVAL = 10
@@ -35,6 +42,31 @@ def size_of(size: int) -> str:
     return f"{size / 1e6:.1f} MB" if size >= 1e5 else f"{size / 1e3:.1f} kB"
 
 
+def rows(name: str, text: str) -> list[str]:
+    """Return the lines of a row of a report: a name and a text, which goes on below where it is longer than a line."""
+    return _wrapped(f"  {name:<{NAMES - 3}} {printable(text, MOST)}".rstrip(), WIDTH, NAMES)
+
+
+def _wrapped(line: str, width: int, indent: int) -> list[str]:
+    """Return a line, or those that it is broken into between words, though not after a number or a colon."""
+    if len(line) <= width:
+        return [line]
+    import re
+    import textwrap
+
+    joined = re.sub(r"(?<=[\d:]) (?=\S)", "\N{NO-BREAK SPACE}", line)
+    broken = textwrap.wrap(joined, width, subsequent_indent=" " * indent, break_on_hyphens=False)
+    return [part.replace("\N{NO-BREAK SPACE}", " ") for part in broken]
+
+
+def _columns() -> int | None:
+    """Return the columns of the terminal that standard error is; None where it is none."""
+    try:
+        return os.get_terminal_size(sys.stderr.fileno()).columns or None
+    except (AttributeError, OSError, ValueError):  # it is closed, redirected, or no file
+        return None
+
+
 def is_terminal(stream: TextIO | None) -> bool:
     """Return whether a stream is a terminal; one that is closed is None."""
     return stream is not None and stream.isatty()
@@ -43,6 +75,11 @@ def is_terminal(stream: TextIO | None) -> bool:
 def say(text: str) -> None:
     """Print one line on standard error unless that is closed, shortened and without control characters."""
     _echo(printable(text, MOST))
+
+
+def print_json(record: dict[str, Any], *, indent: int | None = None) -> None:
+    """Print the result of a command on standard output as one JSON object, which begins with the schema version."""
+    click.echo(json.dumps({"schema_version": JSON_VERSION} | record, indent=indent, allow_nan=False))
 
 
 def say_error(text: str) -> None:
@@ -55,9 +92,6 @@ def say_error(text: str) -> None:
 def say_usage_error(error: click.ClickException) -> None:
     """Print the usage of the command, how to get its help, and in the last line what is wrong."""
     ctx = error.ctx if isinstance(error, click.UsageError) else None
-    if isinstance(error, getattr(click.exceptions, "NoArgsIsHelpError", ())) and ctx is not None:  # since click 8.2
-        _echo(ctx.get_help())
-        return
     if ctx is not None:
         _echo(f"{ctx.get_usage()}\nTry '{ctx.command_path} --help'.\n")
     text = error.format_message()
@@ -67,11 +101,21 @@ def say_usage_error(error: click.ClickException) -> None:
 
 
 def _meant(error: click.NoSuchOption) -> str:
-    """Return a hint at the option with a similar name, or with a value of that name (--quality)."""
-    value = error.option_name.lstrip("-")
-    for param in error.ctx.command.params if error.ctx is not None else ():
-        if isinstance(param.type, click.Choice) and value in param.type.choices:
-            return f"; did you mean {param.opts[0]} {value}?"
+    """Return a hint at a value of that name (--quality), at the commands that have the option, or at a similar one."""
+    ctx, flag = error.ctx, error.option_name
+    if ctx is None:
+        return ""
+    for param in ctx.command.params:
+        if isinstance(param.type, click.Choice) and flag.lstrip("-") in param.type.choices:
+            return f"; did you mean {param.opts[0]} {flag.lstrip('-')}?"
+    root = ctx.find_root()
+    assert isinstance(root.command, click.Group)
+    others = {name: root.command.get_command(root, name) for name in root.command.list_commands(root)}
+    having = [name for name, other in others.items() if other and any(flag in param.opts for param in other.params)]
+    if having and ctx is root:
+        return f"; options of a command follow its name, as in sparklod {having[0]} {flag}"
+    if having:
+        return f"; {', '.join(having)} {'have' if having[1:] else 'has'} it"
     return f"; did you mean {error.possibilities[0]}?" if error.possibilities else ""
 
 
@@ -131,9 +175,12 @@ class Console:
         say_error(text)
 
     def say(self, text: str) -> None:
+        """Print a line; on a terminal, one that is too long is broken between words."""
         if not self._quiet:
             self.clear()
-            say(text)
+            line, width = printable(text, MOST), _columns()
+            for part in [line] if width is None else _wrapped(line, max(width, 2 * INDENT), INDENT):
+                _echo(part)
 
     def detail(self, text: str) -> None:
         """Print a line with `--verbose` only."""

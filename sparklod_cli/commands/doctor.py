@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from ..support.printable import printable
-from .console import count_of
+from .console import count_of, print_json
 from .option_groups import command, values_of
 from .options.common import Messages, quiet_flag, verbose_flag
 
@@ -19,8 +18,8 @@ if TYPE_CHECKING:
 
 EXAMPLES = """\
   sparklod doctor
-  sparklod doctor --quiet || exit 1                       # in CI
-  sparklod doctor --json > doctor.json                    # to attach to a report
+  sparklod doctor --quiet || exit 1      # in CI
+  sparklod doctor --json > doctor.json   # to attach to a report
 """
 
 
@@ -45,7 +44,7 @@ def doctor(ctx: click.Context, /, **_: Any) -> None:
         problems = [check for check in checks if check.state == "problem"]
         if messages.as_json:
             about = {"ok": not problems, "checks": [dataclasses.asdict(check) for check in checks]}
-            click.echo(json.dumps(about, indent=2))
+            print_json(about, indent=2)
         else:
             for line in _lines(problems if messages.quiet else checks):
                 click.echo(line)

@@ -33,11 +33,12 @@ if TYPE_CHECKING:
 
 EXAMPLES = """\
   sparklod inspect scene-lod.spz
-  sparklod inspect web/*.spz --check --format github      # exit status 3 if one is broken
-  sparklod inspect scene-lod.spz --assert 'nodes<5M' --assert 'growth<=1.4' --assert 'bytes<40MB'
+  sparklod inspect web/*.spz --check                      # exit status 3
+  sparklod inspect scene-lod.spz --assert 'nodes<5M' --assert 'bytes<40MB'
   sparklod inspect scene-lod.spz --check --leaves-of scene.ply
-  sparklod inspect scene-lod.spz --field tree.leaves
   sparklod inspect scene-lod.spz --html report.html
+  sparklod inspect scene-lod.spz --field tree.leaves
+  sparklod inspect web/*.spz --check --format github      # in GitHub Actions
   curl -s https://example.org/scene.spz | sparklod inspect -
 """
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 from ..support.printable import MOST, printable, shortened
-from .console import count_of, size_of
+from .console import count_of, rows, size_of
 
 if TYPE_CHECKING:
     from ..inspection.findings import Finding
@@ -32,13 +32,13 @@ def lines(name: str, report: dict[str, Any]) -> Iterator[str]:
     about += [f"{report['up']} is up"] * bool(report["up"])
     if "fractional_bits" in report["header"]:
         about.append(f"{report['header']['fractional_bits']} fractional bits")
-    yield _row("holds", ", ".join(about))
+    yield from rows("holds", ", ".join(about))
     if report["bytes_per_splat"]:
         ratio = report["compression_ratio"]
         less = "" if ratio is None else f", {ratio:.1f} times less than as floats"
-        yield _row("takes", f"{report['bytes_per_splat']:.1f} bytes a {noun}{less}")
+        yield from rows("takes", f"{report['bytes_per_splat']:.1f} bytes a {noun}{less}")
     for note in report["notes"]:
-        yield _row("note", note)
+        yield from rows("note", note)
     if report["rad"]:
         yield from _rad(report["rad"])
     if report["streamed_sog"]:
@@ -49,59 +49,58 @@ def lines(name: str, report: dict[str, Any]) -> Iterator[str]:
         yield from _values(values)
 
 
-def _row(name: str, text: str) -> str:
-    return f"  {name:<10} {printable(text, MOST)}"
-
-
 def _rad(rad: dict[str, Any]) -> Iterator[str]:
     where = "files of their own" if rad["chunked"] else "one file"
     header, first = size_of(rad["header_bytes"]), size_of(rad["first_bytes"])
-    yield _row("stored", f"{where}, header {header}, with the first chunk {first}")
+    yield from rows("stored", f"{where}, header {header}, with the first chunk {first}")
     if rad["chunk_bytes"]:
         least, median, most = (size_of(rad["chunk_bytes"][name]) for name in ("min", "median", "max"))
-        yield _row("chunks", f"{least} to {most}, median {median}, of {rad['chunk_size']:,} splats")
+        yield from rows("chunks", f"{least} to {most}, median {median}, of {rad['chunk_size']:,} splats")
     if rad["palette"]:
-        yield _row("palette", count_of(rad["palette"], "entry", "entries") + " of SH")
+        yield from rows("palette", count_of(rad["palette"], "entry", "entries") + " of SH")
     if rad["ranges"]:
-        yield _row("ranges", ", ".join(f"{name} {_ranged(value)}" for name, value in rad["ranges"].items()))
+        yield from rows("ranges", ", ".join(f"{name} {_ranged(value)}" for name, value in rad["ranges"].items()))
     if rad["properties"]:
-        yield _row("properties", f"{'encoding':<12} {'bytes':>13} {'share':>7}  range")
+        yield from rows("properties", f"{'encoding':<12} {'bytes':>13} {'share':>7}  range")
     for name, found in rad["properties"].items():
         ends = [f"{found[end]:g}" for end in ("min", "max") if found[end] is not None]
         share = f"{100 * found['share']:.1f} %"
         text = f"{found['encoding']:<12} {found['bytes']:>13,} {share:>7}  {' to '.join(ends)}"
         yield f"    {name:<12} {text}".rstrip()
     if rad["comment"]:
-        yield _row("comment", printable(rad["comment"], MOST_COMMENT))
+        yield from rows("comment", printable(rad["comment"], MOST_COMMENT))
 
 
 def _streamed_sog(streamed: dict[str, Any]) -> Iterator[str]:
     first, manifest = size_of(streamed["first_bytes"]), size_of(streamed["manifest_bytes"])
     around = " and the environment" if streamed["environment"] else ""
-    yield _row("stored", f"manifest {manifest}, with the coarsest level{around} {first}")
+    yield from rows("stored", f"manifest {manifest}, with the coarsest level{around} {first}")
     if streamed["file_bytes"]:
         least, median, most = (size_of(streamed["file_bytes"][name]) for name in ("min", "median", "max"))
         count = count_of(streamed["files"], "chunk file")
-        yield _row("files", f"{count} of {least} to {most}, median {median}")
+        yield from rows("files", f"{count} of {least} to {most}, median {median}")
     splats, edge = streamed["region_splats"], streamed["region_edge"]
     regions = count_of(streamed["regions"], "region")
-    yield _row("regions", f"{regions} in a tree of depth {streamed['depth']}")
-    yield _row("", f"{splats['min']:,.0f} to {splats['max']:,.0f} splats of level 0 each, median {splats['p50']:,.0f}")
-    yield _row("", f"{edge['min']:.4g} to {edge['max']:.4g} world units long, median {edge['p50']:.4g}")
-    head = [f"{'splats':>12} {'share':>8} {'regions':>8} {'files':>6} {'bytes':>13}"]
+    yield from rows("regions", f"{regions} in a tree of depth {streamed['depth']}")
+    yield from rows(
+        "", f"{splats['min']:,.0f} to {splats['max']:,.0f} splats of level 0 each, median {splats['p50']:,.0f}"
+    )
+    yield from rows("", f"{edge['min']:.4g} to {edge['max']:.4g} world units long, median {edge['p50']:.4g}")
+    head = f"{'splats':>11} {'share':>7} {'regions':>7} {'files':>5} {'size':>9}"
     if any(level["errors"] for level in streamed["levels"]):
-        head.append(f"{'error p25':>10} {'p50':>10} {'p75':>10}")
-    yield _row("levels", " ".join(head))
+        head += f"{'err. p25':>9}{'p50':>8}{'p75':>8}"
+    yield from rows("levels", head)
     for number, level in enumerate(streamed["levels"]):
         share = "" if level["share"] is None else f"{100 * level['share']:.1f} %"
-        errors = [f"{level['errors'][name]:>10.3g}" for name in ("p25", "p50", "p75")] if level["errors"] else []
-        counts = f"{level['splats']:>12,} {share:>8} {level['regions']:>8,} {level['files']:>6,} {level['bytes']:>13,}"
-        yield f"    {number:<8} {' '.join([counts, *errors])}"
+        errors = (f"{level['errors'][name]:>8.2g}" for name in ("p25", "p50", "p75") if level["errors"])
+        size = size_of(level["bytes"])
+        counts = f"{level['splats']:>11,} {share:>7} {level['regions']:>7,} {level['files']:>5,} {size:>9}"
+        yield f"    {number:<8} {counts}{''.join(errors)}"
     if streamed["environment"]:
         around = streamed["environment"]
-        yield _row("environment", f"{count_of(around['splats'], 'splat')}, {size_of(around['bytes'])}")
+        yield from rows("environment", f"{count_of(around['splats'], 'splat')}, {size_of(around['bytes'])}")
     if streamed["generator"]:
-        yield _row("written by", streamed["generator"])
+        yield from rows("written by", streamed["generator"])
 
 
 def _ranged(value: float | bool) -> str:
@@ -111,26 +110,26 @@ def _ranged(value: float | bool) -> str:
 def _tree(tree: dict[str, Any]) -> Iterator[str]:
     inner = count_of(tree["inner"], "inner node")
     leaves = count_of(tree["leaves"], "leaf", "leaves")
-    yield _row("tree", f"{leaves}, {inner}, growth {tree['growth']:.3f}, depth {tree['depth']}")
+    yield from rows("tree", f"{leaves}, {inner}, growth {tree['growth']:.3f}, depth {tree['depth']}")
     if tree["more_than_opaque"] is not None:
-        yield _row("", f"{100 * tree['more_than_opaque']:.1f} % of the nodes have a LoD opacity above 1")
+        yield from rows("", f"{100 * tree['more_than_opaque']:.1f} % of the nodes have a LoD opacity above 1")
     chunks = count_of(tree["chunks"], "chunk")
-    yield _row(
+    yield from rows(
         "", f"{chunks} of 65,536 nodes, {tree['chunks_of_coarse_cut']} of them for the coarsest cut of that many nodes"
     )
     if tree["split_siblings"]:
-        yield _row("", f"the children of {count_of(tree['split_siblings'], 'node')} lie in more than one chunk")
+        yield from rows("", f"the children of {count_of(tree['split_siblings'], 'node')} lie in more than one chunk")
     counts = sorted(tree["children"].items(), key=lambda item: -item[1])
     shown = ", ".join(f"{children}: {count:,}" for children, count in counts[:MOST_ROWS])
-    yield _row(
+    yield from rows(
         "children", shown + (f", and {len(counts) - MOST_ROWS} other numbers" if len(counts) > MOST_ROWS else "")
     )
-    yield _row("by depth", f"{'depth':>5} {'nodes':>12} {'leaves':>12} {'size':>10}")
+    yield from rows("by depth", f"{'depth':>5} {'nodes':>12} {'leaves':>12} {'size':>10}")
     for depth, level in enumerate(tree["levels"][:MOST_DEPTHS]):
         size = "" if level["size"] is None else f"{level['size']:.4g}"
-        yield _row("", f"{depth:>5} {level['nodes']:>12,} {level['leaves']:>12,} {size:>10}")
+        yield from rows("", f"{depth:>5} {level['nodes']:>12,} {level['leaves']:>12,} {size:>10}")
     if tree["depth"] >= MOST_DEPTHS:
-        yield _row("", f"and {tree['depth'] + 1 - MOST_DEPTHS:,} more")
+        yield from rows("", f"and {tree['depth'] + 1 - MOST_DEPTHS:,} more")
 
 
 def _values(values: dict[str, Any]) -> Iterator[str]:
@@ -138,12 +137,12 @@ def _values(values: dict[str, Any]) -> Iterator[str]:
         box = values[name]
         if box:
             low, high = (" ".join(f"{number:.4g}" for number in box[end]) for end in ("min", "max"))
-            yield _row(what, f"{low}  to  {high}")
-    names = ("min", "p1", "p25", "p50", "p75", "p99", "max", "mean")
-    yield _row("values", " ".join(f"{name:>10}" for name in names))
+            yield from rows(what, f"{low}  to  {high}")
+    names = ("min", "p1", "p50", "p99", "max", "mean")
+    yield from rows("values", " ".join(f"{name:>10}" for name in names))
     for quantity, summary in values["quantities"].items():
         cells = ("" if summary[name] is None else f"{summary[name]:.4g}" for name in names)
-        yield _row(quantity, " ".join(f"{cell:>10}" for cell in cells))
+        yield from rows(quantity, " ".join(f"{cell:>10}" for cell in cells))
     counts = {
         "not finite": values["non_finite"],
         "of a negative scale": values["negative_scale"],
@@ -152,7 +151,7 @@ def _values(values: dict[str, Any]) -> Iterator[str]:
     }
     bad = ", ".join(f"{count:,} {what}" for what, count in counts.items() if count)
     if bad:
-        yield _row("degenerate", bad)
+        yield from rows("degenerate", bad)
 
 
 def finding_line(file: str, found: Finding, style: str) -> str:

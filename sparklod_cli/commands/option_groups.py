@@ -43,9 +43,8 @@ def command(
         decorated = click.version_option(__version__, package_name="sparklod")(click.pass_context(function))
         for decorator in reversed(list(_options(options, GENERAL))):
             decorated = decorator(decorated)
-        settings = {"show_default": True}
-        epilog = f"\n\b\nExamples:\n{examples}"
-        return click.command(name, cls=Command, headings=headings, epilog=epilog, context_settings=settings)(decorated)
+        how: dict[str, Any] = {"headings": headings, "examples": examples, "context_settings": {"show_default": True}}
+        return click.command(name, cls=Command, **how)(decorated)
 
     return decorate
 

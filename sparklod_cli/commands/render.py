@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ..images.defaults import THUMBNAIL_SIZE, THUMBNAIL_SUPERSAMPLE
-from .console import Console, count_of, size_of
+from .console import Console, count_of, print_json, size_of
 from .option_groups import COMMON, check_declared, command, exclude, flags_set, values_of
 from .options.cameras import PictureCameras
 from .options.common import General, json_flag
@@ -31,14 +30,19 @@ if TYPE_CHECKING:
 EXAMPLES = """\
   sparklod render scene-lod.spz --budget 500k --size 1280x720 -o preview.png
   sparklod render scene.ply --thumbnail
-  sparklod render scene.ply --look-at 0,-1,4:0,0,0 --supersample 2 --alpha -o view.webp
-  sparklod render scene-lod.spz --view 0,-1,4:0,0,0 --view 4,-1,0:0,0,0 -o sheet.png
-  sparklod render scene-lod.spz --orbit 120 -o orbit.mp4             # or .webm, .gif, .webp
-  sparklod render scene-lod.spz --camera-path path.json -o 'frames/out.%04d.png' --jobs 4
+  sparklod render scene.ply --look-at 0,-1,4:0,0,0 --alpha -o view.webp
+  sparklod render scene-lod.spz --orbit 120 -o orbit.mp4    # or .webm, .gif
   sparklod render scene-lod.spz --budget 5% --color-by level -o levels.png
-  sparklod render scene-lod.rad --after 1s --bandwidth 20Mbit --latency 60ms -o after-1s.png
-  sparklod render scene-lod.spz --full --through packed --diff scene-lod.spz -o rounding.png
-  sparklod render scene-lod.spz --orbit 6 --compare --budget 5%,25% --assert '25%:psnr>30'   # exit status 3
+  sparklod render scene-lod.spz \\
+    --view 0,-1,4:0,0,0 --view 4,-1,0:0,0,0 -o sheet.png
+  sparklod render scene-lod.spz --camera-path path.json \\
+    --jobs 4 -o 'frames/out.%04d.png'
+  sparklod render scene-lod.rad \\
+    --after 1s --bandwidth 20Mbit --latency 60ms -o after-1s.png
+  sparklod render scene-lod.spz \\
+    --full --through packed --diff scene-lod.spz -o rounding.png
+  sparklod render scene-lod.spz --orbit 6 --compare \\
+    --budget 5%,25% --assert '25%:psnr>30'                  # exit status 3
 """
 
 HEADINGS = (
@@ -234,7 +238,7 @@ def _report(console: Console, drawn: DrawnPath, seconds: float, *, as_json: bool
             "frames": written.frames,
             "seconds": round(seconds, 3),
         }
-        click.echo(json.dumps(whole if written.gain is None else whole | {"gain": written.gain}, allow_nan=False))
+        print_json(whole if written.gain is None else whole | {"gain": written.gain})
     name = "standard output" if output.name is None else output.name
     console.say(f"{name}  {_describe(written)}, {seconds:.2f} s")
     console.detail(

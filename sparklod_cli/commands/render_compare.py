@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import sys
 import time
 from collections.abc import Iterable, Iterator, Sequence
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from ..support.stdin import DASH
-from .console import Console, count_of, for_screen, is_terminal
+from .console import Console, count_of, for_screen, is_terminal, print_json
 from .options.common import report_outcomes, table_form
 from .options.cut import check_scenes, viewed_files
 from .paths import Folder, keep_apart
@@ -110,7 +109,7 @@ def _report(console: Console, options: RenderOptions, compared: Compared, about:
         figures = [each.as_dict() for each in summary]
         frames = len(compared.path.cameras)
         whole = {"frames": frames, "leaves": compared.leaves, "budgets": figures, "asserts": asserts}
-        click.echo(json.dumps(whole, allow_nan=False))
+        print_json(whole)
     texts = lines(summary, compared.path, compared.leaves)
     if _on_screen(options):
         click.echo("\n".join(texts))
@@ -131,12 +130,12 @@ def lines(summary: Sequence[BudgetSummary], path: CameraPath, leaves: int) -> It
     yield f"  {count_of(len(path.cameras), 'frame')} of {size}, against {count_of(leaves, 'splat')}, on black and white"
     pops = any(each.popping is not None for each in summary)
     head = f" {'popping':>7} {'most':>5}" if pops else ""
-    yield f"  {'budget':>8} {'splats':>11} {'PSNR':>6} {'least':>6} {'SSIM':>6} {'edges':>6}{head}   worst tile"
+    yield f"  {'budget':>8} {'splats':>10} {'PSNR':>6} {'least':>6} {'SSIM':>6} {'edges':>6}{head}  worst tile"
     for each in summary:
         popped = f" {_or_dash(each.popping):>7} {_or_dash(each.popping_max):>5}" if pops else ""
         yield (
-            f"  {each.text:>8} {round(each.selected):>11,} {each.psnr:>6.2f} {each.psnr_min:>6.2f} {each.ssim:>6.4f}"
-            f" {_or_dash(each.edge_psnr):>6}{popped}   {each.worst_tile_psnr:.2f}"
+            f"  {each.text:>8} {round(each.selected):>10,} {each.psnr:>6.2f} {each.psnr_min:>6.2f} {each.ssim:>6.4f}"
+            f" {_or_dash(each.edge_psnr):>6}{popped}  {each.worst_tile_psnr:.2f}"
             f" at {each.worst_tile_x}, {each.worst_tile_y} of frame {each.worst_frame:,}"
         )
 

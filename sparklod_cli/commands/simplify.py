@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,7 +21,7 @@ from ..support.stdin import DASH
 from ..support.units import parse_size
 from .build_lod_files import SPZ, record_of, refuse_others
 from .build_lod_text import report_simplified
-from .console import say
+from .console import print_json, say
 from .option_groups import (
     COMMON,
     argument,
@@ -64,13 +63,14 @@ if TYPE_CHECKING:
 EXAMPLES = """\
   sparklod simplify scene.ply --to 10% -o small.ply
   sparklod simplify scene.ply --to 100k -o small.spz
-  sparklod simplify scene.ply --max-bytes 8MB -o small.sog     # as many splats as fit
-  sparklod simplify scene.ply --psnr 40 -o small.spz           # as few splats as hold it
-  sparklod simplify scene.ply --to 1% --refine -o small.ply    # closer to the scene, in minutes
+  sparklod simplify scene.ply --max-bytes 8MB -o small.sog  # as many as fit
+  sparklod simplify scene.ply --psnr 40 -o small.spz        # to hold 40 dB
+  sparklod simplify scene.ply --to 1% --refine -o small.ply # in minutes
   sparklod simplify scene.ply --psnr 35 --camera-path path.json -o small.ply
-  sparklod simplify scene.ply --to 500k --up -y -o small.glb --glb-profile cesium
-  sparklod simplify tiles/*.ply --to 1M --up -y -o city.sog    # several files as one scene
-  sparklod simplify scene-lod.rad --to 5% -o small.ply         # a cut of the tree that it has
+  sparklod simplify scene.ply \\
+    --to 500k --up -y -o small.glb --glb-profile cesium
+  sparklod simplify tiles/*.ply --to 1M --up -y -o city.sog # one scene of all
+  sparklod simplify scene-lod.rad --to 5% -o small.ply      # a cut of its tree
 """
 
 #: Ways to say how many splats are left, by parameter.
@@ -187,13 +187,11 @@ HEADINGS = (COMMON, "Selection", "Rotation, scale and position", "File format", 
 
 @command("simplify", SimplifyOptions, examples=EXAMPLES, headings=HEADINGS)
 def simplify(ctx: click.Context, /, **_: Any) -> None:
-    """Write a scene with fewer splats, the same for all cameras.
+    """Write a scene with fewer splats, the same for all cameras. Give one of --to, --max-bytes and --psnr.
 
     Reads all that build-lod reads, builds its quality tree, and writes the cut of it that loses least, without a tree:
     a file that every viewer of plain splats shows. Several INPUTs become one scene, each where its own coordinates put
     it; an INPUT of - is standard input. A Level-of-Detail file is cut as it is.
-
-    Give one of --to, --max-bytes and --psnr.
     """
     output = ctx.params["output"]
     if isinstance(output, Folder):
@@ -219,7 +217,7 @@ def simplify(ctx: click.Context, /, **_: Any) -> None:
         report_simplified(console, files.source, files.output, baked)
         if general.as_json:
             record = {**record_of(files.source), "output": str(files.output), **dataclasses.asdict(baked)}
-            click.echo(json.dumps(record))
+            print_json(record)
         if interrupts.came():  # while the set was fitted, which ended early then
             console.clear()
             say("interrupted")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 from collections.abc import Iterator
@@ -16,7 +15,7 @@ from ..simulation.streaming_settings import StreamingSettings
 from ..support.printable import printable
 from ..support.stdin import DASH
 from ..tables.files import FORMS
-from .console import Console, count_of, for_screen, is_terminal, size_of
+from .console import WIDTH, Console, count_of, for_screen, is_terminal, print_json, rows, size_of
 from .option_groups import COMMON, check_declared, command, exclude, flag, option, refuse, values_of
 from .options.cameras import Cameras
 from .options.common import (
@@ -46,12 +45,16 @@ if TYPE_CHECKING:
 LEAST_IN_FRONT = 0.05
 
 EXAMPLES = """\
-  sparklod traverse scene-lod.spz --budget 500k            # an orbit; the summary, or CSV into a pipe
-  sparklod traverse scene-lod.spz --camera-path path.json -o frames.csv --summary
-  sparklod traverse scene-lod.spz --preset quest --assert 'churn_p95<0.2'    # exit status 3
-  sparklod traverse scene-lod.spz --dolly --bandwidth 20Mbit --latency 60ms --plot path.png
-  sparklod traverse --scene city.json --keyframes '0,-2,9:0,0,0 9,-2,0:0,0,0' --per-instance
-  sparklod traverse scene-lod.spz --look-at 0,-1,4:0,0,0 --indices-out cuts --padded
+  sparklod traverse scene-lod.spz --budget 500k    # an orbit
+  sparklod traverse scene-lod.spz --camera-path path.json -o frames.csv
+  sparklod traverse scene-lod.spz --assert 'churn_p95<0.2'    # exit status 3
+  sparklod traverse scene-lod.spz --dolly --bandwidth 20Mbit --plot path.png
+  sparklod traverse scene-lod.spz --preset quest --json
+  sparklod traverse scene-lod.rad --bandwidth 20Mbit --latency 60ms
+  sparklod traverse --scene city.json \\
+    --keyframes '0,-2,9:0,0,0 9,-2,0:0,0,0' --per-instance
+  sparklod traverse scene-lod.spz \\
+    --look-at 0,-1,4:0,0,0 --indices-out cuts --padded
 """
 
 #: Options that say what is in the table.
@@ -232,7 +235,7 @@ def _report(console: Console, traversed: Traversed, summary: bool | None, *, as_
     whole, outcomes = traversed.summary, traversed.outcomes
     if as_json:
         asserts = [each.as_dict() for each in outcomes]
-        click.echo(json.dumps(whole.as_dict() | {"asserts": asserts}, allow_nan=False))
+        print_json(whole.as_dict() | {"asserts": asserts})
     if on_stdout and summary is not False:
         click.echo("\n".join(lines(whole)))
     elif summary or (summary is None and is_terminal(sys.stderr)):
@@ -240,9 +243,6 @@ def _report(console: Console, traversed: Traversed, summary: bool | None, *, as_
             console.say(line)
     return report_outcomes(console, outcomes)
 
-
-#: No line is longer; names of frames are cut to fit.
-WIDTH = 100
 
 #: Names of the quantities, and how a number of each is printed.
 QUANTITIES = {
@@ -279,33 +279,25 @@ STOPS = {
 }
 
 
-def lines(summary: Summary) -> list[str]:
-    """Return the lines of a summary, none longer than `WIDTH`."""
-    return [_cut(line) for line in _lines(summary)]
-
-
-def _lines(summary: Summary) -> Iterator[str]:
-    yield _row("path", f"{count_of(summary.frames, 'frame')}, {summary.seconds:.3f} s")
+def lines(summary: Summary) -> Iterator[str]:
+    """Yield the lines of a summary."""
+    yield from rows("path", f"{count_of(summary.frames, 'frame')}, {summary.seconds:.3f} s")
     if summary.stop_reasons:
         stops = (f"{_share(share)} {STOPS.get(reason, reason)}" for reason, share in summary.stop_reasons.items())
-        yield _row("stops", ", ".join(stops))
+        yield from rows("stops", ", ".join(stops))
     if summary.chunks:
-        first = f"{size_of(summary.bytes_first)} of it in {count_of(summary.chunks_first, 'chunk')} for the first frame"
-        yield _row("fetches", f"{size_of(summary.bytes)} in {count_of(summary.chunks, 'chunk')}, {first}")
+        first = f"{size_of(summary.bytes_first)} in {count_of(summary.chunks_first, 'chunk')} for the first frame"
+        yield from rows("fetches", f"{size_of(summary.bytes)} in {count_of(summary.chunks, 'chunk')}, {first}")
     if summary.loading:
-        yield _row("opens", _loading(summary.loading))
+        yield from rows("opens", _loading(summary.loading))
     if summary.quantities:
-        yield _row("a frame", f"{'':<18} {'min':>12} {'median':>12} {'p95':>12} {'max':>12}")
+        yield from rows("a frame", f"{'':<18} {'min':>11} {'median':>11} {'p95':>11} {'max':>11}")
         for quantity in summary.quantities:
-            yield _row("", _quantity(quantity))
+            yield from rows("", _quantity(quantity))
     if summary.moments:
-        yield _row("look at", f"{'frame':>7} {'time':>11}")
+        yield from rows("look at", f"{'frame':>7} {'time':>11}")
         for moment in summary.moments:
-            yield _row("", _moment(moment))
-
-
-def _row(name: str, text: str) -> str:
-    return f"  {name:<10} {text}".rstrip()
+            yield from rows("", _moment(moment))
 
 
 def _loading(figures: Row) -> str:
@@ -321,7 +313,7 @@ def _loading(figures: Row) -> str:
 def _quantity(quantity: FrameStatistics) -> str:
     name, style = QUANTITIES[quantity.name]
     numbers = (quantity.min, quantity.p50, quantity.p95, quantity.max)
-    return f"{name:<18} " + " ".join(f"{_said(number, style):>12}" for number in numbers)
+    return f"{name:<18} " + " ".join(f"{_said(number, style):>11}" for number in numbers)
 
 
 def _moment(moment: Moment) -> str:
@@ -348,7 +340,3 @@ def _said(value: float, style: str) -> str:
 
 def _share(value: float) -> str:
     return f"{100 * value:.1f} %"
-
-
-def _cut(line: str) -> str:
-    return line if len(line) <= WIDTH else f"{line[: WIDTH - 1]}…"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import sys
 import threading
@@ -16,7 +15,7 @@ import click
 from ..support.printable import printable
 from ..support.setting_fields import Quantity, Range, whole
 from ..support.units import parse_count
-from .console import Console, count_of, size_of
+from .console import Console, count_of, print_json, size_of
 from .option_groups import COMMON, argument, check_declared, command, flag, option, values_of
 from .options.common import General, json_flag, overwrite_flag, quiet_flag, verbose_flag
 from .parameter_types import DIRECTION, VIEW
@@ -27,13 +26,13 @@ if TYPE_CHECKING:
 
 EXAMPLES = """\
   sparklod view scene-lod.rad
-  sparklod view web/lod-meta.json                         # in PlayCanvas
+  sparklod view web/lod-meta.json                    # in PlayCanvas
   sparklod view scene-lod.spz --look-at 0,-1,4:0,0,0 --budget 500k
-  sparklod view quick-lod.spz quality-lod.spz             # both, with a box for each
+  sparklod view quick-lod.spz quality-lod.spz        # a box for each
   sparklod view scene-lod.rad --camera-path path.json
   npm install --prefix ~/spark @sparkjsdev/spark@2.2.0 three@0.187.0
-  sparklod view scene-lod.rad --spark-dir ~/spark         # without a network
-  sparklod view scene-lod.rad --export site               # for any web server
+  sparklod view scene-lod.rad --spark-dir ~/spark    # without a network
+  sparklod view scene-lod.rad --export site          # for any web server
 """
 
 
@@ -154,7 +153,10 @@ def view(ctx: click.Context, /, **_: Any) -> None:
 def _serve(console: Console, server: Server, *, opens: bool, as_json: bool) -> None:
     """Serve until an interrupt, which is how a server ends."""
     with server, contextlib.suppress(KeyboardInterrupt):
-        click.echo(json.dumps({"url": server.url, "files": _files(server.site)}) if as_json else server.url)
+        if as_json:
+            print_json({"url": server.url, "files": _files(server.site)})
+        else:
+            click.echo(server.url)
         sys.stdout.flush()
         names = ", ".join(printable(file.name) for file in server.site.shown)
         everybody = "" if server.loopback else "; everybody who can reach this machine can read them"
@@ -180,7 +182,7 @@ def _open(console: Console, url: str) -> None:
 def _report_export(console: Console, folder: Path, site: Site, size: int, *, as_json: bool) -> None:
     console.say(f"wrote {printable(str(folder))}: {count_of(len(site.resources), 'file')}, {size_of(size)}")
     if as_json:
-        click.echo(json.dumps({"folder": str(folder), "bytes": size, "files": _files(site)}))
+        print_json({"folder": str(folder), "bytes": size, "files": _files(site)})
 
 
 def _files(site: Site) -> list[dict[str, Any]]:

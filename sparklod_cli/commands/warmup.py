@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from dataclasses import dataclass
 from typing import Any
@@ -10,14 +9,14 @@ from typing import Any
 import click
 
 from ..support.setting_fields import whole
-from .console import count_of
+from .console import count_of, print_json
 from .option_groups import command, option, values_of
 from .options.common import Messages, processors_to_use, verbose_flag
 
 EXAMPLES = """\
-  sparklod warmup                                  # once, after pip install
-  RUN pip install ./sparklod && sparklod warmup    # in a Dockerfile
-  NUMBA_CACHE_DIR=.cache/numba sparklod warmup     # in CI, with that folder cached
+  sparklod warmup                                # once, after pip install
+  RUN pip install ./sparklod && sparklod warmup  # in a Dockerfile
+  NUMBA_CACHE_DIR=.cache/numba sparklod warmup   # in CI, with a cached folder
 """
 
 
@@ -56,4 +55,4 @@ def warmup(ctx: click.Context, /, **_: Any) -> None:
             else f"all kernels are in {jit.CACHE_FOLDER}"
         )
         if options.as_json:
-            click.echo(json.dumps({"compiled": compiled, "seconds": round(seconds, 2), "cache": str(jit.CACHE_FOLDER)}))
+            print_json({"compiled": compiled, "seconds": round(seconds, 2), "cache": str(jit.CACHE_FOLDER)})

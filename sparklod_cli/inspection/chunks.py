@@ -32,19 +32,18 @@ COLUMNS = (
     Column("parent_chunks", int, "", "", "other chunks that hold parents of its nodes; empty without a tree"),
 )
 
-#: The columns of a table that a person reads, and their widths.
+#: The columns of a table that a person reads, with their headings and widths, 80 in all.
 SHOWN = {
-    "chunk": 6,
-    "base": 12,
-    "splats": 8,
-    "leaves": 8,
-    "bytes": 11,
-    "extent": 10,
-    "size_min": 11,
-    "size_max": 11,
-    "depth_min": 10,
-    "depth_max": 10,
-    "parent_chunks": 14,
+    "chunk": ("chunk", 6),
+    "splats": ("splats", 8),
+    "leaves": ("leaves", 8),
+    "bytes": ("bytes", 11),
+    "extent": ("extent", 9),
+    "size_min": ("size", 10),
+    "size_max": ("to", 10),
+    "depth_min": ("depth", 6),
+    "depth_max": ("to", 4),
+    "parent_chunks": ("parents", 8),
 }
 
 
@@ -95,10 +94,10 @@ def _add_links(rows: Sequence[dict[str, Any]], nodes: tree.TreeColumns) -> None:
 
 def lines(rows: list[dict[str, Any]]) -> Iterator[str]:
     """Yield the table as a person reads it; its rows may come from JSON."""
-    shown = {name: width for name, width in SHOWN.items() if any(row[name] is not None for row in rows)}
-    yield "".join(f"{name:>{width}}" for name, width in shown.items())
+    shown = {name: column for name, column in SHOWN.items() if any(row[name] is not None for row in rows)}
+    yield "".join(f"{heading:>{width}}" for heading, width in shown.values())
     for row in rows:
-        yield "".join(f"{_text(row[name]):>{width}}" for name, width in shown.items())
+        yield "".join(f"{_text(row[name]):>{width}}" for name, (_, width) in shown.items())
 
 
 def _text(value: Cell) -> str:

@@ -20,8 +20,9 @@ from ..support.untrusted import quoted_value
 #: Names in a folder that are compared with one that is missing: more take longer than a person expects of an error.
 MOST_NAMES = 10_000
 
-#: How similar two names are that may be meant by one another, as `difflib` measures it: a letter or two differ.
-SIMILAR = 0.8
+#: How similar two names are that may be meant by one another, as `difflib` measures it: a letter or two differ, or
+#: the suffix.
+SIMILAR = 0.75
 
 
 def is_file_name(text: str) -> bool:

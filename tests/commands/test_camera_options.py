@@ -249,6 +249,6 @@ def test_too_many_generated_cameras_are_refused(options: tuple[str, ...], monkey
 
 
 def test_the_help_lists_formats_and_axes() -> None:
-    text = " ".join(run("--help")[0].output.split())
-    for said in ("EYE:TARGET", "'EYE:TARGET ...'", "WxH", "auto|sparklod|csv|nerfstudio", "opengl-c2w|opencv-c2w"):
+    text = " ".join(run("--help-all")[0].output.split())
+    for said in ("EYE:TARGET", "'EYE:TARGET ...'", "WxH", "sparklod, csv, nerfstudio", "opengl-c2w|opencv-c2w"):
         assert said in text

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import re
+import shlex
 import subprocess
 import sys
+from pathlib import Path
 
 import click
 import pytest
 
-from sparklod_cli.cli import COMMANDS, cli, run
-from sparklod_cli.commands.command import ALIASES, COMMON, GENERAL, Command
-from tests.conftest import ROOT, Capture
+from sparklod_cli.cli import COMMANDS, TASKS, cli, run
+from sparklod_cli.commands.command import ALIASES, COMMON, FEW_EXAMPLES, GENERAL, Command
+from tests.conftest import FIXTURES, ROOT, Capture
 
 COMMAND_NAMES = [name for name in COMMANDS if name != "help"]
+
+#: Columns of the narrowest terminal that help is written for, and the most options that `--help` lists.
+COLUMNS, MOST = 80, 14
 
 
 def command_of(name: str) -> Command:
@@ -27,14 +32,21 @@ def printed(*arguments: str, capsys: Capture) -> str:
     return capsys.readouterr().out
 
 
+def listed(text: str) -> list[str]:
+    """The options that a help text lists below its first heading, by their last names."""
+    _, _, options = text.partition(":\n")
+    return re.findall(r"^  (?:-\w, )?(?:--[\w-]+ / )?(--[\w-]+)(?![\w-])", options, re.MULTILINE)
+
+
 @pytest.mark.parametrize("name", COMMAND_NAMES)
 def test_each_option_stands_under_one_heading(name: str, capsys: Capture) -> None:
     command = command_of(name)
     headings = command.by_heading(click.Context(command))
-    listed = [param for params in headings.values() for param in params]
-    options = [param for param in command.get_params(click.Context(command)) if isinstance(param, click.Option)]
-    assert sorted(map(id, listed)) == sorted(map(id, options))
-    text = printed(name, "--help", capsys=capsys)
+    params = [param for params in headings.values() for param in params]
+    params_of_all = command.get_params(click.Context(command))
+    options = [param for param in params_of_all if isinstance(param, click.Option) and not param.hidden]
+    assert sorted(map(id, params)) == sorted(map(id, options))
+    text = printed(name, "--help-all", capsys=capsys)
     for heading in headings:
         assert f"\n{heading}:\n" in text
     text = text[text.index(f"\n{next(iter(headings))}:\n") :]  # after the words about the command
@@ -43,12 +55,43 @@ def test_each_option_stands_under_one_heading(name: str, capsys: Capture) -> Non
     assert next(iter(reversed(headings))) == GENERAL
 
 
-@pytest.mark.parametrize("name", ["build-lod", "inspect"])
-def test_the_first_heading_has_the_few_options_that_most_people_need(name: str) -> None:
+@pytest.mark.parametrize("name", COMMAND_NAMES)
+def test_help_lists_the_few_options_that_most_people_need(name: str, capsys: Capture) -> None:
     command = command_of(name)
-    first, params = next(iter(command.by_heading(click.Context(command)).items()))
-    assert first == COMMON
-    assert 5 <= len(params) <= 12
+    text = printed(name, "--help", capsys=capsys)
+    if not command.abridged:
+        assert len(listed(text)) <= MOST
+        assert text == printed(name, "--help-all", capsys=capsys)
+        return
+    common = command.by_heading(click.Context(command))[COMMON]
+    shown = [*(param.opts[-1] for param in common), "--help-all", "--help"]
+    assert [flag for flag in listed(text) if flag != "--no-summary"] == [flag for flag in shown if flag != "--summary"]
+    assert 5 <= len(shown) <= MOST
+    assert [line for line in text.splitlines() if line in command.examples] == command.examples[:FEW_EXAMPLES]
+    assert not any(line.endswith("\\") for line in command.examples[:FEW_EXAMPLES])  # each is whole
+
+
+@pytest.mark.parametrize(
+    "arguments", [("--help",), *((name, flag) for name in COMMAND_NAMES for flag in ("--help", "--help-all"))]
+)
+def test_help_fits_the_narrowest_terminal(
+    arguments: tuple[str, ...], capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", str(COLUMNS))
+    for line in printed(*arguments, capsys=capsys).splitlines():
+        assert len(line) <= COLUMNS, line
+        assert not re.search(r"[\w-]-$", line), line  # which is broken within a word
+
+
+def test_brief_help_of_an_option_is_its_first_sentence_and_its_first_default(capsys: Capture) -> None:
+    text = re.sub(r"\s+", " ", printed("build-lod", "--help", capsys=capsys))
+    for row in (
+        "--output FILE Output of a single input, or a folder for all outputs; - is standard output."
+        " [default: NAME-lod.spz beside the input] --output-dir",
+        "--max-sh N Highest degree of spherical harmonics to keep. [default: 3] --min-opacity",
+        "Scenes as trained",
+    ):
+        assert (row in text) == row.startswith("--")
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -62,11 +105,37 @@ def test_help_ends_with_examples(name: str, capsys: Capture) -> None:
     assert f"  sparklod {name}" in examples
 
 
-def test_without_a_command_the_program_prints_its_help(capsys: Capture) -> None:
-    help_text = printed("--help", capsys=capsys)
-    run([])
-    said = capsys.readouterr()
-    assert (said.out + said.err).strip() == help_text.strip()
+@pytest.mark.parametrize("name", COMMAND_NAMES)
+def test_examples_are_command_lines(name: str) -> None:
+    command = command_of(name)
+    for line in "\n".join(command.examples).replace("\\\n", " ").splitlines():
+        words = shlex.split(line, comments=True)
+        if "sparklod" not in words:  # but in a substitution, or not at all
+            continue
+        called, *arguments = words[words.index("sparklod") + 1 :]
+        end = next((at for at, word in enumerate(arguments) if word in ("|", "||", ">")), None)
+        assert called == name
+        command.make_context(name, arguments[:end])
+
+
+def test_without_a_command_the_program_shows_tasks(capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert run([]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert max(map(len, err.splitlines())) <= COLUMNS
+    assert [line[2:] for line in err.splitlines() if line.startswith("  ")] == [
+        f"{task:<26}{command}" for task, command in TASKS.items()
+    ]
+
+
+def test_the_commands_of_tasks_can_be_run_one_after_the_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene.ply").write_bytes((FIXTURES / "sh0.ply").read_bytes())
+    for command in TASKS.values():
+        arguments = command.split()[1:]
+        if arguments[0] == "view":  # which serves until Ctrl-C
+            arguments += ["--export", "site"]
+        assert run([*arguments, "-q"]) == 0, command
 
 
 def test_help_alone_is_that_of_the_program(capsys: Capture) -> None:
@@ -124,6 +193,30 @@ def test_an_option_that_there_is_not_names_the_one_that_was_meant(
     assert err.splitlines()[-1] == f"error: there is no option {wrong}; did you mean {meant}?"
 
 
+@pytest.mark.parametrize(
+    ("arguments", "hint"),
+    [
+        (["warmup", "--outside-foveate", "1"], "; traverse, render have it"),
+        (["inspect", "--unlod"], "; build-lod has it"),
+        (["--overwrite", "build-lod"], "; options of a command follow its name, as in sparklod build-lod --overwrite"),
+        (["-q"], "; options of a command follow its name, as in sparklod build-lod -q"),
+        (["doctor", "--xyzzy"], ""),
+    ],
+)
+def test_an_option_of_other_commands_names_them(arguments: list[str], hint: str, capsys: Capture) -> None:
+    assert run(arguments) == 2
+    flag = next(each for each in arguments if each.startswith("-"))
+    assert capsys.readouterr().err.splitlines()[-1] == f"error: there is no option {flag}{hint}"
+
+
+def test_a_file_in_place_of_a_command_names_what_bakes_it(tmp_path: Path, capsys: Capture) -> None:
+    (path := tmp_path / "my scene.ply").touch()
+    assert run([str(path)]) == 2
+    assert capsys.readouterr().err.endswith(
+        f"error: there is no command {str(path)!r}; did you mean build-lod '{path}'?\n"
+    )
+
+
 @pytest.mark.parametrize("arguments", [(), *((name,) for name in COMMANDS)], ids=" ".join)
 def test_help_loads_nothing_heavy(arguments: tuple[str, ...]) -> None:
     code = "import sys; from sparklod_cli.cli import run; run(sys.argv[1:]); print(*sys.modules, file=sys.stderr)"
@@ -147,7 +240,7 @@ def test_options_stand_under_headings_the_common_ones_first(name: str) -> None:
     groups = command.by_heading(click.Context(command))
     assert [*groups] == [COMMON, *HEADINGS[name], GENERAL]
     assert len(groups[COMMON]) == 10
-    general = {"--threads", "--json", "--quiet", "--verbose", "--version", "--help"}
+    general = {"--threads", "--json", "--quiet", "--verbose", "--version", "--help-all", "--help"}
     assert {max(param.opts, key=len) for param in groups[GENERAL]} == general
 
 

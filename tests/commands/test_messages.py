@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import io
 import json
+import os
 import re
 import sys
 from collections.abc import Callable
@@ -308,3 +309,15 @@ def test_a_missing_package_is_reported_before_the_work(
     assert f" by {package}: " in err
     assert "missing.spz" not in err
     assert not any(tmp_path.iterdir())
+
+
+def test_a_line_that_is_too_long_for_a_terminal_goes_on_below(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    long = "a.ply  152,746 splats, SH 0  ->  a-lod.spz  179,140 nodes, depth 16, 2.9 MB, 7.7 s"
+    Console(quiet=False, verbose=False).say(long)
+    monkeypatch.setattr("os.get_terminal_size", lambda _: os.terminal_size((80, 24)))
+    Console(quiet=False, verbose=False).say(long)
+    Console(quiet=False, verbose=False).say(long[:80])
+    split = long.index("7.7 s")
+    assert capfd.readouterr().err.splitlines() == [long, long[: split - 1], f"    {long[split:]}", long[:80]]

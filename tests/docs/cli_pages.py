@@ -1,10 +1,11 @@
-"""Writes docs/cli, a page for each command from what its `--help` says: `python -m tests.docs.cli_pages`."""
+"""Writes docs/cli, a page for each command from its help: `python -m tests.docs.cli_pages`."""
 
 from __future__ import annotations
 
 import click
 
 from sparklod_cli.cli import cli
+from sparklod_cli.commands.command import Command
 from tests.conftest import ROOT
 
 FOLDER = ROOT / "docs" / "cli"
@@ -28,7 +29,8 @@ INDEX = """\
 {rows}
 
 Data goes to standard output, messages to standard error. Outputs appear whole or not at all, and existing ones are
-replaced only with `--overwrite`. [Installation](../install.md#shell-completion) has shell completion.
+replaced only with `--overwrite`. [Installation](../install.md#shell-completion) has shell completion. These pages have
+all options, as `--help-all` prints them; `--help` lists those that most people need.
 """
 
 PAGE = """\
@@ -59,12 +61,14 @@ def _command(name: str) -> click.Command:
 
 
 def _help(command: click.Command, name: str | None = None) -> str:
-    """What `--help` prints, in the width of the pages."""
+    """What `--help-all` prints, or `--help` where there is no other, in the width of the pages."""
     width = {"terminal_width": WIDTH, "max_content_width": WIDTH}
     parent = click.Context(cli, info_name="sparklod", **width, **cli.context_settings)
     if name is None:
         return command.get_help(parent)
-    return command.get_help(click.Context(command, info_name=name, parent=parent, **width, **command.context_settings))
+    assert isinstance(command, Command)
+    context = click.Context(command, info_name=name, parent=parent, **width, **command.context_settings)
+    return command.get_help(context, whole=True)
 
 
 def main() -> None:

@@ -93,8 +93,8 @@ def test_the_table_is_printed_and_written(tmp_path: Path, capsys: Capture) -> No
     output = tmp_path / "chunks.csv"
     assert run(["inspect", str(path), "--chunks", "--chunks-out", str(output), "-q"]) == 0
     head, first, second = (line.split() for line in capsys.readouterr().out.splitlines())
-    assert head[:4] == ["chunk", "base", "splats", "leaves"]
-    assert (first[:3], second[:3]) == (["0", "0", "65,536"], ["1", "65,536", "8"])
+    assert head[:3] == ["chunk", "splats", "leaves"]
+    assert (first[:2], second[:2]) == (["0", "65,536"], ["1", "8"])
     with output.open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [column.name for column in chunks.COLUMNS] == list(rows[0])
@@ -107,8 +107,8 @@ def test_the_table_is_printed_and_written(tmp_path: Path, capsys: Capture) -> No
 def test_the_table_without_a_tree_has_no_empty_columns(capsys: Capture) -> None:
     assert run(["inspect", str(FIXTURES / "sh0.ply"), "--chunks", "-q"]) == 0
     head, row = capsys.readouterr().out.splitlines()
-    assert head.split() == ["chunk", "base", "splats", "extent", "size_min", "size_max"]
-    assert len(row.split()) == 6
+    assert head.split() == ["chunk", "splats", "extent", "size", "to"]
+    assert len(row.split()) == 5
 
 
 def test_the_table_of_a_chunked_file_is_that_of_the_whole_one(tmp_path: Path) -> None:

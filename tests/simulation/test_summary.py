@@ -7,7 +7,8 @@ import json
 import numpy as np
 import pytest
 
-from sparklod_cli.commands.traverse import WIDTH, lines
+from sparklod_cli.commands.console import WIDTH
+from sparklod_cli.commands.traverse import lines
 from sparklod_cli.simulation.columns import COLUMNS
 from sparklod_cli.simulation.summary import IN_FRUSTUM, MOMENTS, QUANTITIES, summarize
 from sparklod_cli.tables.assertions import check, parse
@@ -76,7 +77,7 @@ def test_a_summary_leaves_single_instances_out() -> None:
 def test_a_summary_of_no_frames_is_empty() -> None:
     summary = summarize([])
     assert (summary.frames, summary.seconds, summary.quantities, summary.moments) == (0, 0, (), ())
-    assert lines(summary) == ["  path       0 frames, 0.000 s"]
+    assert list(lines(summary)) == ["  path       0 frames, 0.000 s"]
 
 
 def test_a_summary_survives_json() -> None:
@@ -93,7 +94,7 @@ def test_every_quantity_of_a_summary_is_a_column() -> None:
 
 class TestText:
     def test_a_summary_fits_the_width_of_a_terminal(self) -> None:
-        text = lines(summarize(flight()))
+        text = list(lines(summarize(flight())))
         assert max(map(len, text)) <= WIDTH
         assert len(text) == 3 + 1 + len(QUANTITIES) + 1 + len(MOMENTS)
         assert all(line == line.rstrip() for line in text)
@@ -102,7 +103,7 @@ class TestText:
         rows = flight(40, budget=900_000_000)
         for each in rows:
             each |= {"name": "a long\nname " * 20, "bytes_new": 10**13, "frame": 9_999_999, "time_s": 123456.789}
-        text = lines(summarize(rows))
+        text = list(lines(summarize(rows)))
         assert max(map(len, text)) <= WIDTH
         assert not any("\n" in line for line in text)
 
@@ -110,7 +111,7 @@ class TestText:
         text = "\n".join(lines(summarize(flight())))
         assert "300 frames, 9.967 s" in text
         assert "67.3 % at the pixel limit, 32.7 % at the budget" in text
-        assert "45.5 MB in 56 chunks, 11.4 MB of it in 14 chunks for the first frame" in text
+        assert "45.5 MB in 56 chunks, 11.4 MB in 14 chunks for the first frame" in text
         assert "219     7.300 s  39.9 % of the splats pop" in text
 
     def test_columns_without_values_have_no_line(self) -> None:

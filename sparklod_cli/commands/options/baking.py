@@ -44,7 +44,7 @@ class TreeOptions:
     HEADING: ClassVar[str] = "Tree"
 
     method: str | None = option(
-        "How splats are merged. quick takes seconds; quality takes longer, and its cuts come closer to full detail."
+        "How splats are merged: quick takes seconds; quality takes longer, and its cuts come closer to full detail."
         f"  [default: {METHOD}; {METHOD_OF_DETAIL} with --format {STREAMED_SOG}]",
         METHODS,
         heading=COMMON,

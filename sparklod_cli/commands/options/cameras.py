@@ -78,8 +78,10 @@ class Cameras:
         "Move the camera smoothly through two or more views, separated by spaces or semicolons.", VIEWS
     )
     camera_format: str | None = option(
-        "Format of --camera-path; auto recognises it by its content.  [default: auto]",
+        f"Format of --camera-path: {', '.join(form.name for form in FORMATS)}, or auto, which recognises it by its"
+        " content.  [default: auto]",
         ("auto", *(form.name for form in FORMATS)),
+        metavar="FORMAT",
     )
     camera_axes: str | None = option(
         "Axes of the matrices of --camera-path: y up (opengl) or down (opencv), camera to world (c2w) or world to"

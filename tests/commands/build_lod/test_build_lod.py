@@ -76,7 +76,11 @@ def test_json_is_an_object_a_file(scene: Path, tmp_path: Path, capsys: Capture) 
     assert good["nodes"] == len(read_scene(output).splats)
     assert (good["splats"], good["sh_degree"], good["dropped"]) == (len(read_scene(scene).splats), 1, {})
     assert set(good["seconds"]) == {"read", "build", "write"}
-    assert bad == {"input": str(tmp_path / "missing.ply"), "error": "cannot be read: no such file or directory"}
+    assert bad == {
+        "schema_version": 1,
+        "input": str(tmp_path / "missing.ply"),
+        "error": "cannot be read: no such file or directory",
+    }
 
 
 def test_merged_splats_beyond_the_leaves_lower_the_fractional_bits(

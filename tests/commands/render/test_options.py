@@ -234,4 +234,4 @@ def test_every_option_of_render_is_used_or_refused(
 
 
 def test_every_option_of_render_has_a_row() -> None:
-    assert {param.name for param in command.params} == set(GIVEN) | OF_WORK | {"version"}
+    assert {param.name for param in command.params} == set(GIVEN) | OF_WORK | {"version", "help_all"}

@@ -138,4 +138,4 @@ def test_every_option_of_traverse_is_used_or_refused(
 
 
 def test_every_option_of_traverse_has_a_row() -> None:
-    assert {param.name for param in command.params} == set(GIVEN) | OF_WORK | {"version"}
+    assert {param.name for param in command.params} == set(GIVEN) | OF_WORK | {"version", "help_all"}
