@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from ..codecs.scene_files import Chunk
 from ..codecs.stream import size_of
-from ..codecs.streamed_sog.chunks import Chunk
 from ..codecs.streamed_sog.manifest import VERSION, Manifest, ManifestNode
 from ..codecs.streamed_sog.manifest_rules import level_counts, scan_files, scan_splats
 from ..io import opened
