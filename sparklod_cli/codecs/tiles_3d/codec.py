@@ -30,6 +30,9 @@ from .tile_writer import encode_files as encode_files
 from .tileset import MAX_TILESET, Tileset, read_whole
 from .tileset_rules import matrices_of, matrix_of, read_violations, violations, volumes_of
 
+#: Note of scenes whose splats have the coordinates of their tileset.
+NOT_PLACED = "the transform of the tileset, its place on the Earth, is not applied"
+
 Matrix = NDArray[np.float64]
 
 
@@ -132,7 +135,7 @@ def _open(source: Source, tileset: Tileset, wanted: Sequence[int]) -> tuple[Cont
     check_promise(row * 4 * (14 + 3 * COEFFICIENTS[degree]), size)
     notes = tuple(dict.fromkeys(note for chunk in chunks for note in chunk.notes))
     if not np.array_equal(_root_transform(tileset), np.eye(4)):
-        notes += ("the place of the tileset on the Earth is left out: its transform is not applied",)
+        notes += (NOT_PLACED,)
     if len({chunk.up for chunk in chunks}) > 1:
         raise error_of("tiles.kind", "the axes that point up in its tiles differ; such tilesets are not read")
     up, antialiased = common(chunk.up for chunk in chunks), any(chunk.antialiased for chunk in chunks)

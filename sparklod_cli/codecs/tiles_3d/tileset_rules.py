@@ -129,6 +129,15 @@ def matrices_of(tileset: Tileset) -> list[NDArray[np.float64]]:
     return matrices
 
 
+def depths_of(tileset: Tileset) -> list[int]:
+    """Return the edges from the root to each tile; one that stands for a nested tileset has the depth of its root."""
+    depths = list[int]()
+    for tile in tileset.tiles:
+        above = None if tile.parent < 0 else tileset.tiles[tile.parent]
+        depths.append(0 if above is None else depths[tile.parent] + (not above.is_nested))
+    return depths
+
+
 def volumes_of(tileset: Tileset) -> list[Volume | None]:
     """Return the bounding volume of each tile in the axes of the tileset; None where it has none that is known."""
     volumes = list[Volume | None]()
