@@ -43,7 +43,7 @@ UNREAD = ("implicitTiling", "contents")
 
 
 @dataclass(frozen=True)
-class Tile:
+class TileRecord:
     """A tile as a file has it.
 
     Attributes:
@@ -86,7 +86,7 @@ class Tileset:
     """
 
     head: Mapping[str, Any]
-    tiles: tuple[Tile, ...]
+    tiles: tuple[TileRecord, ...]
     heads: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     bytes: int = 0
 
@@ -141,7 +141,7 @@ def parse(data: bytes, file: str = "") -> Tileset:
     return Tileset(head, tiles, {file: head}, len(data))
 
 
-def _tiles(root: Any, called: str, file: str) -> tuple[Tile, ...]:
+def _tiles(root: Any, called: str, file: str) -> tuple[TileRecord, ...]:
     """Return the tiles of a file, root first and depth first."""
     records, uris = list[Mapping[str, Any]](), list[str | None]()
     parents, children = list[int](), list[list[int]]()
@@ -176,7 +176,7 @@ def _tiles(root: Any, called: str, file: str) -> tuple[Tile, ...]:
         uris.append(uri)
         waiting.extend((each, number) for each in reversed(below))
     rows = zip(records, uris, children, parents, strict=True)
-    return tuple(Tile(record, uri, tuple(below), parent, file) for record, uri, below, parent in rows)
+    return tuple(TileRecord(record, uri, tuple(below), parent, file) for record, uri, below, parent in rows)
 
 
 def read_whole(data: bytes, open_companion: OpenCompanion | None) -> Tileset:
@@ -202,11 +202,11 @@ def read_whole(data: bytes, open_companion: OpenCompanion | None) -> Tileset:
             offset = len(tiles)
             if offset + len(inner.tiles) > MAX_TILES:
                 raise FormatError(f"it has more than {MAX_TILES:,} tiles")
-            tiles[number] = Tile(tile.record, tile.uri, (offset,), tile.parent, tile.file)
+            tiles[number] = TileRecord(tile.record, tile.uri, (offset,), tile.parent, tile.file)
             for each in inner.tiles:
                 below = tuple(child + offset for child in each.children)
                 parent = number if each.parent < 0 else each.parent + offset
-                tiles.append(Tile(each.record, each.uri, below, parent, name))
+                tiles.append(TileRecord(each.record, each.uri, below, parent, name))
         number += 1
     return Tileset(first.head, tuple(tiles), heads, size)
 
