@@ -65,7 +65,8 @@ def test_an_unpacked_sog_is_refused_as_spark_does_not_read_it(name: str) -> None
 
 def test_a_folder_that_is_no_splat_file_is_not_called_a_sog(tmp_path: Path) -> None:
     with pytest.raises(
-        FormatError, match=r"is a directory, without the meta\.json of an unpacked SOG or a lod-meta\.json$"
+        FormatError,
+        match=r"is a directory, without the meta\.json of an unpacked SOG, a lod-meta\.json or a tileset\.json$",
     ):
         shown_files([tmp_path])
 

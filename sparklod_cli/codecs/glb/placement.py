@@ -56,7 +56,7 @@ def placement_of(file: GlbFile, mesh: int) -> Transform:
         at = parent.get(at)
     if at is not None:
         raise FormatError(f"its nodes are linked in a circle, or more than {DEEPEST} deep")
-    return _transform(matrix)
+    return transform_of(matrix)
 
 
 def _matrix(node: dict[str, Any]) -> NDArray[np.float64]:
@@ -81,8 +81,8 @@ def _numbers(node: dict[str, Any], name: str, count: int, default: tuple[float, 
     return np.array(values, np.float64)
 
 
-def _transform(matrix: NDArray[np.float64]) -> Transform:
-    """Return a matrix as a rotation, a uniform scale and a translation."""
+def transform_of(matrix: NDArray[np.float64]) -> Transform:
+    """Return a (4, 4) matrix as a rotation, a uniform scale and a translation; `FormatError` where it is more."""
     axes = matrix[:3, :3]
     scale = float(np.cbrt(np.linalg.det(axes)))
     is_affine = bool((matrix[3] == (0, 0, 0, 1)).all())
@@ -98,8 +98,12 @@ def _transform(matrix: NDArray[np.float64]) -> Transform:
         raise FormatError(f"the transform of its splats: {error}") from None
 
 
+def rotation_of_up(up: str | None) -> NDArray[np.float64]:
+    """Return the (3, 3) turn of an axis to +y, exactly; the identity where it is unknown."""
+    return np.rint(rotation_matrices(np.array([TURNS[up or "y"]]))[..., 0]) + 0.0  # no -0
+
+
 def is_turn_of(transform: Transform, up: str) -> bool:
     """Return True if a transform is the turn of an axis to +y, and nothing else."""
-    turn = rotation_matrices(np.array([TURNS[up]]))[..., 0]
     at_rest = transform.scale == 1 and not transform.translation.any()
-    return at_rest and bool(np.abs(transform.rotation - turn).max() <= SKEW)
+    return at_rest and bool(np.abs(transform.rotation - rotation_of_up(up)).max() <= SKEW)

@@ -6,28 +6,25 @@ report can be made of a file that breaks it.
 
 from __future__ import annotations
 
-import bisect
 import decimal
 import functools
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from ...support.errors import FormatError, VersionError
-from ...support.untrusted import parse_json, quoted_value
+from ...support.untrusted import quoted_value
 from .. import quantize
 from ..file_names import MANIFEST
 from ..file_notes import FileNote, read_note
+from ..json_trees import parse_manifest, place_of
 
 #: The version that is read and written. A manifest from before versions has none.
 VERSION = 1
 
 #: Largest manifest, bytes: that of 100,000 regions at some levels.
 MAX_MANIFEST = 1 << 25
-
-#: Deepest nesting of its JSON; a node of the tree takes two.
-MAX_NESTING = 512
 
 #: Most detail levels; tools write up to ten.
 MAX_LEVELS = 32
@@ -104,7 +101,7 @@ class Manifest:
 
     def place(self, number: int) -> str:
         """Return where a node is in the file: "tree.children[0]"."""
-        return _place(number, lambda each: self.nodes[each].parent, lambda each: self.nodes[each].children)
+        return place_of("tree", number, lambda each: self.nodes[each].parent, lambda each: self.nodes[each].children)
 
     def regions(self) -> Iterator[tuple[int, ManifestNode]]:
         """Return the nodes without children, and their numbers."""
@@ -122,14 +119,7 @@ def parse(data: bytes) -> Manifest:
         VersionError: it is of another version than 1.
         FormatError: it is not JSON, or lacks what reading needs; names the value and its place.
     """
-    if len(data) > MAX_MANIFEST:
-        raise FormatError(f"{MANIFEST} has more than {MAX_MANIFEST:,} bytes")
-    try:
-        root = parse_json(data, depth=MAX_NESTING)
-    except ValueError as error:
-        raise FormatError(f"{MANIFEST} is not JSON: {error}") from None
-    if not isinstance(root, dict):
-        raise FormatError(f"{MANIFEST} is not an object")
+    root = parse_manifest(data, MANIFEST, MAX_MANIFEST)
     version = root.get("version")
     if version is not None and (type(version) is not int or version != VERSION):
         raise VersionError(f"Streamed SOG version {quoted_value(version)} is unknown, only {VERSION} is read")
@@ -145,15 +135,6 @@ def parse(data: bytes) -> Manifest:
     return Manifest(levels, tuple(filenames), nodes, environment, head)
 
 
-def _place(number: int, parent_of: Callable[[int], int], children_of: Callable[[int], Sequence[int]]) -> str:
-    """Return where a node is in the file: "tree.children[0]"."""
-    way = list[str]()
-    while (parent := parent_of(number)) >= 0:
-        way.append(f".children[{bisect.bisect_left(children_of(parent), number)}]")
-        number = parent
-    return "tree" + "".join(reversed(way))
-
-
 def _nodes(tree: Any, levels: int, files: int) -> tuple[ManifestNode, ...]:
     """Return the nodes of a tree, however deep, root first and depth first."""
     keys = {str(level): level for level in range(levels)}
@@ -162,7 +143,7 @@ def _nodes(tree: Any, levels: int, files: int) -> tuple[ManifestNode, ...]:
     waiting = [(tree, -1)]  # a value, and the number of its parent
 
     def place() -> str:
-        return _place(number, parents.__getitem__, children.__getitem__)
+        return place_of("tree", number, parents.__getitem__, children.__getitem__)
 
     while waiting:
         value, parent = waiting.pop()
