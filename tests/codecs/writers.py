@@ -101,7 +101,7 @@ def as_spz(source: Scene, version: int) -> bytes:
 def spz_precision(source: Scene, version: int) -> Precision:
     bits = spz.settled(source, WriteOptions(spz_version=version)).fractional_bits
     assert bits is not None
-    coding = quantize.decode_quat_smallest_three if version == 3 else quantize.decode_quat_first_three
+    coding = quantize.decode_quat_smallest_three if version >= 3 else quantize.decode_quat_first_three
     return Precision(
         center=0.5 * 2.0**-bits,
         log_scale=1.001 / 32,
@@ -124,8 +124,7 @@ SPZ = {
         functools.partial(spz_precision, version=version),
         lod,
     )
-    for version in (2, 3)
-    for lod in (False, True)
+    for version, lod in ((2, False), (2, True), (3, False), (3, True), (4, False))
 }
 
 # --- SOG --------------------------------------------------------------------------------------------------------------
