@@ -28,6 +28,10 @@ from .tensor_pickle import Tensor, unpickled
 #: Bytes of data.pkl at most. That of nerfstudio, with the state of its optimisers, has some 50,000. Chosen.
 MOST_PICKLE = 1 << 24
 
+#: Numbers from one row of a tensor to the next at most: those of all SH coefficients of degree 4, of which `sh0` may be
+#: a part. What is between is read, too.
+MOST_PITCH = 75
+
 #: Bytes of a member's local header before its name, and of its fields with the lengths of the name and of what follows.
 LOCAL_HEADER, LENGTHS = 30, slice(26, 30)
 
@@ -207,7 +211,7 @@ class _TensorArchive:
             raise FormatError(f"its tensor {name} has no numbers of 16, 32 or 64 bits with a point")
         member, values = self._member(f"data/{tensor.key}"), int(np.prod(tensor.size, dtype=np.float64))
         pitch, rows = tensor.pitch, tensor.size[0] if tensor.size else 1
-        if pitch is None:
+        if pitch is None or pitch > MOST_PITCH:
             raise FormatError(f"the values of its tensor {name} are not in order; save it with .contiguous()")
         end = tensor.first + (values and (rows - 1) * pitch + values // rows)
         if tensor.first < 0 or end * tensor.type.itemsize > member.file_size:

@@ -1,6 +1,7 @@
 """Hierarchies of hierarchical-3d-gaussians (.hier), read as the splats of full detail.
 
-A file has a column of all splats after the other, and then the nodes of the tree, each of which names a run of splats.
+A file has the columns of all splats one after the other, then the nodes of the tree, each of which names a run of
+splats.
 Facts: `hierarchy_loader.cpp`, `writer.cpp` and `traversal.cpp` of graphdeco-inria/gaussian-hierarchy.
 """
 
@@ -39,7 +40,13 @@ BOX_NUMBERS = 8
 
 @dataclass(frozen=True)
 class HierColumn:
-    """A column of the file: as many numbers a splat, floats or halves, unless `is_float`; what it makes of splats."""
+    """Column of the file.
+
+    Attributes:
+        numbers: of a splat.
+        put: decodes its (n, numbers) values into a column of n splats.
+        is_float: its numbers are floats even where the file has halves.
+    """
 
     numbers: int
     put: Callable[[Splats, FloatArray], None]
@@ -59,7 +66,7 @@ def _put_scale(splats: Splats, values: FloatArray) -> None:
 
 
 def _put_opacity(splats: Splats, values: FloatArray) -> None:
-    # Linear. Training may leave a little more than 1, which its rasterizer clamps.
+    # Linear. The optimiser of hierarchies does not bound it; a leaf is an input splat.
     splats.opacity[:] = np.minimum(values[:, 0], np.float32(1))
 
 
@@ -69,6 +76,7 @@ def _put_colours(splats: Splats, values: FloatArray) -> None:
     splats.sh[:] = coefficients[:, 1:]
 
 
+#: SH degree of all files.
 DEGREE = 3
 
 #: The columns in the order of the file.

@@ -87,7 +87,7 @@ def read_extensions(data: bytes, size: int) -> Extensions:
                 up = up_of(name)
                 if not is_right_handed(name):
                     notes.append(f"its axes are left-handed ({name}) and stay as they are: viewers mirror the scene")
-            else:
+            elif not notes:
                 notes.append(f"its coordinate system {system} is unknown, and ignored")
     names = list(unknown)
     notes += [f"extension {name} ({unknown[name]:,} bytes) is left out" for name in names[:MOST_NAMED]]

@@ -115,6 +115,16 @@ def test_shapes_that_are_none_of_splats_are_refused() -> None:
             decode(by_hand_checkpoint.checkpoint(**columns | {name: values}))
 
 
+def test_rows_that_are_far_apart_are_refused() -> None:
+    columns = linear(SCENE)
+    tensors = {"means": np.zeros((50, 4_000), "<f4")[:, :3]}
+    names = {"scales": "scale", "quats": "quat_wxyz", "opacities": "opacity", "shN": "sh"}
+    tensors |= {name: columns[column].astype("<f4") for name, column in names.items()}
+    tensors["sh0"] = columns["rgb"].astype("<f4")
+    with pytest.raises(FormatError, match="means are not in order"):
+        decode(by_hand_checkpoint.saved(tensors, under="splats", is_parameter=True))
+
+
 def test_numbers_of_sixteen_bits_are_read() -> None:
     splats = decode(by_hand_checkpoint.checkpoint(**linear(SCENE), number="<f2")).splats
     np.testing.assert_allclose(splats.center, SCENE.splats.center, rtol=1e-3, atol=1e-3)

@@ -371,6 +371,7 @@ EXTENSIONS: dict[str, tuple[bytes, str | None, list[str]]] = {
     "left-handed": (record(KNOWN, b"\x08\0\0\0"), "y", [r"left-handed \(RUF\)"]),
     "unspecified": (record(KNOWN, bytes(4)), None, ["system 0 is unknown"]),
     "beyond the last": (record(KNOWN, b"\x11\0\0\0"), None, ["system 17 is unknown"]),
+    "beyond the last, often": (record(KNOWN, b"\x11\0\0\0") * 99, None, ["system 17 is unknown"]),
     "too short": (record(KNOWN, b"\6"), None, ["system 0 is unknown"]),
     "a camera": (record(0xADBE0002, bytes(12)), None, [r"SPZ_ADOBE_safe_orbit_camera \(12 bytes\)"]),
     "others first": (record(UNKNOWN, b"x" * 9) * 2 + record(KNOWN, b"\4\0\0\0"), "y", [r"0x12340001 \(18 bytes\)"]),
