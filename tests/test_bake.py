@@ -35,7 +35,7 @@ from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.selection import Selection
 from sparklod_cli.model.sh import COEFFICIENTS
 from sparklod_cli.model.splats import Splats
-from sparklod_cli.support.defaults import MAX_FRACTIONAL_BITS, SPZ_VERSIONS
+from sparklod_cli.support.defaults import MAX_FRACTIONAL_BITS, TREE_SPZ_VERSIONS
 from sparklod_cli.support.errors import InvalidSplatsError, SparklodError
 from sparklod_cli.tables import histograms
 from tests.conftest import FIXTURES, real_scene
@@ -141,7 +141,7 @@ def refused(error: SparklodError) -> bool:
     return bool(str(error)) and "\n" not in str(error)
 
 
-@given(scenes(), st.sampled_from(METHODS), st.sampled_from(SPZ_VERSIONS), BITS)
+@given(scenes(), st.sampled_from(METHODS), st.sampled_from(TREE_SPZ_VERSIONS), BITS)
 @settings(max_examples=300, deadline=None)
 def test_baked_files_pass_inspect_check(splats: Splats, method: str, version: int, bits: int | None) -> None:
     with tempfile.TemporaryDirectory() as folder:

@@ -66,7 +66,7 @@ def write(
             of an unpacked SOG beside it; for a tree, lod-meta.json has the folders of a Streamed SOG.
         scene: what is written.
         overwrite: replace a file that exists.
-        spz_version: of SPZ, 2 or 3; None for 3.
+        spz_version: of SPZ, 2, 3, or for a scene without a tree 4; None for 3.
         fractional_bits: of SPZ positions, 0 to 24; None for as many as suit the scene.
         compression_level: of SPZ and RAD, 1 (fast) to 9 (small).
         chunked: of RAD: write each chunk into a file of its own, NAME-0.radc and so on, beside the header; all files

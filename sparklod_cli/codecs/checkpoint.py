@@ -28,6 +28,10 @@ from .tensor_pickle import Tensor, unpickled
 #: Bytes of data.pkl at most. That of nerfstudio, with the state of its optimisers, has some 50,000. Chosen.
 MOST_PICKLE = 1 << 24
 
+#: Numbers from one row of a tensor to the next at most: those of all SH coefficients of degree 4, of which `sh0` may be
+#: a part. What is between is read, too.
+MOST_PITCH = 75
+
 #: Bytes of a member's local header before its name, and of its fields with the lengths of the name and of what follows.
 LOCAL_HEADER, LENGTHS = 30, slice(26, 30)
 
@@ -69,20 +73,25 @@ COLUMNS = (
 
 @dataclass(frozen=True)
 class _StoredColumn:
-    """Values of a column in the file: `type` has those of a splat, of which the first is at `offset`."""
+    """Values of a column in the file: of a splat, those of `type`, every `pitch` bytes from `offset` on."""
 
     of: TensorColumn
     type: np.dtype[Any]
     offset: int
+    pitch: int
 
     def read(self, file: Positioned, start: int, stop: int) -> FloatArray:
         """Return the values of some splats, as float32."""
-        size = (stop - start) * self.type.itemsize
-        data = file.read(self.offset + start * self.type.itemsize, size)
+        if not self.type.itemsize or start == stop:
+            return np.empty((stop - start, self.type.shape[0]), np.float32)
+        size = (stop - start - 1) * self.pitch + self.type.itemsize
+        data = file.read(self.offset + start * self.pitch, size)
         if len(data) < size:
             raise TruncatedError(f"cut short inside its tensor {self.of.names[0]}")
-        values: FloatArray = np.frombuffer(data, self.type.base).astype(np.float32)
-        return values.reshape(stop - start, -1)
+        rows = np.ndarray(
+            (stop - start, *self.type.shape), self.type.base, data, strides=(self.pitch, self.type.base.itemsize)
+        )
+        return rows.astype(np.float32)
 
 
 def open_content(source: Source) -> Content:
@@ -105,7 +114,8 @@ def open_content(source: Source) -> Content:
         widths = [each.width] if each.width else [3 * terms for terms in COEFFICIENTS]
         if tensor.size[:1] != count or values not in widths:
             raise FormatError(f"its tensor {name} has the shape {tensor.size}, which is not one of splats")
-        stored.append(_StoredColumn(each, np.dtype((tensor.type, (values,))), archive.offset_of(name, tensor)))
+        offset, pitch = archive.place_of(name, tensor)
+        stored.append(_StoredColumn(each, np.dtype((tensor.type, (values,))), offset, pitch))
     degree = COEFFICIENTS.index(values // 3)
     positioned = Positioned(source.file)
     # Without SH nerfstudio trains logits of colours.
@@ -191,8 +201,8 @@ class _TensorArchive:
             raise FormatError("its numbers are big-endian, which is not read")
         return unpickled(self._read("data.pkl", MOST_PICKLE))
 
-    def offset_of(self, name: str, tensor: Tensor) -> int:
-        """Return where the values of a tensor begin in the file.
+    def place_of(self, name: str, tensor: Tensor) -> tuple[int, int]:
+        """Return where the values of a tensor begin in the file, and the bytes from one row to the next.
 
         Raises:
             FormatError: they are not there, not in order, or no floating-point numbers.
@@ -200,8 +210,10 @@ class _TensorArchive:
         if tensor.type is None:
             raise FormatError(f"its tensor {name} has no numbers of 16, 32 or 64 bits with a point")
         member, values = self._member(f"data/{tensor.key}"), int(np.prod(tensor.size, dtype=np.float64))
-        if not tensor.is_contiguous:
+        pitch, rows = tensor.pitch, tensor.size[0] if tensor.size else 1
+        if pitch is None or pitch > MOST_PITCH:
             raise FormatError(f"the values of its tensor {name} are not in order; save it with .contiguous()")
-        if tensor.first < 0 or (tensor.first + values) * tensor.type.itemsize > member.file_size:
+        end = tensor.first + (values and (rows - 1) * pitch + values // rows)
+        if tensor.first < 0 or end * tensor.type.itemsize > member.file_size:
             raise TruncatedError(f"cut short, or corrupt: its tensor {name} announces {values:,} values")
-        return self._offset(member) + tensor.first * tensor.type.itemsize
+        return self._offset(member) + tensor.first * tensor.type.itemsize, pitch * tensor.type.itemsize

@@ -1,4 +1,4 @@
-"""Compression: writes one gzip member on several threads, and reads zstd without buffering more than requested.
+"""Compression: writes one gzip member on several threads, and zstd frames, which it reads in small pieces.
 
 benchmarks/notes/file-sizes.md explains why the library's own threaded gzip is not used. `inflate` reads gzip.
 """
@@ -155,6 +155,17 @@ def check_promise(total: int, file_size: int) -> None:
     """Raise `PromiseError` if a header announces more bytes than a file of this size can expand to."""
     if total > TRUSTED_SIZE and total > MAX_RATIO * file_size:
         raise PromiseError(f"its header announces {total:,} bytes, more than a file of {file_size:,} bytes can hold")
+
+
+def zstd_frame(pieces: Iterable[Any], size: int, level: int) -> bytes:
+    """Return one zstd frame, with a checksum.
+
+    Args:
+        pieces: bytes, or contiguous arrays, of `size` bytes together.
+        level: of deflate, 1 to 9, for which zstd's from 3 to 19 stand.
+    """
+    packer = zstandard.ZstdCompressor(level=2 * level + 1, write_checksum=True).compressobj(size=size)
+    return b"".join([*(packer.compress(memoryview(piece).cast("B")) for piece in pieces), packer.flush()])
 
 
 class _Window:

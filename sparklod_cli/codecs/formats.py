@@ -77,8 +77,8 @@ class Format:
         return self.beginning is not None and re.match(self.beginning, head, re.DOTALL) is not None
 
 
-#: The formats in the order in which they are tried: compressed PLY is PLY too. A .splat file begins with any float, so
-#: no beginning may have two bytes or fewer.
+#: The formats in the order in which they are tried: compressed PLY is PLY too. A .splat file begins with any float, a
+#: .hier file with any number of splats and a float, so no beginning may have two bytes or fewer.
 FORMATS = (
     Format(
         "compressed PLY",
@@ -123,7 +123,9 @@ FORMATS = (
         companions=True,
     ),
     Format("GLB", "glb.codec", (".glb",), rb"glTF", writable=True),
-    Format("KSPLAT", "ksplat", (".ksplat",), rb"\0[\x01-\xff]\0\0"),  # version 0.1 on; as a float it would be denormal
+    # Version 0.1 on, as a float denormal, and fewer than 2 ** 24 sections, which as a float would be, too.
+    Format("KSPLAT", "ksplat", (".ksplat",), rb"\0[\x01-\xff]\0\0...\0"),
+    Format("HIER", "hier", (".hier",), None),
     Format("SPLAT", "splat", (".splat",), None, writable=True, bare=True),
 )
 

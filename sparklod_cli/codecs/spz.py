@@ -1,7 +1,7 @@
 """SPZ, Niantic's compressed splats, and Spark's extension of it for Level-of-Detail trees.
 
-Reads versions 1 to 4, see `spz_streams`; writes versions 2 and 3. `docs/formats.md` lays the extension out byte by
-byte.
+Reads versions 1 to 4, see `spz_streams`; writes versions 2 and 3, and 4 without a tree, for which Spark's extension is
+not defined. `docs/formats.md` lays the extension out byte by byte.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from ..model.lod_tree import LodTree
 from ..model.scene import Scene
 from ..model.splats import COLUMNS, FloatArray, Splats
 from ..model.streams import NodeStream
-from ..support.defaults import DEFAULT_SPZ_VERSION, MAX_FRACTIONAL_BITS, SPZ_VERSIONS
+from ..support.defaults import DEFAULT_SPZ_VERSION, MAX_FRACTIONAL_BITS, TREE_SPZ_VERSIONS
 from ..support.errors import FormatError
-from ..support.parallel import blocks_of
+from ..support.parallel import blocks_of, ordered_map
 from ..support.progress import Progress, silent
 from . import clamps, compression, coverage, quantize
 from .clamps import CodeRange
@@ -30,7 +30,20 @@ from .encoder import Encoded, Encoder, Get, results, windows_of
 from .file_notes import comment_of
 from .options import DEFAULTS, WriteOptions
 from .quantize import Bytes
-from .spz_streams import ANTIALIASED, HEADER, LOD, MAGIC, Layout, SpzStream, column_of, read_codes
+from .spz_extensions import SYSTEM_OF_UP, extensions_of
+from .spz_streams import (
+    ANTIALIASED,
+    EXTENSIONS,
+    HEADER,
+    HEADER_V4,
+    LOD,
+    MAGIC,
+    STREAM_SIZES,
+    Layout,
+    SpzStream,
+    column_of,
+    read_codes,
+)
 from .spz_streams import open_content as open_content
 from .statistics import ALL_BITS, Statistics, enough, fine_bits
 
@@ -71,10 +84,13 @@ def settled(scene: Scene | Statistics, options: WriteOptions) -> WriteOptions:
     full detail (`statistics.STEPS_A_SPLAT`): merged splats are larger. SH get as many bits as colours need (`enough`).
 
     Raises:
-        FormatError: a coordinate does not fit the fractional bits; the text names the most that would.
+        FormatError: a coordinate does not fit the fractional bits; the text names the most that would. Version 4 was
+            chosen for a tree, or for a scene in which x points up.
         ValueError: there are no such bits.
     """
     version = DEFAULT_SPZ_VERSION if options.spz_version is None else options.spz_version
+    if version not in TREE_SPZ_VERSIONS:
+        _check_v4(scene)
     found = scene if isinstance(scene, Statistics) else Statistics.of_scene(scene, needed(options))
     assert found.reach is not None
     bits, most = options.fractional_bits, largest_fractional_bits(found.reach)
@@ -91,18 +107,26 @@ def settled(scene: Scene | Statistics, options: WriteOptions) -> WriteOptions:
     return dataclasses.replace(options, spz_version=version, fractional_bits=bits, sh_bits=sh_bits)
 
 
+def _check_v4(scene: Scene | Statistics) -> None:
+    """Raise `FormatError` if version 4 cannot hold a scene; statistics are those of a tree."""
+    if isinstance(scene, Statistics) or scene.tree is not None:
+        raise FormatError("SPZ version 4 holds no tree that Spark reads; use version 2 or 3, or RAD")
+    if scene.up is not None and scene.up not in SYSTEM_OF_UP:
+        raise FormatError(f"SPZ version 4 cannot note that {scene.up} points up; use version 3, or turn the scene")
+
+
 def like(header: Mapping[str, int], options: WriteOptions) -> WriteOptions:
     """Return the options, and where they leave a choice open, that of the SPZ file which a scene was read from.
 
-    Its values then stay as they are. A version that is not written becomes the newest one that is; a scene from
-    another format, by its `Scene.header`, leaves the choice open.
+    Its values then stay as they are. Version 1 becomes 3, and so does 4, which fewer viewers read; a scene from another
+    format, by its `Scene.header`, leaves the choice open.
     """
     version, bits = options.spz_version, options.fractional_bits
     if "fractional_bits" not in header:
         return options
     if version is None:
         version = int(header["version"])
-        version = version if version in SPZ_VERSIONS else max(SPZ_VERSIONS)
+        version = version if version in TREE_SPZ_VERSIONS else max(TREE_SPZ_VERSIONS)
     bits = int(header["fractional_bits"]) if bits is None else bits
     return dataclasses.replace(options, spz_version=version, fractional_bits=bits)
 
@@ -161,8 +185,11 @@ class SpzEncoder(Encoder):
         return codes
 
     def pieces(self, get: Get, *, threads: int, progress: Progress) -> Iterator[bytes]:
-        """Return the header and all streams, as one gzip member, piece by piece."""
+        """Return the header and all streams, piece by piece: as one gzip member, or those of version 4."""
         layout = self.layout
+        if layout.version not in TREE_SPZ_VERSIONS:
+            yield from self._pieces_v4(get, threads, progress)
+            return
         fields = layout.version, layout.count, layout.sh_degree, layout.fractional_bits, layout.flags, 0
 
         def data() -> Iterator[bytes | NDArray[Any]]:
@@ -178,6 +205,25 @@ class SpzEncoder(Encoder):
         comment = "" if self.up is None else comment_of(up=self.up)
         level = self.options.compression_level
         yield from compression.gzip_member(data(), runs, level, threads, progress, comment=comment.encode())
+
+    def _pieces_v4(self, get: Get, threads: int, progress: Progress) -> Iterator[bytes]:
+        """Return the header, the extensions, the table of streams, and the streams, which are compressed before."""
+        layout, streams, frames = self.layout, self.layout.streams(), list[bytes]()
+
+        def packed(stream: SpzStream) -> bytes:
+            parts = (get(number, stream.name) for number in range(len(windows_of(layout.count))))
+            return compression.zstd_frame(parts, stream.size * layout.count, self.options.compression_level)
+
+        sizes = [stream.size * layout.count for stream in streams]
+        for frame in ordered_map(packed, streams, threads):
+            frames.append(frame)
+            progress("writing", sum(sizes[: len(frames)]), layout.total, "B")
+        extensions = extensions_of(self.up)
+        flags = layout.flags | EXTENSIONS * bool(extensions)
+        fields = layout.version, layout.count, layout.sh_degree, layout.fractional_bits, flags, len(streams)
+        yield HEADER_V4.pack(MAGIC, *fields, HEADER_V4.size + len(extensions), b"") + extensions
+        yield b"".join(STREAM_SIZES.pack(len(frame), size) for frame, size in zip(frames, sizes, strict=True))
+        yield from frames
 
 
 def encoder(

@@ -27,6 +27,7 @@ from .content import Content, Source, Target
 from .file_notes import FileNote, read_comment
 from .inflate import GZIP_MAGIC, Inflate
 from .quantize import Bytes
+from .spz_extensions import MOST_BYTES, Extensions, read_extensions
 from .statistics import ALL_BITS
 from .stream import Positioned, Read, rows_between, rows_of, size_of
 
@@ -173,16 +174,20 @@ def read_codes(source: Source) -> tuple[Layout, dict[str, Bytes]]:
 
 def _open(source: Source) -> tuple[Content, Layout, Iterator[StreamRows]]:
     """Open a file: its content, its layout, and the rows of its streams, which can be read once."""
-    file, note, header = source.file, FileNote(), dict[str, int]()
+    file, note, extensions, header = source.file, FileNote(), Extensions(), dict[str, int]()
     size = size_of(file)
     plain = file.read(4) == struct.pack("<I", MAGIC)
     file.seek(0)
     if plain:
-        layout, rows = _read_v4(file, size, header)
+        layout, rows, extensions = _read_v4(file, size, header)
     else:
         inflate = Inflate(file, source.threads)
         layout, rows = _read_gzip(inflate, size, header)
         note = read_comment(inflate.comment)
+        if layout.flags & EXTENSIONS:  # they follow the streams, which are read again
+            extensions = _extensions_behind(inflate, layout)
+            file.seek(0)
+            layout, rows = _read_gzip(Inflate(file, source.threads), size, header)
 
     def unpacked() -> Iterator[bytes]:
         done = 0
@@ -218,7 +223,7 @@ def _open(source: Source) -> tuple[Content, Layout, Iterator[StreamRows]]:
             done += count
             progress("reading", done, layout.total, "B")
 
-    notes = notes_on_degree(layout.sh_degree) + note.problems
+    notes = notes_on_degree(layout.sh_degree) + note.problems + extensions.notes
     if header.get("unknown_streams"):
         notes += (f"{header['unknown_streams']} streams of an unknown kind are left out",)
     content = Content(
@@ -229,7 +234,7 @@ def _open(source: Source) -> tuple[Content, Layout, Iterator[StreamRows]]:
         bool(layout.flags & ANTIALIASED),
         notes,
         header,
-        note.up,
+        note.up or extensions.up,
         layout.has_tree,
         coding=lambda: CODING,
     )
@@ -283,7 +288,20 @@ def _read_gzip(inflate: Inflate, size: int, header: dict[str, int]) -> tuple[Lay
     return layout, rows()
 
 
-def _read_v4(file: BinaryIO, size: int, header: dict[str, int]) -> tuple[Layout, Iterator[StreamRows]]:
+def _extensions_behind(inflate: Inflate, layout: Layout) -> Extensions:
+    """Return the extensions behind the streams; none where the streams are cut short, which reading these reports."""
+    left = layout.total
+    while left:
+        piece = inflate.read(min(left, compression.PIECE))
+        if not piece:
+            return Extensions()
+        left -= len(piece)
+    data = bytes(inflate.read(MOST_BYTES))
+    inflate.close()
+    return read_extensions(data, len(data))
+
+
+def _read_v4(file: BinaryIO, size: int, header: dict[str, int]) -> tuple[Layout, Iterator[StreamRows], Extensions]:
     head = file.read(HEADER_V4.size)
     if len(head) < HEADER_V4.size:
         raise TruncatedError("cut short inside the SPZ header")
@@ -295,9 +313,15 @@ def _read_v4(file: BinaryIO, size: int, header: dict[str, int]) -> tuple[Layout,
     if streams < len(expected):
         raise FormatError(f"{streams} streams, but SH degree {sh_degree} and flags {flags:#x} need {len(expected)}")
     header |= {"reserved": int(any(reserved)), "unknown_streams": streams - len(expected)}
+    if table < HEADER_V4.size:
+        raise FormatError(f"its table of streams begins at byte {table}, inside the header")
     at = table + streams * STREAM_SIZES.size
     if at > size:
         raise TruncatedError("cut short inside the table of streams")
+    extensions = Extensions()
+    if flags & EXTENSIONS:
+        between = table - HEADER_V4.size
+        extensions = read_extensions(file.read(min(between, MOST_BYTES)), between)
     file.seek(table)
     sizes = list(STREAM_SIZES.iter_unpack(file.read(streams * STREAM_SIZES.size)))
     for stream, (packed, unpacked) in zip(expected, sizes, strict=False):
@@ -318,4 +342,4 @@ def _read_v4(file: BinaryIO, size: int, header: dict[str, int]) -> tuple[Layout,
             file.seek(end)
         header["trailing_bytes"] = size - end if streams == len(expected) else 0
 
-    return layout, rows()
+    return layout, rows(), extensions

@@ -50,14 +50,19 @@ class Tensor:
     stride: tuple[int, ...]
 
     @property
-    def is_contiguous(self) -> bool:
-        """True if its numbers are in the order of its axes, without gaps."""
-        expected = 1
-        for size, stride in zip(reversed(self.size), reversed(self.stride), strict=True):
-            if size != 1 and stride != expected:
-                return 0 in self.size
-            expected *= size
-        return True
+    def pitch(self) -> int | None:
+        """Numbers from one row, of the first axis, to the next; None if the numbers of a row have gaps or turns.
+
+        The rows of a part of a larger tensor are apart, as those of SH that gsplat cuts off from all coefficients.
+        """
+        row = 1
+        for size, stride in zip(reversed(self.size[1:]), reversed(self.stride[1:]), strict=True):
+            if size != 1 and stride != row:
+                return row if 0 in self.size else None
+            row *= size
+        if not self.size or self.size[0] <= 1 or not row:
+            return row
+        return self.stride[0] if self.stride[0] >= row else None
 
 
 @dataclass(frozen=True)

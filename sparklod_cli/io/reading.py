@@ -130,7 +130,8 @@ def opened(path: Place) -> Iterator[tuple[BinaryIO, Format, dict[str, Any]]]:
             form = sniff(head, path.suffix)
             if form is None:
                 names = ", ".join(form.name for form in FORMATS)
-                hint = "; a .splat file is not recognised by its content: pass it as a file" if path == DASH else ""
+                unmarked = " or ".join(ending for each in FORMATS if each.beginning is None for ending in each.suffixes)
+                hint = f"; {unmarked} is not recognised by its content: pass it as a file" if path == DASH else ""
                 if path.suffix.lower() in RAW_SUFFIXES:
                     hint = "; words alone, as --encoding writes them by this suffix, do not tell what they are"
                 raise UnknownFormatError(f"not a splat file that sparklod reads ({names}){hint}")

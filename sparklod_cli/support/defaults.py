@@ -12,8 +12,8 @@ MAX_SH_DEGREE = 3
 #: Largest accepted number of threads.
 MAX_THREADS = 256
 
-#: SPZ versions that can be written, and the default; measured in docs/decisions/05-spz.md.
-SPZ_VERSIONS, DEFAULT_SPZ_VERSION = (2, 3), 3
+#: SPZ versions that can be written, those that hold trees, and the default; see docs/decisions/05-spz.md.
+SPZ_VERSIONS, TREE_SPZ_VERSIONS, DEFAULT_SPZ_VERSION = (2, 3, 4), (2, 3), 3
 
 #: Largest number of fractional bits of an SPZ position.
 MAX_FRACTIONAL_BITS = 24

@@ -65,7 +65,7 @@ class Case:
 def put(content: Content, directory: Path, form: str) -> Path:
     """Writes a file under a name that says as little as possible of its format; returns its path."""
     if isinstance(content, bytes):
-        path = directory / ("scene.splat" if form == "SPLAT" else "scene.bin")
+        path = directory / {"SPLAT": "scene.splat", "HIER": "scene.hier"}.get(form, "scene.bin")
         path.write_bytes(content)
         return path
     folder = directory / "scene"

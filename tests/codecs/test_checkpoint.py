@@ -7,6 +7,7 @@ import pickle
 import struct
 import zipfile
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +16,8 @@ from fixtures import by_hand_checkpoint
 from sparklod_cli.codecs import checkpoint
 from sparklod_cli.codecs.tensor_pickle import Tensor, unpickled
 from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.sh import SH_C0
+from sparklod_cli.model.splats import COLUMNS
 from sparklod_cli.support.errors import FormatError, NotSplatsError
 from tests.codecs.cases import linear
 from tests.scenes import random_splats
@@ -77,11 +80,13 @@ def test_keys_that_take_for_ever_to_hash_are_left_out() -> None:
 
 
 def test_views_of_storages_are_read_if_their_values_are_in_order() -> None:
-    def of(size: tuple[int, ...], stride: tuple[int, ...]) -> bool:
-        return Tensor(np.dtype("<f4"), "0", 0, size, stride).is_contiguous
+    def of(size: tuple[int, ...], stride: tuple[int, ...]) -> int | None:
+        return Tensor(np.dtype("<f4"), "0", 0, size, stride).pitch
 
-    assert of((5, 3), (3, 1)) and of((5, 1, 3), (3, 99, 1)) and of((), ()) and of((5, 0, 3), (7, 7, 7))
-    assert not of((5, 3), (1, 5)) and not of((5,), (2,))
+    assert (of((5, 3), (3, 1)), of((5, 1, 3), (3, 99, 1)), of((), ()), of((1, 3), (99, 1))) == (3, 3, 1, 3)
+    assert (of((5, 2, 3), (12, 3, 1)), of((5,), (2,))) == (12, 2)  # parts of larger ones
+    assert of((5, 0, 3), (7, 7, 7)) is not None
+    assert [of((5, 3), stride) for stride in ((1, 5), (2, 1), (0, 1), (-3, 1), (6, 2))] == [None] * 5
 
 
 def test_nerfstudio_without_sh_has_logits_of_colours() -> None:
@@ -110,6 +115,66 @@ def test_shapes_that_are_none_of_splats_are_refused() -> None:
             decode(by_hand_checkpoint.checkpoint(**columns | {name: values}))
 
 
+def test_rows_that_are_far_apart_are_refused() -> None:
+    columns = linear(SCENE)
+    tensors = {"means": np.zeros((50, 4_000), "<f4")[:, :3]}
+    names = {"scales": "scale", "quats": "quat_wxyz", "opacities": "opacity", "shN": "sh"}
+    tensors |= {name: columns[column].astype("<f4") for name, column in names.items()}
+    tensors["sh0"] = columns["rgb"].astype("<f4")
+    with pytest.raises(FormatError, match="means are not in order"):
+        decode(by_hand_checkpoint.saved(tensors, under="splats", is_parameter=True))
+
+
 def test_numbers_of_sixteen_bits_are_read() -> None:
     splats = decode(by_hand_checkpoint.checkpoint(**linear(SCENE), number="<f2")).splats
     np.testing.assert_allclose(splats.center, SCENE.splats.center, rtol=1e-3, atol=1e-3)
+
+
+def torch_columns(torch: Any) -> dict[str, Any]:
+    """Returns the splats as gsplat begins to train them: SH are parts of a tensor of all coefficients."""
+    splats = SCENE.splats
+    values = {
+        "means": splats.center,
+        "scales": np.log(splats.scale),
+        "quats": 3 * splats.quat_xyzw[:, [3, 0, 1, 2]],
+        "opacities": np.log(splats.opacity / (1 - splats.opacity)),
+    }
+    tensors = {name: torch.from_numpy(np.array(array, order="C")) for name, array in values.items()}
+    colors = torch.from_numpy(np.concatenate([(splats.rgb[:, None] - 0.5) / SH_C0, splats.sh], axis=1))
+    tensors |= {"sh0": colors[:, :1], "shN": colors[:, 1:]}
+    return {name: torch.nn.Parameter(tensor) for name, tensor in tensors.items()}
+
+
+def saved_by_torch(program: str, torch: Any) -> bytes:
+    """Has PyTorch save a step of a training, with an optimizer that has run, as a program does."""
+    columns = torch_columns(torch)
+    if program == "nerfstudio":
+        columns["opacities"] = torch.nn.Parameter(columns["opacities"].detach()[:, None])
+        columns["features_dc"] = torch.nn.Parameter(columns.pop("sh0").detach()[:, 0].clone())
+        columns["features_rest"] = columns.pop("shN")
+    splats = torch.nn.ParameterDict(columns)
+    optimizer = torch.optim.Adam([{"params": [each], "lr": 0.0, "name": name} for name, each in columns.items()])
+    sum(each.sum() for each in columns.values()).backward()
+    optimizer.step()
+    content = {"step": 1, "splats": splats.state_dict()}
+    if program == "nerfstudio":
+        model = torch.nn.Module()
+        model.gauss_params = splats
+        model.register_buffer("device_indicator", torch.zeros(0))
+        pipeline = torch.nn.Module()
+        pipeline._model = model
+        optimizers, scaler = {"means": optimizer.state_dict()}, torch.amp.GradScaler("cpu").state_dict()
+        content = {"step": 1, "pipeline": pipeline.state_dict(), "optimizers": optimizers, "scalers": scaler}
+    buffer = io.BytesIO()
+    torch.save(content, buffer)
+    return buffer.getvalue()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("program", ["gsplat", "nerfstudio"])
+def test_what_pytorch_saves_is_read(program: str) -> None:
+    torch = pytest.importorskip("torch", reason="PyTorch is not installed")
+    splats = decode(saved_by_torch(program, torch)).splats
+    for column in COLUMNS:
+        expected = getattr(SCENE.splats, column)
+        np.testing.assert_allclose(getattr(splats, column), expected, atol=2e-6, rtol=2e-6, err_msg=column)

@@ -38,6 +38,7 @@ FILES = (
     "golden/sh1-tiles/tileset.json",
     *(f"golden/sh2-level{level}.ksplat" for level in (0, 1, 2)),
     "golden/sh0.splat",
+    *("golden/sh1.hier", "golden/sh3-half.hier"),
     *("golden/sh2-gsplat.pt", "golden/sh1-nerfstudio.ckpt"),
     "golden/sh1-tree.rad",
     *(f"golden/{name}.glb" for name in ("sh2", "sh1-quantized", "hand-spz")),
@@ -122,6 +123,10 @@ def header(name: str, data: bytes) -> list[int]:
         return list(range(28 + struct.unpack_from("<I", data, 12)[0]))
     if name.endswith(".rad"):  # the file's, and that of the first chunk
         return list(range(data.index(b"RADC") + 1200))
+    if name.endswith(".hier"):  # the number of splats, and the nodes without their boxes
+        count = struct.unpack_from("<i", data)[0]
+        nodes, node = (4 + 236 * count, 28) if count > 0 else (4 - 124 * count, 20)
+        return [*range(4), *range(nodes, nodes + 4 + node * struct.unpack_from("<i", data, nodes)[0])]
     return list(range(len(data) if name.endswith(".json") else min(120, len(data))))
 
 
@@ -256,7 +261,7 @@ MAGICS = (
     *(b"ply\n", b"ply\r", b"ply\nelement chunk 1\nelement vertex 1\nproperty uint packed_position\n"),
     *(b"\x1f\x8b\x08\0", b"NGSP", b"PK\x03\x04", b'{"means":', b'\n { "version" :2', b'{"lodLevels":'),
     b"PK\x03\x04" + bytes(26) + b"archive/data.pkl",
-    *(b"\0\1\0\0", b"\0\1\0\0\3" + bytes(4091)),
+    *(b"\0\1\0\0\1\0\0\0", b"\0\1\0\0\3" + bytes(4091)),
     *(b"RAD0", b"RAD0\40\0\0\0{", b"RADC"),
     *(b"glTF", b"glTF\2\0\0\0"),
 )

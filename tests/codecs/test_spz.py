@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import io
 import math
+import re
 import struct
 from collections.abc import Callable
 
@@ -16,6 +17,8 @@ from hypothesis import strategies as st
 from fixtures import by_hand
 from sparklod_cli.codecs import clamps, quantize, spz
 from sparklod_cli.codecs.options import WriteOptions
+from sparklod_cli.codecs.spz_extensions import MOST_BYTES
+from sparklod_cli.codecs.statistics import Statistics
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
@@ -53,7 +56,7 @@ def golden(name: str) -> Scene:
         ("hand-v2", "SPZ 2", 2, False, FIRST_THREE),
         ("hand-v3", "SPZ 3", 3, True, SMALLEST_THREE),
         ("hand-v4", "SPZ 4", 3, True, SMALLEST_THREE),
-        ("hand-v4-sh4", "SPZ 4", 3, False, SMALLEST_THREE),  # its table of streams comes after 16 other bytes
+        ("hand-v4-sh4", "SPZ 4", 3, False, SMALLEST_THREE),  # its table of streams comes after extension records
     ],
 )
 def test_every_field_of_a_file_made_by_hand_is_decoded(
@@ -62,7 +65,8 @@ def test_every_field_of_a_file_made_by_hand_is_decoded(
     scene = golden(name)
     splats = scene.splats
     assert (scene.format, scene.antialiased, scene.tree) == (format_name, antialiased, None)
-    assert scene.notes == (("SH degree 4 is cut to 3",) if name.endswith("sh4") else ())
+    left_out = "SH degree 4 is cut to 3", "extension 0x12340001 (5 bytes) is left out"
+    assert (scene.up, scene.notes) == (("-y", left_out) if name.endswith("sh4") else (None, ()))
     np.testing.assert_array_equal(splats.center, [[1.5, -2.25, 0.125], [0, -100, 2047], [-0.5, 0.25, -2048]])
     np.testing.assert_allclose(splats.opacity, [1, 0, 0.2], atol=1e-7)
     np.testing.assert_allclose(splats.rgb, RGB, atol=1e-6)
@@ -117,7 +121,7 @@ def test_a_tree_comes_back() -> None:
     np.testing.assert_allclose(scene.splats.opacity[[3, 5]], [127 * 2 / 255, 0], rtol=1e-6)
 
 
-@pytest.mark.parametrize("version", [2, 3])
+@pytest.mark.parametrize("version", [2, 3, 4])
 @pytest.mark.parametrize("threads", [2, 5])
 def test_threads_do_not_change_a_file(version: int, threads: int) -> None:
     scene = Scene(random_splats(40_000, sh_degree=1))  # more than two chunks of rows and five gzip blocks
@@ -191,10 +195,48 @@ def test_coordinates_that_no_fractional_bits_hold_are_refused() -> None:
             bits_of(splats_with(reach=1e7), bits)
 
 
-def test_only_versions_2_and_3_are_written() -> None:
-    for version in (1, 4):
-        with pytest.raises(ValueError, match=rf"no spz version {version}; give one of 2, 3"):
+def test_only_versions_2_to_4_are_written() -> None:
+    for version in (1, 5):
+        with pytest.raises(ValueError, match=rf"no spz version {version}; give one of 2, 3, 4"):
             spz.settled(Scene(random_splats(1)), WriteOptions(spz_version=version))
+
+
+def test_version_4_holds_no_trees() -> None:
+    tree, options = golden("tree-v3"), WriteOptions(spz_version=4)
+    for scene in (tree, Statistics.of_scene(tree, spz.needed(options))):
+        with pytest.raises(FormatError, match="SPZ version 4 holds no tree"):
+            spz.settled(scene, options)
+
+
+def test_version_4_has_the_streams_of_version_3() -> None:
+    scene = Scene(random_splats(3000, sh_degree=2), antialiased=True)
+    files = {version: b"".join(spz.encode(scene, WriteOptions(spz_version=version))) for version in (3, 4)}
+    raw = by_hand.unpacked(files[4])
+    fields = struct.unpack_from("<IIIBBBBI12s", files[4])
+    assert fields == (0x5053474E, 4, 3000, 2, *gzip.decompress(files[3])[13:15], 6, 32, bytes(12))
+    streams, at = [], 32
+    while at < len(raw):
+        (size,) = struct.unpack_from("<Q", raw, at)
+        streams.append(raw[at + 8 : at + 8 + size])
+        at += 8 + size
+    assert b"".join(streams) == gzip.decompress(files[3])[16:]
+
+
+@pytest.mark.parametrize("up", ["y", "-y", "z", "-z"])
+def test_version_4_notes_what_is_up_as_a_coordinate_system(up: str) -> None:
+    data = b"".join(spz.encode(Scene(random_splats(3), up=up), WriteOptions(spz_version=4)))
+    system = {"y": 4, "-y": 6, "z": 12, "-z": 14}[up]
+    assert (data[14], struct.unpack_from("<I", data, 16), data[32:44]) == (
+        0x02,
+        (44,),
+        by_hand.spz_extension(0xADBE0003, struct.pack("<I", system)),
+    )
+    assert spz.decode(io.BytesIO(data)).up == up
+
+
+def test_version_4_notes_no_x_axis() -> None:
+    with pytest.raises(FormatError, match="cannot note that -x points up"):
+        spz.settled(Scene(random_splats(1), up="-x"), WriteOptions(spz_version=4))
 
 
 def test_fractional_bits_are_chosen_by_the_leaves_alone() -> None:
@@ -292,6 +334,7 @@ REFUSED: dict[str, tuple[Callable[[], bytes], str]] = {
     "wrong checksum": (lambda: with_byte(gzipped(), len(gzipped()) - 8, gzipped()[-8] ^ 1), "corrupt gzip data"),
     "no checksum": (lambda: gzipped()[:-8], "checksum is missing"),
     "a table past the end": (lambda: with_byte(zstd(), 18, 1), "inside the table of streams"),
+    "a table in the header": (lambda: with_byte(zstd(), 16, 31), "begins at byte 31, inside the header"),
     "too few streams": (lambda: with_byte(zstd(), 15, 4), "4 streams, but"),
     "a wrong size in the table": (lambda: zstd(sizes=[27, 4, 9, 9, 12]), "stream alphas has 4 bytes"),
     "a frame that is too short": (
@@ -317,8 +360,53 @@ def test_broken_spz_is_refused_with_a_reason(what: str) -> None:
         spz.decode(io.BytesIO(make()))
 
 
-def test_bytes_after_the_streams_are_allowed_with_extensions() -> None:
-    assert len(spz.decode(io.BytesIO(gzipped(flags=0x02, more=b"an extension"))).splats) == 3
+KNOWN, UNKNOWN = 0xADBE0003, 0x12340001
+record = by_hand.spz_extension
+
+#: Extension records, the axis that they say points up, and a word for each note on them.
+EXTENSIONS: dict[str, tuple[bytes, str | None, list[str]]] = {
+    "none": (b"", None, []),
+    "y down": (record(KNOWN, b"\6\0\0\0"), "-y", []),
+    "the first counts": (record(KNOWN, b"\x0c\0\0\0") + record(KNOWN, b"\6\0\0\0"), "z", []),
+    "left-handed": (record(KNOWN, b"\x08\0\0\0"), "y", [r"left-handed \(RUF\)"]),
+    "unspecified": (record(KNOWN, bytes(4)), None, ["system 0 is unknown"]),
+    "beyond the last": (record(KNOWN, b"\x11\0\0\0"), None, ["system 17 is unknown"]),
+    "beyond the last, often": (record(KNOWN, b"\x11\0\0\0") * 99, None, ["system 17 is unknown"]),
+    "too short": (record(KNOWN, b"\6"), None, ["system 0 is unknown"]),
+    "a camera": (record(0xADBE0002, bytes(12)), None, [r"SPZ_ADOBE_safe_orbit_camera \(12 bytes\)"]),
+    "others first": (record(UNKNOWN, b"x" * 9) * 2 + record(KNOWN, b"\4\0\0\0"), "y", [r"0x12340001 \(18 bytes\)"]),
+    "many": (b"".join(record(UNKNOWN + n, b"") for n in range(99)), None, [*["0 bytes"] * 8, "91 more kinds"]),
+    "a payload past the end": (record(KNOWN, b"\6\0\0\0") + struct.pack("<II", UNKNOWN, 1), "-y", ["last 8 bytes"]),
+    "no records": (b"an extension", None, ["last 12 bytes"]),
+}
+
+
+@pytest.mark.parametrize("version", [2, 3, 4])
+@pytest.mark.parametrize("what", EXTENSIONS)
+def test_extension_records_say_what_is_up(what: str, version: int) -> None:
+    records, up, notes = EXTENSIONS[what]
+    data = zstd(flags=0x02, extension=records) if version == 4 else gzipped(version, flags=0x02, more=records)
+    scene, plain = spz.decode(io.BytesIO(data)), spz.decode(io.BytesIO(zstd() if version == 4 else gzipped(version)))
+    for column in COLUMNS:
+        np.testing.assert_array_equal(getattr(scene.splats, column), getattr(plain.splats, column), column)
+    assert scene.up == up
+    for note, pattern in zip(scene.notes, notes, strict=True):
+        assert re.search(pattern, note)
+        assert note.isprintable()
+
+
+@pytest.mark.parametrize("version", [3, 4])
+def test_records_beyond_a_megabyte_are_left_out(version: int) -> None:
+    records = record(UNKNOWN, bytes(MOST_BYTES)) + EXTENSIONS["y down"][0]
+    data = zstd(flags=0x02, extension=records) if version == 4 else gzipped(flags=0x02, more=records)
+    scene = spz.decode(io.BytesIO(data))
+    assert scene.up is None
+    assert "bytes of its extensions are no records that can be read" in scene.notes[-1]
+
+
+def test_extension_records_without_the_flag_say_nothing() -> None:
+    scene = spz.decode(io.BytesIO(zstd(extension=EXTENSIONS["y down"][0])))
+    assert (scene.up, scene.notes) == (None, ())
 
 
 def test_more_streams_than_are_known_are_allowed() -> None:

@@ -15,6 +15,7 @@ from fixtures import (
     by_hand_checkpoint,
     by_hand_compressed_ply,
     by_hand_glb,
+    by_hand_hier,
     by_hand_ksplat,
     by_hand_sog,
     by_hand_splat,
@@ -102,7 +103,7 @@ def as_spz(source: Scene, version: int) -> bytes:
 def spz_precision(source: Scene, version: int) -> Precision:
     bits = spz.settled(source, WriteOptions(spz_version=version)).fractional_bits
     assert bits is not None
-    coding = quantize.decode_quat_smallest_three if version == 3 else quantize.decode_quat_first_three
+    coding = quantize.decode_quat_smallest_three if version >= 3 else quantize.decode_quat_first_three
     return Precision(
         center=0.5 * 2.0**-bits,
         log_scale=1.001 / 32,
@@ -125,8 +126,7 @@ SPZ = {
         functools.partial(spz_precision, version=version),
         lod,
     )
-    for version in (2, 3)
-    for lod in (False, True)
+    for version, lod in ((2, False), (2, True), (3, False), (3, True), (4, False))
 }
 
 # --- SOG --------------------------------------------------------------------------------------------------------------
@@ -375,6 +375,34 @@ CHECKPOINT = {
     }.items()
 }
 
+# --- Hierarchies ------------------------------------------------------------------------------------------------------
+
+
+def with_all_sh(splats: Splats) -> Splats:
+    sh = np.zeros((len(splats), 15, 3), np.float32)
+    sh[:, : splats.sh.shape[1]] = splats.sh
+    return dataclasses.replace(splats, sh=sh)
+
+
+def half_precision(source: Scene) -> Precision:
+    values = linear(source)
+    sh = 2.0**-11 * float(np.abs(values["sh"]).max(initial=0)) + 2.0**-25
+    return Precision(
+        log_scale=2.0**-11 * np.abs(np.log(values["scale"])) + 2e-6,
+        degrees=float(np.degrees(2 * 2 * 2.0**-11)),  # four components of three or less, which are divided by that
+        opacity=2.0**-12 * 1.001,
+        rgb=2.0**-11 * np.abs(values["rgb"] - 0.5) + 1e-6,
+        sh=(sh, sh),
+    )
+
+
+HIER = {
+    "floats": Case("HIER", lambda source: by_hand_hier.hier(**linear(source)), exact, held=with_all_sh),
+    "halves": Case(
+        "HIER", lambda source: by_hand_hier.hier(**linear(source), half=True), half_precision, held=with_all_sh
+    ),
+}
+
 #: Every way to write each format of the table, by its name there.
 WRITERS: dict[str, dict[str, Case]] = {
     "PLY": PLY,
@@ -388,4 +416,5 @@ WRITERS: dict[str, dict[str, Case]] = {
     "GLB": GLB,
     "3D Tiles": TILES,
     "checkpoint": CHECKPOINT,
+    "HIER": HIER,
 }

@@ -286,9 +286,11 @@ def test_a_second_member_is_told_wherever_it_begins(size: int, tmp_path: Path) -
 @pytest.mark.parametrize("size", [0, 100, 3 * PIECE])
 def test_extensions_are_not_trailing_bytes(size: int, tmp_path: Path) -> None:
     whole, path = gzip.decompress((FOLDER / "spz-flags.spz").read_bytes()), tmp_path / "scene.spz"
-    extension = np.random.default_rng(0).bytes(size)  # which deflate does not make smaller
-    path.write_bytes(gzip.compress(whole[:14] + b"\x02" + whole[15:] + extension, mtime=0))
-    assert checked(path).findings == []
+    payload = np.random.default_rng(0).bytes(size)  # which deflate does not make smaller
+    path.write_bytes(gzip.compress(whole[:14] + b"\x02" + whole[15:] + by_hand.spz_extension(0x12340001, payload)))
+    (left_out,) = checked(path).findings or []
+    assert left_out.code == "container.left-out"
+    assert left_out.message == f"extension 0x12340001 ({size:,} bytes) is left out"
 
 
 def changed(data: bytes, rng: np.random.Generator) -> bytes:

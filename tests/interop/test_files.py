@@ -44,6 +44,12 @@ def test_spark_reads_plain_splats_as_they_were_written(spark: Spark, version: in
     laws.check(spark, Scene(random_splats(2000, sh_degree=sh_degree)), WriteOptions(spz_version=version))
 
 
+def test_spark_refuses_version_4(spark: Spark) -> None:
+    """As docs/formats.md says: once this fails, its table has changed."""
+    with pytest.raises(AssertionError, match="failed"):
+        spark.load(b"".join(spz.encode(Scene(random_splats(2)), WriteOptions(spz_version=4))))
+
+
 @pytest.mark.parametrize("extent, bits", [(5e3, 0), (1, 12), (0.05, 24), (0.05, None), (1, None), (5e3, None)])
 def test_spark_reads_any_number_of_fractional_bits(spark: Spark, extent: float, bits: int | None) -> None:
     scene = baked(random_splats(2000, extent=extent))

@@ -232,7 +232,7 @@ def test_the_leaves_of_a_piped_tree_can_be_written(tmp_path: Path, monkeypatch: 
     [
         (b"", "error: standard input: the file is empty"),
         (b"hello", "error: standard input: not a splat file that sparklod reads"),
-        ((FIXTURES / "golden/sh0.splat").read_bytes(), "a .splat file is not recognised by its content"),
+        ((FIXTURES / "golden/sh0.splat").read_bytes(), ".hier or .splat is not recognised by its content"),
         (SMALL.read_bytes()[:-9], "error: standard input: "),
         (b'{"version": 2, "means": {"files": ["means_l.webp", "means_u.webp"]}}', "error: standard input: "),
     ],

@@ -1,0 +1,166 @@
+"""Hierarchies of hierarchical-3d-gaussians (.hier), read as the splats of full detail.
+
+A file has the columns of all splats one after the other, then the nodes of the tree, each of which names a run of
+splats.
+Facts: `hierarchy_loader.cpp`, `writer.cpp` and `traversal.cpp` of graphdeco-inria/gaussian-hierarchy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..model.gaussian import normalized_quat
+from ..model.sh import COEFFICIENTS
+from ..model.splats import FloatArray, Splats
+from ..support.errors import FormatError, TruncatedError
+from ..support.parallel import BLOCK_ROWS, blocks_of, ordered_map
+from ..support.progress import Progress
+from . import quantize
+from .content import Content, Source, Target, decoder
+from .stream import Positioned, rows_between, size_of
+
+#: Before the columns, the number of splats, negative where numbers are halves; before the nodes, their number.
+COUNT = np.dtype("<i4")
+
+#: A node: it has `leaves` splats of the scene from `start` on, and then `merged` ones that stand for its children.
+NODE = np.dtype([(name, "<i4") for name in ("depth", "parent", "start", "leaves", "merged", "first_child", "children")])
+HALF_NODE = np.dtype(
+    [(name, "<i4") for name in ("parent", "start", "first_child")]
+    + [(name, "<i2") for name in ("depth", "children", "leaves", "merged")]
+)
+
+#: Numbers of the box of a node: the lowest and the highest corner, of four numbers each. They are not read.
+BOX_NUMBERS = 8
+
+
+@dataclass(frozen=True)
+class HierColumn:
+    """Column of the file.
+
+    Attributes:
+        numbers: of a splat.
+        put: decodes its (n, numbers) values into a column of n splats.
+        is_float: its numbers are floats even where the file has halves.
+    """
+
+    numbers: int
+    put: Callable[[Splats, FloatArray], None]
+    is_float: bool = False
+
+
+def _put_center(splats: Splats, values: FloatArray) -> None:
+    splats.center[:] = values
+
+
+def _put_rotation(splats: Splats, wxyz: FloatArray) -> None:
+    splats.quat_xyzw[:] = normalized_quat(wxyz)[:, [1, 2, 3, 0]]
+
+
+def _put_scale(splats: Splats, values: FloatArray) -> None:
+    splats.scale[:] = quantize.decode_log(values)
+
+
+def _put_opacity(splats: Splats, values: FloatArray) -> None:
+    # Linear. The optimiser of hierarchies does not bound it; a leaf is an input splat.
+    splats.opacity[:] = np.minimum(values[:, 0], np.float32(1))
+
+
+def _put_colours(splats: Splats, values: FloatArray) -> None:
+    coefficients = values.reshape(len(values), -1, 3)
+    splats.rgb[:] = quantize.decode_dc(coefficients[:, 0])
+    splats.sh[:] = coefficients[:, 1:]
+
+
+#: SH degree of all files.
+DEGREE = 3
+
+#: The columns in the order of the file.
+COLUMNS = (
+    HierColumn(3, _put_center, is_float=True),
+    HierColumn(4, _put_rotation),
+    HierColumn(3, _put_scale),
+    HierColumn(1, _put_opacity),
+    HierColumn(3 * (1 + COEFFICIENTS[DEGREE]), _put_colours),
+)
+
+
+def open_content(source: Source) -> Content:
+    """Open a hierarchy.
+
+    Raises:
+        FormatError: the file is cut short, or its nodes name splats that are not there, or the same ones.
+    """
+    size, file = size_of(source.file), Positioned(source.file)
+    count = _count(file, 0, size)
+    is_half, count = count < 0, abs(count)
+    number, node = (np.dtype("<f2"), HALF_NODE) if is_half else (np.dtype("<f4"), NODE)
+    types = [np.dtype(("<f4" if each.is_float else number, (each.numbers,))) for each in COLUMNS]
+    starts = COUNT.itemsize + count * np.cumsum([0, *(each.itemsize for each in types)], dtype=np.int64)
+    nodes_at = int(starts[-1])
+    nodes = _count(file, nodes_at, size)
+    end = nodes_at + COUNT.itemsize + nodes * (node.itemsize + BOX_NUMBERS * number.itemsize)
+    if nodes < 0 or end > size:
+        raise TruncatedError(f"cut short, or no .hier: it announces {count:,} splats in {nodes:,} nodes")
+    leaves = _leaves(file, nodes_at + COUNT.itemsize, node, nodes, count)
+
+    def fill(target: Target, threads: int, progress: Progress) -> None:
+        @np.errstate(over="ignore", invalid="ignore")  # whether numbers are valid is for others to say
+        def read(part: slice) -> int:
+            first, last = np.searchsorted(rows, [part.start, part.stop])
+            splats = target.splats.rows(slice(first, last))
+            some = rows[first:last] - part.start
+            for column, row_type, start in zip(COLUMNS, types, starts[:-1], strict=True):
+                between = rows_between(file, int(start), row_type, part.start, part.stop, count)
+                values = np.concatenate([values for _, values in between])
+                column.put(splats, values[some].astype(np.float32))
+            return target.start + int(last)
+
+        rows = leaves[target.start : target.stop]
+        if len(rows):
+            around = int(rows[0]), int(rows[-1]) + 1
+            parts = (slice(around[0] + at.start, around[0] + at.stop) for at in blocks_of(around[1] - around[0]))
+            for done in ordered_map(read, parts, threads):
+                progress("reading", done, len(leaves), "splat")
+
+    trailing = {"trailing_bytes": size - end}
+    return Content(len(leaves), DEGREE, "HIER", fill, header=trailing, block=BLOCK_ROWS)
+
+
+decode = decoder(open_content)
+
+
+def _count(file: Positioned, at: int, size: int) -> int:
+    """Return a number of splats or nodes."""
+    if at + COUNT.itemsize > size:
+        raise TruncatedError("cut short, or no .hier: it has fewer splats than it announces")
+    return int(np.frombuffer(file.read(at, COUNT.itemsize), COUNT)[0])
+
+
+def _leaves(file: Positioned, at: int, node: np.dtype[Any], nodes: int, count: int) -> NDArray[np.int64]:
+    """Return the splats of full detail, ascending: leaves of all nodes, and merged splats of nodes without children.
+
+    Hierarchies that were cut to a chunk have nodes that lost their children.
+    """
+    runs = [np.empty((0, 2), np.int64)]
+    for _, some in rows_between(file, at, node, 0, nodes, nodes, "nodes"):
+        start, leaves, merged, depth, children, first_child = (
+            some[name].astype(np.int64) for name in ("start", "leaves", "merged", "depth", "children", "first_child")
+        )
+        wrong = (np.minimum.reduce([start, leaves, merged, children]) < 0) | (start + leaves + merged > count)
+        wrong |= (children > 0) & ((first_child < 1) | (first_child + children > nodes))
+        if wrong.any():
+            raise FormatError("corrupt: a node names splats or children that the file does not have")
+        lengths = leaves + np.where((children == 0) & (depth > 0), merged, 0)
+        runs.append(np.stack([start, lengths], axis=1)[lengths > 0])
+    start, lengths = np.concatenate(runs).T
+    order = np.argsort(start, kind="stable")
+    start, lengths = start[order], lengths[order]
+    if (start[1:] < start[:-1] + lengths[:-1]).any():
+        raise FormatError("corrupt: two of its nodes name the same splats")
+    before = np.cumsum(lengths) - lengths
+    return np.repeat(start - before, lengths) + np.arange(int(lengths.sum()))
