@@ -23,6 +23,8 @@ HERE = Path(__file__).parent
 TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
 #: To those of glTF: half a turn about x.
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+#: From the axes of glTF, y up, to those of a tile of 3D Tiles, z up: a quarter turn about x.
+Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 #: To those of Babylon.js, whose axes are left-handed with y up.
 MIRROR = np.diag([1.0, -1.0, 1.0])
 #: Planes between which splats are drawn, world units.
@@ -124,6 +126,19 @@ class Browser:
         else:
             html = recipes.babylon_of_one_file(file.name)
         return self._show(recipes.replaced(html, changes or {}), "babylon.js", file, camera, view)
+
+    def cesium(self, file: Path, camera: Camera) -> Shown:
+        """What CesiumJS shows of a tileset whose content turns -y up."""
+        pose = Z_UP @ FLIP @ camera.camera_to_world
+        view = {
+            "position": pose[:3, 3].tolist(),
+            "ahead": (-pose[:3, 2]).tolist(),
+            "up": pose[:3, 1].tolist(),
+            "fov": max(camera.fov_x, camera.fov_y),
+            "near": NEAR,
+            "far": FAR,
+        }
+        return self._show(recipes.cesium(), "cesium.js", file, camera, view)
 
     def still(self, html: str, folder: Path, size: tuple[int, int]) -> NDArray[np.float64]:
         """(height, width, 3) what a page shows by itself of the files of a folder, 0..1."""
