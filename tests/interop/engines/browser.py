@@ -132,8 +132,9 @@ class Browser:
         pose = Z_UP @ FLIP @ camera.camera_to_world
         view = {
             "position": pose[:3, 3].tolist(),
-            "ahead": (-pose[:3, 2]).tolist(),
+            "right": pose[:3, 0].tolist(),
             "up": pose[:3, 1].tolist(),
+            "ahead": (-pose[:3, 2]).tolist(),
             "fov": max(camera.fov_x, camera.fov_y),
             "near": NEAR,
             "far": FAR,

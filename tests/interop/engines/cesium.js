@@ -44,17 +44,15 @@ const settled = () =>
   });
 
 /** Moves the camera of the page in the frame of the tileset and waits: {pixels, frames}. */
-window.draw = async ({ position, ahead, up, fov, near, far }) => {
+window.draw = async ({ position, right, up, ahead, fov, near, far }) => {
   while (!drawn()[0]) await new Promise(requestAnimationFrame);
   const [tileset] = drawn();
   const { camera } = scene;
   camera.cancelFlight();
   const frame = tileset.root.computedTransform;
-  const turned = (axis) => Matrix4.multiplyByPointAsVector(frame, Cartesian3.fromArray(axis), new Cartesian3());
-  camera.setView({
-    destination: Matrix4.multiplyByPoint(frame, Cartesian3.fromArray(position), new Cartesian3()),
-    orientation: { direction: turned(ahead), up: turned(up) },
-  });
+  Matrix4.multiplyByPoint(frame, Cartesian3.fromArray(position), camera.position);
+  for (const [name, axis] of Object.entries({ direction: ahead, up, right }))
+    Matrix4.multiplyByPointAsVector(frame, Cartesian3.fromArray(axis), camera[name]);
   Object.assign(camera.frustum, { fov, near, far });
   const [, splats] = drawn();
   if (splats) splats._hasLastSteadySortCameraPosition = false; // sorts anew even where the camera has hardly moved
