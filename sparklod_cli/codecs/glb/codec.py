@@ -31,7 +31,7 @@ from ..file_notes import note_of, read_note
 from ..options import CESIUM, DEFAULTS, WriteOptions
 from ..stream import Positioned, encode_rows
 from .glb_container import FLOAT, TYPES, Accessor, GlbFile, check_length, head_of
-from .placement import is_turn_of, placement_of, turn_of
+from .placement import TURNS, is_turn_of, placement_of
 
 EXTENSION, COMPRESSION = "KHR_gaussian_splatting", "KHR_gaussian_splatting_compression_spz_2"
 
@@ -312,6 +312,7 @@ def _root(
     """Return the JSON of a file with one mesh of one primitive, in one node."""
     note = note_of(antialiased=scene.antialiased, up=scene.up)
     asset = {"version": "2.0", "generator": note.pop("generator")} | ({"extras": note} if note else {})
+    turn = TURNS[scene.up or "y"]
     extensions = [EXTENSION, COMPRESSION] if required else [EXTENSION]
     return {
         "asset": asset,
@@ -319,7 +320,7 @@ def _root(
         **({"extensionsRequired": extensions} if required else {}),
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0} | turn_of(scene.up or "y", as_matrix=required)],
+        "nodes": [{"mesh": 0} | ({} if turn == TURNS["y"] else {"rotation": turn})],
         "meshes": [
             {
                 "primitives": [

@@ -98,24 +98,8 @@ def _transform(matrix: NDArray[np.float64]) -> Transform:
         raise FormatError(f"the transform of its splats: {error}") from None
 
 
-def turn_of(up: str, *, as_matrix: bool) -> dict[str, list[float]]:
-    """Return the members of a node by which it turns an axis to +y; none for y.
-
-    Args:
-        as_matrix: write a matrix in place of a quaternion, since CesiumJS 1.145 fails on splats in a node that has one.
-    """
-    if up == "y":
-        return {}
-    matrix = np.eye(4)
-    matrix[:3, :3] = np.rint(_rotation(up))
-    return {"matrix": matrix.T.ravel().tolist()} if as_matrix else {"rotation": list(TURNS[up])}
-
-
 def is_turn_of(transform: Transform, up: str) -> bool:
     """Return True if a transform is the turn of an axis to +y, and nothing else."""
+    turn = rotation_matrices(np.array([TURNS[up]]))[..., 0]
     at_rest = transform.scale == 1 and not transform.translation.any()
-    return at_rest and bool(np.abs(transform.rotation - _rotation(up)).max() <= SKEW)
-
-
-def _rotation(up: str) -> NDArray[np.float64]:
-    return rotation_matrices(np.array([TURNS[up]]))[..., 0]
+    return at_rest and bool(np.abs(transform.rotation - turn).max() <= SKEW)
