@@ -65,6 +65,11 @@ def output_of(
         from .detail_output import DetailOutput
 
         return DetailOutput(settings.detail, settings.options, detail_sink(target, overwrite=overwrite))
+    if settings.tiles is not None:
+        from ..io.details import detail_sink
+        from .tile_output import TileOutput
+
+        return TileOutput(settings.tiles, settings.options, detail_sink(target, overwrite=overwrite))
     if settings.simplify is not None:
         from .simplifying import SimplifiedOutput, Simplifier
 
@@ -95,7 +100,8 @@ def output_of_existing_tree(
             something that only splats without a tree can be given.
     """
     held = scene.format.split()[0]
-    plain = settings.detail is None and settings.encoding is None and settings.simplify is None
+    others = settings.detail, settings.tiles, settings.encoding, settings.simplify
+    plain = all(other is None for other in others)
     is_same = plain and WRITABLE[settings.suffix].name == held
     is_same_container = bool(scene.header.get("chunked")) == settings.options.rad.chunked
     converts = settings.converts and settings.encoding is None and not (is_same and is_same_container)

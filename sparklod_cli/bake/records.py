@@ -115,6 +115,24 @@ class WrittenDetail:
 
 
 @dataclass(frozen=True)
+class WrittenTiles:
+    """Tiles of a tileset.
+
+    Attributes:
+        tiles, levels: how many.
+        splats: of each level's cut, the root's first; the last has full detail.
+        error: geometric error of the root.
+        georeferenced: the tileset stands on the Earth.
+    """
+
+    tiles: int
+    levels: int
+    splats: tuple[int, ...]
+    error: float
+    georeferenced: bool
+
+
+@dataclass(frozen=True)
 class WrittenSet(Losses):
     """A simplified scene.
 
@@ -135,8 +153,8 @@ class WrittenTree:
     """Result of writing a tree.
 
     Attributes:
-        output_format: "spz", "rad", "rad-chunked", "streamed-sog", the name of the encoding of arrays, or the name of
-            the format of a simplified scene.
+        output_format: "spz", "rad", "rad-chunked", "streamed-sog", "3d-tiles", the name of the encoding of
+            arrays, or the name of the format of a simplified scene.
         bytes: of the output, all of its files.
         version, fractional_bits: of an SPZ output, else None.
         chunks: of a RAD output, else None.
@@ -144,6 +162,7 @@ class WrittenTree:
         sh_codes: the most entries of the SH palette of a RAD output; None without one.
         arrays: shapes of the arrays of another output, in its order.
         detail: of a Streamed SOG, else None.
+        tiles: of 3D Tiles, else None.
         simplified: of a simplified scene, else None.
         clamped: by the column of `Splats`, the number of nodes with a value that the output cannot hold.
         clamps: at which ends, and how far beyond.
@@ -158,6 +177,7 @@ class WrittenTree:
     sh_codes: int | None = None
     arrays: dict[str, tuple[int, ...]] = field(default_factory=dict)
     detail: WrittenDetail | None = None
+    tiles: WrittenTiles | None = None
     simplified: WrittenSet | None = None
     clamped: dict[str, int] = field(default_factory=dict)
     clamps: tuple[Clamp, ...] = ()
@@ -170,7 +190,7 @@ class Baked(WrittenTree):
     Attributes:
         format, read, splats, dropped, method, levels, notes, blocks: as in `BuiltTree`.
         sh_degree, nodes: of the tree.
-        seconds: by stage (read, build, order, refine, arrange, levels, errors, simplify, encode, write).
+        seconds: by stage (read, build, order, refine, arrange, levels, tiles, errors, simplify, encode, write).
         refine: result of fitting merged splats; None without `--refine`.
         scratch_bytes_written, scratch_bytes_read: in the scratch folder; None in memory.
     """

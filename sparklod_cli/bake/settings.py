@@ -11,6 +11,7 @@ from ..images.metrics import MOST_PSNR
 from ..lod.budget import Budget
 from ..lod.builders import METHODS
 from ..lod.detail_rule import DetailSettings
+from ..lod.tile_settings import TileSettings
 from ..model.selection import Selection
 from ..model.transforms import Transform, rotated
 from ..support.addresses import Place
@@ -65,6 +66,7 @@ class BakeSettings:
         encoding: of `codecs.formats.ENCODINGS`, to write arrays in that layout instead.
         raw: write their words alone, rather than as .npz.
         detail: of regions and detail levels, to write a Streamed SOG instead.
+        tiles: of tiles and where they stand, to write 3D Tiles instead.
         environment: of a Streamed SOG, a file whose splats are always drawn; turned and moved as the scene.
         environment_beyond: of a Streamed SOG, splats of the input farther out than this become its environment, see
             `lod.regions.beyond`; in the input's units. None for none.
@@ -89,6 +91,7 @@ class BakeSettings:
     encoding: str | None = None
     raw: bool = False
     detail: DetailSettings | None = None
+    tiles: TileSettings | None = None
     environment: Path | None = None
     environment_beyond: float | None = None
     simplify: SimplifyGoal | None = None

@@ -29,7 +29,11 @@ MANIFEST = "lod-meta.json"
 ENVIRONMENT = "env"
 ENVIRONMENT_FILE = f"{ENVIRONMENT}/env.sog"
 
+#: The manifest of 3D Tiles, and the folder of its other files: tiles, by level and number, and nested tilesets.
+TILESET, TILES = "tileset.json", "tiles"
+
 _ALL_IMAGES = [name for names in SOG_IMAGES.values() for name in names]
+_TILE = re.compile(re.escape(TILES) + r"/(?:0|[1-9]\d{0,8})-(?:0|[1-9]\d{0,8})\.(?:glb|json)", re.ASCII)
 _CHUNK_FOLDER = re.compile(r"(?:0|[1-9]\d{0,8})_(?:0|[1-9]\d{0,8})", re.ASCII)
 
 
@@ -69,6 +73,16 @@ def is_of_streamed_sog(name: str) -> bool:
     """Return True if a file could be of an output: named by its manifest, or an image in a folder of it."""
     folder, _, file = name.partition("/")
     return is_in_manifest(name) or (is_chunk_folder(folder) and sog_image_number(file) is not None)
+
+
+def tile_name(level: int, number: int, suffix: str = ".glb") -> str:
+    """Return the name of the file of a tile in the folder `TILES`; of a nested tileset with the suffix ".json"."""
+    return f"{level}-{number}{suffix}"
+
+
+def is_of_tileset(name: str) -> bool:
+    """Return True if a file could be of an output of 3D Tiles: a tile or a nested tileset in their folder."""
+    return _TILE.fullmatch(name) is not None
 
 
 def folders_of(names: Collection[str]) -> list[str]:

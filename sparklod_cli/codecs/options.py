@@ -129,9 +129,10 @@ class WriteOptions(CheckedSettings):
     sog: SogOptions = field(default_factory=SogOptions)
     sh_bits: int | None = None
     covering: bool = True
-    glb_profile: str = setting(
-        KHRONOS,
-        "GLB with 32-bit floats, as KHR_gaussian_splatting defines it, or with SPZ inside, as CesiumJS reads it.",
+    glb_profile: str | None = setting(
+        None,
+        "GLB with 32-bit floats, as KHR_gaussian_splatting defines it, or with SPZ inside, as CesiumJS reads it."
+        f"  [default: {KHRONOS}; {CESIUM} of 3D Tiles]",
         PROFILES,
     )
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ..codecs.options import SogOptions, WriteOptions
+from ..lod.tile_settings import TileSettings
 from ..support import interrupts
 from ..support.addresses import Place
 from ..support.errors import SparklodError
@@ -67,6 +68,7 @@ EXAMPLES = """\
   sparklod build-lod scene-lod.spz --refine             # the same tree, fitted: scene-lod-refined.spz
   sparklod build-lod scene.ply -o web/lod-meta.json     # Streamed SOG, which PlayCanvas streams
   sparklod build-lod scene.ply --format streamed-sog --levels 50%,25%,10%    # scene-lod/lod-meta.json
+  sparklod build-lod scene.ply --up -y -o city/tileset.json --lat 47.37 --lon 8.54    # 3D Tiles for CesiumJS
   sparklod build-lod scene.sog --encoding ext           # writes scene-lod.npz
   sparklod build-lod scene-lod.spz --unlod -o scene.ply
   sparklod build-lod scene-lod.spz --unlod -o scene.sog # for PlayCanvas
@@ -87,6 +89,7 @@ class BuildLodOptions:
     written: WriteOptions = field(default_factory=WriteOptions)
     palette: PaletteOptions = field(default_factory=PaletteOptions)
     detail: DetailOptions = field(default_factory=DetailOptions)
+    tiles: TileSettings = field(default_factory=TileSettings)
     resources: ResourceOptions = field(default_factory=ResourceOptions)
     cluster: ClusterOptions = field(default_factory=ClusterOptions)
     general: General = field(default_factory=General)
@@ -97,7 +100,7 @@ class BuildLodOptions:
 
         files = self.files
         return BakeSettings(
-            **self.tree.settings(streamed_sog=files.is_streamed_sog),
+            **self.tree.settings(only_cuts=files.manifest is not None),
             selection=self.selection.selection(),
             transform=self.transform.transform(),
             up=self.transform.up if is_set(ctx, "up") else None,
@@ -107,6 +110,7 @@ class BuildLodOptions:
             encoding=files.encoding,
             raw=files.is_raw,
             detail=self.detail.settings if files.is_streamed_sog else None,
+            tiles=self.tiles if files.is_tiles else None,
             environment=self.detail.environment,
             environment_beyond=self.detail.environment_beyond,
             refine=files.refining.settings(),
@@ -123,19 +127,19 @@ class BuildLodOptions:
 
 
 HEADINGS = (
-    *(COMMON, "Tree", "Selection", "Rotation, scale and position", "File format", "RAD", "Streamed SOG", "Refining"),
-    *("Large scenes", "Cluster"),
+    *(COMMON, "Tree", "Selection", "Rotation, scale and position", "File format", "RAD", "Streamed SOG", "3D Tiles"),
+    *("Refining", "Large scenes", "Cluster"),
 )
 
 
 @command("build-lod", BuildLodOptions, examples=EXAMPLES, headings=HEADINGS)
 def build_lod(ctx: click.Context, /, **_: Any) -> None:
-    """Bake splat files into Level-of-Detail files for Spark, PlayCanvas, SuperSplat and Babylon.js.
+    """Bake splat files into Level-of-Detail files for Spark, PlayCanvas, SuperSplat, Babylon.js and CesiumJS.
 
-    Reads PLY (also PlayCanvas's compressed PLY), SPZ, RAD, SOG (.sog, or a folder with a meta.json), Streamed SOG
-    (its full detail), .splat and .ksplat; merges splats into a tree, and writes the tree as SPZ with Spark's
-    extension, or as RAD, which Spark streams, or cuts of it as Streamed SOG, which the others stream. An INPUT of - is
-    standard input.
+    Reads PLY (also PlayCanvas's compressed PLY), SPZ, RAD, SOG (.sog, or a folder with a meta.json), Streamed SOG and
+    3D Tiles (their full detail), .splat and .ksplat; merges splats into a tree, and writes the tree as SPZ with
+    Spark's extension, or as RAD, which Spark streams, or cuts of it as 3D Tiles, which CesiumJS streams, or as Streamed
+    SOG, which the others stream. An INPUT of - is standard input.
 
     The axes of the input are kept unless --up or --rotate turns them. Selection goes by the coordinates of the input;
     of merged inputs, by those at which they stand together.
@@ -197,7 +201,7 @@ def _check(ctx: click.Context, options: BuildLodOptions, named: list[Path]) -> N
     targets = [output] if output is not None else [files.target(source) for source in inputs]
     if files.may_replace_inputs and not files.is_merged:
         targets = [target for source, target in zip(inputs, targets, strict=True) if not is_same_place(source, target)]
-    if files.is_chunked or files.is_folder or files.is_streamed_sog:
+    if files.is_chunked or files.is_folder or files.manifest is not None:
         targets = with_chunks(targets)
     keep_apart(ctx, {"output" if files.output_dir is None else "output_dir": targets, "scene": named})
     claim_stdout(ctx, "output", as_json=options.general.as_json, binary=True)
@@ -215,7 +219,7 @@ def _check(ctx: click.Context, options: BuildLodOptions, named: list[Path]) -> N
     if files.unlod:
         exclude(ctx, (*parameters_of(ResourceOptions), *of_clusters, "refine", "skip_existing"), "--unlod")
     else:
-        options.tree.check(ctx, streamed_sog=files.is_streamed_sog)
+        options.tree.check(ctx, only_cuts=files.manifest is not None)
     if DASH in inputs:
         exclude(ctx, of_clusters, "standard input, which workers cannot read; save it to a file first")
 

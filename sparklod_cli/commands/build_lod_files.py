@@ -9,15 +9,16 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..codecs.file_names import MANIFEST
+from ..codecs.file_names import MANIFEST, TILESET
 from ..codecs.file_names import RAD_SUFFIX as RAD
 from ..codecs.formats import ENCODINGS, FORMATS, NPZ, RAW_SUFFIXES, WRITABLE, ending_of
 from ..codecs.options import RadOptions
 from ..lod.detail_rule import DetailSettings
+from ..lod.tile_settings import TileSettings
 from ..support.addresses import Place
 from ..support.stdin import DASH
 from .option_groups import COMMON, argument, exclude, flag, is_set, option, parameters_of, refuse
-from .options.baking import OF_TREES, STREAMED_SOG, DetailOptions, RefineOptions
+from .options.baking import OF_TREES, STREAMED_SOG, TILES_3D, DetailOptions, RefineOptions
 from .options.common import output_option, overwrite_flag
 from .paths import InputPath, OutputPath, require_suffix, stem_of
 
@@ -41,22 +42,29 @@ FORMS = {
     "rad": (".rad", False),
     "rad-chunked": (".rad", True),
     STREAMED_SOG: (".json", False),
+    TILES_3D: (".json", False),
 }
 
-DETAIL = DetailOptions.HEADING
+#: What the formats of cuts are called.
+DETAIL, TILED = DetailOptions.HEADING, TileSettings.HEADING
+
+#: By the value of --format, for those that are cuts of a tree: the names of the manifest and of the format, and what is
+#: beside the manifest.
+MANIFESTS = {STREAMED_SOG: (MANIFEST, DETAIL, "folders"), TILES_3D: (TILESET, TILED, "a folder")}
 
 #: Parameters of formats, the names of these, and how to get one of them.
 OF_FORMATS = (
     (("spz_version", "fractional_bits"), ("SPZ",), ""),
     (parameters_of(RadOptions), ("RAD",), "; name the output .rad, or add --format rad"),
     (("compression_level",), ("SPZ", "RAD"), ""),
-    (("glb_profile",), ("GLB",), "; GLB is written by --unlod and simplify"),
+    (("glb_profile",), ("GLB", TILED), "; GLB is written by --unlod and simplify"),
     (("cluster_sh",), ("RAD", "SOG"), "; name the output .rad, or add --format rad"),
     (
         parameters_of(DetailSettings, DetailOptions),
         (DETAIL,),
         f"; name the output {MANIFEST}, or add --format {STREAMED_SOG}",
     ),
+    (parameters_of(TileSettings), (TILED,), f"; name the output {TILESET}, or add --format {TILES_3D}"),
 )
 
 
@@ -77,8 +85,9 @@ class BakedFiles:
     )
     output: Place | None = output_option(
         "Output of a single input, or a folder for all outputs; - is standard output.  [default: NAME-lod.spz beside"
-        f" the input; NAME-lod.rad with --format rad, NAME-lod/{MANIFEST} with --format {STREAMED_SOG}, NAME-lod.npz"
-        " with --encoding, NAME-unlod.spz with --unlod, NAME-lod-refined.spz of a NAME-lod.spz with --refine]",
+        f" the input; NAME-lod.rad with --format rad, NAME-lod/{MANIFEST} with --format {STREAMED_SOG},"
+        f" NAME-lod/{TILESET} with --format {TILES_3D}, NAME-lod.npz with --encoding, NAME-unlod.spz with --unlod,"
+        " NAME-lod-refined.spz of a NAME-lod.spz with --refine]",
         addresses=True,
     )
     output_dir: Place | None = option(
@@ -105,7 +114,8 @@ class BakedFiles:
     form: str | None = option(
         "Format of the output. rad is what Spark streams; rad-chunked writes each chunk to a file of its own,"
         " NAME-lod-0.radc and so on, beside NAME-lod.rad; streamed-sog is what PlayCanvas, SuperSplat and Babylon.js"
-        f" stream, {MANIFEST} and folders beside it. A Level-of-Detail file of another format keeps its tree. "
+        f" stream, {MANIFEST} and folders beside it; 3d-tiles is what CesiumJS streams, {TILESET} and a folder beside"
+        " it. A Level-of-Detail file of another format keeps its tree. "
         " [default: by the name of FILE, or spz]",
         tuple(FORMS),
         flags=("--format",),
@@ -178,14 +188,27 @@ class BakedFiles:
         return self.refining.refine is not None and self.overwrite and not self.skip_existing
 
     @property
-    def is_streamed_sog(self) -> bool:
-        """Whether regions at several detail levels are written."""
-        return self.form == STREAMED_SOG or (self.is_manifest and not (self.form or self.encoding or self.unlod))
+    def manifest(self) -> str | None:
+        """The value of --format of an output of cuts of a tree, with files beside a manifest; None for others."""
+        if self.form in MANIFESTS:
+            return self.form
+        return None if self.form or self.encoding or self.unlod else self.named_manifest
 
     @property
-    def is_manifest(self) -> bool:
-        """Whether the named output has the name of the manifest of a Streamed SOG."""
-        return self.output is not None and self.output != DASH and self.output.name == MANIFEST
+    def named_manifest(self) -> str | None:
+        """The format whose manifest has the name of the named output; None where that has another name."""
+        name = self.output.name if self.output is not None and self.output != DASH else ""
+        return next((form for form, (manifest, *_) in MANIFESTS.items() if manifest == name), None)
+
+    @property
+    def is_streamed_sog(self) -> bool:
+        """Whether regions at several detail levels are written."""
+        return self.manifest == STREAMED_SOG
+
+    @property
+    def is_tiles(self) -> bool:
+        """Whether 3D Tiles are written."""
+        return self.manifest == TILES_3D
 
     @property
     def is_chunked(self) -> bool:
@@ -200,7 +223,7 @@ class BakedFiles:
     @property
     def format_is_chosen(self) -> bool:
         """Whether somebody chose the format, by --format or by a name."""
-        return self.form is not None or self.named_suffix in TREES or self.is_streamed_sog
+        return self.form is not None or self.named_suffix in TREES or self.manifest is not None
 
     def check_format_of_trees(self) -> None:
         """Raise a `click.UsageError` where trees of several formats would have to be refined as one format."""
@@ -217,8 +240,8 @@ class BakedFiles:
 
     def _name(self, source: Place) -> str:
         stem = stem_of(source)
-        if self.is_streamed_sog:
-            return f"{stem.removesuffix('-lod')}-lod/{MANIFEST}"
+        if self.manifest is not None:
+            return f"{stem.removesuffix('-lod')}-lod/{MANIFESTS[self.manifest][0]}"
         if self.unlod:
             return f"{stem.removesuffix('-lod')}-unlod{self.suffix}"
         known = self.form is not None or self.refining.refine is not None
@@ -255,8 +278,8 @@ def check_formats(ctx: click.Context, outputs: BakedFiles) -> None:
     """Raise a `click.UsageError` where the options of formats, and the name of the output, contradict each other."""
     suffix = outputs.named_suffix
     outputs.check_format_of_trees()
-    if outputs.is_streamed_sog:
-        _check_streamed_sog(ctx, outputs)
+    if outputs.manifest is not None:
+        _check_manifest(ctx, outputs, outputs.manifest)
         return
     if outputs.is_chunked and outputs.output == DASH:
         raise click.UsageError("--format rad-chunked writes several files; name the output, or use --format rad")
@@ -266,7 +289,7 @@ def check_formats(ctx: click.Context, outputs: BakedFiles) -> None:
     if outputs.form is not None and suffix not in ("", outputs.suffix):
         raise click.UsageError(f"--format {outputs.form} writes {outputs.suffix}, not {suffix}")
     if outputs.output is not None and outputs.form is None:
-        arrays, trees = (NPZ, *RAW_SUFFIXES), (*TREES, MANIFEST)
+        arrays, trees = (NPZ, *RAW_SUFFIXES), (*TREES, MANIFEST, TILESET)
         require_suffix("--output", outputs.output, arrays if outputs.encoding else WRITABLE if outputs.unlod else trees)
     if outputs.unlod:
         _check_unlod(ctx, outputs)
@@ -286,36 +309,38 @@ def refuse_others(ctx: click.Context, written: str, *, hints: bool = True) -> No
             refuse(ctx, names, f"is an option of {' and '.join(formats)}, not of {written}{hint if hints else ''}")
 
 
-def _check_streamed_sog(ctx: click.Context, outputs: BakedFiles) -> None:
-    flag = f"--format {STREAMED_SOG}"
+def _check_manifest(ctx: click.Context, outputs: BakedFiles, form: str) -> None:
+    manifest, written, beside = MANIFESTS[form]
+    flag = f"--format {form}"
     refuse(ctx, ("unlod", "encoding"), f"cannot be used with {flag}")
     if outputs.output == DASH:
-        raise click.UsageError(f"{flag} writes several files; name the output, such as web/{MANIFEST}")
-    if outputs.output is not None and not outputs.is_manifest:
+        raise click.UsageError(f"{flag} writes several files; name the output, such as web/{manifest}")
+    if outputs.output is not None and outputs.named_manifest != form:
         raise click.UsageError(
-            f"{flag} writes {MANIFEST} and folders beside it, not {outputs.output.name}; name the output"
-            f" {outputs.output.parent / outputs.output.stem / MANIFEST}"
+            f"{flag} writes {manifest} and {beside} beside it, not {outputs.output.name}; name the output"
+            f" {outputs.output.parent / outputs.output.stem / manifest}"
         )
-    refuse_others(ctx, DETAIL, hints=False)
+    refuse_others(ctx, written, hints=False)
     if is_set(ctx, "environment"):
         refuse(ctx, ("environment_beyond",), "cannot be used with --environment")
 
 
 def _check_unlod(ctx: click.Context, outputs: BakedFiles) -> None:
     suffix = outputs.named_suffix
-    if outputs.is_manifest:
-        raise click.UsageError(f"--unlod writes splats without detail levels, not {MANIFEST}")
+    if outputs.named_manifest is not None:
+        manifest = MANIFESTS[outputs.named_manifest][0]
+        raise click.UsageError(f"--unlod writes splats without detail levels, not {manifest}")
     refuse(ctx, (*OF_TREES, "encoding"), "cannot be used with --unlod")
     if suffix not in ("", *WRITABLE):
         raise click.UsageError(f"--unlod writes {', '.join(WRITABLE)}, not {suffix}")
 
 
 def _check_tree(suffix: str) -> None:
-    known = f"{', '.join(TREES)} or {MANIFEST}"
+    known = f"{', '.join((*TREES, MANIFEST))} or {TILESET}"
     if suffix in (NPZ, *RAW_SUFFIXES):
         raise click.UsageError(f"{suffix} is a file of arrays; choose their layout with --encoding")
     if suffix in PLAIN:
         raise click.UsageError(f"{suffix} cannot hold a tree; name the output {known}")
     if suffix not in ("", *TREES):
-        names = f"{', '.join(TREES.values())} or {DETAIL}"
+        names = f"{', '.join((*TREES.values(), DETAIL))} or {TILED}"
         raise click.UsageError(f"trees are written as {names}, not as {suffix}; name the output {known}")

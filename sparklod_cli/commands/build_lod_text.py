@@ -61,6 +61,8 @@ def report_baked(console: Console, source: Place, target: Place, baked: Baked) -
     )
     if baked.detail is not None and len(baked.detail.levels) > 1:
         console.say(f"  {_levels(baked.detail)}")
+    if baked.tiles is not None and baked.tiles.levels > 1:
+        console.say(f"  splats level by level: {', '.join(f'{count:,}' for count in baked.tiles.splats)}")
     _report_tree(console, baked, baked.refine)
     consequences = _consequences(baked)
     if consequences:
@@ -89,7 +91,10 @@ def _report_tree(console: Console, baked: Baked, refine: Refined | None) -> None
 
 def _contents(baked: Baked) -> str:
     """Return a phrase on the contents of the output."""
-    detail = baked.detail
+    detail, tiles = baked.detail, baked.tiles
+    if tiles is not None:
+        place = ", on the Earth" if tiles.georeferenced else ""
+        return f"{count_of(tiles.tiles, 'tile')} of {count_of(tiles.levels, 'level')}{place}"
     if detail is None:
         chunks = f", {count_of(baked.chunks, 'chunk')}" if baked.chunks else ""
         return f"{count_of(baked.nodes, 'node')}, depth {baked.levels - 1}{chunks}"
@@ -127,6 +132,8 @@ def _written(baked: Baked) -> str:
     """Return the format of the output and the choices that were made for it."""
     if baked.detail is not None:
         return "Streamed SOG"
+    if baked.tiles is not None:
+        return "3D Tiles"
     if baked.arrays:
         return ", ".join(f"{name} uint32{list(shape)}" for name, shape in baked.arrays.items())
     if baked.chunks is None:

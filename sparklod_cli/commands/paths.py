@@ -13,7 +13,7 @@ from typing import Any
 
 import click
 
-from ..codecs.file_names import MANIFEST, META
+from ..codecs.file_names import MANIFEST, META, TILESET
 from ..support.addresses import Address, Place, place_of
 from ..support.stdin import DASH
 from ..tables.files import FORMS
@@ -167,11 +167,11 @@ def keep_apart(ctx: click.Context, stands_for: Mapping[str, Iterable[Place]] | N
 def with_chunks(headers: Iterable[Place]) -> list[Place]:
     """Return outputs of several files, and the files beside them that are replaced or removed with them."""
     from ..io import chunk_files
-    from ..io.details import detail_files
+    from ..io.details import FILE_SETS, detail_files
 
     chunks: list[Place] = []
     for header in headers:
-        others = detail_files if header.name == MANIFEST else chunk_files
+        others = detail_files if header.name in FILE_SETS else chunk_files
         chunks += [header, *(others(header) if isinstance(header, Path) else ())]
     return chunks
 
@@ -274,7 +274,7 @@ def _folds_case(folder: str) -> bool:
 def stem_of(source: Place) -> str:
     """Return the stem of the names of outputs: that of the input, or of its folder where it is an unpacked SOG."""
     whole = source if isinstance(source, Address) else source.absolute()
-    return whole.parent.name if source.name in (META, MANIFEST) else whole.stem or whole.name
+    return whole.parent.name if source.name in (META, MANIFEST, TILESET) else whole.stem or whole.name
 
 
 def file_of(text: str) -> Path | None:

@@ -1,17 +1,32 @@
-"""Files of a Streamed SOG, a manifest and folders of chunks: their sizes, and writing all of them or none."""
+"""Files of a scene at several detail levels, a manifest and folders beside it: their sizes, and writing all or none.
+
+They are those of a Streamed SOG, or of 3D Tiles, as the name of the manifest tells.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import functools
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..codecs.file_names import META, chunk_folder, folders_of, is_chunk_folder, is_in_manifest, is_of_streamed_sog
+from ..codecs.file_names import (
+    MANIFEST,
+    META,
+    TILES,
+    TILESET,
+    chunk_folder,
+    folders_of,
+    is_chunk_folder,
+    is_in_manifest,
+    is_of_streamed_sog,
+    is_of_tileset,
+)
 from ..codecs.sog.sog_container import MAX_META, companion_names
 from ..codecs.streamed_sog.manifest import MAX_MANIFEST, Manifest, parse
+from ..codecs.tiles_3d import tileset
 from ..support import atomic, atomic_set
 from ..support.addresses import Address, Place
 from ..support.errors import FormatError, OutputError
@@ -20,28 +35,70 @@ from .local_files import companions, in_folder, reason_of
 from .reading import opened
 from .writing import Files, SinkTogether, check_header, send_together
 
-#: The folder that every output has.
-FIRST = chunk_folder(0, 0)
+
+@dataclass(frozen=True)
+class FileSet:
+    """Names of the files of an output beside its manifest.
+
+    Attributes:
+        first: the folder that every output has.
+        is_folder: whether a folder has the name of one of an output.
+        is_member: whether a file in such a folder, by its path from the manifest's on, has the name of one.
+        named: the files that a manifest and what it names name, whatever they are called; `OSError` or `FormatError`
+            where it cannot be read.
+    """
+
+    first: str
+    is_folder: Callable[[str], bool]
+    is_member: Callable[[str], bool]
+    named: Callable[[Place], Iterable[str]]
+
+
+def _of_streamed_sog(target: Place) -> Iterator[str]:
+    for meta in parse(_content(target, MAX_MANIFEST)).names():
+        folder = target.parent / meta.partition("/")[0]
+        if is_in_manifest(meta) and not (isinstance(folder, Path) and folder.is_symlink()):
+            yield meta
+            with contextlib.suppress(OSError):
+                images = companion_names(_content(target.parent / meta, MAX_META))
+                yield from (meta.removesuffix(META) + image for image in images)
+
+
+def _of_tileset(target: Place) -> Iterator[str]:
+    for name in tileset.parse(_content(target, tileset.MAX_TILESET)).names():
+        yield name
+        if is_of_tileset(name) and name.endswith(tileset.NESTED):
+            with contextlib.suppress(OSError, FormatError):
+                inner = tileset.parse(_content(target.parent / name, tileset.MAX_TILESET))
+                yield from (f"{TILES}/{each}" for each in inner.names())
+
+
+#: By the name of the manifest.
+FILE_SETS = {
+    MANIFEST: FileSet(chunk_folder(0, 0), is_chunk_folder, is_of_streamed_sog, _of_streamed_sog),
+    TILESET: FileSet(TILES, TILES.__eq__, is_of_tileset, _of_tileset),
+}
 
 
 def detail_sink(path: Place, *, overwrite: bool) -> SinkTogether:
-    """Return the function that writes a manifest and its chunk files. Fail now if they cannot be written later.
+    """Return the function that writes a manifest and its files. Fail now if they cannot be written later.
 
     It is given names, with their folders, and contents, the manifest last, and returns the size of all. With
-    `overwrite`, the chunks of the output that was there before are replaced or removed: those files that its manifest
-    and its chunks name. A folder that is called as one of the output and is not one of the former is never touched.
+    `overwrite`, the files of the output that was there before are replaced or removed: those that its manifest, and
+    what that names, name. A folder that is called as one of the output and is not one of the former is never touched.
     See `atomic_set.write` for what an interruption leaves.
 
     Args:
-        path: of the manifest; where it is a symbolic link, all files go to where that leads.
+        path: of the manifest, one of `FILE_SETS`; where it is a symbolic link, all files go to where that leads.
 
     Raises:
         OutputError: it is no place for several files, a folder is in the way, or see `check_writable`.
     """
-    target = _target(path)
+    target, files = _target(path), FILE_SETS[path.name]
     check_header(path, overwrite=overwrite)
-    former = _former(target)
-    for folder in [FIRST] if isinstance(target, Path) else [FIRST, *folders_of(_standing(target))]:
+    former = _former(target, files)
+    folders = [] if isinstance(target, Path) else folders_of(_standing(target, files))
+    for folder in [files.first, *folders]:
         _check_folder(target, folder, former)  # at an address all of them now: nothing can be undone there later
     return functools.partial(_write, path, overwrite=overwrite)
 
@@ -49,12 +106,12 @@ def detail_sink(path: Place, *, overwrite: bool) -> SinkTogether:
 def detail_files(path: Path) -> list[Path]:
     """Return the files beside a manifest that are called as those of an output there, whether it names them or not."""
     target = Path(os.path.realpath(path))
-    return [target.parent / name for name in _standing(target)]
+    return [target.parent / name for name in _standing(target, FILE_SETS[path.name])]
 
 
 def _write(path: Place, files: Files, *, overwrite: bool) -> int:
     target = _target(path)
-    former = _former(target)
+    former = _former(target, FILE_SETS[path.name])
 
     def placed() -> Iterator[tuple[str, Iterable[bytes]]]:
         seen = set[str]()
@@ -107,20 +164,13 @@ def _check_folder(target: Place, folder: str, former: Iterable[str]) -> None:
         )
 
 
-def _former(target: Place) -> list[str]:
-    """Return the files of a former output that its manifest and its chunks name, and that have names of ours."""
+def _former(target: Place, files: FileSet) -> list[str]:
+    """Return the files of a former output that its manifest, and what that names, name, and that have names of ours."""
     found = list[str]()
     with contextlib.suppress(OSError, FormatError):
-        metas = parse(_content(target, MAX_MANIFEST)).names()
-        for meta in metas:
-            folder = target.parent / meta.partition("/")[0]
-            if is_in_manifest(meta) and not (isinstance(folder, Path) and folder.is_symlink()):
-                found.append(meta)
-                with contextlib.suppress(OSError):
-                    images = companion_names(_content(target.parent / meta, MAX_META))
-                    names = (meta.removesuffix(META) + image for image in images)
-                    found += [name for name in names if is_of_streamed_sog(name)]
-    standing = set(_standing(target))
+        for name in files.named(target):
+            found.append(name)
+    standing = set(_standing(target, files))
     return [name for name in dict.fromkeys(found) if name in standing]
 
 
@@ -129,16 +179,16 @@ def _content(path: Place, most: int) -> bytes:
         return file.read(most + 1)
 
 
-def _standing(target: Place) -> list[str]:
+def _standing(target: Place, files: FileSet) -> list[str]:
     """Return the files in folders beside a manifest that are called as those of an output."""
     if isinstance(target, Address):
-        return sorted(name for name in target.parent.files() if is_of_streamed_sog(name))
+        return sorted(name for name in target.parent.files() if files.is_member(name))
     found = list[str]()
     with contextlib.suppress(OSError):
         for folder in target.parent.iterdir():
-            if is_chunk_folder(folder.name) and folder.is_dir() and not folder.is_symlink():
+            if files.is_folder(folder.name) and folder.is_dir() and not folder.is_symlink():
                 found += [f"{folder.name}/{file.name}" for file in folder.iterdir()]
-    return sorted(name for name in found if is_of_streamed_sog(name))
+    return sorted(name for name in found if files.is_member(name))
 
 
 @dataclass(frozen=True)

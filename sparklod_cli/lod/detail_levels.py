@@ -111,17 +111,27 @@ class DetailCuts:
 
     def owners(self) -> NDArray[np.int64]:
         """Return the (M,) place in `coarsest` of each node or its ancestor that is there; -1 above the coarsest."""
-        above = np.maximum(self.parent, 0).astype(np.int64)
-        above[self.coarsest] = self.coarsest
-        while True:  # each round doubles the number of edges that are gone up
-            higher = above[above]
-            if np.array_equal(higher, above):
-                break
-            above = higher
-        place = np.full(len(self.parent), -1, np.int64)
-        place[self.coarsest] = np.arange(len(self.coarsest))
-        owner: NDArray[np.int64] = place[above]
-        return owner
+        return owners_of(self.parent, self.coarsest)
+
+
+def owners_of(parent: NDArray[np.int32], cut: Nodes) -> NDArray[np.int64]:
+    """Return the (M,) place in a cut of each node or its ancestor that is there; -1 above the cut.
+
+    Args:
+        parent: (M,) of each node, -1 of the root.
+        cut: (n,) int64 nodes.
+    """
+    above = np.maximum(parent, 0).astype(np.int64)
+    above[cut] = cut
+    while True:  # each round doubles the number of edges that are gone up
+        higher = above[above]
+        if np.array_equal(higher, above):
+            break
+        above = higher
+    place = np.full(len(parent), -1, np.int64)
+    place[cut] = np.arange(len(cut))
+    owner: NDArray[np.int64] = place[above]
+    return owner
 
 
 def shares_of(levels: Sequence[float] | None, leaves: int) -> list[float]:

@@ -168,6 +168,8 @@ def _as_a_whole(settings: BakeSettings) -> str | None:
         return "--refine fits a whole tree"
     if settings.simplify is not None:
         return "a simplified scene is a cut of a whole tree"
+    if settings.tiles is not None:
+        return "tiles are made of a whole tree"
     return None if settings.detail is None else "detail levels are made of a whole tree"
 
 

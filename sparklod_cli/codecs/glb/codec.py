@@ -28,10 +28,10 @@ from .. import quantize, spz
 from ..clamps import SPZ, CodeRange
 from ..content import Content, Source, Target, decoder
 from ..file_notes import note_of, read_note
-from ..options import CESIUM, DEFAULTS, WriteOptions
+from ..options import CESIUM, DEFAULTS, KHRONOS, WriteOptions
 from ..stream import Positioned, encode_rows
 from .glb_container import FLOAT, TYPES, Accessor, GlbFile, check_length, head_of
-from .placement import TURNS, is_turn_of, placement_of
+from .placement import TURNS, is_turn_of, placement_of, rotation_of_up
 
 EXTENSION, COMPRESSION = "KHR_gaussian_splatting", "KHR_gaussian_splatting_compression_spz_2"
 
@@ -213,6 +213,16 @@ def _placed(content: Content, transform: Transform) -> Content:
     return dataclasses.replace(content, fill=fill, up=None)
 
 
+def profile_of(options: WriteOptions) -> str:
+    """Return the profile that is written, which nobody has to choose."""
+    return options.glb_profile or KHRONOS
+
+
+def extensions_of(profile: str) -> list[str]:
+    """Return the extensions of glTF that the files of a profile use."""
+    return [EXTENSION, COMPRESSION] if profile == CESIUM else [EXTENSION]
+
+
 def settled(scene: Scene, options: WriteOptions) -> WriteOptions:
     """Return the options with nothing left open, those of SPZ, too, which the profile "cesium" has inside.
 
@@ -225,7 +235,7 @@ def settled(scene: Scene, options: WriteOptions) -> WriteOptions:
     most = float(splats.opacity.max(initial=0))
     if most > 1:
         raise FormatError(f"GLB holds no opacity above 1, and a splat has {most:g}; extract the leaves, or simplify")
-    if options.glb_profile == CESIUM:
+    if profile_of(options) == CESIUM:
         return spz.settled(scene, options)
     check_length(4 * len(splats) * (14 + 3 * splats.sh.shape[1]) + (1 << 16))
     return options
@@ -233,7 +243,7 @@ def settled(scene: Scene, options: WriteOptions) -> WriteOptions:
 
 def held(options: WriteOptions, sh_degree: int) -> Sequence[CodeRange]:
     """Return the values that the profile holds without clamping them: all, or those of SPZ."""
-    return SPZ if options.glb_profile == CESIUM else ()
+    return SPZ if profile_of(options) == CESIUM else ()
 
 
 def encode(
@@ -247,7 +257,7 @@ def encode(
         FormatError: see `settled`.
     """
     options = settled(scene, options)
-    yield from (_encode_spz if options.glb_profile == CESIUM else _encode_plain)(scene, options, threads, progress)
+    yield from (_encode_spz if profile_of(options) == CESIUM else _encode_plain)(scene, options, threads, progress)
 
 
 def _encode_plain(scene: Scene, options: WriteOptions, threads: int, progress: Progress) -> Iterator[bytes]:
@@ -312,15 +322,14 @@ def _root(
     """Return the JSON of a file with one mesh of one primitive, in one node."""
     note = note_of(antialiased=scene.antialiased, up=scene.up)
     asset = {"version": "2.0", "generator": note.pop("generator")} | ({"extras": note} if note else {})
-    turn = TURNS[scene.up or "y"]
-    extensions = [EXTENSION, COMPRESSION] if required else [EXTENSION]
+    extensions = extensions_of(CESIUM if required else KHRONOS)
     return {
         "asset": asset,
         "extensionsUsed": extensions,
         **({"extensionsRequired": extensions} if required else {}),
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0} | ({} if turn == TURNS["y"] else {"rotation": turn})],
+        "nodes": [{"mesh": 0} | _turn(scene.up, as_matrix=required)],
         "meshes": [
             {
                 "primitives": [
@@ -336,3 +345,13 @@ def _root(
         "bufferViews": views,
         "buffers": [{"byteLength": length}],
     }
+
+
+def _turn(up: str | None, *, as_matrix: bool) -> dict[str, Any]:
+    """Return the turn of a node that makes an axis y. As content of a tile, CesiumJS reads nothing but a matrix."""
+    if as_matrix:
+        matrix = np.eye(4)
+        matrix[:3, :3] = rotation_of_up(up)
+        return {"matrix": matrix.T.ravel().tolist()}
+    turn = TURNS[up or "y"]
+    return {} if turn == TURNS["y"] else {"rotation": turn}

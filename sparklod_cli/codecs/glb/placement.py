@@ -98,8 +98,12 @@ def _transform(matrix: NDArray[np.float64]) -> Transform:
         raise FormatError(f"the transform of its splats: {error}") from None
 
 
+def rotation_of_up(up: str | None) -> NDArray[np.float64]:
+    """Return the (3, 3) turn of an axis to +y, exactly; the identity where it is unknown."""
+    return np.rint(rotation_matrices(np.array([TURNS[up or "y"]]))[..., 0]) + 0.0  # no -0
+
+
 def is_turn_of(transform: Transform, up: str) -> bool:
     """Return True if a transform is the turn of an axis to +y, and nothing else."""
-    turn = rotation_matrices(np.array([TURNS[up]]))[..., 0]
     at_rest = transform.scale == 1 and not transform.translation.any()
-    return at_rest and bool(np.abs(transform.rotation - turn).max() <= SKEW)
+    return at_rest and bool(np.abs(transform.rotation - rotation_of_up(up)).max() <= SKEW)

@@ -30,10 +30,10 @@ if TYPE_CHECKING:
     from ...model.transforms import Transform
     from ..console import Console
 
-#: The value of --format for regions at several detail levels.
-STREAMED_SOG = "streamed-sog"
+#: The values of --format for regions at several detail levels, and for tiles.
+STREAMED_SOG, TILES_3D = "streamed-sog", "3d-tiles"
 
-#: What builds the tree unless somebody chooses, and what builds that which a Streamed SOG is cut from.
+#: What builds the tree unless somebody chooses, and what builds that which detail levels or tiles are cut from.
 METHOD, METHOD_OF_DETAIL = METHODS[0], "quality"
 
 
@@ -45,7 +45,7 @@ class TreeOptions:
 
     method: str | None = option(
         "How splats are merged. quick takes seconds; quality takes longer, and its cuts come closer to full detail."
-        f"  [default: {METHOD}; {METHOD_OF_DETAIL} with --format {STREAMED_SOG}]",
+        f"  [default: {METHOD}; {METHOD_OF_DETAIL} with --format {STREAMED_SOG} or {TILES_3D}]",
         METHODS,
         heading=COMMON,
     )
@@ -63,23 +63,28 @@ class TreeOptions:
     )
     growth: float | None = option(
         "Largest number of nodes for each leaf, with --method quality."
-        f"  [default: {defaults.DEFAULT_GROWTH:g}; {defaults.DETAIL_GROWTH:g} with --format {STREAMED_SOG}]",
+        f"  [default: {defaults.DEFAULT_GROWTH:g}; {defaults.DETAIL_GROWTH:g} with --format {STREAMED_SOG} or"
+        f" {TILES_3D}]",
         Range(defaults.MIN_GROWTH, defaults.MAX_GROWTH, unit="N"),
     )
 
-    def settings(self, *, streamed_sog: bool) -> dict[str, Any]:
-        """Return the fields of `BakeSettings` for the tree; the defaults suit the output."""
-        growth = defaults.DETAIL_GROWTH if streamed_sog else defaults.DEFAULT_GROWTH
+    def settings(self, *, only_cuts: bool) -> dict[str, Any]:
+        """Return the fields of `BakeSettings` for the tree; the defaults suit the output.
+
+        Args:
+            only_cuts: the output has cuts of the tree, and not the tree.
+        """
+        growth = defaults.DETAIL_GROWTH if only_cuts else defaults.DEFAULT_GROWTH
         return {
-            "method": self.method or (METHOD_OF_DETAIL if streamed_sog else METHOD),
+            "method": self.method or (METHOD_OF_DETAIL if only_cuts else METHOD),
             "base": self.base,
             "growth": growth if self.growth is None else self.growth,
             "max_sh": self.max_sh,
         }
 
-    def check(self, ctx: click.Context, *, streamed_sog: bool) -> None:
+    def check(self, ctx: click.Context, *, only_cuts: bool) -> None:
         """Raise a `click.UsageError` where the number of one method is given with another."""
-        chosen = self.settings(streamed_sog=streamed_sog)["method"]
+        chosen = self.settings(only_cuts=only_cuts)["method"]
         for method, row in BUILDERS.items():
             if method != chosen:
                 refuse(ctx, [row.setting], f"is an option of --method {method}, not of {chosen}")

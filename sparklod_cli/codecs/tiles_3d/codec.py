@@ -1,0 +1,1 @@
+from .tile_writer import encode_files as encode_files

@@ -1,0 +1,96 @@
+"""Settings of 3D Tiles: how large tiles are, and where on the Earth they stand. Imports nothing heavy."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+from ..model.georeference import IDENTITY, Matrix16, placed
+from ..support.setting_fields import CheckedSettings, Quantity, Range, setting, whole
+from ..support.units import parse_count
+
+#: Least determinant of the axes of a transform, as a share of the product of their lengths: less is flat. Chosen.
+LEAST_VOLUME = 1e-6
+
+
+def parse_matrix(text: str) -> Matrix16:
+    """Return the numbers of a text such as "1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1".
+
+    Raises:
+        ValueError: they are not 16 finite numbers of an affine transform that neither flattens nor mirrors.
+    """
+    parts = text.replace(",", " ").split()
+    try:
+        matrix = tuple(map(float, parts))
+    except ValueError:
+        matrix = ()
+    check_matrix(matrix, repr(text))
+    return matrix
+
+
+def check_matrix(matrix: Matrix16, name: str) -> None:
+    """Raise `ValueError` where numbers are no affine transform, column by column, that keeps volumes and hands."""
+    if len(matrix) != 16 or not all(map(math.isfinite, matrix)):
+        raise ValueError(f"{name} is not 16 finite numbers, a matrix of 4 rows column by column")
+    (a, b, c, p), (d, e, f, q), (g, h, i, r), (*_, s) = (matrix[at : at + 4] for at in (0, 4, 8, 12))
+    if (p, q, r, s) != (0, 0, 0, 1):
+        raise ValueError(f"{name} has the last row {p:g} {q:g} {r:g} {s:g}, not 0 0 0 1; give it column by column")
+    volume = a * (e * i - f * h) - d * (b * i - c * h) + g * (b * f - c * e)
+    if not volume > LEAST_VOLUME * math.hypot(a, b, c) * math.hypot(d, e, f) * math.hypot(g, h, i):
+        raise ValueError(f"{name} flattens or mirrors; give one that turns, moves and scales")
+
+
+@dataclass(frozen=True)
+class TileSettings(CheckedSettings):
+    """Settings of 3D Tiles."""
+
+    HEADING: ClassVar[str] = "3D Tiles"
+
+    tile_splats: int = setting(100_000, "Most splats of a tile, which is a file.", Quantity("N", parse_count, whole(1)))
+    lat: float | None = setting(
+        None,
+        "Latitude of the origin of the scene, in degrees, geodetic (WGS 84).",
+        Range(-90, 90, unit="DEG"),
+        needs="lon",
+    )
+    lon: float | None = setting(None, "Longitude of the origin, in degrees.", Range(-180, 180, unit="DEG"), needs="lat")
+    height: float | None = setting(
+        None, "Height of the origin above the ellipsoid, in metres.", Range(unit="M"), needs="lat"
+    )
+    heading: float | None = setting(
+        None,
+        "Direction that the scene's forward axis, -z where y is up, points to on the ground, in degrees clockwise from"
+        " north.",
+        Range(unit="DEG"),
+        needs="lat",
+    )
+    transform: tuple[float, ...] | None = setting(
+        None,
+        "Transform of the root tile instead: 16 numbers, column by column, from the axes of the tileset, x right, y"
+        " forward, z up, to those of the Earth (ECEF), in metres.",
+        Quantity("NUMBERS", parse_matrix),
+        excludes=("lat", "lon", "height", "heading"),
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if (self.lat is None) != (self.lon is None):
+            raise ValueError("lat and lon go together; give both")
+        if self.lat is None and not (self.height is None and self.heading is None):
+            raise ValueError("height and heading are of a place; give lat and lon, too")
+        for name in ("height", "heading"):
+            value = getattr(self, name)
+            if value is not None and not math.isfinite(value):
+                raise ValueError(f"{name} is {value}; give a finite number")
+        if self.transform is not None:
+            if self.lat is not None:
+                raise ValueError("transform cannot be used with lat and lon")
+            check_matrix(self.transform, "transform")
+
+    @property
+    def matrix(self) -> Matrix16:
+        """Transform of the root tile, column by column."""
+        if self.lat is None or self.lon is None:
+            return self.transform or IDENTITY
+        return placed(self.lat, self.lon, self.height or 0.0, self.heading or 0.0)
