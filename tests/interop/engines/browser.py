@@ -64,11 +64,13 @@ class Shown:
         rgba: (height, width, 4) float64, 0..1, when all was loaded.
         frames: the number of splats in the first frame that drew any, and in each that drew another number.
         requests: for files of the scene, in order.
+        tiles: of 3D Tiles, names of those that the picture shows, in order.
     """
 
     rgba: NDArray[np.float64]
     frames: list[int]
     requests: list[Request]
+    tiles: list[str]
 
 
 class Browser:
@@ -127,8 +129,8 @@ class Browser:
             html = recipes.babylon_of_one_file(file.name)
         return self._show(recipes.replaced(html, changes or {}), "babylon.js", file, camera, view)
 
-    def cesium(self, file: Path, camera: Camera) -> Shown:
-        """What CesiumJS shows of a tileset whose content turns -y up."""
+    def cesium(self, file: Path, camera: Camera, changes: Mapping[str, str] | None = None) -> Shown:
+        """What CesiumJS shows of a tileset whose content turns -y up; `changes` replace text of its page."""
         pose = Z_UP @ FLIP @ camera.camera_to_world
         view = {
             "position": pose[:3, 3].tolist(),
@@ -139,7 +141,7 @@ class Browser:
             "near": NEAR,
             "far": FAR,
         }
-        return self._show(recipes.cesium(), "cesium.js", file, camera, view)
+        return self._show(recipes.replaced(recipes.cesium(), changes or {}), "cesium.js", file, camera, view)
 
     def still(self, html: str, folder: Path, size: tuple[int, int]) -> NDArray[np.float64]:
         """(height, width, 3) what a page shows by itself of the files of a folder, 0..1."""
@@ -155,4 +157,5 @@ class Browser:
         answer = self._node.ask({"do": "draw", "camera": view, "out": str(self._out)})
         requests = self._node.ask({"do": "requests"})["requests"]
         rgba = np.fromfile(self._out, "u1").reshape(camera.height, camera.width, 4)[::-1] / 255
-        return Shown(rgba, answer["frames"], [Request(**each) for each in requests])
+        tiles = sorted(answer.get("tiles", ()))
+        return Shown(rgba, answer["frames"], [Request(**each) for each in requests], tiles)

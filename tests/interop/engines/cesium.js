@@ -56,5 +56,7 @@ window.draw = async ({ position, right, up, ahead, fov, near, far }) => {
   Object.assign(camera.frustum, { fov, near, far });
   const [, splats] = drawn();
   if (splats) splats._hasLastSteadySortCameraPosition = false; // sorts anew even where the camera has hardly moved
-  return { pixels: await settled(), frames };
+  const read = await settled();
+  const folder = new URL('.', document.baseURI).href;
+  return { pixels: read, frames, tiles: tileset._selectedTiles.map(({ content }) => content.url.slice(folder.length)) };
 };
