@@ -43,6 +43,8 @@ class Format:
             threads, progress, beside) -> DetailScene`, and `encode_files(scene, options, settings, *, threads,
             progress)`, which
             gives the names and contents of the files of one.
+        tiled: its files have tiles that replace each other. Its module also has `decode_tiles(file, *, threads,
+            progress, open_companion) -> TileScene`, and `encode_files(scene, options, *, threads, progress)` as above.
         bare: its files hold nothing but splats, so that nothing can be noted in them, see `file_notes`.
     """
 
@@ -56,6 +58,7 @@ class Format:
     companions: bool = False
     folders: bool = False
     detailed: bool = False
+    tiled: bool = False
     bare: bool = False
 
     @property
@@ -97,6 +100,15 @@ FORMATS = (
         companions=True,
         folders=True,
         detailed=True,
+    ),
+    Format(
+        "3D Tiles",
+        "tiles_3d.codec",
+        (".json",),
+        rb"\s*\{.*?\"geometricError\"\s*:",
+        companions=True,
+        folders=True,
+        tiled=True,
     ),
     # A zip that begins with NAME/data.pkl; SOG is a zip, too.
     Format("checkpoint", "checkpoint", (".pt", ".ckpt"), rb"PK\x03\x04.{26}[^/]{1,200}/data\.pkl"),

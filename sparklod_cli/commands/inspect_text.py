@@ -43,6 +43,8 @@ def lines(name: str, report: dict[str, Any]) -> Iterator[str]:
         yield from _rad(report["rad"])
     if report["streamed_sog"]:
         yield from _streamed_sog(report["streamed_sog"])
+    if report["tiles"]:
+        yield from _tiles(report["tiles"])
     if tree:
         yield from _tree(tree)
     if values:
@@ -102,6 +104,32 @@ def _streamed_sog(streamed: dict[str, Any]) -> Iterator[str]:
         yield _row("environment", f"{count_of(around['splats'], 'splat')}, {size_of(around['bytes'])}")
     if streamed["generator"]:
         yield _row("written by", streamed["generator"])
+
+
+def _tiles(tiles: dict[str, Any]) -> Iterator[str]:
+    first, tileset = size_of(tiles["first_bytes"]), size_of(tiles["tileset_bytes"])
+    nested = f" and {tiles['tilesets'] - 1:,} nested" if tiles["tilesets"] > 1 else ""
+    yield _row("stored", f"tileset.json{nested} {tileset}, with the root tile {first}")
+    if tiles["file_bytes"]:
+        least, median, most = (size_of(tiles["file_bytes"][name]) for name in ("min", "median", "max"))
+        yield _row("files", f"{count_of(tiles['tiles'], 'tile')} of {least} to {most}, median {median}")
+    splats = tiles["tile_splats"]
+    yield _row("", f"{splats['min']:,.0f} to {splats['max']:,.0f} splats each, median {splats['p50']:,.0f}")
+    if tiles["geometric_error"] is not None:
+        yield _row("error", f"{tiles['geometric_error']:.4g} where nothing is drawn")
+    yield _row(
+        "depths", f"{'splats':>12} {'tiles':>8} {'leaves':>8} {'bytes':>13} {'error min':>10} {'p50':>10} {'max':>10}"
+    )
+    for number, level in enumerate(tiles["levels"]):
+        errors = [f"{level['errors'][name]:>10.3g}" for name in ("min", "p50", "max")] if level["errors"] else []
+        counts = f"{level['splats']:>12,} {level['tiles']:>8,} {level['leaves']:>8,} {level['bytes']:>13,}"
+        yield f"    {number:<8} {' '.join([counts, *errors])}"
+    if tiles["georeference"]:
+        place = tiles["georeference"]
+        where = f"latitude {place['latitude']:.7g}, longitude {place['longitude']:.7g}, height {place['height']:.6g} m"
+        yield _row("stands at", f"{where}, heading {place['heading']:.5g}")
+    if tiles["generator"]:
+        yield _row("written by", tiles["generator"])
 
 
 def _ranged(value: float | bool) -> str:

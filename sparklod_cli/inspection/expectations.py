@@ -31,15 +31,17 @@ NAMES: dict[str, Callable[[dict[str, Any]], Any]] = {
     "sh": lambda report: report["sh_degree"],
     "lod": lambda report: report["tree"] is not None,
     "chunk_bytes": lambda report: _chunked(report)["max"],
-    "first_bytes": lambda report: (report["rad"] or report["streamed_sog"])["first_bytes"],
+    "first_bytes": lambda report: _streamed(report)["first_bytes"],
     "chunked": lambda report: report["rad"]["chunked"],
     "palette": lambda report: report["rad"]["palette"],
     "levels": lambda report: len(report["streamed_sog"]["levels"]),
     "regions": lambda report: report["streamed_sog"]["regions"],
+    "tiles": lambda report: report["tiles"]["tiles"],
 }
 
 #: The formats of those of them that are not about a tree.
-FORMATS = dict.fromkeys(("chunk_bytes", "first_bytes"), "RAD or Streamed SOG")
+FORMATS = dict.fromkeys(("chunk_bytes", "first_bytes"), "RAD, Streamed SOG or 3D Tiles")
+FORMATS["tiles"] = "3D Tiles"
 FORMATS |= dict.fromkeys(("chunked", "palette"), "RAD") | dict.fromkeys(("levels", "regions"), "Streamed SOG")
 
 #: The codes of findings about some names; that of the others is expect.value.
@@ -182,9 +184,14 @@ def _value(plain: dict[str, Any], name: str) -> Any:
         raise NoFieldError("the file has no tree" if form is None else f"the file is not {form}") from None
 
 
+def _streamed(report: dict[str, Any]) -> Any:
+    """Facts of a format that a viewer fetches in parts."""
+    return report["rad"] or report["streamed_sog"] or report["tiles"]
+
+
 def _chunked(report: dict[str, Any]) -> Any:
     """Sizes of what a viewer fetches at a time."""
-    return report["rad"]["chunk_bytes"] if report["rad"] else report["streamed_sog"]["file_bytes"]
+    return _streamed(report)["chunk_bytes" if report["rad"] else "file_bytes"]
 
 
 def check(report: Report, expected: Expectations) -> list[Finding]:

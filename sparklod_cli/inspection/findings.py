@@ -11,6 +11,8 @@ from ..codecs.rad.rad_rules import ERRORS as RAD_ERRORS
 from ..codecs.rad.rad_rules import WARNINGS as RAD_WARNINGS
 from ..codecs.streamed_sog.manifest_rules import ERRORS as STREAMED_SOG_ERRORS
 from ..codecs.streamed_sog.manifest_rules import WARNINGS as STREAMED_SOG_WARNINGS
+from ..codecs.tiles_3d.tileset_rules import ERRORS as TILE_ERRORS
+from ..codecs.tiles_3d.tileset_rules import WARNINGS as TILE_WARNINGS
 from ..codecs.validation import RuleViolation
 
 ERROR, WARNING, NOTE = "error", "warning", "note"
@@ -34,6 +36,8 @@ CODES: dict[str, tuple[str, str]] = {
     **{code: (WARNING, meaning) for code, meaning in RAD_WARNINGS.items()},
     **{code: (ERROR, meaning) for code, meaning in STREAMED_SOG_ERRORS.items()},
     **{code: (WARNING, meaning) for code, meaning in STREAMED_SOG_WARNINGS.items()},
+    **{code: (ERROR, meaning) for code, meaning in TILE_ERRORS.items()},
+    **{code: (WARNING, meaning) for code, meaning in TILE_WARNINGS.items()},
     "values.empty": (ERROR, "there are no splats"),
     "values.non-finite": (ERROR, "a number is not finite, or a rotation has length 0"),
     "values.rotation": (ERROR, "the length of a rotation is not 1"),
@@ -148,9 +152,10 @@ class HeaderScan:
     """Facts and broken rules from the headers of a file and of the files that it names.
 
     Attributes:
-        field: of the report that has the facts, "rad" or "streamed_sog".
+        field: of the report that has the facts, "rad", "streamed_sog" or "tiles".
         head: what a report begins with; None where `facts` is.
-        facts: `RadFacts` or `StreamedSogFacts`; None where a rule is broken without which the rest cannot be trusted.
+        facts: `RadFacts`, `StreamedSogFacts` or `TileFacts`; None where a rule is broken without which the rest cannot be
+            trusted.
         findings: broken rules, one for each code.
         fatal: findings because of which the file cannot be read.
     """

@@ -76,6 +76,34 @@ def _regions(streamed: Mapping[str, Any]) -> str:
     return panel("Regions", table_of(("", *names), rows, caption))
 
 
+def tile_panels(tiles: Mapping[str, Any]) -> str:
+    """Return the panels, from `tiles` of a report as JSON."""
+    most = max(level["splats"] for level in tiles["levels"]) or 1
+    rows = []
+    for number, level in enumerate(tiles["levels"]):
+        errors = level["errors"] or {}
+        cells = [number_text(level[name]) for name in ("splats", "tiles", "leaves")]
+        cells += [size_text(level["bytes"]), *(number_text(errors.get(name)) for name in ("min", "p50", "max"))]
+        rows.append([f"{number}", *cells, bar(level["splats"] / most)])
+    head = ("Depth", "Splats", "Tiles", "Without children", "Size", "Geometric error, least", "Median", "Largest", "")
+    levels = table_of(head, rows, "Depth 0 is the root tile. Tiles without children have full detail.")
+    facts = [
+        ["Tileset files", f"{number_text(tiles['tilesets'])}, {size_text(tiles['tileset_bytes'])}"],
+        ["Tileset files and the root tile", size_text(tiles["first_bytes"])],
+    ]
+    if tiles["file_bytes"]:
+        sizes = [size_text(tiles["file_bytes"][name]) for name in ("min", "median", "max")]
+        facts.append(["Smallest, median and largest tile", ", ".join(sizes)])
+    if tiles["georeference"]:
+        place = tiles["georeference"]
+        where = ", ".join(number_text(place[name]) for name in ("latitude", "longitude", "height", "heading"))
+        facts.append(["Latitude, longitude, height and heading", where])
+    if tiles["generator"]:
+        facts.append(["Written by", text_of(tiles["generator"])])
+    about = table_of(("3D Tiles", ""), facts, "As the tileset says.")
+    return f"{panel('Tiles', levels)}\n{panel('Container', about)}"
+
+
 #: Content security policy: only the style and the pictures inside the page, whatever the name of a file contains.
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
 
@@ -191,6 +219,8 @@ def _section(section: FileSection, anchor: str) -> str:
         parts.append(_rad(report["rad"]))
     if report.get("streamed_sog"):
         parts.append(streamed_sog_panels(report["streamed_sog"]))
+    if report.get("tiles"):
+        parts.append(tile_panels(report["tiles"]))
     if report.get("tree"):
         parts.append(_tree(report["tree"]))
     if report.get("values"):

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ..codecs.spz_streams import KNOWN_FLAGS
+from ..codecs.tiles_3d.codec import NOT_PLACED
 from ..io import examine_scene, read_arrays, size_of_input
 from ..io.rad_file import RadFile
 from ..model.scene import Scene
@@ -19,7 +20,7 @@ from ..support.printable import printable
 from ..support.progress import Progress, silent
 from ..support.untrusted import QUOTED
 from ..tables.columns import Row
-from . import arrays, chunks, rad, streamed_sog, tree, value_checks, values
+from . import arrays, chunks, rad, streamed_sog, tiles, tree, value_checks, values
 from .blocks import Block, ReportBlocks, merged
 from .findings import Finding, Head, HeaderScan
 from .value_checks import ValueTally
@@ -31,9 +32,10 @@ SCHEMA_VERSION = 1
 #: need of a file whose codes cannot be invalid, and what --stats needs besides.
 OF_TREE, OF_VALUES, OF_STATISTICS = {"scale", "opacity"}, {"center", "scale", "opacity"}, {"rgb", "sh"}
 
-#: Fields for which the headers of a RAD file, or of the files of a Streamed SOG, are enough.
+#: Fields for which the headers of a RAD file, or of the files of a Streamed SOG or 3D Tiles, are enough.
 HEADER_FIELDS = (
     *("file", "bytes", "format", "splats", "sh_degree", "bytes_per_splat", "compression_ratio", "rad", "streamed_sog"),
+    "tiles",
 )
 
 
@@ -80,6 +82,7 @@ class Report:
         notes: data that the reader left out.
         rad: what the headers of a RAD file tell; None for other formats.
         streamed_sog: what the manifest of a Streamed SOG tells; None for other formats.
+        tiles: what the tilesets and headers of 3D Tiles tell; None for other formats.
         tree: facts of the Level-of-Detail tree; None without one.
         values: statistics of the splats; None if not asked for.
         chunks: a row for each chunk, see `chunks.COLUMNS`; None if not asked for.
@@ -99,6 +102,7 @@ class Report:
     notes: list[str] = dataclasses.field(default_factory=list)
     rad: rad.RadFacts | None = None
     streamed_sog: streamed_sog.StreamedSogFacts | None = None
+    tiles: tiles.TileFacts | None = None
     tree: tree.TreeFacts | None = None
     values: values.ValueFacts | None = None
     chunks: list[Row] | None = None
@@ -154,8 +158,10 @@ def inspect(
             fields, scene_of_arrays = arrays.examine(held, settings, threads=threads)
             each = round(size / fields["splats"], 3) if size and fields["splats"] else None
             return Report(str(path), size, bytes_per_splat=each, **fields), scene_of_arrays
-        surveyed = rad.survey(path, check=settings.check) or streamed_sog.survey(
-            path, check=settings.check, threads=threads, progress=progress
+        surveyed = (
+            rad.survey(path, check=settings.check)
+            or streamed_sog.survey(path, check=settings.check, threads=threads, progress=progress)
+            or tiles.survey(path, check=settings.check, threads=threads, progress=progress)
         )
         if surveyed is not None and surveyed.facts is None:
             return Report(str(path), size, findings=surveyed.findings if settings.check else surveyed.fatal), None
@@ -257,7 +263,7 @@ def _report(path: Path, head: Head | None, surveyed: HeaderScan | None) -> Repor
 
 def _container_findings(scene: Scene) -> list[Finding]:
     header = scene.header
-    findings = [Finding("container.left-out", note) for note in scene.notes]
+    findings = [Finding("container.left-out", note) for note in scene.notes if note != NOT_PLACED]
     unknown = header.get("flags", 0) & ~KNOWN_FLAGS
     if unknown:
         findings.append(Finding("container.flags", f"the header sets flags {unknown:#04x}, which have no meaning"))

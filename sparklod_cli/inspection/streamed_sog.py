@@ -6,10 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
+from ..codecs.scene_files import Chunk
 from ..codecs.stream import size_of
-from ..codecs.streamed_sog.chunks import Chunk
 from ..codecs.streamed_sog.manifest import VERSION, Manifest, ManifestNode
 from ..codecs.streamed_sog.manifest_rules import level_counts, scan_files, scan_splats
 from ..io import opened
@@ -17,13 +15,11 @@ from ..support.printable import MOST, printable
 from ..support.progress import Progress, silent
 from ..support.untrusted import LARGEST
 from .findings import ChunkBytes, Head, HeaderScan, findings_of
+from .quantiles import quantiles_of
 from .values import Box
 
 #: Name of the format in `codecs.formats`.
 FORMAT = "Streamed SOG"
-
-#: Quantiles of regions, by name.
-QUANTILES = {"min": 0.0, "p25": 0.25, "p50": 0.5, "p75": 0.75, "max": 1.0}
 
 
 @dataclass(frozen=True)
@@ -135,8 +131,8 @@ def _facts(manifest: Manifest, chunks: Mapping[str, Chunk], size: int) -> Stream
         levels=levels,
         regions=len(regions),
         depth=_depth(manifest),
-        region_splats=_quantiles(full),
-        region_edge=_quantiles(edges),
+        region_splats=quantiles_of(full),
+        region_edge=quantiles_of(edges),
         bound=Box(list(bound[0]), list(bound[1])),
         files=len(sizes),
         file_bytes=ChunkBytes.of(sizes),
@@ -156,7 +152,7 @@ def _level(manifest: Manifest, chunks: Mapping[str, Chunk], level: int, counts: 
         regions=len(held),
         files=len(names),
         bytes=sum(chunks[name].bytes for name in names),
-        errors=_quantiles(errors, weights) if known else None,
+        errors=quantiles_of(errors, weights) if known else None,
     )
 
 
@@ -176,20 +172,3 @@ def _depth(manifest: Manifest) -> int:
 def _edge(low: float, high: float) -> float:
     """Return the length between two numbers, which are finite but may be as large as numbers are."""
     return min(max(high - low, -LARGEST), LARGEST)
-
-
-def _quantiles(values: Sequence[float], weights: Sequence[float] | None = None) -> dict[str, float]:
-    """Return the quantiles of values, each of them one of these, and their mean.
-
-    Args:
-        values: one or more.
-        weights: of the values, not all 0; without, all count the same.
-    """
-    numbers = np.asarray(values, np.float64)
-    order = np.argsort(numbers, kind="stable")
-    weighed = np.ones(len(numbers)) if weights is None else np.asarray(weights, np.float64)
-    below = np.cumsum(weighed[order])
-    places = np.searchsorted(below, [share * below[-1] for share in QUANTILES.values()])
-    found = numbers[order][places]
-    mean = float(numbers @ (weighed / below[-1]))
-    return {name: float(f"{each:.6g}") for name, each in [*zip(QUANTILES, found, strict=True), ("mean", mean)]}

@@ -14,6 +14,7 @@ from .reading import (
     read_scene,
     read_stored,
     read_text,
+    read_tiles,
     read_together,
     size_of_input,
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import os
 import stat
@@ -9,7 +10,7 @@ from collections.abc import Collection, Iterable
 from pathlib import Path, PurePath
 from typing import BinaryIO
 
-from ..codecs.file_names import MANIFEST, META, rad_chunk_number, sog_image_number
+from ..codecs.file_names import MANIFEST, META, TILESET, rad_chunk_number, sog_image_number
 from ..codecs.formats import HEAD, sniff
 from ..support.addresses import Place
 from ..support.errors import FormatError, UnreadableError
@@ -84,7 +85,7 @@ def open_plain(path: Path) -> BinaryIO:
 
 
 #: The splat file that a folder stands for: the first of these that is there.
-IN_FOLDERS = (MANIFEST, META)
+IN_FOLDERS = (MANIFEST, TILESET, META)
 
 
 def companions(path: Path, sets: Collection[Collection[str]]) -> list[Path]:
@@ -106,7 +107,7 @@ def companions(path: Path, sets: Collection[Collection[str]]) -> list[Path]:
 
 
 def _named_in(path: Path) -> list[Path]:
-    """Return the files that a splat file names: images of an unpacked SOG, chunks of a RAD, all of a Streamed SOG."""
+    """Return the files that a splat file names: images of a SOG, chunks of a RAD, all of a Streamed SOG or 3D Tiles."""
     with path.open("rb") as file:
         head = file.read(HEAD)
         form = sniff(head, "")
@@ -114,14 +115,25 @@ def _named_in(path: Path) -> list[Path]:
             return []
         from ..codecs.rad import rad_header  # what most jobs do without, as what follows
         from ..codecs.streamed_sog.manifest import MAX_MANIFEST, parse
+        from ..codecs.tiles_3d.tileset import MAX_TILESET
 
         file.seek(0)
         if head.startswith(rad_header.MAGIC):
             return _companion_paths(path, rad_header.read_header(file).filenames)
+        if form is not None and form.tiled:
+            return _tiles_of(path, file.read(MAX_TILESET + 1))
         if form is not None and form.folders:
             metas = _companion_paths(path, parse(file.read(MAX_MANIFEST + 1)).names(), folders=True)
             return [*metas, *itertools.chain(*map(_images_of, metas))]
     return _images_of(path)
+
+
+def _tiles_of(path: Path, data: bytes) -> list[Path]:
+    """Return the files of the tiles of a tileset, and of the nested ones that it names."""
+    from ..codecs.tiles_3d.tileset import read_whole
+
+    tileset = read_whole(data, functools.partial(open_named, path, folders=True))
+    return _companion_paths(path, tileset.names(), folders=True)
 
 
 def _images_of(path: Path) -> list[Path]:
@@ -140,14 +152,16 @@ def _companion_paths(path: Path, names: Iterable[str], *, folders: bool = False)
 
 
 def in_folder(folder: Place) -> Place:
-    """Return the splat file that a folder stands for: the manifest of Streamed SOG, or else the meta.json of a SOG.
+    """Return the splat file that a folder stands for: a manifest of Streamed SOG or 3D Tiles, or a SOG's meta.json.
 
     Raises:
-        UnreadableError: the folder holds neither.
+        UnreadableError: the folder holds none.
     """
     path = next((folder / name for name in IN_FOLDERS if (folder / name).is_file()), None)
     if path is None:
-        raise UnreadableError(f"cannot be read: is a directory, without the {META} of an unpacked SOG or a {MANIFEST}")
+        raise UnreadableError(
+            f"cannot be read: is a directory, without the {META} of an unpacked SOG, a {MANIFEST} or a {TILESET}"
+        )
     return path
 
 

@@ -15,6 +15,7 @@ from ..codecs.encoder import Stored
 from ..codecs.formats import FORMATS, HEAD, NPZ, RAW_SUFFIXES, Format, sniff
 from ..model.scene import DetailScene, Scene
 from ..model.splats import COLUMNS, FloatArray
+from ..model.tile_scene import TileScene
 from ..support.addresses import Place, size_of
 from ..support.errors import FormatError, UnknownFormatError, UnreadableError
 from ..support.progress import Progress, silent
@@ -75,6 +76,24 @@ def read_levels(path: Place, *, threads: int = 1, progress: Progress = silent) -
             known = " and ".join(form.name for form in FORMATS if form.detailed)
             raise UnknownFormatError(f"{form.name} has no detail levels; {known} has")
         scene: DetailScene = form.codec().decode_levels(file, threads=threads, progress=progress, **more)
+    return scene
+
+
+def read_tiles(path: Place, *, threads: int = 1, progress: Progress = silent) -> TileScene:
+    """Read a scene with all its tiles.
+
+    Args:
+        path: of the tileset.json of 3D Tiles, or of the folder that holds it.
+
+    Raises:
+        UnknownFormatError: its format has no tiles.
+        FormatError: as `read_scene`.
+    """
+    with opened(path) as (file, form, more):
+        if not form.tiled:
+            known = " and ".join(form.name for form in FORMATS if form.tiled)
+            raise UnknownFormatError(f"{form.name} has no tiles; {known} has")
+        scene: TileScene = form.codec().decode_tiles(file, threads=threads, progress=progress, **more)
     return scene
 
 

@@ -134,7 +134,7 @@ def open_content(source: Source) -> Content:
     )
     antialiased = content.antialiased or noted.antialiased
     content = dataclasses.replace(content, notes=notes, antialiased=antialiased, up=noted.up)
-    return content if transform.is_identity else _placed(content, transform)
+    return content if transform.is_identity else placed(content, transform)
 
 
 decode = decoder(open_content)
@@ -198,7 +198,7 @@ def _plain_content(file: GlbFile, primitive: dict[str, Any], source: Source) -> 
     return Content(count, degree, "GLB", fill, header={"bytes": file.size})
 
 
-def _placed(content: Content, transform: Transform) -> Content:
+def placed(content: Content, transform: Transform) -> Content:
     """Return the content with its splats transformed as they are read."""
     axes = ("center", "scale", "quat_xyzw", "sh")
 

@@ -56,7 +56,7 @@ def placement_of(file: GlbFile, mesh: int) -> Transform:
         at = parent.get(at)
     if at is not None:
         raise FormatError(f"its nodes are linked in a circle, or more than {DEEPEST} deep")
-    return _transform(matrix)
+    return transform_of(matrix)
 
 
 def _matrix(node: dict[str, Any]) -> NDArray[np.float64]:
@@ -81,8 +81,8 @@ def _numbers(node: dict[str, Any], name: str, count: int, default: tuple[float, 
     return np.array(values, np.float64)
 
 
-def _transform(matrix: NDArray[np.float64]) -> Transform:
-    """Return a matrix as a rotation, a uniform scale and a translation."""
+def transform_of(matrix: NDArray[np.float64]) -> Transform:
+    """Return a (4, 4) matrix as a rotation, a uniform scale and a translation; `FormatError` where it is more."""
     axes = matrix[:3, :3]
     scale = float(np.cbrt(np.linalg.det(axes)))
     is_affine = bool((matrix[3] == (0, 0, 0, 1)).all())

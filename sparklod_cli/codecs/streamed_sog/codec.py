@@ -13,17 +13,17 @@ from numpy.typing import NDArray
 
 from ...model.scene import Bounds, Counts, DetailScene
 from ...model.sh import COEFFICIENTS
-from ...model.splats import COLUMNS, Splats
 from ...support.errors import FormatError
 from ...support.progress import Progress, silent
 from ...support.units import count_of
 from ...support.untrusted import quoted_value
 from ..compression import check_promise
-from ..content import Content, OpenCompanion, Source, Target, decoder
+from ..content import Content, OpenCompanion, Source, decoder
 from ..file_names import MANIFEST
+from ..scene_files import Chunk, Piece
 from ..stream import size_of
 from ..validation import check_rules, error_of
-from .chunks import Chunk, Piece, open_chunk, read_pieces
+from .chunks import chunk_files
 from .manifest import MAX_MANIFEST, VERSION, Manifest, parse
 from .manifest_rules import run_violations, violations
 from .streamed_writer import encode_files as encode_files
@@ -127,7 +127,7 @@ def layout_of(manifest: Manifest) -> RegionLayout:
 
 def _open(source: Source, *, full_detail: bool) -> tuple[RegionLayout, Content]:
     """Read a manifest, and open its chunks: those of level 0, or all."""
-    size, open_companion = size_of(source.file), source.open_companion
+    size, beside = size_of(source.file), chunk_files(source.open_companion)
     manifest = parse(source.file.read(MAX_MANIFEST + 1))
     check_rules(run_violations(manifest) if full_detail else violations(manifest))
     layout = layout_of(manifest)
@@ -145,7 +145,7 @@ def _open(source: Source, *, full_detail: bool) -> tuple[RegionLayout, Content]:
             raise FormatError(f"{MANIFEST} names {quoted_value(name)} twice")
         names.add(name)
         pieces = [Piece(int(layout.offset[run]), int(layout.count[run]), int(rows[run])) for run in here]
-        chunks.append(open_chunk(open_companion, name, pieces))
+        chunks.append(beside.open(name, pieces))
         if chunks[-1].count != (expected := int(layout.count[begin:end].sum())):
             has = count_of(chunks[-1].count, "splat")
             text = f"{quoted_value(name)} has {has}, but its runs in {MANIFEST} have {expected:,}"
@@ -153,37 +153,13 @@ def _open(source: Source, *, full_detail: bool) -> tuple[RegionLayout, Content]:
     if not chunks:
         raise FormatError(f"{MANIFEST} has no splats of {'level 0' if full_detail else 'any level'}")
     if manifest.environment is not None:
-        chunks.append(open_chunk(open_companion, manifest.environment, None, sum(chunk.rows for chunk in chunks)))
+        chunks.append(beside.open(manifest.environment, row=sum(chunk.rows for chunk in chunks)))
     count, degree = sum(chunk.rows for chunk in chunks), max(chunk.sh_degree for chunk in chunks)
     size += sum(chunk.bytes for chunk in chunks)
     check_promise(count * 4 * (14 + 3 * COEFFICIENTS[degree]), size)
-    last: dict[int, Splats] = {}
-
-    def decoded(chunk: Chunk, row: int) -> Splats:
-        if row not in last:
-            last.clear()
-            splats = Splats.empty(chunk.rows, degree)
-            read_pieces(open_companion, [chunk], splats, source.threads, first_row=row)
-            last[row] = splats
-        return last[row]
-
-    def fill(target: Target, threads: int, progress: Progress) -> None:
-        if len(target.splats) == count:
-            read_pieces(open_companion, chunks, target.splats, threads, progress)
-            return
-        end = 0
-        for chunk in chunks:
-            begin, end = end, end + chunk.rows
-            start, stop = max(target.start, begin), min(target.stop, end)
-            if start < stop:
-                rows, splats = target.rows(slice(start, stop)), decoded(chunk, begin)
-                for column in COLUMNS:
-                    getattr(rows, column)[:] = getattr(splats, column)[start - begin : stop - begin]
-        if target.stop == count:
-            last.clear()
-
     regions, levels = layout.counts.shape
     header = {"version": VERSION, "levels": levels, "regions": regions, "bytes": size}
     antialiased, note = any(chunk.antialiased for chunk in chunks), manifest.noted
     form = f"Streamed SOG {VERSION}"
+    fill = beside.fill(chunks, degree, source.threads)
     return layout, Content(count, degree, form, fill, antialiased, note.problems, header, note.up)

@@ -6,11 +6,10 @@ report can be made of a file that breaks it.
 
 from __future__ import annotations
 
-import bisect
 import decimal
 import functools
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -19,6 +18,7 @@ from ...support.untrusted import parse_json, quoted_value
 from .. import quantize
 from ..file_names import MANIFEST
 from ..file_notes import FileNote, read_note
+from ..json_trees import place_of
 
 #: The version that is read and written. A manifest from before versions has none.
 VERSION = 1
@@ -104,7 +104,7 @@ class Manifest:
 
     def place(self, number: int) -> str:
         """Return where a node is in the file: "tree.children[0]"."""
-        return _place(number, lambda each: self.nodes[each].parent, lambda each: self.nodes[each].children)
+        return place_of("tree", number, lambda each: self.nodes[each].parent, lambda each: self.nodes[each].children)
 
     def regions(self) -> Iterator[tuple[int, ManifestNode]]:
         """Return the nodes without children, and their numbers."""
@@ -145,15 +145,6 @@ def parse(data: bytes) -> Manifest:
     return Manifest(levels, tuple(filenames), nodes, environment, head)
 
 
-def _place(number: int, parent_of: Callable[[int], int], children_of: Callable[[int], Sequence[int]]) -> str:
-    """Return where a node is in the file: "tree.children[0]"."""
-    way = list[str]()
-    while (parent := parent_of(number)) >= 0:
-        way.append(f".children[{bisect.bisect_left(children_of(parent), number)}]")
-        number = parent
-    return "tree" + "".join(reversed(way))
-
-
 def _nodes(tree: Any, levels: int, files: int) -> tuple[ManifestNode, ...]:
     """Return the nodes of a tree, however deep, root first and depth first."""
     keys = {str(level): level for level in range(levels)}
@@ -162,7 +153,7 @@ def _nodes(tree: Any, levels: int, files: int) -> tuple[ManifestNode, ...]:
     waiting = [(tree, -1)]  # a value, and the number of its parent
 
     def place() -> str:
-        return _place(number, parents.__getitem__, children.__getitem__)
+        return place_of("tree", number, parents.__getitem__, children.__getitem__)
 
     while waiting:
         value, parent = waiting.pop()

@@ -9,20 +9,19 @@ from collections.abc import Iterator, Mapping
 from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ...model.gaussian import covariance
 from ...model.morton import order_of_cells
 from ...model.splats import FloatArray, Splats
 from ...support.errors import FormatError
-from ...support.parallel import blocks_of
 from ...support.progress import Progress, silent
 from ...support.units import count_of
 from ...support.untrusted import quoted_value
 from ..content import OpenCompanion
+from ..scene_files import Chunk
 from ..sog import texel_codings
+from ..splat_bounds import count_outside
 from ..validation import RuleViolation
-from .chunks import Chunk, open_chunk, read_pieces
+from .chunks import chunk_files
 from .manifest import MAX_MANIFEST, Bound, Manifest, ManifestNode, Run, parse
 
 #: Meaning of each code; the text of a violation has the values. Values of the wrong kind, which
@@ -251,11 +250,6 @@ def _wrong_errors(errors: Any, runs: Mapping[int, Run], levels: int) -> tuple[st
     return ("which decrease", False) if held != sorted(held) else None
 
 
-#: By how much a splat may lie outside of its bound: a share of its own extent, by which codes of 8 bits change it; of
-#: its largest scale, since they turn it by up to 1.1 degrees; of the bound; and, for codes of logarithms of 16 bits, of
-#: the distance from the origin plus 1, or half a step of these codes where that is more.
-LOOSE_EXTENT, LOOSE_TURN, LOOSE_BOUND, LOOSE_CENTER = 0.25, 0.02, 1e-3, 2e-4
-
 #: Cells along each axis in which the order of a run is looked at; writers sort by as many, or by more.
 CELLS = 1 << 10
 
@@ -285,7 +279,7 @@ def scan_files(
 def _chunk_or_reason(open_companion: OpenCompanion, name: str) -> Chunk | str:
     """Read the meta.json of a file, or return why it cannot be read."""
     try:
-        return open_chunk(open_companion, name, None)
+        return chunk_files(open_companion).open(name)
     except FormatError as error:
         return str(error)
 
@@ -311,7 +305,7 @@ def scan_splats(
             continue
         try:
             splats = Splats.empty(chunk.rows, chunk.sh_degree)
-            read_pieces(open_companion, [chunk], splats, threads)
+            chunk_files(open_companion).read([chunk], splats, threads)
         except FormatError as error:
             yield broken("chunk-files", str(error))
             continue
@@ -325,7 +319,7 @@ def scan_splats(
             part = splats.take(slice(run.offset, run.offset + run.count))
             subject = f"{manifest.place(number)} at level {level}"
             bound = manifest.nodes[number].bound
-            outside = _outside(part, np.array(bound), steps) if bound is not None and is_box(bound) else 0
+            outside = count_outside(part, np.array(bound), steps) if bound is not None and is_box(bound) else 0
             if outside:
                 yield broken(
                     "extents", f"{count_of(outside, 'splat')} of {subject} lie outside of its bound", fatal=False
@@ -336,22 +330,6 @@ def scan_splats(
                 yield broken("order", text, fatal=False)
         done += chunk.count
         progress("checking", done, total, "splat")
-
-
-def _outside(splats: Splats, bound: NDArray[np.float64], steps: NDArray[np.float64] | float) -> int:
-    """Count the splats of a run that lie outside of a (2, 3) bound with the ellipsoids of one standard deviation.
-
-    `steps` are (3,) those of the codes of centres, as shares of the distance from the origin plus 1.
-    """
-    loose, step = LOOSE_BOUND * np.abs(bound[1] - bound[0]), np.maximum(LOOSE_CENTER, np.expm1(steps) / 2)
-    count = 0
-    for block in blocks_of(len(splats)):
-        center = splats.center[block].astype(np.float64)
-        extent = np.sqrt(covariance(splats.scale[block], splats.quat_xyzw[block])[:, [0, 3, 5]])
-        turned = LOOSE_TURN * np.maximum.reduce(splats.scale[block].T)[:, None]
-        reach = (1 - LOOSE_EXTENT) * extent - turned - loose - step * (1 + np.abs(center))
-        count += int(np.count_nonzero(np.any((center - reach < bound[0]) | (center + reach > bound[1]), axis=1)))
-    return count
 
 
 def _descents(center: FloatArray) -> int:

@@ -1,1 +1,164 @@
+"""3D Tiles: a tileset.json and a GLB for each tile, whose children replace it by more splats.
+
+As a scene it is full detail, the tiles without children; `decode_tiles` reads all tiles. Tilesets of other programs are
+read if their tiles are listed one by one, replace their parents, and have GLBs with splats.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...model.sh import COEFFICIENTS
+from ...model.tile_scene import TileScene
+from ...model.transforms import common
+from ...support.errors import FormatError
+from ...support.progress import Progress, silent
+from ...support.untrusted import quoted_value
+from ..compression import check_promise
+from ..content import Content, OpenCompanion, Source, decoder
+from ..file_names import TILESET
+from ..glb import codec as glb
+from ..glb.placement import transform_of
+from ..scene_files import Chunk, SceneFiles
+from ..validation import check_rules, error_of
+from .axes import to_tileset, turned
 from .tile_writer import encode_files as encode_files
+from .tileset import MAX_TILESET, Tileset, read_whole
+from .tileset_rules import matrices_of, matrix_of, read_violations, violations, volumes_of
+
+#: Note of scenes whose splats have the coordinates of their tileset.
+NOT_PLACED = "the transform of the tileset, its place on the Earth, is not applied"
+
+Matrix = NDArray[np.float64]
+
+
+def open_content(source: Source) -> Content:
+    """Open the tiles without children, one after the other.
+
+    The transform of the root is not applied: splats are where they are in the axes of the scene, not on the Earth.
+    Nothing is unpacked to `scratch`: where blocks are read, one tile at a time stays in memory.
+
+    Raises:
+        FormatError: the file is no tileset, a tile is missing or no GLB of splats, or what it holds is not read.
+    """
+    tileset = _read(source.file, source.open_companion)
+    wanted = [number for number, tile in enumerate(tileset.tiles) if not tile.children and tile.uri is not None]
+    return _open(source, tileset, wanted)[0]
+
+
+decode = decoder(open_content)
+
+
+def decode_tiles(
+    file: BinaryIO, *, threads: int = 1, progress: Progress = silent, open_companion: OpenCompanion | None = None
+) -> TileScene:
+    """Read all tiles, those with most edges to the root last. The level of a tile is the number of these edges.
+
+    A tile that stands for a nested tileset is one with the root of that.
+
+    Raises:
+        FormatError: as `open_content`; or a bounding volume is a region, or a number is wrong.
+    """
+    source = Source(file, open_companion, threads=threads)
+    tileset = _read(file, open_companion)
+    order, parent, level = _hierarchy(tileset)
+    held = [number for number in order if tileset.tiles[number].uri is not None]
+    content, chunks = _open(source, tileset, held)
+    scene = content.scene(threads=threads, progress=progress)
+    counts = dict(zip(held, (chunk.rows for chunk in chunks), strict=True))
+    check_rules(violations(tileset))
+    volumes = volumes_of(tileset)
+    boxes = [volume.bounds() for number in order if (volume := volumes[number]) is not None]
+    if len(boxes) < len(order):
+        raise error_of("tiles.volumes", "a bounding volume of it is a region, of which no box is made")
+    errors = np.array([float(tileset.tiles[number].record["geometricError"]) for number in order])
+    about = scene.antialiased, scene.format, scene.notes, scene.header, scene.up
+    return TileScene(
+        scene.splats,
+        parent,
+        level,
+        np.array([counts.get(number, 0) for number in order], np.int64),
+        errors,
+        turned(np.array(boxes), to_tileset(scene.up).T),
+        _root_transform(tileset),
+        *about,
+    )
+
+
+def _read(file: BinaryIO, open_companion: OpenCompanion | None) -> Tileset:
+    tileset = read_whole(file.read(MAX_TILESET + 1), open_companion)
+    check_rules(read_violations(tileset))
+    return tileset
+
+
+def _hierarchy(tileset: Tileset) -> tuple[list[int], NDArray[np.int32], NDArray[np.int32]]:
+    """Return the tiles in order of their depth, without those that stand for nested tilesets, and their links."""
+    tiles, order, parent, level = tileset.tiles, list[int](), list[int](), list[int]()
+    frontier = [(0, -1)]
+    while frontier:
+        following = list[tuple[int, int]]()
+        depth = level[-1] + 1 if level else 0
+        for number, above in frontier:
+            while tiles[number].is_nested and tiles[number].children:
+                (number,) = tiles[number].children
+            following += [(child, len(order)) for child in tiles[number].children]
+            order.append(number)
+            parent.append(above)
+            level.append(depth)
+        frontier = following
+    return order, np.array(parent, np.int32), np.array(level, np.int32)
+
+
+def _open(source: Source, tileset: Tileset, wanted: Sequence[int]) -> tuple[Content, list[Chunk]]:
+    """Return the content of some tiles, one after the other, and the files of these."""
+    if not wanted:
+        raise FormatError("no tile of it has splats")
+    matrices, files = matrices_of(tileset), dict[str, int]()
+    for number in wanted:
+        name = tileset.tiles[number].name
+        assert name is not None
+        if name in files:
+            raise error_of(
+                "tiles.shared", f"two tiles have the content {quoted_value(name)}; such tilesets are not read"
+            )
+        files[name] = number
+    beside = tile_files(source.open_companion, {name: matrices[number] for name, number in files.items()})
+    chunks, row = list[Chunk](), 0
+    for name in files:
+        chunks.append(beside.open(name, row=row))
+        row += chunks[-1].rows
+    degree, size = max(chunk.sh_degree for chunk in chunks), tileset.bytes + sum(chunk.bytes for chunk in chunks)
+    check_promise(row * 4 * (14 + 3 * COEFFICIENTS[degree]), size)
+    notes = tuple(dict.fromkeys(note for chunk in chunks for note in chunk.notes))
+    if not np.array_equal(_root_transform(tileset), np.eye(4)):
+        notes += (NOT_PLACED,)
+    if len({chunk.up for chunk in chunks}) > 1:
+        raise error_of("tiles.kind", "the axes that point up in its tiles differ; such tilesets are not read")
+    up, antialiased = common(chunk.up for chunk in chunks), any(chunk.antialiased for chunk in chunks)
+    form = f"3D Tiles {tileset.head['asset']['version']} of {chunks[0].format}"
+    header = {"tiles": len(chunks), "bytes": size}
+    fill = beside.fill(chunks, degree, source.threads)
+    return Content(row, degree, form, fill, antialiased, notes, header, up), chunks
+
+
+def tile_files(open_companion: OpenCompanion | None, matrices: dict[str, Matrix]) -> SceneFiles:
+    """Return the GLBs of tiles, each read where its (4, 4) transform puts it."""
+
+    def open_tile(name: str, source: Source) -> Content:
+        content = glb.open_content(source)
+        matrix = matrices.get(name)
+        if matrix is None or np.array_equal(matrix, np.eye(4)):
+            return content
+        turn = np.eye(4)
+        turn[:3, :3] = to_tileset(content.up)
+        return glb.placed(content, transform_of(turn.T @ matrix @ turn))
+
+    return SceneFiles(open_companion, TILESET, "tiles.files", open_tile)
+
+
+def _root_transform(tileset: Tileset) -> Matrix:
+    return matrix_of(tileset.tiles[0].record)

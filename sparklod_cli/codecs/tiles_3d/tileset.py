@@ -1,8 +1,221 @@
-"""Tilesets of 3D Tiles as they are read."""
+"""Tilesets of 3D Tiles as they are read: one file, and a file with the nested ones that it names.
 
-VERSION, REPLACE, CONTENT_GLTF = "1.1", "REPLACE", "3DTILES_content_gltf"
-MAX_TILESET, NESTED = 1 << 25, ".json"
+What reading needs is checked when a file is parsed; every other rule is for `tileset_rules` to tell of. Facts: the
+specification of 3D Tiles 1.1 (OGC 22-025r4), sections 5 and 6.
+"""
+
+from __future__ import annotations
+
+import posixpath
+import urllib.parse
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from ...support.errors import FormatError, VersionError
+from ...support.untrusted import parse_json, quoted_value
+from ..content import OpenCompanion
+from ..file_names import TILESET
+from ..file_notes import FileNote, read_note
+from ..json_trees import place_of
+from ..validation import error_of
+
+#: The version that is written, and the one before it, which is read, too.
+VERSION, OLD_VERSION = "1.1", "1.0"
+
+#: How the children of a tile refine it, the one way that is read and written.
+REPLACE = "REPLACE"
+
+#: The extension that tells which extensions of glTF the tiles use.
+CONTENT_GLTF = "3DTILES_content_gltf"
+
+#: Largest tileset file, bytes, and deepest nesting of its JSON: a tile takes two.
+MAX_TILESET, MAX_NESTING = 1 << 25, 512
+
+#: Most tiles, and files of tilesets, of one scene: a hundred thousand tiles hold ten billion splats. Chosen.
+MAX_TILES, MAX_FILES = 1 << 17, 1 << 12
+
+#: Suffixes of the content of tiles that is read: nested tilesets, and splats.
+NESTED, SPLATS = ".json", ".glb"
+
+#: Keys of a tile for what is not read, and of extensions of tiles.
+UNREAD = ("implicitTiling", "contents")
 
 
-def parse(data):
-    raise OSError
+@dataclass(frozen=True)
+class Tile:
+    """A tile as a file has it.
+
+    Attributes:
+        record: its JSON object.
+        uri: of its content; None without.
+        children: numbers of tiles, ascending.
+        parent: number of the tile above, -1 of a root.
+        file: the tileset file that it is in, by its path from the folder of the first one on; empty for that.
+    """
+
+    record: Mapping[str, Any]
+    uri: str | None
+    children: tuple[int, ...] = ()
+    parent: int = -1
+    file: str = ""
+
+    @property
+    def name(self) -> str | None:
+        """Path of its content from the folder of the first tileset file on; None without content."""
+        if self.uri is None:
+            return None
+        path = urllib.parse.unquote(self.uri)
+        return posixpath.normpath(posixpath.join(posixpath.dirname(self.file), path)) if path else path
+
+    @property
+    def is_nested(self) -> bool:
+        """Whether its content is a tileset file."""
+        return self.uri is not None and self.uri.lower().endswith(NESTED)
+
+
+@dataclass(frozen=True)
+class Tileset:
+    """Contents of a tileset file, or of one and the nested ones.
+
+    Attributes:
+        head: everything but the tiles, as the first file has it: "asset", "geometricError", "extensions".
+        tiles: root first, each after its parent; that with a nested tileset has the root of that as its child.
+        heads: `head` of each file, by its path; empty for the first one.
+        bytes: of all files.
+    """
+
+    head: Mapping[str, Any]
+    tiles: tuple[Tile, ...]
+    heads: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    bytes: int = 0
+
+    @property
+    def noted(self) -> FileNote:
+        """Note of sparklod in the first file."""
+        return read_note(self.head["asset"].get("extras"))
+
+    def place(self, number: int) -> str:
+        """Return where a tile is: "root.children[0]", in a nested file with its name before that."""
+        file = self.tiles[number].file
+
+        def parent_of(each: int) -> int:
+            parent = self.tiles[each].parent
+            return parent if parent >= 0 and self.tiles[parent].file == file else -1
+
+        place = place_of("root", number, parent_of, lambda each: self.tiles[each].children)
+        return f"{quoted_value(file)} {place}" if file else place
+
+    def names(self) -> Iterator[str]:
+        """Yield the files that its tiles name, from its folder on."""
+        return (name for tile in self.tiles if (name := tile.name) is not None)
+
+
+def parse(data: bytes, file: str = "") -> Tileset:
+    """Parse the bytes of a tileset file, without the nested ones that it names.
+
+    Args:
+        file: path of it, for messages and for what it names; empty for the first one.
+
+    Raises:
+        VersionError: it is of another version than 1.0 or 1.1.
+        FormatError: it is not JSON, or lacks what reading needs; names the value and its place.
+    """
+    called = quoted_value(file) if file else TILESET
+    if len(data) > MAX_TILESET:
+        raise FormatError(f"{called} has more than {MAX_TILESET:,} bytes")
+    try:
+        root = parse_json(data, depth=MAX_NESTING)
+    except ValueError as error:
+        raise FormatError(f"{called} is not JSON: {error}") from None
+    if not isinstance(root, dict):
+        raise FormatError(f"{called} is not an object")
+    asset = root.get("asset")
+    if not isinstance(asset, dict):
+        raise FormatError(f"{called} has no asset, which must be an object with a version")
+    if asset.get("version") not in (VERSION, OLD_VERSION):
+        text = f"3D Tiles version {quoted_value(asset.get('version'))} is unknown, only {OLD_VERSION} and {VERSION}"
+        raise VersionError(f"{text} are read")
+    tiles = _tiles(root.get("root"), called, file)
+    head = {key: value for key, value in root.items() if key != "root"}
+    return Tileset(head, tiles, {file: head}, len(data))
+
+
+def _tiles(root: Any, called: str, file: str) -> tuple[Tile, ...]:
+    """Return the tiles of a file, root first and depth first."""
+    records, uris = list[Mapping[str, Any]](), list[str | None]()
+    parents, children = list[int](), list[list[int]]()
+    waiting = [(root, -1)]
+    while waiting:
+        value, parent = waiting.pop()
+        number = len(records)
+        if number == MAX_TILES:
+            raise FormatError(f"{called} has more than {MAX_TILES:,} tiles")
+        parents.append(parent)
+        children.append([])
+        if parent >= 0:
+            children[parent].append(number)
+
+        def wrong(key: str, value: Any, expected: str, number: int = number) -> FormatError:
+            place = place_of("root", number, parents.__getitem__, children.__getitem__) + key
+            if value is None:
+                return FormatError(f"{called} has no {place}, which must be {expected}")
+            return FormatError(f"{place} of {called} is {quoted_value(value)}, not {expected}")
+
+        if not isinstance(value, dict):
+            raise wrong("", value, "a tile")
+        below, content = value.get("children", []), value.get("content")
+        if not isinstance(below, list):
+            raise wrong(".children", below, "a list")
+        if content is not None and not isinstance(content, dict):
+            raise wrong(".content", content, "an object")
+        uri = None if content is None else content.get("uri")
+        if content is not None and not isinstance(uri, str):
+            raise wrong(".content.uri", uri, "a path")
+        records.append({key: each for key, each in value.items() if key != "children"})
+        uris.append(uri)
+        waiting.extend((each, number) for each in reversed(below))
+    rows = zip(records, uris, children, parents, strict=True)
+    return tuple(Tile(record, uri, tuple(below), parent, file) for record, uri, below, parent in rows)
+
+
+def read_whole(data: bytes, open_companion: OpenCompanion | None) -> Tileset:
+    """Return a tileset with all tiles of the nested ones. Nested files that cannot be opened are named by an error.
+
+    Raises:
+        FormatError: as `parse`; or nested tilesets are too many, or name each other in a circle.
+    """
+    first = parse(data)
+    tiles, heads, size = list(first.tiles), dict(first.heads), first.bytes
+    number = 0
+    while number < len(tiles):
+        tile = tiles[number]
+        name = tile.name
+        if tile.is_nested and name is not None and not tile.children:
+            if name in heads or name == TILESET:
+                raise FormatError(f"it names the tileset {quoted_value(name)} twice")
+            if len(heads) == MAX_FILES:
+                raise FormatError(f"it has more than {MAX_FILES:,} tileset files")
+            inner = _opened(name, open_companion)
+            heads[name] = inner.head
+            size += inner.bytes
+            offset = len(tiles)
+            if offset + len(inner.tiles) > MAX_TILES:
+                raise FormatError(f"it has more than {MAX_TILES:,} tiles")
+            tiles[number] = Tile(tile.record, tile.uri, (offset,), tile.parent, tile.file)
+            for each in inner.tiles:
+                below = tuple(child + offset for child in each.children)
+                parent = number if each.parent < 0 else each.parent + offset
+                tiles.append(Tile(each.record, each.uri, below, parent, name))
+        number += 1
+    return Tileset(first.head, tuple(tiles), heads, size)
+
+
+def _opened(name: str, open_companion: OpenCompanion | None) -> Tileset:
+    if open_companion is None:
+        raise FormatError(f"{TILESET} names {quoted_value(name)}, but other files cannot be opened here")
+    try:
+        with open_companion(name) as file:
+            return parse(file.read(MAX_TILESET + 1), name)
+    except FormatError as error:  # which names it
+        raise error_of("tiles.files", str(error)) from None

@@ -118,13 +118,13 @@ def test_a_stream_has_the_same_splats_from_any_on(block: int, monkeypatch: pytes
 
 def test_a_stream_decodes_each_chunk_once(monkeypatch: pytest.MonkeyPatch) -> None:
     decoded = list[str]()
-    read_pieces = codec.read_pieces
+    read = SceneFiles.read
 
-    def counted(open_companion: Any, chunks: Any, *rest: Any, **more: Any) -> None:
+    def counted(self: SceneFiles, chunks: Any, *rest: Any, **more: Any) -> None:
         decoded.extend(chunk.name for chunk in chunks)
-        read_pieces(open_companion, chunks, *rest, **more)
+        read(self, chunks, *rest, **more)
 
-    monkeypatch.setattr(codec, "read_pieces", counted)
+    monkeypatch.setattr(SceneFiles, "read", counted)
     with open_stream(GOLDEN) as stream:
         for start in range(0, 66, 5):
             list(stream.read(start, min(start + 5, 66)))

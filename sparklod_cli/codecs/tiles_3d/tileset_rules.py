@@ -1,0 +1,338 @@
+"""Rules for 3D Tiles: of the tileset files, the tiles and their splats, for reports and for the reader."""
+
+from __future__ import annotations
+
+import math
+import posixpath
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...model.splats import Splats
+from ...support.errors import FormatError
+from ...support.progress import Progress, silent
+from ...support.units import count_of
+from ...support.untrusted import quoted_value
+from ..glb.codec import COMPRESSION, EXTENSION
+from ..scene_files import Chunk, SceneFiles
+from ..splat_bounds import LOOSE_BOUND, count_outside
+from ..validation import RuleViolation
+from .axes import to_tileset
+from .tileset import CONTENT_GLTF, OLD_VERSION, REPLACE, SPLATS, UNREAD, VERSION, Tile, Tileset
+from .volumes import Volume, volume_of
+
+#: Meaning of each code; the text of a violation has the values. Values of the wrong kind, which the parser refuses,
+#: have the codes "container.corrupt" and "container.version", as in other formats.
+ERRORS = {
+    "tiles.unread": "a tile has content, or children, of a kind that is not read",
+    "tiles.refine": "the children of a tile do not replace it",
+    "tiles.required": "a property that the specification demands is missing",
+    "tiles.transform": "a transform is not 16 finite numbers of an affine transform",
+    "tiles.volumes": "a bounding volume is none, or is not of finite numbers",
+    "tiles.inside": "the bounding volume of a tile is not inside that of its parent",
+    "tiles.extents": "splats of a tile lie outside of its bounding volume",
+    "tiles.errors": "a geometric error is below 0, not finite, or larger than that of the tile above",
+    "tiles.unrefined": "the geometric error of a tile with children is 0, so that no viewer refines it",
+    "tiles.files": "the file of a tile is missing, damaged or no GLB of splats, or its name leads elsewhere",
+    "tiles.shared": "two tiles have the same file",
+    "tiles.sh": "the SH degrees of tiles differ, and viewers take that of one for all",
+    "tiles.kind": "the axes that point up in tiles differ",
+    "tiles.extensions": "the tileset does not name the extensions that its tiles use, by which viewers know splats",
+}
+WARNINGS = {
+    "tiles.old": "the version is 1.0, which has no tiles of glTF without an extension",
+    "tiles.leaf-error": "the geometric error of a tile without children is not 0, though nothing refines it",
+    "tiles.empty": "a tile without children has no splats",
+    "tiles.decreasing": "the children of a tile have fewer splats than it",
+    "tiles.large": "a tile has more splats than a viewer should load at once",
+}
+
+#: Splats of a tile from which on `tiles.large` is told of: ten times what is written unless somebody chooses. Chosen.
+LARGE = 1_000_000
+
+#: By how much a bounding volume may be outside of that of its parent, as a share of its largest number.
+ROUNDING = 1e-5
+
+#: The extensions by which a tile is splats, see `glb.codec`.
+SPLAT_EXTENSIONS = (EXTENSION, COMPRESSION)
+
+
+def broken(code: str, text: str, *, fatal: bool = True) -> RuleViolation:
+    """Return a violation by the last part of its code."""
+    return RuleViolation(f"tiles.{code}", text, fatal)
+
+
+def read_violations(tileset: Tileset) -> Iterator[RuleViolation]:
+    """Yield the broken rules without which the splats of its tiles cannot be read."""
+    for name, head in tileset.heads.items():
+        required = head.get("extensionsRequired", [])
+        others = [each for each in required if each != CONTENT_GLTF] if isinstance(required, list) else [required]
+        if others:
+            where = f"{quoted_value(name)} requires" if name else "it requires"
+            yield broken("unread", f"{where} the extension {quoted_value(others[0])}, which is not read")
+    for number, tile in enumerate(tileset.tiles):
+        yield from _unread(tileset, number, tile)
+
+
+def _unread(tileset: Tileset, number: int, tile: Tile) -> Iterator[RuleViolation]:
+    extensions = tile.record.get("extensions")
+    implicit = isinstance(extensions, dict) and "3DTILES_implicit_tiling" in extensions
+    for key in (*(each for each in UNREAD if each in tile.record), *(["implicit tiling"] if implicit else [])):
+        yield broken(
+            "unread", f"{tileset.place(number)} has {key}, which is not read; only tiles listed one by one are"
+        )
+    refine = tile.record.get("refine", REPLACE)
+    if refine != REPLACE:
+        yield broken("refine", f"{tileset.place(number)} has refine {quoted_value(refine)}; only {REPLACE} is read")
+    name = tile.name
+    if name is not None and (leads_away(name) or ":" in (tile.uri or "")):
+        text = f"{tileset.place(number)} has the content {quoted_value(tile.uri)}, which is not a file below its folder"
+        yield broken("files", text)
+    elif name is not None and not tile.is_nested and posixpath.splitext(name)[1].lower() != SPLATS:
+        text = f"{tileset.place(number)} has the content {quoted_value(tile.uri)}; only {SPLATS} and tilesets are read"
+        yield broken("unread", text)
+    elif tile.is_nested and (len(tile.children) != 1 or tileset.tiles[tile.children[0]].file == tile.file):
+        text = f"{tileset.place(number)} has a nested tileset and children beside it, which is not read"
+        yield broken("unread", text)
+    if "transform" in tile.record and _numbers(tile.record) is None:
+        text = f"the transform of {tileset.place(number)} is {quoted_value(tile.record['transform'])}"
+        yield broken("transform", f"{text}, not 16 finite numbers that end with 1")
+
+
+def leads_away(name: str) -> bool:
+    """Return True if a name means something else than a file in the tileset's folder or in one below."""
+    return any(part in ("", ".", "..") for part in name.split("/")) or any(mark in name for mark in "\\:\0?#")
+
+
+def _numbers(record: Mapping[str, object]) -> list[float] | None:
+    """Return the numbers of a transform; None where it is none."""
+    numbers = record.get("transform")
+    if not isinstance(numbers, list) or len(numbers) != 16:
+        return None
+    if not all(type(each) in (int, float) and math.isfinite(each) for each in numbers):
+        return None
+    return numbers if numbers[3::4] == [0, 0, 0, 1] else None
+
+
+def matrix_of(record: Mapping[str, object]) -> NDArray[np.float64]:
+    """Return the (4, 4) transform of a tile, the identity unless it has one, for column vectors."""
+    numbers = _numbers(record)
+    return np.eye(4) if numbers is None else np.array(numbers, np.float64).reshape(4, 4).T
+
+
+def matrices_of(tileset: Tileset) -> list[NDArray[np.float64]]:
+    """Return the (4, 4) transform of each tile to the axes of the tileset, without that of the root."""
+    matrices = list[NDArray[np.float64]]()
+    for tile in tileset.tiles:
+        matrices.append(np.eye(4) if tile.parent < 0 else matrices[tile.parent] @ matrix_of(tile.record))
+    return matrices
+
+
+def depths_of(tileset: Tileset) -> list[int]:
+    """Return the edges from the root to each tile; one that stands for a nested tileset has the depth of its root."""
+    depths = list[int]()
+    for tile in tileset.tiles:
+        above = None if tile.parent < 0 else tileset.tiles[tile.parent]
+        depths.append(0 if above is None else depths[tile.parent] + (not above.is_nested))
+    return depths
+
+
+def volumes_of(tileset: Tileset) -> list[Volume | None]:
+    """Return the bounding volume of each tile in the axes of the tileset; None where it has none that is known."""
+    volumes = list[Volume | None]()
+    for tile, matrix in zip(tileset.tiles, matrices_of(tileset), strict=True):
+        try:
+            volume = volume_of(tile.record.get("boundingVolume"))
+        except ValueError:
+            volume = None
+        volumes.append(None if volume is None else volume.moved(matrix))
+    return volumes
+
+
+def violations(tileset: Tileset) -> Iterator[RuleViolation]:
+    """Yield the broken rules of the tileset files, but for `read_violations`."""
+    yield from _heads(tileset)
+    yield from _volumes(tileset)
+    yield from _errors(tileset)
+    seen = set[str]()
+    for number, tile in enumerate(tileset.tiles):
+        name = tile.name
+        if name is not None and name in seen:
+            yield broken("shared", f"{tileset.place(number)} has the file {quoted_value(name)}, as a tile before it")
+        seen |= set() if name is None else {name}
+        if name is None and not tile.children:
+            yield broken("empty", f"{tileset.place(number)} has neither children nor content", fatal=False)
+
+
+def _heads(tileset: Tileset) -> Iterator[RuleViolation]:
+    for name, head in tileset.heads.items():
+        where = f"{quoted_value(name)} " if name else ""
+        version, error = head["asset"].get("version"), head.get("geometricError")
+        if version == OLD_VERSION:
+            yield broken("old", f"{where}has the version {OLD_VERSION}, not {VERSION}", fatal=False)
+        if _number(error) is None:
+            text = f"the geometricError of {where or 'the tileset '}is {quoted_value(error)}, not a number from 0 on"
+            yield broken("required", text, fatal=False)
+    for number, tile in enumerate(tileset.tiles):
+        is_root = tile.parent < 0 or tileset.tiles[tile.parent].file != tile.file
+        if is_root and "refine" not in tile.record:
+            yield broken("required", f"{tileset.place(number)} has no refine, which a root must have", fatal=False)
+    root, error = (_number(each.get("geometricError")) for each in (tileset.tiles[0].record, tileset.head))
+    if root is not None and error is not None and root > error * (1 + ROUNDING):
+        text = f"the geometricError of root is {root:g}, more than that of the tileset, {error:g}"
+        yield broken("errors", text, fatal=False)
+
+
+def _number(value: object) -> float | None:
+    """Return a geometric error; None where it is no finite number from 0 on."""
+    is_error = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value) and value >= 0
+    return float(value) if is_error else None  # type: ignore[arg-type]
+
+
+def _volumes(tileset: Tileset) -> Iterator[RuleViolation]:
+    volumes = volumes_of(tileset)
+    for number, tile in enumerate(tileset.tiles):
+        try:
+            volume_of(tile.record.get("boundingVolume"))
+        except ValueError as error:
+            yield broken("volumes", f"the bounding volume of {tileset.place(number)} is {error}")
+            continue
+        own, above = volumes[number], volumes[tile.parent] if tile.parent >= 0 else None
+        if own is not None and above is not None and not above.holds(own, ROUNDING * max(own.size, above.size)):
+            text = f"the bounding volume of {tileset.place(number)} reaches out of that of the tile above"
+            yield broken("inside", text, fatal=False)
+
+
+def _errors(tileset: Tileset) -> Iterator[RuleViolation]:
+    for number, tile in enumerate(tileset.tiles):
+        value, place = tile.record.get("geometricError"), f"the geometricError of {tileset.place(number)}"
+        error = _number(value)
+        if error is None:
+            yield broken("errors", f"{place} is {quoted_value(value)}, not a number from 0 on")
+            continue
+        above = _number(tileset.tiles[tile.parent].record.get("geometricError")) if tile.parent >= 0 else None
+        if above is not None and error > above * (1 + ROUNDING):
+            yield broken("errors", f"{place} is {error:g}, more than that of the tile above, {above:g}", fatal=False)
+        if not tile.children and error:
+            yield broken("leaf-error", f"{place} is {error:g}, but it has no children", fatal=False)
+        # A tile that stands for a nested tileset, as one without splats, is refined whatever its error is.
+        if tile.children and not error and tile.uri is not None and not tile.is_nested:
+            yield broken("unrefined", f"{place} is 0, but it has children", fatal=False)
+
+
+def scan_files(tileset: Tileset, files: SceneFiles) -> tuple[dict[int, Chunk], list[RuleViolation]]:
+    """Read the header of each tile; return those that can be read, by the number of the tile, and the broken rules."""
+    chunks, found = dict[int, Chunk](), list[RuleViolation]()
+    for number, tile in enumerate(tileset.tiles):
+        name = tile.name
+        if name is None or tile.is_nested:
+            continue
+        try:
+            chunks[number] = files.open(name)
+        except FormatError as error:
+            found.append(broken("files", str(error)))
+    return chunks, [*found, *_kinds(tileset, chunks), *_counts(tileset, chunks)]
+
+
+def _kinds(tileset: Tileset, chunks: Mapping[int, Chunk]) -> Iterator[RuleViolation]:
+    first = next(iter(chunks.values()), None)
+    if first is None:
+        return
+    for chunk in chunks.values():
+        if chunk.sh_degree != first.sh_degree:
+            text = f"{quoted_value(chunk.name)} has SH degree {chunk.sh_degree}; the first tile has {first.sh_degree}"
+            yield broken("sh", text, fatal=False)
+        if chunk.up != first.up:
+            text = f"{quoted_value(chunk.name)} has {_up(chunk)}; the first tile has {_up(first)}"
+            yield broken("kind", text)
+    # GLBs with an SPZ inside are told by their format, see `glb.codec`.
+    needed = SPLAT_EXTENSIONS if any("SPZ" in chunk.format for chunk in chunks.values()) else SPLAT_EXTENSIONS[:1]
+    for name, head in tileset.heads.items():
+        where = f"{quoted_value(name)} does not list" if name else "it does not list"
+        if CONTENT_GLTF not in _list(head.get("extensionsUsed")):
+            yield broken("extensions", f"{where} {CONTENT_GLTF} in extensionsUsed", fatal=False)
+        extensions = head.get("extensions")
+        held = extensions.get(CONTENT_GLTF) if isinstance(extensions, dict) else None
+        for key in ("extensionsUsed", "extensionsRequired"):
+            missing = [each for each in needed if each not in _list(held.get(key) if isinstance(held, dict) else None)]
+            if missing:
+                text = f"{where} {' and '.join(missing)} in {key} of {CONTENT_GLTF}"
+                yield broken("extensions", text, fatal=False)
+
+
+def _up(chunk: Chunk) -> str:
+    return "no axis noted that points up" if chunk.up is None else f"{chunk.up} up"
+
+
+def _list(value: object) -> Sequence[object]:
+    return value if isinstance(value, list) else ()
+
+
+def _counts(tileset: Tileset, chunks: Mapping[int, Chunk]) -> Iterator[RuleViolation]:
+    for number, chunk in chunks.items():
+        if chunk.count > LARGE:
+            text = f"{quoted_value(chunk.name)} has {count_of(chunk.count, 'splat')}, more than {LARGE:,}"
+            yield broken("large", f"{text}, which take long to load", fatal=False)
+        below = [_stands_for(tileset, child) for child in tileset.tiles[number].children]
+        if below and all(child in chunks for child in below):
+            total = sum(chunks[child].count for child in below)
+            if total < chunk.count:
+                text = f"the children of {tileset.place(number)} have {count_of(total, 'splat')}"
+                yield broken("decreasing", f"{text}, and it has {chunk.count:,}", fatal=False)
+
+
+def _stands_for(tileset: Tileset, number: int) -> int:
+    """Return the root of a nested tileset for the tile that stands for it, else the tile."""
+    while tileset.tiles[number].is_nested and tileset.tiles[number].children:
+        (number,) = tileset.tiles[number].children
+    return number
+
+
+def scan_splats(
+    tileset: Tileset,
+    files: SceneFiles,
+    chunks: Mapping[int, Chunk],
+    *,
+    threads: int = 1,
+    progress: Progress = silent,
+) -> Iterator[RuleViolation]:
+    """Yield the rules about splats that tiles break, whose files are decoded one at a time.
+
+    Args:
+        chunks: by the number of the tile, of `scan_files`.
+    """
+    total, done, volumes = sum(chunk.count for chunk in chunks.values()), 0, volumes_of(tileset)
+    for number, chunk in chunks.items():
+        splats = Splats.empty(chunk.count, chunk.sh_degree)
+        try:
+            files.read([chunk], splats, threads)
+        except FormatError as error:
+            yield broken("files", str(error))
+            continue
+        done += chunk.count
+        progress("checking", done, total, "splat")
+        if invalid := splats.invalid():
+            count = int(np.count_nonzero(np.any(list(invalid.values()), axis=0)))
+            text = f"{count_of(count, 'splat')} of {quoted_value(chunk.name)} have a number that is not finite"
+            yield RuleViolation("values.non-finite", text, fatal=False)
+            continue
+        volume = volumes[number]
+        outside = 0 if volume is None else _outside(splats, volume, to_tileset(chunk.up))
+        if outside:
+            text = f"{count_of(outside, 'splat')} of {tileset.place(number)} lie outside of its bounding volume"
+            yield broken("extents", text, fatal=False)
+
+
+def _outside(splats: Splats, volume: Volume, rotation: NDArray[np.float64]) -> int:
+    """Count splats outside of a volume.
+
+    Args:
+        rotation: (3, 3) from the axes of the splats to those of the volume.
+    """
+    if not len(volume.axes):
+        far = np.linalg.norm(splats.center @ rotation.T - volume.center, axis=1)
+        return int(np.count_nonzero(far > volume.radius * (1 + LOOSE_BOUND)))
+    sides = volume.directions()
+    middle, half = sides @ volume.center, volume.reach(sides)
+    return count_outside(splats, np.stack([middle - half, middle + half]), directions=sides @ rotation)

@@ -1,0 +1,160 @@
+"""Facts of 3D Tiles that the tileset files and the headers of the tiles tell, and findings about both."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..codecs.scene_files import Chunk
+from ..codecs.tiles_3d.codec import tile_files
+from ..codecs.tiles_3d.tileset import MAX_TILESET, Tileset, read_whole
+from ..codecs.tiles_3d.tileset_rules import (
+    depths_of,
+    matrices_of,
+    matrix_of,
+    read_violations,
+    scan_files,
+    scan_splats,
+    violations,
+)
+from ..io import opened
+from ..model.georeference import Place, place_of
+from ..model.transforms import common
+from ..support.printable import MOST, printable
+from ..support.progress import Progress, silent
+from .findings import ChunkBytes, Head, HeaderScan, findings_of
+from .quantiles import quantiles_of
+
+#: Name of the format in `codecs.formats`.
+FORMAT = "3D Tiles"
+
+#: Distance from the centre of the Earth, metres, from which on a transform places a tileset on it. Chosen.
+ON_EARTH = 1e6
+
+
+@dataclass(frozen=True)
+class TileLevelFacts:
+    """The tiles of a depth, see `schema.json`."""
+
+    tiles: int
+    splats: int
+    bytes: int
+    leaves: int
+    errors: dict[str, float] | None
+
+
+@dataclass(frozen=True)
+class TileFacts:
+    """Facts from the tileset files and the headers of the tiles, see `schema.json`."""
+
+    generator: str | None
+    version: str
+    bytes: int
+    tileset_bytes: int
+    first_bytes: int
+    splats: int
+    tiles: int
+    levels: list[TileLevelFacts]
+    tilesets: int
+    geometric_error: float | None
+    tile_splats: dict[str, float]
+    file_bytes: ChunkBytes | None
+    georeference: Place | None
+
+
+def survey(path: Path, *, check: bool, threads: int = 1, progress: Progress = silent) -> HeaderScan | None:
+    """Read a tileset and the headers of its tiles; None for a file of another format.
+
+    Args:
+        path: of the tileset.json, or of its folder; - is standard input.
+        check: decode the tiles and look at their splats, too.
+
+    Raises:
+        FormatError: a tileset file cannot be parsed, or the path is no splat file.
+    """
+    with opened(path) as (file, form, more):
+        if form.name != FORMAT:
+            return None
+        tileset = read_whole(file.read(MAX_TILESET + 1), more["open_companion"])
+        found = list(read_violations(tileset))
+        if not found:
+            found += violations(tileset)
+        fatal, chunks = [each for each in found if each.fatal], dict[int, Chunk]()
+        if not fatal:
+            matrices = matrices_of(tileset)
+            named = {name: matrices[at] for at, tile in enumerate(tileset.tiles) if (name := tile.name) is not None}
+            files = tile_files(more["open_companion"], named)
+            chunks, about_files = scan_files(tileset, files)
+            found += about_files
+            fatal = [each for each in found if each.fatal]
+        if fatal:
+            return HeaderScan("tiles", None, None, findings_of(found), findings_of(fatal))
+        if check:
+            found += scan_splats(tileset, files, chunks, threads=threads, progress=progress)
+    return HeaderScan("tiles", _head(tileset, chunks), _facts(tileset, chunks), findings_of(found), [])
+
+
+def _head(tileset: Tileset, chunks: Mapping[int, Chunk]) -> Head:
+    """As reading the tiles without children gives it."""
+    read = [chunk for number, chunk in chunks.items() if not tileset.tiles[number].children]
+    return Head(
+        f"{FORMAT} {tileset.head['asset']['version']} of {read[0].format}" if read else FORMAT,
+        tileset.bytes + sum(chunk.bytes for chunk in chunks.values()),
+        sum(chunk.count for chunk in read),
+        max((chunk.sh_degree for chunk in read), default=0),
+        any(chunk.antialiased for chunk in read),
+        common(chunk.up for chunk in read),
+    )
+
+
+def _facts(tileset: Tileset, chunks: Mapping[int, Chunk]) -> TileFacts:
+    asset = tileset.head["asset"]
+    extras = asset.get("extras")
+    generator = extras.get("generator") if isinstance(extras, dict) else None
+    depths = depths_of(tileset)
+    sizes = [chunk.bytes for chunk in chunks.values()]
+    by_depth = [[at for at in range(len(depths)) if depths[at] == depth] for depth in range(max(depths) + 1)]
+    total, error = tileset.bytes + sum(sizes), tileset.head.get("geometricError")
+    first = next((chunk.bytes for number, chunk in chunks.items() if depths[number] == 0), 0)
+    return TileFacts(
+        generator=printable(" ".join(generator.split()), MOST) if isinstance(generator, str) else None,
+        version=asset["version"],
+        bytes=total,
+        tileset_bytes=tileset.bytes,
+        first_bytes=tileset.bytes + first,
+        splats=sum(chunk.count for chunk in chunks.values()),
+        tiles=len(chunks),
+        levels=[_level(tileset, chunks, numbers) for numbers in by_depth],
+        tilesets=len(tileset.heads),
+        geometric_error=float(error) if isinstance(error, (int, float)) else None,
+        tile_splats=quantiles_of([chunk.count for chunk in chunks.values()] or [0]),
+        file_bytes=ChunkBytes.of(sizes),
+        georeference=_place(tileset),
+    )
+
+
+def _level(tileset: Tileset, chunks: Mapping[int, Chunk], numbers: Sequence[int]) -> TileLevelFacts:
+    held = [number for number in numbers if number in chunks]
+    inner = [number for number in held if tileset.tiles[number].children]
+    errors = [float(tileset.tiles[number].record["geometricError"]) for number in inner]
+    return TileLevelFacts(
+        tiles=len(held),
+        splats=sum(chunks[number].count for number in held),
+        bytes=sum(chunks[number].bytes for number in held),
+        leaves=len(held) - len(inner),
+        errors=quantiles_of(errors) if errors else None,
+    )
+
+
+def _place(tileset: Tileset) -> Place | None:
+    """Return where the transform of the root puts the origin of the scene; None where that is not on the Earth."""
+    matrix = matrix_of(tileset.tiles[0].record)
+    if float(np.linalg.norm(matrix[:3, 3])) < ON_EARTH:
+        return None
+    found = place_of(tuple(matrix.T.ravel().tolist()))
+    return Place(
+        *(round(each, 9) for each in (found.latitude, found.longitude)), round(found.height, 4), round(found.heading, 6)
+    )
