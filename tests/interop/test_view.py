@@ -6,6 +6,7 @@ import base64
 import functools
 import hashlib
 import json
+import math
 import os
 import shutil
 import subprocess
@@ -24,16 +25,21 @@ import pytest
 from PIL import Image
 
 from sparklod_cli import read, write
+from sparklod_cli.cameras.camera import Camera
+from sparklod_cli.cameras.pose import look_at
 from sparklod_cli.cli import run
-from sparklod_cli.view.libraries import CDN, MODULES, PACKAGES, PLAYCANVAS, THREE, VERSIONS
+from sparklod_cli.lod.tile_settings import TileSettings
+from sparklod_cli.view.libraries import CDN, CESIUM, MODULES, PACKAGES, PLAYCANVAS, THREE, VERSIONS
 from tests.conftest import FIXTURES
 from tests.interop import npm
 from tests.interop.conftest import PAGE
 from tests.interop.engines import PACKAGES as ENGINES
 from tests.interop.engines.conftest import engines_dir as engines_dir
+from tests.interop.engines.likeness import like_cesium
 from tests.interop.node import Node
 from tests.interop.pictures import psnr
 from tests.signals import heed_signals
+from tests.tiled import tiled
 
 pytestmark = pytest.mark.slow
 
@@ -231,6 +237,29 @@ def test_streamed_sog_is_shown_in_playcanvas(
         assert tab.until(lambda state: state["legend"] is not None)["legend"] == "01"
         tab.ask("fill", id="budget", value="0")
         tab.until(lambda state: 0 < state["drawn"] < SPLATS)
+
+
+def test_3d_tiles_are_shown_in_cesium(
+    tab: Tab, packages: Path, trees: Path, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    """Where their own axes put them, not where they are on the Earth; without any other host."""
+    engines: Path = request.getfixturevalue("engines_dir")
+    (tmp_path / "node_modules").mkdir()
+    for package, folder in ((CESIUM, engines), (THREE, packages)):
+        (tmp_path / "node_modules" / package).symlink_to(folder / "node_modules" / package)
+    assert ENGINES[CESIUM] == VERSIONS[CESIUM]
+    place = TileSettings(tile_splats=2_000, lat=47.37, lon=8.54)
+    tileset = tiled(read(trees / "demo.ply").splats, tmp_path, place)
+    with Served(tmp_path, tileset, *LOOK) as url:
+        tab.open(url)
+        state = tab.settled()
+        assert (state["faults"], state["message"], state["drawn"]) == ([], None, SPLATS)
+        assert state["camera"] == "--look-at=0,-3.4,9:0,-1.1,0 --fov=40"
+        focal = SIZE[1] / 2 / math.tan(math.radians(40) / 2)
+        pose = look_at(np.array([0, -3.4, 9]), np.array([0, -1.1, 0]), (0, -1, 0))
+        camera = Camera(pose, *SIZE, (focal, focal), (SIZE[0] / 2, SIZE[1] / 2))
+        theirs = tab.picture(tmp_path / "page.png")
+        assert psnr(theirs - like_cesium(read(tileset).splats, camera)[..., :3]) >= LEAST
 
 
 def eye_of(camera: str) -> list[float]:

@@ -1,5 +1,6 @@
 // PlayCanvas in a canvas: what view.js draws Streamed SOG with. The members of Stage are those of spark.js.
 import * as pc from 'playcanvas';
+import { FileState } from './file_state.js';
 import { size, whole } from './text.js';
 
 /** The colours that PlayCanvas gives to detail levels, the finest first; it repeats them. */
@@ -7,9 +8,9 @@ const COLORS = ['#f00', '#0f0', '#00f', '#ff0', '#f0f', '#0ff', '#ff8000', '#800
 const UNDERFILL = 10; // coarser levels are drawn while finer ones load
 const REQUESTS = 100_000; // that the browser keeps the sizes of
 
-class ShownFile {
+class ShownFile extends FileState {
   constructor(app, file, changed, failed) {
-    Object.assign(this, { file, changed, failed, visible: true, builds: false, isTree: true, loading: true, bad: false, state: '' });
+    super(file, changed, failed);
     const { href } = new URL(file.url, document.baseURI);
     this.folder = href.slice(0, href.lastIndexOf('/') + 1);
     this.asset = new pc.Asset(file.name, 'gsplat', { url: href });
@@ -27,26 +28,15 @@ class ShownFile {
 
   /** Says what it is, and how much of it has arrived. */
   report() {
-    if (this.bad) return;
     const { bytes, format, levels, leaves } = this.file;
     const arrived = performance.getEntriesByType('resource').filter(({ name }) => name.startsWith(this.folder));
     const loaded = `${size(arrived.reduce((sum, entry) => sum + entry.encodedBodySize, 0))} of ${size(bytes)}`;
-    const state = this.loading ? `loading ${loaded}` : `${format}, ${loaded} loaded, ${levels} levels of ${whole(leaves)} splats`;
-    if (state === this.state) return;
-    this.state = state;
-    this.changed(this);
+    this.say(this.loading ? `loading ${loaded}` : `${format}, ${loaded} loaded, ${levels} levels of ${whole(leaves)} splats`);
   }
 
   show(visible) {
-    this.visible = this.entity.enabled = visible;
-    this.changed(this);
-  }
-
-  fail(error) {
-    const text = String(error?.message ?? error);
-    Object.assign(this, { loading: false, bad: true, state: `cannot be shown: ${text}` });
-    this.changed(this);
-    this.failed(`${this.file.name} ${this.state}`);
+    this.entity.enabled = visible;
+    super.show(visible);
   }
 }
 

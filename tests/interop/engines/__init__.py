@@ -1,4 +1,4 @@
-"""Engines: PlayCanvas, SuperSplat's viewer and Babylon.js for Streamed SOG, CesiumJS for 3D Tiles; and splat-transform."""
+"""Engines: PlayCanvas, SuperSplat's viewer and Babylon.js show SOG, CesiumJS 3D Tiles; and splat-transform."""
 
 from __future__ import annotations
 

@@ -23,8 +23,8 @@ HERE = Path(__file__).parent
 TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
 #: To those of glTF: half a turn about x.
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
-#: From the axes of glTF, y up, to those of a tile of 3D Tiles, z up: a quarter turn about x.
-Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+#: To those of 3D Tiles, z up: a quarter turn about x from those of glTF.
+TO_TILES = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]]) @ FLIP
 #: To those of Babylon.js, whose axes are left-handed with y up.
 MIRROR = np.diag([1.0, -1.0, 1.0])
 #: Planes between which splats are drawn, world units.
@@ -129,9 +129,20 @@ class Browser:
             html = recipes.babylon_of_one_file(file.name)
         return self._show(recipes.replaced(html, changes or {}), "babylon.js", file, camera, view)
 
-    def cesium(self, file: Path, camera: Camera, changes: Mapping[str, str] | None = None) -> Shown:
-        """What CesiumJS shows of a tileset whose content turns -y up; `changes` replace text of its page."""
-        pose = Z_UP @ FLIP @ camera.camera_to_world
+    def cesium(
+        self,
+        file: Path,
+        camera: Camera,
+        changes: Mapping[str, str] | None = None,
+        to_tiles: NDArray[np.float64] = TO_TILES,
+    ) -> Shown:
+        """What CesiumJS shows of a tileset.
+
+        Args:
+            changes: replace text of its page.
+            to_tiles: (4, 4) from the axes of the splats to those of the tileset.
+        """
+        pose = to_tiles @ camera.camera_to_world
         view = {
             "position": pose[:3, 3].tolist(),
             "right": pose[:3, 0].tolist(),
