@@ -55,7 +55,12 @@ def valid_seeds() -> tuple[str, ...]:
 
 
 #: Folders of files that belong together, and the names by which a command is given them.
-FOLDERS = {"sh1-sog": (".", "meta.json"), "sh1-streamed-sog": (".", "lod-meta.json"), "sh3-rad": ("sh3.rad",)}
+FOLDERS = {
+    "sh1-sog": (".", "meta.json"),
+    "sh1-streamed-sog": (".", "lod-meta.json"),
+    "sh1-tiles": (".", "tileset.json"),
+    "sh3-rad": ("sh3.rad",),
+}
 
 
 def folder_seed(name: str) -> dict[str, bytes]:

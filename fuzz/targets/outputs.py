@@ -19,7 +19,7 @@ from ..mutate import pick
 EXTENTS = (0.0, 1e-30, 1e-3, 1.0, 1.0, 1.0, 100.0, 1e6, 1e9, 1e20, 1e30, 1e38)
 
 #: Outputs of a tree, and of the splats of one.
-TREES = ("tree.spz", "tree.rad", "tree.rad", "chunks/tree.rad", "levels/lod-meta.json", "levels/lod-meta.json")
+TREES = ("tree.spz", "tree.rad", "tree.rad", "chunks/tree.rad", "levels/lod-meta.json", "tiles/tileset.json")
 PLAIN = ("plain.spz", "plain.rad", "plain.ply", "plain.splat", "plain.sog", "unpacked/meta.json")
 
 LEVELS = ("auto", "50%", "90%,50%,1%", "99%,0.001%")
@@ -47,6 +47,8 @@ def make(rng: Rng) -> Case:
             "--chunk-splats",
             pick(rng, ("20", "40", "9999")),
         ]
+    if output.startswith("tiles"):
+        options += ["--tile-splats", pick(rng, ("1", "7", "40", "9999"))]
     what = f"{len(columns['center'])} splats, {' '.join(options)}"
     return Case(what, {"scene.ply": scenes.ply_of(columns)}, {"options": options, "plain": pick(rng, PLAIN)})
 
@@ -54,7 +56,7 @@ def make(rng: Rng) -> Case:
 def check(case: Case, folder: Path) -> None:
     """Bakes, and writes the splats of the tree back; each output passes the check, or there is none."""
     options, plain = case.run["options"], case.run["plain"]
-    if not _written(["scene.ply", *options], folder / options[1]) or options[1].startswith("levels"):
+    if not _written(["scene.ply", *options], folder / options[1]) or options[1].endswith(".json"):
         return
     _written([options[1], "--unlod", "-o", plain], folder / plain)
 

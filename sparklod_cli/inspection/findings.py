@@ -154,8 +154,8 @@ class HeaderScan:
     Attributes:
         field: of the report that has the facts, "rad", "streamed_sog" or "tiles".
         head: what a report begins with; None where `facts` is.
-        facts: `RadFacts`, `StreamedSogFacts` or `TileFacts`; None where a rule is broken without which the rest cannot be
-            trusted.
+        facts: `RadFacts`, `StreamedSogFacts` or `TileFacts`; None where a rule is broken without which the rest cannot
+            be trusted.
         findings: broken rules, one for each code.
         fatal: findings because of which the file cannot be read.
     """

@@ -155,6 +155,5 @@ def _place(tileset: Tileset) -> Place | None:
     if float(np.linalg.norm(matrix[:3, 3])) < ON_EARTH:
         return None
     found = place_of(tuple(matrix.T.ravel().tolist()))
-    return Place(
-        *(round(each, 9) for each in (found.latitude, found.longitude)), round(found.height, 4), round(found.heading, 6)
-    )
+    latitude, longitude = round(found.latitude, 9) + 0.0, round(found.longitude, 9) + 0.0  # no -0
+    return Place(latitude, longitude, round(found.height, 4) + 0.0, round(found.heading, 6) % 360)

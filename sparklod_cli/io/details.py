@@ -89,12 +89,12 @@ def detail_sink(path: Place, *, overwrite: bool) -> SinkTogether:
     See `atomic_set.write` for what an interruption leaves.
 
     Args:
-        path: of the manifest, one of `FILE_SETS`; where it is a symbolic link, all files go to where that leads.
+        path: of the manifest, whose name tells the format (`FILE_SETS`); where it is a symbolic link, all files go to where that leads.
 
     Raises:
         OutputError: it is no place for several files, a folder is in the way, or see `check_writable`.
     """
-    target, files = _target(path), FILE_SETS[path.name]
+    target, files = _target(path), _files_of(path)
     check_header(path, overwrite=overwrite)
     former = _former(target, files)
     folders = [] if isinstance(target, Path) else folders_of(_standing(target, files))
@@ -106,12 +106,12 @@ def detail_sink(path: Place, *, overwrite: bool) -> SinkTogether:
 def detail_files(path: Path) -> list[Path]:
     """Return the files beside a manifest that are called as those of an output there, whether it names them or not."""
     target = Path(os.path.realpath(path))
-    return [target.parent / name for name in _standing(target, FILE_SETS[path.name])]
+    return [target.parent / name for name in _standing(target, _files_of(path))]
 
 
 def _write(path: Place, files: Files, *, overwrite: bool) -> int:
     target = _target(path)
-    former = _former(target, FILE_SETS[path.name])
+    former = _former(target, _files_of(path))
 
     def placed() -> Iterator[tuple[str, Iterable[bytes]]]:
         seen = set[str]()
@@ -140,6 +140,11 @@ def _write(path: Place, files: Files, *, overwrite: bool) -> int:
         raise OutputError(f"{taken} exists, add --overwrite to replace it") from None
     except OSError as error:
         raise OutputError(f"cannot write {path}: {reason_of(error)}") from None
+
+
+def _files_of(path: Place) -> FileSet:
+    """Return the names of the files beside a manifest; a manifest of another name is that of a Streamed SOG."""
+    return FILE_SETS.get(path.name, FILE_SETS[MANIFEST])
 
 
 def _target(path: Place) -> Place:

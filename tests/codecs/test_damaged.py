@@ -35,6 +35,7 @@ FILES = (
     "golden/sh3-v2.sog",
     "golden/sh2-v1.sog",
     "golden/sh1-streamed-sog/lod-meta.json",
+    "golden/sh1-tiles/tileset.json",
     *(f"golden/sh2-level{level}.ksplat" for level in (0, 1, 2)),
     "golden/sh0.splat",
     *("golden/sh2-gsplat.pt", "golden/sh1-nerfstudio.ckpt"),

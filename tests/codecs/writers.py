@@ -19,6 +19,7 @@ from fixtures import (
     by_hand_sog,
     by_hand_splat,
     by_hand_streamed_sog,
+    by_hand_tiles,
 )
 from sparklod_cli.codecs import ply, quantize, sh_palette, splat, spz
 from sparklod_cli.codecs.glb import codec as glb
@@ -339,6 +340,25 @@ GLB = {
     ),
 }
 
+# --- 3D Tiles ---------------------------------------------------------------------------------------------------------
+
+
+def as_tiles(source: Scene, *, nested: bool = False) -> Content:
+    """A root of some of the splats, and three tiles of all of them, of which the last is a nested tileset."""
+    values = linear(source)
+    parts = [part for part in np.array_split(np.arange(len(source)), 3) if len(part)]
+    tiles = [by_hand_tiles.Tile({name: column[part] for name, column in values.items()}) for part in parts]
+    if nested:
+        tiles[-1] = dataclasses.replace(tiles[-1], children=[tiles[-1]], nested=True)
+    root = by_hand_tiles.Tile({name: column[::3] for name, column in values.items()}, tiles)
+    return by_hand_tiles.tileset_files(root, by_hand_glb.glb)
+
+
+TILES = {
+    "by hand": Case("3D Tiles 1.1 of GLB", as_tiles, exact),
+    "nested": Case("3D Tiles 1.1 of GLB", functools.partial(as_tiles, nested=True), exact),
+}
+
 # --- Checkpoints ------------------------------------------------------------------------------------------------------
 
 CHECKPOINT = {
@@ -366,5 +386,6 @@ WRITERS: dict[str, dict[str, Case]] = {
     "SPLAT": SPLAT,
     "RAD": RAD,
     "GLB": GLB,
+    "3D Tiles": TILES,
     "checkpoint": CHECKPOINT,
 }

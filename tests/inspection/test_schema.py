@@ -176,7 +176,11 @@ def full(lod: Path) -> Report:
     finding = {"severity": "error", "code": "tree.size", "message": "node 3", "index": 3, "count": 1}
     rad = report_of(FIXTURES / "golden" / "sh1-tree.rad", ReportSettings())["rad"]
     streamed = report_of(FIXTURES / "golden" / "sh1-streamed-sog", ReportSettings())["streamed_sog"]
-    report = report | {"findings": [finding], "notes": ["a note"], "rad": rad, "streamed_sog": streamed}
+    tiles = report_of(FIXTURES / "golden" / "sh1-tiles", ReportSettings())["tiles"]
+    place = {"latitude": 47.0, "longitude": 8.0, "height": 400.0, "heading": 90.0}
+    tiles |= {"generator": "by hand", "georeference": place}
+    facts = {"rad": rad, "streamed_sog": streamed, "tiles": tiles}
+    report = report | {"findings": [finding], "notes": ["a note"]} | facts
     assert faults(report) == []
     return report
 
@@ -190,6 +194,7 @@ def may_be_null(way: tuple[Any, ...]) -> bool:
             "compression_ratio",
             "rad",
             "streamed_sog",
+            "tiles",
             "tree",
             "values",
             "chunks",
@@ -201,6 +206,7 @@ def may_be_null(way: tuple[Any, ...]) -> bool:
         or way in (("rad", "chunk_bytes"), ("rad", "ranges"), ("rad", "comment"))
         or (way[:2] == ("rad", "properties") and way[-1] in ("min", "max"))
         or (way[0] == "streamed_sog" and way[-1] in ("generator", "file_bytes", "environment", "share", "errors"))
+        or (way[0] == "tiles" and way[-1] in ("generator", "file_bytes", "georeference", "geometric_error", "errors"))
         or (way[:2] == ("values", "quantities") and len(way) == 4)
         or (way[0] == "chunks" and len(way) == 3 and way[-1] not in ("chunk", "base", "splats"))
         or (finding and way[-1] in ("index", "count"))
@@ -325,7 +331,7 @@ def test_the_page_has_every_field(full: Report) -> None:
         value_at(full, way.replace("KEY", "rgbMax").replace("PROPERTY", "center"))
     tops = {way.split(".")[0] for way in named}
     assert tops == SCHEMA["properties"].keys()
-    for name in ("rad", "streamed_sog", "tree", "values"):
+    for name in ("rad", "streamed_sog", "tiles", "tree", "values"):
         assert {way.split(".")[1] for way in named if way.startswith(f"{name}.")} == full[name].keys()
     assert {way.split(".")[2] for way in named if way.startswith("chunks.")} == {each.name for each in chunks.COLUMNS}
     assert {way.split(".")[2] for way in named if way.startswith("findings.")} == full["findings"][0].keys()

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from fixtures import by_hand_sog, by_hand_streamed_sog
+from sparklod_cli.codecs.scene_files import SceneFiles
 from sparklod_cli.codecs.streamed_sog import codec
 from sparklod_cli.io import open_stream, read_levels, read_scene
 from sparklod_cli.model import streams
