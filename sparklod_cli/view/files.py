@@ -13,8 +13,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import quote
 
+from ..codecs.content import Source
 from ..codecs.file_names import META
 from ..codecs.formats import FORMATS, HEAD, sniff
+from ..codecs.glb.codec import open_content as open_glb
+from ..codecs.glb.glb_container import MAGIC as GLB_MAGIC
 from ..codecs.rad.rad_header import MAGIC, RadHeader, read_header
 from ..codecs.tiles_3d.tileset import MAX_TILESET, read_whole
 from ..io.details import read_level_files
@@ -36,7 +39,7 @@ SPARK_TYPES = {
 }
 
 #: What shows the others, but for those that nothing shows.
-OTHER_ENGINES = {"Streamed SOG": "playcanvas", "3D Tiles": "cesium"}
+OTHER_ENGINES = {"Streamed SOG": "playcanvas", "GLB": "playcanvas", "3D Tiles": "cesium"}
 
 #: How files begin that sparklod reads and Spark 2.2.0 does not, and what they are.
 UNREAD = ((rb"NGSP", "SPZ version 4"), (rb"ply\s+format (?!binary_little)", "PLY that is ascii or big-endian"))
@@ -135,18 +138,20 @@ def _named(path: Path, folder: str) -> ShownFile:
 
 
 def _shown(path: Path, folder: str) -> ShownFile:
-    if (in_folder(path) if path.is_dir() else path).name == META:
-        raise NotSplatsError("Spark does not read an unpacked SOG; zip its files into a .sog")
     if path.is_dir():
-        return _shown(in_folder(path), folder)
+        return _shown(path / in_folder(path).name, folder)
+    if path.name == META:
+        raise NotSplatsError("Spark does not read an unpacked SOG; zip its files into a .sog")
     if path.exists() and not path.is_file():
         raise UnreadableError("it is a pipe or a device; save it to a file first")
     header = None
     with open_plain(path.resolve()) as file:
         head = file.read(HEAD)
+        file.seek(0)
         if head.startswith(MAGIC):
-            file.seek(0)
             header = read_header(file)
+        elif head.startswith(GLB_MAGIC) and open_glb(Source(file)).format != "GLB":
+            raise NotSplatsError("PlayCanvas does not read the SPZ in it; write it with --glb-profile khronos")
     if not head:
         raise UnreadableError("the file is empty")
     form = sniff(head, path.suffix)
@@ -156,7 +161,7 @@ def _shown(path: Path, folder: str) -> ShownFile:
         raise NotSplatsError(f"Spark does not read {form.name}; bake it first with sparklod build-lod")
     name = f"{folder}/{path.name}"
     files = {name: path.resolve()}
-    if form.name in OTHER_ENGINES:
+    if form.folders:
         companions = _tileset_files(path) if form.tiled else _manifest_files(path)
         files |= {f"{folder}/{each}": _inside(path, path.parent / each) for each in companions}
     elif header is not None:

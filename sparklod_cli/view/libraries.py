@@ -138,11 +138,10 @@ def from_folder(folder: Path, engine: str = "spark") -> Libraries:
         if not os.path.isdir(packages / package):  # noqa: PTH112, since `Path.is_dir` fails on names that are too long
             raise SparklodError(f"{packages} has no {package}; install it with {install}")
         versions[package] = _version(packages / package)
-        for name in LICENSES:
-            files[f"lib/{package}/{name}"] = packages / package / name
-        for pattern in FILES.get(package, ()):
-            for path in (packages / package).glob(pattern):
-                files[f"lib/{package}/{path.relative_to(packages / package).as_posix()}"] = path
+        home = packages / package
+        for pattern in (*LICENSES, *FILES.get(package, ())):
+            for found in home.glob(pattern):
+                files[f"lib/{package}/{found.relative_to(home).as_posix()}"] = found
     for package, path in MODULES:
         if package in versions:
             files[f"lib/{package}/{path}"] = packages / package / path

@@ -94,9 +94,9 @@ def extent_of(shown: ShownFile, *, threads: int = 1, progress: Progress = silent
     try:
         if shown.header is not None and shown.header.lod_tree and len(shown.header.chunks) > 1:
             return _coarse_extent(shown, shown.header)
-        if shown.engine == "cesium":
+        if shown.format == "3D Tiles":
             return _tiles_extent(shown.path, threads, progress)
-        if shown.engine == "playcanvas":
+        if shown.format == "Streamed SOG":
             return _detail_extent(shown.path, threads, progress)
         scene = read_scene(shown.path, columns=USED, threads=threads, progress=progress)
     except SparklodError as error:

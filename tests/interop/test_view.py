@@ -212,19 +212,24 @@ def open_slowly(tab: Tab, url: str, file: Path, size: tuple[int, int] = SIZE) ->
     return state
 
 
-def test_streamed_sog_is_shown_in_playcanvas(
-    tab: Tab, packages: Path, trees: Path, tmp_path: Path, request: pytest.FixtureRequest
-) -> None:
-    """From the camera of the page, which it copies out; its modules have the digests that the page asks a CDN for."""
+@pytest.fixture(scope="module")
+def others(packages: Path, tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Path:
+    """A folder whose node_modules has PlayCanvas, CesiumJS and three.js."""
     engines: Path = request.getfixturevalue("engines_dir")
-    (tmp_path / "node_modules").mkdir()
-    for package, folder in ((PLAYCANVAS, engines), (THREE, packages)):
-        (tmp_path / "node_modules" / package).symlink_to(folder / "node_modules" / package)
-    check_digests(tmp_path, (PLAYCANVAS, THREE))
+    folder = tmp_path_factory.mktemp("others")
+    (folder / "node_modules").mkdir()
+    for package, source in ((PLAYCANVAS, engines), (CESIUM, engines), (THREE, packages)):
+        (folder / "node_modules" / package).symlink_to(source / "node_modules" / package)
+    return folder
+
+
+def test_streamed_sog_is_shown_in_playcanvas(tab: Tab, others: Path, trees: Path, tmp_path: Path) -> None:
+    """From the camera of the page, which it copies out; its modules have the digests that the page asks a CDN for."""
+    check_digests(others, (PLAYCANVAS, THREE))
     assert ENGINES[PLAYCANVAS] == VERSIONS[PLAYCANVAS]
     manifest = trees / "web" / "lod-meta.json"
     assert run(["build-lod", str(trees / "demo.ply"), "-o", str(manifest), "-q"]) == 0
-    with Served(tmp_path, manifest, *LOOK) as url:
+    with Served(others, manifest, *LOOK) as url:
         tab.open(url)
         state = tab.settled()
         assert state["faults"] == []
@@ -239,18 +244,26 @@ def test_streamed_sog_is_shown_in_playcanvas(
         tab.until(lambda state: 0 < state["drawn"] < SPLATS)
 
 
-def test_3d_tiles_are_shown_in_cesium(
-    tab: Tab, packages: Path, trees: Path, tmp_path: Path, request: pytest.FixtureRequest
-) -> None:
+@pytest.mark.parametrize("up", [None, "-y"])
+def test_a_glb_is_shown_in_playcanvas(up: str | None, tab: Tab, others: Path, trees: Path, tmp_path: Path) -> None:
+    """Upright whether its node turns it or not."""
+    file = tmp_path / "demo.glb"
+    write(file, replace(read(trees / "demo.ply"), up=up))
+    with Served(others, file, *LOOK) as url:
+        tab.open(url)
+        state = tab.settled()
+        assert (state["faults"], state["message"], state["drawn"]) == ([], None, SPLATS)
+        theirs = tab.picture(tmp_path / "page.png")
+        ours = rendered(file, state["camera"].split(), tmp_path / "r.png", SPLATS)
+        assert psnr(theirs - ours) >= LEAST_OF_PLAYCANVAS
+
+
+def test_3d_tiles_are_shown_in_cesium(tab: Tab, others: Path, trees: Path, tmp_path: Path) -> None:
     """Where their own axes put them, not where they are on the Earth; without any other host."""
-    engines: Path = request.getfixturevalue("engines_dir")
-    (tmp_path / "node_modules").mkdir()
-    for package, folder in ((CESIUM, engines), (THREE, packages)):
-        (tmp_path / "node_modules" / package).symlink_to(folder / "node_modules" / package)
     assert ENGINES[CESIUM] == VERSIONS[CESIUM]
     place = TileSettings(tile_splats=2_000, lat=47.37, lon=8.54)
     tileset = tiled(read(trees / "demo.ply").splats, tmp_path, place)
-    with Served(tmp_path, tileset, *LOOK) as url:
+    with Served(others, tileset, *LOOK) as url:
         tab.open(url)
         state = tab.settled()
         assert (state["faults"], state["message"], state["drawn"]) == ([], None, SPLATS)

@@ -300,6 +300,15 @@ def test_a_name_that_is_no_text_is_shown_escaped(tmp_path: Path) -> None:
     assert (file["name"], file["url"]) == (r"\xff.spz", "data/0/%FF.spz")
 
 
+def test_a_glb_is_shown_by_playcanvas_unless_it_has_spz_inside() -> None:
+    settings = settings_of(GOLDEN / "sh2.glb")
+    assert (settings["engine"], settings["files"][0]["levels"]) == ("playcanvas", None)
+    with pytest.raises(
+        FormatError, match=r"hand-spz\.glb: PlayCanvas does not read the SPZ in it; write it with --glb"
+    ):
+        shown_files([GOLDEN / "hand-spz.glb"])
+
+
 def test_a_format_that_no_engine_of_the_page_reads_is_refused() -> None:
-    with pytest.raises(FormatError, match=r"sh2\.glb: Spark does not read GLB; bake it first with sparklod build-lod"):
-        shown_files([GOLDEN / "sh2.glb"])
+    with pytest.raises(FormatError, match=r"gsplat\.pt: Spark does not read checkpoint; bake it first with sparklod"):
+        shown_files([GOLDEN / "sh2-gsplat.pt"])
