@@ -141,9 +141,11 @@ def _detail_extent(path: Path, threads: int, progress: Progress) -> Extent:
 
 
 def _tiles_extent(path: Path, threads: int, progress: Progress) -> Extent:
-    """Return the extent of 3D Tiles by the root tile, which stands for all."""
+    """Return the extent of 3D Tiles by the coarsest level that has splats."""
     scene = read_tiles(path, threads=threads, progress=progress)
-    balls = balls_of(scene.splats.take(scene.run(0)), slice(None), np.eye(4))
+    first = int(scene.level[np.argmax(scene.counts > 0)])
+    coarse = np.repeat(np.isin(np.arange(scene.tiles), scene.at_level(first)), scene.counts)
+    balls = balls_of(scene.splats, coarse, np.eye(4))
     leaves, levels = int(scene.counts[scene.is_leaf].sum()), int(scene.level.max()) + 1
     return Extent(len(scene.splats), leaves, balls, _sizes(scene.splats), scene.up, levels)
 

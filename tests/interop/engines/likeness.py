@@ -50,9 +50,10 @@ def our_picture(splats: Splats, camera: Camera) -> NDArray[np.float32]:
 def like_cesium(splats: Splats, camera: Camera) -> NDArray[np.float32]:
     """Our picture of splats, drawn as CesiumJS's shaders do: (height, width, 4), 0..1.
 
-    Splats are sorted by depth, opacity does not make up for the blur, and small splats are left out.
+    Splats are sorted by depth, opacity does not make up for the blur, small splats are left out, and colours are clamped
+    before reflections are added to them.
     """
-    shaded = shade([(splats, np.eye(4))], camera)
+    shaded = shade([(dataclasses.replace(splats, rgb=np.clip(splats.rgb, 0, 1)), np.eye(4))], camera)
     on_screen = _variances(shaded, camera)
     blurred = on_screen + CESIUM_BLUR * np.eye(2)
     # What the renderer divides opacity by.
