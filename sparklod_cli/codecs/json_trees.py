@@ -1,9 +1,37 @@
-"""Trees in JSON, of nodes with "children": where a node is, for messages."""
+"""Manifests in JSON with trees of nodes that have "children": parsing one, and where a node is, for messages."""
 
 from __future__ import annotations
 
 import bisect
 from collections.abc import Callable, Sequence
+from typing import Any
+
+from ..support.errors import FormatError
+from ..support.untrusted import parse_json
+
+#: Deepest nesting of a manifest; a node of a tree takes two.
+MAX_NESTING = 512
+
+
+def parse_manifest(data: bytes, called: str, most: int) -> dict[str, Any]:
+    """Return the object that a manifest is.
+
+    Args:
+        called: its name, for messages.
+        most: bytes that are read.
+
+    Raises:
+        FormatError: it has more bytes, is not JSON, or no object.
+    """
+    if len(data) > most:
+        raise FormatError(f"{called} has more than {most:,} bytes")
+    try:
+        root = parse_json(data, depth=MAX_NESTING)
+    except ValueError as error:
+        raise FormatError(f"{called} is not JSON: {error}") from None
+    if not isinstance(root, dict):
+        raise FormatError(f"{called} is not an object")
+    return root
 
 
 def place_of(

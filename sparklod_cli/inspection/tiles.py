@@ -21,7 +21,7 @@ from ..codecs.tiles_3d.tileset_rules import (
     violations,
 )
 from ..io import opened
-from ..model.georeference import Place, place_of
+from ..model.georeference import EarthPlace, place_of
 from ..model.transforms import common
 from ..support.printable import MOST, printable
 from ..support.progress import Progress, silent
@@ -62,7 +62,7 @@ class TileFacts:
     geometric_error: float | None
     tile_splats: dict[str, float]
     file_bytes: ChunkBytes | None
-    georeference: Place | None
+    georeference: EarthPlace | None
 
 
 def survey(path: Path, *, check: bool, threads: int = 1, progress: Progress = silent) -> HeaderScan | None:
@@ -149,11 +149,11 @@ def _level(tileset: Tileset, chunks: Mapping[int, Chunk], numbers: Sequence[int]
     )
 
 
-def _place(tileset: Tileset) -> Place | None:
+def _place(tileset: Tileset) -> EarthPlace | None:
     """Return where the transform of the root puts the origin of the scene; None where that is not on the Earth."""
     matrix = matrix_of(tileset.tiles[0].record)
     if float(np.linalg.norm(matrix[:3, 3])) < ON_EARTH:
         return None
     found = place_of(tuple(matrix.T.ravel().tolist()))
     latitude, longitude = round(found.latitude, 9) + 0.0, round(found.longitude, 9) + 0.0  # no -0
-    return Place(latitude, longitude, round(found.height, 4) + 0.0, round(found.heading, 6) % 360)
+    return EarthPlace(latitude, longitude, round(found.height, 4) + 0.0, round(found.heading, 6) % 360)

@@ -89,7 +89,8 @@ def detail_sink(path: Place, *, overwrite: bool) -> SinkTogether:
     See `atomic_set.write` for what an interruption leaves.
 
     Args:
-        path: of the manifest, whose name tells the format (`FILE_SETS`); where it is a symbolic link, all files go to where that leads.
+        path: of the manifest, whose name tells the format (`FILE_SETS`); where it is a symbolic link, all files go to
+            where that leads.
 
     Raises:
         OutputError: it is no place for several files, a folder is in the way, or see `check_writable`.

@@ -52,25 +52,20 @@ class TileSettings(CheckedSettings):
         None,
         "Latitude of the origin of the scene, in degrees, geodetic (WGS 84).",
         Range(-90, 90, unit="DEG"),
-        needs="lon",
     )
-    lon: float | None = setting(None, "Longitude of the origin, in degrees.", Range(-180, 180, unit="DEG"), needs="lat")
-    height: float | None = setting(
-        None, "Height of the origin above the ellipsoid, in metres.", Range(unit="M"), needs="lat"
-    )
+    lon: float | None = setting(None, "Longitude of the origin, in degrees.", Range(-180, 180, unit="DEG"))
+    height: float | None = setting(None, "Height of the origin above the ellipsoid, in metres.", Range(unit="M"))
     heading: float | None = setting(
         None,
         "Direction that the scene's forward axis, -z where y is up, points to on the ground, in degrees clockwise from"
         " north.",
         Range(unit="DEG"),
-        needs="lat",
     )
     transform: tuple[float, ...] | None = setting(
         None,
         "Transform of the root tile instead: 16 numbers, column by column, from the axes of the tileset, x right, y"
         " forward, z up, to those of the Earth (ECEF), in metres.",
         Quantity("NUMBERS", parse_matrix),
-        excludes=("lat", "lon", "height", "heading"),
     )
 
     def __post_init__(self) -> None:

@@ -48,8 +48,8 @@ def placed(latitude: float, longitude: float, height: float = 0.0, heading: floa
 
 
 @dataclass(frozen=True)
-class Place:
-    """Where a matrix puts the origin, and what it does with the y axis, as for `placed`; degrees and metres."""
+class EarthPlace:
+    """Place of the origin of a matrix and heading of its y axis, as for `placed`; degrees and metres."""
 
     latitude: float
     longitude: float
@@ -57,7 +57,7 @@ class Place:
     heading: float
 
 
-def place_of(matrix: Matrix16) -> Place:
+def place_of(matrix: Matrix16) -> EarthPlace:
     """Return the place of the origin of a matrix that is not at the centre of the Earth; the inverse of `placed`."""
     x, y, z = matrix[12:15]
     ahead = matrix[4:7]
@@ -70,4 +70,4 @@ def place_of(matrix: Matrix16) -> Place:
     height = across * cos_phi + z * sin_phi - RADIUS * math.sqrt(1 - squared * sin_phi**2)
     east = -sin_lam * ahead[0] + cos_lam * ahead[1]
     north = -sin_phi * (cos_lam * ahead[0] + sin_lam * ahead[1]) + cos_phi * ahead[2]
-    return Place(math.degrees(phi), math.degrees(lam), height, math.degrees(math.atan2(east, north)) % 360)
+    return EarthPlace(math.degrees(phi), math.degrees(lam), height, math.degrees(math.atan2(east, north)) % 360)

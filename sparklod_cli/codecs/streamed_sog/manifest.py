@@ -14,20 +14,17 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ...support.errors import FormatError, VersionError
-from ...support.untrusted import parse_json, quoted_value
+from ...support.untrusted import quoted_value
 from .. import quantize
 from ..file_names import MANIFEST
 from ..file_notes import FileNote, read_note
-from ..json_trees import place_of
+from ..json_trees import parse_manifest, place_of
 
 #: The version that is read and written. A manifest from before versions has none.
 VERSION = 1
 
 #: Largest manifest, bytes: that of 100,000 regions at some levels.
 MAX_MANIFEST = 1 << 25
-
-#: Deepest nesting of its JSON; a node of the tree takes two.
-MAX_NESTING = 512
 
 #: Most detail levels; tools write up to ten.
 MAX_LEVELS = 32
@@ -122,14 +119,7 @@ def parse(data: bytes) -> Manifest:
         VersionError: it is of another version than 1.
         FormatError: it is not JSON, or lacks what reading needs; names the value and its place.
     """
-    if len(data) > MAX_MANIFEST:
-        raise FormatError(f"{MANIFEST} has more than {MAX_MANIFEST:,} bytes")
-    try:
-        root = parse_json(data, depth=MAX_NESTING)
-    except ValueError as error:
-        raise FormatError(f"{MANIFEST} is not JSON: {error}") from None
-    if not isinstance(root, dict):
-        raise FormatError(f"{MANIFEST} is not an object")
+    root = parse_manifest(data, MANIFEST, MAX_MANIFEST)
     version = root.get("version")
     if version is not None and (type(version) is not int or version != VERSION):
         raise VersionError(f"Streamed SOG version {quoted_value(version)} is unknown, only {VERSION} is read")

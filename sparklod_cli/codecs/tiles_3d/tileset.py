@@ -13,11 +13,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ...support.errors import FormatError, VersionError
-from ...support.untrusted import parse_json, quoted_value
+from ...support.untrusted import quoted_value
 from ..content import OpenCompanion
 from ..file_names import TILESET
 from ..file_notes import FileNote, read_note
-from ..json_trees import place_of
+from ..json_trees import parse_manifest, place_of
 from ..validation import error_of
 
 #: The version that is written, and the one before it, which is read, too.
@@ -29,8 +29,8 @@ REPLACE = "REPLACE"
 #: The extension that tells which extensions of glTF the tiles use.
 CONTENT_GLTF = "3DTILES_content_gltf"
 
-#: Largest tileset file, bytes, and deepest nesting of its JSON: a tile takes two.
-MAX_TILESET, MAX_NESTING = 1 << 25, 512
+#: Largest tileset file, bytes: that of 100,000 tiles.
+MAX_TILESET = 1 << 25
 
 #: Most tiles, and files of tilesets, of one scene: a hundred thousand tiles hold ten billion splats. Chosen.
 MAX_TILES, MAX_FILES = 1 << 17, 1 << 12
@@ -43,7 +43,7 @@ UNREAD = ("implicitTiling", "contents")
 
 
 @dataclass(frozen=True)
-class Tile:
+class TileRecord:
     """A tile as a file has it.
 
     Attributes:
@@ -86,7 +86,7 @@ class Tileset:
     """
 
     head: Mapping[str, Any]
-    tiles: tuple[Tile, ...]
+    tiles: tuple[TileRecord, ...]
     heads: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     bytes: int = 0
 
@@ -122,14 +122,7 @@ def parse(data: bytes, file: str = "") -> Tileset:
         FormatError: it is not JSON, or lacks what reading needs; names the value and its place.
     """
     called = quoted_value(file) if file else TILESET
-    if len(data) > MAX_TILESET:
-        raise FormatError(f"{called} has more than {MAX_TILESET:,} bytes")
-    try:
-        root = parse_json(data, depth=MAX_NESTING)
-    except ValueError as error:
-        raise FormatError(f"{called} is not JSON: {error}") from None
-    if not isinstance(root, dict):
-        raise FormatError(f"{called} is not an object")
+    root = parse_manifest(data, called, MAX_TILESET)
     asset = root.get("asset")
     if not isinstance(asset, dict):
         raise FormatError(f"{called} has no asset, which must be an object with a version")
@@ -141,7 +134,7 @@ def parse(data: bytes, file: str = "") -> Tileset:
     return Tileset(head, tiles, {file: head}, len(data))
 
 
-def _tiles(root: Any, called: str, file: str) -> tuple[Tile, ...]:
+def _tiles(root: Any, called: str, file: str) -> tuple[TileRecord, ...]:
     """Return the tiles of a file, root first and depth first."""
     records, uris = list[Mapping[str, Any]](), list[str | None]()
     parents, children = list[int](), list[list[int]]()
@@ -176,7 +169,7 @@ def _tiles(root: Any, called: str, file: str) -> tuple[Tile, ...]:
         uris.append(uri)
         waiting.extend((each, number) for each in reversed(below))
     rows = zip(records, uris, children, parents, strict=True)
-    return tuple(Tile(record, uri, tuple(below), parent, file) for record, uri, below, parent in rows)
+    return tuple(TileRecord(record, uri, tuple(below), parent, file) for record, uri, below, parent in rows)
 
 
 def read_whole(data: bytes, open_companion: OpenCompanion | None) -> Tileset:
@@ -202,11 +195,11 @@ def read_whole(data: bytes, open_companion: OpenCompanion | None) -> Tileset:
             offset = len(tiles)
             if offset + len(inner.tiles) > MAX_TILES:
                 raise FormatError(f"it has more than {MAX_TILES:,} tiles")
-            tiles[number] = Tile(tile.record, tile.uri, (offset,), tile.parent, tile.file)
+            tiles[number] = TileRecord(tile.record, tile.uri, (offset,), tile.parent, tile.file)
             for each in inner.tiles:
                 below = tuple(child + offset for child in each.children)
                 parent = number if each.parent < 0 else each.parent + offset
-                tiles.append(Tile(each.record, each.uri, below, parent, name))
+                tiles.append(TileRecord(each.record, each.uri, below, parent, name))
         number += 1
     return Tileset(first.head, tuple(tiles), heads, size)
 

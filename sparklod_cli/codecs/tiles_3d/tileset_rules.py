@@ -19,7 +19,7 @@ from ..scene_files import Chunk, SceneFiles
 from ..splat_bounds import LOOSE_BOUND, count_outside
 from ..validation import RuleViolation
 from .axes import to_tileset
-from .tileset import CONTENT_GLTF, OLD_VERSION, REPLACE, SPLATS, UNREAD, VERSION, Tile, Tileset
+from .tileset import CONTENT_GLTF, OLD_VERSION, REPLACE, SPLATS, UNREAD, VERSION, TileRecord, Tileset
 from .volumes import Volume, volume_of
 
 #: Meaning of each code; the text of a violation has the values. Values of the wrong kind, which the parser refuses,
@@ -75,7 +75,7 @@ def read_violations(tileset: Tileset) -> Iterator[RuleViolation]:
         yield from _unread(tileset, number, tile)
 
 
-def _unread(tileset: Tileset, number: int, tile: Tile) -> Iterator[RuleViolation]:
+def _unread(tileset: Tileset, number: int, tile: TileRecord) -> Iterator[RuleViolation]:
     extensions = tile.record.get("extensions")
     implicit = isinstance(extensions, dict) and "3DTILES_implicit_tiling" in extensions
     for key in (*(each for each in UNREAD if each in tile.record), *(["implicit tiling"] if implicit else [])):

@@ -222,7 +222,7 @@ def test_what_is_not_read_is_refused_by_name(files: Files, match: str) -> None:
 
 
 def test_another_version_is_refused() -> None:
-    with pytest.raises(VersionError, match="version '2.0' is unknown, only 1.0 and 1.1 are read"):
+    with pytest.raises(VersionError, match=r"version '2\.0' is unknown, only 1\.0 and 1\.1 are read"):
         scene_of(changed(lambda tileset: tileset["asset"].update(version="2.0")))
 
 
@@ -230,7 +230,7 @@ def test_nested_tilesets_in_a_circle_are_refused() -> None:
     root = json.loads(two_tiles()["tileset.json"])
     root["root"] = {"content": {"uri": "inner.json"}}
     inner = root | {"root": {"children": [{"content": {"uri": "inner.json"}}]}}
-    with pytest.raises(FormatError, match="names the tileset 'inner.json' twice"):
+    with pytest.raises(FormatError, match=r"names the tileset 'inner\.json' twice"):
         scene_of({"tileset.json": json.dumps(root).encode(), "inner.json": json.dumps(inner).encode()})
 
 
