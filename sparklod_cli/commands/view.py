@@ -125,8 +125,8 @@ def view(ctx: click.Context, /, **_: Any) -> None:
     page has a slider for the budget, colours by level, and what is drawn and how fast; it copies the camera as
     --look-at, and plays camera paths that are dropped onto it.
 
-    Trees in RAD files are streamed, chunk by chunk, as a viewer on the web streams them. Streamed SOG and
-    GLB are shown in PlayCanvas, 3D Tiles in CesiumJS, everything else in Spark. Spark, PlayCanvas and three.js come from a CDN unless
+    Trees in RAD files are streamed, chunk by chunk, as a viewer on the web streams them. Streamed SOG and GLB are shown
+    in PlayCanvas, 3D Tiles in CesiumJS, everything else in Spark. Spark, PlayCanvas and three.js come from a CDN unless
     --spark-dir names a folder that has them; CesiumJS needs one.
     """
     options = values_of(ctx, _ViewOptions)

@@ -1,7 +1,7 @@
 """Draws the pictures of docs/playcanvas.md and docs/cesium.md anew: `python -m tests.docs.engine_pictures`.
 
-ENGINES_DIR names a folder whose node_modules has what `tests/interop/engines/__init__.py` lists. Chromium shows the demo
-scene in the pages that the documents give, with an environment but in CesiumJS.
+ENGINES_DIR names a folder whose node_modules has what `tests/interop/engines/__init__.py` lists. Chromium shows the
+demo scene in the pages that the documents give, with an environment but in CesiumJS.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ SIZE, QUALITY = (480, 270), 80
 #: The demo scene takes this many splats a tile where it is to have three levels.
 TILES = TileSettings(tile_splats=3_000)
 
-#: World units from the middle of the demo scene within which CesiumJS shows it: beyond are stars, whose tiles the camera
-#: would be in.
+#: World units from the middle of the demo scene within which CesiumJS shows it: beyond are stars, whose tiles would
+#: have the camera inside.
 WITHIN = 12.0
 
 #: The pages of CesiumJS by their pictures, as changes.

@@ -50,8 +50,8 @@ def our_picture(splats: Splats, camera: Camera) -> NDArray[np.float32]:
 def like_cesium(splats: Splats, camera: Camera) -> NDArray[np.float32]:
     """Our picture of splats, drawn as CesiumJS's shaders do: (height, width, 4), 0..1.
 
-    Splats are sorted by depth, opacity does not make up for the blur, small splats are left out, and colours are clamped
-    before reflections are added to them.
+    Splats are sorted by depth, opacity does not make up for the blur, small splats are left out, and colours are
+    clamped before reflections are added to them.
     """
     shaded = shade([(dataclasses.replace(splats, rgb=np.clip(splats.rgb, 0, 1)), np.eye(4))], camera)
     on_screen = _variances(shaded, camera)
