@@ -76,7 +76,7 @@ def _of_tileset(target: Place) -> Iterator[str]:
 #: By the name of the manifest.
 FILE_SETS = {
     MANIFEST: FileSet(chunk_folder(0, 0), is_chunk_folder, is_of_streamed_sog, _of_streamed_sog),
-    TILESET: FileSet(TILES, TILES.__eq__, is_of_tileset, _of_tileset),
+    TILESET: FileSet(TILES, lambda name: name == TILES, is_of_tileset, _of_tileset),
 }
 
 

@@ -110,7 +110,10 @@ def test_what_cannot_be_is_said(scan: Address, folder: Address, capsys: Capture)
         ([folder / "none.ply"], f"{folder}/none.ply: cannot be read: no such file"),
         ([SMALL, "-o", "https://host/x.spz?secret=1"], "cannot write https://host/x.spz?***: https:// is for reading"),
         (["s4://bucket/scan.ply"], "addresses of s4:// cannot be opened"),
-        ([scan, "-o", scan.parent / "scan.png"], "trees are written as SPZ, RAD or Streamed SOG, not as .png"),
+        (
+            [scan, "-o", scan.parent / "scan.png"],
+            "written as SPZ, RAD, Streamed SOG or 3D Tiles, not as .png",
+        ),
     ):
         assert build(*(each.url if isinstance(each, Address) else each for each in arguments)) != 0
         assert said in capsys.readouterr().err

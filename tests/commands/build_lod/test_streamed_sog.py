@@ -255,7 +255,10 @@ def test_other_outputs_have_no_detail(scene: Path, tmp_path: Path, capsys: Captu
         (["--format", "streamed-sog", "-o", "x.spz"], f"not x.spz; name the output x/{MANIFEST}"),
         (["--format", "streamed-sog", "-o", "web"], f"and folders beside it, not web; name the output web/{MANIFEST}"),
         (["--format", "rad", "-o", MANIFEST], "--format rad writes .rad, not .json"),
-        (["-o", "web/other.json"], ".json cannot hold a tree; name the output .spz, .rad or lod-meta.json"),
+        (
+            ["-o", "web/other.json"],
+            ".json cannot hold a tree; name the output .spz, .rad, lod-meta.json or",
+        ),
         (["--unlod", "-o", MANIFEST], "--unlod writes splats without detail levels, not lod-meta.json"),
         (["--unlod", "--format", "streamed-sog"], "--unlod cannot be used with --format streamed-sog"),
         (["--encoding", "ext", "-o", MANIFEST], "--encoding writes .npz, .bin, .raw, not .json"),

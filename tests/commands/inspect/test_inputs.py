@@ -39,7 +39,7 @@ def test_an_unpacked_sog_counts_as_one_file(tmp_path: Path, capsys: Capture) -> 
     assert capsys.readouterr().out.splitlines() == [
         f"{broken}: error: container.corrupt: 'quats.webp', which it names, cannot be read: no such file or directory",
         f"{tmp_path}: error: file.unreadable: cannot be read: is a directory, without the meta.json of an"
-        " unpacked SOG or a lod-meta.json",
+        " unpacked SOG, a lod-meta.json or a tileset.json",
     ]
 
 
@@ -149,7 +149,7 @@ def test_what_a_plain_file_does_not_have_does_not_hold(capsys: Capture) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_every_short_name_has_a_value_of_a_tree(name: str, capsys: Capture) -> None:
-    files = {"Streamed SOG": STREAMED, "RAD": RAD, "RAD or Streamed SOG": STREAMED}
+    files = {"Streamed SOG": STREAMED, "RAD": RAD, "RAD, Streamed SOG or 3D Tiles": STREAMED}
     assert inspect(files.get(FORMATS.get(name, ""), TREE), "--assert", f"{name}==12345") == 3
     assert f"{name}==12345: {name} is " in capsys.readouterr().out
 
