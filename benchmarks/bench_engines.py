@@ -1,4 +1,4 @@
-"""Loads SOG and Streamed SOG in PlayCanvas and Babylon.js: `python -m benchmarks.bench_engines --help`.
+"""Loads SOG in PlayCanvas and Babylon.js, 3D Tiles in CesiumJS: `python -m benchmarks.bench_engines --help`.
 
 Run it from the repository's root: it imports the tests' program that drives the browser. The engines draw on the
 processor here, so seconds compare files, and say little about what a visitor waits for.
@@ -9,17 +9,21 @@ from __future__ import annotations
 import argparse
 import itertools
 import os
+import re
 import shutil
 import tempfile
 import time
-from collections.abc import Mapping
 from pathlib import Path
 
+import numpy as np
+
+from sparklod_cli.codecs.file_names import TILESET
+from sparklod_cli.codecs.tiles_3d.axes import to_tileset
 from sparklod_cli.io import read_scene
 from sparklod_cli.support import jit
 from sparklod_cli.support.parallel import processors
 from tests.interop.engines.browser import Browser, Shown
-from tests.interop.engines.likeness import likeness, our_picture
+from tests.interop.engines.likeness import like_cesium, likeness, our_picture
 from tests.interop.pictures import cameras_around
 
 HEADINGS = ("scene", "engine", "first frame", "last frame", "levels asked for", "files", "MB", "PSNR", "seconds")
@@ -28,17 +32,21 @@ HEADINGS = ("scene", "engine", "first frame", "last frame", "levels asked for", 
 FARTHER = {"lodBaseDistance: 20": "lodBaseDistance: 1000"}
 
 
+#: How the requests that tell a level begin: for a tile, or the first image of a chunk.
+LEVEL = re.compile(r"(?:tiles/(\d+)-\d+\.glb|(\d+)_\d+/means_l\.webp)$")
+
+
 def levels_of(shown: Shown) -> str:
-    """The levels of the chunks whose images were asked for, in order, and how many of each follow: "2 x1, 0 x4"."""
-    names = [each.name for each in shown.requests if each.name.endswith("/means_l.webp") and each.name[0].isdigit()]
-    levels = itertools.groupby(name.split("_")[0] for name in names)
+    """The levels of the chunks or tiles that were asked for, in order, and how many of each follow: "2 x1, 0 x4"."""
+    names = [found[1] or found[2] for each in shown.requests if (found := LEVEL.match(each.name))]
+    levels = itertools.groupby(names)
     return ", ".join(f"{level} x{len(list(files))}" for level, files in levels)
 
 
 def main() -> None:
     """Prints a Markdown table."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("files", type=Path, nargs="+", help="lod-meta.json of Streamed SOG, and .sog files")
+    parser.add_argument("files", type=Path, nargs="+", help="lod-meta.json, tileset.json and .sog files")
     parser.add_argument("--size", default="320x180", help="width and height in pixels")
     parser.add_argument("--view", type=int, default=1, help="number of the view, 0 to 5")
     arguments = parser.parse_args()
@@ -51,16 +59,20 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         browser = Browser(Path(os.environ["ENGINES_DIR"]), chromium, Path(folder))
         for file in arguments.files:
-            splats = read_scene(file).splats
-            camera = cameras_around(splats.center, *map(int, arguments.size.split("x")))[arguments.view]
-            ours = our_picture(splats, camera)
-            changes: Mapping[str, str] = FARTHER if file.suffix == ".json" else {}
-            for engine in ("PlayCanvas", "Babylon.js"):
+            scene = read_scene(file)
+            camera = cameras_around(scene.splats.center, *map(int, arguments.size.split("x")))[arguments.view]
+            tiled = file.name == TILESET
+            ours = (like_cesium if tiled else our_picture)(scene.splats, camera)
+            for engine in ("CesiumJS",) if tiled else ("PlayCanvas", "Babylon.js"):
                 start = time.perf_counter()
-                if engine == "PlayCanvas":
+                if engine == "CesiumJS":
+                    to_tiles = np.eye(4)
+                    to_tiles[:3, :3] = to_tileset(scene.up)
+                    shown = browser.cesium(file, camera, to_tiles=to_tiles)
+                elif engine == "PlayCanvas":
                     shown = browser.playcanvas(file, camera)
                 else:
-                    shown = browser.babylon(file, camera, changes)
+                    shown = browser.babylon(file, camera, FARTHER if file.suffix == ".json" else {})
                 seconds = time.perf_counter() - start
                 cells = [
                     f"{file.parent.name}/{file.name}",

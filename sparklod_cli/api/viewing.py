@@ -9,7 +9,7 @@ from pathlib import Path
 from ..cameras.frame import Settings, direction_of
 from ..cameras.sources import read_path
 from ..model.transforms import common
-from ..support.errors import memory_errors_translated
+from ..support.errors import SparklodError, memory_errors_translated
 from ..support.progress import Progress, silent
 from ..view.export import check_folder as check_folder
 from ..view.export import export as export
@@ -45,13 +45,16 @@ def prepare(
         up: direction that is up; None for what the files note, or -y.
         budget: splats; None for Spark's default on the device.
         camera_path: file of cameras that the page plays; None for none.
-        spark_dir: folder whose node_modules has Spark, or PlayCanvas, and three.js; None for a CDN.
+        spark_dir: folder whose node_modules has Spark, PlayCanvas or CesiumJS, and three.js; None for a CDN, which has
+            no CesiumJS.
 
     Raises:
         SparklodError: a file or a library is missing or broken, or the camera makes no sense.
     """
     shown = shown_files(paths)
     engine = shown[0].engine
+    if budget is not None and engine == "cesium":
+        raise SparklodError(f"{shown[0].path}: CesiumJS has no budget of splats; leave out --budget")
     libraries = from_cdn(engine) if spark_dir is None else from_folder(spark_dir, engine)
     # Files are read only after the camera path, unless its cameras need their up axis.
     extents = functools.cache(lambda: [extent_of(file, threads=threads, progress=progress) for file in shown])

@@ -1,4 +1,4 @@
-"""`sparklod view`: a page that shows splat files in Spark, or in PlayCanvas."""
+"""`sparklod view`: a page that shows splat files in Spark, PlayCanvas or CesiumJS."""
 
 from __future__ import annotations
 
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 EXAMPLES = """\
   sparklod view scene-lod.rad
   sparklod view web/lod-meta.json                    # in PlayCanvas
+  sparklod view city/tileset.json --spark-dir ~/spark      # in CesiumJS
   sparklod view scene-lod.spz --look-at 0,-1,4:0,0,0 --budget 500k
   sparklod view quick-lod.spz quality-lod.spz        # a box for each
   sparklod view scene-lod.rad --camera-path path.json
@@ -51,7 +52,8 @@ class _Page:
         "Play the cameras of a file, or of a folder written by COLMAP.", InputPath(), heading=COMMON
     )
     spark_dir: Path | None = option(
-        "Take Spark, or PlayCanvas, and three.js from the node_modules of a folder.  [default: from a CDN]",
+        "Take Spark, PlayCanvas or CesiumJS, and three.js from the node_modules of a folder.  [default: from a CDN, but"
+        " for CesiumJS]",
         InputPath(),
         heading=COMMON,
         metavar="DIR",
@@ -116,15 +118,15 @@ HEADINGS = (COMMON, "Page", "Server")
 
 @command("view", _ViewOptions, examples=EXAMPLES, headings=HEADINGS)
 def view(ctx: click.Context, /, **_: Any) -> None:
-    """Show splat files in Spark or PlayCanvas, in a browser.
+    """Show splat files in Spark, PlayCanvas or CesiumJS, in a browser.
 
     Serves a page and the files that it shows, prints its address and opens it in a browser, until Ctrl-C ends it. The
     page has a slider for the budget, colours by level, and what is drawn and how fast; it copies the camera as
     --look-at, and plays camera paths that are dropped onto it.
 
-    Trees in RAD files are streamed, chunk by chunk, as a viewer on the web streams them. Streamed SOG is shown in
-    PlayCanvas, everything else in Spark; both, and three.js, come from a CDN unless --spark-dir names a folder that
-    has them.
+    Trees in RAD files are streamed, chunk by chunk, as a viewer on the web streams them. Streamed SOG and GLB are shown
+    in PlayCanvas, 3D Tiles in CesiumJS, everything else in Spark. Spark, PlayCanvas and three.js come from a CDN unless
+    --spark-dir names a folder that has them; CesiumJS needs one.
     """
     options = values_of(ctx, _ViewOptions)
     files, page, place, general = options.files, options.page, options.place, options.general

@@ -5,6 +5,7 @@ A site is a closed table of names: whatever is not in it is not served, so no na
 
 from __future__ import annotations
 
+import functools
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -12,17 +13,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import quote
 
-from ..codecs.file_names import MANIFEST, META
+from ..codecs.content import Source
+from ..codecs.file_names import META
 from ..codecs.formats import FORMATS, HEAD, sniff
+from ..codecs.glb.codec import open_content as open_glb
+from ..codecs.glb.glb_container import MAGIC as GLB_MAGIC
 from ..codecs.rad.rad_header import MAGIC, RadHeader, read_header
+from ..codecs.tiles_3d.tileset import MAX_TILESET, read_whole
 from ..io.details import read_level_files
-from ..io.local_files import companion_path, companions, in_folder, open_plain, reason_unreadable
+from ..io.local_files import companion_path, companions, in_folder, open_named, open_plain, reason_unreadable
 from ..model.lod_tree import CHUNK_NODES
 from ..support.errors import FormatError, NotSplatsError, UnknownFormatError, UnreadableError
 from ..support.printable import printable
 from ..support.untrusted import quoted_value
 
-#: What Spark calls the formats that sparklod reads; PlayCanvas shows the one that is missing, Streamed SOG.
+#: What Spark calls the formats that sparklod reads.
 SPARK_TYPES = {
     "compressed PLY": "ply",
     "PLY": "ply",
@@ -33,11 +38,14 @@ SPARK_TYPES = {
     "RAD": "rad",
 }
 
+#: What shows the others, but for those that nothing shows.
+OTHER_ENGINES = {"Streamed SOG": "playcanvas", "GLB": "playcanvas", "3D Tiles": "cesium"}
+
 #: How files begin that sparklod reads and Spark 2.2.0 does not, and what they are.
 UNREAD = ((rb"NGSP", "SPZ version 4"), (rb"ply\s+format (?!binary_little)", "PLY that is ascii or big-endian"))
 
 #: What can show files, and its name for display.
-ENGINES = {"spark": "Spark", "playcanvas": "PlayCanvas"}
+ENGINES = {"spark": "Spark", "playcanvas": "PlayCanvas", "cesium": "CesiumJS"}
 
 #: Media types by suffix; anything else is bytes.
 MEDIA_TYPES = {
@@ -64,7 +72,7 @@ class ShownFile:
         name: for display.
         url: where the page finds it, relative to the page.
         format: for display: "RAD", "SPZ".
-        spark_type: what Spark calls its format; None where PlayCanvas shows it.
+        spark_type: what Spark calls its format; None where another engine shows it.
         header: of a RAD file.
         files: itself and what it refers to, by the names that it is served under.
         note: why Spark will not show it; None where nothing is known against it.
@@ -82,7 +90,7 @@ class ShownFile:
     @property
     def engine(self) -> str:
         """Engine that shows the file, one of `ENGINES`."""
-        return "playcanvas" if self.spark_type is None else "spark"
+        return OTHER_ENGINES.get(self.format, "spark")
 
     @property
     def paged(self) -> bool:
@@ -130,31 +138,32 @@ def _named(path: Path, folder: str) -> ShownFile:
 
 
 def _shown(path: Path, folder: str) -> ShownFile:
-    if (in_folder(path) if path.is_dir() else path).name == META:
-        raise NotSplatsError("Spark does not read an unpacked SOG; zip its files into a .sog")
     if path.is_dir():
-        return _shown(path / MANIFEST, folder)
+        return _shown(path / in_folder(path).name, folder)
+    if path.name == META:
+        raise NotSplatsError("Spark does not read an unpacked SOG; zip its files into a .sog")
     if path.exists() and not path.is_file():
         raise UnreadableError("it is a pipe or a device; save it to a file first")
     header = None
     with open_plain(path.resolve()) as file:
         head = file.read(HEAD)
+        file.seek(0)
         if head.startswith(MAGIC):
-            file.seek(0)
             header = read_header(file)
+        elif head.startswith(GLB_MAGIC) and open_glb(Source(file)).format != "GLB":
+            raise NotSplatsError("PlayCanvas does not read the SPZ in it; write it with --glb-profile khronos")
     if not head:
         raise UnreadableError("the file is empty")
     form = sniff(head, path.suffix)
     if form is None:
         raise UnknownFormatError(f"not a splat file that sparklod reads ({', '.join(form.name for form in FORMATS)})")
-    if not form.detailed and form.name not in SPARK_TYPES:
+    if form.name not in SPARK_TYPES | OTHER_ENGINES:
         raise NotSplatsError(f"Spark does not read {form.name}; bake it first with sparklod build-lod")
     name = f"{folder}/{path.name}"
     files = {name: path.resolve()}
-    if form.detailed:
-        files |= {
-            f"{folder}/{companion}": _inside(path, path.parent / companion) for companion in _manifest_files(path)
-        }
+    if form.folders:
+        companions = _tileset_files(path) if form.tiled else _manifest_files(path)
+        files |= {f"{folder}/{each}": _inside(path, path.parent / each) for each in companions}
     elif header is not None:
         files |= {f"{folder}/{chunk}": companion for chunk, companion in _chunk_files(path, header)}
     note = _note(path.name, head, header)
@@ -191,6 +200,15 @@ def _manifest_files(path: Path) -> list[str]:
     if missing is not None:
         raise FormatError(f"its chunk file {quoted_value(missing)} is missing")
     return list(files)
+
+
+def _tileset_files(path: Path) -> list[str]:
+    """Return the names of all files that a tileset refers to; `FormatError` where one is missing or elsewhere."""
+    with open_plain(path.resolve()) as file:
+        tileset = read_whole(file.read(MAX_TILESET + 1), functools.partial(open_named, path, folders=True))
+    for name in (names := list(dict.fromkeys(tileset.names()))):
+        open_named(path, name, folders=True).close()
+    return names
 
 
 def _inside(path: Path, companion: Path) -> Path:

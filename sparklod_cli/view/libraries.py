@@ -11,14 +11,15 @@ from ..io import read_text
 from ..support.errors import SparklodError
 from ..support.printable import printable
 from ..support.untrusted import parse_json
+from .files import ENGINES
 
-SPARK, PLAYCANVAS, THREE = "@sparkjsdev/spark", "playcanvas", "three"
+SPARK, PLAYCANVAS, CESIUM, THREE = "@sparkjsdev/spark", "playcanvas", "cesium", "three"
 
 #: What each engine of `files.ENGINES` needs; the page has its vectors from three.js, whatever draws.
-PACKAGES = {"spark": (SPARK, THREE), "playcanvas": (PLAYCANVAS, THREE)}
+PACKAGES = {"spark": (SPARK, THREE), "playcanvas": (PLAYCANVAS, THREE), "cesium": (CESIUM, THREE)}
 
 #: The versions that the page was tested with.
-VERSIONS = {SPARK: "2.2.0", PLAYCANVAS: "2.23.3", THREE: "0.187.0"}
+VERSIONS = {SPARK: "2.2.0", PLAYCANVAS: "2.23.3", CESIUM: "1.145.0", THREE: "0.187.0"}
 
 #: Serves the files of npm packages as they were published.
 CDN = "https://cdn.jsdelivr.net/npm"
@@ -33,16 +34,34 @@ MODULES = {
     (THREE, "examples/jsm/postprocessing/Pass.js"): "927X5fcqlqKPsXZV1w3tv5BZx797OXX3D/TDJk0FHwJd12z58B5aqS77g5LZoprI",
 }
 
+#: What else an engine loads, as patterns of paths in its package: workers of CesiumJS that pack and sort splats, whose
+#: names of other modules change from version to version; and what every scene of it reads.
+FILES = {
+    CESIUM: (
+        "Build/Cesium/index.js",
+        "Build/Cesium/Workers/chunk-*.js",
+        "Build/Cesium/Workers/gaussianSplat*.js",
+        "Build/Cesium/Workers/transferTypedArrayTest.js",
+        "Build/Cesium/ThirdParty/wasm_splats_bg.wasm",
+        "Build/Cesium/Assets/Images/ion-credit.png",
+        "Build/Cesium/Assets/IAU2006_XYS/*.json",
+    )
+}
+
+#: Packages that do not load where a page may not evaluate text: Knockout, in CesiumJS, looks for `this` so.
+EVALUATING = {CESIUM}
+
 #: What the page and Spark call modules, and what those names begin or are.
 NAMES = {
     SPARK: (SPARK, "dist/spark.module.js"),
     PLAYCANVAS: (PLAYCANVAS, "build/playcanvas.min.mjs"),
+    CESIUM: (CESIUM, "Build/Cesium/index.js"),
     THREE: (THREE, "build/three.module.js"),
     "three/addons/": (THREE, "examples/jsm/"),
 }
 
-#: Accompanies the modules, as the licenses of both packages ask for.
-LICENSE = "LICENSE"
+#: Accompany the modules, as the licenses of all packages ask for: a package has one of these.
+LICENSES = ("LICENSE", "LICENSE.md")
 
 
 @dataclass(frozen=True)
@@ -87,7 +106,16 @@ def _url(base: str, package: str, version: str | None, path: str) -> str:
 
 
 def from_cdn(engine: str = "spark") -> Libraries:
-    """Return the libraries of the CDN for an engine."""
+    """Return the libraries of the CDN for an engine.
+
+    Raises:
+        SparklodError: the engine loads workers, which a browser does not check by digests.
+    """
+    if any(package in FILES for package in PACKAGES[engine]):
+        raise SparklodError(
+            f"{ENGINES[engine]} cannot be taken from a CDN; install it with {_install(Path('DIR'), engine)} and give"
+            " --spark-dir DIR"
+        )
     versions = {package: VERSIONS[package] for package in PACKAGES[engine]}
     integrity = {
         _url(CDN, package, versions[package], path): f"sha384-{digest}"
@@ -104,13 +132,16 @@ def from_folder(folder: Path, engine: str = "spark") -> Libraries:
         SparklodError: a package, or a module of it, is missing; the text says how to install it.
     """
     packages = folder if folder.name == "node_modules" else folder / "node_modules"
-    install = f"npm install --prefix {folder} " + " ".join(f"{name}@{VERSIONS[name]}" for name in PACKAGES[engine])
+    install = _install(folder, engine)
     versions, files = {}, {}
     for package in PACKAGES[engine]:
         if not os.path.isdir(packages / package):  # noqa: PTH112, since `Path.is_dir` fails on names that are too long
             raise SparklodError(f"{packages} has no {package}; install it with {install}")
         versions[package] = _version(packages / package)
-        files[f"lib/{package}/{LICENSE}"] = packages / package / LICENSE
+        home = packages / package
+        for pattern in (*LICENSES, *FILES.get(package, ())):
+            for found in home.glob(pattern):
+                files[f"lib/{package}/{found.relative_to(home).as_posix()}"] = found
     for package, path in MODULES:
         if package in versions:
             files[f"lib/{package}/{path}"] = packages / package / path
@@ -121,6 +152,11 @@ def from_folder(folder: Path, engine: str = "spark") -> Libraries:
         if package in versions and not path.endswith("/") and name not in files:
             raise SparklodError(f"{packages / package} has no {path}; install {package} anew with {install}")
     return Libraries(versions, str(folder), "./lib", {}, files)
+
+
+def _install(folder: Path, engine: str) -> str:
+    """Return the command that installs the packages of an engine in a folder."""
+    return f"npm install --prefix {folder} " + " ".join(f"{name}@{VERSIONS[name]}" for name in PACKAGES[engine])
 
 
 def _version(package: Path) -> str:

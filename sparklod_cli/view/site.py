@@ -30,7 +30,7 @@ from ..io.local_files import leads_away
 from ..support.errors import CameraPathError
 from ..support.untrusted import parse_json, quoted_value
 from .files import Resources, ShownFile
-from .libraries import Libraries
+from .libraries import EVALUATING, Libraries
 from .start import Extent, Start
 
 #: Bytes of a request with camera files, in base64: COLMAP's images.txt of a large scene has 50 MB.
@@ -109,7 +109,7 @@ def frames_of(path: CameraPath) -> dict[str, Any]:
 #: Files of the page, in the package's folder `page`; `INDEX` is a template.
 INDEX = "index.html"
 PAGE = (
-    *("boot.js", "view.js", "spark.js", "playcanvas.js", "scene.js", "sizes.js"),
+    *("boot.js", "view.js", "spark.js", "scene.js", "sizes.js", "playcanvas.js", "cesium.js", "file_state.js"),
     *("controls.js", "panel.js", "player.js", "paths.js", "text.js"),
     "style.css",
 )
@@ -201,6 +201,7 @@ def _file(shown: ShownFile, extent: Extent) -> dict[str, Any]:
         "splats": extent.splats,
         "leaves": extent.leaves,
         "levels": extent.levels,
+        "up": extent.up,
         "chunks": None if shown.header is None else len(shown.header.chunks),
         "first_bytes": None if shown.header is None else sum(entry.bytes for entry in shown.header.chunks[:1]),
         "paged": shown.paged,
@@ -213,10 +214,12 @@ def _index(template: str, title: str, libraries: Libraries) -> str:
     import_map = json.dumps(libraries.import_map(), indent=1).replace("<", "\\u003c")
     digest = base64.b64encode(hashlib.sha256(import_map.encode()).digest()).decode()
     scripts = ["'self'", f"'sha256-{digest}'", "'wasm-unsafe-eval'", *libraries.integrity]
+    if EVALUATING & libraries.versions.keys():
+        scripts.append("'unsafe-eval'")
     policy = {
         "default-src": ["'none'"],
         "script-src": scripts,
-        "worker-src": ["blob:", "data:"],
+        "worker-src": ["'self'", "blob:", "data:"],
         "style-src": ["'self'"],
         "img-src": ["'self'", "data:", "blob:"],
         "connect-src": ["'self'", "data:", "blob:"],

@@ -16,7 +16,7 @@ from ..cameras.frame import DEFAULT_FOV_Y, Settings
 from ..cameras.sources import SingleViews, WholeScene
 from ..codecs.rad.rad_header import RadHeader
 from ..codecs.rad.rad_reader import count_leaves, file_of, read_chunk
-from ..io import read_levels, read_scene
+from ..io import read_levels, read_scene, read_tiles
 from ..io.local_files import open_plain, reason_of
 from ..model.balls import USED, Balls, balls_of
 from ..model.splats import Splats
@@ -48,7 +48,7 @@ class Extent:
 
     Attributes:
         splats: how many, nodes where it is a tree.
-        leaves: how many of a tree, or splats of level 0 where there are detail levels; None without either.
+        leaves: how many of a tree, or splats of full detail where there are levels; None without either.
         balls: what its splats cover; only the coarsest of a large RAD tree.
         sizes: (2,) the range of the feature sizes of its splats, but for a few at either end, world units.
         up: as in `Scene`.
@@ -94,7 +94,9 @@ def extent_of(shown: ShownFile, *, threads: int = 1, progress: Progress = silent
     try:
         if shown.header is not None and shown.header.lod_tree and len(shown.header.chunks) > 1:
             return _coarse_extent(shown, shown.header)
-        if shown.spark_type is None:
+        if shown.format == "3D Tiles":
+            return _tiles_extent(shown.path, threads, progress)
+        if shown.format == "Streamed SOG":
             return _detail_extent(shown.path, threads, progress)
         scene = read_scene(shown.path, columns=USED, threads=threads, progress=progress)
     except SparklodError as error:
@@ -136,6 +138,16 @@ def _detail_extent(path: Path, threads: int, progress: Progress) -> Extent:
     coarsest = scene.splats.take(scene.level(scene.levels - 1))
     balls = balls_of(coarsest, slice(None), np.eye(4))
     return Extent(len(scene.splats), int(scene.counts[:, 0].sum()), balls, _sizes(scene.splats), scene.up, scene.levels)
+
+
+def _tiles_extent(path: Path, threads: int, progress: Progress) -> Extent:
+    """Return the extent of 3D Tiles by the coarsest level that has splats."""
+    scene = read_tiles(path, threads=threads, progress=progress)
+    first = int(scene.level[np.argmax(scene.counts > 0)])
+    coarse = np.repeat(np.isin(np.arange(scene.tiles), scene.at_level(first)), scene.counts)
+    balls = balls_of(scene.splats, coarse, np.eye(4))
+    leaves, levels = int(scene.counts[scene.is_leaf].sum()), int(scene.level.max()) + 1
+    return Extent(len(scene.splats), leaves, balls, _sizes(scene.splats), scene.up, levels)
 
 
 def _sizes(splats: Splats) -> tuple[float, float]:

@@ -1,7 +1,7 @@
-"""Draws the pictures of docs/playcanvas.md anew: `ENGINES_DIR=folder python -m tests.docs.engine_pictures`.
+"""Draws the pictures of docs/playcanvas.md and docs/cesium.md anew: `python -m tests.docs.engine_pictures`.
 
-Chromium shows the demo scene with an environment in the pages that the document gives; the folder's node_modules has
-what `tests/interop/engines/__init__.py` lists.
+ENGINES_DIR names a folder whose node_modules has what `tests/interop/engines/__init__.py` lists. Chromium shows the
+demo scene in the pages that the documents give, with an environment but in CesiumJS.
 """
 
 from __future__ import annotations
@@ -15,9 +15,12 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from tests.conftest import ROOT
-from tests.interop.engines.browser import Browser
+from sparklod_cli.io import read_scene
+from sparklod_cli.lod.tile_settings import TileSettings
+from tests.conftest import FIXTURES, ROOT
+from tests.interop.engines.browser import Browser, Shown
 from tests.interop.engines.conftest import detailed, sky, written
+from tests.tiled import tiled
 
 FOLDER = ROOT / "docs" / "images" / "engines"
 
@@ -25,8 +28,19 @@ FOLDER = ROOT / "docs" / "images" / "engines"
 SIZE, QUALITY = (480, 270), 80
 
 
+#: The demo scene takes this many splats a tile where it is to have three levels.
+TILES = TileSettings(tile_splats=3_000)
+
+#: World units from the middle of the demo scene within which CesiumJS shows it: beyond are stars, whose tiles would
+#: have the camera inside.
+WITHIN = 12.0
+
+#: The pages of CesiumJS by their pictures, as changes.
+CESIUM = {"cesium": {}, "cesium-coarse": {"maximumScreenSpaceError: 16": "maximumScreenSpaceError: 512"}}
+
+
 def main() -> None:
-    """Draw the scene in both engines."""
+    """Draw the scene in all engines."""
     chromium = shutil.which("chromium")
     assert chromium, "Chromium is not installed"
     FOLDER.mkdir(exist_ok=True)
@@ -34,10 +48,18 @@ def main() -> None:
         shot = written(dataclasses.replace(detailed(), environment=sky()), Path(name), SIZE)
         browser = Browser(Path(os.environ["ENGINES_DIR"]), chromium, Path(name))
         for engine, settings in (("playcanvas", {}), ("babylon", None)):
-            rgba = getattr(browser, engine)(shot.file, shot.camera, settings).rgba
-            picture = Image.fromarray(np.round(255 * rgba[..., :3]).astype(np.uint8))
-            picture.save(FOLDER / f"{engine}.webp", quality=QUALITY, method=6)
+            _save(engine, getattr(browser, engine)(shot.file, shot.camera, settings))
+        splats = read_scene(FIXTURES / "demo.ply").splats
+        inner = splats.take(np.linalg.norm(splats.center, axis=1) < WITHIN)
+        tileset = tiled(inner, Path(name), TILES)
+        for picture, changes in CESIUM.items():
+            _save(picture, browser.cesium(tileset, shot.camera, changes))
         browser.close()
+
+
+def _save(name: str, shown: Shown) -> None:
+    picture = Image.fromarray(np.round(255 * shown.rgba[..., :3]).astype(np.uint8))
+    picture.save(FOLDER / f"{name}.webp", quality=QUALITY, method=6)
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ import base64
 import functools
 import hashlib
 import json
+import math
 import os
 import shutil
 import subprocess
@@ -24,16 +25,21 @@ import pytest
 from PIL import Image
 
 from sparklod_cli import read, write
+from sparklod_cli.cameras.camera import Camera
+from sparklod_cli.cameras.pose import look_at
 from sparklod_cli.cli import run
-from sparklod_cli.view.libraries import CDN, MODULES, PACKAGES, PLAYCANVAS, THREE, VERSIONS
+from sparklod_cli.lod.tile_settings import TileSettings
+from sparklod_cli.view.libraries import CDN, CESIUM, MODULES, PACKAGES, PLAYCANVAS, THREE, VERSIONS
 from tests.conftest import FIXTURES
 from tests.interop import npm
 from tests.interop.conftest import PAGE
 from tests.interop.engines import PACKAGES as ENGINES
 from tests.interop.engines.conftest import engines_dir as engines_dir
+from tests.interop.engines.likeness import like_cesium
 from tests.interop.node import Node
 from tests.interop.pictures import psnr
 from tests.signals import heed_signals
+from tests.tiled import tiled
 
 pytestmark = pytest.mark.slow
 
@@ -167,10 +173,13 @@ def shown(tab: Tab, packages: Path, trees: Path) -> Iterator[Tab]:
         yield tab
 
 
-def rendered(file: Path, camera: list[str], out: Path, budget: int = BUDGET) -> np.ndarray[Any, np.dtype[np.float64]]:
+def rendered(
+    file: Path, camera: list[str], out: Path, budget: int | None = BUDGET
+) -> np.ndarray[Any, np.dtype[np.float64]]:
     """The picture of `sparklod render`."""
+    more = [*camera, *(() if budget is None else ("--budget", str(budget)))]
     size = f"{SIZE[0]}x{SIZE[1]}"
-    command = ["render", str(file), *camera, "--budget", str(budget), "--size", size, "--background", "black", "-q"]
+    command = ["render", str(file), *more, "--size", size, "--background", "black", "-q"]
     assert run([*command, "-o", str(out), "--overwrite"]) == 0
     return pixels(out)
 
@@ -206,19 +215,24 @@ def open_slowly(tab: Tab, url: str, file: Path, size: tuple[int, int] = SIZE) ->
     return state
 
 
-def test_streamed_sog_is_shown_in_playcanvas(
-    tab: Tab, packages: Path, trees: Path, tmp_path: Path, request: pytest.FixtureRequest
-) -> None:
-    """From the camera of the page, which it copies out; its modules have the digests that the page asks a CDN for."""
+@pytest.fixture(scope="module")
+def others(packages: Path, tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Path:
+    """A folder whose node_modules has PlayCanvas, CesiumJS and three.js."""
     engines: Path = request.getfixturevalue("engines_dir")
-    (tmp_path / "node_modules").mkdir()
-    for package, folder in ((PLAYCANVAS, engines), (THREE, packages)):
-        (tmp_path / "node_modules" / package).symlink_to(folder / "node_modules" / package)
-    check_digests(tmp_path, (PLAYCANVAS, THREE))
+    folder = tmp_path_factory.mktemp("others")
+    (folder / "node_modules").mkdir()
+    for package, source in ((PLAYCANVAS, engines), (CESIUM, engines), (THREE, packages)):
+        (folder / "node_modules" / package).symlink_to(source / "node_modules" / package)
+    return folder
+
+
+def test_streamed_sog_is_shown_in_playcanvas(tab: Tab, others: Path, trees: Path, tmp_path: Path) -> None:
+    """From the camera of the page, which it copies out; its modules have the digests that the page asks a CDN for."""
+    check_digests(others, (PLAYCANVAS, THREE))
     assert ENGINES[PLAYCANVAS] == VERSIONS[PLAYCANVAS]
     manifest = trees / "web" / "lod-meta.json"
     assert run(["build-lod", str(trees / "demo.ply"), "-o", str(manifest), "-q"]) == 0
-    with Served(tmp_path, manifest, *LOOK) as url:
+    with Served(others, manifest, *LOOK) as url:
         tab.open(url)
         state = tab.settled()
         assert state["faults"] == []
@@ -231,6 +245,37 @@ def test_streamed_sog_is_shown_in_playcanvas(
         assert tab.until(lambda state: state["legend"] is not None)["legend"] == "01"
         tab.ask("fill", id="budget", value="0")
         tab.until(lambda state: 0 < state["drawn"] < SPLATS)
+
+
+@pytest.mark.parametrize("up", [None, "-y"])
+def test_a_glb_is_shown_in_playcanvas(up: str | None, tab: Tab, others: Path, trees: Path, tmp_path: Path) -> None:
+    """Upright whether its node turns it or not."""
+    file = tmp_path / "demo.glb"
+    write(file, replace(read(trees / "demo.ply"), up=up))
+    with Served(others, file, *LOOK) as url:
+        tab.open(url)
+        state = tab.settled()
+        assert (state["faults"], state["message"], state["drawn"]) == ([], None, SPLATS)
+        theirs = tab.picture(tmp_path / "page.png")
+        ours = rendered(file, state["camera"].split(), tmp_path / "r.png", None)
+        assert psnr(theirs - ours) >= LEAST_OF_PLAYCANVAS
+
+
+def test_3d_tiles_are_shown_in_cesium(tab: Tab, others: Path, trees: Path, tmp_path: Path) -> None:
+    """Where their own axes put them, not where they are on the Earth; without any other host."""
+    assert ENGINES[CESIUM] == VERSIONS[CESIUM]
+    place = TileSettings(tile_splats=2_000, lat=47.37, lon=8.54)
+    tileset = tiled(read(trees / "demo.ply").splats, tmp_path, place)
+    with Served(others, tileset, *LOOK) as url:
+        tab.open(url)
+        state = tab.settled()
+        assert (state["faults"], state["message"], state["drawn"]) == ([], None, SPLATS)
+        assert state["camera"] == "--look-at=0,-3.4,9:0,-1.1,0 --fov=40"
+        focal = SIZE[1] / 2 / math.tan(math.radians(40) / 2)
+        pose = look_at(np.array([0, -3.4, 9]), np.array([0, -1.1, 0]), (0, -1, 0))
+        camera = Camera(pose, *SIZE, (focal, focal), (SIZE[0] / 2, SIZE[1] / 2))
+        theirs = tab.picture(tmp_path / "page.png")
+        assert psnr(theirs - like_cesium(read(tileset).splats, camera)[..., :3]) >= LEAST
 
 
 def eye_of(camera: str) -> list[float]:

@@ -51,8 +51,8 @@ async function open({ url, width, height, without = [], hold = false }) {
 function progress() {
   const view = window.sparklod;
   if (!view) return null;
-  const { spark, app } = view.stage;
-  if (app) return { busy: view.files.some((shown) => shown.loading), frame: app.frame, drawn: view.stage.drawn };
+  const { spark, app, scene, drawn } = view.stage;
+  if (!spark) return { busy: view.files.some((shown) => shown.loading), frame: app?.frame ?? scene.frameState.frameNumber, drawn };
   const { camera } = view;
   const { pager } = spark;
   const isPaged = view.files.some((shown) => shown.paged);

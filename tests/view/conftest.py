@@ -13,10 +13,13 @@ from typing import Any
 import pytest
 
 from sparklod_cli.api import viewing
-from sparklod_cli.view.libraries import MODULES, VERSIONS
+from sparklod_cli.lod.tile_settings import TileSettings
+from sparklod_cli.view.libraries import FILES, LICENSES, MODULES, VERSIONS
 from sparklod_cli.view.server import Server
 from sparklod_cli.view.site import Site
 from tests.conftest import FIXTURES
+from tests.scenes import random_splats
+from tests.tiled import tiled
 
 TREE = FIXTURES / "golden" / "tree-v3.spz"
 CHUNKED = FIXTURES / "golden" / "sh3-rad" / "sh3.rad"
@@ -71,6 +74,12 @@ def ask(server: Server, target: str, method: str = "GET", body: bytes | None = N
 
 
 @pytest.fixture(scope="session")
+def tileset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """3D Tiles of several levels."""
+    return tiled(random_splats(300), tmp_path_factory.mktemp("tiles"), TileSettings(tile_splats=40))
+
+
+@pytest.fixture(scope="session")
 def site() -> Site:
     """A tree, and a RAD file whose chunks are files of their own."""
     return prepared([TREE, CHUNKED])
@@ -85,13 +94,14 @@ def server(site: Site) -> Iterator[Server]:
 
 @pytest.fixture
 def packages(tmp_path: Path) -> Path:
-    """A folder whose node_modules looks as if Spark and three.js were installed."""
+    """A folder whose node_modules looks as if all packages of `VERSIONS` were installed."""
     root = tmp_path / "packages" / "node_modules"
     for package, version in VERSIONS.items():
         (root / package).mkdir(parents=True)
         (root / package / "package.json").write_text(f'{{"version": "{version}"}}')
-        (root / package / "LICENSE").write_text(f"license of {package}")
-    for package, path in MODULES:
+        (root / package / LICENSES[package in FILES]).write_text(f"license of {package}")
+    named = [(package, pattern.replace("*", "one")) for package, patterns in FILES.items() for pattern in patterns]
+    for package, path in (*MODULES, *named):
         (root / package / path).parent.mkdir(parents=True, exist_ok=True)
         (root / package / path).write_text(f"// {package} {path}")
     return root.parent

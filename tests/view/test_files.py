@@ -14,7 +14,7 @@ import pytest
 
 import sparklod_cli as sparklod
 from sparklod_cli.codecs.rad.rad_header import RadChunkEntry, RadHeader, pack_header, read_chunk_header
-from sparklod_cli.io import read_levels
+from sparklod_cli.io import read_levels, read_tiles
 from sparklod_cli.support.errors import CameraPathError, FormatError, SparklodError
 from sparklod_cli.view.files import shown_files
 from tests.conftest import FIXTURES
@@ -95,6 +95,34 @@ def test_streamed_sog_is_framed_without_its_environment(tmp_path: Path) -> None:
     del manifest["environment"]
     (tmp_path / "web" / "lod-meta.json").write_text(json.dumps(manifest))
     assert settings_of(tmp_path / "web")["start"] == start
+
+
+def test_3d_tiles_are_shown_by_cesium_with_all_their_tiles(tileset: Path, packages: Path) -> None:
+    settings = settings_of(tileset, spark_dir=packages)
+    (file,) = settings["files"]
+    scene = read_tiles(tileset)
+    assert (settings["engine"], file["url"], file["up"]) == ("cesium", "data/0/tileset.json", "-y")
+    assert (file["splats"], file["leaves"], file["levels"]) == (len(scene.splats), 300, int(scene.level.max()) + 1)
+    names = {f"data/0/{each.relative_to(tileset.parent).as_posix()}" for each in tileset.parent.rglob("*.*")}
+    site = prepared([tileset.parent], spark_dir=packages)
+    assert {each for each in site.resources if each.startswith("data/")} == names
+
+
+def test_3d_tiles_have_no_budget(tileset: Path, packages: Path) -> None:
+    with pytest.raises(SparklodError, match=r"CesiumJS has no budget of splats; leave out --budget$"):
+        prepared([tileset], spark_dir=packages, budget=1_000)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="POSIX only")
+def test_a_missing_tile_and_a_tile_that_is_a_link_are_refused(tileset: Path, tmp_path: Path) -> None:
+    shutil.copytree(tileset.parent, tmp_path / "web")
+    tile = tmp_path / "web" / "tiles" / "0-0.glb"
+    tile.rename(tmp_path / "away.glb")
+    with pytest.raises(FormatError, match=r"'tiles/0-0\.glb'"):
+        shown_files([tmp_path / "web"])
+    tile.symlink_to(tmp_path / "away.glb")
+    with pytest.raises(FormatError, match=r"is a link to another folder; copy it there"):
+        shown_files([tmp_path / "web"])
 
 
 def test_files_of_different_engines_are_refused_together() -> None:
@@ -272,6 +300,15 @@ def test_a_name_that_is_no_text_is_shown_escaped(tmp_path: Path) -> None:
     assert (file["name"], file["url"]) == (r"\xff.spz", "data/0/%FF.spz")
 
 
+def test_a_glb_is_shown_by_playcanvas_unless_it_has_spz_inside() -> None:
+    settings = settings_of(GOLDEN / "sh2.glb")
+    assert (settings["engine"], settings["files"][0]["levels"]) == ("playcanvas", None)
+    with pytest.raises(
+        FormatError, match=r"hand-spz\.glb: PlayCanvas does not read the SPZ in it; write it with --glb"
+    ):
+        shown_files([GOLDEN / "hand-spz.glb"])
+
+
 def test_a_format_that_no_engine_of_the_page_reads_is_refused() -> None:
-    with pytest.raises(FormatError, match=r"sh2\.glb: Spark does not read GLB; bake it first with sparklod build-lod"):
-        shown_files([GOLDEN / "sh2.glb"])
+    with pytest.raises(FormatError, match=r"gsplat\.pt: Spark does not read checkpoint; bake it first with sparklod"):
+        shown_files([GOLDEN / "sh2-gsplat.pt"])

@@ -12,17 +12,24 @@ from pathlib import Path
 import pytest
 
 from sparklod_cli.support.errors import SparklodError
-from sparklod_cli.view.libraries import MODULES, PACKAGES, VERSIONS, from_cdn, from_folder
+from sparklod_cli.view.libraries import LICENSES, MODULES, PACKAGES, VERSIONS, from_cdn, from_folder
+from sparklod_cli.view.site import Site
 from tests.conftest import FIXTURES
 from tests.view.conftest import TREE, prepared
 
-#: A file of each engine.
-SHOWN = {"spark": TREE, "playcanvas": FIXTURES / "golden" / "sh1-streamed-sog"}
+#: Engines that come from a CDN.
+ON_CDN = [engine for engine in PACKAGES if engine != "cesium"]
 
 
-def page_of(libraries: Path | None, engine: str) -> tuple[dict[str, dict[str, str]], str]:
+@pytest.fixture
+def shown(tileset: Path) -> dict[str, Path]:
+    """A file of each engine."""
+    return {"spark": TREE, "playcanvas": FIXTURES / "golden" / "sh1-streamed-sog", "cesium": tileset}
+
+
+def page_of(site: Site) -> tuple[dict[str, dict[str, str]], str]:
     """The import map of the page, and its policy."""
-    index = prepared([SHOWN[engine]], spark_dir=libraries).resources["index.html"]
+    index = site.resources["index.html"]
     assert isinstance(index, bytes)
     found = re.search(r'<script type="importmap">(.*?)</script>', index.decode(), re.DOTALL)
     policy = re.search(r'http-equiv="Content-Security-Policy" content="([^"]*)"', index.decode())
@@ -32,9 +39,9 @@ def page_of(libraries: Path | None, engine: str) -> tuple[dict[str, dict[str, st
     return json.loads(found[1]), html.unescape(policy[1])
 
 
-@pytest.mark.parametrize("engine", PACKAGES)
-def test_the_cdn_is_asked_for_fixed_versions_by_their_digests(engine: str) -> None:
-    mapped, policy = page_of(None, engine)
+@pytest.mark.parametrize("engine", ON_CDN)
+def test_the_cdn_is_asked_for_fixed_versions_by_their_digests(engine: str, shown: dict[str, Path]) -> None:
+    mapped, policy = page_of(prepared([shown[engine]]))
     assert all(url.startswith("https://") for url in mapped["imports"].values())
     assert len(mapped["integrity"]) == sum(package in PACKAGES[engine] for package, _ in MODULES)
     for url, digest in mapped["integrity"].items():
@@ -45,15 +52,23 @@ def test_the_cdn_is_asked_for_fixed_versions_by_their_digests(engine: str) -> No
 
 
 @pytest.mark.parametrize("engine", PACKAGES)
-def test_a_folder_needs_no_other_host(packages: Path, engine: str) -> None:
-    mapped, policy = page_of(packages, engine)
+def test_a_folder_needs_no_other_host(packages: Path, engine: str, shown: dict[str, Path]) -> None:
+    site = prepared([shown[engine]], spark_dir=packages)
+    mapped, policy = page_of(site)
     assert "http" not in json.dumps(mapped) + policy
-    site = prepared([SHOWN[engine]], spark_dir=packages)
+    assert ("'unsafe-eval'" in policy) == (engine == "cesium")
     for url in mapped["imports"].values():
         name = url.removeprefix("./")
         assert any(each == name or (url.endswith("/") and each.startswith(name)) for each in site.resources)
-    licenses = [name for name in site.resources if name.endswith("/LICENSE")]
+    licenses = [name for name in site.resources if name.endswith(LICENSES)]
     assert len(licenses) == len(PACKAGES[engine])
+
+
+def test_workers_come_with_an_engine_and_from_no_cdn(packages: Path, tileset: Path) -> None:
+    site = prepared([tileset], spark_dir=packages)
+    assert "lib/cesium/Build/Cesium/Workers/gaussianSplatone.js" in site.resources
+    with pytest.raises(SparklodError, match=r"^CesiumJS cannot be taken from a CDN; install it with npm .* cesium@"):
+        prepared([tileset])
 
 
 def test_node_modules_itself_can_be_given(packages: Path) -> None:

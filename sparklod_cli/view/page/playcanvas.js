@@ -1,52 +1,57 @@
-// PlayCanvas in a canvas: what view.js draws Streamed SOG with. The members of Stage are those of spark.js.
+// PlayCanvas in a canvas: what view.js draws Streamed SOG and GLB with. The members of Stage are those of spark.js.
 import * as pc from 'playcanvas';
-import { size, whole } from './text.js';
+import { Quaternion } from 'three';
+import { FileState } from './file_state.js';
+import { direction, size, whole } from './text.js';
+import { upright } from './view.js';
 
 /** The colours that PlayCanvas gives to detail levels, the finest first; it repeats them. */
 const COLORS = ['#f00', '#0f0', '#00f', '#ff0', '#f0f', '#0ff', '#ff8000', '#8000ff'];
 const UNDERFILL = 10; // coarser levels are drawn while finer ones load
 const REQUESTS = 100_000; // that the browser keeps the sizes of
 
-class ShownFile {
+class ShownFile extends FileState {
   constructor(app, file, changed, failed) {
-    Object.assign(this, { file, changed, failed, visible: true, builds: false, isTree: true, loading: true, bad: false, state: '' });
+    super(file, changed, failed);
     const { href } = new URL(file.url, document.baseURI);
     this.folder = href.slice(0, href.lastIndexOf('/') + 1);
-    this.asset = new pc.Asset(file.name, 'gsplat', { url: href });
+    this.asset = new pc.Asset(file.name, file.levels === null ? 'container' : 'gsplat', { url: href });
     this.asset.on('error', (error) => this.fail(error));
     this.entity = new pc.Entity(file.name, app);
     this.app = app;
   }
 
   load() {
-    this.entity.addComponent('gsplat', { asset: this.asset, unified: true });
     this.app.assets.add(this.asset);
     this.app.root.addChild(this.entity);
+    if (this.file.levels !== null) {
+      this.entity.addComponent('gsplat', { asset: this.asset, unified: true });
+    } else {
+      this.asset.ready(({ resource }) => this.entity.addChild(resource.instantiateRenderEntity()));
+      this.app.assets.load(this.asset);
+    }
     this.report();
+  }
+
+  /** Turns the splats; the nodes of a GLB have turned them already. */
+  turn(quaternion) {
+    const back = this.file.levels === null ? upright(direction(this.file.up ?? 'y')).invert() : new Quaternion();
+    const { x, y, z, w } = quaternion.clone().multiply(back);
+    this.entity.setLocalRotation(x, y, z, w);
   }
 
   /** Says what it is, and how much of it has arrived. */
   report() {
-    if (this.bad) return;
-    const { bytes, format, levels, leaves } = this.file;
+    const { bytes, format, levels, leaves, splats } = this.file;
+    const what = levels === null ? `${whole(splats)} splats` : `${levels} levels of ${whole(leaves)} splats`;
     const arrived = performance.getEntriesByType('resource').filter(({ name }) => name.startsWith(this.folder));
     const loaded = `${size(arrived.reduce((sum, entry) => sum + entry.encodedBodySize, 0))} of ${size(bytes)}`;
-    const state = this.loading ? `loading ${loaded}` : `${format}, ${loaded} loaded, ${levels} levels of ${whole(leaves)} splats`;
-    if (state === this.state) return;
-    this.state = state;
-    this.changed(this);
+    this.say(this.loading ? `loading ${loaded}` : `${format}, ${loaded} loaded, ${what}`);
   }
 
   show(visible) {
-    this.visible = this.entity.enabled = visible;
-    this.changed(this);
-  }
-
-  fail(error) {
-    const text = String(error?.message ?? error);
-    Object.assign(this, { loading: false, bad: true, state: `cannot be shown: ${text}` });
-    this.changed(this);
-    this.failed(`${this.file.name} ${this.state}`);
+    this.entity.enabled = visible;
+    super.show(visible);
   }
 }
 
@@ -72,8 +77,8 @@ export class Stage {
     return this.files.at(-1);
   }
 
-  turn({ x, y, z, w }) {
-    for (const { entity } of this.files) entity.setLocalRotation(x, y, z, w);
+  turn(quaternion) {
+    for (const shown of this.files) shown.turn(quaternion);
   }
 
   resize(ratio, width, height) {

@@ -1,4 +1,4 @@
-// The page: a stage, which draws with Spark or PlayCanvas, the camera, and the panel that steers both.
+// The page: a stage, which draws with Spark, PlayCanvas or CesiumJS, the camera, and the panel that steers both.
 import { PerspectiveCamera, Quaternion, Vector3 } from 'three';
 import { Controls } from './controls.js';
 import { clearMessage, copyField, covered, drawLegend, element, listFiles, listen, notice, onDrop, showPanel } from './panel.js';
@@ -13,7 +13,7 @@ const SMOOTHING = 0.1; // share of a frame in the frame time that is shown
 const FRAMED = 16 / 9; // width to height that the first look was chosen for
 
 /** The turn that makes a direction +y, which is up for three. */
-function upright(up) {
+export function upright(up) {
   const from = new Vector3(...up).normalize();
   return from.y < -1 + 1e-9 ? new Quaternion(1, 0, 0, 0) : new Quaternion().setFromUnitVectors(from, UP);
 }
@@ -118,6 +118,9 @@ class View {
   }
 
   firstBudget() {
+    // CesiumJS goes by errors on the screen, and has no colours of levels.
+    element('detail').hidden = this.stage.defaultBudget === null;
+    if (this.stage.defaultBudget === null) return;
     const budget = this.settings.budget ?? this.stage.defaultBudget;
     const most = this.budgetAt(1);
     this.setBudget(Math.log(budget / LEAST_BUDGET) / Math.log(most / LEAST_BUDGET));

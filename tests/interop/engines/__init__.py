@@ -1,4 +1,4 @@
-"""Engines that show SOG and Streamed SOG: PlayCanvas, SuperSplat's viewer and Babylon.js; and splat-transform."""
+"""Engines: PlayCanvas, SuperSplat's viewer and Babylon.js show SOG, CesiumJS 3D Tiles; and splat-transform."""
 
 from __future__ import annotations
 
@@ -10,5 +10,6 @@ PACKAGES = {
     "@babylonjs/core": "9.34.0",
     "@babylonjs/loaders": "9.28.0",
     "fflate": "0.8.3",
+    "cesium": "1.145.0",
     "playwright-core": "1.65.1",
 }

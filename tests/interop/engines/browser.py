@@ -23,6 +23,8 @@ HERE = Path(__file__).parent
 TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
 #: To those of glTF: half a turn about x.
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+#: To those of 3D Tiles, z up: a quarter turn about x from those of glTF.
+TO_TILES = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]]) @ FLIP
 #: To those of Babylon.js, whose axes are left-handed with y up.
 MIRROR = np.diag([1.0, -1.0, 1.0])
 #: Planes between which splats are drawn, world units.
@@ -62,11 +64,13 @@ class Shown:
         rgba: (height, width, 4) float64, 0..1, when all was loaded.
         frames: the number of splats in the first frame that drew any, and in each that drew another number.
         requests: for files of the scene, in order.
+        tiles: of 3D Tiles, names of those that the picture shows, in order.
     """
 
     rgba: NDArray[np.float64]
     frames: list[int]
     requests: list[Request]
+    tiles: list[str]
 
 
 class Browser:
@@ -125,6 +129,31 @@ class Browser:
             html = recipes.babylon_of_one_file(file.name)
         return self._show(recipes.replaced(html, changes or {}), "babylon.js", file, camera, view)
 
+    def cesium(
+        self,
+        file: Path,
+        camera: Camera,
+        changes: Mapping[str, str] | None = None,
+        to_tiles: NDArray[np.float64] = TO_TILES,
+    ) -> Shown:
+        """What CesiumJS shows of a tileset.
+
+        Args:
+            changes: replace text of its page.
+            to_tiles: (4, 4) from the axes of the splats to those of the tileset.
+        """
+        pose = to_tiles @ camera.camera_to_world
+        view = {
+            "position": pose[:3, 3].tolist(),
+            "right": pose[:3, 0].tolist(),
+            "up": pose[:3, 1].tolist(),
+            "ahead": (-pose[:3, 2]).tolist(),
+            "fov": max(camera.fov_x, camera.fov_y),
+            "near": NEAR,
+            "far": FAR,
+        }
+        return self._show(recipes.replaced(recipes.cesium(), changes or {}), "cesium.js", file, camera, view)
+
     def still(self, html: str, folder: Path, size: tuple[int, int]) -> NDArray[np.float64]:
         """(height, width, 3) what a page shows by itself of the files of a folder, 0..1."""
         width, height = size
@@ -139,4 +168,5 @@ class Browser:
         answer = self._node.ask({"do": "draw", "camera": view, "out": str(self._out)})
         requests = self._node.ask({"do": "requests"})["requests"]
         rgba = np.fromfile(self._out, "u1").reshape(camera.height, camera.width, 4)[::-1] / 255
-        return Shown(rgba, answer["frames"], [Request(**each) for each in requests])
+        tiles = sorted(answer.get("tiles", ()))
+        return Shown(rgba, answer["frames"], [Request(**each) for each in requests], tiles)

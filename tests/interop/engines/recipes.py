@@ -10,6 +10,8 @@ from tests.conftest import ROOT
 
 #: Headings of the engines' sections.
 PLAYCANVAS, SUPERSPLAT, BABYLON = "PlayCanvas", "SuperSplat's viewer", "Babylon.js"
+#: Headings in docs/cesium.md: of its page.
+CESIUM = "A page"
 #: Headings in docs/spark.md: of its page, and of the lines that change where a tree is streamed.
 SPARK, STREAMED = "A page", "Streamed"
 #: Names of the scene in the pages.
@@ -54,6 +56,12 @@ def spark(*, streamed: bool) -> str:
     first = next(line for line in html.splitlines() if "new SparkRenderer(" in line)
     second = next(line for line in html.splitlines() if "new SplatMesh(" in line)
     return replaced(html, {f"{first}\n{second}\n": lines})
+
+
+def cesium() -> str:
+    """The page of docs/cesium.md, which shows tileset.json."""
+    (html,) = blocks(CESIUM, "html", "cesium.md")
+    return html
 
 
 def replaced(html: str, changes: Mapping[str, str]) -> str:
