@@ -23,6 +23,7 @@ from ..support.jit import threads_for
 from ..support.parallel import blocks_of
 from ..support.progress import Progress, silent
 from .families import families_of, node_order, reordered
+from .kernels import family_rows
 from .kernels.chunk_sets import DEMAND_BYTES, LANES, Families, fill_demand, sort_within_chunks, split_sets
 from .kernels.pixel_scale import NODE, VIEW
 from .kernels.sort import sort_by_key
@@ -154,11 +155,10 @@ def _families(
     threads: int,
 ) -> Families:
     """Return the families in an order."""
-    records = np.empty(len(order), NODE)
-    records["x"], records["y"], records["z"] = center[order].T
-    records["size"], records["child_count"] = size[order], count[order]
-    records["child_start"] = 0  # not read
-    parent, rank, views = _parents_in(order, parent), _ranks_in(order, center, threads), viewpoints(center[order])
+    records = np.zeros(len(order), NODE)
+    family_rows.fill_parents(order, center, size, count, records)
+    parent, rank = family_rows.parents_in(order, parent), _ranks_in(order, center, threads)
+    views = viewpoints(center[order])
     demand = np.empty((len(order), VIEWPOINTS), np.uint8)
     total = 1 + int(count.sum(dtype=np.int64))
     least = min(total * LEAST_BUDGET, float(CHUNK_NODES))
@@ -166,22 +166,13 @@ def _families(
     return Families(parent, count[order].astype(np.int32), rank, demand)
 
 
-def _parents_in(order: NDArray[np.uint32], parent: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Return the (F,) place of each family's parent, -1 without one, where families are in an order."""
-    place = np.empty(len(order), np.int32)
-    place[order] = np.arange(len(order), dtype=np.int32)
-    above = parent[order]
-    return np.where(above < 0, np.int32(-1), place[above])
-
-
 def _ranks_in(order: NDArray[np.uint32], center: FloatArray, threads: int) -> NDArray[np.int32]:
     """Return the (F, 3) ranks of the centres along each axis, where families are in an order."""
     rank = np.empty((len(order), 3), np.int32)
     for axis in range(3):
-        bits = center[order, axis].view(np.uint32)
-        ordered = np.where(bits >> 31, ~bits, bits | np.uint32(1 << 31))  # in the order of the numbers
-        _, by_place = sort_by_key(ordered.astype(np.uint64), np.arange(len(order), dtype=np.uint32), 32, threads)
-        rank[by_place, axis] = np.arange(len(order), dtype=np.int32)
+        keys = family_rows.axis_keys(center, order, axis)
+        _, by_place = sort_by_key(keys, np.arange(len(order), dtype=np.uint32), 32, threads)
+        family_rows.fill_ranks(by_place, axis, rank)
     return rank
 
 

@@ -178,9 +178,7 @@ class BinaryTree:
 
     def rows_of(self, nodes: Nodes) -> Nodes:
         """Return the (n,) rows of nodes; those of leaves that are merged have other content by now."""
-        found = nodes.copy()
-        merged = nodes >= self.leaves
-        found[merged] = self.row[nodes[merged] - np.uint32(self.leaves)]
+        found: Nodes = node_rows.rows_of(nodes, self.row, self.leaves)
         return found
 
     def keep_rows(self, slots: Nodes) -> None:
@@ -267,15 +265,16 @@ def _merge(
         with threads_for(len(active)) as threads:
             at = binary.rows_of(active)
             order = curve.sort(binary.rows, at, binary.rounds, threads)
-            active, at = active[order], at[order]
+            active, at = node_rows.taken(active, order), node_rows.taken(at, order)
             partner, cost = pair_cost.find_partners(binary.rows, at, WINDOW, np.float32(largest))
             del at
             before = len(active)
-            pairs, rest = pair_cost.match_pairs(active, partner, cost, _largest_cost(cost), binary.used)
+            pairs, rest = pair_cost.match_pairs(active, partner, cost, _largest_cost(cost), binary.used, threads)
             if rounds is None and not len(pairs):  # no finite cost: too far apart for float32
                 partner = np.arange(before, dtype=np.int32) ^ 1
                 partner[partner >= before] = -1
-                pairs, rest = pair_cost.match_pairs(active, partner, np.zeros_like(cost), np.float32(0), binary.used)
+                free = np.zeros_like(cost)
+                pairs, rest = pair_cost.match_pairs(active, partner, free, np.float32(0), binary.used, threads)
             active = rest
             columns = binary.rows, binary.row, binary.spare, binary.children, binary.size, binary.error
             pair_merge.merge_pairs(pairs, binary.used, leaves, *columns)

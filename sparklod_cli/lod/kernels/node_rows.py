@@ -90,6 +90,30 @@ def fill_leaf_rows(index, splats, rgb, space, rows, size):
         size[i] = max(2 * (a + b + c) / 3, LEAST)
 
 
+@kernel(u4[:], u4[:], i8, parallel=True)
+def rows_of(nodes, row, leaves):
+    """Return the (n,) uint32 rows of nodes: those of leaves are their own.
+
+    Args:
+        nodes: (n,) uint32.
+        row: (nodes - leaves,) uint32 row of each merged node.
+        leaves: number of leaves; nodes from there on are merged.
+    """
+    found = np.empty(len(nodes), np.uint32)
+    for i in prange(len(nodes)):
+        found[i] = nodes[i] if nodes[i] < leaves else row[nodes[i] - leaves]
+    return found
+
+
+@kernel(u4[:], u4[:], parallel=True)
+def taken(values, order):
+    """Return (n,) uint32 `values[order]`."""
+    found = np.empty(len(order), np.uint32)
+    for i in prange(len(order)):
+        found[i] = values[order[i]]
+    return found
+
+
 @kernel(f4[:, :], u4[:], f8[:], f8, parallel=True)
 def morton_keys(rows, nodes, low, step):
     """Return Morton codes of nodes, of CURVE_BITS per axis; centres outside the curve's box are clamped to it.

@@ -162,8 +162,8 @@ def keep_cheaper(cost, count, best, at, here, there):
         at[i] = new if lower else at[i]
 
 
-@kernel(u4[:], i4[:], f4[:], f4, i8)
-def match_pairs(nodes, partner, cost, limit, made):
+@kernel(u4[:], i4[:], f4[:], f4, i8, i8, parallel=True)
+def match_pairs(nodes, partner, cost, limit, made, blocks):
     """Return pairs of nodes that are each other's cheapest partner, and the list in which merged nodes replace them.
 
     Args:
@@ -171,24 +171,38 @@ def match_pairs(nodes, partner, cost, limit, made):
         partner, cost: of `find_partners`.
         limit: largest cost of a pair, float32.
         made: the node that the first pair is merged into; the next pair's is one more.
+        blocks: ranges of nodes to process in parallel; the result does not depend on it.
 
     Returns:
         pairs: (P, 2) uint32.
         rest: (n - P,) uint32, the list in its order; a merged node replaces the first of its pair.
     """
     n = len(nodes)
-    mutual = 0
-    for i in range(n):
-        j = partner[i]
-        mutual += (j > i) & (partner[j] == i) & (cost[i] <= limit)
-    # One more than there are: each step writes where the next pair will be, as branches would be mispredicted.
-    pairs, rest = np.empty((mutual + 1, 2), np.uint32), np.empty(n - mutual + 1, np.uint32)
-    found = left = 0
-    for i in range(n):
-        j = partner[i]
-        merges = (j >= 0) & (partner[j] == i) & (cost[i] <= limit)
-        pairs[found, 0], pairs[found, 1] = nodes[i], nodes[j]
-        rest[left] = made + found if merges else nodes[i]
-        found += merges & (j > i)
-        left += not (merges & (j < i))
-    return pairs[:mutual], rest[: n - mutual]
+    begin = np.zeros(blocks + 1, np.int64)  # pairs whose first node is in a block before
+    second = np.zeros(blocks + 1, np.int64)  # second nodes of pairs in a block before
+    for block in prange(blocks):
+        mutual = behind = 0
+        for i in range(n * block // blocks, n * (block + 1) // blocks):
+            j = partner[i]
+            merges = (j >= 0) & (partner[j] == i) & (cost[i] <= limit)
+            mutual += merges & (j > i)
+            behind += merges & (j < i)
+        begin[block + 1], second[block + 1] = mutual, behind
+    for block in range(blocks):
+        begin[block + 1] += begin[block]
+        second[block + 1] += second[block]
+    pairs, rest = np.empty((begin[blocks], 2), np.uint32), np.empty(n - begin[blocks], np.uint32)
+    for block in prange(blocks):
+        found = begin[block]
+        left = n * block // blocks - second[block]
+        for i in range(n * block // blocks, n * (block + 1) // blocks):
+            j = partner[i]
+            merges = (j >= 0) & (partner[j] == i) & (cost[i] <= limit)
+            if merges & (j < i):
+                continue
+            rest[left] = made + found if merges else nodes[i]
+            left += 1
+            if merges:
+                pairs[found, 0], pairs[found, 1] = nodes[i], nodes[j]
+                found += 1
+    return pairs, rest

@@ -151,7 +151,7 @@ def drop_nodes(leaves, most, parent, log_size, lost, weight, saved, blocks):
     kept = np.empty(slots, np.uint32)  # the first `many`: merged nodes but the root, less `leaves`, parents first
     for slot in range(slots):
         kept[slot] = slots - 1 - slot
-    keys = np.empty(slots, np.uint16)
+    keys, others = np.empty(slots, np.uint16), np.empty(slots, np.uint32)
     turn, children = ROUNDS, MOST_CHILDREN
     while left > most:  # also after ROUNDS, where nodes gained usefulness as their children were dropped
         counts = np.zeros((blocks, 1 << KEY_BITS), np.int32)
@@ -193,15 +193,27 @@ def drop_nodes(leaves, most, parent, log_size, lost, weight, saved, blocks):
                 left -= 1
                 if above < slots:
                     keys[above] = 0  # its usefulness has changed, and is computed again when its turn comes
-        after = 0
-        for i in range(many):
-            node = kept[i]
-            above = parent[node + leaves]
-            if saved[above - leaves] == -1:
-                parent[node + leaves] = parent[above]
-            kept[after] = node
-            after += saved[node] != -1
-        many = after
+        left_in = np.zeros(blocks + 1, np.int64)  # of the blocks before
+        for block in prange(blocks):
+            here = 0
+            for i in range(many * block // blocks, many * (block + 1) // blocks):
+                here += saved[kept[i]] != -1
+            left_in[block + 1] = here
+        for block in range(blocks):
+            left_in[block + 1] += left_in[block]
+        for block in prange(blocks):
+            after = left_in[block]
+            for i in range(many * block // blocks, many * (block + 1) // blocks):
+                node = kept[i]
+                if saved[node] == -1:
+                    continue
+                # Dropped nodes keep the parent that they had, so that no thread reads what another one writes.
+                while saved[parent[node + leaves] - leaves] == -1:
+                    parent[node + leaves] = parent[parent[node + leaves]]
+                others[after] = node
+                after += 1
+        many = left_in[blocks]
+        kept, others = others, kept
         turn = max(turn - 1, 1)
     for block in prange(blocks):
         for leaf in range(leaves * block // blocks, leaves * (block + 1) // blocks):

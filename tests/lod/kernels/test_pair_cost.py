@@ -49,14 +49,16 @@ def test_among_equal_rows_half_find_each_other() -> None:
     for count in (2, 3, 100, pair_cost.BLOCK + 1, 3 * pair_cost.BLOCK + 7):
         rows = np.repeat(twin.random_rows(1, seed=3), count, axis=0)
         nodes = np.arange(count, dtype=np.uint32)
-        found, _ = pair_cost.match_pairs(nodes, *pair_cost.find_partners(rows, nodes, 12, NO_LIMIT), NO_LIMIT, count)
+        found, _ = pair_cost.match_pairs(nodes, *pair_cost.find_partners(rows, nodes, 12, NO_LIMIT), NO_LIMIT, count, 2)
         assert 4 * 2 * len(found) >= count
 
 
-@given(st.integers(1, 80), st.integers(1, 12), st.integers(0, 1000), st.floats(0, 1), st.booleans())
+@given(
+    st.integers(1, 80), st.integers(1, 12), st.integers(0, 1000), st.floats(0, 1), st.booleans(), st.integers(1, 100)
+)
 @settings(max_examples=80)
 def test_pairs_are_disjoint_and_mutual_and_nobody_is_lost(
-    count: int, window: int, seed: int, share: float, coincident: bool
+    count: int, window: int, seed: int, share: float, coincident: bool, blocks: int
 ) -> None:
     rows = twin.random_rows(count, seed)
     if coincident:  # some are equal
@@ -64,7 +66,7 @@ def test_pairs_are_disjoint_and_mutual_and_nobody_is_lost(
     nodes = np.random.default_rng(seed + 1).permutation(count).astype(np.uint32)
     partner, cost = pair_cost.find_partners(rows, nodes, window, NO_LIMIT)
     limit = np.float32(np.quantile(cost, share)) if count > 1 else NO_LIMIT
-    found, rest = pair_cost.match_pairs(nodes, partner, cost, limit, 1000)
+    found, rest = pair_cost.match_pairs(nodes, partner, cost, limit, 1000, blocks)
 
     place = {int(node): i for i, node in enumerate(nodes)}
     expected = [(i, int(partner[i])) for i in range(count) if i < partner[i] and partner[partner[i]] == i]
