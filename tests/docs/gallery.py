@@ -36,7 +36,7 @@ OF_A_BROWSER = {"browser.webp"}
 QUALITY = 85
 
 #: Scripts that end only when they are stopped: servers.
-SERVERS = re.compile(r"\Asparklod view (?!.*--export)|http\.server", re.MULTILINE)
+SERVERS = re.compile(r"^sparklod view (?!.*--export)|http\.server", re.MULTILINE)
 
 
 def folder_of(page: Path) -> Path:

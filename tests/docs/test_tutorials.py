@@ -59,7 +59,8 @@ def is_same(shown: str, line: str) -> bool:
 
 def check_server(shell: Shell, script: str) -> None:
     """Start the server of a script at any free port, fetch its page, and stop it."""
-    script = script.strip().replace(" 8000 ", " 0 ")
+    (line,) = script.splitlines()
+    script = line.replace(" 8000 ", " 0 ")
     server = shell.start(f"{script} --no-open" if script.startswith("sparklod") else script)
     try:
         assert server.stdout is not None
