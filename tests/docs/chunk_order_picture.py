@@ -1,4 +1,4 @@
-"""Draws docs/images/chunk-order.svg from the table in docs/streaming-measured.md: `python -m tests.docs.chunk_order_picture`."""
+"""Draws docs/images/chunk-order.svg from docs/streaming-measured.md: `python -m tests.docs.chunk_order_picture`."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ from tests.conftest import FIXTURES, ROOT
 from tests.interop.pictures import psnr
 
 from .gallery import OF_A_BROWSER, SCENE, SERVERS, TUTORIALS, drawn, folder_of, pictures
-from .shell import Shell
+from .shell import TIMEOUT, Shell
 from .test_pages import words
 
 #: Words of a tutorial, and bytes of one of its pictures.
@@ -59,15 +59,13 @@ def is_same(shown: str, line: str) -> bool:
 
 def check_server(shell: Shell, script: str) -> None:
     """Start the server of a script at any free port, fetch its page, and stop it."""
-    (line,) = script.splitlines()
-    script = line.replace(" 8000 ", " 0 ")
-    server = shell.start(f"{script} --no-open" if script.startswith("sparklod") else script)
+    (command,) = script.splitlines()
+    server = shell.start(f"{command} --no-open" if "sparklod" in command else command.replace(" 8000 ", " 0 "))
     try:
         assert server.stdout is not None
-        address = next(
-            found for line in server.stdout if (found := re.search(r"http://[^/\s]*:(\d+)(/[^\s)]*)?", line))
-        )
-        with urllib.request.urlopen(f"http://127.0.0.1:{address[1]}{address[2] or '/'}") as page:
+        ports = (re.search(r"http://\S+:(\d+)/", line) for line in server.stdout)
+        port = next(filter(None, ports))[1]
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/", timeout=TIMEOUT) as page:
             assert b"<title>" in page.read()
     finally:
         server.terminate()
