@@ -108,9 +108,10 @@ def test_the_workflow_stops_at_leaves_of_another_original(project: Path, web: Pa
 # --- The action -------------------------------------------------------------------------------------------------------
 
 
-def run_action(shell: Shell, **more: str) -> subprocess.CompletedProcess[str]:
-    """The body of the action with the page's inputs, as GitHub calls it."""
-    inputs = {name.upper(): value for name, value in ACTION.items() if name in ("scenes", "options", "checks")} | more
+def run_action(shell: Shell, action: dict[str, str] | None = None, **more: str) -> subprocess.CompletedProcess[str]:
+    """Run the body of the action with the inputs of docs/ci.md or of other settings, as GitHub calls it."""
+    given = action or ACTION
+    inputs = {name.upper(): value for name, value in given.items() if name in ("scenes", "options", "checks")} | more
     words = [f"{name}={shlex.quote(value)}" for name, value in {**inputs, "GITHUB_OUTPUT": "out"}.items()]
     return shell(
         " ".join([*words, f"PYTHON={shlex.quote(sys.executable)}", shlex.quote(str(ROOT / "action" / "check"))])
@@ -125,6 +126,13 @@ def test_the_action_bakes_checks_and_reports(project: Path, shell: Shell) -> Non
     reports = [json.loads(line) for line in (project / "web" / "report.jsonl").read_text().splitlines()]
     assert [report["file"] for report in reports] == ["web/demo-lod.spz", "web/sh0-lod.spz"]
     assert (project / "summary.md").read_text().count("leaves") >= 2
+
+
+def test_the_action_of_the_tutorial_bakes_and_checks(project: Path, shell: Shell) -> None:
+    (action,) = blocks((ROOT / "docs" / "tutorials" / "pipeline.md").read_text(encoding="utf-8"), "yaml")
+    done = run_action(shell, settings(action))
+    assert done.returncode == 0, done.stderr
+    assert {path.name for path in (project / "web").glob("*.rad")} == {"demo-lod.rad", "sh0-lod.rad"}
 
 
 def test_the_action_looks_at_all_files_before_it_fails(project: Path, shell: Shell) -> None:

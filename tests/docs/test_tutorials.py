@@ -53,8 +53,8 @@ def is_same(shown: str, line: str) -> bool:
     found = re.fullmatch("".join(patterns.get(part, re.escape(part)) for part in parts), line)
     if found is None:
         return False
-    pairs = [[float(number.replace(",", "")) for number in each] for each in (found.groups(), numbers)]
-    return bool(np.allclose(*pairs, rtol=TOLERANCE, atol=0))
+    printed, expected = ([float(each.replace(",", "")) for each in some] for some in (found.groups(), numbers))
+    return bool(np.allclose(printed, expected, rtol=TOLERANCE, atol=0))
 
 
 def check_server(shell: Shell, script: str) -> None:
