@@ -103,14 +103,14 @@ def _contents(baked: Baked) -> str:
 def _refined(refined: Refined) -> str:
     """Return a phrase on the PSNR of cuts before and after the fitting, on held-out cameras."""
     gains = [
-        f"{100 * share:g} % {before:.2f} -> {refined.psnr_after[share]:.2f}"
+        f"{100 * share:.3g} % {before:.2f} -> {refined.psnr_after[share]:.2f}"
         for share, before in refined.psnr_before.items()
     ]
     seen = f"held-out PSNR {', '.join(gains)} dB" if refined.psnr_before else "no held-out camera sees anything of it"
     early = "" if refined.is_complete else ", interrupted"
     return (
         f"refined in {count_of(refined.steps, 'step')}{early}: {seen};"
-        f" {100 * refined.kept:.3g} % of the merged splats are new"
+        f" {100 * refined.kept:.3g} % of the splats fitted have new values"
     )
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 
 import numpy as np
 
@@ -25,6 +27,9 @@ NEAR, FAR = 0.01, 100.0
 
 #: Shares of the leaves that cuts are drawn of, and the golden ratio, whose multiples spread evenly.
 LEAST_SHARE, MOST_SHARE, GOLDEN = 0.01, 0.7, 0.6180339887498949
+
+#: Steps whose cuts are found while as many steps before them are taken. Measured (benchmarks/notes/cuts-ahead.md).
+AHEAD = 8
 
 #: Least mean gain of a stage of the second half, dB a step; after a smaller one, half of the steps that remain are left
 #: out. Large steps may lose at first and pay later. Chosen.
@@ -58,13 +63,14 @@ def fit(
         interrupted: asked between steps; when it returns True, what the finished stages gained is returned.
 
     Raises:
-        BackendError: `settings.device` is a card that there is not, or its memory does not suffice.
+        BackendError: `settings.device` is "cuda", and there is no card, or it failed, or its memory does not suffice.
 
     Returns:
         N nodes, and what fitting brought: at none of `settings.SHARES` less than before on the held-out cameras.
     """
-    with on_threads(threads):
-        fitting = _Fitting(nodes, tree, settings, fixed, threads, say)
+
+    def run(device: str) -> tuple[Splats, FitReport]:
+        fitting = _Fitting(nodes, tree, dataclasses.replace(settings, device=device), fixed, threads, say)
         is_complete = True
         while fitting.has_steps:
             if not fitting.run_stage(progress, interrupted):
@@ -72,6 +78,16 @@ def fit(
                 break
             say(fitting.describe_stage())
         return fitting.finish(is_complete)
+
+    with on_threads(threads):
+        try:
+            return run(settings.device)
+        except BackendError as error:
+            if settings.device != "auto":
+                raise
+            say(f"starts again on the processor: {error}")
+        # Not from where the card stopped: the result is that of the processor.
+        return run("cpu")
 
 
 def raster_for(place: Place) -> RasterSettings:
@@ -92,6 +108,7 @@ class _Fitting:
         threads: int,
         say: Callable[[str], None],
     ) -> None:
+        self._threads = threads
         place = Place.of(nodes.center[tree.is_leaf])
         raster = raster_for(place)
         self.nodes = (
@@ -131,10 +148,10 @@ class _Fitting:
         """Take the steps of a stage, and keep the nodes if they gained; return False if it was interrupted."""
         schedule = self._schedule
         steps = schedule.stage_steps
-        for picture, share in itertools.islice(self._examples, steps):
+        for picture, cut in self._with_cuts(itertools.islice(self._examples, steps)):
             if interrupted():
                 return False
-            self._optimiser.step(picture, self.nodes.cut(picture.camera, share), schedule.rates())
+            self._optimiser.step(picture, cut, schedule.rates())
             schedule.advance()
             progress("refining", schedule.done, schedule.done + schedule.remaining, "step")
         self._optimiser.synchronize()
@@ -147,10 +164,36 @@ class _Fitting:
             self._best, self._kept = now, self.nodes.copy()
         return True
 
+    def _with_cuts(
+        self, examples: Iterator[tuple[FullDetailPicture, float]]
+    ) -> Iterator[tuple[FullDetailPicture, Index]]:
+        """Yield pictures and cuts, which threads find ahead; the nodes are placed when the last step is taken.
+
+        Cuts of AHEAD steps are found while the AHEAD steps before them are taken, from the nodes as they were before
+        these; those of the first steps of a stage from the nodes at its start. So they depend on neither the time that
+        they take nor the number of threads.
+        """
+        with ThreadPoolExecutor(self._threads) as pool:
+            following = self._begin_cuts(pool, examples)
+            while group := following:
+                cuts = [cut.result() for _, cut in group]
+                self._optimiser.place()
+                following = self._begin_cuts(pool, examples)
+                yield from zip((picture for picture, _ in group), cuts, strict=True)
+            self._optimiser.place()
+
+    def _begin_cuts(
+        self, pool: Executor, examples: Iterator[tuple[FullDetailPicture, float]]
+    ) -> list[tuple[FullDetailPicture, Future[Index]]]:
+        """Return the next AHEAD pictures, with cuts that a pool finds."""
+        some = itertools.islice(examples, AHEAD)
+        return [(picture, pool.submit(self.nodes.cut, picture.camera, share)) for picture, share in some]
+
     def describe_stage(self) -> str:
         """Return what the steps so far gained, for display."""
         stage, before = self._stages[-1], self._before
-        changes = (f"{share:.0%} {before[share]:.2f} -> {after:.2f} dB" for share, after in stage.psnr_after.items())
+        after = stage.psnr_after
+        changes = (f"{100 * share:.3g} % {before[share]:.2f} -> {after[share]:.2f} dB" for share in after)
         return f"{stage.name}: {', '.join(changes)}"
 
     def finish(self, is_complete: bool) -> tuple[Splats, FitReport]:
@@ -173,15 +216,9 @@ class _Fitting:
 
 
 def _optimiser_on(device: str, nodes: FittedNodes, say: Callable[[str], None]) -> Optimiser:
-    """Return the optimiser of a device; with "auto" that of the processor if the card has too little memory."""
+    """Return the optimiser of a device."""
     if not uses_card(device, say):
         return Optimiser(nodes)
     from .cuda.optimiser import CardOptimiser
 
-    try:
-        return CardOptimiser(nodes)
-    except BackendError as error:
-        if device == "cuda":
-            raise
-        say(f"uses the processor: {error}")
-        return Optimiser(nodes)
+    return CardOptimiser(nodes)

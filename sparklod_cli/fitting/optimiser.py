@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,7 @@ class Optimiser:
 
     def __init__(self, nodes: FittedNodes) -> None:
         self.nodes = nodes
+        self._moved: list[Any] = []
         count, terms = len(nodes.fitted), nodes.columns.sh.shape[1]
         self._slots = slots_of(nodes)
         self._moments = adam.Moments(
@@ -37,8 +39,8 @@ class Optimiser:
             np.zeros(count, np.int32),
         )
 
-    def step(self, picture: FullDetailPicture, index: Index, rates: adam.Rates) -> Index:
-        """Take one step for a picture of a cut, and renew the nodes that it showed; return them."""
+    def step(self, picture: FullDetailPicture, index: Index, rates: adam.Rates) -> None:
+        """Take one step for a picture of a cut."""
         nodes, camera = self.nodes, picture.camera
         seen, shaded = nodes.visible(index, camera)
         drawing = gradients.draw(shaded, camera, nodes.raster)
@@ -49,8 +51,13 @@ class Optimiser:
         columns = adam.Gradients(*map(np.ascontiguousarray, derivatives))
         rates = adam.Rates(*map(np.float32, rates))
         adam.step(nodes.columns, nodes.old, seen, self._slots, columns, rates, self._moments, nodes.bounds)
-        nodes.renew(seen)
-        return seen
+        self._moved.append(seen)
+
+    def place(self) -> None:
+        """Update the nodes that cuts are found with, by the steps since the last call."""
+        for seen in self._moved:
+            self.nodes.renew(seen)
+        self._moved.clear()
 
     def synchronize(self) -> None:
         """Bring the columns of the nodes up to date; here they always are."""

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from ..render.devices import DEVICES
+from ..render.devices import device_setting
 from ..support.setting_fields import CheckedSettings, setting, whole
 
 if TYPE_CHECKING:
@@ -34,13 +34,7 @@ class FitSettings(CheckedSettings):
     )
     seed: int = setting(0, "Seed of the cameras and budgets that --refine draws at random.", SEED, needs="refine")
     path: CameraPath | None = None
-    device: str = setting(
-        "cpu",
-        "What --refine computes with: an NVIDIA card if there is one (auto), the processor, or a card (cuda)."
-        " Cards are tested in a simulator only.",
-        DEVICES,
-        needs="refine",
-    )
+    device: str = device_setting("--refine", needs="refine")
 
 
 @dataclass(frozen=True)

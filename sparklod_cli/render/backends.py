@@ -39,12 +39,15 @@ class Backend:
         return cast("Image", module.draw(splats, camera, settings, **options))
 
 
+#: The backend that draws instead of numba where that is to use an NVIDIA card.
+ON_CARD = "cuda"
+
 #: By name; the first is the default.
 BACKENDS = {
     backend.name: backend
     for backend in (
         Backend("numba", ".rasterizer"),
-        Backend("cuda", ".cuda.rasterizer"),
+        Backend(ON_CARD, ".cuda.rasterizer"),
         Backend("osmesa", ".gl.osmesa"),
         Backend("open3d", ".open3d.backend"),
     )

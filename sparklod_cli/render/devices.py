@@ -4,11 +4,24 @@ from __future__ import annotations
 
 import importlib.util
 from collections.abc import Callable
+from typing import Any
 
+from ..support.setting_fields import setting
 from .backends import BackendError
 
 #: What is asked for: a card if there is one; the processor; a card.
 DEVICES = ("auto", "cpu", "cuda")
+
+
+def device_setting(user: str, *, needs: str = "") -> Any:
+    """Return a `setting` for one of `DEVICES`; `user` is what computes on it."""
+    return setting(
+        "cpu",
+        f"What {user} computes with: an NVIDIA card if there is one (auto), the processor, or a card (cuda). Cards are"
+        " tested in a simulator only.",
+        DEVICES,
+        needs=needs,
+    )
 
 
 def uses_card(device: str, say: Callable[[str], None] = lambda text: None) -> bool:

@@ -15,7 +15,9 @@ from ..scenes.finder import CutSource
 from ..scenes.loaded import Cut
 from ..support.progress import Progress, silent
 from . import color_by, styles
+from .backends import ON_CARD
 from .color_by import Scale
+from .devices import uses_card
 from .rasterizer import Image
 from .settings import RasterSettings, RenderSettings
 from .shading import ShadedSplats, shade
@@ -50,12 +52,15 @@ class Renderer:
 
     Raises:
         SparklodError: there is nothing to colour by.
+        BackendError: the device is a card, and there is none that can be used.
     """
 
     def __init__(
         self, source: CutSource, settings: RenderSettings, cameras: Sequence[Camera], *, progress: Progress = silent
     ) -> None:
         self.source, self.settings = source, settings
+        on_card = settings.backend == "numba" and uses_card(settings.device)
+        self._backend = ON_CARD if on_card else settings.backend
         self.scale = self._scale(cameras, progress)
 
     def _scale(self, cameras: Sequence[Camera], progress: Progress) -> Scale | None:
@@ -95,7 +100,7 @@ class Renderer:
 
     def _image(self, shaded: ShadedSplats, camera: Camera) -> Image:
         settings = self.settings
-        return styles.draw(settings.style, settings.backend, shaded, camera, self._raster, settings.options)
+        return styles.draw(settings.style, self._backend, shaded, camera, self._raster, settings.options)
 
     @property
     def _raster(self) -> RasterSettings:

@@ -8,7 +8,8 @@ from typing import Any
 
 from ..support.defaults import FARTHEST, MAX_SH_DEGREE, MAX_SUPERSAMPLE
 from ..support.setting_fields import CheckedSettings, Range, setting, whole
-from .backends import BACKENDS
+from .backends import BACKENDS, ON_CARD
+from .devices import device_setting
 
 #: Pixels squared that are added to the covariance on the screen, for which opacity makes up: Spark's `blurAmount`.
 BLUR = 0.3
@@ -93,10 +94,10 @@ class RenderSettings(CheckedSettings):
     )
     backend: str = setting(
         "numba",
-        "Renderer: numba is the reference, cuda is its kernels on an NVIDIA card (tested in a simulator only), osmesa"
-        " is OpenGL in software, open3d is a quick look.",
-        tuple(BACKENDS),
+        "Renderer: numba is the reference, osmesa is OpenGL in software, open3d is a quick look.",
+        tuple(name for name in BACKENDS if name != ON_CARD),
     )
+    device: str = device_setting("the backend numba")
     color_by: str | None = setting(
         None,
         "Colour splats by a quantity, unlit, with a colour bar beside the picture.  [default: their own colours]",

@@ -12,6 +12,7 @@ import pytest
 from sparklod_cli.cli import run
 from sparklod_cli.fitting.settings import FitSettings
 from sparklod_cli.render.backends import BackendError
+from sparklod_cli.render.cuda.card import card_errors, on_card
 from sparklod_cli.render.devices import DEVICES, uses_card
 from tests.cards import MISSING
 from tests.conftest import FIXTURES, Capture
@@ -58,6 +59,29 @@ def test_what_the_extra_brings_is_named_where_it_is_missing(monkeypatch: pytest.
     monkeypatch.setitem(sys.modules, "numba.cuda", None)
     with pytest.raises(BackendError, match=r"takes numba-cuda: .*install"):
         uses_card("cuda")
+
+
+class Context:
+    """Memory of a card of 10 GB, of which 4 are free."""
+
+    def get_memory_info(self) -> tuple[int, int]:
+        return 4 * 10**9, 10 * 10**9
+
+
+def test_too_little_memory_is_one_line_with_the_splats_that_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    from numba import cuda
+
+    def device_array(*arguments: object) -> None:
+        raise RuntimeError("[2] Call to cuMemAlloc results in CUDA_ERROR_OUT_OF_MEMORY")
+
+    monkeypatch.setattr(cuda, "device_array", device_array)
+    monkeypatch.setattr(cuda, "current_context", Context)
+    for size, fits in ((4.1e9, "990,000"), (14e9, "500,000")):
+        with pytest.raises(BackendError) as error, card_errors(1_000_000):
+            on_card(int(size / 4))
+        assert str(error.value).startswith(f"the card has too little memory for 1,000,000 splats; about {fits} fit, or")
+    with pytest.raises(BackendError, match="; fewer fit"), card_errors(5):
+        raise type("OutOfMemoryError", (Exception,), {})  # of cupy
 
 
 @pytest.mark.parametrize("device", DEVICES)

@@ -12,7 +12,7 @@ import click
 
 from ...codecs.rounding import ROUND_TRIPS
 from ...images.defaults import JPEG_QUALITY, MOVING, STILL, THUMBNAIL_SIZE, THUMBNAIL_SUPERSAMPLE
-from ...render.devices import DEVICES, uses_card
+from ...render.devices import uses_card
 from ...render.settings import OF_PIXELS, SORTINGS, RenderSettings
 from ...support import defaults
 from ...support.setting_fields import Range, whole
@@ -67,12 +67,6 @@ class Appearance:
     )
     alpha: bool = flag("Keep alpha, as --background transparent does.")
     render: RenderSettings = field(default_factory=RenderSettings)
-    device: str = option(
-        "What the backend numba draws with: an NVIDIA card if there is one (auto), the processor, or a card (cuda)."
-        " Cards are tested in a simulator only.",
-        DEVICES,
-        "cpu",
-    )
     no_bar: bool = flag("Leave out the colour bar of --color-by or --diff.")
     through: str | None = option(
         "Draw splats as Spark's PackedSplats or ExtSplats, SPZ or RAD round them; cuts stay those of the file."
@@ -126,16 +120,15 @@ class Appearance:
         return None if self.keeps_alpha or (form == "npy" and not is_set(ctx, "background")) else self.background
 
     def settings(self, say: Callable[[str], None]) -> RenderSettings:
-        """Return the settings of pictures, with the options of the backend; say which device draws, if it is chosen.
+        """Return the settings of pictures, with the options of the backend and the device that there is, which it says.
 
         Raises:
             BackendError: a card is asked for, and there is none that can be used.
         """
         options = {"sorting": self.sorting, "throttle": self.sort_throttle}
         known = {name: value for name, value in options.items() if value is not None}
-        on_card = self.render.backend == "numba" and uses_card(self.device, say)
-        backend = "cuda" if on_card else self.render.backend
-        return dataclasses.replace(self.render, backend=backend, options=known)
+        device = "cuda" if uses_card(self.render.device, say) else "cpu"
+        return dataclasses.replace(self.render, device=device, options=known)
 
     def of_pictures(self) -> tuple[str, ...]:
         """Return the options that cannot be used with a file of numbers, by what its numbers are."""

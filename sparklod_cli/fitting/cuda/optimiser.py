@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,9 +36,10 @@ class CardOptimiser(Optimiser):
     """
 
     def __init__(self, nodes: FittedNodes) -> None:
-        self.nodes = nodes
+        self.nodes, self._moved = nodes, []
+        self._errors = functools.partial(card_errors, len(nodes.leaves))
         count, terms = len(nodes.fitted), nodes.columns.sh.shape[1]
-        with card_errors():
+        with self._errors():
             self._now = CardSplats.of(*nodes.columns)
             self._old = tuple(map(to_card, nodes.old))
             self._slots = to_card(slots_of(nodes))
@@ -48,16 +50,21 @@ class CardOptimiser(Optimiser):
         # By identity: those of a fit live as long as it does.
         self._examples: dict[int, _CardExample] = {}
 
-    def step(self, picture: FullDetailPicture, index: Index, rates: adam.Rates) -> Index:
-        """Take one step for a picture of a cut, and renew the nodes of the cut; return them."""
-        with card_errors():
+    def step(self, picture: FullDetailPicture, index: Index, rates: adam.Rates) -> None:
+        """Take one step for a picture of a cut."""
+        with self._errors():
             example = self._example(picture)
             drawn = self._index(index)
             seen = draw_on_card(self._now, drawn, example.view)
             gradients = gradients_on_card(self._now, seen, example.view, self._by_image(seen, example))
             moved = self._move(drawn, example.view, gradients, rates)
-        self.nodes.place(index, moved[:, :3], moved[:, 3])
-        return index
+        self._moved.append((index, moved))
+
+    def place(self) -> None:
+        """Update the nodes that cuts are found with, by the steps since the last call."""
+        for index, moved in self._moved:
+            self.nodes.place(index, moved[:, :3], moved[:, 3])
+        self._moved.clear()
 
     def _example(self, picture: FullDetailPicture) -> _CardExample:
         """Return a picture on the card, uploaded when it is first used."""
@@ -97,7 +104,7 @@ class CardOptimiser(Optimiser):
 
     def synchronize(self) -> None:
         """Copy the columns of the nodes from the card."""
-        with card_errors():
+        with self._errors():
             for name, column in self.nodes.columns._asdict().items():
                 if column.size:
                     column[...] = getattr(self._now, name).copy_to_host()

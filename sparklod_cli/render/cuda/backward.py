@@ -28,7 +28,6 @@ from ..kernels.backward import (
     SUMS,
     carry_splat_back,
 )
-from ..kernels.ellipse import Lens, Limits
 from ..kernels.project import (
     ACROSS,
     ALONG,
@@ -49,7 +48,7 @@ from ..kernels.project import (
     index_of,
 )
 from ..kernels.raster import OPAQUE
-from .forward import PIXELS, pixel_of
+from .forward import PIXELS, lens_of, limits_of, pixel_of
 
 f32, f64 = np.float32, np.float64
 
@@ -236,7 +235,6 @@ def carry_back(center, scale, quat, lod_opacity, colors, index, matrix, view, sc
         for column in range(GRADIENT_COLUMNS):
             gradients[i, column] = f32(0)
         return
-    lens = Lens(view[0], view[1], view[2], view[3], view[4], view[5])
-    limits = Limits(view[6], view[7], view[8], view[9], view[10], view[11], view[12], view[13])
+    lens, limits = lens_of(view), limits_of(view)
     splats = ShadedColumns(center, scale, quat, lod_opacity, colors)
     carry_splat_back(splats, index[i], matrix, lens, limits, screen[i], totals[i], gradients[i])

@@ -92,34 +92,65 @@ def print_card() -> None:
     print(f"{card}, {card.free / 1e9:.1f} GB are free; {', '.join(versions)}; arrays are sorted by {card.sorter}")
 
 
+class _TooLargeError(Exception):
+    """An array does not fit into the memory of the card.
+
+    Attributes:
+        share: memory of the card over what is in use with that array.
+    """
+
+    def __init__(self, share: float) -> None:
+        super().__init__(share)
+        self.share = share
+
+
+def _is_of_memory(error: Exception) -> bool:
+    """Return True if an error of numba or cupy says that the memory of the card does not suffice."""
+    return "OUT_OF_MEMORY" in str(error) or type(error).__name__ == "OutOfMemoryError"
+
+
 @contextlib.contextmanager
-def card_errors() -> Iterator[None]:
-    """Turn errors of the card inside, such as memory that does not suffice, into `BackendError`."""
+def card_errors(splats: int) -> Iterator[None]:
+    """Turn errors of the card inside into `BackendError`; if memory does not suffice, it names how many splats fit.
+
+    Args:
+        splats: number of splats that are drawn or fitted; memory is proportional to it, but for pixels.
+    """
     try:
         yield
     except BackendError:
         raise
     except Exception as error:
         kind = type(error).__name__
-        if "OUT_OF_MEMORY" in str(error) or kind == "OutOfMemoryError":
-            raise BackendError("the card has too little memory; use --device cpu, or fewer splats or pixels") from None
+        if isinstance(error, _TooLargeError) or _is_of_memory(error):
+            share = getattr(error, "share", None)
+            fit = "fewer" if share is None else f"about {float(f'{splats * share:.2g}'):,.0f}"
+            advice = f"{fit} fit, or use --device cpu"
+            raise BackendError(f"the card has too little memory for {splats:,} splats; {advice}") from None
         if kind in ("CudaAPIError", "CudaDriverError", "CudaSupportError", "CUDARuntimeError", "NvvmError"):
             raise BackendError(f"the card failed ({' '.join(str(error).split())}); use --device cpu") from None
         raise
 
 
 def to_card(array: NDArray[Any]) -> CardArray:
-    """Copy a C-contiguous array to the card."""
-    from numba import cuda
-
-    return cuda.to_device(np.ascontiguousarray(array))
+    """Copy an array to the card."""
+    copy = on_card(array.shape, array.dtype)
+    if array.size:
+        copy.copy_to_device(np.ascontiguousarray(array))
+    return copy
 
 
 def on_card(shape: int | tuple[int, ...], dtype: Any = np.float32) -> CardArray:
     """Return an array on the card whose values are undefined."""
     from numba import cuda
 
-    return cuda.device_array(shape, dtype)
+    try:
+        return cuda.device_array(shape, dtype)
+    except Exception as error:
+        if not _is_of_memory(error):
+            raise
+        free, total = cuda.current_context().get_memory_info()
+        raise _TooLargeError(total / (total - free + np.prod(shape) * np.dtype(dtype).itemsize)) from None
 
 
 class CardMemory:

@@ -45,8 +45,17 @@ PIXELS = TILE * TILE
 #: Splats of a tile that are fetched together, one for each thread.
 BATCH = PIXELS
 
-#: Numbers of `view`: those of `Lens` and of `Limits`.
-VIEW = len(Lens._fields) + len(Limits._fields)
+
+@kernel(inline=True)
+def lens_of(view):
+    """Return the `Lens` of a view."""
+    return Lens(view[0], view[1], view[2], view[3], view[4], view[5])
+
+
+@kernel(inline=True)
+def limits_of(view):
+    """Return the `Limits` of a view."""
+    return Limits(view[6], view[7], view[8], view[9], view[10], view[11], view[12], view[13])
 
 
 @cuda_kernel(
@@ -78,7 +87,7 @@ def project(
         center, scale, quat, lod_opacity, rgb, sh: columns of N splats.
         degree: of the spherical harmonics, 0 for none.
         index: (M,) int32, which splats to draw.
-        eye: (3,) position of the camera. matrix: (3, 4) world to camera. view: (VIEW,) numbers of `Lens` and `Limits`.
+        eye: (3,) position of the camera. matrix: (3, 4) world to camera. view: numbers of `Lens` and `Limits`.
         radial: splats are sorted by distance from the camera, not by depth.
         colors: (N, 3), filled for the M splats: what the camera sees.
         screen, keys, boxes: of `kernels.project.project`, filled for the M splats.
@@ -94,8 +103,7 @@ def project(
         add_sh_of(node, center, sh, eye, degree, colors)
     for c in range(3):
         colors[node, c] = max(colors[node, c], f32(0))
-    lens = Lens(view[0], view[1], view[2], view[3], view[4], view[5])
-    limits = Limits(view[6], view[7], view[8], view[9], view[10], view[11], view[12], view[13])
+    lens, limits = lens_of(view), limits_of(view)
     splats = ShadedColumns(center, scale, quat, lod_opacity, colors)
     depth = project_splat(splats, node, matrix, lens, limits, radial, screen[i])
     if depth < f32(0):

@@ -55,7 +55,7 @@ class CardView:
     """A camera and raster settings on the card.
 
     Attributes:
-        eye: (3,). matrix: (3, 4). view: (`forward.VIEW`,). See `forward.project`.
+        eye: (3,). matrix: (3, 4). view: numbers of `Lens` and `Limits`. See `forward.project`.
     """
 
     camera: Camera
@@ -130,7 +130,7 @@ def draw(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> Imag
         BackendError: there is no card that can be used, or its memory does not suffice.
     """
     find_card()
-    with card_errors():
+    with card_errors(len(splats)):
         no_sh = np.empty((len(splats), 0, 3), np.float32)
         uploaded = CardSplats.of(splats.center, splats.scale, splats.quat_xyzw, splats.lod_opacity, splats.rgb, no_sh)
         every = to_card(np.arange(len(splats), dtype=np.int32))

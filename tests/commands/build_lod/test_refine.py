@@ -74,13 +74,13 @@ def test_the_report_has_a_line_for_each_stage_and_one_for_all(scene: Path, stand
     err = capsys.readouterr().err
     assert "fit 1 of 1: 2 % 30.0 -> 32.5 dB\n" in err
     assert f"  refined in {STEPS} steps: held-out PSNR 2 % 30.00 -> 32.50, 5 % 30.00 -> 32.50," in err
-    assert "50 % 30.00 -> 32.50 dB; 80 % of the merged splats are new\n" in err
+    assert "50 % 30.00 -> 32.50 dB; 80 % of the splats fitted have new values\n" in err
     assert "quick tree, refined -> SPZ" in err
 
 
 def test_a_scene_of_which_nothing_is_seen_is_said(tmp_path: Path, capsys: Capture) -> None:
     assert build(ONE, "--refine", "-o", tmp_path / "out.spz") == 0
-    said = "refined in 0 steps: no held-out camera sees anything of it; 0 % of the merged splats are new\n"
+    said = "refined in 0 steps: no held-out camera sees anything of it; 0 % of the splats fitted have new values\n"
     assert said in capsys.readouterr().err
 
 

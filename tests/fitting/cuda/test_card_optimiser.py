@@ -50,6 +50,7 @@ def after_steps(nodes: FittedNodes, optimiser: Optimiser) -> FittedNodes:
     picture = next(pictures(seen, nodes))
     for _ in range(STEPS):
         optimiser.step(picture, nodes.cut(picture.camera, SHARE), RATES)
+        optimiser.place()
     optimiser.synchronize()
     return nodes
 

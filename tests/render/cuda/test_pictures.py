@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+import sparklod_cli as sparklod
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.model.gaussian import lod_opacity
 from sparklod_cli.model.splats import Splats
@@ -67,6 +68,14 @@ def test_no_splats_are_an_empty_picture() -> None:
     assert not BACKENDS["cuda"].draw(empty, camera_at(), RasterSettings()).any()
     behind = shade([(splats_of(5), np.eye(4))], camera_at(-9.0))
     assert not BACKENDS["cuda"].draw(behind, camera_at(-9.0, (17, 5)), RasterSettings(far=1.0)).any()
+
+
+def test_a_device_of_settings_is_where_the_reference_draws() -> None:
+    scene, settings = sparklod.Scene(splats_of(20, 1)), sparklod.RenderSettings(device="cuda")
+    reference = sparklod.render(scene, camera_at())
+    image = sparklod.render(scene, camera_at(), settings=settings)
+    assert agreement(image, reference) > LEAST
+    assert not np.array_equal(image, reference)  # sums of a card are in another order
 
 
 @pytest.mark.parametrize("degree", [1, 3])
