@@ -1,10 +1,10 @@
-"""Draws docs/images/chunk-order.svg from the table in docs/streaming.md: `python -m tests.docs.chunk_order_picture`."""
+"""Draws docs/images/chunk-order.svg from docs/streaming-measured.md: `python -m tests.docs.chunk_order_picture`."""
 
 from __future__ import annotations
 
 from tests.conftest import ROOT
 
-PAGE = ROOT / "docs" / "streaming.md"
+PAGE = ROOT / "docs" / "streaming-measured.md"
 PICTURE = ROOT / "docs" / "images" / "chunk-order.svg"
 
 #: The first cell of the table's heading.

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import shlex
 import shutil
 import subprocess
 import sys
 import textwrap
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -18,18 +16,13 @@ import pytest
 from sparklod_cli.cli import run
 from tests.conftest import FIXTURES, ROOT
 
+from .shell import Shell, blocks
+
 pytestmark = pytest.mark.slow
 
 CI = (ROOT / "docs" / "ci.md").read_text(encoding="utf-8")
 PAGE = (ROOT / "docs" / "inspect.md").read_text(encoding="utf-8")
 HOOKS = (ROOT / ".pre-commit-hooks.yaml").read_text(encoding="utf-8")
-
-Shell = Callable[..., subprocess.CompletedProcess[str]]
-
-
-def blocks(page: str, language: str) -> list[str]:
-    """The code blocks of a page in a language."""
-    return re.findall(rf"^```{language}\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)
 
 
 def steps(workflow: str) -> dict[str, str]:
@@ -58,33 +51,6 @@ def project(tmp_path: Path) -> Path:
         shutil.copy(FIXTURES / f"{name}.ply", tmp_path / "scenes")
     (tmp_path / "scenes" / "expect.toml").write_text(blocks(PAGE, "toml")[0])
     return tmp_path
-
-
-@pytest.fixture
-def shell(project: Path) -> Shell:
-    """Runs a script there, as bash runs the steps of a workflow, with a `sparklod` that is the one under test."""
-    bash = shutil.which("bash")
-    if bash is None:
-        pytest.skip("there is no bash")
-    command = project / "bin" / "sparklod"
-    command.parent.mkdir()
-    command.write_text(f'#!/bin/sh\nexec {shlex.quote(sys.executable)} -m sparklod_cli "$@"\n')
-    command.chmod(0o755)
-    extra = {"PATH": f"{command.parent}{os.pathsep}{os.environ['PATH']}", "GITHUB_STEP_SUMMARY": "summary.md"}
-    environment = os.environ | extra | {"PYTHONPATH": str(ROOT)}
-
-    def go(*words: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            words if len(words) > 1 else [bash, "-e", "-c", *words],
-            cwd=project,
-            env=environment,
-            capture_output=True,
-            encoding="utf-8",
-            timeout=300,
-            check=False,
-        )
-
-    return go
 
 
 @pytest.fixture
@@ -142,9 +108,10 @@ def test_the_workflow_stops_at_leaves_of_another_original(project: Path, web: Pa
 # --- The action -------------------------------------------------------------------------------------------------------
 
 
-def run_action(shell: Shell, **more: str) -> subprocess.CompletedProcess[str]:
-    """The body of the action with the page's inputs, as GitHub calls it."""
-    inputs = {name.upper(): value for name, value in ACTION.items() if name in ("scenes", "options", "checks")} | more
+def run_action(shell: Shell, action: dict[str, str] | None = None, **more: str) -> subprocess.CompletedProcess[str]:
+    """Run the body of the action with the inputs of docs/ci.md or of other settings, as GitHub calls it."""
+    given = action or ACTION
+    inputs = {name.upper(): value for name, value in given.items() if name in ("scenes", "options", "checks")} | more
     words = [f"{name}={shlex.quote(value)}" for name, value in {**inputs, "GITHUB_OUTPUT": "out"}.items()]
     return shell(
         " ".join([*words, f"PYTHON={shlex.quote(sys.executable)}", shlex.quote(str(ROOT / "action" / "check"))])
@@ -159,6 +126,13 @@ def test_the_action_bakes_checks_and_reports(project: Path, shell: Shell) -> Non
     reports = [json.loads(line) for line in (project / "web" / "report.jsonl").read_text().splitlines()]
     assert [report["file"] for report in reports] == ["web/demo-lod.spz", "web/sh0-lod.spz"]
     assert (project / "summary.md").read_text().count("leaves") >= 2
+
+
+def test_the_action_of_the_tutorial_bakes_and_checks(project: Path, shell: Shell) -> None:
+    (action,) = blocks((ROOT / "docs" / "tutorials" / "pipeline.md").read_text(encoding="utf-8"), "yaml")
+    done = run_action(shell, settings(action))
+    assert done.returncode == 0, done.stderr
+    assert {path.name for path in (project / "web").glob("*.rad")} == {"demo-lod.rad", "sh0-lod.rad"}
 
 
 def test_the_action_looks_at_all_files_before_it_fails(project: Path, shell: Shell) -> None:

@@ -1,4 +1,4 @@
-"""The picture of docs/streaming.md shows the figures of its table."""
+"""The picture of docs/streaming-measured.md shows the figures of its table."""
 
 from __future__ import annotations
 

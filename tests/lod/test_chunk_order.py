@@ -195,7 +195,7 @@ def test_no_family_is_in_two_chunks(built: tuple[Splats, LodTree]) -> None:
 
 @pytest.mark.slow
 def test_views_touch_fewer_chunks_than_in_spark_s_order() -> None:
-    """A ring of clusters, seen from among them: an example; docs/streaming.md has the measurements."""
+    """A ring of clusters, seen from among them: an example; docs/streaming-measured.md has the measurements."""
     rng = np.random.default_rng(5)
     angle = rng.integers(0, 24, 200_000) * (2 * np.pi / 24)
     splats = random_splats(len(angle), seed=5)
