@@ -272,6 +272,8 @@ def _lod(
     if settings is None:
         settings = LodSettings(detail_rule.BUDGET) if scenes.details else LodSettings()
     if budget is not None:
+        if scenes.tiled:
+            raise ValueError(f"{scenes.tiled[0].name} is 3D Tiles, which CesiumJS draws without a budget; leave it out")
         settings = replace(settings, budget=budget_like(budget).of(scenes.leaves))
     if continuous:
         if continuous is not True and not continuous > 1:

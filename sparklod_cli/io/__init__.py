@@ -7,6 +7,7 @@ from .local_files import companions, is_file_name
 from .reading import (
     MAX_TEXT,
     examine_scene,
+    format_of,
     opened,
     read_arrays,
     read_levels,

@@ -30,7 +30,6 @@ from ..codecs.tiles_3d import tileset
 from ..support import atomic, atomic_set
 from ..support.addresses import Address, Place
 from ..support.errors import FormatError, OutputError
-from ..support.stdin import DASH
 from .local_files import companions, in_folder, reason_of
 from .reading import opened
 from .writing import Files, SinkTogether, check_header, send_together
@@ -210,18 +209,6 @@ class LevelFiles:
     manifest: Manifest
     bytes: int
     sizes: tuple[int, ...]
-
-
-def has_levels(path: Path) -> bool:
-    """Return whether a file, or what a folder stands for, has a scene at several detail levels.
-
-    Raises:
-        FormatError: it cannot be read, or is of no known format.
-    """
-    if path == DASH:
-        return False
-    with opened(path) as (_, form, _):
-        return form.detailed
 
 
 def read_level_files(path: Path) -> LevelFiles:

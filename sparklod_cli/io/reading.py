@@ -97,6 +97,16 @@ def read_tiles(path: Place, *, threads: int = 1, progress: Progress = silent) ->
     return scene
 
 
+def format_of(path: Place) -> Format:
+    """Return the format of a file, or of what a folder stands for.
+
+    Raises:
+        FormatError: it cannot be read, or is of no known format.
+    """
+    with opened(path) as (_, form, _):
+        return form
+
+
 def examine_scene(
     path: Place, *, columns: Collection[str] = COLUMNS, threads: int = 1, progress: Progress = silent
 ) -> Scene:

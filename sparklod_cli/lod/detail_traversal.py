@@ -6,7 +6,6 @@ was. PlayCanvas 2.23 does so in `GSplatOctreeInstance.applyLodChanges`; prioriti
 
 from __future__ import annotations
 
-import functools
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,24 +13,22 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..model.gaussian import spark_size
 from ..model.scene import DetailScene
 from ..model.splats import Splats
 from .detail_choice import Chains, Distances, Distant, Levels, RegionBounds, choose
 from .detail_rule import LEAST_BASE_DISTANCE, DetailRule
-from .kernels import pixel_scale
-from .traversal import CutView, Forest, TreeCut, TreeInstance, views_of
+from .splat_forest import SplatForest
+from .traversal import CutView, TreeCut, TreeInstance, views_of
 
 #: Priorities of files, whole numbers: for regions of which nothing is drawn, for those at another level, and for what
 #: comes next. The environment is asked for before all others.
 ENVIRONMENT, NOTHING_DRAWN, ANOTHER_LEVEL, NEXT = 4, 2, 1, 0
 
 
-class DetailForest(Forest):
-    """Scenes at several detail levels in the memory layout of traversals, so that statistics of cuts are of them, too.
+class DetailForest(SplatForest):
+    """Scenes at several detail levels in the memory layout of traversals; see `SplatForest`.
 
-    Every splat is a node. Those of level 0 and of the environment have no children, so that they count as leaves.
-    Chunks are chunk files.
+    Splats of level 0 and of the environment count as leaves. Chunks are chunk files.
 
     Args:
         scenes: at least one.
@@ -40,20 +37,11 @@ class DetailForest(Forest):
     """
 
     def __init__(self, scenes: Sequence[DetailScene], splats: Sequence[Splats], files: Sequence[DetailFiles]) -> None:
-        self.scenes, self.files, self._splats = scenes, files, splats
-        self.node_base = np.cumsum([0, *map(len, splats)]).astype(np.int64)
-        self.chunk_base = np.cumsum([0, *(len(each.sizes) for each in files)]).astype(np.int64)
-
-    @functools.cached_property
-    def nodes(self) -> NDArray[np.void]:  # type: ignore[override]  # made when the first statistics are asked for
-        """(N,) `pixel_scale.NODE` of all scenes."""
-        nodes = np.zeros(int(self.node_base[-1]), pixel_scale.NODE)
-        for scene, splats, start in zip(self.scenes, self._splats, self.node_base.tolist(), strict=False):
-            part = nodes[start : start + len(splats)]
-            part["x"], part["y"], part["z"] = splats.center.T
-            part["size"] = spark_size(splats)
-            part["child_count"][scene.level(0).stop : len(scene.splats)] = 1
-        return nodes
+        self.scenes, self.files = scenes, files
+        coarse = [np.zeros(len(each), np.bool_) for each in splats]
+        for scene, mask in zip(scenes, coarse, strict=True):
+            mask[scene.level(0).stop : len(scene.splats)] = True
+        super().__init__(splats, coarse, [len(each.sizes) for each in files])
 
 
 class DetailTraversal:

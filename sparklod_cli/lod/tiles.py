@@ -116,4 +116,4 @@ def _measured(
             bounds[above, 0] = np.minimum(bounds[above, 0], bounds[tile, 0])
             bounds[above, 1] = np.maximum(bounds[above, 1], bounds[tile, 1])
     transform = np.array(settings.matrix).reshape(4, 4).T
-    return TileScene(splats, parent, level, counts, errors, bounds, transform)
+    return TileScene(splats, parent, level, counts, errors, bounds, transform=transform)

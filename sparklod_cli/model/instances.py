@@ -12,9 +12,13 @@ from numpy.typing import NDArray
 
 from .foveation import Foveation
 from .scene import DetailScene, Scene
+from .tile_scene import TileScene
 from .transforms import LARGEST, SKEW, Transform
 
 Matrix = NDArray[np.float64]
+
+#: What an instance is of.
+Source = Path | Scene | DetailScene | TileScene
 
 #: What all instances together are called in tables.
 TOTAL = "total"
@@ -37,7 +41,7 @@ class Instance:
         ValueError: the matrix has another shape.
     """
 
-    source: Path | Scene | DetailScene
+    source: Source
     name: str = ""
     object_to_world: Matrix = field(default_factory=lambda: np.eye(4))
     lod_scale: float = 1.0
@@ -46,7 +50,7 @@ class Instance:
     def __post_init__(self) -> None:
         if isinstance(self.source, str):
             object.__setattr__(self, "source", Path(self.source))
-        if not isinstance(self.source, (Path, Scene, DetailScene)):
+        if not isinstance(self.source, (Path, Scene, DetailScene, TileScene)):
             raise TypeError(f"an instance is of a file or a scene, not of {type(self.source).__name__}")
         matrix = np.asarray(self.object_to_world, np.float64)
         if matrix.shape != (4, 4):

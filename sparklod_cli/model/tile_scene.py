@@ -27,6 +27,7 @@ class TileScene:
         counts: (T,) int64 splats of each tile.
         errors: (T,) float64 geometric error of each tile in world units, 0 of tiles without children.
         bounds: (T, 2, 3) float64 lowest and highest corner of each tile and those below it, in the axes of the splats.
+        sizes: (T,) int64 bytes of the file of each tile, 0 without splats; None for a scene in memory.
         transform: (4, 4) float64 for column vectors, from the axes of the tileset, z up, to the Earth's (ECEF), metres;
             the identity where the scene has no place there.
         antialiased, format, notes, header, up: as of `Scene`.
@@ -38,6 +39,7 @@ class TileScene:
     counts: Counts
     errors: NDArray[np.float64]
     bounds: Bounds
+    sizes: Counts | None = None
     transform: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
     antialiased: bool = False
     format: str = ""

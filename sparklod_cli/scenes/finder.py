@@ -10,6 +10,7 @@ from ..cameras.camera import Camera
 from ..lod.continuous import ContinuousCuts
 from ..lod.detail_traversal import DetailTraversal
 from ..lod.settings import LodSettings
+from ..lod.tile_traversal import TileTraversal
 from ..lod.traversal import CutView, Traversal
 from .loaded import Cut, Part, Scenes
 
@@ -52,7 +53,7 @@ class CutFinder:
 
     def __init__(self, scenes: Scenes, settings: LodSettings | None) -> None:
         self.scenes, self.settings = scenes, settings
-        self._traversal: Traversal | DetailTraversal | None = None
+        self._traversal: Traversal | DetailTraversal | TileTraversal | None = None
         self._continuous: ContinuousCuts | None = None
         if settings is not None and scenes.with_cuts:
             self._traversal = scenes.traversal(settings)

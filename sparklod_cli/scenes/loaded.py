@@ -15,6 +15,7 @@ from ..lod.budget import Budget
 from ..lod.continuous import faded
 from ..lod.detail_traversal import DetailForest, DetailTraversal
 from ..lod.settings import LodSettings
+from ..lod.tile_traversal import TileForest, TileTraversal
 from ..lod.traversal import Forest, Traversal, TreeCut, TreeInstance
 from ..model.balls import Balls, balls_of
 from ..model.foveation import Foveation
@@ -25,7 +26,7 @@ from ..model.scene import Scene
 from ..model.splats import Splats
 from ..model.transforms import common, rotated
 from ..support.units import count_of
-from .loaded_scene import Index, LoadedDetail, LoadedScene, nodes_of
+from .loaded_scene import Index, LoadedDetail, LoadedRuns, LoadedScene, LoadedTiles, nodes_of
 from .pages import PagedForest, PagedScene, sampled_balls
 
 Weights = NDArray[np.float64]
@@ -145,19 +146,36 @@ class Scenes:
         """The scenes at several detail levels, in the order of `forest`."""
         return [loaded for loaded in self.loaded if isinstance(loaded, LoadedDetail)]
 
+    @functools.cached_property
+    def tiled(self) -> list[LoadedTiles]:
+        """The scenes of tiles, in the order of `forest`."""
+        return [loaded for loaded in self.loaded if isinstance(loaded, LoadedTiles)]
+
+    @property
+    def in_runs(self) -> Sequence[LoadedRuns]:
+        """The scenes of which viewers draw whole runs of splats, in the order of `forest`."""
+        return self.details or self.tiled
+
     @property
     def with_cuts(self) -> Sequence[LoadedScene]:
-        """The scenes of which viewers draw cuts, in the order of `forest`: trees, or scenes at several detail levels.
+        """The scenes of which viewers draw cuts, in the order of `forest`: trees, detail levels or tiles.
 
         Raises:
-            ValueError: there are both, which no viewer draws.
+            ValueError: there are two kinds of them, which no viewer draws.
         """
-        if self.trees and self.details:
+        kinds: dict[str, Sequence[LoadedScene]] = {
+            "a Level-of-Detail tree": self.trees,
+            "Streamed SOG": self.details,
+            "3D Tiles": self.tiled,
+        }
+        found = [(kind, scenes[0]) for kind, scenes in kinds.items() if scenes]
+        if len(found) > 1:
+            (kind, first), (other, second) = found[:2]
             raise ValueError(
-                f"{self.trees[0].name} is a Level-of-Detail tree and {self.details[0].name} is Streamed SOG, whose"
-                " viewers choose splats in different ways; look at one of them at a time, or at full detail"
+                f"{first.name} is {kind} and {second.name} is {other}, whose viewers choose splats in different ways;"
+                " look at one of them at a time, or at full detail"
             )
-        return self.details or self.trees
+        return self.in_runs or self.trees
 
     @functools.cached_property
     def leaves(self) -> int:
@@ -168,6 +186,8 @@ class Scenes:
         """Return the splats of a budget, of which some are shares of the leaves."""
         if budget.by_default and self.details:
             budget = replace(budget, count=detail_rule.BUDGET)
+        if self.tiled:  # CesiumJS has no budget
+            return max(1, self.leaves)
         return budget.of(self.leaves if budget.share is not None else 0)
 
     @functools.cached_property
@@ -177,6 +197,8 @@ class Scenes:
             return DetailForest(
                 *zip(*((each.detail, each.scene.splats, each.files) for each in self.details), strict=True)
             )
+        if self.tiled:
+            return TileForest([each.tiles for each in self.tiled], [each.scene.splats for each in self.tiled])
         if not any(isinstance(loaded, PagedScene) for loaded in self.trees):
             return Forest([self._nodes(loaded.scene) for loaded in self.trees])
         return PagedForest(
@@ -206,8 +228,10 @@ class Scenes:
             if loaded.has_cuts
         ]
 
-    def traversal(self, settings: LodSettings, *, remembers: bool = False) -> Traversal | DetailTraversal:
-        """Find the cuts of the instances of trees, or of scenes at several detail levels.
+    def traversal(
+        self, settings: LodSettings, *, remembers: bool = False
+    ) -> Traversal | DetailTraversal | TileTraversal:
+        """Find the cuts of the instances of trees, of scenes at several detail levels, or of tiles.
 
         Args:
             remembers: of `DetailTraversal`: cuts are found one after the other, along a path.
@@ -222,15 +246,17 @@ class Scenes:
             raise ValueError(f"a budget of {budget} is less than one for each of {len(instances)} instances")
         if len(instances) > MAX_INSTANCES:
             raise ValueError(f"{len(instances):,} instances are more than {MAX_INSTANCES:,}")
-        if not isinstance(self.forest, DetailForest):
+        if not self.in_runs:
             return Traversal(self.forest, instances)
+        kind = "Streamed SOG" if self.details else "3D Tiles"
         if settings.continuous is not None:
-            raise ValueError(f"{self.details[0].name} is Streamed SOG; continuous cuts are of trees alone")
+            raise ValueError(f"{self.in_runs[0].name} is {kind}; continuous cuts are of trees alone")
         for at, loaded in zip(self.instances, self.of_instance, strict=True):
             if loaded.has_cuts and at.foveation is not None:
-                raise ValueError(
-                    f"{at.name} is Streamed SOG, and has a foveation, which is for trees alone; leave it out"
-                )
+                raise ValueError(f"{at.name} is {kind}, and has a foveation, which is for trees alone; leave it out")
+        if isinstance(self.forest, TileForest):
+            return TileTraversal(self.forest, instances)
+        assert isinstance(self.forest, DetailForest)
         fixed = sum(loaded.leaf_count for loaded in self.of_instance if not loaded.has_cuts)
         return DetailTraversal(self.forest, instances, settings.detail, fixed=fixed, remembers=remembers)
 

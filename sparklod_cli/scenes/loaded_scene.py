@@ -5,16 +5,19 @@ from __future__ import annotations
 import functools
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..codecs.gpu import loaded_nodes, lod_tree
 from ..io.details import LevelFiles
+from ..lod import detail_rule, tile_traversal
 from ..lod.detail_traversal import DetailFiles
 from ..model.lod_tree import CHUNK_NODES, LodTree, Nodes
 from ..model.scene import DetailScene, FileCoding, Scene
 from ..model.splats import COLUMNS, Splats
+from ..model.tile_scene import TileScene
 
 Index = NDArray[np.signedinteger]
 
@@ -126,8 +129,29 @@ def nodes_of(splats: Splats, tree: LodTree, coding: FileCoding, *, precision: st
     return loaded_nodes.nodes(splats, tree, precision, coding, threads=threads)
 
 
+class LoadedRuns(LoadedScene):
+    """A scene of which viewers draw whole runs of splats, each from a file that a manifest names."""
+
+    #: Requests that its viewer has under way at a time.
+    fetchers: ClassVar[int]
+
+    @property
+    def has_cuts(self) -> bool:
+        return True
+
+    @property
+    def manifest_bytes(self) -> int:
+        """Bytes of the manifest, which is read before any other file; 0 for a scene in memory."""
+        raise NotImplementedError
+
+    @property
+    def chunks(self) -> int:
+        """Number of files."""
+        return len(self.chunk_bytes())
+
+
 @dataclass(frozen=True, eq=False)
-class LoadedDetail(LoadedScene):
+class LoadedDetail(LoadedRuns):
     """A scene at several detail levels; `scene` and `splats` have those of all levels, then the environment.
 
     Attributes:
@@ -135,12 +159,14 @@ class LoadedDetail(LoadedScene):
         files: where its splats are.
     """
 
+    fetchers = detail_rule.FETCHERS
+
     detail: DetailScene = field(kw_only=True)
     files: DetailFiles = field(kw_only=True)
 
     @property
-    def has_cuts(self) -> bool:
-        return True
+    def manifest_bytes(self) -> int:
+        return self.files.manifest
 
     @functools.cached_property
     def depth(self) -> NDArray[np.int32]:
@@ -152,11 +178,6 @@ class LoadedDetail(LoadedScene):
     def leaves(self) -> Index:
         """(M,) indices of full detail: level 0, and the environment."""
         return np.flatnonzero(self.depth == 0)
-
-    @property
-    def chunks(self) -> int:
-        """Number of chunk files."""
-        return len(self.files.sizes)
 
     def chunk_of(self, index: Index) -> NDArray[np.int64]:
         """Return the (M,) numbers of the chunk files that some splats are in."""
@@ -170,6 +191,48 @@ class LoadedDetail(LoadedScene):
     def chunk_bytes(self) -> NDArray[np.int64]:
         """Return the (chunks,) bytes of each chunk file."""
         return self.files.sizes
+
+
+@dataclass(frozen=True, eq=False)
+class LoadedTiles(LoadedRuns):
+    """A scene of tiles; `scene` and `splats` have those of all tiles.
+
+    Attributes:
+        tiles: their boxes, errors and links.
+    """
+
+    fetchers = tile_traversal.FETCHERS
+
+    tiles: TileScene = field(kw_only=True)
+
+    @property
+    def manifest_bytes(self) -> int:
+        return 0 if self.tiles.sizes is None else self.bytes - int(self.tiles.sizes.sum())
+
+    @functools.cached_property
+    def depth(self) -> NDArray[np.int32]:
+        """(N,) the level of the tile of each splat, 0 of the root."""
+        return np.repeat(self.tiles.level, self.tiles.counts)
+
+    @functools.cached_property
+    def leaves(self) -> Index:
+        """(M,) indices of full detail: the splats of tiles without children."""
+        return np.flatnonzero(np.repeat(self.tiles.is_leaf, self.tiles.counts))
+
+    def chunk_of(self, index: Index) -> NDArray[np.int64]:
+        """Return the (M,) numbers of the tiles that some splats are in."""
+        return self.first_chunk + np.searchsorted(np.cumsum(self.tiles.counts), index, side="right")
+
+    def chunk_bytes(self) -> NDArray[np.int64]:
+        """Return the (chunks,) bytes of the file of each tile; of a scene in memory, of its columns."""
+        if self.tiles.sizes is not None:
+            return self.tiles.sizes
+        return bytes_of(self.splats) * self.tiles.counts // max(1, self.count)
+
+
+def all_tiles(tiles: TileScene) -> Scene:
+    """Return the splats of all tiles as one plain scene."""
+    return Scene(tiles.splats, None, tiles.antialiased, tiles.format, tiles.notes, tiles.header, up=tiles.up)
 
 
 def whole_scene(detail: DetailScene) -> Scene:

@@ -9,19 +9,32 @@ from pathlib import Path
 
 from ..codecs.formats import PRECISIONS
 from ..codecs.rounding import after
-from ..io import examine_scene, read_levels, size_of_input
-from ..io.details import has_levels, read_level_files
+from ..io import examine_scene, format_of, read_levels, read_tiles, size_of_input
+from ..io.details import read_level_files
 from ..io.rad_file import RadFile
-from ..model.instances import Instance
+from ..model.instances import Instance, Source
 from ..model.lod_tree import CHUNK_NODES
 from ..model.scene import DetailScene, Scene
 from ..model.selection import Selection, describe
 from ..model.splats import COLUMNS
+from ..model.tile_scene import TileScene
 from ..support.errors import FormatError, InvalidSplatsError, SparklodError, TreeError, memory_errors_translated
 from ..support.progress import Progress, silent
 from ..support.stdin import DASH
 from .loaded import Scenes
-from .loaded_scene import UNNAMED, LoadedDetail, LoadedScene, bytes_of, files_in_memory, files_of, nodes_of, whole_scene
+from .loaded_scene import (
+    UNNAMED,
+    LoadedDetail,
+    LoadedRuns,
+    LoadedScene,
+    LoadedTiles,
+    all_tiles,
+    bytes_of,
+    files_in_memory,
+    files_of,
+    nodes_of,
+    whole_scene,
+)
 from .pages import PagedScene, Pages, empty_scene
 
 
@@ -42,7 +55,7 @@ def read_scenes(
 
     Args:
         columns: of `Splats` that are read; only with `trees_only`; of scenes without trees all are read.
-        trees_only: refuse scenes of which no cuts are drawn: those with neither a tree nor detail levels.
+        trees_only: refuse scenes of which no cuts are drawn: those with neither a tree nor detail levels nor tiles.
         through: one of `rounding.ROUND_TRIPS`, a coding after which splats are drawn; cuts are those of the scene.
         precision: one of `PRECISIONS`, of the nodes that cuts are found with.
         paged: only cuts are looked at, so that of large RAD trees those chunks suffice
@@ -66,15 +79,16 @@ def read_scenes(
             assert file is not None
             empty = empty_scene(pages.file)
             entry: LoadedScene = PagedScene(file, size_of_input(file) or 0, empty, empty.splats, chunks, pages=pages)
-        elif (detail := _detail(source, threads, progress)) is not None:
-            entry = _loaded_detail(file, detail, through, chunks, threads)
-            notes += (f"{entry.name}: {note}" for note in detail.notes)
+        elif (runs := _runs(source, threads, progress)) is not None:
+            entry = _loaded_runs(file, runs, through, chunks, threads)
+            notes += (f"{entry.name}: {note}" for note in runs.notes)
         else:
             name = file or UNNAMED
             scene = _read(source, columns if trees_only else COLUMNS, threads, progress)
             if scene.tree is None and trees_only:
                 raise FormatError(
-                    f"{name}: it is not a Level-of-Detail tree, nor Streamed SOG; bake it first with sparklod build-lod"
+                    f"{name}: it is not a Level-of-Detail tree, Streamed SOG or 3D Tiles; bake it first with sparklod"
+                    " build-lod"
                 )
             notes += (f"{name}: {note}" for note in scene.notes)
             if scene.tree is None:
@@ -87,39 +101,44 @@ def read_scenes(
     return Scenes(instances, list(loaded.values()), of_instance, notes, precision, threads)
 
 
-def _key(source: Path | Scene | DetailScene) -> Path | int:
+def _key(source: Source) -> Path | int:
     return source if isinstance(source, Path) else id(source)
 
 
-def _detail(source: Path | Scene | DetailScene, threads: int, progress: Progress) -> DetailScene | None:
-    """Return a scene at several detail levels; None for others."""
+def _runs(source: Source, threads: int, progress: Progress) -> DetailScene | TileScene | None:
+    """Return a scene at several detail levels, or of tiles; None for others."""
     if isinstance(source, Scene):
         return None
+    if not isinstance(source, Path):
+        return source
     try:
-        if not isinstance(source, DetailScene):
-            if not has_levels(source):
-                return None
-            with memory_errors_translated():
-                source = read_levels(source, threads=threads, progress=progress)
+        form = None if source == DASH else format_of(source)
+        read = None if form is None else read_levels if form.detailed else read_tiles if form.tiled else None
+        if read is None:
+            return None
+        with memory_errors_translated():
+            return read(source, threads=threads, progress=progress)
     except SparklodError as error:
         raise type(error)(f"{source}: {error}") from None
-    return source
 
 
-def _loaded_detail(
-    file: Path | None, detail: DetailScene, through: str | None, chunks: int, threads: int
-) -> LoadedDetail:
-    scene = whole_scene(detail)
+def _loaded_runs(
+    file: Path | None, found: DetailScene | TileScene, through: str | None, chunks: int, threads: int
+) -> LoadedRuns:
+    scene = whole_scene(found) if isinstance(found, DetailScene) else all_tiles(found)
     if not len(scene.splats):
         raise InvalidSplatsError(f"{file or UNNAMED}: it has no splats")
-    files = files_in_memory(detail) if file is None else files_of(read_level_files(file))
     drawn = after(through, file or Path(UNNAMED), scene, threads)
-    return LoadedDetail(file, int(files.sizes.sum()) + files.manifest, scene, drawn, chunks, detail=detail, files=files)
+    if isinstance(found, TileScene):
+        size = found.header.get("bytes", bytes_of(scene.splats))
+        return LoadedTiles(file, size, scene, drawn, chunks, tiles=found)
+    files = files_in_memory(found) if file is None else files_of(read_level_files(file))
+    return LoadedDetail(file, int(files.sizes.sum()) + files.manifest, scene, drawn, chunks, detail=found, files=files)
 
 
-def _pages(source: Path | Scene | DetailScene, precision: str, threads: int) -> Pages | None:
+def _pages(source: Source, precision: str, threads: int) -> Pages | None:
     """Return the pages of a file too large to be read whole; None for others, and where reading will fail."""
-    if isinstance(source, (Scene, DetailScene)) or source == DASH:
+    if not isinstance(source, Path) or source == DASH:
         return None
     try:
         file = RadFile.open(source)
@@ -130,9 +149,9 @@ def _pages(source: Path | Scene | DetailScene, precision: str, threads: int) -> 
     return Pages(file, str(source), functools.partial(nodes_of, precision=precision, threads=1), threads)
 
 
-def _read(source: Path | Scene | DetailScene, columns: Collection[str], threads: int, progress: Progress) -> Scene:
+def _read(source: Source, columns: Collection[str], threads: int, progress: Progress) -> Scene:
     """Return the scene of a source; its tree, if it has one, is sound."""
-    assert not isinstance(source, DetailScene)
+    assert isinstance(source, (Path, Scene))
     name = UNNAMED if isinstance(source, Scene) else source
     try:
         if isinstance(source, Scene):

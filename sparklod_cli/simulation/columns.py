@@ -35,7 +35,7 @@ COLUMNS = (
         "",
         "why the cut is not finer: `budget`: refining one more node would exceed it; `pixel`: no node above the "
         "pixel-scale limit is left to refine; `missing`: the children of the nodes to be refined are not resident; "
-        "`exhausted`: only leaves are left; of Streamed SOG `distance`: no region is near enough for a finer level",
+        "`exhausted`: only leaves are left; of Streamed SOG and 3D Tiles `distance`: no region or tile is near enough to be finer",
     ),
     Column("pixel_scale_min", float, ".6g", "", "pixel scale down to which all nodes have been refined"),
     Column("frontier", int, "", "splats", "of the cut, nodes still waiting to be refined when the search stops"),
@@ -66,7 +66,7 @@ COLUMNS = (
         "",
         "chunks",
         "chunks of 65,536 nodes that the search for the cut reads, or would read if they were resident; of Streamed SOG"
-        " chunk files that are drawn from or asked for",
+        " and 3D Tiles files that are drawn from or asked for",
     ),
     Column("chunks_new", int, "", "chunks", "chunks that arrived since the previous frame"),
     Column(
@@ -115,8 +115,11 @@ LOADING = (
     Column("resident_all_bytes", int, "", "bytes", "bytes that have arrived by then"),
 )
 
-#: Columns that Streamed SOG has no values for.
+#: Columns that Streamed SOG and 3D Tiles have no values for.
 OF_TREES = ("pixel_scale_limit", "pixel_scale_min", "frontier")
+
+#: Columns of viewers that have a budget, which CesiumJS has not.
+OF_BUDGETS = ("budget", "budget_used")
 
 #: Columns that differ from run to run.
 TIMING = ("traverse_ms",)
@@ -129,8 +132,9 @@ EMPTY = {
     **dict.fromkeys(
         ("added", "removed", "churn"), "it compares a frame with the one before, and there is only one frame"
     ),
-    **dict.fromkeys(("pixel_scale_limit", "frontier"), "only trees have it, not Streamed SOG"),
-    "pixel_scale_min": "no node was refined, or it is Streamed SOG",
+    **dict.fromkeys(("pixel_scale_limit", "frontier"), "only trees have it, not Streamed SOG or 3D Tiles"),
+    "pixel_scale_min": "no node was refined, or it is Streamed SOG or 3D Tiles",
+    **dict.fromkeys(OF_BUDGETS, "CesiumJS, which draws 3D Tiles, has no budget"),
     **dict.fromkeys(("projected_px_p50", "projected_px_p95"), "no splat is inside the frustum on any frame"),
     **dict.fromkeys((column.name for column in LOADING), "it needs --bandwidth, and a --chunk-cache that suffices"),
 }

@@ -19,7 +19,7 @@ from ..scenes.loaded import Scenes
 from ..support.parallel import ordered_map
 from ..support.progress import Progress, silent
 from ..tables.columns import Row
-from .columns import COLUMNS, OF_TREES
+from .columns import COLUMNS, OF_BUDGETS, OF_TREES
 from .loading import Viewer
 from .streaming import ChunkStream
 from .streaming_settings import StreamingSettings
@@ -87,8 +87,9 @@ class Simulation(Viewer):
             rows[0] |= chunks
             whole = drawn.whole
             in_front = 1 - whole.behind / whole.selected if whole.selected else 1.0
-            if self.scenes.details:
-                rows = [row | dict.fromkeys(OF_TREES) for row in rows]
+            if self.scenes.in_runs:
+                none = (*OF_TREES, *(OF_BUDGETS if self.scenes.tiled else ()))
+                rows = [row | dict.fromkeys(none) for row in rows]
             yield SimulatedFrame(number, camera, drawn.cut, resident, [_rounded(row) for row in rows], in_front)
             progress("traverse", at + 1, len(path.cameras), "frame")
 

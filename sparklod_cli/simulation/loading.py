@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras.camera import Camera
-from ..lod import detail_rule
 from ..lod.settings import LodSettings
 from ..lod.traversal import TreeCut
 from ..scenes.finder import CutFinder, view_of
@@ -156,10 +155,10 @@ class LoadingCuts(Loader):
 
 def chunks_of(scenes: Scenes) -> Chunks:
     """Return the chunks of scenes with cuts, and what a viewer needs before it can ask for them."""
-    if scenes.details:
-        manifests = [[loaded.files.manifest] if loaded.files.manifest else [] for loaded in scenes.details]
-        sizes = [loaded.chunk_bytes() for loaded in scenes.details]
-        return Chunks(sizes, manifests, rooted=False, fetchers=detail_rule.FETCHERS)
+    if scenes.in_runs:
+        manifests = [[loaded.manifest_bytes] if loaded.manifest_bytes else [] for loaded in scenes.in_runs]
+        sizes = [loaded.chunk_bytes() for loaded in scenes.in_runs]
+        return Chunks(sizes, manifests, rooted=False, fetchers=scenes.in_runs[0].fetchers)
     return Chunks(
         [tree.chunk_bytes() for tree in scenes.trees],
         [header_answers(tree.header_bytes, tree.bytes) for tree in scenes.trees],

@@ -158,7 +158,7 @@ def _plot(simulation: Simulation, path: CameraPath, target: Path, data: _ChartDa
         cut.splats,
         np.concatenate([part.depth for part in cut.parts]),
         path.numbers.index(frame.number),
-        "detail level" if simulation.scenes.details else "tree depth",
+        "level" if simulation.scenes.in_runs else "tree depth",
     )
     marked = {moment.criterion: moment.frame for moment in data.lookout.moments()}
     drawn = traversal_chart.plot(data.rows, marked, simulation.scenes.title, scene)

@@ -70,6 +70,7 @@ def decode_tiles(
     content, chunks = _open(source, tileset, held)
     scene = content.scene(threads=threads, progress=progress)
     counts = dict(zip(held, (chunk.rows for chunk in chunks), strict=True))
+    sizes = dict(zip(held, (chunk.bytes for chunk in chunks), strict=True))
     check_rules(violations(tileset))
     volumes = volumes_of(tileset)
     boxes = [volume.bounds() for number in order if (volume := volumes[number]) is not None]
@@ -84,6 +85,7 @@ def decode_tiles(
         np.array([counts.get(number, 0) for number in order], np.int64),
         errors,
         turned(np.array(boxes), to_tileset(scene.up).T),
+        np.array([sizes.get(number, 0) for number in order], np.int64),
         _root_transform(tileset),
         *about,
     )

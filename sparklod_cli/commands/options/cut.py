@@ -32,10 +32,13 @@ if TYPE_CHECKING:
 #: A key of `defaults.PRESETS`.
 DEFAULT_PRESET = "desktop"
 
+#: Options of the size on the screen, pixels, which 3D Tiles have, too.
+OF_PIXELS = ("lod_render_scale", "pixel_scale_limit")
+
 #: Options of the foveation cones, which --outside-foveate replaces, and of nodes, which Streamed SOG does not have.
 CONES = ("cone_fov0", "cone_fov", "cone_foveate")
 NODES = (
-    *("lod_render_scale", "pixel_scale_limit", *CONES, "outside_foveate", "behind_foveate"),
+    *(*OF_PIXELS, *CONES, "outside_foveate", "behind_foveate"),
     *("precision", "continuous", "blend"),
 )
 
@@ -241,6 +244,10 @@ def check_scenes(ctx: click.Context, scenes: Scenes) -> None:
     if scenes.details:
         streamed = "is for trees; use --budget, --budget-mode and --lod-multiplier for Streamed SOG"
         refuse(ctx, (*NODES, "chunk_cache", "indices_out", "padded"), streamed)
+    elif scenes.tiled:
+        tiled = "is not for 3D Tiles, which CesiumJS draws without a budget; --lod-render-scale 2 halves their detail"
+        others = (each for each in (*CUTS, *DETAIL, "indices_out", "padded") if each not in OF_PIXELS)
+        refuse(ctx, (*others, "chunk_cache"), tiled)
     elif scenes.trees:
         refuse(ctx, DETAIL, "is for Streamed SOG, and no file is; --budget and --preset are for trees, too")
     else:

@@ -17,6 +17,7 @@ from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.cli import run
 from sparklod_cli.codecs import ply
 from sparklod_cli.commands.render import render as command
+from sparklod_cli.lod.tile_settings import TileSettings
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.render.backends import Backend
 from sparklod_cli.render.rasterizer import Image
@@ -26,6 +27,7 @@ from tests.conftest import FIXTURES, Capture
 from tests.lod.details import row_of_regions
 from tests.scenes import random_splats
 from tests.streamed import write_streamed
+from tests.tiled import tiled
 
 pytestmark = pytest.mark.slow
 
@@ -118,6 +120,7 @@ MODES: dict[str, tuple[str, ...]] = {
     "a view of the scene": ("-o", "out.png"),
     "a file without a tree": (*AT, "-o", "out.png"),
     "Streamed SOG": ("--look-at", "0,0,7:0,0,20", "--budget", "200", "-o", "out.png"),
+    "3D Tiles": ("--look-at", "0,0,-4:0,0,0", "-o", "out.png"),
     "full": (*AT, "--full", "-o", "out.png"),
     "views": ("--view", "1,0,-2:0,0,0", "--view", "0,1,-2:0,0,0", "-o", "out.png"),
     "frames": ("--orbit", "3", "--distance", "2", "-o", "out.%d.png"),
@@ -178,6 +181,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for tree, file in zip(MORE, ("other.ply", "plain.ply"), strict=True):
         assert run(["build-lod", str(folder / file), "-o", str(folder / tree), "-q"]) == 0
     write_streamed(folder / "web", row_of_regions(8, 4), together=4)
+    tiled(splats, folder / "city", TileSettings(tile_splats=100))
     there = {"file": "tree.spz", "translation": [-AWAY, 0, 0]}
     (folder / "back.json").write_text(json.dumps({"instances": [there]}))
     twice = [there, there | {"translation": [1 - AWAY, 0, 0]}]
@@ -203,7 +207,7 @@ def test_every_option_of_render_is_used_or_refused(
 
     def came(*arguments: str) -> Came:
         if arguments not in known:
-            others = {"a file without a tree": ("plain.ply",), "Streamed SOG": ("web",)}
+            others = {"a file without a tree": ("plain.ply",), "Streamed SOG": ("web",), "3D Tiles": ("city",)}
             scene = others.get(mode, ("--scene", "back.json"))
             size = () if "--size" in arguments else ("--size", "48x32")
             asked.clear()

@@ -13,12 +13,14 @@ from sparklod_cli.codecs import spz
 from sparklod_cli.commands.traverse import traverse as command
 from sparklod_cli.figures import traversal_chart
 from sparklod_cli.lod import quick
+from sparklod_cli.lod.tile_settings import TileSettings
 from sparklod_cli.model.scene import Scene
 from tests.commands.render.test_options import GIVEN as OF_RENDER
 from tests.conftest import FIXTURES, Capture
 from tests.lod.details import row_of_regions
 from tests.scenes import random_splats
 from tests.streamed import write_streamed
+from tests.tiled import tiled
 
 CAMERAS = FIXTURES / "cameras"
 
@@ -64,9 +66,13 @@ MODES: dict[str, tuple[str, ...]] = {
     "a camera path": ("--camera-path", str(CAMERAS / "inria.json")),
     "keyframes": ("--keyframes", "0.5,-0.5,0.5:3,0,3 -0.5,-0.5,0.5:3,0,-3", "--every", "20"),
     "Streamed SOG": ("--keyframes", "0,0,7:0,0,20 0,0,1:0,0,20", "--every", "10", "--budget", "200"),
+    "3D Tiles": ("--orbit", "3", "--distance", "9"),
     "a summary": ("--orbit", "3", "--distance", "2", "--json"),
     "a summary and a table": ("--orbit", "3", "--distance", "2", "--json", "-o", "out.csv"),
 }
+
+#: What is looked at in place of trees.
+IN_RUNS = {"Streamed SOG": ("web",), "3D Tiles": ("city",)}
 
 #: Options that ask for what is so already: nothing is behind cameras that see all.
 THE_SAME = {"a dolly over a network": {"behind_foveate"}}
@@ -106,13 +112,14 @@ def test_every_option_of_traverse_is_used_or_refused(
     for name, data in trees.items():
         (tmp_path / name).write_bytes(data)
     write_streamed(tmp_path / "web", row_of_regions(8, 4), together=4)
+    tiled(random_splats(900), tmp_path / "city", TileSettings(tile_splats=200))
     (tmp_path / "scene.json").write_text(json.dumps({"instances": [{"file": "tree.spz", "scale": 3}]}))
     inputs = {path.name for path in tmp_path.iterdir()}
     known: dict[tuple[str, ...], Any] = {}
 
     def came(*arguments: str) -> Any:
         if arguments not in known:
-            files = () if "--scene" in arguments else ("web",) if mode == "Streamed SOG" else TREES
+            files = () if "--scene" in arguments else IN_RUNS.get(mode, TREES)
             code = run(["traverse", *files, *MODES[mode], *arguments])
             out, err = capsys.readouterr()
             written = {}

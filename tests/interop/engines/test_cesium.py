@@ -15,9 +15,13 @@ from numpy.typing import NDArray
 
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.codecs.file_names import TILESET
-from sparklod_cli.io import read_scene
+from sparklod_cli.io import read_scene, read_tiles
+from sparklod_cli.lod.settings import pixel_limit
 from sparklod_cli.lod.tile_settings import TileSettings
+from sparklod_cli.lod.tile_traversal import choose
+from sparklod_cli.lod.tiles import PIXEL_ERROR
 from sparklod_cli.model.splats import Splats
+from sparklod_cli.scenes.finder import view_of
 from tests.conftest import FIXTURES, ROOT
 from tests.interop.engines import PACKAGES, recipes
 from tests.interop.engines.browser import Browser, Shown
@@ -87,6 +91,17 @@ def check(shown: Shown, ours: NDArray[np.float32]) -> None:
     assert max(likeness(wrong[seen], ours[seen]) for wrong in wrongs) < WRONG
 
 
+def chosen(file: Path, camera: Camera) -> list[str]:
+    """The names of the tiles that our traversal draws, in order."""
+    names, frontier = list[str](), [json.loads(file.read_text(encoding="utf-8"))["root"]]
+    while frontier:  # in the order of `read_tiles`
+        names += (tile["content"]["uri"] for tile in frontier)
+        frontier = [child for tile in frontier for child in tile.get("children", ())]
+    scene, limit = read_tiles(file), PIXEL_ERROR * pixel_limit(camera.fov_y, camera.height)
+    found = choose(scene, view_of(camera), np.eye(4), limit, np.ones(scene.tiles, np.bool_))
+    return sorted(names[tile] for tile in np.flatnonzero(found.drawn))
+
+
 def parents(tile: dict[str, Any], above: str | None = None) -> Iterator[tuple[str, str | None]]:
     """The names of tiles, each with that of the tile above it."""
     name = tile["content"]["uri"]
@@ -127,6 +142,7 @@ def test_it_asks_for_coarse_tiles_first_and_for_no_finer_ones_than_it_needs(
     shown = browser.cesium(tileset, camera, NO_LOOK)
     check(shown, like_cesium(drawn(tileset, shown), camera))
     assert levels(shown.tiles) == LEVELS[away]
+    assert shown.tiles == chosen(tileset, camera), "traverse and render choose other tiles"
     above = dict(parents(json.loads(tileset.read_text(encoding="utf-8"))["root"]))
     first, *names = (each.name for each in shown.requests)
     assert first == TILESET and len(set(names)) == len(names)
