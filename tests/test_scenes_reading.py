@@ -210,7 +210,11 @@ def test_foveation_is_that_of_all_or_its_own() -> None:
 @pytest.mark.parametrize(
     ("file", "kind", "said"),
     [
-        (FIXTURES / "sh2.ply", FormatError, "it is not a Level-of-Detail tree, nor Streamed SOG; bake it first"),
+        (
+            FIXTURES / "sh2.ply",
+            FormatError,
+            "it is not a Level-of-Detail tree, Streamed SOG or 3D Tiles; bake it first",
+        ),
         (FIXTURES / "golden" / "sh3-v3.spz", FormatError, "it is not a Level-of-Detail tree"),
         (FIXTURES / "faults" / "tree-cycle.spz", TreeError, "its tree is broken: node"),
         (FIXTURES / "faults" / "tree-orphan.spz", TreeError, "its tree is broken: node 9 has no parent"),

@@ -88,7 +88,7 @@ def _streamed_sog(streamed: dict[str, Any]) -> Iterator[str]:
         "", f"{splats['min']:,.0f} to {splats['max']:,.0f} splats of level 0 each, median {splats['p50']:,.0f}"
     )
     yield from rows("", f"{edge['min']:.4g} to {edge['max']:.4g} world units long, median {edge['p50']:.4g}")
-    head = f"{'splats':>11} {'share':>7} {'regions':>7} {'files':>5} {'size':>9}"
+    head = f"{'splats':>11} {'share':>7} {'regions':>7} {'files':>5} {'size':>8}"
     if any(level["errors"] for level in streamed["levels"]):
         head += f"{'err. p25':>9}{'p50':>8}{'p75':>8}"
     yield from rows("levels", head)
@@ -96,8 +96,8 @@ def _streamed_sog(streamed: dict[str, Any]) -> Iterator[str]:
         share = "" if level["share"] is None else f"{100 * level['share']:.1f} %"
         errors = (f"{level['errors'][name]:>8.2g}" for name in ("p25", "p50", "p75") if level["errors"])
         size = size_of(level["bytes"])
-        counts = f"{level['splats']:>11,} {share:>7} {level['regions']:>7,} {level['files']:>5,} {size:>9}"
-        yield f"    {number:<8} {counts}{''.join(errors)}"
+        counts = f"{level['splats']:>11,} {share:>7} {level['regions']:>7,} {level['files']:>5,} {size:>8}"
+        yield f"    {number:<8} {counts} {''.join(errors)}".rstrip()
     if streamed["environment"]:
         around = streamed["environment"]
         yield from rows("environment", f"{count_of(around['splats'], 'splat')}, {size_of(around['bytes'])}")

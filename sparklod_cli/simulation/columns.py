@@ -35,7 +35,8 @@ COLUMNS = (
         "",
         "why the cut is not finer: `budget`: refining one more node would exceed it; `pixel`: no node above the "
         "pixel-scale limit is left to refine; `missing`: the children of the nodes to be refined are not resident; "
-        "`exhausted`: only leaves are left; of Streamed SOG and 3D Tiles `distance`: no region or tile is near enough to be finer",
+        "`exhausted`: only leaves are left; of Streamed SOG"
+        " and 3D Tiles `distance`: no region or tile is near enough to be finer",
     ),
     Column("pixel_scale_min", float, ".6g", "", "pixel scale down to which all nodes have been refined"),
     Column("frontier", int, "", "splats", "of the cut, nodes still waiting to be refined when the search stops"),

@@ -129,7 +129,7 @@ def test_a_page_has_the_figures_of_its_report() -> None:
         "123.5 kB",
         "24.7 bytes a node",
         "12.5 %",
-        "1.0",
+        "Growth 1 nodes per leaf",
         "not checked",
     ):
         assert part in text

@@ -198,15 +198,19 @@ def test_a_part_swept_before_it_is_locked_is_made_again(tmp_path: Path, monkeypa
 
 
 #: Modules that write files, and what: outputs (whole, or to a device or an address), the cache of kernels, what the
-#: process of Open3D says.
+#: process of Open3D says, a line in the settings of a shell.
 WRITERS = {
     *("io/writing.py", "support/addresses.py", "support/atomic.py", "support/atomic_set.py"),
-    "render/open3d/process.py",
+    *("render/open3d/process.py", "commands/completion.py"),
 }
 
 
 def writes(call: ast.Call) -> bool:
-    name = call.func.attr if isinstance(call.func, ast.Attribute) else getattr(call.func, "id", "")
+    """Whether a call writes a file; a help formatter of click, on which `write_text` is called, too, writes none."""
+    if isinstance(call.func, ast.Attribute):
+        name = "" if ast.unparse(call.func.value) in ("formatter", "super()") else call.func.attr
+    else:
+        name = getattr(call.func, "id", "")
     modes = [
         value.value
         for value in [*call.args, *(each.value for each in call.keywords)]

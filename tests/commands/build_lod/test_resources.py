@@ -133,7 +133,12 @@ def test_scenes_that_are_there_are_skipped(tmp_path: Path, capsys: Capture) -> N
     assert build(*line) == 0
     out, err = capsys.readouterr()
     first, second = map(json.loads, out.splitlines())
-    assert first == {"input": str(scenes[0]), "output": str(tmp_path / "web" / "a-lod.spz"), "skipped": True}
+    assert first == {
+        "schema_version": 1,
+        "input": str(scenes[0]),
+        "output": str(tmp_path / "web" / "a-lod.spz"),
+        "skipped": True,
+    }
     assert second["sh_degree"] == 3
     assert f"{scenes[0]}  ->  {tmp_path / 'web' / 'a-lod.spz'}  is there already" in err
     assert not list(tmp_path.rglob(f"*{SUFFIX}"))

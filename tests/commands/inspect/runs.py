@@ -10,7 +10,7 @@ from tests.conftest import FIXTURES
 
 TREE, PLAIN = FIXTURES / "golden" / "hand-tree-v3.spz", FIXTURES / "sh2.ply"
 RAD = FIXTURES / "golden" / "sh1-tree.rad"
-STREAMED = FIXTURES / "golden" / "sh1-streamed-sog"
+STREAMED, TILES = FIXTURES / "golden" / "sh1-streamed-sog", FIXTURES / "golden" / "sh1-tiles"
 FOLDER = FIXTURES / "golden" / "sh1-sog"
 FAULTS = FIXTURES / "faults"
 CORRUPT, WARNED, NOTED = FAULTS / "spz-flipped-bit.spz", FAULTS / "spz-flags.spz", FAULTS / "tree-fine-first.spz"

@@ -19,7 +19,7 @@ from sparklod_cli.inspection.expectations import FORMATS, NAMES
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
-from tests.commands.inspect.runs import FAULTS, FOLDER, PLAIN, RAD, STREAMED, TREE, inspect, records
+from tests.commands.inspect.runs import FAULTS, FOLDER, PLAIN, RAD, STREAMED, TILES, TREE, inspect, records
 from tests.conftest import Capture
 
 
@@ -149,7 +149,7 @@ def test_what_a_plain_file_does_not_have_does_not_hold(capsys: Capture) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_every_short_name_has_a_value_of_a_tree(name: str, capsys: Capture) -> None:
-    files = {"Streamed SOG": STREAMED, "RAD": RAD, "RAD, Streamed SOG or 3D Tiles": STREAMED}
+    files = {"Streamed SOG": STREAMED, "RAD": RAD, "RAD, Streamed SOG or 3D Tiles": STREAMED, "3D Tiles": TILES}
     assert inspect(files.get(FORMATS.get(name, ""), TREE), "--assert", f"{name}==12345") == 3
     assert f"{name}==12345: {name} is " in capsys.readouterr().out
 
