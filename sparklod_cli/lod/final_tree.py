@@ -109,7 +109,7 @@ def in_final_order(
     for name in GEOMETRY:
         fill(name)
     places = (getattr(out, name)[hidden:] for name in GEOMETRY)
-    node_rows.fill_merged_splats(order[hidden:], n, binary.row, binary.rows, curve.space, *places)
+    node_rows.fill_merged_splats(order[hidden:], n, binary.row, binary.rows, curve.space, threads_in_use(), *places)
     weight = binary.rows[binary.row[slots], pair_cost.WEIGHT]
     binary.rows = rows = binary.rows[binary.row[slots[:0] if goal.is_whole else slots]]  # frees what is not returned
     weights = np.empty(binary.used, np.float32)

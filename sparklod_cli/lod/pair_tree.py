@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..model.splats import FloatArray, Splats
 from ..support.jit import threads_for
-from ..support.parallel import blocks_of
+from ..support.parallel import blocks_of, for_blocks
 from ..support.progress import Progress
 from .check import Bounds
 from .kernels import node_rows, pair_cost, pair_merge
@@ -99,9 +99,13 @@ class Curve:
 
     def order(self, center: FloatArray, threads: int) -> Nodes:
         """Return the (n,) places of (n, 3) centres, in world units, along the curve of the first round."""
-        units = np.subtract(center, self.middle, dtype=np.float64)
-        units /= self.unit
-        return self.sort(units.astype(np.float32), np.arange(len(center), dtype=np.uint32), 0, threads)
+        units = np.empty((len(center), 3), np.float32)
+
+        def fill(part: slice) -> None:
+            units[part] = np.subtract(center[part], self.middle, dtype=np.float64) / self.unit
+
+        for_blocks(fill, len(center), threads, lambda done: None)
+        return self.sort(units, np.arange(len(center), dtype=np.uint32), 0, threads)
 
     def leaf_rows(self, splats: Splats, index: Nodes) -> tuple[FloatArray, FloatArray]:
         """Return the (n, WIDTH) node rows and (n,) feature sizes, in units, of some splats."""
@@ -222,9 +226,8 @@ def merge_levels(
         nodes: (n,) uint32, without a parent.
         levels: (n,) at which they would have merged next.
     """
-    by_level = np.argsort(levels, kind="stable").astype(np.uint32)
     lowest = int(levels.min())
-    ends = np.cumsum(np.bincount(levels - lowest))
+    by_level, ends = _by_level(levels - np.int32(lowest))
     del levels
     corners = (region.low, region.high) if region else ((-math.inf,) * 3, (math.inf,) * 3)
     low, high = ((np.array(corner) - curve.middle) / curve.unit for corner in corners)
@@ -248,6 +251,14 @@ def merge_levels(
         active = _merge(binary, active, curve, math.inf, None, progress)
     waiting.append((active, np.full(len(active), lowest + level, np.int32)))
     return np.concatenate([nodes for nodes, _ in waiting]), np.concatenate([at for _, at in waiting])
+
+
+def _by_level(level: Levels) -> tuple[Nodes, NDArray[np.int64]]:
+    """Return the (N,) leaves by level, and how many there are up to each; levels are at least 0."""
+    counts = np.bincount(level)
+    with threads_for(len(level)) as threads:
+        leaves = np.arange(len(level), dtype=np.uint32)
+        return sort_by_key(level.astype(np.uint64), leaves, len(counts).bit_length(), threads)[1], np.cumsum(counts)
 
 
 def _merge(

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..model.lod_tree import LodTree
 from ..model.splats import COLUMNS, FloatArray, Splats
-from ..support.jit import threads_for
+from ..support.jit import threads_for, threads_in_use
 from ..support.parallel import blocks_of
 from .kernels.cell_pairs import merge_in_cells, split_families
 from .kernels.geometry import SplatColumns
@@ -223,7 +223,7 @@ class VoxelTree:
         is_merged = (self._count[part] > 0) | (self._number[part] >= self.leaves)
         at = np.where(is_merged, np.arange(1, count + 1, dtype=np.uint32), np.uint32(0))
         columns = self._center[part], self._scale[part], self._quat[part], self._opacity[part]
-        fill_merged_splats(at, 1, nodes, rows.node, self._space, *columns)
+        fill_merged_splats(at, 1, nodes, rows.node, self._space, threads_in_use(), *columns)
         self.total += count
 
     def finish(self, tops: NodeRows, index: Nodes, given: Splats) -> Final:

@@ -138,8 +138,8 @@ def morton_keys(rows, nodes, low, step):
     return keys
 
 
-@kernel(u4[:], i8, u4[:], f4[:, :], Space, out(f4[:, :]), out(f4[:, :]), out(f4[:, :]), out(f4[:]), parallel=True)
-def fill_merged_splats(order, leaves, row, rows, space, center, scale, quat, opacity):
+@kernel(u4[:], i8, u4[:], f4[:, :], Space, i8, out(f4[:, :]), out(f4[:, :]), out(f4[:, :]), out(f4[:]), parallel=True)
+def fill_merged_splats(order, leaves, row, rows, space, threads, center, scale, quat, opacity):
     """Fill the geometry of merged splats in final order; leaves are left as they are.
 
     Args:
@@ -148,34 +148,38 @@ def fill_merged_splats(order, leaves, row, rows, space, center, scale, quat, opa
         row: (nodes - leaves,) uint32 row of each merged node.
         rows: node rows.
         space: `Space`.
+        threads: number of threads; the result does not depend on it.
         center, scale, quat, opacity: columns of M splats.
     """
     middle, unit = space
     n = len(order)
-    for block in prange((n + BLOCK - 1) // BLOCK):
-        begin, end = block * BLOCK, min(n, block * BLOCK + BLOCK)
+    for thread in prange(threads):
         moments = np.empty((ROWS, BLOCK), np.float64)
         found, source = np.empty(BLOCK, np.int64), np.empty(BLOCK, np.int64)
-        count = 0
-        for i in range(begin, end):
-            if order[i] >= leaves:
-                found[count], source[count] = i, row[order[i] - leaves]
-                for element in range(6):
-                    moments[element, count] = rows[source[count], COVARIANCE + element]
-                count += 1
-        decompose(moments, np.int64(count))  # a literal 0 would be compiled as a type of its own
-        for k in range(count):
-            i = found[k]
-            merged = rows[source[k]]
-            needle = is_needle(moments[0, k], moments[1, k], moments[2, k])
-            linear, spread = profile_of(np.float64(merged[DENSITY]), needle)
-            opacity[i] = linear
-            for axis in range(3):
-                place = np.float64(merged[CENTER + axis]) * unit + middle[axis]
-                center[i, axis] = min(max(place, -LARGEST), LARGEST)
-                scale[i, axis] = min(max(math.sqrt(max(moments[axis, k], 0.0) / spread) * unit, SCALE_FLOOR), LARGEST)
-            for part in range(4):
-                quat[i, part] = moments[6 + part, k]
+        # Blocks in turn, as most merged splats come before most leaves.
+        for begin in range(thread * BLOCK, n, threads * BLOCK):
+            end = min(n, begin + BLOCK)
+            count = np.int64(0)
+            for i in range(begin, end):
+                if order[i] >= leaves:
+                    found[count], source[count] = i, row[order[i] - leaves]
+                    for element in range(6):
+                        moments[element, count] = rows[source[count], COVARIANCE + element]
+                    count += 1
+            decompose(moments, count)
+            for k in range(count):
+                i = found[k]
+                merged = rows[source[k]]
+                needle = is_needle(moments[0, k], moments[1, k], moments[2, k])
+                linear, spread = profile_of(np.float64(merged[DENSITY]), needle)
+                opacity[i] = linear
+                for axis in range(3):
+                    place = np.float64(merged[CENTER + axis]) * unit + middle[axis]
+                    center[i, axis] = min(max(place, -LARGEST), LARGEST)
+                    axis_scale = math.sqrt(max(moments[axis, k], 0.0) / spread) * unit
+                    scale[i, axis] = min(max(axis_scale, SCALE_FLOOR), LARGEST)
+                for part in range(4):
+                    quat[i, part] = moments[6 + part, k]
 
 
 @kernel(u4[:], u4[:], f4[:, :], out(f4[:, :]), parallel=True)

@@ -44,7 +44,7 @@ def test_merged_nodes_are_drawn_with_the_variance_and_coverage_of_their_rows() -
     before = out.take(np.arange(100))
     space, geometry = node_rows.Space(middle, unit), (out.center, out.scale, out.quat_xyzw, out.opacity)
     row = np.random.default_rng(3).permutation(60).astype(np.uint32)  # of nodes 40 to 99
-    node_rows.fill_merged_splats(order, 40, row, rows, space, *geometry)
+    node_rows.fill_merged_splats(order, 40, row, rows, space, 2, *geometry)
     for i, node in enumerate(order):
         if node < 40:  # a leaf
             assert np.array_equal(out.center[i], before.center[i])
