@@ -1,4 +1,4 @@
-"""Draws the pictures of docs/playcanvas.md and docs/cesium.md anew: `python -m tests.docs.engine_pictures`.
+"""Draws the pictures of engines in the documentation anew: `python -m tests.docs.engine_pictures`.
 
 ENGINES_DIR names a folder whose node_modules has what `tests/interop/engines/__init__.py` lists. Chromium shows the
 demo scene in the pages that the documents give, with an environment but in CesiumJS.
@@ -15,9 +15,12 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+import sparklod_cli
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod.tile_settings import TileSettings
+from sparklod_cli.model.scene import Scene
 from tests.conftest import FIXTURES, ROOT
+from tests.interop.engines import recipes
 from tests.interop.engines.browser import Browser, Shown
 from tests.interop.engines.conftest import detailed, sky, written
 from tests.tiled import tiled
@@ -51,6 +54,9 @@ def main() -> None:
             _save(engine, getattr(browser, engine)(shot.file, shot.camera, settings))
         splats = read_scene(FIXTURES / "demo.ply").splats
         inner = splats.take(np.linalg.norm(splats.center, axis=1) < WITHIN)
+        glb = Path(name) / recipes.GLB
+        sparklod_cli.write(glb, Scene(inner, up="-y"))
+        _save("playcanvas-glb", browser.playcanvas_glb(glb, shot.camera))
         tileset = tiled(inner, Path(name), TILES)
         for picture, changes in CESIUM.items():
             _save(picture, browser.cesium(tileset, shot.camera, changes))
