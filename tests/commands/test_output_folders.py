@@ -77,8 +77,8 @@ def test_a_name_without_suffix_is_refused_with_a_hint(command: str, name: str, t
 @pytest.mark.parametrize(
     ("options", "endings"),
     [
-        ((), ".spz, .rad, /lod-meta.json"),
-        (("--refine",), ".spz, .rad, /lod-meta.json"),
+        ((), ".spz, .rad, /lod-meta.json, /tileset.json"),
+        (("--refine",), ".spz, .rad, /lod-meta.json, /tileset.json"),
         (("--unlod",), ".ply, .spz, .rad, .sog, /meta.json, .glb, .splat"),
         (("--encoding", "ext"), ".npz, .bin, .raw"),
     ],

@@ -177,7 +177,7 @@ def test_other_backends_draw_or_say_what_is_missing(backend: str, tmp_path: Path
 
 
 def test_every_backend_can_be_named_but_that_which_a_device_names(capsys: Capture) -> None:
-    assert render("--help") == 0
+    assert render("--help-all") == 0
     said = capsys.readouterr().out
     assert f"[{'|'.join(name for name in BACKENDS if name != ON_CARD)}]" in said
     assert ON_CARD in DEVICES
