@@ -10,22 +10,11 @@ import numpy as np
 from ..codecs.options import WriteOptions
 from ..io.writing import SinkTogether
 from ..lod.tile_settings import TileSettings
-from ..model.scene import Scene
 from ..model.tile_scene import TileScene
 from ..support.parallel import on_threads
 from ..support.progress import Progress
 from .output import BakeOutput, Encode
 from .records import BuiltTree, Clock, WrittenTiles, WrittenTree
-
-
-def tiles_of(scene: Scene, settings: TileSettings, *, threads: int, progress: Progress) -> TileScene:
-    """Return the tiles of a tree."""
-    from ..lod.tiles import make
-
-    assert scene.tree is not None
-    with on_threads(threads):
-        made = make(scene.splats, scene.tree, settings, progress=progress)
-    return dataclasses.replace(made, antialiased=scene.antialiased, up=scene.up)
 
 
 @dataclass(frozen=True)
@@ -38,13 +27,14 @@ class TileOutput(BakeOutput):
 
     def write(self, tree: BuiltTree, encode: Encode, clock: Clock, threads: int, progress: Progress) -> WrittenTree:
         """Make the tiles of a tree and write them."""
-        return self.write_tiles(tree.scene, clock, threads, progress)
-
-    def write_tiles(self, scene: Scene, clock: Clock, threads: int, progress: Progress) -> WrittenTree:
-        """Make the tiles of a tree and write them."""
         from ..codecs.tiles_3d.codec import encode_files
+        from ..lod.tiles import make
 
-        made = tiles_of(scene, self.settings, threads=threads, progress=progress)
+        scene = tree.scene
+        assert scene.tree is not None
+        with on_threads(threads):
+            made = make(scene.splats, scene.tree, self.settings, progress=progress)
+        made = dataclasses.replace(made, antialiased=scene.antialiased, up=scene.up)
         clock.end("tiles")
         size = self.sink(encode_files(made, self.options, threads=threads, progress=progress))
         clock.end("write")

@@ -52,11 +52,13 @@ class TileChoice:
         drawn: (T,) bool, tiles that are drawn.
         coarse: (T,) bool, those of them that would be refined if no child were missing.
         wanted: (T,) bool, tiles that are drawn or refined, and children of those that are or should be refined.
+        distance: (T,) from the camera to the boxes of all tiles, in units of the scene; 0 inside.
     """
 
     drawn: Mask
     coarse: Mask
     wanted: Mask
+    distance: NDArray[np.float64]
 
 
 class TileTraversal:
@@ -86,7 +88,7 @@ class TileTraversal:
             missing += int(scene.counts[choice.coarse | (choice.drawn & ~there[own])].sum())
             limited |= bool((drawn & ~choice.coarse & ~scene.is_leaf).any())
             # Coarser tiles first, and nearer ones of a level.
-            rank = 1 / (1 + distances(scene, view, instance.object_to_world))
+            rank = 1 / (1 + choice.distance)
             priority = (scene.level.max() + 1 - scene.level + rank).astype(np.float32)
             demand[own] = np.maximum(demand[own], np.where(choice.wanted & (scene.counts > 0), priority, 0))
         return TreeCut(
@@ -117,7 +119,8 @@ def choose(
     present = resident | (scene.counts == 0)
     refinable = np.ones(scene.tiles, np.bool_)  # all children are there
     np.logical_and.at(refinable, scene.parent[1:], present[1:])
-    exceeds = (scene.errors > limit * distances(scene, view, object_to_world)) | (scene.counts == 0)
+    distance = distances(scene, view, object_to_world)
+    exceeds = (scene.errors > limit * distance) | (scene.counts == 0)
     desired = visible & exceeds & ~scene.is_leaf
     visited, wanted = np.zeros(scene.tiles, np.bool_), np.zeros(scene.tiles, np.bool_)
     visited[0] = wanted[0] = visible[0]
@@ -127,7 +130,7 @@ def choose(
         wanted[tiles] = visited[above] & desired[above]
         visited[tiles] = wanted[tiles] & refinable[above]
     drawn = visited & visible & ~(desired & refinable)
-    return TileChoice(drawn, drawn & desired, wanted)
+    return TileChoice(drawn, drawn & desired, wanted, distance)
 
 
 def distances(scene: TileScene, view: CutView, object_to_world: NDArray[np.float64]) -> NDArray[np.float64]:
