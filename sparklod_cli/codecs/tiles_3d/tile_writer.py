@@ -20,6 +20,7 @@ from ..glb import codec as glb
 from ..options import CESIUM, WriteOptions
 from .axes import to_tileset, turned
 from .tileset import CONTENT_GLTF, REPLACE, VERSION
+from .volumes import LARGEST
 
 #: Tiles of a tileset file from which on its subtrees go to files of their own, each of at most as many; and the least
 #: tiles for which such a file is made. A tile takes some 300 bytes of JSON. Chosen.
@@ -48,8 +49,8 @@ def encode_files(
     Raises:
         FormatError: the tiles cannot hold the splats, or JSON not the extent of the scene.
     """
-    if not np.isfinite(scene.bounds).all() or not np.isfinite(scene.errors).all():
-        raise FormatError("its splats reach beyond what numbers can hold; scale it down")
+    if not (np.abs(scene.bounds) <= LARGEST).all() or not (scene.errors <= LARGEST).all():
+        raise FormatError("its splats reach beyond what float32 holds, in which viewers draw; scale it down")
     options = replace(options, glb_profile=options.glb_profile or CESIUM)
     names, together, done = tile_names(scene), max(1, min(threads, scene.tiles)), 0
 

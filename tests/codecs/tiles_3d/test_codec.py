@@ -16,6 +16,7 @@ import pytest
 from fixtures import by_hand_glb, by_hand_tiles
 from sparklod_cli.codecs.options import PROFILES, WriteOptions
 from sparklod_cli.codecs.tiles_3d import codec, tile_writer
+from sparklod_cli.codecs.tiles_3d.volumes import LARGEST
 from sparklod_cli.io import open_stream, read_scene, read_tiles
 from sparklod_cli.lod import quality
 from sparklod_cli.lod.tile_settings import TileSettings
@@ -161,6 +162,18 @@ def test_subtrees_of_many_tiles_are_nested_tilesets() -> None:
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
     assert_close(one.splats, other.splats, 0, 1e-6)
     assert len(scene_of(nested)) == 3_000
+
+
+@pytest.mark.parametrize("corner", [3.3e38, 3.41e38, np.inf])
+def test_what_is_written_has_boxes_that_the_check_takes(corner: float) -> None:
+    bounds = tiles().bounds.copy()
+    bounds[0, 1] = corner
+    scene = dataclasses.replace(tiles(), bounds=bounds)
+    if corner > LARGEST:
+        with pytest.raises(FormatError, match="beyond what float32 holds"):
+            files_of(scene)
+    else:
+        assert tiles_of(files_of(scene)).bounds.max() == pytest.approx(corner)
 
 
 def test_the_golden_file_is_read() -> None:
