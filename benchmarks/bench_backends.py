@@ -24,9 +24,7 @@ from sparklod_cli.render.backends import BACKENDS
 from sparklod_cli.render.rasterizer import Image
 from sparklod_cli.render.settings import RasterSettings
 from sparklod_cli.render.shading import ShadedSplats, shade
-from sparklod_cli.support import jit
 from sparklod_cli.support.errors import SparklodError
-from sparklod_cli.support.parallel import processors
 
 HEADINGS = (
     "scene",
@@ -142,7 +140,6 @@ def main() -> None:
     for spec in specs:
         if spec.partition(":")[0] not in BACKENDS:
             parser.error(f"{spec} is not a backend; choose from {', '.join(BACKENDS)}")
-    jit.use_threads(processors())
     print(f"Machine: {machine()}. Paths of {arguments.frames} frames: the least PSNR, the median time.\n")
     print("| " + " | ".join(HEADINGS) + " |")
     print("|---" * len(HEADINGS) + "|")

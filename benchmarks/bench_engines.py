@@ -20,8 +20,6 @@ import numpy as np
 from sparklod_cli.codecs.file_names import TILESET
 from sparklod_cli.codecs.tiles_3d.axes import to_tileset
 from sparklod_cli.io import read_scene
-from sparklod_cli.support import jit
-from sparklod_cli.support.parallel import processors
 from tests.interop.engines.browser import Browser, Shown
 from tests.interop.engines.likeness import like_cesium, likeness, our_picture
 from tests.interop.pictures import cameras_around
@@ -53,7 +51,6 @@ def main() -> None:
     chromium = shutil.which("chromium")
     if chromium is None or "ENGINES_DIR" not in os.environ:
         raise SystemExit("needs Chromium, and ENGINES_DIR: a folder whose node_modules has the engines")
-    jit.use_threads(processors())
     print("| " + " | ".join(HEADINGS) + " |")
     print("|---" * len(HEADINGS) + "|")
     with tempfile.TemporaryDirectory() as folder:

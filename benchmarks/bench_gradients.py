@@ -17,7 +17,6 @@ from performance.rows import Row, Table, figure, label, ratio
 
 from sparklod_cli.render import gradients
 from sparklod_cli.render.settings import RasterSettings
-from sparklod_cli.support import jit
 
 TABLE = Table(
     columns=(
@@ -47,7 +46,6 @@ def seconds_of(work: Callable[[], object], runs: int) -> list[float]:
 
 def rows(counts: Iterable[int], size: tuple[int, int], runs: int) -> Iterator[Row]:
     """A row for each number of splats."""
-    jit.use_threads(1)
     width, height = size
     camera = ahead(size)
     by_image = np.random.default_rng(0).normal(size=(height, width, 4)).astype(np.float32)

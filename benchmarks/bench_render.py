@@ -22,8 +22,6 @@ from sparklod_cli.model.scene import Scene
 from sparklod_cli.render.rasterizer import draw
 from sparklod_cli.render.settings import RasterSettings
 from sparklod_cli.render.shading import ShadedSplats, shade
-from sparklod_cli.support import jit
-from sparklod_cli.support.parallel import processors
 
 #: Width and height in pixels, and numbers of splats.
 SIZE, SPLATS = (1280, 720), (100_000, 500_000, 1_500_000)
@@ -89,7 +87,6 @@ def scattered(count: int, camera: Camera) -> ShadedSplats:
 
 def scattered_rows(counts: Iterable[int], size: tuple[int, int], runs: int) -> Iterator[Row]:
     """A row for each number of scattered splats, from shaded splats to floats, on all processors."""
-    jit.use_threads(processors())
     camera = ahead(size)
     for count in counts:
         splats = scattered(count, camera)
@@ -101,7 +98,6 @@ def view_rows(paths: Iterable[Path], size: tuple[int, int], runs: int, budget: i
 
     A run is the mean of all views; the slowest view of each run stands beside.
     """
-    jit.use_threads(processors())
     for path in paths:
         scene = Scene(load(path))
         cameras = cameras_of("around", scene, size)

@@ -15,8 +15,6 @@ import numpy as np
 
 from sparklod_cli.io import read_scene
 from sparklod_cli.render.settings import SORTS, RasterSettings
-from sparklod_cli.support import jit
-from sparklod_cli.support.parallel import processors
 from tests.interop.page import Page
 from tests.interop.pictures import AROUND, Difference, cameras_around, compare
 
@@ -66,7 +64,6 @@ def main() -> None:
         raise SystemExit(
             "needs Chromium, and SPARK_DIR: a folder whose node_modules has Spark, three and playwright-core"
         )
-    jit.use_threads(processors())
     width, height = map(int, arguments.size.split("x"))
     print("| " + " | ".join(HEADINGS) + " |")
     print("|---" * len(HEADINGS) + "|")

@@ -31,8 +31,8 @@ from sparklod_cli.model.lod_tree import Nodes
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.scenes.finder import view_of
-from sparklod_cli.support import jit
-from sparklod_cli.support.parallel import ordered_map, processors
+from sparklod_cli.support.parallel import ordered_map
+from sparklod_cli.support.threads import on_threads, processors
 
 #: Nodes of the trees of tiled scenes in millions, budgets in nodes, and frames of their path.
 MILLIONS, BUDGETS, FRAMES = (0.5, 1, 2, 5, 10, 20), (50_000, 200_000, 500_000, 1_500_000), 24
@@ -208,16 +208,15 @@ class Measured:
 
     def _statistics(self, budget: int) -> float:
         """Seconds per frame of the statistics of cuts, and of what changes from one to the next, on one thread."""
-        jit.use_threads(1)
         changes = Changes(self._forest, self._traversal.instances)
         seconds = []
-        for view in self._views:
-            cut = self._traversal.cut(view, budget=budget)
-            seconds.append(
-                _seconds(lambda cut=cut, view=view: measure(self._forest, self._depths, cut, view, size=SIZE))
-                + _seconds(lambda cut=cut: changes.next(cut))
-            )
-        jit.use_threads(processors())
+        with on_threads(1):
+            for view in self._views:
+                cut = self._traversal.cut(view, budget=budget)
+                seconds.append(
+                    _seconds(lambda cut=cut, view=view: measure(self._forest, self._depths, cut, view, size=SIZE))
+                    + _seconds(lambda cut=cut: changes.next(cut))
+                )
         return statistics.mean(seconds)
 
     def _blended(self, budget: int) -> float:

@@ -22,8 +22,8 @@ from typing import Literal
 from . import __version__
 from .support import machine
 from .support.optional import DISTRIBUTION, install_hint, pip_install, required_by
-from .support.parallel import processors
 from .support.python_process import program_command
+from .support.threads import processors
 
 #: ok: works. note: something optional is missing, or could be better. problem: baking does not work.
 State = Literal["ok", "note", "problem"]

@@ -45,7 +45,7 @@ def pytest_sessionstart(session: pytest.Session) -> None:
     from sparklod_cli import warmup
     from sparklod_cli.commands.console import count_of
     from sparklod_cli.support import jit
-    from sparklod_cli.support.parallel import processors
+    from sparklod_cli.support.threads import processors
 
     _refuse_undeclared_types()
     is_worker = hasattr(session.config, "workerinput")  # of xdist; the controlling process has compiled them

@@ -7,7 +7,7 @@ import platform
 from importlib.metadata import version
 from pathlib import Path
 
-from sparklod_cli.support.parallel import processors
+from sparklod_cli.support.threads import processors
 
 
 def machine() -> str:

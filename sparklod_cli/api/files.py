@@ -14,7 +14,7 @@ from ..io import examine_scene, rad_file, read_scene
 from ..model.scene import Scene, Tree
 from ..model.splats import COLUMNS, FloatArray
 from ..support.errors import FormatError, InvalidSplatsError, TreeError, memory_errors_translated
-from ..support.parallel import thread_count
+from ..support.threads import thread_count
 from .arguments import ProgressLike, progress_callback, scene_like
 
 if TYPE_CHECKING:

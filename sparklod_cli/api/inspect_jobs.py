@@ -15,8 +15,8 @@ from ..inspection.report import Report, ReportSettings, inspect
 from ..io import check_writable, read_scene, write_whole
 from ..model.scene import Scene
 from ..support.errors import FormatError, SparklodError, memory_errors_translated
-from ..support.parallel import on_threads
 from ..support.progress import Progress
+from ..support.threads import on_threads
 from ..tables.output import TableOutput
 
 if TYPE_CHECKING:

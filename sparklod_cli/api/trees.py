@@ -27,9 +27,9 @@ from ..support.defaults import (
     MIN_GROWTH,
 )
 from ..support.errors import FormatError, memory_errors_translated
-from ..support.parallel import on_threads, thread_count
 from ..support.progress import Progress
 from ..support.setting_fields import Range, whole
+from ..support.threads import on_threads, thread_count
 from .arguments import BudgetLike, ProgressLike, budget_like, path_like, progress_callback, scene_like
 
 

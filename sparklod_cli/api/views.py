@@ -25,7 +25,7 @@ from ..scenes.loaded_scene import UNNAMED
 from ..scenes.reading import read_scenes
 from ..support.defaults import BLEND
 from ..support.errors import FormatError, memory_errors_translated
-from ..support.parallel import on_threads, thread_count
+from ..support.threads import on_threads, thread_count
 from ..tables.comparison import COLUMNS as OF_COMPARISON
 from .arguments import BudgetLike, ProgressLike, budget_like, camera_like, path_like, progress_callback, viewed_like
 from .results import ComparisonTable, Frames

@@ -14,7 +14,7 @@ from ..io.details import detail_sink
 from ..model.scene import Scene
 from ..support.defaults import DEFAULT_COMPRESSION
 from ..support.errors import FormatError, InvalidSplatsError, memory_errors_translated
-from ..support.parallel import thread_count
+from ..support.threads import thread_count
 from .arguments import ProgressLike, file_path, progress_callback, scene_like
 from .files import naming, pack
 

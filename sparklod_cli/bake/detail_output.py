@@ -12,8 +12,8 @@ from ..io.writing import Files, SinkTogether
 from ..lod.detail_rule import DetailSettings
 from ..model.scene import DetailScene, Scene
 from ..model.splats import Splats
-from ..support.parallel import on_threads
 from ..support.progress import Progress
+from ..support.threads import on_threads
 from .output import BakeOutput, Encode
 from .records import BuiltTree, Clock, WrittenDetail, WrittenLevel, WrittenTree
 

@@ -23,8 +23,8 @@ from ..render.kernels.project import TILE, ShadedColumns
 from ..render.kernels.region_errors import compare_levels
 from ..render.kernels.shade import add_sh
 from ..render.settings import BLUR, CLIP
-from ..support.parallel import on_threads
 from ..support.progress import Progress, silent
+from ..support.threads import on_threads
 
 Errors = NDArray[np.float64]
 
@@ -92,7 +92,9 @@ def _differences(
     with on_threads(threads):
         for batch in batches:
             part = slice(int(batch[0]), int(batch[-1]) + 1)
-            compare_levels(columns, splats.sh, runs[part], poses[part], basis, widths[part], focal, limits, sums[part])
+            jobs = len(batch) * len(turns)
+            places = runs[part], poses[part], basis, widths[part]
+            compare_levels(jobs, columns, splats.sh, *places, focal, limits, sums[part])
             progress("errors", part.stop, scene.regions, "region")
     return sums.sum(axis=1)
 
@@ -122,7 +124,7 @@ def _basis(turns: NDArray[np.float64], coefficients: int) -> NDArray[np.float32]
     if coefficients:
         for turn, values in zip(turns, basis, strict=True):
             ahead = np.tile(turn[2].astype(np.float32), (coefficients, 1))
-            add_sh(ahead, ones, np.zeros(3, np.float32), degree_of(coefficients), values)
+            add_sh(len(ahead), ahead, ones, np.zeros(3, np.float32), degree_of(coefficients), values)
     return np.ascontiguousarray(basis[:, :, 0])
 
 

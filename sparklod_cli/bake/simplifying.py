@@ -22,8 +22,8 @@ from ..lod.detail_levels import RefinementOrder, with_plain_opacity
 from ..model.scene import Scene
 from ..model.splats import Splats
 from ..support.errors import FormatError, SparklodError
-from ..support.parallel import on_threads
 from ..support.progress import Progress
+from ..support.threads import on_threads
 from .output import BakeOutput, Encode
 from .records import BuiltTree, Clock, WrittenSet, WrittenTree
 from .refining import Refined, fit_settings, refined

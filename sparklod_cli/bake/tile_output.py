@@ -11,8 +11,8 @@ from ..codecs.options import WriteOptions
 from ..io.writing import SinkTogether
 from ..lod.tile_settings import TileSettings
 from ..model.tile_scene import TileScene
-from ..support.parallel import on_threads
 from ..support.progress import Progress
+from ..support.threads import on_threads
 from .output import BakeOutput, Encode
 from .records import BuiltTree, Clock, WrittenTiles, WrittenTree
 

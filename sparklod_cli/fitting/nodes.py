@@ -72,11 +72,18 @@ class FittedNodes:
         whole = ShadedSplats(now.center, now.scale, now.quat_xyzw, now.lod_opacity, now.rgb)
         _, matrix, lens, limits = rasterizer.arguments(whole, camera, self.raster)
         marks = np.empty(len(index), np.bool_)
-        mark_seen(now.center, now.lod_opacity, index, matrix, lens, limits, marks)
+        mark_seen(len(index), now.center, now.lod_opacity, index, matrix, lens, limits, marks)
         seen = index[marks]
         found = Columns(*(column[seen] for column in now))
         if terms := found.sh.shape[1]:
-            add_sh(found.center, found.sh, camera.position.astype(np.float32), COEFFICIENTS.index(terms), found.rgb)
+            add_sh(
+                len(found.rgb),
+                found.center,
+                found.sh,
+                camera.position.astype(np.float32),
+                COEFFICIENTS.index(terms),
+                found.rgb,
+            )
         np.maximum(found.rgb, 0, out=found.rgb)
         return seen, ShadedSplats(found.center, found.scale, found.quat_xyzw, found.lod_opacity, found.rgb)
 

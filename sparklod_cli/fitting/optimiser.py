@@ -50,7 +50,7 @@ class Optimiser:
         derivatives = found.center, found.log_scale, found.turn, found.lod_opacity, rgb, sh
         columns = adam.Gradients(*map(np.ascontiguousarray, derivatives))
         rates = adam.Rates(*map(np.float32, rates))
-        adam.step(nodes.columns, nodes.old, seen, self._slots, columns, rates, self._moments, nodes.bounds)
+        adam.step(len(seen), nodes.columns, nodes.old, seen, self._slots, columns, rates, self._moments, nodes.bounds)
         self._moved.append(seen)
 
     def place(self) -> None:

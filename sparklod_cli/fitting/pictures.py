@@ -50,7 +50,7 @@ class FullDetailPicture:
     def errors(self, image: Image) -> tuple[float, float]:
         """Return the mean squared errors of a picture on black and on white."""
         sums = np.empty((len(image), 2))
-        squared_differences(image, self.full, sums)
+        squared_differences(len(image), image, self.full, sums)
         black, white = sums.sum(axis=0) / (image.shape[0] * image.shape[1] * 3)
         return float(black), float(white)
 
@@ -58,7 +58,7 @@ class FullDetailPicture:
         """Return the derivative of the mean logarithm of `errors`, as in PSNR."""
         result, pixels = np.empty_like(image), image.shape[0] * image.shape[1] * 3
         errors = [error + LEAST_ERROR for error in self.errors(image)]
-        by_image(image, self.full, *(np.float32(1 / (pixels * error)) for error in errors), result)
+        by_image(len(image), image, self.full, *(np.float32(1 / (pixels * error)) for error in errors), result)
         return result
 
 

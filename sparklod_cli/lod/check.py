@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ..codecs.validation import check_valid
 from ..model.splats import Splats
 from ..support.errors import InvalidSplatsError
-from ..support.jit import threads_for
+from ..support.threads import threads_for
 from .kernels.geometry import find_bounds
 
 

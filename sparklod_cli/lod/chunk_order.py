@@ -19,9 +19,9 @@ from ..model.foveation import SPARK
 from ..model.gaussian import spark_size
 from ..model.lod_tree import CHUNK_NODES, LodTree
 from ..model.splats import FloatArray, Splats
-from ..support.jit import threads_for
 from ..support.parallel import blocks_of
 from ..support.progress import Progress, silent
+from ..support.threads import threads_for
 from .families import families_of, node_order, reordered
 from .kernels import family_rows
 from .kernels.chunk_sets import DEMAND_BYTES, LANES, Families, fill_demand, sort_within_chunks, split_sets

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..model.splats import FloatArray, Splats
-from ..support.jit import threads_for
 from ..support.parallel import blocks_of, for_blocks
 from ..support.progress import Progress
+from ..support.threads import threads_for
 from .check import Bounds
 from .kernels import node_rows, pair_cost, pair_merge
 from .kernels.geometry import SplatColumns

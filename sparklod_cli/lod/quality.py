@@ -27,8 +27,8 @@ from ..model.gaussian import spark_size
 from ..model.lod_tree import LodTree
 from ..model.splats import FloatArray, Splats
 from ..support.defaults import DEFAULT_GROWTH, MAX_GROWTH, MIN_GROWTH
-from ..support.jit import threads_for
 from ..support.progress import Progress, silent
+from ..support.threads import threads_for
 from .check import Bounds, check, check_setting
 from .final_tree import FinalTree, PruningGoal, in_final_order
 from .kernels import pair_cost

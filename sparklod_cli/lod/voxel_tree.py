@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from ..model.lod_tree import LodTree
 from ..model.splats import COLUMNS, FloatArray, Splats
-from ..support.jit import threads_for, threads_in_use
 from ..support.parallel import blocks_of
+from ..support.threads import threads_for, threads_in_use
 from .kernels.cell_pairs import merge_in_cells, split_families
 from .kernels.geometry import SplatColumns
 from .kernels.node_rows import Space, fill_leaf_rows, fill_leaves, fill_merged_splats, merge_colors

@@ -70,10 +70,10 @@ class Drawing:
         sums = np.empty((first[-1], backward.SUMS), np.float32)
         drawn = backward.Drawn(screen, boxes, self.tiles.start, self.tiles.splats, self.tiles.stop, across)
         by_image = np.ascontiguousarray(by_image, np.float32)
-        backward.weigh_tiles(drawn, first, np.float32(MIN_ALPHA), self.image, by_image, sums)
+        backward.weigh_tiles(len(drawn.stop), drawn, first, np.float32(MIN_ALPHA), self.image, by_image, sums)
         found = np.zeros((len(self.splats), backward.GRADIENT_COLUMNS), np.float32)
         arguments = rasterizer.arguments(self.splats, self.camera, self.settings)
-        backward.carry_back(*arguments, backward.Rows(screen, first, sums), found)
+        backward.carry_back(len(screen), *arguments, backward.Rows(screen, first, sums), found)
         return SplatGradients(
             center=found[:, CENTER : CENTER + 3],
             log_scale=found[:, LOG_SCALE : LOG_SCALE + 3],
@@ -118,5 +118,5 @@ def by_sh(
     by_color = np.where(rgb > 0, by_rgb, np.float32(0))
     found = np.empty((len(center), coefficients, 3), np.float32)
     if coefficients:
-        sh_gradients(center, np.asarray(eye, np.float32), by_color, found)
+        sh_gradients(len(center), center, np.asarray(eye, np.float32), by_color, found)
     return by_color, found

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..cameras.camera import Camera
 from ..cameras.pose import FARTHEST, FLIP
 from ..model.falloff import MAX_STD_DEV, MIN_ALPHA, STD_DEV_PER_D
-from ..support.jit import threads_in_use
+from ..support.threads import threads_in_use
 from .kernels import ellipse, project, raster
 from .settings import BLUR, CLIP, RasterSettings
 from .shading import ShadedSplats
@@ -71,12 +71,37 @@ def draw(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> Imag
 def draw_projected(seen: Projected, camera: Camera, settings: RasterSettings) -> tuple[Image, Tiles]:
     """Draw splats on the screen; return the picture and its tiles."""
     across, down = tiles_across(camera)
-    start, order = raster.sort_into_tiles(seen.keys, seen.boxes, across, down, CHUNKS * threads_in_use())
+    start, order = sort_into_tiles(seen, across, down, CHUNKS * threads_in_use())
     drawn = Tiles(start, order, np.empty(across * down, np.int64))
     image = np.empty((camera.height, camera.width, 4), np.float32)
     is_design = settings.profile == "shifted"
-    raster.draw_tiles(seen.screen, start, order, across, is_design, np.float32(MIN_ALPHA), image, drawn.stop)
+    raster.draw_tiles(
+        len(drawn.stop), seen.screen, start, order, across, is_design, np.float32(MIN_ALPHA), image, drawn.stop
+    )
     return image, drawn
+
+
+def sort_into_tiles(
+    seen: Projected, across: int, down: int, blocks: int
+) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+    """List the splats of each tile, from near to far.
+
+    Args:
+        across, down: numbers of tiles.
+        blocks: number of ranges of splats that threads process; the result does not depend on it.
+
+    Returns:
+        (tiles + 1,) int64 where the splats of each tile begin; (total,) int32 splats.
+    """
+    counts = np.zeros((blocks, across * down), np.int32)
+    boxes = np.empty((len(seen.keys), 4), np.int16)
+    raster.count_in_tiles(blocks, seen.keys, seen.boxes, across, boxes, counts)
+    ends = np.cumsum(counts.T, dtype=np.int64).reshape(across * down, blocks)
+    at = np.ascontiguousarray(ends.T - counts)
+    start = np.append(at[0], ends[-1, -1])
+    splats = np.empty(start[-1], np.int32)
+    raster.list_in_tiles(blocks, seen.keys, boxes, across, at, splats)
+    return start, splats
 
 
 def tiles_across(camera: Camera) -> tuple[int, int]:
@@ -90,7 +115,8 @@ def project_splats(splats: ShadedSplats, camera: Camera, settings: RasterSetting
     """Project splats onto the screen; `screen` and `boxes` are buffers, which the next call overwrites."""
     tiles_across(camera)
     screen, boxes, keys = _buffers(len(splats))
-    project.project(*arguments(splats, camera, settings), settings.sort == "radial", screen, keys, boxes)
+    is_radial = settings.sort == "radial"
+    project.project(len(keys), *arguments(splats, camera, settings), is_radial, screen, keys, boxes)
     return Projected(screen, boxes, np.sort(keys[keys != project.NOT_DRAWN]))
 
 

@@ -51,7 +51,7 @@ def _shade(splats: Splats, matrix: Matrix, camera: Camera) -> ShadedSplats:
     rgb = splats.rgb.copy()
     if splats.sh.shape[1]:
         eye = np.linalg.solve(matrix, np.append(camera.position, 1))[:3].astype(np.float32)
-        add_sh(splats.center, splats.sh, eye, COEFFICIENTS.index(splats.sh.shape[1]), rgb)
+        add_sh(len(rgb), splats.center, splats.sh, eye, COEFFICIENTS.index(splats.sh.shape[1]), rgb)
     np.maximum(rgb, 0, out=rgb)
     if not np.array_equal(matrix, np.eye(4)):
         splats = placed(splats, matrix)

@@ -60,6 +60,7 @@ def draw(
     radius = np.clip(width * np.float32(camera.focal[1]) / depth, 0.5, settings.max_radius)
     rgb = np.minimum(splats.rgb[index], 1)
     bands.draw_discs(
+        camera.height,
         np.ascontiguousarray(x[order]),
         np.ascontiguousarray(y[order]),
         radius.astype(np.float32),
@@ -101,5 +102,5 @@ def overdraw(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> 
     if len(splats.center):
         seen = rasterizer.project_splats(splats, camera, settings)
         is_design = settings.profile == "shifted"
-        bands.count_fragments(seen.screen, seen.keys, is_design, np.float32(MIN_ALPHA), counts)
+        bands.count_fragments(len(counts), seen.screen, seen.keys, is_design, np.float32(MIN_ALPHA), counts)
     return counts.astype(np.float32)

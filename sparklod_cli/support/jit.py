@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import os
-import sys
-import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -15,26 +12,11 @@ from typing import Any
 
 from .jit_types import as_declared, example
 from .kernel_cache import SETTINGS, Trouble, cache_folder
-
-#: How long OpenMP's threads spin while they wait for one another at the end of a parallel loop. By default they
-#: spin for milliseconds, which on a busy machine takes the processor from the thread they wait for: four concurrent
-#: bakes then take 1.5 times as long as four in sequence (benchmarks/notes/kernels.md). The variables are read
-#: when the threads start; variables that are already set are left unchanged.
-WAIT_SETTINGS = {
-    "GOMP_SPINCOUNT": "1000",  # GNU: iterations, about 20 microseconds
-    "KMP_BLOCKTIME": "0",  # LLVM and Intel: milliseconds
-}
-if "OMP_WAIT_POLICY" not in os.environ:
-    for _name, _value in WAIT_SETTINGS.items():
-        os.environ.setdefault(_name, _value)
+from .threads import run_ranges
 
 #: Called with the name of a kernel when its compilation begins, and with its duration in seconds when it ends.
 Begun = Callable[[str], None]
 Done = Callable[[float], None]
-
-#: Least number of rows for which several threads are used: with fewer, one thread finishes before another wakes up.
-#: Chosen; no difference was measured up to 65,536 (benchmarks/notes/kernels.md).
-PARALLEL_ROWS = 4096
 
 #: The folder for compiled code; None if kernels have to be compiled in every process.
 CACHE_FOLDER = cache_folder(Path(__file__))
@@ -60,6 +42,7 @@ class Options:
     """Compilation options of a kernel; see `kernel`."""
 
     parallel: bool
+    ranges: bool
     nogil: bool
     inline: bool
     contract: bool
@@ -88,9 +71,8 @@ class Kernel:
     def __call__(self, *arguments: Any) -> Any:
         if self.declared:  # signatures differ in the types of numbers only
             arguments = tuple(map(as_declared, self.declared[0], arguments))
-        if self.options.parallel:
-            with _one_at_a_time():
-                return self.dispatcher(*arguments)
+        if self.options.ranges:
+            return run_ranges(self.dispatcher, *arguments)
         return self.dispatcher(*arguments)
 
     def __reduce__(self) -> str:
@@ -103,14 +85,23 @@ class Kernel:
 
     @functools.cached_property
     def signatures(self) -> list[tuple[Any, ...]]:
-        """Numba's types of the arguments of each declared signature."""
+        """Numba's types of the arguments of each declared signature, as `dispatcher.compile` takes them."""
         import numba
+        from numba.core.types import StarArgTuple
 
-        return [tuple(numba.typeof(example(each)) for each in types) for types in self.declared]
+        signatures = [tuple(numba.typeof(example(each)) for each in types) for types in self.declared]
+        if not self.options.ranges:
+            return signatures
+        return [(StarArgTuple((numba.int64, *types)),) for types in signatures]  # see `jit_numba._called`
 
 
 def kernel(
-    *types: Any, parallel: bool = False, nogil: bool = False, inline: bool = False, contract: bool = False
+    *types: Any,
+    parallel: bool = False,
+    ranges: bool = False,
+    nogil: bool = False,
+    inline: bool = False,
+    contract: bool = False,
 ) -> Callable[[Callable[..., Any]], Any]:
     """Decorate a function that is compiled.
 
@@ -124,15 +115,20 @@ def kernel(
     Args:
         types: of the arguments; a tuple for each signature if there are several; nothing if only kernels call it.
         parallel: the function has loops that run on the threads of `use_threads`.
+        ranges: the first two arguments are the first row of a range and the one after its last. Python gives the number
+            of rows instead, the first declared type, and the threads of `use_threads` run ranges of them. Ranges must
+            not write to the same place, and what they write must not depend on how the rows are divided.
         nogil: releases the GIL, so that other Python threads can run.
         inline: always inlines the function into its callers, which LLVM does not always do by itself.
         contract: allows fused multiply-add, which rounds once instead of twice, on processors that have it.
     """
-    options = Options(parallel, nogil, inline, contract)
+    options = Options(parallel, ranges, nogil or ranges, inline, contract)
     signatures = types if not types or isinstance(types[0], tuple) else (types,)
 
     def decorate(function: Callable[..., Any]) -> Any:
-        return function if _is_disabled() else Kernel(function, options, signatures)
+        if not _is_disabled():
+            return Kernel(function, options, signatures)
+        return functools.wraps(function)(lambda rows, *more: function(0, rows, *more)) if ranges else function
 
     return decorate
 
@@ -170,86 +166,6 @@ def load_numba() -> ModuleType:
             f" ({' '.join(str(error).split())}); correct it, remove it, or work in another folder"
         ) from None
     return jit_numba
-
-
-# Threads
-
-#: Held while a parallel kernel runs on a layer that is not thread-safe. Reentrant, because a signal handler or a
-#: finaliser can call a kernel in the thread that holds it.
-_running = threading.RLock()
-
-#: True in a process that was forked from one that had started threads: it has one thread.
-_has_one_thread = False
-
-
-def use_threads(count: int) -> None:
-    """Run kernels that this thread calls on `count` threads, or on all if there are fewer.
-
-    Raises:
-        ValueError: `count` is less than 1.
-    """
-    load_numba()
-    import numba
-
-    if count < 1:
-        raise ValueError(f"kernels cannot run on {count} threads")
-    numba.set_num_threads(min(count, 1 if _has_one_thread else numba.config.NUMBA_NUM_THREADS))
-
-
-def threads_in_use() -> int:
-    """Return the number of threads that kernels called by this thread run on."""
-    load_numba()
-    import numba
-
-    return int(numba.get_num_threads())
-
-
-@contextlib.contextmanager
-def threads_for(rows: int) -> Iterator[int]:
-    """Run kernels inside on one thread if there are fewer than PARALLEL_ROWS rows; yield the number of threads.
-
-    Waking the other threads takes longer than processing a few thousand rows; on a busy machine, where the threads
-    sleep, a thousand times longer.
-    """
-    threads = threads_in_use()
-    use_threads(1 if rows < PARALLEL_ROWS else threads)
-    try:
-        yield threads_in_use()
-    finally:
-        use_threads(threads)
-
-
-@functools.cache
-def threading_layer() -> str:
-    """Start the threads, and return the layer that runs parallel loops: omp, tbb or workqueue.
-
-    Raises:
-        ValueError: no threading layer can be loaded.
-    """
-    threads_in_use()
-    import numba
-
-    return str(numba.threading_layer())
-
-
-def _one_at_a_time() -> contextlib.AbstractContextManager[Any]:
-    """Return a context for a call of a parallel kernel, in which others wait where the layer is not thread-safe.
-
-    numba's own layer, workqueue, which is used where neither TBB nor OpenMP is installed, aborts the process if two
-    threads run parallel loops at the same time.
-    """
-    return _running if threading_layer() == "workqueue" else contextlib.nullcontext()
-
-
-def _after_fork() -> None:
-    global _running, _has_one_thread
-    _running = threading.RLock()  # another thread of the parent may hold the lock
-    if f"{__package__}.jit_numba" in sys.modules:
-        _has_one_thread = load_numba().restart_on_one_thread()
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_after_fork)
 
 
 # Who is told of compilations, and of a cache that does not work

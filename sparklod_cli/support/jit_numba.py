@@ -1,15 +1,13 @@
 """Kernels as numba has them; loaded when one is called for the first time, because numba takes half a second to load.
 
 Of what numba does not document, this and `kernel_cache` use the cache of a dispatcher (`_cache`), what makes bytes of a
-compiled function and back (`_reduce`, `_rebuild`, `_numba_unpickle`), and what starts the threads of a threading layer
-(`launch_threads`).
+compiled function and back (`_reduce`, `_rebuild`, `_numba_unpickle`), and the options `no_cfunc_wrapper` and
+`no_cpython_wrapper`.
 """
 
 from __future__ import annotations
 
-import ctypes
 import functools
-import sys
 import threading
 import time
 from collections.abc import Callable
@@ -20,6 +18,7 @@ import numba
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils, event, serialize
+from numba.core.compiler import Compiler
 from numba.extending import intrinsic
 
 from . import jit
@@ -30,9 +29,6 @@ _lock = threading.RLock()
 # numba calls this Python function while a kernel returns; if a signal handler raised an exception in it, such as
 # `KeyboardInterrupt`, that would be lost or end in a `SystemError`. A second call for an object runs no Python code.
 serialize._numba_unpickle = functools.cache(serialize._numba_unpickle)
-
-#: Modules of the threading layers.
-LAYERS = {"tbb": "tbbpool", "omp": "omppool", "workqueue": "workqueue"}
 
 #: The name under which a module's globals have a copy of themselves, as numba has them.
 _NAMESPACE = "__globals_of_kernels__"
@@ -48,20 +44,32 @@ def dispatcher_of(kernel: jit.Kernel) -> Any:
         if kernel.built is None:
             options, function = kernel.options, kernel.py_func
             namespace = function.__globals__.setdefault(_NAMESPACE, {})
-            decorate: Any = numba.njit(
+            compiled: Any = numba.njit(
                 error_model="numpy",
                 parallel=options.parallel,
                 nogil=options.nogil,
                 inline="always" if options.inline else "never",
+                forceinline=options.ranges,
                 fastmath={"contract"} if options.contract else False,
                 no_cfunc_wrapper=True,
-            )
-            kernel.built = decorate(_copy(function, namespace))
+                no_cpython_wrapper=options.ranges or not kernel.declared,
+                pipeline_class=_ApartCompiler if options.ranges else Compiler,
+            )(_copy(function, namespace))
+            kernel.built = _called(compiled, function) if options.ranges else compiled
             if jit.CACHE_FOLDER is not None:
                 kernel.built._cache = KernelCache(function, jit.CACHE_FOLDER, jit.report_trouble)
             for name, value in list(function.__globals__.items()):
                 namespace[name] = _known(value)
         return kernel.built
+
+
+class _ApartCompiler(Compiler):
+    """Compiles functions whose arrays do not overlap, which LLVM then need not test before it vectorizes loops."""
+
+    def define_pipelines(self) -> Any:
+        """Return numba's pipelines."""
+        self.state.flags.noalias = True
+        return super().define_pipelines()
 
 
 def _copy(function: Callable[..., Any], namespace: dict[str, Any]) -> FunctionType:
@@ -72,6 +80,21 @@ def _copy(function: Callable[..., Any], namespace: dict[str, Any]) -> FunctionTy
     copy.__module__, copy.__qualname__ = function.__module__, function.__qualname__
     copy.__kwdefaults__ = function.__kwdefaults__
     return copy
+
+
+def _called(compiled: Any, function: Callable[..., Any]) -> Any:
+    """Return a compiled function that calls another, which LLVM makes a part of it.
+
+    LLVM optimizes functions, then numba removes the counts of references to arrays, which keep loops from being
+    vectorized; a function that is part of another one is optimized again, and vectorized.
+    """
+
+    def call(*arguments: Any) -> None:
+        compiled(*arguments)
+
+    for name in ("__module__", "__name__", "__qualname__"):
+        setattr(call, name, getattr(function, name))
+    return numba.njit(error_model="numpy", nogil=True, no_cfunc_wrapper=True)(call)
 
 
 def _lower_prefetch(typing_context: Any, array: Any, index: Any) -> Any:
@@ -101,21 +124,6 @@ def _known(value: Any) -> Any:
     if value is jit.prefetch:
         return _prefetch
     return dispatcher_of(value) if isinstance(value, jit.Kernel) else value
-
-
-def restart_on_one_thread() -> bool:
-    """Run kernels on one thread in a forked process, if its parent had started threads, of which it has none.
-
-    GNU's OpenMP would wait for them forever, so numba ends the process; workqueue would crash.
-    """
-    try:
-        name = numba.threading_layer()
-    except ValueError:  # no threads were started
-        return False
-    layer: Any = sys.modules[f"numba.np.ufunc.{LAYERS[name]}"]
-    ctypes.CFUNCTYPE(None, ctypes.c_int)(layer.launch_threads)(1)
-    numba.set_num_threads(1)
-    return True
 
 
 class _OnCompile(event.Listener):

@@ -1,15 +1,9 @@
-"""Blocks of rows that are processed on several threads, and the number of these.
-
-A function of the API takes `threads`, None for all processors. It passes the number to functions with their own pools
-(`ordered_map`), and runs kernels inside `on_threads`, which restores numba's setting.
-"""
+"""Blocks of rows and other items that are processed on several threads, in order."""
 
 from __future__ import annotations
 
-import contextlib
-import os
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
 
@@ -19,12 +13,6 @@ Result = TypeVar("Result")
 #: Rows of a block: few enough for temporaries to stay in the processor's cache, enough for the
 #: overhead of the interpreter to stay small.
 BLOCK_ROWS = 1 << 14
-
-
-def processors() -> int:
-    """Return the number of processors that this process may use."""
-    affinity = getattr(os, "sched_getaffinity", None)
-    return len(affinity(0)) if affinity else os.cpu_count() or 1
 
 
 def ordered_map(work: Callable[[Item], Result], items: Iterable[Item], threads: int) -> Generator[Result, None, None]:
@@ -62,25 +50,3 @@ def for_blocks(work: Callable[[slice], None], rows: int, threads: int, done: Cal
 
     for stop in ordered_map(run, blocks_of(rows), threads):
         done(stop)
-
-
-def thread_count(threads: int | None) -> int:
-    """Return the number of threads, that of all processors for None; raise `ValueError` below 1."""
-    if threads is None:
-        return processors()
-    if threads < 1:
-        raise ValueError(f"threads is {threads}; give 1 or more, or None for all processors")
-    return threads
-
-
-@contextlib.contextmanager
-def on_threads(threads: int | None) -> Iterator[int]:
-    """Run kernels that this thread calls inside on so many threads; yield the number. `ValueError` if it is below 1."""
-    from . import jit  # loads numpy
-
-    count, before = thread_count(threads), jit.threads_in_use()
-    jit.use_threads(count)
-    try:
-        yield count
-    finally:
-        jit.use_threads(before)

@@ -14,7 +14,7 @@ from typing import Any
 from ...support import machine
 from ...support.errors import SparklodError
 from ...support.optional import optional_import
-from ...support.parallel import thread_count
+from ...support.threads import thread_count
 from .cluster_engine import ClusterEngine
 from .cluster_pool import Connection
 from .estimate import default_memory

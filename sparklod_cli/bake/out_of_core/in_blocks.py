@@ -18,8 +18,9 @@ from ...lod.builders import BUILDERS
 from ...lod.stage_records import NO_FAMILY, Pending, StageFamilies
 from ...model.selection import SelectionTally
 from ...model.splats import Splats
-from ...support.parallel import blocks_of, on_threads
+from ...support.parallel import blocks_of
 from ...support.progress import Progress
+from ...support.threads import on_threads
 from ..output import BakeOutput
 from ..records import BuiltTree, Clock
 from .blocks import BuildStage, cut_into_blocks

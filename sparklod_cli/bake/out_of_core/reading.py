@@ -14,8 +14,9 @@ from ...lod.kernels.geometry import find_bounds
 from ...model.selection import REASONS, SelectionTally
 from ...model.splats import FloatArray, Splats
 from ...model.streams import SceneStream
-from ...support.parallel import blocks_of, on_threads
+from ...support.parallel import blocks_of
 from ...support.progress import Progress
+from ...support.threads import on_threads
 from ..selecting import check_transformed, select, transform
 from ..settings import BakeSettings
 from .job import Job

@@ -37,7 +37,7 @@ def _note_verbosity(ctx: click.Context, param: click.Parameter, value: bool) -> 
 
 def processors_to_use() -> int:
     """Return the default of --threads."""
-    from ...support.parallel import processors
+    from ...support.threads import processors
 
     return min(processors(), MAX_THREADS)
 

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...model import gaussian
-from ...support.jit import kernel, prange
+from ...support.jit import kernel
 from ...support.jit_types import f4, fields, i4, i8, out
 
 f32 = np.float32
@@ -234,8 +234,8 @@ def step_of(i, nodes, old, index, slots, gradients, rates, moments, bounds):
                 sh[node, k, c] = min(max(value, min(LEAST_COLOR, was)), max(MOST_COLOR, was))
 
 
-@kernel(out(Columns), Columns, i8[:], i4[:], Gradients, Rates, Moments, FitBounds, parallel=True)
-def step(nodes, old, index, slots, gradients, rates, moments, bounds):
+@kernel(i8, out(Columns), Columns, i8[:], i4[:], Gradients, Rates, Moments, FitBounds, ranges=True)
+def step(start, stop, nodes, old, index, slots, gradients, rates, moments, bounds):
     """Move the merged splats that were drawn against their gradients.
 
     Args:
@@ -248,5 +248,5 @@ def step(nodes, old, index, slots, gradients, rates, moments, bounds):
         moments: `Moments`, changed.
         bounds: `FitBounds`.
     """
-    for i in prange(len(index)):
+    for i in range(start, stop):
         step_of(i, nodes, old, index, slots, gradients, rates, moments, bounds)

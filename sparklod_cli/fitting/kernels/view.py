@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...render.kernels.ellipse import Lens, Limits
-from ...support.jit import kernel, prange
+from ...support.jit import kernel
 from ...support.jit_types import b1, f4, f8, i8, out, u2
 
 f32 = np.float32
@@ -16,8 +16,8 @@ ZERO, ONE = f32(0), f32(1)
 LEVEL = f32(1 / 65535)
 
 
-@kernel(f4[:, :], f4[:], i8[:], f4[:, :], Lens, Limits, out(b1[:]), parallel=True)
-def mark_seen(center, lod_opacity, index, world_to_camera, lens, limits, seen):
+@kernel(i8, f4[:, :], f4[:], i8[:], f4[:, :], Lens, Limits, out(b1[:]), ranges=True)
+def mark_seen(start, stop, center, lod_opacity, index, world_to_camera, lens, limits, seen):
     """Mark the nodes that `project` may draw: between near and far, with a centre in or near the picture.
 
     Args:
@@ -31,7 +31,7 @@ def mark_seen(center, lod_opacity, index, world_to_camera, lens, limits, seen):
     """
     m = world_to_camera
     half_width, half_height = f32(0.5) * lens.width, f32(0.5) * lens.height
-    for i in prange(len(index)):
+    for i in range(start, stop):
         at = index[i]
         x, y, z = center[at, 0], center[at, 1], center[at, 2]
         w = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
@@ -62,8 +62,8 @@ def differences(image, full, y, x, c):
     return clipped(a) - clipped(b), clipped(a + behind) - clipped(b + full_behind)
 
 
-@kernel(f4[:, :, :], u2[:, :, :], out(f8[:, :]), parallel=True)
-def squared_differences(image, full, sums):
+@kernel(i8, f4[:, :, :], u2[:, :, :], out(f8[:, :]), ranges=True)
+def squared_differences(start, stop, image, full, sums):
     """Fill the sums of squared differences over the pixels of each row.
 
     Args:
@@ -71,8 +71,8 @@ def squared_differences(image, full, sums):
         full: (H, W, 4) uint16, the same in units of `LEVEL`.
         sums: (H, 2) float64, filled: on black and on white.
     """
-    height, width = image.shape[:2]
-    for y in prange(height):
+    width = image.shape[1]
+    for y in range(start, stop):
         black, white = 0.0, 0.0
         for x in range(width):
             for c in range(3):
@@ -94,8 +94,8 @@ def by_pixel(image, full, y, x, on_black, on_white, result):
     result[y, x, 3] = by_alpha
 
 
-@kernel(f4[:, :, :], u2[:, :, :], f4, f4, out(f4[:, :, :]), parallel=True)
-def by_image(image, full, on_black, on_white, result):
+@kernel(i8, f4[:, :, :], u2[:, :, :], f4, f4, out(f4[:, :, :]), ranges=True)
+def by_image(start, stop, image, full, on_black, on_white, result):
     """Fill the derivative of half the squared differences on either background, times `on_black` and `on_white`.
 
     A value that is clipped counts only if it is to come back.
@@ -105,7 +105,7 @@ def by_image(image, full, on_black, on_white, result):
         on_black, on_white: float32.
         result: (H, W, 4) float32, filled: derivative by each value of `image`.
     """
-    height, width = image.shape[:2]
-    for y in prange(height):
+    width = image.shape[1]
+    for y in range(start, stop):
         for x in range(width):
             by_pixel(image, full, y, x, on_black, on_white, result)

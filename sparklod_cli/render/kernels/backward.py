@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...model.falloff import HALF_LOG2E, deviations_of, merged_slopes, plain_slopes
-from ...support.jit import kernel, prange
+from ...support.jit import kernel
 from ...support.jit_types import f4, fields, i2, i4, i8, out
 from .ellipse import MAX_D, Lens, Limits, in_camera, jacobian, per_world_unit, rotation_matrix, turned
 from .project import (
@@ -183,8 +183,8 @@ def add_lanes(lanes, out):
         out[k] += ((v[0] + v[1]) + (v[2] + v[3])) + ((v[4] + v[5]) + (v[6] + v[7]))
 
 
-@kernel(Drawn, i8[:], f4, f4[:, :, :], f4[:, :, :], out(f4[:, :]), parallel=True, contract=True)
-def weigh_tiles(drawn, first, least, image, by_image, sums):
+@kernel(i8, Drawn, i8[:], f4, f4[:, :, :], f4[:, :, :], out(f4[:, :]), ranges=True, contract=True)
+def weigh_tiles(begin, end, drawn, first, least, image, by_image, sums):
     """Sum for each splat over the pixels of each tile that its box overlaps.
 
     Args:
@@ -197,7 +197,7 @@ def weigh_tiles(drawn, first, least, image, by_image, sums):
     """
     height, width = image.shape[:2]
     across = drawn.across
-    for tile in prange(len(drawn.stop)):
+    for tile in range(begin, end):
         left, top = tile % across * TILE, tile // across * TILE
         rows, columns = min(TILE, height - top), min(TILE, width - left)
         records = np.empty((BLOCKS, (TILE + 1) * RECORD), np.float32)
@@ -260,8 +260,8 @@ def weighed(a, u, b, v, c, w):
     return a * u[0] + b * v[0] + c * w[0], a * u[1] + b * v[1] + c * w[1], a * u[2] + b * v[2] + c * w[2]
 
 
-@kernel(ShadedColumns, f4[:, :], Lens, Limits, Rows, out(f4[:, :]), parallel=True)
-def carry_back(splats, world_to_camera, lens, limits, rows, gradients):
+@kernel(i8, ShadedColumns, f4[:, :], Lens, Limits, Rows, out(f4[:, :]), ranges=True)
+def carry_back(start, stop, splats, world_to_camera, lens, limits, rows, gradients):
     """Compute the derivatives by the properties of splats; see `SplatGradients`.
 
     The box of a splat and where it ends are held constant, and so is the shape of one whose axes are shortened to the
@@ -272,7 +272,7 @@ def carry_back(splats, world_to_camera, lens, limits, rows, gradients):
         rows: `Rows`.
         gradients: (N, GRADIENT_COLUMNS) float32, filled for the splats that are drawn.
     """
-    for i in prange(len(rows.screen)):
+    for i in range(start, stop):
         if rows.first[i] == rows.first[i + 1]:
             continue
         total = np.zeros(SUMS)

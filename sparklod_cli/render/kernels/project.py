@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...model import gaussian
-from ...support.jit import kernel, prange
-from ...support.jit_types import b1, f4, fields, i2, out, u8
+from ...support.jit import kernel
+from ...support.jit_types import b1, f4, fields, i2, i8, out, u8
 from .ellipse import Lens, Limits, ellipse, on_screen, shortened
 
 f32 = np.float32
@@ -150,8 +150,8 @@ def index_of(key):
     return MAX_INDEX - np.int64(key & np.uint64(MAX_INDEX))
 
 
-@kernel(ShadedColumns, f4[:, :], Lens, Limits, b1, out(f4[:, :]), out(u8[:]), out(i2[:, :]), parallel=True)
-def project(splats, world_to_camera, lens, limits, radial, screen, keys, boxes):
+@kernel(i8, ShadedColumns, f4[:, :], Lens, Limits, b1, out(f4[:, :]), out(u8[:]), out(i2[:, :]), ranges=True)
+def project(start, stop, splats, world_to_camera, lens, limits, radial, screen, keys, boxes):
     """Project splats onto the screen; see `project_splat`, of which this is the same for many splats at once.
 
     Args:
@@ -161,12 +161,11 @@ def project(splats, world_to_camera, lens, limits, radial, screen, keys, boxes):
             distances the last splat is in front, as in Spark; NOT_DRAWN for splats that are not drawn.
         boxes: (N, 4) int16, filled with the `tiles_of` splats that are drawn, and for others with an empty box.
     """
-    n = len(splats.center)
-    for group in prange((n + GROUP - 1) // GROUP):
-        fields = np.empty((FIELDS, GROUP), np.float32)
-        start = GROUP * group
-        project_group(splats, start, min(GROUP, n - start), world_to_camera, lens, limits, fields)
-        finish_group(splats, start, min(GROUP, n - start), lens, radial, fields, screen, keys, boxes)
+    fields = np.empty((FIELDS, GROUP), np.float32)
+    for first in range(start, stop, GROUP):
+        count = min(GROUP, stop - first)
+        project_group(splats, first, count, world_to_camera, lens, limits, fields)
+        finish_group(splats, first, count, lens, radial, fields, screen, keys, boxes)
 
 
 @kernel(inline=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...model.falloff import merged, plain, shifted
-from ...support.jit import kernel, prange, prefetch
+from ...support.jit import kernel, prefetch
 from ...support.jit_types import b1, f4, i2, i4, i8, out, u8
 from .project import (
     ACROSS,
@@ -62,27 +62,22 @@ MIDDLE, MOST = range(2)
 AHEAD = 16
 
 
-@kernel(u8[:], i2[:, :], i8, i8, i8, parallel=True)
-def sort_into_tiles(keys, boxes, across, down, blocks):
-    """List the splats of each tile, in their order.
+@kernel(i8, u8[:], i2[:, :], i8, out(i2[:, :]), out(i4[:, :]), ranges=True)
+def count_in_tiles(begin, end, keys, boxes, across, sorted_boxes, counts):
+    """Gather the boxes of splats in the order of their keys, and count those that overlap each tile.
 
     Args:
+        begin, end: blocks of splats, of `len(counts)` of about one size.
         keys: (M,) uint64 of `project`, sorted, without NOT_DRAWN.
         boxes: (N, 4) int16 of it.
-        across, down: numbers of tiles.
-        blocks: ranges of splats to process in parallel; the result does not depend on it.
-
-    Returns:
-        start: (tiles + 1,) int64, where the splats of each tile begin.
-        splats: (total,) int32 splats, from near to far.
+        across: number of tiles in a row of them.
+        sorted_boxes: (M, 4) int16, filled.
+        counts: (blocks, tiles) int32, added to: for each block, the splats of each tile.
     """
-    tiles = across * down
-    count = np.zeros((blocks, tiles), np.int32)
-    n = len(keys)
-    sorted_boxes, words = np.empty((n, 4), np.int16), boxes.reshape(-1)
-    for block in prange(blocks):
-        last = n * (block + 1) // blocks
-        for k in range(n * block // blocks, last):
+    words = boxes.reshape(-1)
+    for block in range(begin, end):
+        last = len(keys) * (block + 1) // len(counts)
+        for k in range(len(keys) * block // len(counts), last):
             if k + AHEAD < last:
                 prefetch(words, 4 * index_of(keys[k + AHEAD]))
             box = boxes[np.uint64(index_of(keys[k]))]
@@ -91,19 +86,20 @@ def sort_into_tiles(keys, boxes, across, down, blocks):
             near[0], near[1], near[2], near[3] = left, right, top, bottom
             for y in range(top, bottom + 1):
                 for x in range(left, right + 1):
-                    count[block, np.uint64(y * across + x)] += 1
-    start = np.empty(tiles + 1, np.int64)
-    at = np.empty((blocks, tiles), np.int64)
-    total = 0
-    for tile in range(tiles):
-        start[tile] = total
-        for block in range(blocks):
-            at[block, tile] = total
-            total += count[block, tile]
-    start[tiles] = total
-    splats = np.empty(total, np.int32)
-    for block in prange(blocks):
-        for k in range(n * block // blocks, n * (block + 1) // blocks):
+                    counts[block, np.uint64(y * across + x)] += 1
+
+
+@kernel(i8, u8[:], i2[:, :], i8, out(i8[:, :]), out(i4[:]), ranges=True)
+def list_in_tiles(begin, end, keys, sorted_boxes, across, at, splats):
+    """List the splats of each tile, in the order of their keys.
+
+    Args:
+        begin, end, keys, sorted_boxes, across: of `count_in_tiles`.
+        at: (blocks, tiles) int64 where the splats of each block begin in the list of each tile; changed.
+        splats: (total,) int32, filled: the lists, one after another.
+    """
+    for block in range(begin, end):
+        for k in range(len(keys) * block // len(at), len(keys) * (block + 1) // len(at)):
             i = np.int32(index_of(keys[k]))
             box = sorted_boxes[np.uint64(k)]
             left, right, top, bottom = np.int64(box[0]), np.int64(box[1]), np.int64(box[2]), np.int64(box[3])
@@ -113,7 +109,6 @@ def sort_into_tiles(keys, boxes, across, down, blocks):
                     to = at[block, tile]
                     at[block, tile] = to + 1
                     splats[np.uint64(to)] = i
-    return start, splats
 
 
 @kernel(inline=True)
@@ -294,18 +289,18 @@ def draw_tile(screen, start, splats, tile, across, design, least, image):
     return stop
 
 
-@kernel(f4[:, :], i8[:], i4[:], i8, b1, f4, out(f4[:, :, :]), out(i8[:]), parallel=True, contract=True)
-def draw_tiles(screen, start, splats, across, design, least, image, stop):
+@kernel(i8, f4[:, :], i8[:], i4[:], i8, b1, f4, out(f4[:, :, :]), out(i8[:]), ranges=True, contract=True)
+def draw_tiles(begin, end, screen, start, splats, across, design, least, image, stop):
     """Blend the splats of each tile, from near to far.
 
     Args:
         screen: (N, COLUMNS) of `project`.
-        start, splats: of `sort_into_tiles`.
+        start, splats: of `rasterizer.sort_into_tiles`.
         across: number of tiles in a row of them.
         design: merged splats have the falloff `shifted`, that of Spark's LoD design.
         least: float32, least alpha that is drawn.
         image: (height, width, 4) float32, filled: red, green and blue, premultiplied by alpha, and alpha.
         stop: (tiles,) int64, filled: up to where in `splats` each tile was drawn; it is opaque before the rest.
     """
-    for tile in prange(len(stop)):
+    for tile in range(begin, end):
         stop[tile] = draw_tile(screen, start, splats, tile, across, design, least, image)

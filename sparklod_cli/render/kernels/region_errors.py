@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...support.jit import kernel, prange
+from ...support.jit import kernel
 from ...support.jit_types import f4, f8, i8, out
 from .ellipse import Lens, Limits
 from .project import COLUMNS, TILE, ShadedColumns, project_splat, tiles_of
@@ -39,6 +39,7 @@ class View(NamedTuple):
 
 
 @kernel(
+    i8,
     ShadedColumns,
     f4[:, :, :],
     i8[:, :, :],
@@ -48,10 +49,10 @@ class View(NamedTuple):
     f4,
     Limits,
     out(f8[:, :, :]),
-    parallel=True,
+    ranges=True,
     contract=True,
 )
-def compare_levels(splats, sh, runs, poses, basis, sizes, focal, limits, differences):
+def compare_levels(begin, end, splats, sh, runs, poses, basis, sizes, focal, limits, differences):
     """Sum squared differences between pictures of regions at their detail levels and at the first.
 
     Args:
@@ -66,8 +67,8 @@ def compare_levels(splats, sh, runs, poses, basis, sizes, focal, limits, differe
         differences: (R, V, L) float64, filled with sums over pixels and channels; for level 0 with the sum of its own
             squares, and for a level without splats with 0.
     """
-    regions, views = poses.shape[:2]
-    for job in prange(regions * views):
+    regions = len(poses)
+    for job in range(begin, end):
         # All regions of a view, then the next view: threads get equal shares of large regions.
         region, view = job % regions, job // regions
         size = sizes[region]

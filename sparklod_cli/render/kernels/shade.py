@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...model.sh import SH_C1, SH_C2, SH_C3
-from ...support.jit import kernel, prange
+from ...support.jit import kernel
 from ...support.jit_types import f4, i8, out
 
 f32 = np.float32
@@ -73,8 +73,8 @@ def add_sh_of(i, center, sh, eye, degree, rgb):
         rgb[i, c] += value
 
 
-@kernel(f4[:, :], f4[:, :, :], f4[:], i8, out(f4[:, :]), parallel=True)
-def add_sh(center, sh, eye, degree, rgb):
+@kernel(i8, f4[:, :], f4[:, :, :], f4[:], i8, out(f4[:, :]), ranges=True)
+def add_sh(start, stop, center, sh, eye, degree, rgb):
     """Add the terms of degree 1 and above to colours.
 
     Args:
@@ -84,7 +84,7 @@ def add_sh(center, sh, eye, degree, rgb):
         degree: 1 to 3.
         rgb: (N, 3) float32, added to.
     """
-    for i in prange(len(center)):
+    for i in range(start, stop):
         add_sh_of(i, center, sh, eye, degree, rgb)
 
 
@@ -106,8 +106,8 @@ def sh_gradient_of(center, node, eye, by_rgb, by_sh, i):
                 by_sh[i, 8 + k, c] = more[k] * by
 
 
-@kernel(f4[:, :], f4[:], f4[:, :], out(f4[:, :, :]), parallel=True)
-def sh_gradients(center, eye, by_rgb, by_sh):
+@kernel(i8, f4[:, :], f4[:], f4[:, :], out(f4[:, :, :]), ranges=True)
+def sh_gradients(start, stop, center, eye, by_rgb, by_sh):
     """Compute derivatives by SH coefficients: the basis in a splat's direction, times the derivatives by its colour.
 
     Args:
@@ -115,5 +115,5 @@ def sh_gradients(center, eye, by_rgb, by_sh):
         by_rgb: (N, 3) float32 derivatives by colours.
         by_sh: (N, K, 3) float32, filled, K = 3, 8 or 15.
     """
-    for i in prange(len(center)):
+    for i in range(start, stop):
         sh_gradient_of(center, i, eye, by_rgb, by_sh, i)

@@ -7,8 +7,8 @@ import pytest
 
 from sparklod_cli.render import rasterizer
 from sparklod_cli.render.kernels.project import GROUP, HALF_HEIGHT, HALF_WIDTH, LEAST, TILE, X, Y, exponent, index_of
-from sparklod_cli.render.kernels.raster import BLOCKS, LANES, measure, sort_into_tiles
-from sparklod_cli.render.rasterizer import project_splats, tiles_across
+from sparklod_cli.render.kernels.raster import BLOCKS, LANES, measure
+from sparklod_cli.render.rasterizer import project_splats, sort_into_tiles, tiles_across
 from sparklod_cli.render.settings import SORTS, RasterSettings
 from tests.render.test_rasterizer import camera_at, joined, one, shown
 from tests.render.test_rasterizer import rows as rows_of
@@ -20,7 +20,7 @@ def test_a_tile_lists_the_splats_whose_boxes_overlap_it_from_near_to_far(blocks:
     camera = camera_at(size=(200, 150), focal=(100.0, 100.0))
     seen = project_splats(shown(500, spread=2.0, most=3.0), camera, RasterSettings())
     across, down = tiles_across(camera)
-    start, splats = sort_into_tiles(seen.keys, seen.boxes, across, down, blocks)
+    start, splats = sort_into_tiles(seen, across, down, blocks)
     order = [index_of(key) for key in seen.keys]
     assert 0 < len(order) < 500
     for tile in range(across * down):
