@@ -17,6 +17,7 @@ from performance.rows import Row, Table, figure, label, ratio
 
 from sparklod_cli.render import gradients
 from sparklod_cli.render.settings import RasterSettings
+from sparklod_cli.support.threads import on_threads
 
 TABLE = Table(
     columns=(
@@ -66,7 +67,8 @@ def main() -> None:
     arguments = parser.parse_args()
     width, height = arguments.size
     print(f"Machine: {machine()}. {width} x {height} pixels, one thread, medians of {arguments.runs} runs.\n")
-    TABLE.show(rows(arguments.splats, (width, height), arguments.runs))
+    with on_threads(1):
+        TABLE.show(rows(arguments.splats, (width, height), arguments.runs))
 
 
 if __name__ == "__main__":

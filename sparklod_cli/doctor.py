@@ -141,7 +141,7 @@ def _extras() -> Iterator[Check]:
 
 
 def _print_kernels() -> None:
-    """Load all that a bake takes, starts the threads of kernels, and print what there is of kernels, as JSON."""
+    """Load all that a bake takes, and print what there is of kernels, as JSON."""
     from . import warmup
     from .bake.flow import bake  # noqa: F401
     from .support import jit
@@ -151,8 +151,6 @@ def _print_kernels() -> None:
         "folder": None if jit.CACHE_FOLDER is None else str(jit.CACHE_FOLDER.resolve()),
         "wanted": len(warmup.units()),
         "missing": len(warmup.missing()),
-        "layer": jit.threading_layer(),
-        "threads": jit.threads_in_use(),
     }
     print(json.dumps(about))
 
@@ -179,14 +177,6 @@ def _kernels() -> Iterator[Check]:
             value = f"{len(old)} of other versions of sparklod, {_megabytes(sum(map(_size_of, old)))}"
             advice = f"delete the other kernels-* in {Path(folder).parent}, unless those versions are still used"
             yield Check("old caches", "note", value, advice)
-    layer = about["layer"]
-    advice = (
-        f"install OpenMP (on Debian and Ubuntu: apt install libgomp1), or {pip_install('tbb')}:"
-        " kernels of several threads then run at once"
-    )
-    slow = layer == "workqueue"  # numba's own, which runs one parallel kernel at a time
-    value = f"{about['threads']}, run by {layer}"
-    yield Check("threads", "note" if slow else "ok", value, advice if slow else "")
 
 
 def _processors() -> Iterator[Check]:

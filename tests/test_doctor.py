@@ -16,7 +16,7 @@ from sparklod_cli.render.gl import context
 from sparklod_cli.support import jit, machine
 from sparklod_cli.support.optional import Required, install_hint, pip_install
 
-HEALTHY = {"folder": "/nowhere/kernels-1", "wanted": 35, "missing": 0, "layer": "omp", "threads": 4}
+HEALTHY = {"folder": "/nowhere/kernels-1", "wanted": 35, "missing": 0}
 
 
 def answer(monkeypatch: pytest.MonkeyPatch, code: int = 0, out: str = "", err: str = "") -> None:
@@ -111,8 +111,6 @@ def test_a_sparklod_that_is_not_installed_is_a_note(monkeypatch: pytest.MonkeyPa
         ({}, "kernel cache", "ok", "35 of 35 kernels are compiled", ""),
         ({"missing": 3}, "kernel cache", "note", "32 of 35 kernels are compiled", "sparklod warmup"),
         ({"folder": None}, "kernel cache", "note", "no folder can be written to", "NUMBA_CACHE_DIR"),
-        ({}, "threads", "ok", "4, run by omp", ""),
-        ({"layer": "workqueue"}, "threads", "note", "run by workqueue", "libgomp1"),
     ],
 )
 def test_the_check_of_the_cache_counts_kernels(
@@ -131,7 +129,7 @@ def test_caches_of_other_versions_are_counted(tmp_path: Path, monkeypatch: pytes
         (tmp_path / name).mkdir()
         (tmp_path / name / "one.kernel").write_bytes(bytes(size))
     answer(monkeypatch, out=json.dumps({**HEALTHY, "folder": str(tmp_path / "kernels-1")}))
-    cache, old, _ = doctor._kernels()
+    cache, old = doctor._kernels()
     assert "3.0 MB" in cache.value
     assert old.value == "2 of other versions of sparklod, 2.5 MB"
     assert str(tmp_path) in old.advice

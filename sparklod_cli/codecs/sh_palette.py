@@ -15,7 +15,6 @@ docs/decisions/09-palettes-and-sog.md has what it was measured against.
 
 from __future__ import annotations
 
-import threading
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,9 +47,6 @@ WEIGHT_FLOOR = 1e-6
 
 #: Power of the seen area in `visible_weight`. Measured: 1 is better in far views, 0.5 in near ones.
 AREA_POWER = 0.75
-
-#: Held while kernels run: numba's own threads, where it finds no OpenMP, end a process that calls kernels from two.
-_KERNELS = threading.Lock()
 
 Indices = NDArray[np.uint32]
 Weights = NDArray[np.float64]
@@ -112,7 +108,7 @@ def cluster(
     if len(rows) and not (np.isfinite(rows.min()) and np.isfinite(rows.max())):
         raise ValueError("sh holds NaN or infinity; give finite coefficients")
     of_rows = _weights(weight, len(rows))
-    with _KERNELS, on_threads(threads):
+    with on_threads(threads):
         first, inverse = _distinct(rows)
         if len(first) <= codes:
             return ShPalette(sh[first], inverse)
@@ -144,7 +140,8 @@ def _distinct(rows: FloatArray) -> tuple[Indices, Indices]:
     """Return the first of each set of equal rows, ascending, and for each row its place among these."""
     from .kernels.sh_clustering import hash_rows
 
-    key = hash_rows((rows + np.float32(0)).view(np.uint32))  # -0 becomes 0
+    key = np.empty(len(rows), np.uint64)
+    hash_rows(len(rows), (rows + np.float32(0)).view(np.uint32), key)  # -0 becomes 0
     order = np.argsort(key, kind="stable")
     is_first = np.ones(len(rows), np.bool_)
     same_key = np.flatnonzero(key[order[1:]] == key[order[:-1]])
@@ -175,7 +172,7 @@ class _Clustering:
 
         members, begin = self._bisect(codes)
         table = np.empty((len(begin) - 1, self._rows.shape[1]), np.float32)
-        average_cells(self._rows, self._weight, members, begin, table)
+        average_cells(len(table), self._rows, self._weight, members, begin, table)
         labels, errors = np.zeros(len(self._rows), np.int32), np.zeros(len(self._rows), np.float32)
         for number in range(PASSES):
             self._progress("clustering", number, PASSES, "pass")
@@ -183,14 +180,14 @@ class _Clustering:
                 near, distance = _neighbours(table)
             else:
                 distance = np.zeros_like(distance)  # codes have moved: nothing is known
-            choose_codes(self._rows, members, begin, table, near, distance, labels, errors)
+            choose_codes(len(table), self._rows, members, begin, table, near, distance, labels, errors)
             if number < PASSES - 1:
                 members, begin = self._cells(labels, len(table))
                 empty = np.flatnonzero(begin[1:] == begin[:-1])
                 if len(empty):
                     self._refill(empty, labels, errors)
                     members, begin = self._cells(labels, len(table))
-                average_cells(self._rows, self._weight, members, begin, table)
+                average_cells(len(table), self._rows, self._weight, members, begin, table)
         self._progress("clustering", PASSES, PASSES, "pass")
         used, compact = np.unique(labels[self._first], return_inverse=True)
         return table[used], compact.astype(np.uint32)
@@ -208,7 +205,7 @@ class _Clustering:
         begin, end = np.zeros(1, np.int64), np.array([len(members)])
         error = np.array([np.inf])
         cut, halves = np.empty(1, np.int64), np.empty((1, 2))
-        halve_cells(self._rows, self._weight, members, begin, end, cut, halves, places)
+        halve_cells(1, self._rows, self._weight, members, begin, end, cut, halves, places)
         while len(begin) < codes:
             self._progress("bisecting", len(begin), codes, "code")
             gain = np.where(end - begin > 1, error - halves.sum(axis=1), 0)
@@ -219,7 +216,7 @@ class _Clustering:
                 chosen = np.sort(chosen[np.argsort(-gain[chosen], kind="stable")[: codes - len(begin)]])
             made = np.concatenate([begin[chosen], cut[chosen]]), np.concatenate([cut[chosen], end[chosen]])
             cut_made, halves_made = np.empty(len(made[0]), np.int64), np.empty((len(made[0]), 2))
-            halve_cells(self._rows, self._weight, members, *made, cut_made, halves_made, places)
+            halve_cells(len(made[0]), self._rows, self._weight, members, *made, cut_made, halves_made, places)
             kept = np.ones(len(begin), np.bool_)
             kept[chosen] = False
             error = np.concatenate([error[kept], halves[chosen].T.ravel()])
@@ -253,7 +250,7 @@ def _neighbours(table: FloatArray) -> tuple[NDArray[np.int32], FloatArray]:
     sums = np.add.reduceat(table, starts, axis=0, dtype=np.float64)
     means = (sums / np.diff(np.append(starts, count))[:, None]).astype(np.float32)
     near, distance = np.empty((count, NEIGHBOURS), np.int32), np.empty((count, NEIGHBOURS), np.float32)
-    find_neighbours(table, blocks, means, min(SEARCH, len(starts)), near, distance)
+    find_neighbours(len(means), table, blocks, means, min(SEARCH, len(starts)), near, distance)
     return near, distance
 
 

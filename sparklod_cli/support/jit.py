@@ -60,17 +60,21 @@ class Kernel:
         py_func: the Python function.
         options: how to compile it.
         declared: the types that Python calls it with.
-        built: see `jit_numba.dispatcher_of`; None until it is needed.
+        inner, built: numba's dispatchers that kernels and Python call, see `jit_numba`; None until they are needed.
     """
 
     def __init__(self, function: Callable[..., Any], options: Options, declared: Sequence[Sequence[Any]] = ()) -> None:
         functools.update_wrapper(self, function)
         self.py_func, self.options, self.declared = function, options, declared
+        self.inner: Any = None
         self.built: Any = None
 
     def __call__(self, *arguments: Any) -> Any:
         if self.declared:  # signatures differ in the types of numbers only
-            arguments = tuple(map(as_declared, self.declared[0], arguments))
+            types = self.declared[0]
+            if len(arguments) != len(types):
+                raise TypeError(f"{self.__name__} takes {len(types)} arguments but {len(arguments)} were given")
+            arguments = tuple(map(as_declared, types, arguments))
         if self.options.ranges:
             return run_ranges(self.dispatcher, *arguments)
         return self.dispatcher(*arguments)
@@ -92,7 +96,7 @@ class Kernel:
         signatures = [tuple(numba.typeof(example(each)) for each in types) for types in self.declared]
         if not self.options.ranges:
             return signatures
-        return [(StarArgTuple((numba.int64, *types)),) for types in signatures]  # see `jit_numba._called`
+        return [(StarArgTuple((numba.int64, *types)),) for types in signatures]  # see `jit_numba._calling`
 
 
 def kernel(

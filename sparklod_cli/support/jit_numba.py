@@ -35,32 +35,56 @@ _NAMESPACE = "__globals_of_kernels__"
 
 
 def dispatcher_of(kernel: jit.Kernel) -> Any:
-    """Return numba's dispatcher of a kernel, which compiles it for the types of its arguments, or loads it.
+    """Return numba's dispatcher that Python calls, which compiles a kernel for types of arguments, or loads it."""
+    with _lock:
+        if kernel.built is None:
+            inner = _inner_of(kernel)
+            kernel.built = inner if _has_wrapper(kernel) else _calling(inner, kernel.py_func)
+            if kernel.declared:
+                _keep(kernel.built, kernel.py_func)
+        return kernel.built
+
+
+def _inner_of(kernel: jit.Kernel) -> Any:
+    """Return numba's dispatcher that other kernels call.
 
     What it compiles is a copy of the function, in whose globals numba finds its own `prange` and its own dispatchers.
     Nothing is replaced in the modules themselves, since other threads may be calling their functions.
     """
-    with _lock:
-        if kernel.built is None:
-            options, function = kernel.options, kernel.py_func
-            namespace = function.__globals__.setdefault(_NAMESPACE, {})
-            compiled: Any = numba.njit(
-                error_model="numpy",
-                parallel=options.parallel,
-                nogil=options.nogil,
-                inline="always" if options.inline else "never",
-                forceinline=options.ranges,
-                fastmath={"contract"} if options.contract else False,
-                no_cfunc_wrapper=True,
-                no_cpython_wrapper=options.ranges or not kernel.declared,
-                pipeline_class=_ApartCompiler if options.ranges else Compiler,
-            )(_copy(function, namespace))
-            kernel.built = _called(compiled, function) if options.ranges else compiled
-            if jit.CACHE_FOLDER is not None:
-                kernel.built._cache = KernelCache(function, jit.CACHE_FOLDER, jit.report_trouble)
-            for name, value in list(function.__globals__.items()):
-                namespace[name] = _known(value)
-        return kernel.built
+    if kernel.inner is None:
+        options, function = kernel.options, kernel.py_func
+        namespace = function.__globals__.setdefault(_NAMESPACE, {})
+        decorate: Any = numba.njit(
+            error_model="numpy",
+            parallel=options.parallel,
+            nogil=options.nogil,
+            inline="always" if options.inline else "never",
+            forceinline=options.ranges,
+            fastmath={"contract"} if options.contract else False,
+            no_cfunc_wrapper=True,
+            no_cpython_wrapper=not _has_wrapper(kernel),
+            pipeline_class=_ApartCompiler if options.ranges else Compiler,
+        )
+        kernel.inner = decorate(_copy(function, namespace))
+        if not kernel.declared:
+            _keep(kernel.inner, function)
+        for name, value in list(function.__globals__.items()):
+            namespace[name] = _known(value)
+    return kernel.inner
+
+
+def _has_wrapper(kernel: jit.Kernel) -> bool:
+    """Return whether the dispatcher that other kernels call has code that makes it callable from Python.
+
+    That code takes as long to compile as many a kernel, so those have none that Python does not call.
+    """
+    return bool(kernel.declared) and not kernel.options.ranges
+
+
+def _keep(dispatcher: Any, function: Callable[..., Any]) -> None:
+    """Have a dispatcher keep machine code in the cache."""
+    if jit.CACHE_FOLDER is not None:
+        dispatcher._cache = KernelCache(function, jit.CACHE_FOLDER, jit.report_trouble)
 
 
 class _ApartCompiler(Compiler):
@@ -82,15 +106,15 @@ def _copy(function: Callable[..., Any], namespace: dict[str, Any]) -> FunctionTy
     return copy
 
 
-def _called(compiled: Any, function: Callable[..., Any]) -> Any:
-    """Return a compiled function that calls another, which LLVM makes a part of it.
+def _calling(compiled: Any, function: Callable[..., Any]) -> Any:
+    """Return the dispatcher of a function that calls another, which LLVM makes a part of it.
 
-    LLVM optimizes functions, then numba removes the counts of references to arrays, which keep loops from being
-    vectorized; a function that is part of another one is optimized again, and vectorized.
+    This also makes loops of ranges fast. LLVM optimizes a function, and then numba removes the counts of references to
+    arrays, which keep loops from being vectorized. As a part of another function it is optimized again: vectorized.
     """
 
-    def call(*arguments: Any) -> None:
-        compiled(*arguments)
+    def call(*arguments: Any) -> Any:
+        return compiled(*arguments)
 
     for name in ("__module__", "__name__", "__qualname__"):
         setattr(call, name, getattr(function, name))
@@ -123,7 +147,7 @@ def _known(value: Any) -> Any:
         return numba.prange
     if value is jit.prefetch:
         return _prefetch
-    return dispatcher_of(value) if isinstance(value, jit.Kernel) else value
+    return _inner_of(value) if isinstance(value, jit.Kernel) else value
 
 
 class _OnCompile(event.Listener):

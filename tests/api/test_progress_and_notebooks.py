@@ -38,13 +38,13 @@ def test_work_is_done_on_the_threads_that_are_asked_for(
     scene: sparklod.Scene, held: sparklod.Tree, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from sparklod_cli.render import rasterizer
-    from sparklod_cli.support import jit
+    from sparklod_cli.support.threads import threads_in_use
 
-    before, used = jit.threads_in_use(), set()
+    before, used = threads_in_use(), set()
     draw = rasterizer.draw
 
     def noted(*arguments: Any) -> Any:
-        used.add(jit.threads_in_use())
+        used.add(threads_in_use())
         return draw(*arguments)
 
     monkeypatch.setattr(rasterizer, "draw", noted)
@@ -52,7 +52,7 @@ def test_work_is_done_on_the_threads_that_are_asked_for(
     sparklod.compare(held, None, [camera()], budgets=[50, 0.5], threads=1)
     assert used == {1}
     sparklod.build_lod(scene, threads=1)
-    assert jit.threads_in_use() == before
+    assert threads_in_use() == before
 
 
 def test_notebooks_show_pictures_and_tables(held: sparklod.Tree, tmp_path: Path) -> None:

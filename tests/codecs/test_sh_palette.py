@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 
@@ -13,7 +12,6 @@ from sparklod_cli.codecs import sh_palette
 from sparklod_cli.codecs.kernels import sh_clustering
 from sparklod_cli.codecs.sh_palette import MAX_CODES, ShPalette, cluster, visible_weight
 from sparklod_cli.model.splats import Splats
-from sparklod_cli.support import jit
 from tests.references.sh_palettes import distances, halved, k_means, squared_error
 
 #: SH coefficients of degree 1 to 3.
@@ -107,7 +105,7 @@ def test_equal_rows_share_a_code_and_zeros_of_either_sign_are_equal() -> None:
 
 
 def test_rows_with_equal_hashes_are_told_apart(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sh_clustering, "hash_rows", lambda bits: np.zeros(len(bits), np.uint64))
+    monkeypatch.setattr(sh_clustering, "hash_rows", lambda rows, bits, hashes: hashes.fill(0))
     sh = np.repeat(coefficients(30, 3), 2, axis=0)
     assert np.array_equal(cluster(sh, 60).expand(), sh)
 
@@ -196,7 +194,7 @@ def test_a_cell_is_cut_across_its_principal_axis() -> None:
     weight = rng.exponential(1, 1500)
     members = np.arange(1500, dtype=np.uint32)[::-1].copy()
     cuts, errors = np.empty(1, np.int64), np.empty((1, 2))
-    sh_clustering.halve_cells(rows, weight, members, np.array([0]), np.array([1500]), cuts, errors, np.empty(1500))
+    sh_clustering.halve_cells(1, rows, weight, members, np.array([0]), np.array([1500]), cuts, errors, np.empty(1500))
     with_first, expected = halved(rows, weight)
     ours = np.zeros(1500, bool)
     ours[members[: cuts[0]]] = True
@@ -209,7 +207,7 @@ def test_cells_of_one_two_and_equal_rows_are_cut_in_the_middle() -> None:
     rows = np.array([[1, 2, 3], [4, 5, 6], [4, 5, 6], [4, 5, 6], [4, 5, 6], [7, 8, 9], [0, 0, 0]], np.float32)
     begin, end = np.array([0, 1, 5]), np.array([1, 5, 7])
     cuts, errors = np.empty(3, np.int64), np.empty((3, 2))
-    sh_clustering.halve_cells(rows, np.ones(7), np.arange(7, dtype=np.uint32), begin, end, cuts, errors, np.empty(7))
+    sh_clustering.halve_cells(3, rows, np.ones(7), np.arange(7, dtype=np.uint32), begin, end, cuts, errors, np.empty(7))
     assert cuts.tolist() == [0, 3, 6]
     assert errors == pytest.approx(0)
 
@@ -219,7 +217,7 @@ def test_codes_are_the_weighted_means_of_their_cells() -> None:
     rows, weight = rng.normal(size=(60, 9)).astype(np.float32), rng.exponential(1, 60)
     members, begin = rng.permutation(60).astype(np.uint32), np.array([0, 10, 10, 60])
     codes = np.full((3, 9), 7, np.float32)
-    sh_clustering.average_cells(rows, weight, members, begin, codes)
+    sh_clustering.average_cells(3, rows, weight, members, begin, codes)
     parts = members[:10], members[10:]
     means = [np.average(rows[part], axis=0, weights=weight[part]) for part in parts]
     assert codes[[0, 2]] == pytest.approx(np.array(means), abs=1e-6)
@@ -252,7 +250,7 @@ def test_pruning_by_distance_changes_no_label() -> None:
     found = []
     for known in (distance, np.zeros_like(distance)):
         labels, errors = np.empty(len(rows), np.int32), np.empty(len(rows), np.float32)
-        sh_clustering.choose_codes(rows, members, begin, codes, near, known, labels, errors)
+        sh_clustering.choose_codes(len(codes), rows, members, begin, codes, near, known, labels, errors)
         found.append((labels, errors))
     assert np.array_equal(found[0][0], found[1][0])
     assert found[0][1] == pytest.approx(((rows - codes[found[0][0]]) ** 2).sum(axis=1), rel=1e-4, abs=1e-6)
@@ -264,30 +262,3 @@ def test_a_code_without_rows_takes_the_row_that_is_farthest_from_its_own() -> No
     labels = np.zeros(3, np.int32)
     clustering._refill(np.array([1, 2]), labels, np.array([0, 1, 81], np.float32))
     assert labels.tolist() == [0, 2, 1]
-
-
-def test_kernels_run_on_the_threads_that_are_given() -> None:
-    before = jit.threads_in_use()
-    cluster(coefficients(2000, 3), 100, threads=1)
-    assert jit.threads_in_use() == before
-
-
-TOGETHER = """
-import sys
-from concurrent.futures import ThreadPoolExecutor
-import numpy as np
-from sparklod_cli.codecs.sh_palette import cluster
-some = [np.random.default_rng(seed).normal(size=(3000, 3, 3)).astype(np.float32) for seed in range(4)]
-with ThreadPoolExecutor(4) as pool:
-    found = list(pool.map(lambda sh: cluster(sh, 64, threads=2), some))
-assert all(np.array_equal(cluster(sh, 64).codes, each.codes) for sh, each in zip(some, found))
-"""
-
-
-def test_palettes_are_made_on_several_threads_at_once_whoever_runs_the_kernels() -> None:
-    """numba's own layer ends the process where two threads call kernels at once."""
-    environment = {**os.environ, "NUMBA_THREADING_LAYER": "workqueue"}
-    done = subprocess.run(
-        [sys.executable, "-c", TOGETHER], env=environment, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr

@@ -33,7 +33,6 @@ from sparklod_cli.render.rasterizer import Image, draw
 from sparklod_cli.render.settings import RasterSettings
 from sparklod_cli.render.shading import shade
 from sparklod_cli.scenes.finder import view_of
-from sparklod_cli.support import jit
 from tests.conftest import real_scene
 from tests.lod.trees import check_tree, children, coincident, parents
 from tests.scenes import random_splats, single_layer
@@ -168,10 +167,8 @@ def fidelity(splats: Splats, built: tuple[Splats, LodTree], share: float) -> flo
 
 
 def test_cuts_of_a_real_scene_are_closer_to_full_detail_than_those_of_the_quick_builder() -> None:
-    jit.use_threads(2)
     splats, _ = Selection().apply(read_scene(real_scene("playbot-125k.ply")).splats)
     splats = dataclasses.replace(splats, sh=splats.sh[:, :0])
-    jit.use_threads(256)
     ours, quicks = (fidelity(splats, builder.build(splats), 0.1) for builder in (quality, quick))
     assert ours >= quicks + 1
 

@@ -221,24 +221,20 @@ def test_prefetch_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     assert np.array_equal(rows["count"], np.arange(100))
 
 
-@pytest.mark.parametrize("given", [{}, {"OMP_WAIT_POLICY": "ACTIVE"}, {"GOMP_SPINCOUNT": "7"}])
-def test_threads_do_not_spin_unless_the_environment_says_so(given: dict[str, str]) -> None:
-    code = "import os; from sparklod_cli.support import jit; print(os.environ.get('GOMP_SPINCOUNT'))"
-    clean = {name: value for name, value in os.environ.items() if name not in (*jit.WAIT_SETTINGS, "OMP_WAIT_POLICY")}
-    command = [sys.executable, "-c", code]
-    done = subprocess.run(command, cwd=ROOT, env={**clean, **given}, capture_output=True, text=True, check=True)
-    expected = given.get("GOMP_SPINCOUNT", "None" if given else jit.WAIT_SETTINGS["GOMP_SPINCOUNT"])
-    assert done.stdout.strip() == expected
+def test_a_kernel_of_ranges_is_called_with_the_number_of_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fill(start: int, stop: int, values: Any, squares: Any) -> None:
+        for i in range(start, stop):
+            squares[i] = values[i] * values[i]
 
-
-def test_small_work_runs_on_one_thread_and_large_on_all() -> None:
-    before = numba.get_num_threads()
-    with jit.threads_for(jit.PARALLEL_ROWS - 1) as threads:
-        assert threads == numba.get_num_threads() == 1
-        with jit.threads_for(10 * jit.PARALLEL_ROWS) as inner:
-            assert inner == 1
-    with jit.threads_for(jit.PARALLEL_ROWS) as threads:
-        assert threads == before
-    with pytest.raises(KeyError), jit.threads_for(1):
-        raise KeyError
-    assert numba.get_num_threads() == before
+    values = np.arange(10_000.0, dtype=np.float32)
+    decorate = jit.kernel(i8, f4[:], out(f4[:]), ranges=True)
+    compiled = decorate(fill)
+    assert isinstance(compiled, jit.Kernel)
+    monkeypatch.setenv("NUMBA_DISABLE_JIT", "1")
+    for kernel in (compiled, decorate(fill)):
+        squares = np.zeros(len(values), np.float32)
+        kernel(len(values) - 1, values, squares)
+        assert np.array_equal(squares[:-1], values[:-1] ** 2)
+        assert not squares[-1]
+    compiled.dispatcher.compile(compiled.signatures[0])
+    assert len(compiled.dispatcher.overloads) == 1  # what is declared is what the call compiled

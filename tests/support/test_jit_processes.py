@@ -1,4 +1,4 @@
-"""What kernels do in processes of their own: threads, forks, errors, interruptions, numba's threading layers."""
+"""What kernels do in processes of their own: threads, forks, errors, interruptions."""
 
 from __future__ import annotations
 
@@ -21,30 +21,34 @@ KERNELS = """
 import os, signal, sys, threading, time, warnings
 import numpy as np
 from sparklod_cli.support import jit
-from sparklod_cli.support.jit import kernel, prange
-from sparklod_cli.support.jit_types import f8
+from sparklod_cli.support.jit import kernel
+from sparklod_cli.support.jit_types import f8, i8, out
+from sparklod_cli.support.threads import on_threads, threads_in_use
 
-@kernel(f8[:], parallel=True, nogil=True)
+@kernel(i8, f8[:], out(f8[:]), ranges=True)
+def fill_squares(start, stop, values, found):
+    for i in range(start, stop):
+        found[i] = values[i] * values[i]
+
 def squares(values):
     found = np.empty(len(values), np.float64)
-    for i in prange(len(values)):
-        found[i] = values[i] * values[i]
+    fill_squares(len(values), values, found)
     return found
 
-@kernel(nogil=True)
+@kernel(f8[:], nogil=True)
 def total(values):
     found = 0.0
     for value in values:
         found += value
     return found
 
-@kernel()
+@kernel(i8)
 def refuse(number):
     if number > 2:
         raise ValueError("too many")
     return number
 
-@kernel(nogil=True)
+@kernel(f8[:], i8, nogil=True)
 def slow(values, times):
     found = values + 1
     for _ in range(times):
@@ -62,7 +66,7 @@ assert (squares(values) == expected).all() and total(values) == values.sum() and
 slow(values, 1)
 """
 
-#: What holds with each threading layer, in a process that finds everything in the cache.
+#: What holds in a process that finds everything in the cache.
 SCRIPTS = {
     "errors, threads and arrays that outlive modules": """
 for number in (3, 4):
@@ -78,13 +82,6 @@ for arguments in [(), (1, 2)]:
     except TypeError:
         continue
     raise SystemExit("nothing was raised")
-jit.use_threads(1)
-seen = []
-thread = threading.Thread(target=lambda: seen.append(jit.threads_in_use()))
-thread.start(); thread.join()
-assert jit.threads_in_use() == 1 and seen == [2], seen
-jit.use_threads(256)
-assert jit.threads_in_use() == 2
 right = []
 def call():
     for _ in range(20):
@@ -101,7 +98,7 @@ assert total(values) == values.sum()
 warnings.simplefilter("ignore", DeprecationWarning)  # Python 3.12 advises against forks
 child = os.fork()
 if not child:
-    right = total(values) == values.sum() and (squares(values) == expected).all() and jit.threads_in_use() == 2
+    right = total(values) == values.sum() and (squares(values) == expected).all() and threads_in_use() == 2
     os._exit(0 if right else 1)
 assert os.waitpid(child, 0)[1] == 0
 """,
@@ -110,16 +107,16 @@ assert (squares(values) == expected).all()
 warnings.simplefilter("ignore", DeprecationWarning)  # Python 3.12 advises against forks
 child = os.fork()
 if not child:
-    right = jit.threads_in_use() == 1
+    right = True
     for count in (1, 2):
-        jit.use_threads(count)
-        right &= (squares(values) == expected).all()
+        with on_threads(count):
+            right &= (squares(values) == expected).all()
     thread = threading.Thread(target=lambda: seen.append((squares(values) == expected).all()))
     seen = []
     thread.start(); thread.join()
     os._exit(0 if right and seen == [True] else 1)
 assert os.waitpid(child, 0)[1] == 0
-assert (squares(values) == expected).all() and jit.threads_in_use() == 2
+assert (squares(values) == expected).all()
 """,
     "an interruption while a result is returned": """
 def interrupt():
@@ -150,13 +147,12 @@ def kernels(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def run(folder: Path, script: str, **settings: str) -> None:
+def run(folder: Path, script: str) -> None:
     environment = {
         **os.environ,
         "NUMBA_CACHE_DIR": str(folder / "cache"),
         "NUMBA_NUM_THREADS": "2",
         "PYTHONPATH": os.pathsep.join([str(ROOT), str(folder)]),
-        **settings,
     }
     command = [sys.executable, "-c", f"from scripted import *\n{script}"]
     ways: dict[str, Any] = {"preexec_fn": heed_signals} if os.name == "posix" else {}
@@ -165,6 +161,5 @@ def run(folder: Path, script: str, **settings: str) -> None:
 
 
 @pytest.mark.parametrize("script", SCRIPTS.values(), ids=SCRIPTS)
-@pytest.mark.parametrize("layer", ["the first", "workqueue"])
-def test_in_a_process_that_finds_everything_in_the_cache(kernels: Path, layer: str, script: str) -> None:
-    run(kernels, script, **({} if layer == "the first" else {"NUMBA_THREADING_LAYER": layer}))
+def test_in_a_process_that_finds_everything_in_the_cache(kernels: Path, script: str) -> None:
+    run(kernels, script)

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...support.jit import kernel, prange
-from ...support.jit_types import f4, f8, i4, i8, out, u4
+from ...support.jit import kernel
+from ...support.jit_types import f4, f8, i4, i8, out, u4, u8
 
 #: Rows that a cell's direction is found from, spaced evenly over its members. Measured: 8,192 gain nothing.
 SAMPLE = 2048
@@ -149,8 +149,8 @@ def squared_error(rows, weight, cell, origin):
     return max(error, 0.0)
 
 
-@kernel(f4[:, :], f8[:], out(u4[:]), i8[:], i8[:], out(i8[:]), out(f8[:, :]), out(f8[:]), parallel=True)
-def halve_cells(rows, weight, members, begin, end, cuts, errors, places):
+@kernel(i8, f4[:, :], f8[:], out(u4[:]), i8[:], i8[:], out(i8[:]), out(f8[:, :]), out(f8[:]), ranges=True)
+def halve_cells(start, stop, rows, weight, members, begin, end, cuts, errors, places):
     """Sort the members of each cell into two halves.
 
     Args:
@@ -163,7 +163,7 @@ def halve_cells(rows, weight, members, begin, end, cuts, errors, places):
         places: (M,) float64, for intermediate results.
     """
     width = rows.shape[1]
-    for k in prange(len(begin)):
+    for k in range(start, stop):
         cell, place = members[begin[k] : end[k]], places[begin[k] : end[k]]
         cuts[k] = begin[k] + len(cell) // 2
         errors[k, 0] = errors[k, 1] = 0
@@ -183,8 +183,8 @@ def halve_cells(rows, weight, members, begin, end, cuts, errors, places):
             errors[k, 1] = squared_error(rows, weight, cell[first:], mean)
 
 
-@kernel(f4[:, :], f8[:], u4[:], i8[:], out(f4[:, :]), parallel=True)
-def average_cells(rows, weight, members, begin, codes):
+@kernel(i8, f4[:, :], f8[:], u4[:], i8[:], out(f4[:, :]), ranges=True)
+def average_cells(start, stop, rows, weight, members, begin, codes):
     """Fill each code with the weighted mean of the rows of its cell; codes of empty cells are left as they are.
 
     Args:
@@ -195,7 +195,7 @@ def average_cells(rows, weight, members, begin, codes):
         codes: (C, D) float32, filled.
     """
     width = rows.shape[1]
-    for c in prange(len(codes)):
+    for c in range(start, stop):
         if begin[c] < begin[c + 1]:
             total = np.zeros(width)
             mass = 0.0
@@ -214,12 +214,9 @@ GROUP = 256
 #: Codes whose distance to a row is computed at a time.
 LANES = 16
 
-#: Codes whose rows are processed by one iteration of a parallel loop.
-SHARE = 64
 
-
-@kernel(f4[:, :], f4[:, :, :], f4[:, :], i8, out(i4[:, :]), out(f4[:, :]), parallel=True)
-def find_neighbours(codes, blocks, groups, search, near, distance):
+@kernel(i8, f4[:, :], f4[:, :, :], f4[:, :], i8, out(i4[:, :]), out(f4[:, :]), ranges=True)
+def find_neighbours(start, stop, codes, blocks, groups, search, near, distance):
     """Fill the nearest other codes of each code, nearest first, from the groups that are nearest to its own.
 
     Args:
@@ -231,7 +228,7 @@ def find_neighbours(codes, blocks, groups, search, near, distance):
         distance: (C, n) float32, filled with squared distances, infinite there.
     """
     width, count = codes.shape[1], near.shape[1]
-    for g in prange(len(groups)):
+    for g in range(start, stop):
         away = np.zeros(len(groups))
         for h in range(len(groups)):
             for d in range(width):
@@ -257,8 +254,8 @@ def find_neighbours(codes, blocks, groups, search, near, distance):
                         distance[c, at], near[c, at] = sums[lane], h * GROUP + lane
 
 
-@kernel(f4[:, :], u4[:], i8[:], f4[:, :], i4[:, :], f4[:, :], out(i4[:]), out(f4[:]), parallel=True)
-def choose_codes(rows, members, begin, codes, near, distance, labels, errors):
+@kernel(i8, f4[:, :], u4[:], i8[:], f4[:, :], i4[:, :], f4[:, :], out(i4[:]), out(f4[:]), ranges=True)
+def choose_codes(start, stop, rows, members, begin, codes, near, distance, labels, errors):
     """Fill the nearest code of each row, of the one that it has and that one's neighbours.
 
     No further neighbour is looked at than is twice as far from the code as the row is: by the triangle inequality, none
@@ -275,35 +272,34 @@ def choose_codes(rows, members, begin, codes, near, distance, labels, errors):
         errors: (N,) float32, filled with the squared distance of each row to its code.
     """
     width, parts = codes.shape[1], near.shape[1] // LANES
-    for share in prange((len(codes) + SHARE - 1) // SHARE):
-        block, sums = np.empty((parts, width, LANES), np.float32), np.empty(LANES, np.float32)
-        for c in range(share * SHARE, min(len(codes), share * SHARE + SHARE)):
-            filled = 0
-            for a in range(begin[c], begin[c + 1]):
-                i = members[a]
-                best, label = np.float32(0), c
-                for d in range(width):
-                    x = rows[i, d] - codes[c, d]
-                    best += x * x
-                own = best
-                for part in range(parts):
-                    if distance[c, part * LANES] >= np.float32(4) * own:
-                        break
-                    if filled == part:
-                        for lane in range(LANES):
-                            for d in range(width):
-                                block[part, d, lane] = codes[near[c, part * LANES + lane], d]
-                        filled += 1
-                    sums[:] = 0
-                    for d in range(width):
-                        for lane in range(LANES):
-                            x = rows[i, d] - block[part, d, lane]
-                            sums[lane] += x * x
+    block, sums = np.empty((parts, width, LANES), np.float32), np.empty(LANES, np.float32)
+    for c in range(start, stop):
+        filled = 0
+        for a in range(begin[c], begin[c + 1]):
+            i = members[a]
+            best, label = np.float32(0), c
+            for d in range(width):
+                x = rows[i, d] - codes[c, d]
+                best += x * x
+            own = best
+            for part in range(parts):
+                if distance[c, part * LANES] >= np.float32(4) * own:
+                    break
+                if filled == part:
                     for lane in range(LANES):
-                        if sums[lane] < best:
-                            best, label = sums[lane], near[c, part * LANES + lane]
-                labels[i] = label
-                errors[i] = best
+                        for d in range(width):
+                            block[part, d, lane] = codes[near[c, part * LANES + lane], d]
+                    filled += 1
+                sums[:] = 0
+                for d in range(width):
+                    for lane in range(LANES):
+                        x = rows[i, d] - block[part, d, lane]
+                        sums[lane] += x * x
+                for lane in range(LANES):
+                    if sums[lane] < best:
+                        best, label = sums[lane], near[c, part * LANES + lane]
+            labels[i] = label
+            errors[i] = best
 
 
 #: Odd multipliers with irregular bits: 2 ** 64 / golden ratio, and the second of MurmurHash3's finalizer.
@@ -311,21 +307,17 @@ SPREAD, MIX = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xC4CEB9FE1A85EC53)
 SHIFT = np.uint64(29)
 
 
-@kernel(u4[:, :], parallel=True)
-def hash_rows(bits):
-    """Return a hash of each row: equal for equal rows, different for nearly all others.
+@kernel(i8, u4[:, :], out(u8[:]), ranges=True)
+def hash_rows(start, stop, bits, hashes):
+    """Fill a hash of each row: equal for equal rows, different for nearly all others.
 
     Args:
         bits: (N, D) uint32.
-
-    Returns:
-        (N,) uint64.
+        hashes: (N,) uint64, filled.
     """
-    out = np.empty(len(bits), np.uint64)
-    for i in prange(len(bits)):
+    for i in range(start, stop):
         mixed = SPREAD
         for d in range(bits.shape[1]):
             mixed = (mixed ^ np.uint64(bits[i, d])) * MIX
             mixed ^= mixed >> SHIFT
-        out[i] = mixed
-    return out
+        hashes[i] = mixed
