@@ -13,10 +13,7 @@ RUN /src/container/install /src /opt/sparklod "$CPU"
 
 FROM python:${PYTHON}-slim
 ARG CPU=x86-64-v3
-RUN apt-get update \
-    && apt-get install -y --no-install-recommends libgomp1 \
-    && rm -rf /var/lib/apt/lists/* \
-    && useradd --create-home sparklod
+RUN useradd --create-home sparklod
 COPY --from=build /opt/sparklod /opt/sparklod
 # numba compiles for the named processor, not for the one that runs it; empty features are those that the name implies.
 ENV PATH=/opt/sparklod/bin:$PATH NUMBA_CPU_NAME=$CPU NUMBA_CPU_FEATURES= NUMBA_CACHE_DIR=/opt/sparklod/kernels

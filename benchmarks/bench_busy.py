@@ -1,9 +1,10 @@
-"""Measures baking on an idle and on a busy machine, by how OpenMP's threads wait for each other.
+"""Measures baking on an idle and on a busy machine, on all threads and on one.
 
     python benchmarks/bench_busy.py playbot.sog [--rounds 3] [--method quality]
 
-Every round measures each way of waiting: one bake alone, one beside a process that keeps a processor busy, four one
-after another, and four at once. Bakes are whole processes, from file to file, with a warm cache; medians are printed.
+Every round measures for each number of threads: one bake alone, one beside a process that keeps a processor busy, four
+one after another, and four at once. Bakes are whole processes, from file to file, with a warm cache; medians are
+printed.
 """
 
 from __future__ import annotations
@@ -20,26 +21,15 @@ from performance.process import SPARKLOD, environment
 from performance.rows import Row, Table, figure, label, ratio
 
 from sparklod_cli.lod.builders import METHODS
-from sparklod_cli.support.jit import WAIT_SETTINGS
 
-#: Environment variables and options of each way of waiting, by its name in the table: OpenMP's default, what sparklod
-#: sets, two others, and one thread for comparison.
-WAYS: dict[str, tuple[dict[str, str], list[str]]] = {
-    "OpenMP's default": ({"GOMP_SPINCOUNT": "300000"}, []),  # libgomp's default
-    "as shipped": ({}, []),
-    "10,000 looks": ({"GOMP_SPINCOUNT": "10000"}, []),
-    "passive": ({"OMP_WAIT_POLICY": "PASSIVE"}, []),
-    "one thread": ({}, ["--threads", "1"]),
-}
-
-#: Those that tell the most.
-MAIN_WAYS = ("OpenMP's default", "as shipped", "one thread")
+#: Options by the name of a row.
+WAYS: dict[str, list[str]] = {"all": [], "one": ["--threads", "1"]}
 
 AT_ONCE = 4  # bakes at once
 
 TABLE = Table(
     columns=(
-        label("way", "threads wait"),
+        label("way", "threads"),
         figure("alone_s", "alone s", 2),
         figure("beside_s", "beside a busy process s", 2),
         figure("in_turn_s", f"{AT_ONCE} in turn s", 1),
@@ -60,11 +50,9 @@ class Bakes:
         self._started = 0
 
     def start(self, way: str) -> subprocess.Popen[bytes]:
-        settings, options = WAYS[way]
-        unset = dict.fromkeys((*WAIT_SETTINGS, "OMP_WAIT_POLICY"))
         self._started += 1
         output = str(self._folder / f"{self._started}.spz")
-        return subprocess.Popen([*self._line, *options, "-o", output], env=environment({**unset, **settings}))
+        return subprocess.Popen([*self._line, *WAYS[way], "-o", output], env=environment())
 
     def run(self, way: str, count: int, *, at_once: bool) -> float:
         """Seconds that `count` bakes take, at once or one after the other."""
@@ -95,11 +83,11 @@ def beside_a_busy_process(bakes: Bakes, way: str) -> float:
 
 
 def rows(scene: Path, method: str, ways: Iterable[str], rounds: int) -> list[Row]:
-    """A row for each way of waiting; ways take turns, so that there is no row before the last round."""
+    """A row for each of WAYS; they take turns, so that there is no row before the last round."""
     runs: dict[str, list[dict[str, float]]] = {way: [] for way in ways}
     with tempfile.TemporaryDirectory() as folder:
         bakes = Bakes(scene, method, Path(folder))
-        bakes.run("as shipped", 1, at_once=False)  # compiles kernels and fills the system's file cache
+        bakes.run("all", 1, at_once=False)  # compiles kernels and fills the system's file cache
         for _ in range(rounds):
             for way, found in runs.items():
                 found.append(

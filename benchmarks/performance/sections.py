@@ -92,7 +92,7 @@ def _sizes(bench: Any, context: Context) -> Iterable[Row]:
 
 def _busy(bench: Any, context: Context) -> Iterable[Row]:
     scene = context.scene("biker.ply" if context.quick else "playbot.sog")
-    ways = ("as shipped",) if context.quick else bench.MAIN_WAYS
+    ways = ("all",) if context.quick else bench.WAYS
     return bench.rows(scene, "quick" if context.quick else "quality", ways, context.count(1))
 
 

@@ -73,7 +73,7 @@ class Kernel:
         if self.declared:  # signatures differ in the types of numbers only
             types = self.declared[0]
             if len(arguments) != len(types):
-                raise TypeError(f"{self.__name__} takes {len(types)} arguments but {len(arguments)} were given")
+                raise TypeError(f"{self.py_func.__name__} takes {len(types)} arguments but {len(arguments)} were given")
             arguments = tuple(map(as_declared, types, arguments))
         if self.options.ranges:
             return run_ranges(self.dispatcher, *arguments)
