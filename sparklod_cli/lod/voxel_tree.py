@@ -18,7 +18,7 @@ from ..model.lod_tree import LodTree
 from ..model.splats import COLUMNS, FloatArray, Splats
 from ..support.parallel import blocks_of
 from ..support.threads import threads_for, threads_in_use
-from .kernels.cell_pairs import merge_in_cells, split_families
+from .kernels.cell_pairs import SPAN, merge_in_cells, split_families
 from .kernels.geometry import SplatColumns
 from .kernels.node_rows import Space, fill_leaf_rows, fill_leaves, fill_merged_splats, merge_colors
 from .kernels.pair_cost import WEIGHT, WIDTH
@@ -201,7 +201,8 @@ class VoxelTree:
 
     def merge_cells(self, level: int, nodes: Nodes, is_first: NDArray[np.bool_], largest: np.float32) -> Nodes:
         """Merge the nodes of each cell, as `kernels.cell_pairs.merge_in_cells`; returns the nodes without a parent."""
-        owner, row = merge_in_cells(nodes, is_first, self._rows.node, largest, self._used)
+        owner, row = np.empty(len(nodes), np.int64), np.empty(len(nodes), np.uint32)
+        merge_in_cells(-(-len(nodes) // SPAN), nodes, is_first, self._rows.node, largest, self._used, owner, row)
         members, first, made, survivors = split_families(nodes, owner, row)
         del owner, row
         if len(made):
