@@ -73,6 +73,7 @@ def _refuse_undeclared_types() -> None:
     Such a kernel would be compiled when it is called, whatever a warm-up has compiled. Tests may call them so.
     """
     import numba
+    from numba.core.types import StarArgTuple
 
     from sparklod_cli.support import jit
     from sparklod_cli.support.jit_types import as_declared
@@ -84,7 +85,8 @@ def _refuse_undeclared_types() -> None:
         if caller.startswith("sparklod_cli."):
             declared = kernel.declared[0] if kernel.declared else ()
             types = tuple(numba.typeof(as_declared(*each)) for each in zip(declared, arguments, strict=True))
-            if types not in kernel.signatures:
+            signature = (StarArgTuple((numba.int64, *types)),) if kernel.options.ranges else types
+            if signature not in kernel.signatures:
                 name = kernel.py_func.__name__
                 raise AssertionError(f"{caller} calls {name} with types that it does not declare: {types}")
         return call(kernel, *arguments)
