@@ -162,7 +162,7 @@ def _families(
     demand = np.empty((len(order), VIEWPOINTS), np.uint8)
     total = 1 + int(count.sum(dtype=np.int64))
     least = min(total * LEAST_BUDGET, float(CHUNK_NODES))
-    fill_demand(records, parent, views, least, float(total), demand)
+    fill_demand(VIEWPOINTS // LANES, records, parent, views, least, float(total), demand)
     return Families(parent, count[order].astype(np.int32), rank, demand)
 
 
@@ -198,7 +198,7 @@ def _sequence(families: Families, filled: int, total: int, progress: Progress) -
             for number, (begin, end, nodes, room) in enumerate(sets)
         ]
         lengths = np.zeros(len(sets), np.int64)
-        split_sets(families, np.array(rows, np.int64), sequence, set_of, root, weight, spare, lengths)
+        split_sets(len(sets), families, np.array(rows, np.int64), sequence, set_of, root, weight, spare, lengths)
         used += len(sets)
         parts = []
         for (begin, end, nodes, _), first in zip(sets, lengths.tolist(), strict=True):
@@ -209,7 +209,8 @@ def _sequence(families: Families, filled: int, total: int, progress: Progress) -
         progress("arranging", filled + own - sum(nodes for _, _, nodes, _ in sets), total, "node")
     bits = (length - 1).bit_length()
     set_of[:] = -1  # numbers of sets are none of chunks
-    sort_within_chunks(np.unique(ends), families.parent, families.rank, bits, sequence, set_of, root)
+    bounds = np.unique(ends)
+    sort_within_chunks(len(bounds) - 1, bounds, families.parent, families.rank, bits, sequence, set_of, root)
     return sequence
 
 
