@@ -126,15 +126,17 @@ def fill_bins(families, members, root, weight, nodes, greatest):
         family = members[i]
         at = i * BINS // len(members)
         nodes[SIZE, at] += families.count[family]
+        demand, most = families.demand[family], greatest[SIZE, at]  # rows, so that LLVM vectorizes over lanes
         for lane in range(lanes):
-            greatest[SIZE, at, lane] = max(greatest[SIZE, at, lane], families.demand[family, lane])
+            most[lane] = max(most[lane], demand[lane])
         if root[family] != family:
             continue
         for axis in range(3):
             at = (families.rank[family, axis] - low[axis]) * BINS // (high[axis] - low[axis] + 1)
             nodes[axis, at] += weight[family]
+            most = greatest[axis, at]
             for lane in range(lanes):  # no family of a subtree has more demand than its root
-                greatest[axis, at, lane] = max(greatest[axis, at, lane], families.demand[family, lane])
+                most[lane] = max(most[lane], demand[lane])
 
 
 @kernel()
