@@ -101,7 +101,8 @@ def fill_rows_of(start, stop, nodes, row, leaves, found):
         found: (n,) uint32, filled.
     """
     for i in range(start, stop):
-        found[i] = nodes[i] if nodes[i] < leaves else row[nodes[i] - leaves]
+        node = nodes[np.uint64(i)]
+        found[np.uint64(i)] = node if node < leaves else row[np.uint64(node - leaves)]
 
 
 @kernel(i8, f4[:, :], u4[:], f8[:], f8, out(u8[:]), ranges=True)
