@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from ..codecs.validation import check_valid
 from ..model.splats import Splats
 from ..support.errors import InvalidSplatsError
+from ..support.parallel import BLOCK_ROWS
 from ..support.threads import threads_for
 from .kernels.geometry import find_bounds
 
@@ -28,6 +29,14 @@ class Bounds:
     smallest: float
     largest: float
 
+    @classmethod
+    def of(cls, splats: Splats) -> Bounds:
+        """Return the bounds of splats; of none, the box is from infinity to minus infinity."""
+        low, high = np.empty((2, -(-len(splats) // BLOCK_ROWS), 4))
+        find_bounds(len(low), splats.center, splats.scale, low, high)
+        least, most = low.min(axis=0, initial=np.inf), high.max(axis=0, initial=-np.inf)
+        return cls(least[:3], most[:3], 2 * float(least[3]), 2 * float(most[3]))
+
 
 def check_setting(name: str, value: float, least: float, most: float) -> None:
     """Raise a `ValueError` where the setting of a builder is out of its range."""
@@ -41,9 +50,9 @@ def check(splats: Splats) -> Bounds:
         raise InvalidSplatsError("no splat is left to build a tree of")
     with threads_for(len(splats)) as threads:
         check_valid(splats, threads)
-        low, high, smallest, largest = find_bounds(splats.center, splats.scale, threads)
-    check_visible(smallest, float(splats.opacity.min()))
-    return Bounds(low, high, smallest, largest)
+        bounds = Bounds.of(splats)
+    check_visible(bounds.smallest, float(splats.opacity.min()))
+    return bounds
 
 
 def check_visible(smallest: float, faintest: float = 1.0) -> None:

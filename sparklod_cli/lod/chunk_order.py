@@ -23,7 +23,6 @@ from ..support.parallel import blocks_of
 from ..support.progress import Progress, silent
 from ..support.threads import threads_for
 from .families import families_of, node_order, reordered
-from .kernels import family_rows
 from .kernels.chunk_sets import DEMAND_BYTES, LANES, Families, fill_demand, sort_within_chunks, split_sets
 from .kernels.pixel_scale import NODE, VIEW
 from .kernels.sort import sort_by_key
@@ -54,6 +53,9 @@ MOST_FAMILIES = 1 << 22
 
 #: Bytes that a family takes while it is put in order, without those that each thread takes. Measured.
 FAMILY_BYTES = 124
+
+#: Sign bit of a float32.
+SIGN = np.uint32(1 << 31)
 
 Matrix = NDArray[np.float64]
 
@@ -155,24 +157,36 @@ def _families(
     threads: int,
 ) -> Families:
     """Return the families in an order."""
+    above, center = parent[order], center[order]
+    parent = np.where(above < 0, np.int32(-1), _places(order)[above])
     records = np.zeros(len(order), NODE)
-    family_rows.fill_parents(order, center, size, count, records)
-    parent, rank = family_rows.parents_in(order, parent), _ranks_in(order, center, threads)
-    views = viewpoints(center[order])
+    for axis, name in enumerate("xyz"):
+        records[name] = center[:, axis]
+    records["size"], records["child_count"] = size[order], count[order]
+    rank = _ranks(center, threads)
+    views = viewpoints(center)
+    del above, center
     demand = np.empty((len(order), VIEWPOINTS), np.uint8)
     total = 1 + int(count.sum(dtype=np.int64))
     least = min(total * LEAST_BUDGET, float(CHUNK_NODES))
-    fill_demand(records, parent, views, least, float(total), demand)
-    return Families(parent, count[order].astype(np.int32), rank, demand)
+    fill_demand(VIEWPOINTS // LANES, records, parent, views, least, float(total), demand)
+    return Families(parent, records["child_count"].astype(np.int32), rank, demand)
 
 
-def _ranks_in(order: NDArray[np.uint32], center: FloatArray, threads: int) -> NDArray[np.int32]:
-    """Return the (F, 3) ranks of the centres along each axis, where families are in an order."""
-    rank = np.empty((len(order), 3), np.int32)
+def _places(order: NDArray[np.uint32]) -> Index:
+    """Return the (F,) place of each family in an order."""
+    place = np.empty(len(order), np.int32)
+    place[order] = np.arange(len(order), dtype=np.int32)
+    return place
+
+
+def _ranks(center: FloatArray, threads: int) -> NDArray[np.int32]:
+    """Return the (F, 3) ranks of centres along each axis."""
+    rank = np.empty((len(center), 3), np.int32)
     for axis in range(3):
-        keys = family_rows.axis_keys(center, order, axis)
-        _, by_place = sort_by_key(keys, np.arange(len(order), dtype=np.uint32), 32, threads)
-        family_rows.fill_ranks(by_place, axis, rank)
+        bits = center[:, axis].copy().view(np.uint32)
+        keys = np.where(bits & SIGN, ~bits, bits | SIGN).astype(np.uint64)  # ascend as the numbers do
+        rank[:, axis] = _places(sort_by_key(keys, np.arange(len(bits), dtype=np.uint32), 32, threads)[1])
     return rank
 
 
@@ -198,7 +212,7 @@ def _sequence(families: Families, filled: int, total: int, progress: Progress) -
             for number, (begin, end, nodes, room) in enumerate(sets)
         ]
         lengths = np.zeros(len(sets), np.int64)
-        split_sets(families, np.array(rows, np.int64), sequence, set_of, root, weight, spare, lengths)
+        split_sets(len(sets), families, np.array(rows, np.int64), sequence, set_of, root, weight, spare, lengths)
         used += len(sets)
         parts = []
         for (begin, end, nodes, _), first in zip(sets, lengths.tolist(), strict=True):
@@ -209,7 +223,8 @@ def _sequence(families: Families, filled: int, total: int, progress: Progress) -
         progress("arranging", filled + own - sum(nodes for _, _, nodes, _ in sets), total, "node")
     bits = (length - 1).bit_length()
     set_of[:] = -1  # numbers of sets are none of chunks
-    sort_within_chunks(np.unique(ends), families.parent, families.rank, bits, sequence, set_of, root)
+    bounds = np.unique(ends)
+    sort_within_chunks(len(bounds) - 1, bounds, families.parent, families.rank, bits, sequence, set_of, root)
     return sequence
 
 

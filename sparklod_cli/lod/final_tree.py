@@ -104,12 +104,13 @@ def in_final_order(
     out = Splats.empty(total, degree_of(columns["sh"].shape[1]))
 
     def fill(name: str) -> None:
-        fill_leaves(order, index, columns.pop(name).reshape(n, -1), getattr(out, name).reshape(total, -1))
+        fill_leaves(total, order, index, columns.pop(name).reshape(n, -1), getattr(out, name).reshape(total, -1))
 
     for name in GEOMETRY:
         fill(name)
     places = (getattr(out, name)[hidden:] for name in GEOMETRY)
-    node_rows.fill_merged_splats(order[hidden:], n, binary.row, binary.rows, curve.space, threads_in_use(), *places)
+    shown = order[hidden:]
+    node_rows.fill_merged_splats(len(shown), shown, n, binary.row, binary.rows, curve.space, *places)
     weight = binary.rows[binary.row[slots], pair_cost.WEIGHT]
     binary.rows = rows = binary.rows[binary.row[slots[:0] if goal.is_whole else slots]]  # frees what is not returned
     weights = np.empty(binary.used, np.float32)
@@ -118,9 +119,10 @@ def in_final_order(
         fill(name)
     ends = np.concatenate([np.flatnonzero(np.diff(ranks, prepend=ranks[:1] - 1)), [len(inner)]])
     for begin, end in zip(ends[-2::-1], ends[:0:-1], strict=True):
-        with threads_for(int(end - begin)) as threads:
+        with threads_for(int(end - begin)):
             for color in (out.rgb, out.sh.reshape(total, -1)):
-                merge_colors(parents[begin:end], tree.child_start, tree.child_count, order, weights, color, threads)
+                family = parents[begin:end]
+                merge_colors(len(family), family, tree.child_start, tree.child_count, order, weights, color)
         progress("ordering", total - int(begin), total, "node")
     return FinalTree(out, tree, order, parents, ranks, keys, rows)
 

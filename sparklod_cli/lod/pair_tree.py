@@ -111,7 +111,7 @@ class Curve:
         """Return the (n, WIDTH) node rows and (n,) feature sizes, in units, of some splats."""
         rows, size = np.empty((len(index), pair_cost.WIDTH), np.float32), np.empty(len(index), np.float32)
         columns = SplatColumns(splats.center, splats.scale, splats.quat_xyzw, splats.opacity)
-        node_rows.fill_leaf_rows(index, columns, splats.rgb, self.space, rows, size)
+        node_rows.fill_leaf_rows(len(index), index, columns, splats.rgb, self.space, rows, size)
         return rows, size
 
     def sort(self, rows: FloatArray, at: Nodes, turn: int, threads: int) -> Nodes:
@@ -127,7 +127,9 @@ class Curve:
 
     def keys(self, rows: FloatArray, at: Nodes, turn: int) -> Keys:
         """Return the (n,) Morton codes of rows on the curve of a round."""
-        return node_rows.morton_keys(rows, at, *self._grid(turn))
+        keys = np.empty(len(at), np.uint64)
+        node_rows.fill_morton_keys(len(at), rows, at, *self._grid(turn), keys)
+        return keys
 
     def _grid(self, turn: int) -> tuple[NDArray[np.float64], float]:
         """Return the lowest corner of the curve's box in a round, and the edge of a cell, units."""
@@ -182,7 +184,8 @@ class BinaryTree:
 
     def rows_of(self, nodes: Nodes) -> Nodes:
         """Return the (n,) rows of nodes; those of leaves that are merged have other content by now."""
-        found: Nodes = node_rows.rows_of(nodes, self.row, self.leaves)
+        found = np.empty(len(nodes), np.uint32)
+        node_rows.fill_rows_of(len(nodes), nodes, self.row, self.leaves, found)
         return found
 
     def keep_rows(self, slots: Nodes) -> None:
@@ -276,7 +279,7 @@ def _merge(
         with threads_for(len(active)) as threads:
             at = binary.rows_of(active)
             order = curve.sort(binary.rows, at, binary.rounds, threads)
-            active, at = node_rows.taken(active, order), node_rows.taken(at, order)
+            active, at = active[order], at[order]
             partner, cost = pair_cost.find_partners(binary.rows, at, WINDOW, np.float32(largest))
             del at
             before = len(active)

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from ..model.lod_tree import LodTree
 from ..model.splats import COLUMNS, FloatArray, Splats
 from ..support.parallel import blocks_of
-from ..support.threads import threads_for, threads_in_use
-from .kernels.cell_pairs import merge_in_cells, split_families
+from ..support.threads import threads_for
+from .kernels.cell_pairs import SPAN, merge_in_cells, split_families
 from .kernels.geometry import SplatColumns
 from .kernels.node_rows import Space, fill_leaf_rows, fill_leaves, fill_merged_splats, merge_colors
 from .kernels.pair_cost import WEIGHT, WIDTH
@@ -201,7 +201,8 @@ class VoxelTree:
 
     def merge_cells(self, level: int, nodes: Nodes, is_first: NDArray[np.bool_], largest: np.float32) -> Nodes:
         """Merge the nodes of each cell, as `kernels.cell_pairs.merge_in_cells`; returns the nodes without a parent."""
-        owner, row = merge_in_cells(nodes, is_first, self._rows.node, largest, self._used)
+        owner, row = np.empty(len(nodes), np.int64), np.empty(len(nodes), np.uint32)
+        merge_in_cells(-(-len(nodes) // SPAN), nodes, is_first, self._rows.node, largest, self._used, owner, row)
         members, first, made, survivors = split_families(nodes, owner, row)
         del owner, row
         if len(made):
@@ -223,7 +224,7 @@ class VoxelTree:
         is_merged = (self._count[part] > 0) | (self._number[part] >= self.leaves)
         at = np.where(is_merged, np.arange(1, count + 1, dtype=np.uint32), np.uint32(0))
         columns = self._center[part], self._scale[part], self._quat[part], self._opacity[part]
-        fill_merged_splats(at, 1, nodes, rows.node, self._space, threads_in_use(), *columns)
+        fill_merged_splats(count, at, 1, nodes, rows.node, self._space, *columns)
         self.total += count
 
     def finish(self, tops: NodeRows, index: Nodes, given: Splats) -> Final:
@@ -255,14 +256,14 @@ class VoxelTree:
         for name in COLUMNS:
             column, filled = getattr(given, name), getattr(out, name)
             width = math.prod(filled.shape[1:])
-            fill_leaves(number, index, column.reshape(len(column), width), filled.reshape(total, width))
+            fill_leaves(total, number, index, column.reshape(len(column), width), filled.reshape(total, width))
         del index, given, column  # frees memory if the caller has no reference
         same, end = np.arange(total, dtype=np.uint32), len(parents)
         for batch in self.batches:
-            with threads_for(batch.members) as threads:
+            with threads_for(batch.members):
                 for color in (out.rgb, out.sh.reshape(total, math.prod(sh))):
                     family = parents[end - batch.families : end]
-                    merge_colors(family, start, count, same, weight, color, threads)
+                    merge_colors(len(family), family, start, count, same, weight, color)
             end -= batch.families
         return Final(out, LodTree(count, start), number, parents)
 
@@ -321,4 +322,4 @@ def joining(index: Nodes, ends: Offsets, fill: FillRows) -> dict[int, Joining]:
 def fill_rows(index: Nodes, splats: Splats, space: Space, rows: FloatArray) -> None:
     """Fill the node rows of some splats."""
     columns = SplatColumns(splats.center, splats.scale, splats.quat_xyzw, splats.opacity)
-    fill_leaf_rows(index, columns, splats.rgb, space, rows, np.empty(len(index), np.float32))
+    fill_leaf_rows(len(index), index, columns, splats.rgb, space, rows, np.empty(len(index), np.float32))

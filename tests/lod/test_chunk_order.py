@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import tracemalloc
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from sparklod_cli.lod import chunk_order, quality, quick
 from sparklod_cli.lod.chunk_order import arrange, family_order, parts_of
 from sparklod_cli.lod.chunk_order import chunk_order as order_of
-from sparklod_cli.lod.kernels.chunk_sets import fill_demand
+from sparklod_cli.lod.kernels.chunk_sets import LANES, fill_demand
 from sparklod_cli.lod.kernels.pixel_scale import NODE
 from sparklod_cli.lod.kernels.tree_links import find_limits, find_parents
 from sparklod_cli.lod.settings import LodSettings
@@ -164,8 +164,8 @@ def test_chunks_are_not_taken_for_sets(built: tuple[Splats, LodTree], monkeypatc
     """
     sort, asked = chunk_order.sort_within_chunks, []
 
-    def sort_within_chunks(*arguments: np.ndarray) -> None:
-        asked.append(int(arguments[5].max()))
+    def sort_within_chunks(*arguments: Any) -> None:
+        asked.append(int(arguments[6].max()))
         sort(*arguments)
 
     monkeypatch.setattr(chunk_order, "sort_within_chunks", sort_within_chunks)
@@ -249,7 +249,7 @@ def test_demand_never_rises_from_parent_to_child() -> None:
     nodes["size"], nodes["child_count"] = np.exp(rng.normal(size=count)), rng.integers(1, 9, count)
     views = chunk_order.viewpoints(rng.normal(size=(count, 3)).astype(np.float32))
     demand = np.zeros((count, len(views)), np.uint8)
-    fill_demand(nodes, parent, views, 20.0, float(nodes["child_count"].sum()), demand)
+    fill_demand(len(views) // LANES, nodes, parent, views, 20.0, float(nodes["child_count"].sum()), demand)
     assert (demand[1:] <= demand[parent[1:]]).all()
     assert demand[0].min() > 0 and len(np.unique(demand)) > 50
 

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from ...codecs.statistics import Statistics
 from ...lod.check import Bounds, check_visible
-from ...lod.kernels.geometry import find_bounds
 from ...model.selection import REASONS, SelectionTally
 from ...model.splats import FloatArray, Splats
 from ...model.streams import SceneStream
@@ -97,14 +96,13 @@ class Findings:
     statistics: Statistics
 
     @classmethod
-    def of(
-        cls, splats: Splats, tally: SelectionTally, beyond: int, stride: int, needed: Collection[str], threads: int
-    ) -> Findings:
+    def of(cls, splats: Splats, tally: SelectionTally, beyond: int, stride: int, needed: Collection[str]) -> Findings:
         """Examine splats that are kept; every so many are the sample."""
-        low, high, smallest, largest = find_bounds(splats.center, splats.scale, threads)
+        bounds = Bounds.of(splats)
         sample = rows_of(splats.take(slice(None, None, stride)))
         found = Statistics.of(splats, needed=needed)
-        return cls(tally, beyond, np.stack([low, high]), np.array([smallest, largest]), sample, found)
+        sizes = np.array([bounds.smallest, bounds.largest])
+        return cls(tally, beyond, np.stack([bounds.low, bounds.high]), sizes, sample, found)
 
     @classmethod
     def merged(cls, parts: Sequence[Findings]) -> Findings:
@@ -184,5 +182,5 @@ def scatter(job: Job, number: int, *, threads: int, progress: Progress) -> None:
         job.store.put(job.splats(number, group), {"rows": rows[here], "index": here.astype(np.int32)})
     stride = max(1, job.stream.count // SAMPLE_SPLATS)
     with on_threads(threads):
-        findings = Findings.of(splats_of(rows, threads), tally, beyond, stride, job.needed, threads)
+        findings = Findings.of(splats_of(rows, threads), tally, beyond, stride, job.needed)
     job.store.put(job.part(number), {**findings.arrays(), "first": first})

@@ -16,7 +16,7 @@ import math
 import numpy as np
 
 from ...support.fast_math import exp2
-from ...support.jit import kernel, prange
+from ...support.jit import kernel
 from ...support.jit_types import b1, f4, i8, out, u4
 from .geometry import ellipsoid_area
 from .pair_cost import COVARIANCE, COVERED, DENSITY, LOG_DET, NEVER, WEIGHT, WIDTH, log_det, pair_costs
@@ -281,9 +281,11 @@ def merge_span(nodes, is_first, rows, largest, begin, end, made, owner, row):
         owner[begin + i] = begin + (np.int64(joined[i]) if members[joined[i]] > 0 else i)
 
 
-@kernel(u4[:], b1[:], out(f4[:, :]), f4, i8, parallel=True)
-def merge_in_cells(nodes, is_first, rows, largest, made):
-    """Merge nodes with others of their cell, and fills the rows of the nodes that become parents.
+@kernel(i8, u4[:], b1[:], out(f4[:, :]), f4, i8, out(i8[:]), out(u4[:]), ranges=True)
+def merge_in_cells(start, stop, nodes, is_first, rows, largest, made, owner, row):
+    """Merge nodes with others of their cell, and fill the rows of the nodes that become parents.
+
+    The rows of a range are spans: SPAN nodes, but for those whose cell begins before, with the rest of the last cell.
 
     Args:
         nodes: (n,) uint32 rows, by cell and then along a curve.
@@ -291,14 +293,11 @@ def merge_in_cells(nodes, is_first, rows, largest, made):
         rows: node rows; up to n // 2 of them, from `made` on, are filled.
         largest: float32, largest trace of the covariance of a merged node, units squared.
         made: the first row to fill.
-
-    Returns:
-        owner: (n,) int64, the place in `nodes` of the first member of each node's family, or its own.
-        row: (n,) uint32, the row of each family, at the place of its first member.
+        owner: (n,) int64, filled with the place in `nodes` of the first member of each node's family, or its own.
+        row: (n,) uint32; the row of each family is filled in at the place of its first member.
     """
     n = len(nodes)
-    owner, row = np.empty(n, np.int64), np.zeros(n, np.uint32)
-    for span in prange((n + SPAN - 1) // SPAN):
+    for span in range(start, stop):
         begin, end = span * SPAN, min(n, span * SPAN + SPAN)
         while begin < end and not is_first[begin]:
             begin += 1

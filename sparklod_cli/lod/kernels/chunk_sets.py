@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...support.jit import kernel, prange
+from ...support.jit import kernel
 from ...support.jit_types import f8, fields, i4, i8, out, u1
 from .pixel_scale import NODES, VIEWS, ZERO, pixel_scale
 from .sort import AXIS_BITS, interleave
@@ -126,15 +126,17 @@ def fill_bins(families, members, root, weight, nodes, greatest):
         family = members[i]
         at = i * BINS // len(members)
         nodes[SIZE, at] += families.count[family]
+        demand, most = families.demand[family], greatest[SIZE, at]  # rows, so that LLVM vectorizes over lanes
         for lane in range(lanes):
-            greatest[SIZE, at, lane] = max(greatest[SIZE, at, lane], families.demand[family, lane])
+            most[lane] = max(most[lane], demand[lane])
         if root[family] != family:
             continue
         for axis in range(3):
             at = (families.rank[family, axis] - low[axis]) * BINS // (high[axis] - low[axis] + 1)
             nodes[axis, at] += weight[family]
+            most = greatest[axis, at]
             for lane in range(lanes):  # no family of a subtree has more demand than its root
-                greatest[axis, at, lane] = max(greatest[axis, at, lane], families.demand[family, lane])
+                most[lane] = max(most[lane], demand[lane])
 
 
 @kernel()
@@ -255,8 +257,8 @@ def move_first_part(members, root, weight, spare):
     return length
 
 
-@kernel(Families, i8[:, :], out(i4[:]), out(i4[:]), out(i4[:]), out(i8[:]), out(i4[:]), out(i8[:]), parallel=True)
-def split_sets(families, sets, sequence, set_of, root, weight, spare, lengths):
+@kernel(i8, Families, i8[:, :], out(i4[:]), out(i4[:]), out(i4[:]), out(i8[:]), out(i4[:]), out(i8[:]), ranges=True)
+def split_sets(start, stop, families, sets, sequence, set_of, root, weight, spare, lengths):
     """Split each set in two; the first part of each fills whole chunks, but for very few nodes.
 
     Args:
@@ -270,7 +272,7 @@ def split_sets(families, sets, sequence, set_of, root, weight, spare, lengths):
         lengths: (S,) int64, filled with the number of families of each first part.
     """
     lanes = families.demand.shape[1]
-    for i in prange(len(sets)):
+    for i in range(start, stop):
         begin, end, number, size, chunks, room = sets[i]
         members = sequence[begin:end]
         roots = find_roots(families, members, number, set_of, root, weight)
@@ -286,13 +288,13 @@ def split_sets(families, sets, sequence, set_of, root, weight, spare, lengths):
         lengths[i] = move_first_part(members, root, weight, spare[begin:end])
 
 
-@kernel(NODES, i4[:], VIEWS, f8, f8, out(u1[:, :]), parallel=True)
-def fill_demand(families, parent, views, least, most, demand):
+@kernel(i8, NODES, i4[:], VIEWS, f8, f8, out(u1[:, :]), ranges=True)
+def fill_demand(start, stop, families, parent, views, least, most, demand):
     """Fill the chance that a viewer at each viewpoint refines a family's parent, if its budget is unknown.
 
     A viewer refines the largest nodes first. It needs a family if its budget has room for all families whose pixel
     scale, limited by those of their ancestors, is at least as large. The logarithm of budgets is uniform between
-    `least` and `most` nodes.
+    `least` and `most` nodes. The rows of a range are groups of LANES viewpoints.
 
     Args:
         families: (F,) `pixel_scale.NODE`, the parents of families, parents before their children.
@@ -302,11 +304,10 @@ def fill_demand(families, parent, views, least, most, demand):
         demand: (F, V) uint8, filled: 255 for certain. No family has more than its parent.
     """
     span = math.log(most / least)
-    for block in prange(len(views) // LANES):
-        bucket = np.empty((len(families), LANES), np.int16)
-        nodes = np.zeros((LANES, BUCKETS), np.int64)
-        code = np.zeros((LANES, BUCKETS), np.uint8)
-        first = block * LANES
+    bucket = np.empty((len(families), LANES), np.int16)
+    nodes, code = np.empty((LANES, BUCKETS), np.int64), np.empty((LANES, BUCKETS), np.uint8)
+    for first in range(start * LANES, stop * LANES, LANES):
+        nodes[:] = 0
         for family in range(len(families)):
             above = parent[family]
             for lane in range(LANES):
@@ -329,8 +330,8 @@ def fill_demand(families, parent, views, least, most, demand):
                 demand[family, first + lane] = code[lane, bucket[family, lane]]
 
 
-@kernel(i8[:], i4[:], i4[:, :], i8, out(i4[:]), out(i4[:]), out(i4[:]), parallel=True)
-def sort_within_chunks(bounds, parent, rank, axis_bits, sequence, chunk_of, depth):
+@kernel(i8, i8[:], i4[:], i4[:, :], i8, out(i4[:]), out(i4[:]), out(i4[:]), ranges=True)
+def sort_within_chunks(start, stop, bounds, parent, rank, axis_bits, sequence, chunk_of, depth):
     """Sort the families of each chunk by the depth within it, then along a Morton curve.
 
     Neighbours in space have similar centres and colours, which makes them smaller to compress; parents stay before
@@ -346,7 +347,7 @@ def sort_within_chunks(bounds, parent, rank, axis_bits, sequence, chunk_of, dept
         depth: (F,) int32, working memory.
     """
     up, down = np.uint64(max(AXIS_BITS - axis_bits, 0)), np.uint64(max(axis_bits - AXIS_BITS, 0))
-    for chunk in prange(len(bounds) - 1):
+    for chunk in range(start, stop):
         begin, end = bounds[chunk], bounds[chunk + 1]
         members = sequence[begin:end].copy()
         keys = np.empty(len(members), np.uint64)

@@ -15,8 +15,8 @@ import numpy as np
 
 from ...model import gaussian
 from ...model.gaussian import THOMSEN_P
-from ...support.jit import kernel, prange
-from ...support.jit_types import f4, fields, i8
+from ...support.jit import kernel
+from ...support.jit_types import f4, f8, fields, i8, out
 
 #: The largest float32, world units: centres and scales of merged splats are clamped to it.
 LARGEST = float(np.finfo(np.float32).max)
@@ -50,9 +50,6 @@ ROWS = 10
 class SplatColumns(NamedTuple):
     """Geometry of N splats, float32 columns as in `Splats`, for a kernel to read.
 
-    Arrays that a parallel kernel fills must be arguments of their own: numba 0.68 takes writes to arrays out of a tuple
-    for dead code and removes them.
-
     Attributes:
         center: (N, 3). scale: (N, 3). quat_xyzw: (N, 4). opacity: (N,).
     """
@@ -79,22 +76,16 @@ def ellipsoid_area(a, b, c):
     return 4 * math.pi * np.float64(largest) * np.float64(largest) * np.float64(mean)
 
 
-@kernel(f4[:, :], f4[:, :], i8, parallel=True)
-def find_bounds(center, scale, blocks):
-    """Return the box of the centres, and the range of sizes.
+@kernel(i8, f4[:, :], f4[:, :], out(f8[:, :]), out(f8[:, :]), ranges=True)
+def find_bounds(start, stop, center, scale, low, high):
+    """Fill the least and the greatest x, y, z and largest scale of each of the blocks that splats are divided into.
 
     Args:
         center, scale: (N, 3) float32.
-        blocks: ranges of splats to process in parallel; the result does not depend on it.
-
-    Returns:
-        low, high: (3,) float64 corners of the box.
-        smallest, largest: size, 2 * max(scale).
+        low, high: (blocks, 4) float64, filled.
     """
-    n = len(center)
-    low = np.full((blocks, 4), np.inf)
-    high = np.full((blocks, 4), -np.inf)
-    for c in prange(blocks):
+    n, blocks = len(center), len(low)
+    for c in range(start, stop):
         x0 = y0 = z0 = s0 = np.float32(np.inf)
         x1 = y1 = z1 = s1 = np.float32(-np.inf)
         for i in range(n * c // blocks, n * (c + 1) // blocks):
@@ -103,11 +94,6 @@ def find_bounds(center, scale, blocks):
             x1, y1, z1, s1 = max(x1, x), max(y1, y), max(z1, z), max(s1, s)
         low[c, 0], low[c, 1], low[c, 2], low[c, 3] = x0, y0, z0, s0
         high[c, 0], high[c, 1], high[c, 2], high[c, 3] = x1, y1, z1, s1
-    for c in range(1, blocks):
-        for k in range(4):
-            low[0, k] = min(low[0, k], low[c, k])
-            high[0, k] = max(high[0, k], high[c, k])
-    return low[0, :3], high[0, :3], 2 * low[0, 3], 2 * high[0, 3]
 
 
 @kernel()

@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...support.jit import kernel, prange, prefetch
-from ...support.jit_types import f4, f8, fields, i8, out, u2, u4
+from ...support.jit import kernel, prefetch
+from ...support.jit_types import f4, f8, fields, i8, out, u2, u4, u8
 from .geometry import LARGEST, ROWS, SCALE_FLOOR, SplatColumns, covariance, decompose, ellipsoid_area
 from .pair_cost import CENTER, COLOR, COVARIANCE, COVERED, DENSITY, LOG_DET, WEIGHT, log_det
 from .profile import is_needle, profile_of
@@ -50,8 +50,8 @@ class Space(NamedTuple):
     unit: Any
 
 
-@kernel(u4[:], SplatColumns, f4[:, :], Space, out(f4[:, :]), out(f4[:]), parallel=True)
-def fill_leaf_rows(index, splats, rgb, space, rows, size):
+@kernel(i8, u4[:], SplatColumns, f4[:, :], Space, out(f4[:, :]), out(f4[:]), ranges=True)
+def fill_leaf_rows(start, stop, index, splats, rgb, space, rows, size):
     """Fill row i from splat index[i].
 
     Args:
@@ -64,7 +64,7 @@ def fill_leaf_rows(index, splats, rgb, space, rows, size):
     """
     center, scale, quat, opacity = splats
     middle, unit = space
-    for i in prange(len(index)):
+    for i in range(start, stop):
         ahead = np.int64(index[min(i + AHEAD, len(index) - 1)])
         prefetch(center, ahead)
         prefetch(scale, ahead)
@@ -90,56 +90,43 @@ def fill_leaf_rows(index, splats, rgb, space, rows, size):
         size[i] = max(2 * (a + b + c) / 3, LEAST)
 
 
-@kernel(u4[:], u4[:], i8, parallel=True)
-def rows_of(nodes, row, leaves):
-    """Return the (n,) uint32 rows of nodes: those of leaves are their own.
+@kernel(i8, u4[:], u4[:], i8, out(u4[:]), ranges=True)
+def fill_rows_of(start, stop, nodes, row, leaves, found):
+    """Fill the rows of nodes: those of leaves are their own.
 
     Args:
         nodes: (n,) uint32.
         row: (nodes - leaves,) uint32 row of each merged node.
         leaves: number of leaves; nodes from there on are merged.
+        found: (n,) uint32, filled.
     """
-    found = np.empty(len(nodes), np.uint32)
-    for i in prange(len(nodes)):
-        found[i] = nodes[i] if nodes[i] < leaves else row[nodes[i] - leaves]
-    return found
+    for i in range(start, stop):
+        node = nodes[np.uint64(i)]
+        found[np.uint64(i)] = node if node < leaves else row[np.uint64(node - leaves)]
 
 
-@kernel(u4[:], u4[:], parallel=True)
-def taken(values, order):
-    """Return (n,) uint32 `values[order]`."""
-    found = np.empty(len(order), np.uint32)
-    for i in prange(len(order)):
-        found[i] = values[order[i]]
-    return found
-
-
-@kernel(f4[:, :], u4[:], f8[:], f8, parallel=True)
-def morton_keys(rows, nodes, low, step):
-    """Return Morton codes of nodes, of CURVE_BITS per axis; centres outside the curve's box are clamped to it.
+@kernel(i8, f4[:, :], u4[:], f8[:], f8, out(u8[:]), ranges=True)
+def fill_morton_keys(start, stop, rows, nodes, low, step, keys):
+    """Fill the Morton codes of nodes, of CURVE_BITS per axis; centres outside the curve's box are clamped to it.
 
     Args:
         rows: node rows, or any whose first columns are the centre.
         nodes: (n,) uint32 indices of rows.
         low: (3,) float64, the lowest corner of the box, units.
         step: edge of a cell, float64, units.
-
-    Returns:
-        (n,) uint64.
+        keys: (n,) uint64, filled.
     """
-    keys = np.empty(len(nodes), np.uint64)
     most = float((1 << CURVE_BITS) - 1)
-    for i in prange(len(nodes)):
+    for i in range(start, stop):
         at = nodes[i]
         x = np.uint64(min(max((rows[at, CENTER] - low[0]) / step, 0.0), most))
         y = np.uint64(min(max((rows[at, CENTER + 1] - low[1]) / step, 0.0), most))
         z = np.uint64(min(max((rows[at, CENTER + 2] - low[2]) / step, 0.0), most))
         keys[i] = interleave(x, y, z)
-    return keys
 
 
-@kernel(u4[:], i8, u4[:], f4[:, :], Space, i8, out(f4[:, :]), out(f4[:, :]), out(f4[:, :]), out(f4[:]), parallel=True)
-def fill_merged_splats(order, leaves, row, rows, space, threads, center, scale, quat, opacity):
+@kernel(i8, u4[:], i8, u4[:], f4[:, :], Space, out(f4[:, :]), out(f4[:, :]), out(f4[:, :]), out(f4[:]), ranges=True)
+def fill_merged_splats(start, stop, order, leaves, row, rows, space, center, scale, quat, opacity):
     """Fill the geometry of merged splats in final order; leaves are left as they are.
 
     Args:
@@ -148,42 +135,37 @@ def fill_merged_splats(order, leaves, row, rows, space, threads, center, scale, 
         row: (nodes - leaves,) uint32 row of each merged node.
         rows: node rows.
         space: `Space`.
-        threads: number of threads; the result does not depend on it.
         center, scale, quat, opacity: columns of M splats.
     """
     middle, unit = space
-    n = len(order)
-    for thread in prange(threads):
-        moments = np.empty((ROWS, BLOCK), np.float64)
-        found, source = np.empty(BLOCK, np.int64), np.empty(BLOCK, np.int64)
-        # Blocks in turn, as most merged splats come before most leaves.
-        for begin in range(thread * BLOCK, n, threads * BLOCK):
-            end = min(n, begin + BLOCK)
-            count = np.int64(0)
-            for i in range(begin, end):
-                if order[i] >= leaves:
-                    found[count], source[count] = i, row[order[i] - leaves]
-                    for element in range(6):
-                        moments[element, count] = rows[source[count], COVARIANCE + element]
-                    count += 1
-            decompose(moments, count)
-            for k in range(count):
-                i = found[k]
-                merged = rows[source[k]]
-                needle = is_needle(moments[0, k], moments[1, k], moments[2, k])
-                linear, spread = profile_of(np.float64(merged[DENSITY]), needle)
-                opacity[i] = linear
-                for axis in range(3):
-                    place = np.float64(merged[CENTER + axis]) * unit + middle[axis]
-                    center[i, axis] = min(max(place, -LARGEST), LARGEST)
-                    axis_scale = math.sqrt(max(moments[axis, k], 0.0) / spread) * unit
-                    scale[i, axis] = min(max(axis_scale, SCALE_FLOOR), LARGEST)
-                for part in range(4):
-                    quat[i, part] = moments[6 + part, k]
+    moments = np.empty((ROWS, BLOCK), np.float64)
+    found, source = np.empty(BLOCK, np.int64), np.empty(BLOCK, np.int64)
+    for begin in range(start, stop, BLOCK):
+        count = np.int64(0)
+        for i in range(begin, min(stop, begin + BLOCK)):
+            if order[i] >= leaves:
+                found[count], source[count] = i, row[order[i] - leaves]
+                for element in range(6):
+                    moments[element, count] = rows[source[count], COVARIANCE + element]
+                count += 1
+        decompose(moments, count)
+        for k in range(count):
+            i = found[k]
+            merged = rows[source[k]]
+            needle = is_needle(moments[0, k], moments[1, k], moments[2, k])
+            linear, spread = profile_of(np.float64(merged[DENSITY]), needle)
+            opacity[i] = linear
+            for axis in range(3):
+                place = np.float64(merged[CENTER + axis]) * unit + middle[axis]
+                center[i, axis] = min(max(place, -LARGEST), LARGEST)
+                axis_scale = math.sqrt(max(moments[axis, k], 0.0) / spread) * unit
+                scale[i, axis] = min(max(axis_scale, SCALE_FLOOR), LARGEST)
+            for part in range(4):
+                quat[i, part] = moments[6 + part, k]
 
 
-@kernel(u4[:], u4[:], f4[:, :], out(f4[:, :]), parallel=True)
-def fill_leaves(order, index, column, out):
+@kernel(i8, u4[:], u4[:], f4[:, :], out(f4[:, :]), ranges=True)
+def fill_leaves(start, stop, order, index, column, out):
     """Fill the leaves of a column in final order; rows of merged nodes are left as they are.
 
     Args:
@@ -193,7 +175,7 @@ def fill_leaves(order, index, column, out):
         out: (M, J) float32.
     """
     n, width, flat = len(order), column.shape[1], column.reshape(-1)
-    for i in prange(n):
+    for i in range(start, stop):
         ahead = order[min(i + LEAVES_AHEAD, n - 1)]
         if ahead < len(index):
             begin = np.int64(index[ahead]) * width
@@ -207,11 +189,11 @@ def fill_leaves(order, index, column, out):
 
 
 @kernel(
-    (u4[:], u4[:], u2[:], u4[:], f4[:], out(f4[:, :]), i8),
-    (u4[:], u4[:], u2[:], u4[:], f8[:], out(f4[:, :]), i8),
-    parallel=True,
+    (i8, u4[:], u4[:], u2[:], u4[:], f4[:], out(f4[:, :])),
+    (i8, u4[:], u4[:], u2[:], u4[:], f8[:], out(f4[:, :])),
+    ranges=True,
 )
-def merge_colors(parents, child_start, child_count, order, weight, color, blocks):
+def merge_colors(start, stop, parents, child_start, child_count, order, weight, color):
     """Fill the colours of nodes with the weighted mean of their children's, which must be filled already.
 
     Args:
@@ -220,21 +202,19 @@ def merge_colors(parents, child_start, child_count, order, weight, color, blocks
         order: (M,) uint32, the node of each final index.
         weight: (nodes,) of each node.
         color: (M, J) float32 in final order; rows `parents` are filled.
-        blocks: ranges of nodes to process in parallel; the result does not depend on it.
     """
-    n, width = len(parents), color.shape[1]
-    for block in prange(blocks):
-        total = np.empty(width, np.float64)
-        for g in range(n * block // blocks, n * (block + 1) // blocks):
-            node = parents[g]
-            total_weight = 0.0
+    width = color.shape[1]
+    total = np.empty(width, np.float64)
+    for g in range(start, stop):
+        node = parents[g]
+        total_weight = 0.0
+        for k in range(width):
+            total[k] = 0.0
+        begin = np.int64(child_start[node])
+        for child in range(begin, begin + child_count[node]):
+            w = np.float64(weight[order[child]])
+            total_weight += w
             for k in range(width):
-                total[k] = 0.0
-            begin = np.int64(child_start[node])
-            for child in range(begin, begin + child_count[node]):
-                w = np.float64(weight[order[child]])
-                total_weight += w
-                for k in range(width):
-                    total[k] += w * color[child, k]
-            for k in range(width):
-                color[node, k] = total[k] / total_weight
+                total[k] += w * color[child, k]
+        for k in range(width):
+            color[node, k] = total[k] / total_weight

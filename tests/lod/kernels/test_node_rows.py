@@ -22,7 +22,7 @@ def test_rows_of_leaves_are_their_splats_in_units() -> None:
     middle, unit = np.array([0.5, -1.0, 2.0]), 2.0**-6
     columns = SplatColumns(splats.center, splats.scale, splats.quat_xyzw, splats.opacity)
     size = np.zeros(120, np.float32)
-    node_rows.fill_leaf_rows(index, columns, splats.rgb, node_rows.Space(middle, unit), rows, size)
+    node_rows.fill_leaf_rows(100, index, columns, splats.rgb, node_rows.Space(middle, unit), rows, size)
     assert not rows[100:].any() and not size[100:].any()
     np.testing.assert_allclose(size[:100] * unit, spark_size(splats)[index], rtol=1e-5)
     for row, i in zip(rows, index, strict=False):
@@ -44,7 +44,7 @@ def test_merged_nodes_are_drawn_with_the_variance_and_coverage_of_their_rows() -
     before = out.take(np.arange(100))
     space, geometry = node_rows.Space(middle, unit), (out.center, out.scale, out.quat_xyzw, out.opacity)
     row = np.random.default_rng(3).permutation(60).astype(np.uint32)  # of nodes 40 to 99
-    node_rows.fill_merged_splats(order, 40, row, rows, space, 2, *geometry)
+    node_rows.fill_merged_splats(100, order, 40, row, rows, space, *geometry)
     for i, node in enumerate(order):
         if node < 40:  # a leaf
             assert np.array_equal(out.center[i], before.center[i])
@@ -75,7 +75,9 @@ def test_keys_are_places_on_a_morton_curve_and_what_is_outside_is_at_its_edge() 
         )
         for cell in cells
     ]
-    assert node_rows.morton_keys(rows, nodes, low, step).tolist() == expected
+    keys = np.empty(100, np.uint64)
+    node_rows.fill_morton_keys(100, rows, nodes, low, step, keys)
+    assert keys.tolist() == expected
 
 
 def test_colours_are_weighted_means_of_children() -> None:
@@ -87,5 +89,5 @@ def test_colours_are_weighted_means_of_children() -> None:
     for node in (1, 3):
         part = slice(start[node], start[node] + count[node])
         expected[node] = np.average(color[part].astype(np.float64), axis=0, weights=weight[order[part]])
-    merge_colors(np.array([1, 3], np.uint32), start, count, order, weight, color, 2)
+    merge_colors(2, np.array([1, 3], np.uint32), start, count, order, weight, color)
     assert np.allclose(color, expected, atol=1e-6)
