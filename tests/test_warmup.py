@@ -160,7 +160,7 @@ def test_a_kernel_that_does_not_compile_is_named_with_the_reason(monkeypatch: py
     def absent() -> None: ...
 
     absent.__module__ = sort.__name__
-    monkeypatch.setattr(warmup, "missing", lambda: [Unit(jit.Kernel(absent, sort.sort_pass.options), 0)])
+    monkeypatch.setattr(warmup, "missing", lambda: [Unit(jit.Kernel(absent, sort.split_box.options), 0)])
     with pytest.raises(warmup.SparklodError, match=r"sort\.absent cannot be compiled: AttributeError: .*absent"):
         warmup.warm_up(processes=1)
 

@@ -12,6 +12,7 @@ from ..model.sh import degree_of
 from ..model.splats import COLUMNS, FloatArray, Splats
 from ..support.progress import Progress
 from ..support.threads import threads_for, threads_in_use
+from . import pruning
 from .kernels import node_rows, pair_cost, prune
 from .kernels.node_rows import fill_leaves, merge_colors
 from .kernels.sort import Keys, Nodes, sort_by_key
@@ -130,18 +131,18 @@ def in_final_order(
 def _prune(
     binary: BinaryTree, goal: PruningGoal, progress: Progress
 ) -> tuple[Nodes, NDArray[np.int32], NDArray[np.int32]]:
-    """Return parents of all nodes, `saved` of `prune.drop_nodes`, and ranks; frees what only pruning needs."""
+    """Return parents of all nodes, `saved` of `pruning.drop_nodes`, and ranks; frees what only pruning needs."""
     n, top, blocks = binary.leaves, binary.used - goal.is_whole, threads_in_use()
     progress("pruning", 0, binary.used, "node")
     log_size, lost, weight = binary.size[: top + 1], binary.error[: top + 1 - n], np.empty(top + 1 - n, np.float32)
     children = binary.children[: binary.used - n]
-    parent = prune.fill_usefulness_terms(children, n, goal.splats, top, log_size, lost, weight, blocks)
+    parent = pruning.fill_usefulness_terms(children, n, goal.splats, top, log_size, lost, weight, blocks)
     binary.children = children = np.empty((0, 2), np.uint32)
     saved = np.ones(top + 1 - n, np.int32)
     if not goal.is_whole:
         saved[-1] = np.count_nonzero(parent[:-1] == top) - 1 - prune.ROOM
     # A root that is only to be is one node more.
-    prune.drop_nodes(n, goal.most + (not goal.is_whole), parent, log_size, lost, weight, saved, blocks)
+    pruning.drop_nodes(n, goal.most + (not goal.is_whole), parent, log_size, lost, weight, saved, blocks)
     if not goal.is_whole:
         saved[-1] += prune.ROOM
     highest = log_size[top] if goal.highest is None else np.float32(goal.highest)

@@ -280,18 +280,18 @@ def _merge(
             at = binary.rows_of(active)
             order = curve.sort(binary.rows, at, binary.rounds, threads)
             active, at = active[order], at[order]
-            partner, cost = pair_cost.find_partners(binary.rows, at, WINDOW, np.float32(largest))
+            partner, cost = partners(binary.rows, at, WINDOW, np.float32(largest))
             del at
             before = len(active)
-            pairs, rest = pair_cost.match_pairs(active, partner, cost, _largest_cost(cost), binary.used, threads)
+            pairs, rest = matched(active, partner, cost, _largest_cost(cost), binary.used, threads)
             if rounds is None and not len(pairs):  # no finite cost: too far apart for float32
                 partner = np.arange(before, dtype=np.int32) ^ 1
                 partner[partner >= before] = -1
                 free = np.zeros_like(cost)
-                pairs, rest = pair_cost.match_pairs(active, partner, free, np.float32(0), binary.used, threads)
+                pairs, rest = matched(active, partner, free, np.float32(0), binary.used, threads)
             active = rest
             columns = binary.rows, binary.row, binary.spare, binary.children, binary.size, binary.error
-            pair_merge.merge_pairs(pairs, binary.used, leaves, *columns)
+            pair_merge.merge_pairs(len(pairs), pairs, binary.used, leaves, *columns)
         binary.used += len(pairs)
         binary.rounds += 1
         progress("building", binary.used - leaves, leaves - 1, "node")
@@ -299,6 +299,46 @@ def _merge(
         if rounds is not None and len(pairs) <= LEAST * before:
             break
     return active
+
+
+def partners(rows: FloatArray, nodes: Nodes, window: int, largest: np.float32) -> tuple[NDArray[np.int32], FloatArray]:
+    """Return the cheapest partner of each node among its neighbours in a list, and its cost.
+
+    Args:
+        rows, nodes, window, largest: as for `pair_cost.find_partners`.
+
+    Returns:
+        partner: (n,) int32 index into `nodes`, -1 for none.
+        cost: (n,) float32, of merging with it.
+    """
+    partner, cost = np.empty(len(nodes), np.int32), np.empty(len(nodes), np.float32)
+    pair_cost.find_partners(len(nodes), rows, nodes, window, largest, partner, cost)
+    return partner, cost
+
+
+def matched(
+    nodes: Nodes, partner: NDArray[np.int32], cost: FloatArray, limit: np.float32, made: int, blocks: int
+) -> tuple[Nodes, Nodes]:
+    """Return pairs of nodes that are each other's cheapest partner, and the list in which merged nodes replace them.
+
+    Args:
+        nodes: (n,) uint32.
+        partner, cost: of `partners`.
+        limit: largest cost of a pair.
+        made: the node that the first pair is merged into; the next pair's is one more.
+        blocks: ranges of nodes to process in parallel; the result does not depend on it.
+
+    Returns:
+        pairs: (P, 2) uint32.
+        rest: (n - P,) uint32, the list in its order; a merged node replaces the first of its pair.
+    """
+    counts = np.empty((blocks, 2), np.int64)
+    pair_cost.count_pairs(blocks, partner, cost, limit, counts)
+    ends = np.cumsum(counts, axis=0)
+    found = int(ends[-1, 0])
+    pairs, rest = np.empty((found, 2), np.uint32), np.empty(len(nodes) - found, np.uint32)
+    pair_cost.list_pairs(blocks, nodes, partner, cost, limit, made, ends - counts, pairs, rest)
+    return pairs, rest
 
 
 def _largest_cost(cost: FloatArray) -> np.float32:

@@ -245,7 +245,7 @@ def _arrivals(given: Mapping[str, NDArray[Any]], grid: VoxelGrid, threads: int) 
 def _keys(grid: VoxelGrid, level: int, rows: FloatArray) -> Keys:
     """Return Morton codes of the cells of a level that rows are in, the highest word first."""
     parts, nodes = grid.parts(level), np.arange(len(rows), dtype=np.uint32)
-    words = [cell_words(rows, nodes, parts.step, parts.low, word) for word in range(grid.parts(0).words)]
+    words = [cell_words(rows, nodes, parts, word) for word in range(grid.parts(0).words)]
     words[0] &= ~np.uint64((1 << 3 * PART_BITS) - 1)
     return np.stack(words[::-1], axis=1)
 

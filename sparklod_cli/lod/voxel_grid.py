@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..model.splats import FloatArray
 from .check import Bounds
 from .kernels.node_rows import Space
-from .kernels.sort import PART_BITS, Keys, Nodes, Parts, level_keys, split_box
+from .kernels.sort import PART_BITS, Keys, Nodes, Parts, fill_level_keys, split_box
 
 #: Largest coordinate in steps of a level: parts are half a step wide, their coordinates int64, and so must be their
 #: differences. No level is finer than this allows.
@@ -126,7 +126,8 @@ class VoxelGrid:
         low, high = np.array(self.low), np.array(self.high)
         edge = max(float((high - low).max()) / (2**CURVE_BITS - 2), float(steps[0]))  # one cell to spare at either end
         low_cell = np.floor(low / edge).astype(np.int64)
-        keys, levels = level_keys(center, scale, steps, edge, low_cell, 3 * CURVE_BITS)
+        keys, levels = np.empty(len(scale), np.uint64), np.empty(len(scale), np.int32)
+        fill_level_keys(len(scale), center, scale, steps, edge, low_cell, 3 * CURVE_BITS, keys, levels)
         return keys, levels, 3 * CURVE_BITS + len(steps).bit_length()
 
     @property

@@ -17,7 +17,7 @@ def drop_nodes(
     weight: np.ndarray,
     saved: np.ndarray,
 ) -> None:
-    """As `prune.drop_nodes`."""
+    """As `pruning.drop_nodes`."""
     root = len(parent) - 1 - leaves
     left, turn, children = root + 1, prune.ROUNDS, prune.MOST_CHILDREN
 

@@ -11,8 +11,8 @@ import math
 import numpy as np
 
 from ...support.fast_math import log2
-from ...support.jit import kernel, prange
-from ...support.jit_types import f4, i4, i8, u4
+from ...support.jit import kernel
+from ...support.jit_types import f4, i4, i8, out, u4
 
 f32 = np.float32
 
@@ -102,28 +102,25 @@ def pair_costs(lanes, first, step, count, largest, cost):
         cost[i] = total if mxx + myy + mzz <= largest else NEVER
 
 
-@kernel(f4[:, :], u4[:], i8, f4, parallel=True)
-def find_partners(rows, nodes, window, largest):
-    """Return the cheapest partner of each node among its neighbours in a list.
+@kernel(i8, f4[:, :], u4[:], i8, f4, out(i4[:]), out(f4[:]), ranges=True)
+def find_partners(start, stop, rows, nodes, window, largest, partner, lowest):
+    """Find the cheapest partner of each node among its neighbours in a list.
 
     Args:
         rows: node rows, see above.
         nodes: (n,) uint32 indices of rows, in the order of the curve.
         window: largest distance of a partner in the list.
         largest: see `pair_costs`.
-
-    Returns:
-        partner: (n,) int32 index into `nodes`, -1 for none.
-        cost: (n,) float32, of merging with it.
+        partner: (n,) int32, filled with an index into `nodes`, -1 for none.
+        lowest: (n,) float32, filled with the cost of merging with it.
     """
-    n = len(nodes)
-    partner, lowest = np.full(n, -1, np.int32), np.full(n, NEVER, np.float32)
-    for block in prange((n + BLOCK - 1) // BLOCK):
-        begin, end = block * BLOCK, min(n, block * BLOCK + BLOCK)
-        low, high = max(0, begin - window), min(n, end + window)
-        lanes = np.empty((LANES, BLOCK + 2 * window + SIDE_BY_SIDE), np.float32)
-        cost = np.empty(BLOCK + window + SIDE_BY_SIDE, np.float32)
-        best, at = np.full(BLOCK + 2 * window, NEVER, np.float32), np.full(BLOCK + 2 * window, -1, np.int32)
+    lanes = np.empty((LANES, BLOCK + 2 * window + SIDE_BY_SIDE), np.float32)
+    cost = np.empty(BLOCK + window + SIDE_BY_SIDE, np.float32)
+    best, at = np.empty(BLOCK + 2 * window, np.float32), np.empty(BLOCK + 2 * window, np.int32)
+    for begin in range(start, stop, BLOCK):
+        end = min(stop, begin + BLOCK)
+        low, high = max(0, begin - window), min(len(nodes), end + window)
+        best[:], at[:] = NEVER, -1
         for i in range(low, high):
             for column in range(LANES):
                 lanes[column, i - low] = rows[nodes[i], column]
@@ -138,7 +135,6 @@ def find_partners(rows, nodes, window, largest):
             keep_cheaper(cost, count, best[first + step :], at[first + step :], low + first + step, low + first)
         for i in range(begin, end):
             partner[i], lowest[i] = at[i - low], best[i - low]
-    return partner, lowest
 
 
 @kernel()
@@ -162,42 +158,52 @@ def keep_cheaper(cost, count, best, at, here, there):
         at[i] = new if lower else at[i]
 
 
-@kernel(u4[:], i4[:], f4[:], f4, i8, i8, parallel=True)
-def match_pairs(nodes, partner, cost, limit, made, blocks):
-    """Return pairs of nodes that are each other's cheapest partner, and the list in which merged nodes replace them.
+@kernel(inline=True)
+def is_mutual(i, partner, cost, limit):
+    """Return whether a node and its partner chose each other, at no more than a cost."""
+    j = partner[i]
+    return (j >= 0) & (partner[j] == i) & (cost[i] <= limit)
+
+
+@kernel(i8, i4[:], f4[:], f4, out(i8[:, :]), ranges=True)
+def count_pairs(start, stop, partner, cost, limit, counts):
+    """Count the pairs of nodes that are each other's cheapest partner.
 
     Args:
-        nodes: (n,) uint32.
+        start, stop: blocks of nodes, of `len(counts)` of about one size.
         partner, cost: of `find_partners`.
         limit: largest cost of a pair, float32.
-        made: the node that the first pair is merged into; the next pair's is one more.
-        blocks: ranges of nodes to process in parallel; the result does not depend on it.
-
-    Returns:
-        pairs: (P, 2) uint32.
-        rest: (n - P,) uint32, the list in its order; a merged node replaces the first of its pair.
+        counts: (blocks, 2) int64, filled: nodes of the block that are the first, and the second, of a pair.
     """
-    n = len(nodes)
-    begin = np.zeros(blocks + 1, np.int64)  # pairs whose first node is in a block before
-    second = np.zeros(blocks + 1, np.int64)  # second nodes of pairs in a block before
-    for block in prange(blocks):
-        mutual = behind = 0
+    n, blocks = len(partner), len(counts)
+    for block in range(start, stop):
+        first = second = 0
         for i in range(n * block // blocks, n * (block + 1) // blocks):
+            merges = is_mutual(i, partner, cost, limit)
+            first += merges & (partner[i] > i)
+            second += merges & (partner[i] < i)
+        counts[block, 0], counts[block, 1] = first, second
+
+
+@kernel(i8, u4[:], i4[:], f4[:], f4, i8, i8[:, :], out(u4[:, :]), out(u4[:]), ranges=True)
+def list_pairs(start, stop, nodes, partner, cost, limit, made, before, pairs, rest):
+    """List those pairs, and the nodes after they have merged.
+
+    Args:
+        start, stop, partner, cost, limit: of `count_pairs`.
+        nodes: (n,) uint32.
+        made: the node that the first pair is merged into; the next pair's is one more.
+        before: (blocks, 2) int64 sums of `counts` of the blocks before.
+        pairs: (P, 2) uint32, filled.
+        rest: (n - P,) uint32, filled with the nodes in their order; a merged one replaces the first of its pair.
+    """
+    n, blocks = len(nodes), len(before)
+    for block in range(start, stop):
+        begin = n * block // blocks
+        found, left = before[block, 0], begin - before[block, 1]
+        for i in range(begin, n * (block + 1) // blocks):
             j = partner[i]
-            merges = (j >= 0) & (partner[j] == i) & (cost[i] <= limit)
-            mutual += merges & (j > i)
-            behind += merges & (j < i)
-        begin[block + 1], second[block + 1] = mutual, behind
-    for block in range(blocks):
-        begin[block + 1] += begin[block]
-        second[block + 1] += second[block]
-    pairs, rest = np.empty((begin[blocks], 2), np.uint32), np.empty(n - begin[blocks], np.uint32)
-    for block in prange(blocks):
-        found = begin[block]
-        left = n * block // blocks - second[block]
-        for i in range(n * block // blocks, n * (block + 1) // blocks):
-            j = partner[i]
-            merges = (j >= 0) & (partner[j] == i) & (cost[i] <= limit)
+            merges = is_mutual(i, partner, cost, limit)
             if merges & (j < i):
                 continue
             rest[left] = made + found if merges else nodes[i]
@@ -205,4 +211,3 @@ def match_pairs(nodes, partner, cost, limit, made, blocks):
             if merges:
                 pairs[found, 0], pairs[found, 1] = nodes[i], nodes[j]
                 found += 1
-    return pairs, rest

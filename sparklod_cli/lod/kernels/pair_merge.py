@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...support.jit import kernel, prange
+from ...support.jit import kernel
 from ...support.jit_types import f4, i8, out, u4
 from .geometry import ellipsoid_area
 from .pair_cost import CENTER, COLOR, COVARIANCE, COVERED, DENSITY, LOG_DET, WEIGHT, WIDTH, log_det
@@ -46,10 +46,6 @@ LOOSE, DENSE = 0.15, 0.19
 #: A node is in a layer if its shortest axis is no more than the first share of the second one, and in none from the
 #: second share on. Chosen.
 FLAT, ROUND = 0.1, 0.35
-
-#: Pairs that a thread merges one after the other; results do not depend on it. Chosen.
-BLOCK = 256
-
 
 #: Weight of opacity relative to each colour channel in the error of a picture, which may have any background. Chosen.
 ALPHA_WEIGHT = 1.0
@@ -191,8 +187,8 @@ def without(moment, of_product, hidden, first, second):
     return (moment - hidden * of_product) / left - hidden / (left * left) * first * second
 
 
-@kernel(u4[:, :], i8, i8, out(f4[:, :]), out(u4[:]), out(u4[:]), out(u4[:, :]), out(f4[:]), out(f4[:]), parallel=True)
-def merge_pairs(pairs, made, leaves, rows, row, spare, children, size, error):
+@kernel(i8, u4[:, :], i8, i8, out(f4[:, :]), out(u4[:]), out(u4[:]), out(u4[:, :]), out(f4[:]), out(f4[:]), ranges=True)
+def merge_pairs(start, stop, pairs, made, leaves, rows, row, spare, children, size, error):
     """Merge each pair of nodes into one, which takes over the row that is to spare in the tree of the first.
 
     Args:
@@ -207,38 +203,36 @@ def merge_pairs(pairs, made, leaves, rows, row, spare, children, size, error):
             units.
         error: (leaves,) float32, filled with `picture_error`.
     """
-    n = len(pairs)
-    for block in prange((n + BLOCK - 1) // BLOCK):
-        merged = np.empty(WIDTH, np.float32)  # the row that it gets may be that of its first node
-        for pair in range(block * BLOCK, min(n, block * BLOCK + BLOCK)):
-            first, second, node = pairs[pair, 0], pairs[pair, 1], made + pair - leaves
-            a = rows[first if first < leaves else row[first - leaves]]
-            b = rows[second if second < leaves else row[second - leaves]]
-            planes = overlaps(a, b)
-            overlap = merge_pair(a, b, planes, merged)
-            weight = np.float64(a[WEIGHT]) + np.float64(b[WEIGHT])
-            for channel in range(3):
-                merged[COLOR + channel] = (a[WEIGHT] * a[COLOR + channel] + b[WEIGHT] * b[COLOR + channel]) / weight
-            merged[WEIGHT] = weight
-            xx, yy, zz = merged[COVARIANCE], merged[COVARIANCE + 1], merged[COVARIANCE + 2]
-            xy, xz, yz = merged[COVARIANCE + 3], merged[COVARIANCE + 4], merged[COVARIANCE + 5]
-            merged[LOG_DET] = log_det(xx, yy, zz, xy, xz, yz)
-            large, middle, small = semi_axes(
-                np.float64(xx), np.float64(yy), np.float64(zz), np.float64(xy), np.float64(xz), np.float64(yz)
-            )
-            covered = np.float64(a[COVERED]) + np.float64(b[COVERED])
-            merged[COVERED] += covered * closing(overlap, large, middle, small)
-            merged[DENSITY] = np.float64(merged[COVERED]) / ellipsoid_area(large, middle, small)
-            needle = is_needle(large * large, middle * middle, small * small)
-            opacity, spread = profile_of(np.float64(merged[DENSITY]), needle)
-            mean = (large + middle + small) / (3 * math.sqrt(spread))
-            size[made + pair] = 2 * mean * size_factor(opacity)
-            error[node] = picture_error(a, b, merged, planes)
-            children[node, 0], children[node, 1] = first, second
-            row[node] = first if first < leaves else spare[first - leaves]
-            spare[node] = second if second < leaves else spare[second - leaves]
-            for column in range(WIDTH):
-                rows[row[node], column] = merged[column]
+    merged = np.empty(WIDTH, np.float32)  # the row that it gets may be that of its first node
+    for pair in range(start, stop):
+        first, second, node = pairs[pair, 0], pairs[pair, 1], made + pair - leaves
+        a = rows[first if first < leaves else row[first - leaves]]
+        b = rows[second if second < leaves else row[second - leaves]]
+        planes = overlaps(a, b)
+        overlap = merge_pair(a, b, planes, merged)
+        weight = np.float64(a[WEIGHT]) + np.float64(b[WEIGHT])
+        for channel in range(3):
+            merged[COLOR + channel] = (a[WEIGHT] * a[COLOR + channel] + b[WEIGHT] * b[COLOR + channel]) / weight
+        merged[WEIGHT] = weight
+        xx, yy, zz = merged[COVARIANCE], merged[COVARIANCE + 1], merged[COVARIANCE + 2]
+        xy, xz, yz = merged[COVARIANCE + 3], merged[COVARIANCE + 4], merged[COVARIANCE + 5]
+        merged[LOG_DET] = log_det(xx, yy, zz, xy, xz, yz)
+        large, middle, small = semi_axes(
+            np.float64(xx), np.float64(yy), np.float64(zz), np.float64(xy), np.float64(xz), np.float64(yz)
+        )
+        covered = np.float64(a[COVERED]) + np.float64(b[COVERED])
+        merged[COVERED] += covered * closing(overlap, large, middle, small)
+        merged[DENSITY] = np.float64(merged[COVERED]) / ellipsoid_area(large, middle, small)
+        needle = is_needle(large * large, middle * middle, small * small)
+        opacity, spread = profile_of(np.float64(merged[DENSITY]), needle)
+        mean = (large + middle + small) / (3 * math.sqrt(spread))
+        size[made + pair] = 2 * mean * size_factor(opacity)
+        error[node] = picture_error(a, b, merged, planes)
+        children[node, 0], children[node, 1] = first, second
+        row[node] = first if first < leaves else spare[first - leaves]
+        spare[node] = second if second < leaves else spare[second - leaves]
+        for column in range(WIDTH):
+            rows[row[node], column] = merged[column]
 
 
 class OnPlane(NamedTuple):

@@ -11,9 +11,8 @@ import math
 
 import numpy as np
 
-from ...model.lod_tree import MAX_CHILDREN
-from ...support.jit import kernel, prange
-from ...support.jit_types import f4, i4, i8, out, u2, u4
+from ...support.jit import kernel
+from ...support.jit_types import f4, f8, i4, i8, out, u2, u4
 
 #: Size steps per octave, and octaves: all of float32's, 2^-128 to 2^128. Steps chosen.
 STEPS, OCTAVES = 4, 256
@@ -47,7 +46,7 @@ ABOVE_ALL = np.float32(1e6)
 #: Span of ln(size) of a node whose parent is that root. The mean is 0.26 before pruning and 0.43 after it, measured.
 UNKNOWN_SPAN = np.float32(0.3)
 
-#: What such a root has less in `saved` of `drop_nodes`: it may have any number of children.
+#: What such a root has less in `saved` of `pruning.drop_nodes`: it may have any number of children.
 ROOM = 1 << 30
 
 #: The rank of a node that is dropped.
@@ -64,65 +63,64 @@ def size_step(size):
     return min(max(int(STEPS * (math.log2(size) + OCTAVES / 2)), 0), STEPS * OCTAVES - 1)
 
 
-@kernel(u4[:, :], i8, i8, i8, out(f4[:]), out(f4[:]), out(f4[:]), i8, parallel=True)
-def fill_usefulness_terms(children, leaves, drawn_leaves, top, log_size, lost, weight, blocks):
-    """Fill the terms of `usefulness`.
+@kernel(u4[:, :], i8, f4[:], out(u4[:]), out(f4[:]), out(u2[:]), out(i8[:]), out(f8[:]))
+def link(children, leaves, lost, parent, log_size, step_of, inner, sums):
+    """Fill the parents, the logarithms of sizes of merged nodes, and sums over these.
+
+    One after the other, so that threads do not change the rounding of the sums.
 
     Args:
-        children: (T - leaves, 2) uint32 of merged nodes; parents come after their children, and the root is last.
-        leaves: number of leaves; they come first, and have no place in arrays of merged nodes.
-        drawn_leaves: number of splats of the scene under them.
-        top: the root. T - 1, or T if nodes without a parent are to get one later, which is that root until then.
-        log_size: (top + 1,) float32 feature sizes, replaced by ln(size), but no more than the parent's: the threshold
-            above which the traversal does not refine the node.
-        lost: (top + 1 - leaves,) float32, `picture_error`, replaced by the error cost of merged nodes, in splats.
-        weight: (top + 1 - leaves,) float32, filled for merged nodes with their rarity weight.
-        blocks: ranges of nodes to process in parallel; the result does not depend on it.
-
-    Returns:
-        (top + 1,) uint32 parents; the root's is itself.
+        children, leaves, lost, log_size: of `pruning.fill_usefulness_terms`; `log_size` is replaced from `leaves` on.
+        parent: (top + 1,) uint32, the root for all nodes; filled.
+        step_of: (T - leaves,) uint16, filled with the size steps of merged nodes.
+        inner: (STEPS * OCTAVES,) int64, added to: the number of merged nodes of each step.
+        sums: (STEPS * OCTAVES,) float64, added to: what their pictures lose.
     """
-    total, steps = leaves + len(children), STEPS * OCTAVES
-    for block in prange(blocks):
-        for node in range(total * block // blocks, total * (block + 1) // blocks):
-            log_size[node] = math.log(max(log_size[node], LEAST_SIZE))
-    if top == total:
-        log_size[top] = ABOVE_ALL
-    parent = np.empty(top + 1, np.uint32)
-    parent[:] = top
+    total = leaves + len(children)
+    if len(parent) > total:
+        log_size[total] = ABOVE_ALL
     for node in range(total - 1, leaves - 1, -1):
-        log_size[node] = min(log_size[node], log_size[parent[node]])
+        log_size[node] = math.log(max(log_size[node], LEAST_SIZE))
+        log_size[node] = min(log_size[node], log_size[parent[node]])  # the root's parent is itself
         parent[children[node - leaves, 0]] = parent[children[node - leaves, 1]] = node
-    counts, step_of = np.zeros((blocks, 2, steps), np.int64), np.empty(total - leaves, np.uint16)
-    for block in prange(blocks):
-        for node in range(total * block // blocks, total * (block + 1) // blocks):
-            if node < leaves:
-                log_size[node] = min(log_size[node], log_size[parent[node]])
-            step = size_step(math.exp(log_size[node]))
-            counts[block, 0, step] += 1
-            if node >= leaves:
-                counts[block, 1, step] += 1
-                step_of[node - leaves] = step
-    count, inner, sums = np.zeros(steps), np.zeros(steps), np.zeros(steps)
-    for block in range(blocks):
-        for step in range(steps):
-            count[step] += counts[block, 0, step]
-            inner[step] += counts[block, 1, step]
-    for slot in range(total - leaves - 1, -1, -1):  # one after the other, so that threads do not change the rounding
-        sums[step_of[slot]] += lost[slot]
-    drawn, rare = 0.0, np.empty(steps)
-    for step in range(steps - 1, -1, -1):
-        drawn += count[step]  # roughly the splats of a cut with this threshold
-        rare[step] = min(1.0, drawn / (FEW * drawn_leaves))
-        count[step] = max(min(drawn, float(drawn_leaves)), 1.0) ** -RARITY
-    for block in prange(blocks):
-        slots = total - leaves
-        for slot in range(slots * block // blocks, slots * (block + 1) // blocks):
-            step = step_of[slot]
-            weight[slot] = count[step]
-            mean = sums[step] / inner[step]
-            lost[slot] = ERROR_COST * rare[step] * math.sqrt(lost[slot] / mean) if mean > 0 else 0.0
-    return parent
+        step = size_step(math.exp(log_size[node]))
+        step_of[node - leaves] = step
+        inner[step] += 1
+        sums[step] += lost[node - leaves]
+
+
+@kernel(i8, i8, u4[:], out(f4[:]), out(i8[:, :]), ranges=True)
+def count_leaves(begin, end, leaves, parent, log_size, counts):
+    """Replace the sizes of leaves by their logarithms, and count them by size step.
+
+    Args:
+        begin, end: blocks of leaves, of `len(counts)` of about one size.
+        leaves, parent, log_size: of `link`.
+        counts: (blocks, STEPS * OCTAVES) int64, added to: the leaves of each step.
+    """
+    blocks = len(counts)
+    for block in range(begin, end):
+        for leaf in range(leaves * block // blocks, leaves * (block + 1) // blocks):
+            log_size[leaf] = math.log(max(log_size[leaf], LEAST_SIZE))
+            log_size[leaf] = min(log_size[leaf], log_size[parent[leaf]])
+            counts[block, size_step(math.exp(log_size[leaf]))] += 1
+
+
+@kernel(i8, u2[:], f8[:], f8[:], f8[:], out(f4[:]), out(f4[:]), ranges=True)
+def fill_terms(start, stop, step_of, common, rare, mean, lost, weight):
+    """Fill the rarity weights and error costs of merged nodes.
+
+    Args:
+        step_of: of `link`.
+        common: (STEPS * OCTAVES,) float64 rarity weight of each step.
+        rare: (STEPS * OCTAVES,) float64 share of the error cost that counts in its cuts.
+        mean: (STEPS * OCTAVES,) float64 of what the pictures of its nodes lose.
+        lost, weight: of `pruning.fill_usefulness_terms`.
+    """
+    for slot in range(start, stop):
+        step = step_of[slot]
+        weight[slot] = common[step]
+        lost[slot] = ERROR_COST * rare[step] * math.sqrt(lost[slot] / mean[step]) if mean[step] > 0 else 0.0
 
 
 @kernel()
@@ -133,92 +131,78 @@ def usefulness_key(useful):
     return (ordered + 0x80000000) >> (32 - KEY_BITS)
 
 
-@kernel(i8, i8, out(u4[:]), f4[:], out(f4[:]), f4[:], out(i4[:]), i8, parallel=True)
-def drop_nodes(leaves, most, parent, log_size, lost, weight, saved, blocks):
-    """Drop the least useful merged nodes until `most` are left, or none can be dropped.
+@kernel(i8, u4[:], i8, i8, f4[:], f4[:], f4[:], i4[:], out(u4[:]), out(u2[:]), out(i4[:, :]), ranges=True)
+def count_by_key(begin, end, kept, leaves, children, log_size, lost, weight, saved, parent, keys, counts):
+    """Update the parents of merged nodes, and count those that can be dropped by the keys of their usefulness.
 
     Args:
-        leaves: number of leaves; they come first, and have no place in arrays of merged nodes.
-        most: number of merged nodes to keep, at least 1, the root.
-        parent: (T,) uint32, updated for what is kept: the nearest ancestor that is kept.
-        log_size, lost, weight: of `fill_usefulness_terms`; the error cost of a dropped node is added to its parent's.
-        saved: (T - leaves,) int32, on entry 1 for each merged node; what is less for the root allows it that many more
-            children. Updated: the number of children minus 1 of those that are kept, -1 for dropped nodes.
-        blocks: ranges of nodes to process in parallel; the result does not depend on it.
+        begin, end: blocks of `kept`, of `len(counts)` of about one size.
+        kept: (n,) uint32 merged nodes but the root, less `leaves`, parents first.
+        leaves, log_size, lost, weight, saved, parent: of `pruning.drop_nodes`.
+        children: the most of a node.
+        keys: (T - leaves - 1,) uint16, filled for `kept`; LAST_KEY if the node cannot be dropped.
+        counts: (blocks, 1 << KEY_BITS) int32, added to.
     """
-    left = len(parent) - leaves
-    many = slots = left - 1
-    kept = np.empty(slots, np.uint32)  # the first `many`: merged nodes but the root, less `leaves`, parents first
-    for slot in range(slots):
-        kept[slot] = slots - 1 - slot
-    keys, others = np.empty(slots, np.uint16), np.empty(slots, np.uint32)
-    turn, children = ROUNDS, MOST_CHILDREN
-    while left > most:  # also after ROUNDS, where nodes gained usefulness as their children were dropped
-        counts = np.zeros((blocks, 1 << KEY_BITS), np.int32)
-        for block in prange(blocks):
-            for i in range(many * block // blocks, many * (block + 1) // blocks):
-                node = kept[i]
-                keys[node] = LAST_KEY
-                if can_be_dropped(node, leaves, parent, saved, children):
-                    key = usefulness_key(usefulness(node, leaves, parent, log_size, lost, weight, saved))
-                    keys[node] = key
-                    counts[block, key] += 1
-        count, candidates = np.zeros(1 << KEY_BITS, np.int64), 0
-        for block in range(blocks):
-            for key in range(1 << KEY_BITS):
-                count[key] += counts[block, key]
-                candidates += counts[block, key]
-        if candidates == 0:
-            if children == MAX_CHILDREN:
-                break
-            children = min(2 * children, MAX_CHILDREN)
-            continue
-        wanted, threshold, below = min(max((left - most) // turn, 1), candidates), 0, 0
-        while below + count[threshold] < wanted:
-            below += count[threshold]
-            threshold += 1
-        for i in range(many - 1, -1, -1):
+    blocks = len(counts)
+    for block in range(begin, end):
+        for i in range(len(kept) * block // blocks, len(kept) * (block + 1) // blocks):
             node = kept[i]
-            if keys[node] > threshold:
-                continue
-            if left <= most:
-                break
-            if not can_be_dropped(node, leaves, parent, saved, children):
-                continue
-            if usefulness_key(usefulness(node, leaves, parent, log_size, lost, weight, saved)) <= threshold:
-                above = parent[node + leaves] - leaves
-                saved[above] += saved[node]
-                lost[above] += lost[node]
-                saved[node] = -1
-                left -= 1
-                if above < slots:
-                    keys[above] = 0  # its usefulness has changed, and is computed again when its turn comes
-        left_in = np.zeros(blocks + 1, np.int64)  # of the blocks before
-        for block in prange(blocks):
-            here = 0
-            for i in range(many * block // blocks, many * (block + 1) // blocks):
-                here += saved[kept[i]] != -1
-            left_in[block + 1] = here
-        for block in range(blocks):
-            left_in[block + 1] += left_in[block]
-        for block in prange(blocks):
-            after = left_in[block]
-            for i in range(many * block // blocks, many * (block + 1) // blocks):
-                node = kept[i]
-                if saved[node] == -1:
-                    continue
-                # Dropped nodes keep the parent that they had, so that no thread reads what another one writes.
-                while saved[parent[node + leaves] - leaves] == -1:
-                    parent[node + leaves] = parent[parent[node + leaves]]
-                others[after] = node
-                after += 1
-        many = left_in[blocks]
-        kept, others = others, kept
-        turn = max(turn - 1, 1)
-    for block in prange(blocks):
-        for leaf in range(leaves * block // blocks, leaves * (block + 1) // blocks):
-            while saved[parent[leaf] - leaves] == -1:  # once for each round at most
-                parent[leaf] = parent[parent[leaf]]
+            find_parent(node + leaves, leaves, saved, parent)
+            keys[node] = LAST_KEY
+            if can_be_dropped(node, leaves, parent, saved, children):
+                key = usefulness_key(usefulness(node, leaves, parent, log_size, lost, weight, saved))
+                keys[node] = key
+                counts[block, key] += 1
+
+
+@kernel(i8, i8, i8, i8, u4[:], f4[:], f4[:], out(u4[:]), out(u2[:]), out(f4[:]), out(i4[:]))
+def drop_below(threshold, most, leaves, children, parent, log_size, weight, kept, keys, lost, saved):
+    """Drop nodes whose keys are no larger than a threshold; return how many.
+
+    Args:
+        most: number of nodes to drop.
+        leaves, children, parent, log_size, weight, keys, lost, saved: of `count_by_key`; the last three are updated.
+        kept: of `count_by_key`; those that are still kept move to its end.
+    """
+    after = len(kept)
+    dropped = 0
+    for i in range(len(kept) - 1, -1, -1):
+        node = kept[i]
+        if (
+            keys[node] <= threshold
+            and dropped < most
+            and can_be_dropped(node, leaves, parent, saved, children)
+            and usefulness_key(usefulness(node, leaves, parent, log_size, lost, weight, saved)) <= threshold
+        ):
+            above = parent[node + leaves] - leaves
+            saved[above] += saved[node]
+            lost[above] += lost[node]
+            saved[node] = -1
+            dropped += 1
+            if above < len(keys):
+                keys[above] = 0  # its usefulness has changed, and is computed again when its turn comes
+        else:
+            after -= 1
+            kept[after] = node
+    return dropped
+
+
+@kernel(i8, i8, i4[:], out(u4[:]), ranges=True)
+def skip_dropped(start, stop, leaves, saved, parent):
+    """Update the parents of leaves and of merged nodes that are kept; arguments of `pruning.drop_nodes`."""
+    for node in range(start, stop):
+        if node < leaves or saved[node - leaves] != -1:
+            find_parent(node, leaves, saved, parent)
+
+
+@kernel(inline=True)
+def find_parent(node, leaves, saved, parent):
+    """Update the parent of a node: the nearest ancestor that is kept.
+
+    Dropped nodes keep the parent that they had, so that no thread reads what another one writes.
+    """
+    while saved[parent[node] - leaves] == -1:  # once for each round at most
+        parent[node] = parent[parent[node]]
 
 
 @kernel(inline=True)
@@ -241,7 +225,7 @@ def size_ranks(leaves, highest, parent, log_size, saved, latest):
     """Return the ranks of merged nodes in the final order: size steps below the highest, above the parent's.
 
     Args:
-        leaves, parent, log_size, saved: as for `drop_nodes`.
+        leaves, parent, log_size, saved: as for `pruning.drop_nodes`.
         highest: ln(size) of rank 0.
         latest: (leaves,) int32 rank that the leaves' parents must be below; or empty.
 
@@ -277,7 +261,7 @@ def lay_out_children(inner, leaves, parent, saved, order, child_start, child_cou
     Args:
         inner: (I,) uint32, the merged nodes that are kept, parents before their children.
         leaves: number of leaves.
-        parent, saved: of `drop_nodes`.
+        parent, saved: of `pruning.drop_nodes`.
         order: (M,) uint32, filled with the node of each final index.
         child_start, child_count: columns of a `LodTree` of M nodes, filled.
 

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...model.splats import FloatArray
-from ...support.jit import kernel, prange
-from ...support.jit_types import f4, f8, i8, out, u4, u8
+from ...support.jit import kernel
+from ...support.jit_types import f4, f8, i4, i8, out, u4, u8
 from .pair_cost import CENTER
 
 Keys = NDArray[np.uint64]
@@ -73,9 +73,9 @@ def morton_code(x, y, z, step, low, shift):
     return interleave(i, j, k)
 
 
-@kernel(f4[:, :], u4[:], f8, i8[:], i8, parallel=True)
-def cell_words(geometry, nodes, step, low, word):
-    """Return one 63-bit word of the Morton code of each node's cell.
+@kernel(i8, f4[:, :], u4[:], f8, i8[:], i8, out(u8[:]), ranges=True)
+def fill_cell_words(start, stop, geometry, nodes, step, low, word, words):
+    """Fill one 63-bit word of the Morton code of each node's cell.
 
     Args:
         geometry: node rows of `pair_cost.py`; or any whose first columns are the centre.
@@ -83,40 +83,53 @@ def cell_words(geometry, nodes, step, low, word):
         step: edge of a cell, float64.
         low: (3,) int64, the lowest cell on each axis, so that offsets from it are not negative.
         word: index of the word, the lowest first; each has AXIS_BITS bits per axis.
-
-    Returns:
-        (n,) uint64.
+        words: (n,) uint64, filled.
     """
-    out = np.empty(len(nodes), np.uint64)
     shift = np.uint64(AXIS_BITS * word)
-    for i in prange(len(nodes)):
+    for i in range(start, stop):
         x, y, z = geometry[nodes[i], CENTER], geometry[nodes[i], CENTER + 1], geometry[nodes[i], CENTER + 2]
-        out[i] = morton_code(np.float64(x), np.float64(y), np.float64(z), step, low, shift)
-    return out
+        words[i] = morton_code(np.float64(x), np.float64(y), np.float64(z), step, low, shift)
 
 
-@kernel(u8[:], u4[:], out(u8[:]), out(u4[:]), i8, i8, i8, parallel=True)
-def sort_pass(keys, values, keys_out, values_out, shift, bits, blocks):
-    """Do a stable pass of a radix sort, by `bits` bits at `shift`; the result does not depend on `blocks`."""
-    n = len(keys)
-    buckets = 1 << bits
-    mask = np.uint64(buckets - 1)
-    shift = np.uint64(shift)
-    count = np.zeros((blocks, buckets), np.int64)
-    for c in prange(blocks):
-        for i in range(n * c // blocks, n * (c + 1) // blocks):
-            count[c, (keys[i] >> shift) & mask] += 1
-    total = 0
-    for b in range(buckets):
-        for c in range(blocks):
-            here = count[c, b]
-            count[c, b] = total
-            total += here
-    for c in prange(blocks):
-        for i in range(n * c // blocks, n * (c + 1) // blocks):
-            b = (keys[i] >> shift) & mask
-            to = count[c, b]
-            count[c, b] = to + 1
+def cell_words(geometry: FloatArray, nodes: Nodes, grid: Parts, word: int) -> Keys:
+    """Return one 63-bit word of the Morton code of the part that each node is in; see `fill_cell_words`."""
+    words = np.empty(len(nodes), np.uint64)
+    fill_cell_words(len(nodes), geometry, nodes, grid.step, grid.low, word, words)
+    return words
+
+
+@kernel(i8, u8[:], i8, out(i8[:, :]), ranges=True)
+def count_keys(begin, end, keys, shift, counts):
+    """Count the keys by some of their bits.
+
+    Args:
+        begin, end: blocks of keys, of `len(counts)` of about one size.
+        keys: (n,) uint64.
+        shift: the lowest of the bits.
+        counts: (blocks, 1 << bits) int64, added to: for each block, the keys with each value of the bits.
+    """
+    low, mask = np.uint64(shift), np.uint64(counts.shape[1] - 1)
+    for block in range(begin, end):
+        for i in range(len(keys) * block // len(counts), len(keys) * (block + 1) // len(counts)):
+            counts[block, (keys[i] >> low) & mask] += 1
+
+
+@kernel(i8, u8[:], u4[:], i8, out(i8[:, :]), out(u8[:]), out(u4[:]), ranges=True)
+def place_keys(begin, end, keys, values, shift, places, keys_out, values_out):
+    """Put keys in the order of some of their bits, and values with them.
+
+    Args:
+        begin, end, keys, shift: of `count_keys`.
+        values: (n,) uint32.
+        places: (blocks, 1 << bits) int64 where the first key of each block with each value of the bits goes; changed.
+        keys_out, values_out: (n,), filled.
+    """
+    low, mask = np.uint64(shift), np.uint64(places.shape[1] - 1)
+    for block in range(begin, end):
+        for i in range(len(keys) * block // len(places), len(keys) * (block + 1) // len(places)):
+            bucket = (keys[i] >> low) & mask
+            to = places[block, bucket]
+            places[block, bucket] = to + 1
             keys_out[to] = keys[i]
             values_out[to] = values[i]
 
@@ -137,7 +150,10 @@ def sort_by_key(keys: Keys, values: Nodes, key_bits: int, blocks: int) -> tuple[
     bits = max(1, -(-key_bits // passes))
     other_keys, other_values = np.empty_like(keys), np.empty_like(values)
     for k in range(passes):
-        sort_pass(keys, values, other_keys, other_values, k * bits, bits, blocks)
+        counts = np.zeros((blocks, 1 << bits), np.int64)
+        count_keys(blocks, keys, k * bits, counts)
+        places = np.cumsum(counts.T).reshape(-1, blocks).T - counts
+        place_keys(blocks, keys, values, k * bits, np.ascontiguousarray(places), other_keys, other_values)
         keys, other_keys = other_keys, keys
         values, other_values = other_values, values
     return keys, values
@@ -149,7 +165,7 @@ def sort_by_cell(
     """Sort nodes in the Morton order of their cells and, within a cell, of its parts.
 
     Args:
-        geometry, nodes: as for `cell_words`.
+        geometry, nodes: as for `fill_cell_words`.
         grid: of the parts.
         blocks: ranges to process in parallel; the result does not depend on it.
         within: whether to sort within cells, too; otherwise a cell's nodes stay in their order.
@@ -162,22 +178,22 @@ def sort_by_cell(
     is_first = np.zeros(len(nodes), np.bool_)
     is_first[:1] = True
     for word in range(words):
-        keys = cell_words(geometry, nodes, grid.step, grid.low, word)
+        keys = cell_words(geometry, nodes, grid, word)
         if word == 0 and not within:
             keys &= ~((np.uint64(1) << in_cell) - np.uint64(1))
         keys, nodes = sort_by_key(keys, nodes.copy(), 3 * min(axis_bits - AXIS_BITS * word, AXIS_BITS), blocks)
     for word in range(words):
         if words > 1:  # `keys` holds the last word only
-            keys = cell_words(geometry, nodes, grid.step, grid.low, word)
+            keys = cell_words(geometry, nodes, grid, word)
         if word == 0:
             keys = keys >> in_cell
         is_first[1:] |= keys[1:] != keys[:-1]
     return nodes, is_first
 
 
-@kernel(f4[:, :], f4[:, :], f8[:], f8, i8[:], i8, parallel=True)
-def level_keys(center, scale, steps, grid, low, cell_bits):
-    """Return sort keys that order splats by level and, within a level, along a Morton curve.
+@kernel(i8, f4[:, :], f4[:, :], f8[:], f8, i8[:], i8, out(u8[:]), out(i4[:]), ranges=True)
+def fill_level_keys(begin, end, center, scale, steps, grid, low, cell_bits, keys, levels):
+    """Fill sort keys that order splats by level and, within a level, along a Morton curve.
 
     Args:
         center, scale: (n, 3) float32.
@@ -186,17 +202,12 @@ def level_keys(center, scale, steps, grid, low, cell_bits):
         grid: edge of the cells of the curve, float64.
         low: (3,) int64, the lowest cell of the curve.
         cell_bits: number of bits for the curve; the level's bits are above them.
-
-    Returns:
-        keys: (n,) uint64.
-        levels: (n,) int32, indices into `steps`.
+        keys: (n,) uint64, filled.
+        levels: (n,) int32, filled with indices into `steps`.
     """
-    n = len(scale)
-    keys = np.empty(n, np.uint64)
-    levels = np.empty(n, np.int32)
     start = math.log(steps[0])
     per_level = (len(steps) - 1) / (math.log(steps[-1]) - start)
-    for i in prange(n):
+    for i in range(begin, end):
         size = 2 * np.float64(max(scale[i, 0], scale[i, 1], scale[i, 2]))
         level = min(max(np.int64(math.ceil((math.log(size) - start) * per_level)), 0), len(steps) - 1)
         # The logarithm is rounded; the table of steps defines the level.
@@ -206,8 +217,7 @@ def level_keys(center, scale, steps, grid, low, cell_bits):
             level += 1
         levels[i] = level
         x, y, z = np.float64(center[i, 0]), np.float64(center[i, 1]), np.float64(center[i, 2])
-        keys[i] = morton_code(x, y, z, grid, low, np.uint64(0)) | (np.uint64(levels[i]) << np.uint64(cell_bits))
-    return keys, levels
+        keys[i] = morton_code(x, y, z, grid, low, np.uint64(0)) | (np.uint64(level) << np.uint64(cell_bits))
 
 
 @kernel(u4[:], f4[:, :], f4[:], f4[:])

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from sparklod_cli.lod.kernels import pair_cost
 from sparklod_cli.lod.kernels.pair_cost import COVARIANCE, LOG_DET
+from sparklod_cli.lod.pair_tree import matched, partners
 from tests.references import quality as twin
 
 NO_LIMIT = np.float32(np.inf)
@@ -30,7 +31,7 @@ def test_the_logarithm_of_the_determinant_of_what_is_flat_is_finite(flat: tuple[
 def test_the_cheapest_partner_is_that_of_brute_force(count: int, window: int, largest: float) -> None:
     rows = twin.random_rows(count, seed=count)
     nodes = np.random.default_rng(count).permutation(count).astype(np.uint32)
-    partner, cost = pair_cost.find_partners(rows, nodes, window, np.float32(largest))
+    partner, cost = partners(rows, nodes, window, np.float32(largest))
     expected = twin.costs(rows[nodes], window, largest)
     np.testing.assert_allclose(cost, expected.min(axis=1, initial=np.inf), rtol=1e-3, atol=1e-3)
     assert ((partner < 0) == np.isinf(cost)).all()
@@ -40,7 +41,7 @@ def test_the_cheapest_partner_is_that_of_brute_force(count: int, window: int, la
 
 def test_the_cheapest_of_all_pairs_is_mutual() -> None:
     rows = twin.random_rows(300, seed=2)
-    partner, cost = pair_cost.find_partners(rows, np.arange(300, dtype=np.uint32), 12, NO_LIMIT)
+    partner, cost = partners(rows, np.arange(300, dtype=np.uint32), 12, NO_LIMIT)
     first = int(cost.argmin())
     assert partner[partner[first]] == first
 
@@ -49,7 +50,7 @@ def test_among_equal_rows_half_find_each_other() -> None:
     for count in (2, 3, 100, pair_cost.BLOCK + 1, 3 * pair_cost.BLOCK + 7):
         rows = np.repeat(twin.random_rows(1, seed=3), count, axis=0)
         nodes = np.arange(count, dtype=np.uint32)
-        found, _ = pair_cost.match_pairs(nodes, *pair_cost.find_partners(rows, nodes, 12, NO_LIMIT), NO_LIMIT, count, 2)
+        found, _ = matched(nodes, *partners(rows, nodes, 12, NO_LIMIT), NO_LIMIT, count, 2)
         assert 4 * 2 * len(found) >= count
 
 
@@ -64,9 +65,9 @@ def test_pairs_are_disjoint_and_mutual_and_nobody_is_lost(
     if coincident:  # some are equal
         rows = rows[np.random.default_rng(seed).integers(0, (count + 3) // 4, count)]
     nodes = np.random.default_rng(seed + 1).permutation(count).astype(np.uint32)
-    partner, cost = pair_cost.find_partners(rows, nodes, window, NO_LIMIT)
+    partner, cost = partners(rows, nodes, window, NO_LIMIT)
     limit = np.float32(np.quantile(cost, share)) if count > 1 else NO_LIMIT
-    found, rest = pair_cost.match_pairs(nodes, partner, cost, limit, 1000, blocks)
+    found, rest = matched(nodes, partner, cost, limit, 1000, blocks)
 
     place = {int(node): i for i, node in enumerate(nodes)}
     expected = [(i, int(partner[i])) for i in range(count) if i < partner[i] and partner[partner[i]] == i]

@@ -208,7 +208,7 @@ def test_pairs_become_rows_that_cover_as_much_and_are_as_large_as_they_are_drawn
 
 def merge(tree: BinaryTree, pairs: np.ndarray) -> None:
     columns = tree.rows, tree.row, tree.spare, tree.children, tree.size, tree.error
-    pair_merge.merge_pairs(pairs, tree.used, tree.leaves, *columns)
+    pair_merge.merge_pairs(len(pairs), pairs, tree.used, tree.leaves, *columns)
     tree.used += len(pairs)
 
 
