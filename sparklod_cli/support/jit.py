@@ -22,13 +22,6 @@ Done = Callable[[float], None]
 CACHE_FOLDER = cache_folder(Path(__file__))
 
 
-class prange:  # noqa: N801 - it is numba's, and Python's `range` where kernels are not compiled
-    """A range whose iterations run on several threads in a compiled kernel that is `parallel`."""
-
-    def __new__(cls, *bounds: int) -> range:  # type: ignore[misc]
-        return range(*bounds)
-
-
 def prefetch(array: Any, index: int) -> None:
     """Ask the processor to fetch an element of a C-contiguous row of records; in Python, do nothing.
 
@@ -41,7 +34,6 @@ def prefetch(array: Any, index: int) -> None:
 class Options:
     """Compilation options of a kernel; see `kernel`."""
 
-    parallel: bool
     ranges: bool
     nogil: bool
     inline: bool
@@ -101,7 +93,6 @@ class Kernel:
 
 def kernel(
     *types: Any,
-    parallel: bool = False,
     ranges: bool = False,
     nogil: bool = False,
     inline: bool = False,
@@ -118,15 +109,14 @@ def kernel(
 
     Args:
         types: of the arguments; a tuple for each signature if there are several; nothing if only kernels call it.
-        parallel: the function has loops that run on the threads of `use_threads`.
         ranges: the first two arguments are the first row of a range and the one after its last. Python gives the number
-            of rows instead, the first declared type, and the threads of `use_threads` run ranges of them. Ranges must
+            of rows instead, the first declared type, and the threads of `on_threads` run ranges of them. Ranges must
             not write to the same place, and what they write must not depend on how the rows are divided.
         nogil: releases the GIL, so that other Python threads can run.
         inline: always inlines the function into its callers, which LLVM does not always do by itself.
         contract: allows fused multiply-add, which rounds once instead of twice, on processors that have it.
     """
-    options = Options(parallel, ranges, nogil or ranges, inline, contract)
+    options = Options(ranges, nogil or ranges, inline, contract)
     signatures = types if not types or isinstance(types[0], tuple) else (types,)
 
     def decorate(function: Callable[..., Any]) -> Any:

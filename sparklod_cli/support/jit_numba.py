@@ -48,7 +48,7 @@ def dispatcher_of(kernel: jit.Kernel) -> Any:
 def _inner_of(kernel: jit.Kernel) -> Any:
     """Return numba's dispatcher that other kernels call.
 
-    What it compiles is a copy of the function, in whose globals numba finds its own `prange` and its own dispatchers.
+    What it compiles is a copy of the function, in whose globals numba finds its own dispatchers.
     Nothing is replaced in the modules themselves, since other threads may be calling their functions.
     """
     if kernel.inner is None:
@@ -56,7 +56,6 @@ def _inner_of(kernel: jit.Kernel) -> Any:
         namespace = function.__globals__.setdefault(_NAMESPACE, {})
         decorate: Any = numba.njit(
             error_model="numpy",
-            parallel=options.parallel,
             nogil=options.nogil,
             inline="always" if options.inline else "never",
             forceinline=options.ranges,
@@ -142,9 +141,7 @@ _prefetch: Any = intrinsic(_lower_prefetch)
 
 
 def _known(value: Any) -> Any:
-    """Return what numba knows a global as: its own `prange`, and dispatchers instead of kernels."""
-    if value is jit.prange:
-        return numba.prange
+    """Return what numba knows a global as: dispatchers instead of kernels."""
     if value is jit.prefetch:
         return _prefetch
     return _inner_of(value) if isinstance(value, jit.Kernel) else value
