@@ -37,6 +37,7 @@ class Options:
     ranges: bool
     nogil: bool
     inline: bool
+    inline_late: bool
     contract: bool
 
 
@@ -96,6 +97,7 @@ def kernel(
     ranges: bool = False,
     nogil: bool = False,
     inline: bool = False,
+    inline_late: bool = False,
     contract: bool = False,
 ) -> Callable[[Callable[..., Any]], Any]:
     """Decorate a function that is compiled.
@@ -113,10 +115,13 @@ def kernel(
             of rows instead, the first declared type, and the threads of `on_threads` run ranges of them. Ranges must
             not write to the same place, and what they write must not depend on how the rows are divided.
         nogil: releases the GIL, so that other Python threads can run.
-        inline: always inlines the function into its callers, which LLVM does not always do by itself.
+        inline: numba copies the function into its callers before it infers types. For a few lines in innermost loops,
+            which LLVM then vectorizes: the time to compile grows with the square of the lines that are copied.
+        inline_late: LLVM copies the function into its callers, which it does not always do by itself. It is part of
+            them, rather than a function apart that was optimized without knowing them.
         contract: allows fused multiply-add, which rounds once instead of twice, on processors that have it.
     """
-    options = Options(ranges, nogil or ranges, inline, contract)
+    options = Options(ranges, nogil or ranges, inline, inline_late, contract)
     signatures = types if not types or isinstance(types[0], tuple) else (types,)
 
     def decorate(function: Callable[..., Any]) -> Any:

@@ -142,7 +142,7 @@ def moved(first, second, slot, column, of_property, gradient, rate, correction):
     return factor * first[slot, column], factor * first[slot, column + 1], factor * first[slot, column + 2]
 
 
-@kernel(inline=True)
+@kernel(inline_late=True)
 def step_of(i, nodes, old, index, slots, gradients, rates, moments, bounds):
     """Move the node of drawn splat `i`; see `step`."""
     center, scale, quat, lod_opacity, rgb, sh = nodes

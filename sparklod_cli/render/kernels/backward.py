@@ -162,7 +162,7 @@ def weigh_lanes(record, row, x, dy, least):
             weigh(record, i, alpha, by_z2, by_power, (t >= end) & (alpha >= least), red, green, blue, v, dy)
 
 
-@kernel(inline=True)
+@kernel(inline_late=True)
 def start_pixels(records, left, top, rows, columns, image, by_image):
     """Fill what is kept of a tile's pixels before the first splat."""
     records[:] = 0
@@ -282,7 +282,7 @@ def carry_back(start, stop, splats, world_to_camera, lens, limits, rows, gradien
         carry_splat_back(splats, i, world_to_camera, lens, limits, rows.screen[i], total, gradients[i])
 
 
-@kernel(inline=True)
+@kernel(inline_late=True)
 def carry_splat_back(splats, i, m, lens, limits, seen, total, row):
     """Fill a row of gradients from splat `i` on the screen and its sums; see `carry_back`."""
     one, two, half = f64(1), f64(2), f64(0.5)

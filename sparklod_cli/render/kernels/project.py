@@ -90,7 +90,7 @@ def is_in_picture(x, y, half_width, half_height, lens):
     )
 
 
-@kernel(inline=True)
+@kernel(inline_late=True)
 def project_splat(splats, i, world_to_camera, lens, limits, radial, row):
     """Project a splat onto the screen, as Spark's vertex shader does.
 
@@ -209,7 +209,7 @@ def project_group(splats, start, count, world_to_camera, lens, limits, fields):
         fields[SLOPE, k], fields[TALL, k] = slope, tall
 
 
-@kernel(inline=True)
+@kernel(inline_late=True)
 def finish_group(splats, start, count, lens, radial, fields, screen, keys, boxes):
     """Fill `screen`, `keys` and `boxes` of `project` of the fields of `count` splats from `start` on."""
     across, down = -(-np.int64(lens.width) // TILE), -(-np.int64(lens.height) // TILE)

@@ -248,7 +248,7 @@ def measure(row, left, top, rows, columns, lines):
         lines[block, 1] = np.int32(max(min(last, below + f32(2)), f32(0))) if covers else np.int32(0)
 
 
-@kernel(inline=True)
+@kernel(inline_late=True, contract=True)
 def draw_tile(screen, start, splats, tile, across, design, least, image):
     """Blend the splats of a tile, from near to far, see `draw_tiles`; return where in `splats` it stopped."""
     height, width = image.shape[:2]

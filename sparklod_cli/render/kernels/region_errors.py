@@ -148,7 +148,7 @@ def digit_sorted(keys, values, shift):
     return keys_out, values_out
 
 
-@kernel(inline=True)
+@kernel(inline_late=True)
 def draw_run(screen, tiles, least, picture):
     """Draw splats on the screen, from near to far, into a square picture of `tiles` tiles along each side."""
     start = np.zeros(tiles * tiles + 1, np.int64)
