@@ -84,12 +84,9 @@ class Kernel:
     def signatures(self) -> list[tuple[Any, ...]]:
         """Numba's types of the arguments of each declared signature, as `dispatcher.compile` takes them."""
         import numba
-        from numba.core.types import StarArgTuple
 
-        signatures = [tuple(numba.typeof(example(each)) for each in types) for types in self.declared]
-        if not self.options.ranges:
-            return signatures
-        return [(StarArgTuple((numba.int64, *types)),) for types in signatures]  # see `jit_numba._calling`
+        first = (numba.int64,) if self.options.ranges else ()  # a range has two ends, its number of rows is declared
+        return [(*first, *(numba.typeof(example(each)) for each in types)) for types in self.declared]
 
 
 def kernel(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import gc
+import inspect
 import threading
 import time
 from collections.abc import Callable
@@ -112,10 +113,10 @@ def _calling(compiled: Any, function: Callable[..., Any]) -> Any:
     This also makes loops of ranges fast. LLVM optimizes a function, and then numba removes the counts of references to
     arrays, which keep loops from being vectorized. As a part of another function it is optimized again: vectorized.
     """
-
-    def call(*arguments: Any) -> Any:
-        return compiled(*arguments)
-
+    names, namespace = ", ".join(inspect.signature(function).parameters), dict[str, Any](compiled=compiled)
+    # Not (*arguments): numba does not recognise the types of those that it loads from the cache.
+    exec(f"def call({names}):\n    return compiled({names})", namespace)
+    call = namespace["call"]
     for name in ("__module__", "__name__", "__qualname__"):
         setattr(call, name, getattr(function, name))
     return numba.njit(error_model="numpy", nogil=True, no_cfunc_wrapper=True)(call)

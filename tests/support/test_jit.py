@@ -67,19 +67,19 @@ def test_a_kernel_depends_on_all_that_its_module_imports(kernels: Path) -> None:
 def test_a_change_of_a_kernel_or_constant_changes_the_names_of_those_that_depend_on_it(tmp_path: Path) -> None:
     copy = tmp_path / "sparklod_cli"
     shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
-    names = ("geometry", "sort", "node_rows", "prune")
+    names = ("geometry", "sort", "node_rows", "cut_statistics")
     code = "from sparklod_cli.support.kernel_cache import *; " + "".join(
         f"print(digest_of(sources_of(PACKAGE / 'lod/kernels/{name}.py'))); " for name in names
     )
     digests = []
-    for changed in ("model/lod_tree.py", "lod/kernels/geometry.py", "support/jit.py", "README.md"):
+    for changed in ("model/falloff.py", "lod/kernels/geometry.py", "support/jit.py", "README.md"):
         command = [sys.executable, "-c", code]
         found = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True).stdout.split()
         digests.append(dict(zip(names, found, strict=True)))
         with (copy / changed).open("a") as file:
             file.write("# changed\n")
     changes = [{name for name in names if now[name] != before[name]} for before, now in itertools.pairwise(digests)]
-    assert changes == [{"prune"}, {"geometry", "node_rows"}, set(names)]
+    assert changes == [{"node_rows", "cut_statistics"}, {"geometry", "node_rows"}, set(names)]
 
 
 @fields(f4[:, :], out(i8[:]), b1)
@@ -230,11 +230,13 @@ def test_a_kernel_of_ranges_is_called_with_the_number_of_rows(monkeypatch: pytes
     decorate = jit.kernel(i8, f4[:], out(f4[:]), ranges=True)
     compiled = decorate(fill)
     assert isinstance(compiled, jit.Kernel)
-    monkeypatch.setenv("NUMBA_DISABLE_JIT", "1")
-    for kernel in (compiled, decorate(fill)):
+    compiled.dispatcher.compile(compiled.signatures[0])
+    with monkeypatch.context() as patched:
+        patched.setenv("NUMBA_DISABLE_JIT", "1")  # which numba reads when it compiles
+        interpreted = decorate(fill)
+    for kernel in (compiled, interpreted):
         squares = np.zeros(len(values), np.float32)
         kernel(len(values) - 1, values, squares)
         assert np.array_equal(squares[:-1], values[:-1] ** 2)
         assert not squares[-1]
-    compiled.dispatcher.compile(compiled.signatures[0])
     assert len(compiled.dispatcher.overloads) == 1  # what is declared is what the call compiled

@@ -93,6 +93,14 @@ assert len(right) == 160 and all(right)
 import builtins
 builtins.kept = squares(values)[::2]
 """,
+    "a kernel is loaded once": """
+from sparklod_cli.support.kernel_cache import KernelCache
+load, loaded = KernelCache.load_overload, []
+KernelCache.load_overload = lambda cache, *more: loaded.append(cache) or load(cache, *more)
+for _ in range(3):
+    assert (squares(values) == expected).all()
+assert len(loaded) == 1
+""",
     "a forked process": """
 assert total(values) == values.sum()
 warnings.simplefilter("ignore", DeprecationWarning)  # Python 3.12 advises against forks
