@@ -42,7 +42,7 @@ def test_this_installation_has_no_problem(monkeypatch: pytest.MonkeyPatch) -> No
     checks = check_all(begun.append)
     assert [check for check in checks if check.state == "problem"] == []
     names = {check.name for check in checks}
-    assert {"sparklod", "Python", "numpy", "numba", "threads", "processors", "memory", "OpenGL", "Open3D"} <= names
+    assert {"sparklod", "Python", "numpy", "numba", "processors", "memory", "OpenGL", "Open3D"} <= names
     assert {"kernel cache", "extra render", "extra video", "extra parquet", "Node", "Chromium"} <= names
     assert not names & {"extra dev", "extra test"}
     assert begun

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 import sparklod_cli
-from sparklod_cli.support import machine, parallel
+from sparklod_cli.support import machine, threads
 from tests.conftest import FIXTURES, ROOT
 
 PACKAGE = Path(sparklod_cli.__file__).parent
@@ -92,7 +92,7 @@ def test_consoles_without_utf8_show_escapes(tmp_path: Path) -> None:
 def test_all_processors_are_used_where_no_affinity_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delattr(os, "sched_getaffinity", raising=False)
     monkeypatch.setattr(os, "cpu_count", lambda: 5)
-    assert parallel.processors() == 5
+    assert threads.processors() == 5
 
 
 def test_memory_is_unknown_where_nothing_tells_it(monkeypatch: pytest.MonkeyPatch) -> None:
