@@ -18,14 +18,16 @@ pytestmark = pytest.mark.slow
 SCRIPT = """
 import numpy as np
 from sparklod_cli.support import jit
-from sparklod_cli.lod.kernels.geometry import ellipsoid_area
-from sparklod_cli.lod.kernels import sort
+from sparklod_cli.lod.kernels.geometry import find_bounds
+from sparklod_cli.render.kernels.shade import add_sh
 
 begun = []
 jit.listen(begun.append, lambda seconds: None, print)
-area = ellipsoid_area(1.0, 2.0, 3.0)
-code = sort.morton_code(1.0, 2.0, 3.0, 0.5, np.zeros(3, np.int64), np.uint64(0))
-print(jit.CACHE_FOLDER, len(begun), area, code)
+center = np.arange(12, dtype=np.float32).reshape(4, 3)
+rgb, low, high = np.zeros((4, 3), np.float32), np.zeros((1, 4)), np.zeros((1, 4))
+add_sh(4, center, np.ones((4, 3, 3), np.float32), np.zeros(3, np.float32), 1, rgb)
+find_bounds(1, center, center + 1, low, high)
+print(jit.CACHE_FOLDER, len(begun), rgb.sum(), low.sum() + high.sum())
 """
 
 

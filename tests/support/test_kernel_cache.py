@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 
 from sparklod_cli.support import atomic, jit
+from sparklod_cli.support.jit_types import f8
 from sparklod_cli.support.kernel_cache import SUFFIX, is_whole, start_of
 from sparklod_cli.warmup import units
 from tests.conftest import ROOT
@@ -49,7 +50,7 @@ class Cache:
     def compiles(self, argument: float = 2.0) -> bool:
         """Calls `twice` as in a new process; whether it had to be compiled."""
         before = len(self.begun)
-        assert jit.kernel()(twice)(argument) == argument * 2
+        assert jit.kernel(f8)(twice)(argument) == argument * 2
         return len(self.begun) > before
 
 
@@ -155,7 +156,7 @@ def test_a_caller_is_compiled_with_what_is_stored_of_the_kernels_in_it(
             result: float = inner(inner(x))
             return result
 
-        found: float = jit.kernel()(outer)(2.0)
+        found: float = jit.kernel(f8)(outer)(2.0)
         return found
 
     assert fourfold() == 8
