@@ -76,14 +76,8 @@ class FittedNodes:
         seen = index[marks]
         found = Columns(*(column[seen] for column in now))
         if terms := found.sh.shape[1]:
-            add_sh(
-                len(found.rgb),
-                found.center,
-                found.sh,
-                camera.position.astype(np.float32),
-                COEFFICIENTS.index(terms),
-                found.rgb,
-            )
+            eye = camera.position.astype(np.float32)
+            add_sh(len(seen), found.center, found.sh, eye, COEFFICIENTS.index(terms), found.rgb)
         np.maximum(found.rgb, 0, out=found.rgb)
         return seen, ShadedSplats(found.center, found.scale, found.quat_xyzw, found.lod_opacity, found.rgb)
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import ast
+import inspect
 import itertools
 import os
 import shutil
 import subprocess
 import sys
+import textwrap
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,7 +21,7 @@ from sparklod_cli.support import jit
 from sparklod_cli.support.jit import prefetch as jit_prefetch
 from sparklod_cli.support.jit_types import Type, as_declared, b1, example, f4, fields, i8, out, u2, u4
 from sparklod_cli.support.kernel_cache import cache_folder, sources_of
-from sparklod_cli.warmup import Unit
+from sparklod_cli.warmup import Unit, units
 from tests.conftest import ROOT
 
 PACKAGE = ROOT / "sparklod_cli"
@@ -219,6 +221,15 @@ def test_prefetch_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     rows["count"] = np.arange(100)
     assert total(rows) == total.py_func(rows) == 4950  # as machine code, and as Python
     assert np.array_equal(rows["count"], np.arange(100))
+
+
+def test_kernels_of_ranges_return_nothing() -> None:
+    """What one range returned would be lost."""
+    of_ranges = {unit.kernel for unit in units() if unit.kernel.options.ranges}
+    assert len(of_ranges) > 20
+    for kernel in of_ranges:
+        tree = ast.parse(textwrap.dedent(inspect.getsource(kernel.py_func)))
+        assert not [node for node in ast.walk(tree) if isinstance(node, ast.Return)], kernel.py_func.__name__
 
 
 def test_a_kernel_of_ranges_is_called_with_the_number_of_rows(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -305,7 +305,6 @@ def merge_in_cells(start, stop, nodes, is_first, rows, largest, made, owner, row
             while end < n and not is_first[end]:
                 end += 1
             merge_span(nodes, is_first, rows, largest, begin, end, made, owner, row)
-    return owner, row
 
 
 @kernel(u4[:], i8[:], u4[:])
