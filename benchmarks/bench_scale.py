@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -89,9 +90,10 @@ class Watch:
 def size_of(folder: Path) -> int:
     """Bytes of all files in a folder; those that vanish meanwhile do not count."""
     total = 0
-    for path in folder.rglob("*"):
-        with contextlib.suppress(OSError):
-            total += path.stat().st_size if path.is_file() else 0
+    for inside, _, files in os.walk(folder):  # which passes over folders that vanish
+        for name in files:
+            with contextlib.suppress(OSError):
+                total += Path(inside, name).stat().st_size
     return total
 
 

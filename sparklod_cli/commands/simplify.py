@@ -42,6 +42,7 @@ from .options.baking import (
     Steps,
     TransformOptions,
     TreeOptions,
+    memory_size,
 )
 from .options.common import General, overwrite_flag
 from .paths import (
@@ -124,6 +125,11 @@ class SimplifiedFiles:
     )
     overwrite: bool = overwrite_flag()
     max_sh: int = setting_of(TreeOptions, "max_sh")
+    memory: int | None = option(
+        "Memory that the tree may take, such as 4G; a scene that needs more is refused."
+        "  [default: 75 % of what is available]",
+        Quantity("SIZE", memory_size),
+    )
 
     @property
     def suffix(self) -> str:
@@ -204,6 +210,7 @@ def simplify(ctx: click.Context, /, **_: Any) -> None:
     with general.console() as console:
         console.announce_compiling()
         from ..bake.flow import bake
+        from ..bake.settings import Resources
 
         baked = bake(
             files.source,
@@ -212,6 +219,7 @@ def simplify(ctx: click.Context, /, **_: Any) -> None:
             overwrite=files.overwrite,
             threads=general.threads,
             progress=console.progress,
+            resources=Resources(memory=files.memory),
             say=console.say,
         )
         report_simplified(console, files.source, files.output, baked)

@@ -18,7 +18,7 @@ from sparklod_cli.fitting.settings import FitSettings
 from sparklod_cli.io import read_scene, scene_sink
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import same_rows
-from sparklod_cli.support.errors import CameraPathError, FormatError, InvalidSplatsError, OutputError
+from sparklod_cli.support.errors import CameraPathError, FormatError, InvalidSplatsError, OutOfMemoryError, OutputError
 from tests.conftest import FIXTURES
 from tests.fittings import StandIn
 from tests.fittings import stand_in as stand_in
@@ -149,11 +149,16 @@ def test_cameras_that_cannot_be_read_are_told_before_any_work(tmp_path: Path, st
         )
 
 
-def test_it_goes_on_in_memory_and_says_so(tmp_path: Path, stand_in: StandIn) -> None:
+def test_too_little_memory_for_a_whole_tree_is_refused(tmp_path: Path, stand_in: StandIn) -> None:
+    with pytest.raises(OutOfMemoryError, match="--refine fits a whole tree, not in blocks"):
+        bake(SOURCE, tmp_path / "out.spz", REFINE, resources=Resources(memory=1))
+    assert not list(tmp_path.iterdir())
+
+
+def test_blocks_that_were_asked_for_are_not_used(tmp_path: Path, stand_in: StandIn) -> None:
     said: list[str] = []
-    bake(SOURCE, tmp_path / "out.spz", REFINE, resources=Resources(memory=1), say=said.append)
-    assert "goes on in memory, although it would take about" in said[0]
-    assert said[0].endswith("--refine fits a whole tree")
+    bake(SOURCE, tmp_path / "out.spz", REFINE, resources=Resources(block_splats=1 << 16), say=said.append)
+    assert said[0].endswith("goes on in memory, although blocks were asked for: --refine fits a whole tree")
     assert said[1] == "fit 1 of 1: 2 % 30.0 -> 32.5 dB"
 
 

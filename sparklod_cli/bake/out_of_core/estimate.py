@@ -44,6 +44,11 @@ def in_memory_bytes(method: str, splats: int, sh_degree: int) -> int:
     return PROCESS + BUILDERS[method].in_memory.of(splats, sh_degree)
 
 
+def most_in_memory(memory: int, method: str, sh_degree: int) -> int:
+    """Return the most splats whose bake in memory takes at most so many bytes."""
+    return max(memory - PROCESS, 0) // BUILDERS[method].in_memory.of(1, sh_degree)
+
+
 def out_of_core_bytes(
     method: str, splats: int, sh_degree: int, block_splats: int, *, in_chunks: bool = False, threads: int = 1
 ) -> int:

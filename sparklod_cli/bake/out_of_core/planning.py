@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from ...model.streams import SceneStream
 from ...support.addresses import Place, absolute
-from ...support.errors import FormatError, HasTreeError, ScratchError
+from ...support.errors import FormatError, HasTreeError, OutOfMemoryError, ScratchError
 from ...support.progress import Progress
 from ...support.stdin import name_of
 from ...support.units import count_of, format_size
@@ -74,6 +74,7 @@ def blocks_for(
     why = _reason(header, settings, memory, resources, engine, is_left=is_left)
     whole = _as_a_whole(settings)
     if why is not None and whole is not None:
+        _check_memory(header, settings, memory, whole)
         say(f"{name_of(source)}: goes on in memory, although {why}: {whole}")
         why = None
     work = functools.partial(at_work, store, resume=resources.resume, overwrite=overwrite, say=say)
@@ -171,6 +172,23 @@ def _as_a_whole(settings: BakeSettings) -> str | None:
     if settings.tiles is not None:
         return "tiles are made of a whole tree"
     return None if settings.detail is None else "detail levels are made of a whole tree"
+
+
+def _check_memory(header: SceneStream, settings: BakeSettings, memory: int | None, whole: str) -> None:
+    """Raise `OutOfMemoryError` where a bake that cannot go out of core would take more memory than it may.
+
+    Args:
+        whole: of `_as_a_whole`.
+    """
+    needed = estimate.in_memory_bytes(settings.method, header.count, header.sh_degree)
+    if memory is None or needed <= memory:
+        return
+    most = estimate.most_in_memory(memory, settings.method, header.sh_degree)
+    raise OutOfMemoryError(
+        f"{whole}, not in blocks: {count_of(header.count, 'splat')} would take about"
+        f" {format_size(needed)} of memory, and {format_size(memory)} are enough for {most:,}; give --memory"
+        f" {format_size(1.02 * needed)} or more if the machine has it, or fewer splats"
+    )
 
 
 def _check_room(folder: Path, needed: int) -> None:

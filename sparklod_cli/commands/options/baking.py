@@ -243,7 +243,8 @@ class RefineOptions:
         return FitSettings(steps=self.refine or None, seed=self.seed, device=self.device)
 
 
-def _memory(text: str) -> int:
+def memory_size(text: str) -> int:
+    """Parse an amount of memory such as 4G or "600 MB"; raise `ValueError` for one without a unit."""
     size = parse_size(text)
     if not text.strip()[-1:].isalpha():
         raise ValueError(f"{text!r} has no unit; write {text.strip()}G or {text.strip()}MB")
@@ -261,7 +262,7 @@ class ResourceOptions:
     memory: int | None = option(
         "Memory that a bake may take, such as 4G or '600 MB'. A scene that needs more is baked out of core: block by"
         " block, with a scratch folder.  [default: 75 % of what is available]",
-        Quantity("SIZE", _memory),
+        Quantity("SIZE", memory_size),
     )
     scratch_dir: Place | None = option(
         "Where a bake out of core makes its scratch folder, which is removed at the end.  [default: beside the output]",

@@ -38,6 +38,13 @@ def test_more_splats_and_more_coefficients_take_more(method: str, splats: int, d
     assert estimate.block_splats_within(None, method, splats, degree) == estimate.MOST_BLOCK_SPLATS
 
 
+@given(*CASES)
+def test_the_most_splats_in_memory_fill_it(method: str, splats: int, degree: int) -> None:
+    memory = estimate.in_memory_bytes(method, splats, degree)
+    assert estimate.most_in_memory(memory, method, degree) == splats
+    assert estimate.most_in_memory(memory - 1, method, degree) == splats - 1
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_five_million_splats_are_baked_in_600_mb(method: str) -> None:
     estimate.block_splats_within(600_000_000, method, 5_000_000, 0, in_chunks=True, threads=2)

@@ -77,9 +77,29 @@ def test_too_little_memory_is_an_error_that_says_how_much_is_enough(tmp_path: Pa
 
 
 @pytest.mark.usefixtures("small_blocks")
-def test_arrays_and_trees_go_on_in_memory(tmp_path: Path, capsys: Capture) -> None:
-    assert build(DEMO, "-o", tmp_path / "a.npz", "--encoding", "ext", "--memory", "3M") == 0
-    assert "goes on in memory, although it would take about" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("output", "options", "why"),
+    [
+        ("a.npz", ["--encoding", "ext"], "--encoding writes arrays as a whole"),
+        ("a.spz", ["--refine", "1"], "--refine fits a whole tree"),
+        ("web/lod-meta.json", [], "detail levels are made of a whole tree"),
+        ("web/tileset.json", [], "tiles are made of a whole tree"),
+    ],
+)
+def test_what_needs_a_whole_tree_is_refused_with_the_memory_that_is_enough(
+    output: str, options: list[str], why: str, tmp_path: Path, capsys: Capture
+) -> None:
+    (tmp_path / "web").mkdir()
+    assert build(DEMO, "-o", tmp_path / output, *options, "--memory", "3M") == 1
+    error = capsys.readouterr().err
+    assert f"{DEMO.name}: {why}, not in blocks: " in error
+    found = re.search(r"3\.0 MB are enough for [1-9][\d,]+; give --memory (.*) or more if the machine has it", error)
+    assert found is not None
+    assert build(DEMO, "-o", tmp_path / output, *options, "--memory", found[1]) == 0
+
+
+@pytest.mark.usefixtures("small_blocks")
+def test_a_tree_is_read_as_a_whole(tmp_path: Path) -> None:
     assert build(FIXTURES / "golden" / "tree-v3.spz", "-o", tmp_path / "a.rad", "--memory", "1k") == 0
 
 

@@ -213,13 +213,6 @@ def test_an_interruption_leaves_what_was_there(
     assert files(tmp_path) == former
 
 
-def test_a_bake_that_takes_much_memory_goes_on_in_memory(town: Path, tmp_path: Path, capsys: Capture) -> None:
-    assert build(town, "-o", tmp_path / "web" / MANIFEST, "--memory", "1M") == 0
-    err = capsys.readouterr().err
-    assert "town.ply: goes on in memory, although it would take about" in err
-    assert "--memory gives it 1.0 MB: detail levels are made of a whole tree" in err
-
-
 def test_the_same_bake_is_skipped(town: Path, tmp_path: Path, capsys: Capture) -> None:
     web, sky = tmp_path / "web", written(tmp_path / "sky.ply", 40)
     given = [town, "-o", web / MANIFEST, "--skip-existing", "--environment", sky]
