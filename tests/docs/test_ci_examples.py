@@ -1,4 +1,4 @@
-"""The examples of docs/ci.md and docs/inspect.md do what they say, as far as a shell can tell."""
+"""The examples of docs/ci.md and docs/inspect-checks.md do what they say, as far as a shell can tell."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from .shell import Shell, blocks
 pytestmark = pytest.mark.slow
 
 CI = (ROOT / "docs" / "ci.md").read_text(encoding="utf-8")
-PAGE = (ROOT / "docs" / "inspect.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs" / "inspect-checks.md").read_text(encoding="utf-8")
 HOOKS = (ROOT / ".pre-commit-hooks.yaml").read_text(encoding="utf-8")
 
 
@@ -276,7 +276,7 @@ def test_expectations_on_the_page_can_be_read(web: Path, capsys: pytest.CaptureF
     assert run(["inspect", str(FIXTURES / "golden" / "tree-v2.spz"), "--expect", str(path)]) == 3
 
 
-@pytest.mark.parametrize("page", ["ci.md", "inspect.md"])
+@pytest.mark.parametrize("page", ["ci.md", "inspect-checks.md"])
 def test_links_of_the_pages_lead_to_files(page: str) -> None:
     text = (ROOT / "docs" / page).read_text(encoding="utf-8")
     links = re.findall(r"\]\(([^)#]*)(?:#([^)]+))?\)", text)

@@ -1,4 +1,4 @@
-"""What the page about `traverse` promises of columns, assertions and the summary."""
+"""What the pages about `traverse` promise of columns, assertions and the summary."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from tests.conftest import ROOT
 from tests.docs.traverse_picture import example
 from tests.tables.rows import flight
 
-PAGE = ROOT / "docs" / "traverse.md"
+PAGE, TABLE = ROOT / "docs" / "traverse.md", ROOT / "docs" / "traverse-table.md"
 
 
-def test_the_page_about_traverse_lists_the_columns() -> None:
+def test_the_page_about_the_table_lists_the_columns() -> None:
     """Made by `python -m tests.docs.test_traverse_page`."""
-    text = PAGE.read_text()
+    text = TABLE.read_text()
     assert with_columns(text) == text
 
 
@@ -57,4 +57,4 @@ def test_the_biker_of_the_picture_stands_upright() -> None:
 
 
 if __name__ == "__main__":
-    PAGE.write_text(with_columns(PAGE.read_text()))
+    TABLE.write_text(with_columns(TABLE.read_text()))

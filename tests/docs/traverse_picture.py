@@ -1,4 +1,4 @@
-"""Draws the picture of docs/traverse.md anew, with the instances file and the command that the page shows.
+"""Draws the picture of docs/traverse-table.md anew, with the instances file and the command that the page shows.
 
 `SPARKLOD_SCENES=folder python -m tests.docs.traverse_picture`; the folder has biker.spz, playbot.sog and meadow.sog.
 """
@@ -17,7 +17,7 @@ from PIL import Image
 
 from tests.conftest import ROOT
 
-PAGE = ROOT / "docs" / "traverse.md"
+PAGE = ROOT / "docs" / "traverse-table.md"
 PICTURE = ROOT / "docs" / "images" / "traverse.webp"
 
 #: What its trees are baked from, with the quality builder.
