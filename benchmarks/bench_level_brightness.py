@@ -1,4 +1,4 @@
-"""How bright PlayCanvas and Babylon.js draw each detail level beside level 0: a table of docs/playcanvas.md.
+"""How bright PlayCanvas and Babylon.js draw each detail level beside level 0: a table of docs/engines-measured.md.
 
 `ENGINES_DIR=folder python -m benchmarks.bench_level_brightness scene.ply`; the folder's node_modules has the engines.
 """

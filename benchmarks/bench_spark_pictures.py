@@ -23,11 +23,11 @@ HEADINGS = (
     "view",
     "splats",
     "covered",
-    "PSNR",
-    "of what is covered",
-    "largest difference",
-    "PSNR, unrounded",
-    "of Spark's numbers",
+    "PSNR, dB",
+    "of what is covered, dB",
+    "largest difference of 255",
+    "PSNR, unrounded, dB",
+    "of Spark's numbers, dB",
     "same cut",
 )
 
@@ -40,11 +40,11 @@ def row(scene: str, view: int, found: Difference) -> str:
         f"{around}°, {up}° up, {away:g} radii",
         f"{found.drawn:,}",
         f"{found.share:.0%}",
-        f"{found.psnr:.1f} dB",
-        f"{found.covered:.1f} dB",
-        f"{found.most} of 255",
-        f"{found.unrounded:.1f} dB",
-        f"{found.held:.1f} dB",
+        f"{found.psnr:.1f}",
+        f"{found.covered:.1f}",
+        f"{found.most}",
+        f"{found.unrounded:.1f}",
+        f"{found.held:.1f}",
         {None: "", True: "yes", False: "**no**"}[found.same_cut],
     ]
     return "| " + " | ".join(cells) + " |"

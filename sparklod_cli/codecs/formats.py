@@ -133,7 +133,7 @@ FORMATS = (
 WRITABLE = {ending: form for form in FORMATS if form.writable for ending in form.endings}
 
 #: By the name that `--encoding` knows: the module in `gpu`, which has `dump(scene, *, threads)`, the arrays of
-#: words of a scene by their names; docs/formats.md has their layout.
+#: words of a scene by their names; docs/formats/memory.md has their layout.
 ENCODINGS = {"packed": "packed_splats", "ext": "ext_splats", "lodtree": "lod_tree", "texture": "data_texture"}
 
 #: Layouts after which `gpu.loaded_nodes` measures nodes, as Spark does once it has loaded a file: ExtSplats,

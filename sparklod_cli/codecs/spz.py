@@ -1,7 +1,7 @@
 """SPZ, Niantic's compressed splats, and Spark's extension of it for Level-of-Detail trees.
 
 Reads versions 1 to 4, see `spz_streams`; writes versions 2 and 3, and 4 without a tree, for which Spark's extension is
-not defined. `docs/formats.md` lays the extension out byte by byte.
+not defined. `docs/formats/spz.md` lays the extension out byte by byte.
 """
 
 from __future__ import annotations

@@ -45,7 +45,7 @@ def test_spark_reads_plain_splats_as_they_were_written(spark: Spark, version: in
 
 
 def test_spark_refuses_version_4(spark: Spark) -> None:
-    """As docs/formats.md says: once this fails, its table has changed."""
+    """As docs/formats/spz.md says: once this fails, its table has changed."""
     with pytest.raises(AssertionError, match="failed"):
         spark.load(b"".join(spz.encode(Scene(random_splats(2)), WriteOptions(spz_version=4))))
 

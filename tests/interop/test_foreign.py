@@ -292,7 +292,7 @@ def test_mkkelloggs_viewer_reads_spz_1_and_2(foreign: Foreign, name: str) -> Non
 
 @pytest.mark.parametrize("name", ["sh3-v3.spz", "hand-v4.spz", "tree-v2.spz", "tree-v3.spz"])
 def test_mkkelloggs_viewer_refuses_other_spz(foreign: Foreign, name: str) -> None:
-    """As docs/formats.md says: once this fails, its table has changed."""
+    """As docs/formats/spz.md says: once this fails, its table has changed."""
     with pytest.raises(AssertionError, match="reading 'shDegree'"):
         foreign.spz_centers(FIXTURES / "golden" / name)
 

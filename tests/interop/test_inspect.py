@@ -1,6 +1,6 @@
 """`inspect --check` reports the right facts and findings of trees from Spark's own builders.
 
-The expected ones are computed by slow, plain Python from the bytes of the file, as docs/formats.md describes them.
+The expected ones are computed by slow, plain Python from the bytes of the file, as docs/formats/ describes them.
 """
 
 from __future__ import annotations

@@ -21,7 +21,7 @@ Arrays = dict[str, NDArray[Any]]
 
 
 def pack(scene: Scene, encoding: str, threads: int = 1) -> Arrays:
-    """Return the arrays of a scene in one of `formats.ENCODINGS`, by name: uint32 words, see docs/formats.md."""
+    """Return the arrays of a scene in one of `formats.ENCODINGS`, by name: uint32 words, see docs/formats/memory.md."""
     module = import_module(f".{ENCODINGS[encoding]}", __package__)
     arrays: Arrays = module.dump(scene, threads=threads)
     return arrays

@@ -1,6 +1,6 @@
 """RAD, the file of Spark 2 whose Level-of-Detail tree a viewer streams in chunks of 65,536 nodes.
 
-A file is a header and its chunks, or a header that names a file for each chunk; `docs/formats.md` lays them out.
+A file is a header and its chunks, or a header that names a file for each chunk; `docs/formats/rad.md` lays them out.
 """
 
 from __future__ import annotations

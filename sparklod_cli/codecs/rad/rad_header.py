@@ -1,7 +1,7 @@
 """The headers of RAD files and of their chunks: JSON between a magic word and the bytes that it describes.
 
 A file is a header and its chunks, one after the other; or a header alone that names a file for each chunk. Every chunk
-has a header of its own, so that it can be decoded by itself. `docs/formats.md` lays both out.
+has a header of its own, so that it can be decoded by itself. `docs/formats/rad.md` lays both out.
 """
 
 from __future__ import annotations

@@ -67,7 +67,7 @@ def word(r: int, g: int, b: int, signs: int, exponent: int) -> int:
     ("rgb", "expected"),
     [
         ([0.5, -0.125, 0], word(255, 64, 0, 2, -1)),
-        ([0.375, -0.625, -0.6875], word(191, 255, 255, 6, -1)),  # cut off at 1 / 2: see docs/formats.md
+        ([0.375, -0.625, -0.6875], word(191, 255, 255, 6, -1)),  # cut off at 1 / 2: see docs/formats/memory.md
         ([0, 0, 0], word(0, 0, 0, 0, -15)),
         ([-0.0, 0, 1], word(0, 0, 255, 0, 0)),
         ([-1e-9, 0, 1], word(0, 0, 255, 1, 0)),

@@ -262,7 +262,7 @@ def test_few_different_sh_are_all_in_the_palette(shared: Scene) -> None:
 
 
 def test_a_palette_has_as_many_codes_as_the_first_chunk_has_splats_with_zeros_at_its_end(shared: Scene) -> None:
-    """Spark reads no other number, see docs/formats.md."""
+    """Spark reads no other number, see docs/formats/rad.md."""
     file = io.BytesIO(written(shared, sh_codes=64))
     header = read_header(file)
     palette = rad.read_chunk(file, header.chunks[0], header).palette

@@ -141,7 +141,7 @@ def test_a_continuous_cut_is_nearly_the_ordinary_one(tmp_path: Path) -> None:
     assert np.abs(hardly - ordinary).mean() < np.abs(blended - ordinary).mean()
 
 
-def test_the_page_about_render_lists_the_columns() -> None:
-    page = (ROOT / "docs" / "render.md").read_text()
+def test_the_page_about_comparing_lists_the_columns() -> None:
+    page = (ROOT / "docs" / "compare.md").read_text()
     rows = [f"| `{column.name}` | {column.unit} | {column.meaning} |" for column in COLUMNS]
     assert "\n".join(rows) in page
