@@ -239,6 +239,7 @@ def _job_of(
         how: dict[str, Any] = {"suffix": files.suffix, "options": options.write_options(), "threads": threads}
         return _one_by_one(functools.partial(extract_leaves, **how, **shared)), report_extracted
     from ..bake.flow import bake
+    from ..bake.stage_shares import stage_shares
 
     settings = options.bake_settings(ctx)
     make: Callable[..., Baked | None] = bake
@@ -249,9 +250,12 @@ def _job_of(
     resources = options.resources.resources()
     if engine is not None:
         resources = dataclasses.replace(resources, memory=engine.memory)
-    here = functools.partial(
-        make, settings=settings, resources=resources, engine=engine, threads=threads, say=console.say, **shared
-    )
+    how = {"settings": settings, "resources": resources, "engine": engine, "threads": threads, "say": console.say}
+
+    def here(source: Source, target: Place) -> Baked | None:
+        with console.job(stage_shares(settings)):
+            return make(source, target, **how, **shared)
+
     alone = _one_by_one(here)
     if engine is None:
         return alone, report_baked

@@ -6,7 +6,7 @@ import contextlib
 import json
 import os
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from time import monotonic
 from types import TracebackType
@@ -16,6 +16,7 @@ import click
 
 from ..support import interrupts
 from ..support.printable import MOST, printable
+from ..support.progress import StagedProgress
 from ..support.stdout import silence
 from ..support.units import count_of as count_of
 from ..support.units import format_size
@@ -25,6 +26,9 @@ WIDTH, NAMES, INDENT = 80, 13, 4
 
 #: Version of the fields that commands print with --json, but for inspect, whose report has a schema of its own.
 JSON_VERSION = 1
+
+#: The bar of a job of several stages, as tqdm formats it.
+JOB_BAR = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}, {remaining} left"
 
 #: Seconds between two lines of progress where standard error is a log.
 LOG_INTERVAL = 10
@@ -149,7 +153,8 @@ class Console:
         self._quiet, self._verbose = quiet, verbose
         self._bars = not quiet and is_terminal(sys.stderr)
         self._bar: Any = None
-        self._stage, self._stage_start, self._logged = "", 0.0, 0.0
+        self._stage, self._start, self._logged = "", 0.0, 0.0
+        self._job: StagedProgress | None = None
         self._ended = contextlib.ExitStack()
 
     def __enter__(self) -> Console:
@@ -187,27 +192,62 @@ class Console:
         if self._verbose:
             self.say(text)
 
-    def progress(self, stage: str, done: int, total: int, unit: str) -> None:
-        if not self._bars:
-            self._log_progress(stage, done, total, unit)
-            return
-        if self._bar is None or self._bar.desc != stage:
-            from tqdm import tqdm
-
+    @contextlib.contextmanager
+    def job(self, shares: Mapping[str, float]) -> Iterator[None]:
+        """Show the stages of what is done inside as one bar, with the time left; `shares` of `StagedProgress`."""
+        self.clear()
+        self._job, self._start = StagedProgress(shares), monotonic()
+        self._logged = self._start
+        try:
+            yield
+        finally:
             self.clear()
-            scaled = {"unit_scale": True, "unit": unit if unit == "B" else f" {unit}s"}
-            self._bar = tqdm(total=total, desc=stage, leave=False, file=sys.stderr, dynamic_ncols=True, **scaled)
-        self._bar.update(done - self._bar.n)
+            self._job, self._stage = None, ""
+
+    def progress(self, stage: str, done: int, total: int, unit: str) -> None:
+        if self._job is not None:
+            self._show_job(stage, self._job.reach(stage, done, total))
+        elif not self._bars:
+            self._log_progress(stage, done, total, unit)
+        else:
+            bar = self._bar
+            if bar is None or bar.desc != stage:
+                scaled = {"unit_scale": True, "unit": unit if unit == "B" else f" {unit}s"}
+                bar = self._open_bar(total=total, desc=stage, **scaled)
+            bar.update(done - bar.n)
+
+    def _open_bar(self, **how: Any) -> Any:
+        from tqdm import tqdm
+
+        self.clear()
+        self._bar = tqdm(leave=False, file=sys.stderr, dynamic_ncols=True, **how)
+        return self._bar
+
+    def _show_job(self, stage: str, reached: float) -> None:
+        """Show the stage of a job, how much of the job is done, and the time that the rest takes at that rate."""
+        now = monotonic()
+        if self._bars:
+            bar = self._bar
+            if bar is None:
+                bar = self._open_bar(total=1.0, desc=stage, initial=reached, bar_format=JOB_BAR, smoothing=0)
+                bar.initial, bar.start_t = 0, bar.start_t - (now - self._start)  # the rate is that of the whole job
+            bar.update(reached - bar.n)
+            if bar.desc != stage:
+                bar.set_description_str(stage)
+        elif now - self._logged >= LOG_INTERVAL:
+            self._logged = now
+            left = f", some {(now - self._start) * (1 / reached - 1):.0f} s left" if reached else ""
+            self.say(f"{stage}: {100 * reached:.0f} % done after {now - self._start:.0f} s{left}")
 
     def _log_progress(self, stage: str, done: int, total: int, unit: str) -> None:
         """Print a line about a stage that takes long, every `LOG_INTERVAL` seconds."""
         now = monotonic()
         if stage != self._stage:
-            self._stage, self._stage_start, self._logged = stage, now, now
+            self._stage, self._start, self._logged = stage, now, now
         if now - self._logged >= LOG_INTERVAL and done < total:
             self._logged = now
             amount = f"{format_size(done)} of {format_size(total)}" if unit == "B" else f"{done:,} of {total:,} {unit}s"
-            self.say(f"{stage}: {amount} ({100 * done / total:.0f} %), {now - self._stage_start:.0f} s")
+            self.say(f"{stage}: {amount} ({100 * done / total:.0f} %), {now - self._start:.0f} s")
 
     def announce_compiling(self) -> None:
         """Announce the first kernel that is compiled, show a bar, and print at the end how long all of them took.

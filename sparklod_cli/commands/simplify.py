@@ -211,17 +211,20 @@ def simplify(ctx: click.Context, /, **_: Any) -> None:
         console.announce_compiling()
         from ..bake.flow import bake
         from ..bake.settings import Resources
+        from ..bake.stage_shares import stage_shares
 
-        baked = bake(
-            files.source,
-            files.output,
-            options.settings(ctx),
-            overwrite=files.overwrite,
-            threads=general.threads,
-            progress=console.progress,
-            resources=Resources(memory=files.memory),
-            say=console.say,
-        )
+        settings = options.settings(ctx)
+        with console.job(stage_shares(settings)):
+            baked = bake(
+                files.source,
+                files.output,
+                settings,
+                overwrite=files.overwrite,
+                threads=general.threads,
+                progress=console.progress,
+                resources=Resources(memory=files.memory),
+                say=console.say,
+            )
         report_simplified(console, files.source, files.output, baked)
         if general.as_json:
             record = {**record_of(files.source), "output": str(files.output), **dataclasses.asdict(baked)}

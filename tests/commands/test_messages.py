@@ -202,6 +202,33 @@ def test_a_log_gets_a_line_of_a_long_stage_every_ten_seconds(quiet: bool, monkey
     assert log.getvalue().splitlines() == ([] if quiet else lines)
 
 
+def test_a_job_of_several_stages_is_one_bar_with_the_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.stderr", stream := Terminal())
+    with Console(quiet=False, verbose=False) as console:
+        with console.job({"reading": 1, "writing": 3}):
+            for stage, done in (("reading", 0), ("reading", 2), ("writing", 1), ("writing", 2)):
+                console.progress(stage, done, 2, "splat")
+                console.say(f"{stage} {done}")  # which takes the bar away and brings it back
+        console.progress("comparing", 1, 2, "frame")
+    text = stream.getvalue()
+    shares = [int(share) for share in re.findall(r"(?:reading|writing): +(\d+)%", text)]
+    assert shares == sorted(shares)
+    assert {25, 62, 100} <= set(shares)
+    assert " left" in text
+    assert "frames" in text  # after the job, a bar of one stage
+
+
+def test_a_log_gets_how_much_of_a_job_is_done_and_the_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    log, clock = io.StringIO(), iter([0, 4, 12, 15, 60])
+    monkeypatch.setattr("sys.stderr", log)
+    monkeypatch.setattr(console_module, "monotonic", lambda: next(clock))
+    with Console(quiet=False, verbose=False) as console, console.job({"reading": 1, "writing": 3}):
+        for stage, done in (("reading", 0), ("reading", 2), ("writing", 1), ("writing", 1)):
+            console.progress(stage, done, 2, "splat")
+    lines = ["reading: 25 % done after 12 s, some 36 s left", "writing: 62 % done after 60 s, some 36 s left"]
+    assert log.getvalue().splitlines() == lines
+
+
 def test_colour_is_for_terminals_that_want_it(monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value, colour in (("NO_COLOR", "", True), ("NO_COLOR", "1", False), ("TERM", "dumb", False)):
         with monkeypatch.context() as patch:

@@ -87,7 +87,12 @@ class InBlocks:
         job = self.job
         stages = [job.store.get(stage_of(stage.number)) for stage in job.blocks.stages]
         self.job = job = dataclasses.replace(job, families=tuple(int(stage["counts"][0]) for stage in stages))
-        self.engine.run("ordering", [Task(ORDER, put_order, weight=sum(job.families))], job, self.progress)
+        self.engine.run(
+            "arranging" if job.in_chunks else "ordering",
+            [Task(ORDER, put_order, weight=sum(job.families))],
+            job,
+            self.progress,
+        )
         self.clock.end("order")
         count, tree.levels = job.store.get(ORDER, ["counts"])["counts"].tolist()
         tree.statistics = Statistics.merged([Statistics.from_array(stage["statistics"]) for stage in stages])

@@ -75,10 +75,6 @@ def _places(splats: Splats) -> list[tuple[slice, Rows]]:
     return places
 
 
-#: Rows that are not wanted and read with those around them, rather than in another go. Chosen: some 10 KB.
-GAP = 128
-
-
 def node_stream(job: Job, count: int) -> NodeStream:
     """Return the nodes of a tree that is in order."""
     read = functools.partial(_read, job.store, width_of(job.sh_degree))
@@ -146,11 +142,6 @@ def _fill(
     store: Store, name: str, row: NDArray[np.int64], count: NDArray[np.int64], target: NDArray[np.int64], rows: Rows
 ) -> None:
     """Fill rows with the children of some families of a stage: of each `count` of them, from `row` on, at `target`."""
-    cuts = np.flatnonzero(row[1:] > row[:-1] + count[:-1] + GAP) + 1
-    for first, last in zip([0, *cuts.tolist()], [*cuts.tolist(), len(row)], strict=True):
-        begin, end, some = row[first], row[last - 1] + count[last - 1], count[first:last]
-        step = np.arange(some.sum()) - np.repeat(np.cumsum(some) - some, some)
-        found = store.rows(name, "rows", int(begin), int(end))
-        if len(step) < len(found):
-            found = found[np.repeat(row[first:last] - begin, some) + step]
-        rows[np.repeat(target[first:last], some) + step] = found
+    total = int(count.sum())
+    step = np.arange(total) - np.repeat(np.cumsum(count) - count, count)
+    rows[np.repeat(target, count) + step] = store.rows_at(name, "rows", np.repeat(row, count) + step)
