@@ -194,7 +194,17 @@ def test_a_section_that_fails_is_told_and_the_others_go_on(
 
     figures, page = tmp_path / "figures.json", tmp_path / "performance-viewing.md"
     modules("figures").write(figures, {"sizes": measured(modules, [], notes=["of before"])})
-    line = ["run_all.py", "--sections", "short", "sizes", "gradients", "--figures", str(figures), "--docs", str(tmp_path)]
+    line = [
+        "run_all.py",
+        "--sections",
+        "short",
+        "sizes",
+        "gradients",
+        "--figures",
+        str(figures),
+        "--docs",
+        str(tmp_path),
+    ]
     monkeypatch.setattr(run_all, "measured", made_up)
     monkeypatch.setattr(sys, "argv", line)
     assert run_all.main() == 1
