@@ -194,17 +194,8 @@ def test_a_section_that_fails_is_told_and_the_others_go_on(
 
     figures, page = tmp_path / "figures.json", tmp_path / "performance-viewing.md"
     modules("figures").write(figures, {"sizes": measured(modules, [], notes=["of before"])})
-    line = [
-        "run_all.py",
-        "--sections",
-        "short",
-        "sizes",
-        "gradients",
-        "--figures",
-        str(figures),
-        "--docs",
-        str(tmp_path),
-    ]
+    places = ["--figures", str(figures), "--docs", str(tmp_path)]
+    line = ["run_all.py", "--sections", "short", "sizes", "gradients", *places]
     monkeypatch.setattr(run_all, "measured", made_up)
     monkeypatch.setattr(sys, "argv", line)
     assert run_all.main() == 1
@@ -214,7 +205,7 @@ def test_a_section_that_fails_is_told_and_the_others_go_on(
     assert list(modules("figures").read(figures)) == ["sizes", "short", "gradients"]
     assert modules("figures").read(figures)["sizes"].notes == ["of before"]
     assert "| 20,000 | 100.0 | 200.0 (200.0 to 200.0) | 2.0 |" in page.read_text()
-    monkeypatch.setattr(sys, "argv", ["run_all.py", "--write-page", "--figures", str(figures), "--docs", str(tmp_path)])
+    monkeypatch.setattr(sys, "argv", ["run_all.py", "--write-page", *places])
     page.write_text("old")
     assert run_all.main() == 0
     assert "| 20,000 | 100.0 |" in page.read_text()
