@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from fidelity_report import columns, markdown, put_into
+from fidelity_report import add_docs, columns, markdown, put_into
 from fidelity_views import cameras_of, count_of, difference
 from scenes import load
 
@@ -136,8 +136,7 @@ def main() -> None:
     parser.add_argument("--method", choices=("quick", "quality"), default="quick", help="our builder")
     parser.add_argument("--size", type=int, nargs=2, default=(1280, 720), metavar=("WIDTH", "HEIGHT"))
     parser.add_argument("--views", type=int, default=4, help="of those that bench_fidelity.py looks from")
-    text = "pages of which one gets the table between its marks, docs/fidelity-tables.md"
-    parser.add_argument("--docs", type=Path, nargs="+", default=[], help=text)
+    add_docs(parser)
     arguments = parser.parse_args()
     rows = [
         row

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from bench_fidelity import MADE, scenes_of, size_of, sources
-from fidelity_report import columns, markdown, merged, put_into
+from fidelity_report import add_docs, columns, markdown, merged, put_into
 from fidelity_trees import METHODS, spark_command, spark_tree
 from fidelity_views import SIZE, Figures, FullDetail, cameras_of, count_of, of_tree
 from performance.machine import load, machine
@@ -287,8 +287,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="file for all numbers, with those of each camera")
     text = "JSONs of earlier runs, whose rows the table has as well; of what was measured twice, the later one counts"
     parser.add_argument("--results", type=Path, nargs="+", default=[], help=text)
-    text = "pages that get the tables between their marks, docs/fidelity.md and docs/fidelity-tables.md"
-    parser.add_argument("--docs", type=Path, nargs="+", default=[], help=text)
+    add_docs(parser)
     parser.set_defaults(growth=1.4, sh=False, trees=None)  # of `bench_fidelity.sources`
     arguments = parser.parse_args()
     if not (arguments.scenes or arguments.results):

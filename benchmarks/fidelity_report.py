@@ -1,7 +1,6 @@
 """Tables and curves of the records of `bench_fidelity.py`.
 
-python benchmarks/fidelity_report.py fidelity.json more.json --docs docs/fidelity.md docs/fidelity-tables.md \
-  --plot docs/images/fidelity.png
+python benchmarks/fidelity_report.py fidelity.json more.json --docs docs --plot docs/images/fidelity.png
 """
 
 from __future__ import annotations
@@ -204,19 +203,18 @@ def tables(record: dict[str, Any]) -> dict[str, str]:
     return {name: table for name, table in made.items() if table.count("\n") > 1}
 
 
-def put_into(pages: Sequence[Path], made: dict[str, str]) -> None:
-    """Put tables between their marks in the pages; a mark without a table keeps what it has.
+def put_into(docs: Path, made: dict[str, str]) -> None:
+    """Put tables between their marks in the pages of a folder; a mark without a table keeps what it has.
 
     Raises:
         SystemExit: a table has no mark.
     """
-    texts = {page: page.read_text(encoding="utf-8") for page in pages}
+    texts = {page: page.read_text(encoding="utf-8") for page in docs.glob("*.md")}
     for name, table in made.items():
         marks = re.compile(rf"(?<=<!-- table: {re.escape(name)} -->\n).*?(?=<!-- end of table -->)", re.DOTALL)
         place = next((page for page, text in texts.items() if marks.search(text)), None)
         if place is None:
-            names = ", ".join(map(str, pages))
-            raise SystemExit(f"{names}: no place for the table {name!r}: <!-- table: {name} --> and its end")
+            raise SystemExit(f"{docs}: no page with a place for the table {name!r}: <!-- table: {name} --> and its end")
         texts[place] = marks.sub(lambda _, table=table: f"{table}\n", texts[place], count=1)  # type: ignore[misc]
     for page, text in texts.items():
         page.write_text(text, encoding="utf-8")
@@ -263,7 +261,7 @@ def plot(file: Path, record: dict[str, Any]) -> None:
     figure.savefig(file, dpi=100)
 
 
-def report(record: dict[str, Any], docs: Sequence[Path], curves: Path | None) -> None:
+def report(record: dict[str, Any], docs: Path | None, curves: Path | None) -> None:
     """Print the tables, put them into pages, and draw the curves."""
     made = tables(record)
     print(f"{record['size'][0]} x {record['size'][1]} pixels.")
@@ -275,10 +273,14 @@ def report(record: dict[str, Any], docs: Sequence[Path], curves: Path | None) ->
         plot(curves, record)
 
 
+def add_docs(parser: argparse.ArgumentParser) -> None:
+    """Add the option `--docs`."""
+    parser.add_argument("--docs", type=Path, help="folder of the pages that get tables between their marks, docs")
+
+
 def add_outputs(parser: argparse.ArgumentParser) -> None:
     """Add the options that `bench_fidelity.py` has, too."""
-    text = "pages that get the tables between their marks, docs/fidelity.md and docs/fidelity-tables.md"
-    parser.add_argument("--docs", type=Path, nargs="+", default=[], help=text)
+    add_docs(parser)
     parser.add_argument("--plot", type=Path, help="file for the curves, such as fidelity.png; needs matplotlib")
 
 

@@ -1,6 +1,6 @@
-"""Measures every table of docs/performance.md and writes the page: `python benchmarks/run_all.py --help`.
+"""Measures every table of docs/performance*.md and writes the pages: `python benchmarks/run_all.py --help`.
 
-Each section is measured in a process of its own, between two calibrations of the machine; figures.json and the page
+Each section is measured in a process of its own, between two calibrations of the machine; figures.json and the pages
 are written after each, so that a run may be interrupted and go on with `--sections`. A section that fails keeps its
 earlier figures, and the others go on. At the end stands where figures fell behind the last committed ones.
 """
@@ -25,14 +25,14 @@ from performance.figures import Figures, Measured
 from performance.goal_list import GOALS
 from performance.goals import judged
 from performance.machine import load, whole_machine
-from performance.page import TEMPLATE, page
+from performance.page import PAGES, page, template, write_pages
 from performance.rows import Row
 from performance.sections import BY_NAME, SECTIONS
 
 HERE = Path(__file__).resolve().parent
 
 #: What is written, and where real scenes are looked for.
-FIGURES, PAGE = HERE / "figures.json", HERE.parent / "docs" / "performance.md"
+FIGURES, DOCS = HERE / "figures.json", HERE.parent / "docs"
 SCENES = Path(os.environ.get("SPARKLOD_SCENES") or HERE.parents[1] / "shared" / "scenes")
 
 
@@ -40,7 +40,7 @@ def main() -> int:
     """Measures, and returns 1 if a section failed."""
     arguments = _arguments()
     if arguments.write_page:
-        arguments.page.write_text(page(TEMPLATE.read_text(), store.read(arguments.figures)))
+        write_pages(arguments.docs, store.read(arguments.figures))
         return 0
     earlier = store.committed(arguments.figures)
     figures = {} if arguments.quick else store.read(arguments.figures)
@@ -65,9 +65,9 @@ def main() -> int:
             done.append(name)
             if not arguments.quick:
                 store.write(arguments.figures, figures)
-                arguments.page.write_text(page(TEMPLATE.read_text(), figures))
+                write_pages(arguments.docs, figures)
     if arguments.quick:
-        print(page(TEMPLATE.read_text(), figures))
+        print("\n".join(page(template(name), figures) for name in PAGES))
     _report(figures, {} if arguments.quick else earlier, done)
     print(f"\n{len(done)} sections in {time.perf_counter() - started:.0f} s")
     for name, error in failed.items():
@@ -110,14 +110,14 @@ def _arguments() -> argparse.Namespace:
         "--sections", nargs="+", choices=names, default=names, help="sections to measure (default: all)"
     )
     parser.add_argument("--runs", type=int, help="number of runs of each measurement (default: as many as suit it)")
-    parser.add_argument("--quick", action="store_true", help="small scenes, one run; print the page, write no file")
-    parser.add_argument("--write-page", action="store_true", help="only make the page of the figures, measure nothing")
+    parser.add_argument("--quick", action="store_true", help="small scenes, one run; print the pages, write no file")
+    parser.add_argument("--write-page", action="store_true", help="only make the pages of the figures, measure nothing")
     parser.add_argument("--large", action="store_true", help="also scenes of 10 to 20 million splats")
     parser.add_argument("--scenes", type=Path, default=SCENES, help="folder of real scenes (default: SPARKLOD_SCENES)")
     parser.add_argument("--native", type=Path, help="Spark's native build-lod; left out without")
     parser.add_argument("--scratch", type=Path, help="folder whose tiled scenes are kept (default: a temporary one)")
     parser.add_argument("--figures", type=Path, default=FIGURES, help="file of the figures (default: figures.json)")
-    parser.add_argument("--page", type=Path, default=PAGE, help="page to write (default: docs/performance.md)")
+    parser.add_argument("--docs", type=Path, default=DOCS, help="folder of the pages (default: docs)")
     return parser.parse_args()
 
 

@@ -1,4 +1,4 @@
-"""Measures all tables of docs/fidelity.md and docs/fidelity-tables.md, and draws their pictures: two hours.
+"""Measures all tables of docs/fidelity*.md and docs/refine-measured.md, and draws their pictures: two hours.
 
 SPARK_DIR=... ENGINES_DIR=... NANOGS_DIR=... python benchmarks/run_fidelity.py folder-of-scenes --json folder
 """
@@ -14,7 +14,6 @@ from fidelity_report import THIN_SCENES
 
 HERE = Path(__file__).parent
 DOCS = HERE.parent / "docs"
-PAGES: list[str | Path] = ["--docs", DOCS / "fidelity.md", DOCS / "fidelity-tables.md"]
 
 #: Real scenes of the table of refining.
 REFINED = ("biker.ply", "playbot-125k.ply", "meadow.sog")
@@ -40,7 +39,7 @@ def main() -> None:
         arguments.json / f"{name}.json" for name in ("builders", "refined", "blocks", "simplify")
     )
     real, sets = ["biker.ply", "meadow.sog"], ["photo-cloud", "loose-cloud"]
-    run("bench_simplify.py", *(arguments.scenes / name for name in real), *sets, "--json", simplify, *PAGES)
+    run("bench_simplify.py", *(arguments.scenes / name for name in real), *sets, "--json", simplify, "--docs", DOCS)
     spark = ["--methods", "spark-tiny", "spark-quality", "quick", "quality"]
     cameras = ["--cameras", "around", "near", "inside", "above", "--popping", "--sh"]
     made = ["glossy-knot", *THIN_SCENES]
@@ -50,9 +49,9 @@ def main() -> None:
     )
     few = [*(arguments.scenes / name for name in REFINED), "fine-structure"]
     run("bench_fidelity.py", *few, "--methods", "refined", "--cameras", "around", "inside", "--json", refined)
-    run("fidelity_report.py", builders, blocks, refined, *PAGES, "--plot", DOCS / "images" / "fidelity.png")
+    run("fidelity_report.py", builders, blocks, refined, "--docs", DOCS, "--plot", DOCS / "images" / "fidelity.png")
     rounded = ["biker.ply", "playbot-125k.ply", "meadow.sog", "playbot.sog"]
-    run("bench_rad_rounding.py", *(arguments.scenes / name for name in rounded), *PAGES)
+    run("bench_rad_rounding.py", *(arguments.scenes / name for name in rounded), "--docs", DOCS)
     pictured = ["--methods", "spark-quality", "quick", "quality"]
     run("fidelity_pictures.py", "fine-structure", DOCS / "images" / "fine-structure.webp", *pictured)
 

@@ -1,4 +1,4 @@
-"""docs/performance.md is made of its template and the committed figures; what is met or fell behind is computed.
+"""Pages of performance are made of their templates and the committed figures; what is met or fell behind is computed.
 
 Nothing is timed here: figures are the committed ones, or made up.
 """
@@ -32,19 +32,21 @@ def measured(modules: Any, rows: Sequence[Any], speed: float = 1.0, notes: Seque
     return made("2026-01-02", "a machine", 0.25, 7.0, calibration, calibration, rows, notes)
 
 
-def test_the_page_is_what_the_template_and_the_committed_figures_give(modules: Any) -> None:
+def test_the_pages_are_what_their_templates_and_the_committed_figures_give(modules: Any, tmp_path: Path) -> None:
     page = modules("page")
     figures = modules("figures").read(BENCHMARKS / "figures.json")
     assert figures, "figures.json is committed"
-    told = page.page(page.TEMPLATE.read_text(), figures)
-    assert (ROOT / "docs" / "performance.md").read_text() == told, "run `python benchmarks/run_all.py --write-page`"
+    page.write_pages(tmp_path, figures)
+    for name in page.PAGES:
+        told = (tmp_path / name).read_text()
+        assert (ROOT / "docs" / name).read_text() == told, "run `python benchmarks/run_all.py --write-page`"
 
 
 def test_every_section_and_every_goal_has_a_place(modules: Any) -> None:
     page, goals, sections = modules("page"), modules("goal_list").GOALS, modules("sections").SECTIONS
-    template = page.TEMPLATE.read_text()
-    assert page.places(template, "table") == [section.name for section in sections]
-    assert set(page.places(template, "goals")) == {goal.group for goal in goals}
+    templates = "".join(map(page.template, page.PAGES))
+    assert page.places(templates, "table") == [section.name for section in sections]
+    assert set(page.places(templates, "goals")) == {goal.group for goal in goals}
     assert {goal.section for goal in goals} <= {section.name for section in sections}
     assert all((goal.most is None) != (goal.least is None) for goal in goals), "one bound each"
     assert len({(goal.group, goal.text) for goal in goals}) == len(goals)
@@ -190,9 +192,10 @@ def test_a_section_that_fails_is_told_and_the_others_go_on(
             raise FileNotFoundError("there is no scene")
         return measured(modules, [row] if name == "gradients" else [])
 
-    figures, page = tmp_path / "figures.json", tmp_path / "page.md"
+    figures, page = tmp_path / "figures.json", tmp_path / "performance-viewing.md"
     modules("figures").write(figures, {"sizes": measured(modules, [], notes=["of before"])})
-    line = ["run_all.py", "--sections", "short", "sizes", "gradients", "--figures", str(figures), "--page", str(page)]
+    places = ["--figures", str(figures), "--docs", str(tmp_path)]
+    line = ["run_all.py", "--sections", "short", "sizes", "gradients", *places]
     monkeypatch.setattr(run_all, "measured", made_up)
     monkeypatch.setattr(sys, "argv", line)
     assert run_all.main() == 1
@@ -202,7 +205,7 @@ def test_a_section_that_fails_is_told_and_the_others_go_on(
     assert list(modules("figures").read(figures)) == ["sizes", "short", "gradients"]
     assert modules("figures").read(figures)["sizes"].notes == ["of before"]
     assert "| 20,000 | 100.0 | 200.0 (200.0 to 200.0) | 2.0 |" in page.read_text()
-    monkeypatch.setattr(sys, "argv", ["run_all.py", "--write-page", "--figures", str(figures), "--page", str(page)])
+    monkeypatch.setattr(sys, "argv", ["run_all.py", "--write-page", *places])
     page.write_text("old")
     assert run_all.main() == 0
     assert "| 20,000 | 100.0 |" in page.read_text()

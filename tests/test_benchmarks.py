@@ -106,20 +106,20 @@ def test_tables_of_fidelity_go_between_their_marks(benchmark_module: Any, tmp_pa
     page.write_text("before\n<!-- table: ssim -->\nold\n<!-- end of table -->\nafter\n")
     other = tmp_path / "other.md"
     other.write_text("no table\n")
-    report.put_into([other, page], {"ssim": "| new |"})
+    report.put_into(tmp_path, {"ssim": "| new |"})
     assert other.read_text() == "no table\n"
     assert page.read_text() == "before\n<!-- table: ssim -->\n| new |\n<!-- end of table -->\nafter\n"
-    with pytest.raises(SystemExit, match="no place for the table 'edges'"):
-        report.put_into([other, page], {"edges": "| new |"})
+    with pytest.raises(SystemExit, match="no page with a place for the table 'edges'"):
+        report.put_into(tmp_path, {"edges": "| new |"})
 
 
 def test_the_pages_about_fidelity_have_a_place_for_every_table(benchmark_module: Any, tmp_path: Path) -> None:
     report = benchmark_module("fidelity_report")
-    pages = _copies(tmp_path)
     tables = report.tables(record("around", "near", "orbit", "around SH"))
     assert len(tables) == 9
-    report.put_into(pages, tables | {"blocks": "| blocks |", "rounding": "| rounding |"})
-    text = "".join(page.read_text() for page in pages)
+    docs = _copied(tmp_path)
+    report.put_into(docs, tables | {"blocks": "| blocks |", "rounding": "| rounding |"})
+    text = "".join(page.read_text() for page in docs.glob("*.md"))
     assert all(table in text for table in tables.values())
 
 
@@ -202,13 +202,16 @@ def test_simplified_scenes_are_measured_as_whole_processes(
     assert f"| a.ply | NanoGS | all | {psnr['nanogs']:.2f} |" in tables["simplify"]
     assert tables["sets"].count("\n") == 3, "no cuts"
     assert "| photo-cloud.ply" not in bench.tables({"photo-cloud.ply": found})["simplify"], "a made scene"
-    benchmark_module("fidelity_report").put_into(_copies(tmp_path), tables)
+    benchmark_module("fidelity_report").put_into(_copied(tmp_path), tables)
 
 
-def _copies(folder: Path) -> list[Path]:
-    """Return copies of the pages about fidelity."""
-    names = ("fidelity.md", "fidelity-tables.md")
-    return [Path(shutil.copy(ROOT / "docs" / name, folder / name)) for name in names]
+def _copied(folder: Path) -> Path:
+    """Return a copy of the folder of pages."""
+    docs = folder / "docs"
+    docs.mkdir()
+    for page in (ROOT / "docs").glob("*.md"):
+        shutil.copy(page, docs)
+    return docs
 
 
 def test_simplifiers_that_are_missing_are_skipped_with_a_reason(

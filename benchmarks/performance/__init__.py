@@ -1,1 +1,1 @@
-"""What `run_all.py` and the benchmarks of docs/performance.md share: measuring, tables, figures, goals, the page."""
+"""What `run_all.py` and the benchmarks of docs/performance*.md share: measuring, tables, figures, goals, pages."""

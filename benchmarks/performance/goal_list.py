@@ -1,4 +1,4 @@
-"""The goals of docs/performance.md, each with the figure that meets or misses it; they stand here only."""
+"""The goals of docs/performance*.md, each with the figure that meets or misses it; they stand here only."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""docs/performance.md, made of a template and figures.
+"""The pages docs/performance*.md, each made of a template and figures.
 
 A line of the template that is only `{{ table NAME }}` becomes the table of a section, with when and how fast a machine
-measured it; `{{ goals GROUP }}` the goals of a part of the page, met or missed; `{{ machine }}` the machine.
+measured it; `{{ goals GROUP }}` the goals of a part of a page, met or missed; `{{ machine }}` the machine.
 """
 
 from __future__ import annotations
@@ -15,7 +15,14 @@ from performance.goal_list import GOALS
 from performance.goals import table as goals_table
 from performance.sections import BY_NAME
 
-TEMPLATE = Path(__file__).with_name("performance.md.template")
+#: Pages in the order of reading; each has its template beside this module.
+PAGES = (
+    "performance.md",
+    "performance-baking.md",
+    "performance-files.md",
+    "performance-viewing.md",
+    "performance-cuts.md",
+)
 
 #: A line that is filled in: what, and of what.
 PLACE = re.compile(r"^\{\{ (table|goals|machine) ?([a-z-]*) \}\}$", re.MULTILINE)
@@ -23,6 +30,17 @@ PLACE = re.compile(r"^\{\{ (table|goals|machine) ?([a-z-]*) \}\}$", re.MULTILINE
 
 class TemplateError(Exception):
     """The template asks for something that there is not."""
+
+
+def template(name: str) -> str:
+    """Return the template of a page."""
+    return Path(__file__).with_name(f"{name}.template").read_text()
+
+
+def write_pages(docs: Path, figures: Figures) -> None:
+    """Write all pages to a folder."""
+    for name in PAGES:
+        (docs / name).write_text(page(template(name), figures))
 
 
 def page(template: str, figures: Figures) -> str:

@@ -1,4 +1,4 @@
-"""The sections that `run_all.py` measures: each makes the rows of one table of docs/performance.md."""
+"""The sections that `run_all.py` measures: each makes the rows of one table of docs/performance*.md."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class Section:
     """A table and how its rows are measured.
 
     Attributes:
-        name: of the section, in figures.json and in the template of the page.
+        name: of the section, in figures.json and in the template of its page.
         module: which has the table.
         table: its name there.
         measure: makes the rows, with settings of a run.
@@ -177,22 +177,22 @@ def _cuts(bench: Any, context: Context, flights: Any, budgets: Any) -> Iterable[
             spark.close()
 
 
-#: In the order of the page.
+#: In the order of the pages.
 SECTIONS = (
     Section("short", "bench_short", "TABLE", _short),
     Section("bakes", "bench_rad", "TIMES", _bakes),
+    Section("compiling", "bench_compile", "TABLE", _compiling),
     Section("quick", "bench_build", "TABLE", _quick),
-    Section("sizes", "bench_size", "TABLE", _sizes),
     Section("quality", "bench_build", "TABLE", _quality),
     Section("busy", "bench_busy", "TABLE", _busy),
+    Section("sizes", "bench_size", "TABLE", _sizes),
     Section("rad-sizes", "bench_rad", "SIZES", _rad),
-    Section("compiling", "bench_compile", "TABLE", _compiling),
     Section("decoding", "bench_decode", "TABLE", _decoding),
     Section("inspecting", "bench_inspect", "TABLE", _inspecting),
-    Section("gradients", "bench_gradients", "TABLE", _gradients),
     Section("rendering-scattered", "bench_render", "SCATTERED", _scattered),
     Section("rendering-views", "bench_render", "VIEWS", _views),
     Section("rendering-commands", "bench_render", "COMMAND", _commands),
+    Section("gradients", "bench_gradients", "TABLE", _gradients),
     Section("cuts-tiled", "bench_traverse", "TILED", _tiled_cuts),
     Section("cuts-views", "bench_traverse", "REAL", _real_cuts),
 )
