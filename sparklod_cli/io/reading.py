@@ -132,7 +132,7 @@ def opened(path: Place) -> Iterator[tuple[BinaryIO, Format, dict[str, Any]]]:
             path = in_folder(path)
         if path != DASH and path.exists() and not path.is_file():
             raise UnreadableError("it is a pipe or a device; save it to a file first")
-        with _file_of(path) as file:
+        with file_of(path) as file:
             head = file.read(HEAD)
             file.seek(0)
             if not head:
@@ -174,7 +174,7 @@ def read_arrays(path: Path) -> dump.Arrays | None:
     try:
         if path != DASH and not path.is_file():
             return None
-        with _file_of(path) as file:
+        with file_of(path) as file:
             if file.read(len(ZIP)) != ZIP:
                 return None
             return dump.decode_npz(file)
@@ -182,7 +182,7 @@ def read_arrays(path: Path) -> dump.Arrays | None:
         return None
 
 
-def _file_of(path: Place) -> contextlib.AbstractContextManager[BinaryIO]:
+def file_of(path: Place) -> contextlib.AbstractContextManager[BinaryIO]:
     """Return a file that is closed at the end, or standard input, which is not."""
     return contextlib.nullcontext(spooled()) if path == DASH else path.open("rb")
 

@@ -28,10 +28,9 @@ PALETTE = tree(24, max_sh=2, palette=True)
 
 
 def facts_of(path: Path) -> rad.RadFacts:
-    found = rad.survey(path, check=False)
-    assert found is not None
-    assert found.facts is not None
-    return found.facts
+    facts = inspect(path, ReportSettings(headers_only=True))[0].rad
+    assert facts is not None
+    return facts
 
 
 @pytest.mark.parametrize("chunked", [False, True])
