@@ -53,7 +53,7 @@ def pack(
         rows["child_count"] = tree.child_count[part]
         rows["child_start"] = tree.child_start[part]
 
-    for_blocks(encode, len(splats), threads, lambda _: None)
+    for_blocks(encode, len(splats), threads)
     return {"lod_tree": words}
 
 
