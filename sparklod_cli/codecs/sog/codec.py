@@ -82,9 +82,8 @@ def open_content(source: Source) -> Content:
         return sorted(steps, key=lambda step: (step.texture == "shN", -files.bytes_of(step.texture, step.index)))
 
     def unpacked() -> Iterator[bytes]:
-        for number, step in enumerate(in_order(), 1):
+        for step in in_order():
             yield files.pixels(step.texture, step.index, count).tobytes()
-            source.progress("reading", number * count, len(steps) * count, "texel")
 
     def fill(target: Target, threads: int, progress: Progress) -> None:
         if palette is not None:
