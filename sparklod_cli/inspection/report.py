@@ -10,7 +10,7 @@ from typing import Any
 
 from ..codecs.spz_streams import KNOWN_FLAGS
 from ..codecs.tiles_3d.codec import NOT_PLACED
-from ..io import examine_scene, opened, read_arrays, size_of_input
+from ..io import opened, read_arrays, read_scene, size_of_input
 from ..io.rad_file import RadFile
 from ..model.scene import Scene
 from ..model.sh import COEFFICIENTS
@@ -172,7 +172,7 @@ def inspect(
             # Only SPZ files are read by columns. None of their codes is invalid but positions of version 1.
             needed = OF_VALUES | (OF_STATISTICS if settings.values and settings.all_quantities else set())
             unread, columns = columns - needed, columns & needed
-        scene = examine_scene(path, columns=columns, threads=threads, progress=progress)
+        scene = read_scene(path, columns=columns, threads=threads, progress=progress, validate=False)
     except FormatError as error:
         found = surveyed.findings if surveyed is not None and settings.check else []
         known = any(each.code == error.code for each in found)

@@ -31,20 +31,26 @@ ZIP = b"PK\x03\x04"
 
 
 def read_scene(
-    path: Place, *, columns: Collection[str] = COLUMNS, threads: int = 1, progress: Progress = silent
+    path: Place,
+    *,
+    columns: Collection[str] = COLUMNS,
+    threads: int = 1,
+    progress: Progress = silent,
+    validate: bool = True,
 ) -> Scene:
     """Read a splat file of any known format, told by its content, or else by its suffix.
 
     Args:
         path: of a file, or of a folder that holds an unpacked SOG or a Streamed SOG; - is standard input.
         columns: of the splats that are needed; the others may be 0.
+        validate: refuse a broken tree.
 
     Raises:
         FormatError: it is not a file, empty, of no known format, or broken.
     """
     with opened(path) as (file, form, more):
         content: Content = form.codec().open_content(Source(file, threads=threads, **more))
-        return content.scene(columns=columns, threads=threads, progress=progress)
+        return content.scene(columns=columns, threads=threads, progress=progress, validate=validate)
 
 
 def read_stored(path: Place) -> Stored:
@@ -105,19 +111,6 @@ def format_of(path: Place) -> Format:
     """
     with opened(path) as (_, form, _):
         return form
-
-
-def examine_scene(
-    path: Place, *, columns: Collection[str] = COLUMNS, threads: int = 1, progress: Progress = silent
-) -> Scene:
-    """Read a splat file for a report on it: its tree may be broken, and columns that are not asked for may be 0.
-
-    Raises:
-        FormatError: as `read_scene`, but for the tree.
-    """
-    with opened(path) as (file, form, more):
-        content: Content = form.codec().open_content(Source(file, threads=threads, **more))
-        return content.scene(columns=columns, threads=threads, progress=progress, validate=False)
 
 
 @contextlib.contextmanager
