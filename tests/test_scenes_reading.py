@@ -139,13 +139,13 @@ def test_precision_float16_is_what_float16_holds() -> None:
 
 def test_a_file_is_read_once(monkeypatch: pytest.MonkeyPatch) -> None:
     read: list[Path] = []
-    examine: Callable[..., object] = reading.examine_scene
+    original: Callable[..., object] = reading.read_scene
 
     def counted(file: Path, **settings: object) -> object:
         read.append(file)
-        return examine(file, **settings)
+        return original(file, **settings)
 
-    monkeypatch.setattr(reading, "examine_scene", counted)
+    monkeypatch.setattr(reading, "read_scene", counted)
     assert len(read_scenes(five()).trees) == 3
     assert read == [TREE, TOWN, HAND]
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..io import examine_scene, rad_file, read_scene
+from ..io import rad_file, read_scene
 from ..model.scene import Scene, Tree
 from ..model.splats import COLUMNS, FloatArray
 from ..support.errors import FormatError, InvalidSplatsError, TreeError, memory_errors_translated
@@ -55,7 +55,7 @@ def read(
             unknown = sorted(set(columns) - set(COLUMNS))
             if unknown:
                 raise ValueError(f"there is no column {', '.join(unknown)}; give some of {', '.join(COLUMNS)}")
-            scene = examine_scene(path, columns=columns, threads=count, progress=callback)
+            scene = read_scene(path, columns=columns, threads=count, progress=callback, validate=False)
         if scene.tree is not None:
             scene.tree.validate()
     return as_tree(scene)

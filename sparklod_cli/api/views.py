@@ -99,7 +99,7 @@ def render(
     Raises:
         BackendError: the backend cannot draw here.
         InvalidSplatsError: a scene has nothing to draw.
-        ValueError: there is no such backend.
+        ValueError: there is no such backend, or it does not draw on the device.
     """
     camera_like(camera)
     settings = settings or RenderSettings()

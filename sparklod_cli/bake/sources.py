@@ -81,9 +81,7 @@ def read_source(source: Source, *, threads: int = 1, progress: Progress = silent
 
 
 @contextlib.contextmanager
-def opened_source(
-    source: Source, *, scratch: Path | None = None, threads: int = 1, progress: Progress = silent
-) -> Iterator[SceneStream]:
+def opened_source(source: Source, *, scratch: Path | None = None, threads: int = 1) -> Iterator[SceneStream]:
     """Yield a source as a stream.
 
     Args:
@@ -95,8 +93,8 @@ def opened_source(
     """
     keep = scratch is not None
     if isinstance(source, Merged):
-        opened = open_streams(source.files, scratch=scratch, keep=keep, threads=threads, progress=progress)
+        opened = open_streams(source.files, scratch=scratch, keep=keep, threads=threads)
     else:
-        opened = open_stream(source, scratch=scratch, keep=keep, threads=threads, progress=progress)
+        opened = open_stream(source, scratch=scratch, keep=keep, threads=threads)
     with opened as stream:
         yield stream

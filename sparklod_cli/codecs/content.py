@@ -36,14 +36,12 @@ class Source:
         open_companion: opens the files that it names; None if there are none to open.
         scratch: keeps what has to be unpacked before rows can be read in any order; None to read all rows once.
         threads: to inflate on.
-        progress: called while a file is unpacked to `scratch`.
     """
 
     file: BinaryIO
     open_companion: OpenCompanion | None = None
     scratch: Scratch | None = None
     threads: int = 1
-    progress: Progress = silent
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,7 +170,7 @@ def decoder(open_content: Callable[[Source], Content]) -> Callable[..., Scene]:
         progress: Progress = silent,
         **more: Any,
     ) -> Scene:
-        content = open_content(Source(file, open_companion, None, threads, progress))
+        content = open_content(Source(file, open_companion, threads=threads))
         return content.scene(threads=threads, progress=progress, **more)
 
     return decode

@@ -190,11 +190,8 @@ def _open(source: Source) -> tuple[Content, Layout, Iterator[StreamRows]]:
             layout, rows = _read_gzip(Inflate(file, source.threads), size, header)
 
     def unpacked() -> Iterator[bytes]:
-        done = 0
         for _, _, codes in rows:
             yield codes.tobytes()
-            done += codes.size
-            source.progress("reading", done, layout.total, "B")
 
     def read(target: Target) -> Iterator[StreamRows]:
         if source.scratch is None:

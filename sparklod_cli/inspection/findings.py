@@ -153,15 +153,23 @@ class HeaderScan:
 
     Attributes:
         field: of the report that has the facts, "rad", "streamed_sog" or "tiles".
+        violations: broken rules.
         head: what a report begins with; None where `facts` is.
         facts: `RadFacts`, `StreamedSogFacts` or `TileFacts`; None where a rule is broken without which the rest cannot
             be trusted.
-        findings: broken rules, one for each code.
-        fatal: findings because of which the file cannot be read.
     """
 
     field: str
-    head: Head | None
-    facts: Any
-    findings: list[Finding]
-    fatal: list[Finding]
+    violations: Sequence[RuleViolation]
+    head: Head | None = None
+    facts: Any = None
+
+    @property
+    def findings(self) -> list[Finding]:
+        """Broken rules, one finding for each code."""
+        return findings_of(self.violations)
+
+    @property
+    def fatal(self) -> list[Finding]:
+        """Findings because of which the file cannot be read."""
+        return findings_of(each for each in self.violations if each.fatal)

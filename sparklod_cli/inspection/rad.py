@@ -4,20 +4,17 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field, replace
-from pathlib import Path
+from typing import BinaryIO
 
+from ..codecs.content import OpenCompanion
 from ..codecs.rad.property_codings import LARGEST_F16
 from ..codecs.rad.rad_header import ENCODING_KEYS, RadChunkHeader, RadHeader
 from ..codecs.rad.rad_layout import BY_NAME, PROPERTIES, SIZES
 from ..codecs.rad.rad_reader import scan_chunks, scan_header
 from ..codecs.splat_encoding import log_scale_table
-from ..io import opened
 from ..support.printable import MOST, printable
-from .findings import ChunkBytes, Head, HeaderScan, findings_of
+from .findings import ChunkBytes, Head, HeaderScan
 from .value_checks import Ends
-
-#: Name of the format in `codecs.formats`.
-FORMAT = "RAD"
 
 
 @dataclass(frozen=True)
@@ -47,33 +44,27 @@ class RadFacts:
     properties: dict[str, PropertyFacts]
 
 
-def survey(path: Path, *, check: bool) -> HeaderScan | None:
-    """Read the headers of a RAD file and of its chunks; None for a file of another format.
+def survey(file: BinaryIO, open_companion: OpenCompanion, *, check: bool) -> HeaderScan:
+    """Read the headers of a RAD file and of its chunks.
 
     Args:
-        path: of the file; - is standard input.
         check: look at the padding of properties, too.
 
     Raises:
-        FormatError: the header of the file cannot be read, or the path no splat file.
+        FormatError: the header of the file cannot be read.
     """
-    with opened(path) as (file, form, more):
-        if form.name != FORMAT:
-            return None
-        header, violations = scan_header(file, more["open_companion"])
-        gathered = _Gathered()
-        if not any(each.fatal for each in violations):
-            for chunk in scan_chunks(file, more["open_companion"], header, paddings=check):
-                violations += chunk.violations
-                if chunk.header is not None:
-                    gathered.add(chunk.header)
-    fatal = findings_of(each for each in violations if each.fatal)
-    if fatal:
-        return HeaderScan("rad", None, None, findings_of(violations), fatal)
-    facts = _facts(header, gathered)
-    noted = header.noted
+    header, violations = scan_header(file, open_companion)
+    gathered = _Gathered()
+    if not any(each.fatal for each in violations):
+        for chunk in scan_chunks(file, open_companion, header, paddings=check):
+            violations += chunk.violations
+            if chunk.header is not None:
+                gathered.add(chunk.header)
+    if any(each.fatal for each in violations):
+        return HeaderScan("rad", violations)
+    facts, noted = _facts(header, gathered), header.noted
     head = Head(header.format, facts.bytes, header.count, header.max_sh, noted.antialiased, noted.up)
-    return HeaderScan("rad", head, facts, findings_of(violations), [])
+    return HeaderScan("rad", violations, head, facts)
 
 
 @dataclass

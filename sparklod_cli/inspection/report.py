@@ -10,7 +10,7 @@ from typing import Any
 
 from ..codecs.spz_streams import KNOWN_FLAGS
 from ..codecs.tiles_3d.codec import NOT_PLACED
-from ..io import examine_scene, read_arrays, size_of_input
+from ..io import opened, read_arrays, read_scene, size_of_input
 from ..io.rad_file import RadFile
 from ..model.scene import Scene
 from ..model.sh import COEFFICIENTS
@@ -158,11 +158,7 @@ def inspect(
             fields, scene_of_arrays = arrays.examine(held, settings, threads=threads)
             each = round(size / fields["splats"], 3) if size and fields["splats"] else None
             return Report(str(path), size, bytes_per_splat=each, **fields), scene_of_arrays
-        surveyed = (
-            rad.survey(path, check=settings.check)
-            or streamed_sog.survey(path, check=settings.check, threads=threads, progress=progress)
-            or tiles.survey(path, check=settings.check, threads=threads, progress=progress)
-        )
+        surveyed = _surveyed(path, settings.check, threads, progress)
         if surveyed is not None and surveyed.facts is None:
             return Report(str(path), size, findings=surveyed.findings if settings.check else surveyed.fatal), None
         if surveyed is not None and settings.headers_only:
@@ -176,7 +172,7 @@ def inspect(
             # Only SPZ files are read by columns. None of their codes is invalid but positions of version 1.
             needed = OF_VALUES | (OF_STATISTICS if settings.values and settings.all_quantities else set())
             unread, columns = columns - needed, columns & needed
-        scene = examine_scene(path, columns=columns, threads=threads, progress=progress)
+        scene = read_scene(path, columns=columns, threads=threads, progress=progress, validate=False)
     except FormatError as error:
         found = surveyed.findings if surveyed is not None and settings.check else []
         known = any(each.code == error.code for each in found)
@@ -184,6 +180,17 @@ def inspect(
     partial = surveyed is None and settings.at_once is not True and "fractional_bits" in scene.header
     blocks = ReportBlocks.of(scene, unread if partial else ())
     return _of_blocks(path, blocks, columns, size, settings, surveyed, threads), None if partial else scene
+
+
+def _surveyed(path: Path, check: bool, threads: int, progress: Progress) -> HeaderScan | None:
+    """Return what the headers of a file tell; None for formats of which they tell little."""
+    with opened(path) as (file, form, more):
+        if form.name == "RAD":
+            return rad.survey(file, more["open_companion"], check=check)
+        survey = {"Streamed SOG": streamed_sog.survey, "3D Tiles": tiles.survey}.get(form.name)
+        if survey is None:
+            return None
+        return survey(file, more["open_companion"], check=check, threads=threads, progress=progress)
 
 
 def _of_blocks(

@@ -4,22 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from typing import BinaryIO
 
+from ..codecs.content import OpenCompanion
 from ..codecs.scene_files import Chunk
 from ..codecs.stream import size_of
 from ..codecs.streamed_sog.manifest import VERSION, Manifest, ManifestNode
 from ..codecs.streamed_sog.manifest_rules import level_counts, scan_files, scan_splats
-from ..io import opened
 from ..support.printable import MOST, printable
 from ..support.progress import Progress, silent
 from ..support.untrusted import LARGEST
-from .findings import ChunkBytes, Head, HeaderScan, findings_of
+from .findings import ChunkBytes, Head, HeaderScan
 from .quantiles import quantiles_of
 from .values import Box
-
-#: Name of the format in `codecs.formats`.
-FORMAT = "Streamed SOG"
 
 
 @dataclass(frozen=True)
@@ -62,30 +59,26 @@ class StreamedSogFacts:
     environment: EnvironmentFacts | None
 
 
-def survey(path: Path, *, check: bool, threads: int = 1, progress: Progress = silent) -> HeaderScan | None:
-    """Read a manifest and the headers of its chunk files; None for a file of another format.
+def survey(
+    file: BinaryIO, open_companion: OpenCompanion, *, check: bool, threads: int = 1, progress: Progress = silent
+) -> HeaderScan:
+    """Read a manifest and the headers of its chunk files.
 
     Args:
-        path: of the manifest, or of its folder; - is standard input.
         check: decode the chunk files and look at their splats, too.
 
     Raises:
-        FormatError: the manifest cannot be parsed, or the path is no splat file.
+        FormatError: the manifest cannot be parsed.
     """
-    with opened(path) as (file, form, more):
-        if form.name != FORMAT:
-            return None
-        size = size_of(file)
-        manifest, files, violations = scan_files(file, more["open_companion"])
-        fatal = [each for each in violations if each.fatal]
-        if fatal:
-            return HeaderScan("streamed_sog", None, None, findings_of(violations), findings_of(fatal))
-        if check:
-            found = scan_splats(more["open_companion"], manifest, files, threads=threads, progress=progress)
-            violations = [*violations, *found]
+    size = size_of(file)
+    manifest, files, violations = scan_files(file, open_companion)
+    if any(each.fatal for each in violations):
+        return HeaderScan("streamed_sog", violations)
+    if check:
+        violations += scan_splats(open_companion, manifest, files, threads=threads, progress=progress)
     chunks = {name: chunk for name, chunk in files.items() if isinstance(chunk, Chunk)}
     facts = _facts(manifest, chunks, size)
-    return HeaderScan("streamed_sog", _head(manifest, chunks, facts), facts, findings_of(violations), [])
+    return HeaderScan("streamed_sog", violations, _head(manifest, chunks, facts), facts)
 
 
 def _head(manifest: Manifest, chunks: Mapping[str, Chunk], facts: StreamedSogFacts) -> Head:
@@ -97,7 +90,7 @@ def _head(manifest: Manifest, chunks: Mapping[str, Chunk], facts: StreamedSogFac
         count += chunks[manifest.environment].count
     degree = max((chunk.sh_degree for chunk in read), default=0)
     antialiased = any(chunk.antialiased for chunk in read)
-    return Head(f"{FORMAT} {VERSION}", facts.bytes, count, degree, antialiased, manifest.noted.up)
+    return Head(f"Streamed SOG {VERSION}", facts.bytes, count, degree, antialiased, manifest.noted.up)
 
 
 def _names_of(manifest: Manifest, level: int) -> list[str]:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
+from ..codecs.content import OpenCompanion
 from ..codecs.scene_files import Chunk
 from ..codecs.tiles_3d.codec import tile_files
 from ..codecs.tiles_3d.tileset import MAX_TILESET, Tileset, read_whole
@@ -20,16 +21,12 @@ from ..codecs.tiles_3d.tileset_rules import (
     scan_splats,
     violations,
 )
-from ..io import opened
 from ..model.georeference import EarthPlace, place_of
 from ..model.transforms import common
 from ..support.printable import MOST, printable
 from ..support.progress import Progress, silent
-from .findings import ChunkBytes, Head, HeaderScan, findings_of
+from .findings import ChunkBytes, Head, HeaderScan
 from .quantiles import quantiles_of
-
-#: Name of the format in `codecs.formats`.
-FORMAT = "3D Tiles"
 
 #: Distance from the centre of the Earth, metres, from which on a transform places a tileset on it. Chosen.
 ON_EARTH = 1e6
@@ -65,43 +62,40 @@ class TileFacts:
     georeference: EarthPlace | None
 
 
-def survey(path: Path, *, check: bool, threads: int = 1, progress: Progress = silent) -> HeaderScan | None:
-    """Read a tileset and the headers of its tiles; None for a file of another format.
+def survey(
+    file: BinaryIO, open_companion: OpenCompanion, *, check: bool, threads: int = 1, progress: Progress = silent
+) -> HeaderScan:
+    """Read a tileset and the headers of its tiles.
 
     Args:
-        path: of the tileset.json, or of its folder; - is standard input.
         check: decode the tiles and look at their splats, too.
 
     Raises:
-        FormatError: a tileset file cannot be parsed, or the path is no splat file.
+        FormatError: a tileset file cannot be parsed.
     """
-    with opened(path) as (file, form, more):
-        if form.name != FORMAT:
-            return None
-        tileset = read_whole(file.read(MAX_TILESET + 1), more["open_companion"])
-        found = list(read_violations(tileset))
-        if not found:
-            found += violations(tileset)
-        fatal, chunks = [each for each in found if each.fatal], dict[int, Chunk]()
-        if not fatal:
-            matrices = matrices_of(tileset)
-            named = {name: matrices[at] for at, tile in enumerate(tileset.tiles) if (name := tile.name) is not None}
-            files = tile_files(more["open_companion"], named)
-            chunks, about_files = scan_files(tileset, files)
-            found += about_files
-            fatal = [each for each in found if each.fatal]
-        if fatal:
-            return HeaderScan("tiles", None, None, findings_of(found), findings_of(fatal))
-        if check:
-            found += scan_splats(tileset, files, chunks, threads=threads, progress=progress)
-    return HeaderScan("tiles", _head(tileset, chunks), _facts(tileset, chunks), findings_of(found), [])
+    tileset = read_whole(file.read(MAX_TILESET + 1), open_companion)
+    found = list(read_violations(tileset))
+    if not found:
+        found += violations(tileset)
+    if any(each.fatal for each in found):
+        return HeaderScan("tiles", found)
+    matrices = matrices_of(tileset)
+    named = {name: matrices[at] for at, tile in enumerate(tileset.tiles) if (name := tile.name) is not None}
+    files = tile_files(open_companion, named)
+    chunks, about_files = scan_files(tileset, files)
+    found += about_files
+    if any(each.fatal for each in found):
+        return HeaderScan("tiles", found)
+    if check:
+        found += scan_splats(tileset, files, chunks, threads=threads, progress=progress)
+    return HeaderScan("tiles", found, _head(tileset, chunks), _facts(tileset, chunks))
 
 
 def _head(tileset: Tileset, chunks: Mapping[int, Chunk]) -> Head:
     """As reading the tiles without children gives it."""
     read = [chunk for number, chunk in chunks.items() if not tileset.tiles[number].children]
     return Head(
-        f"{FORMAT} {tileset.head['asset']['version']} of {read[0].format}" if read else FORMAT,
+        f"3D Tiles {tileset.head['asset']['version']} of {read[0].format}" if read else "3D Tiles",
         tileset.bytes + sum(chunk.bytes for chunk in chunks.values()),
         sum(chunk.count for chunk in read),
         max((chunk.sh_degree for chunk in read), default=0),

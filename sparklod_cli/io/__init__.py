@@ -6,7 +6,6 @@ What most jobs need is imported here; `rad_file` and `details` are imported by t
 from .local_files import companions, is_file_name
 from .reading import (
     MAX_TEXT,
-    examine_scene,
     format_of,
     opened,
     read_arrays,

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import os
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from dataclasses import dataclass
-from typing import BinaryIO
 
 from ..support.addresses import Address, Place
-from ..support.errors import UnreadableError
-from ..support.stdin import DASH, name_of, spooled
-from .local_files import companions, reason_unreadable
+from ..support.stdin import DASH, name_of
+from .local_files import companions
+from .reading import file_of, readable
 
 #: Places of a file that are looked at, and bytes at each: 4 MB of a large one, which takes milliseconds. Chosen.
 PLACES, PLACE_BYTES = 64, 1 << 16
@@ -61,10 +59,10 @@ def identity_of(path: Place) -> Identity:
     """
     digest = hashlib.blake2b(digest_size=DIGEST_BYTES)
     if isinstance(path, Address):
-        with _readable():
+        with readable():
             digest.update(path.version().encode())
             return Identity(str(path), path.size(), 0, digest.hexdigest())
-    with _opened(path) as file:
+    with readable(), file_of(path) as file:
         size = file.seek(0, os.SEEK_END)
         last = max(0, size - PLACE_BYTES)
         for start in sorted({last * place // (PLACES - 1) for place in range(PLACES)}):
@@ -80,7 +78,7 @@ def stamp_of(path: Place) -> str:
     Raises:
         UnreadableError: there is no such file.
     """
-    with _readable():
+    with readable():
         if isinstance(path, Address):
             return path.version()
         found = path.stat()
@@ -94,27 +92,7 @@ def content_of(path: Place) -> str:
         UnreadableError: it cannot be read.
     """
     digest = hashlib.blake2b(digest_size=DIGEST_BYTES)
-    with _opened(path) as file:
+    with readable(), file_of(path) as file:
         while piece := file.read(_READ_BYTES):
             digest.update(piece)
     return digest.hexdigest()
-
-
-@contextlib.contextmanager
-def _opened(path: Place) -> Iterator[BinaryIO]:
-    """Yield a file, or standard input, at its beginning."""
-    with _readable():
-        if path == DASH:
-            yield spooled()
-        else:
-            with path.open("rb") as file:
-                yield file
-
-
-@contextlib.contextmanager
-def _readable() -> Iterator[None]:
-    """Yield an `OSError` of the body becomes an `UnreadableError`."""
-    try:
-        yield
-    except OSError as error:
-        raise UnreadableError(f"cannot be read: {reason_unreadable(error)}") from None

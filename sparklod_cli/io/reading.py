@@ -31,20 +31,26 @@ ZIP = b"PK\x03\x04"
 
 
 def read_scene(
-    path: Place, *, columns: Collection[str] = COLUMNS, threads: int = 1, progress: Progress = silent
+    path: Place,
+    *,
+    columns: Collection[str] = COLUMNS,
+    threads: int = 1,
+    progress: Progress = silent,
+    validate: bool = True,
 ) -> Scene:
     """Read a splat file of any known format, told by its content, or else by its suffix.
 
     Args:
         path: of a file, or of a folder that holds an unpacked SOG or a Streamed SOG; - is standard input.
         columns: of the splats that are needed; the others may be 0.
+        validate: refuse a broken tree.
 
     Raises:
         FormatError: it is not a file, empty, of no known format, or broken.
     """
     with opened(path) as (file, form, more):
         content: Content = form.codec().open_content(Source(file, threads=threads, **more))
-        return content.scene(columns=columns, threads=threads, progress=progress)
+        return content.scene(columns=columns, threads=threads, progress=progress, validate=validate)
 
 
 def read_stored(path: Place) -> Stored:
@@ -107,19 +113,6 @@ def format_of(path: Place) -> Format:
         return form
 
 
-def examine_scene(
-    path: Place, *, columns: Collection[str] = COLUMNS, threads: int = 1, progress: Progress = silent
-) -> Scene:
-    """Read a splat file for a report on it: its tree may be broken, and columns that are not asked for may be 0.
-
-    Raises:
-        FormatError: as `read_scene`, but for the tree.
-    """
-    with opened(path) as (file, form, more):
-        content: Content = form.codec().open_content(Source(file, threads=threads, **more))
-        return content.scene(columns=columns, threads=threads, progress=progress, validate=False)
-
-
 @contextlib.contextmanager
 def opened(path: Place) -> Iterator[tuple[BinaryIO, Format, dict[str, Any]]]:
     """Yield a splat file of any known format, the format, and what else its codec takes.
@@ -132,7 +125,7 @@ def opened(path: Place) -> Iterator[tuple[BinaryIO, Format, dict[str, Any]]]:
             path = in_folder(path)
         if path != DASH and path.exists() and not path.is_file():
             raise UnreadableError("it is a pipe or a device; save it to a file first")
-        with _file_of(path) as file:
+        with file_of(path) as file:
             head = file.read(HEAD)
             file.seek(0)
             if not head:
@@ -174,7 +167,7 @@ def read_arrays(path: Path) -> dump.Arrays | None:
     try:
         if path != DASH and not path.is_file():
             return None
-        with _file_of(path) as file:
+        with file_of(path) as file:
             if file.read(len(ZIP)) != ZIP:
                 return None
             return dump.decode_npz(file)
@@ -182,7 +175,7 @@ def read_arrays(path: Path) -> dump.Arrays | None:
         return None
 
 
-def _file_of(path: Place) -> contextlib.AbstractContextManager[BinaryIO]:
+def file_of(path: Place) -> contextlib.AbstractContextManager[BinaryIO]:
     """Return a file that is closed at the end, or standard input, which is not."""
     return contextlib.nullcontext(spooled()) if path == DASH else path.open("rb")
 

@@ -22,7 +22,6 @@ from ..model.transforms import Transform
 from ..support import atomic
 from ..support.addresses import Address, Place
 from ..support.errors import FormatError, OutputError, SparklodError
-from ..support.progress import Progress, silent
 from ..support.stdin import DASH, name_of
 from .local_files import reason_of
 from .reading import opened, readable
@@ -33,12 +32,7 @@ Pieces = Callable[[], Iterable[bytes]]
 
 @contextlib.contextmanager
 def open_stream(
-    path: Place,
-    *,
-    scratch: Path | None = None,
-    keep: bool = False,
-    threads: int = 1,
-    progress: Progress = silent,
+    path: Place, *, scratch: Path | None = None, keep: bool = False, threads: int = 1
 ) -> Iterator[SceneStream]:
     """Yield the splats of a file of any known format without a tree, block by block.
 
@@ -49,7 +43,7 @@ def open_stream(
     Args:
         scratch: folder for what is unpacked; None for one of the system's temporary files.
         keep: leave what is unpacked in `scratch`, where the same file is found unpacked the next time, by other
-            processes, too; whoever owns the folder removes it. The stream can be pickled then, if `progress` can.
+            processes, too; whoever owns the folder removes it. The stream can be pickled then.
 
     Raises:
         HasTreeError: the file is a tree.
@@ -61,7 +55,7 @@ def open_stream(
         raise ValueError("keep needs a scratch folder")
     store: _Store = _Folder(scratch) if keep and scratch is not None else _Unnamed(scratch)
     try:
-        source = _Source(path, store, threads, progress)
+        source = _Source(path, store, threads)
         with source.borrowed() as stream:
             found = stream
         yield dataclasses.replace(found, read=_ReadAnew(source, found.count, found.sh_degree))
@@ -85,12 +79,7 @@ class PlacedFile:
 
 @contextlib.contextmanager
 def open_streams(
-    files: Sequence[PlacedFile],
-    *,
-    scratch: Path | None = None,
-    keep: bool = False,
-    threads: int = 1,
-    progress: Progress = silent,
+    files: Sequence[PlacedFile], *, scratch: Path | None = None, keep: bool = False, threads: int = 1
 ) -> Iterator[SceneStream]:
     """Yield the splats of several files, each where it stands, as those of one scene; see `streams.merged`.
 
@@ -100,24 +89,22 @@ def open_streams(
         HasTreeError, FormatError, ValueError: as `open_stream`; names the file.
     """
     names = dict.fromkeys(each.file for each in files)
-    streams = {file: _again(file, scratch, keep, threads, progress) for file in names}
+    streams = {file: _again(file, scratch, keep, threads) for file in names}
     yield merged([Placed(streams[each.file], name_of(each.file), each.transform) for each in files])
 
 
-def _again(file: Place, scratch: Path | None, keep: bool, threads: int, progress: Progress) -> SceneStream:
+def _again(file: Place, scratch: Path | None, keep: bool, threads: int) -> SceneStream:
     """Return the stream of a file that need not stay open."""
     try:
-        with open_stream(file, scratch=scratch, keep=keep, threads=threads, progress=progress) as stream:
-            once = functools.partial(_read_once, file, scratch, threads, progress)
+        with open_stream(file, scratch=scratch, keep=keep, threads=threads) as stream:
+            once = functools.partial(_read_once, file, scratch, threads)
             return stream if keep else dataclasses.replace(stream, read=once)
     except SparklodError as error:
         raise type(error)(f"{name_of(file)}: {error}") from None
 
 
-def _read_once(
-    path: Place, scratch: Path | None, threads: int, progress: Progress, start: int, stop: int
-) -> Iterator[Splats]:
-    with open_stream(path, scratch=scratch, threads=threads, progress=progress) as stream:
+def _read_once(path: Place, scratch: Path | None, threads: int, start: int, stop: int) -> Iterator[Splats]:
+    with open_stream(path, scratch=scratch, threads=threads) as stream:
         yield from stream.read(start, stop)
 
 
@@ -220,7 +207,6 @@ class _Key(NamedTuple):
     path: Place
     version: str
     threads: int
-    progress: Progress
 
 
 @dataclass(frozen=True)
@@ -230,13 +216,12 @@ class _Source:
     path: Place
     store: _Store
     threads: int
-    progress: Progress
 
     @contextlib.contextmanager
     def borrowed(self) -> Iterator[SceneStream]:
         """Yield the stream of the file, which nobody else reads as long as the body runs."""
         with readable():
-            key = _Key(self.store.name, self.path, _digest(self.path), self.threads, self.progress)
+            key = _Key(self.store.name, self.path, _digest(self.path), self.threads)
             with borrowed(key, self._opened) as stream:
                 yield stream
 
@@ -256,7 +241,7 @@ class _Source:
         with contextlib.ExitStack() as after_an_error:
             after_an_error.enter_context(closing)
             file, form, more = closing.enter_context(opened(self.path))
-            source = Source(file, scratch=scratch, threads=self.threads, progress=self.progress, **more)
+            source = Source(file, scratch=scratch, threads=self.threads, **more)
             content: Content = form.codec().open_content(source)
             stream = content.stream(self.threads)
             after_an_error.pop_all()

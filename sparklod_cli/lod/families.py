@@ -87,7 +87,7 @@ def _rows(column: FloatArray, order: NDArray[np.uint32]) -> FloatArray:
         # "clip" lets numpy write to `found` at once; with its default it has a copy of its own.
         np.take(column, order[part], axis=0, out=found[part], mode="clip")
 
-    for_blocks(copy, len(order), threads_in_use(), lambda done: None)
+    for_blocks(copy, len(order), threads_in_use())
     return found
 
 

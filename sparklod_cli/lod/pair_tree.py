@@ -104,7 +104,7 @@ class Curve:
         def fill(part: slice) -> None:
             units[part] = np.subtract(center[part], self.middle, dtype=np.float64) / self.unit
 
-        for_blocks(fill, len(center), threads, lambda done: None)
+        for_blocks(fill, len(center), threads)
         return self.sort(units, np.arange(len(center), dtype=np.uint32), 0, threads)
 
     def leaf_rows(self, splats: Splats, index: Nodes) -> tuple[FloatArray, FloatArray]:

@@ -160,8 +160,3 @@ def spark_size(splats: Splats) -> FloatArray:
     factor *= 2
     factor *= mean
     return factor
-
-
-def design_size(splats: Splats) -> FloatArray:
-    """Return (N,) 2 * max(scale) * max(1, D): feature size in Spark's LoD design, by which its quick builder sorts."""
-    return 2 * splats.scale.max(axis=1) * np.maximum(lod_opacity(splats.opacity), 1)

@@ -53,12 +53,15 @@ class Renderer:
     Raises:
         SparklodError: there is nothing to colour by.
         BackendError: the device is a card, and there is none that can be used.
+        ValueError: the device is a card, and the backend does not draw on one.
     """
 
     def __init__(
         self, source: CutSource, settings: RenderSettings, cameras: Sequence[Camera], *, progress: Progress = silent
     ) -> None:
         self.source, self.settings = source, settings
+        if settings.device == "cuda" and settings.backend != "numba":
+            raise ValueError(f"device is 'cuda'; the backend numba draws on cards, not {settings.backend}")
         on_card = settings.backend == "numba" and uses_card(settings.device)
         self._backend = ON_CARD if on_card else settings.backend
         self.scale = self._scale(cameras, progress)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from ..codecs.formats import PRECISIONS
 from ..codecs.rounding import after
-from ..io import examine_scene, format_of, read_levels, read_tiles, size_of_input
+from ..io import format_of, read_levels, read_scene, read_tiles, size_of_input
 from ..io.details import read_level_files
 from ..io.rad_file import RadFile
 from ..model.instances import Instance, Source
@@ -158,7 +158,7 @@ def _read(source: Source, columns: Collection[str], threads: int, progress: Prog
             scene = source
         else:
             with memory_errors_translated():
-                scene = examine_scene(source, columns=columns, threads=threads, progress=progress)
+                scene = read_scene(source, columns=columns, threads=threads, progress=progress, validate=False)
         if scene.tree is not None:
             scene.tree.validate()
     except TreeError as error:

@@ -41,12 +41,6 @@ def blocks_of(rows: int, size: int = BLOCK_ROWS) -> list[slice]:
     return [slice(start, min(start + size, rows)) for start in range(0, rows, size)]
 
 
-def for_blocks(work: Callable[[slice], None], rows: int, threads: int, done: Callable[[int], None]) -> None:
-    """Call `work` with slices that cover `rows`, and `done` with the number of rows finished so far, ascending."""
-
-    def run(part: slice) -> int:
-        work(part)
-        return part.stop
-
-    for stop in ordered_map(run, blocks_of(rows), threads):
-        done(stop)
+def for_blocks(work: Callable[[slice], None], rows: int, threads: int) -> None:
+    """Call `work` with slices that cover `rows`."""
+    deque(ordered_map(work, blocks_of(rows), threads), maxlen=0)

@@ -18,7 +18,7 @@ from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.inspection import leaves
 from sparklod_cli.inspection.findings import Finding
 from sparklod_cli.inspection.leaves import check
-from sparklod_cli.io import examine_scene, read_scene
+from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quick
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
@@ -30,7 +30,7 @@ from tests.scenes import random_splats
 def baked(source: Path, folder: Path, *options: object) -> Scene:
     output = folder / "out.spz"
     assert run(["build-lod", str(source), "-o", str(output), "-q", "--overwrite", *map(str, options)]) == 0
-    return examine_scene(output)
+    return read_scene(output, validate=False)
 
 
 SOURCES = [f"sh{degree}.ply" for degree in range(4)]

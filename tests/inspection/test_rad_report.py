@@ -19,7 +19,7 @@ from sparklod_cli.inspection import leaves, rad
 from sparklod_cli.inspection.html import FileSection, page
 from sparklod_cli.inspection.rad import PropertyFacts
 from sparklod_cli.inspection.report import ReportSettings, inspect
-from sparklod_cli.io import examine_scene, read_scene
+from sparklod_cli.io import read_scene
 from sparklod_cli.model.scene import Scene
 from tests.conftest import FIXTURES, Capture, real_scene
 from tests.inspection.rad_files import CHUNK, RANGES, Rad, tree, with_chunk, with_fields
@@ -28,10 +28,9 @@ PALETTE = tree(24, max_sh=2, palette=True)
 
 
 def facts_of(path: Path) -> rad.RadFacts:
-    found = rad.survey(path, check=False)
-    assert found is not None
-    assert found.facts is not None
-    return found.facts
+    facts = inspect(path, ReportSettings(headers_only=True))[0].rad
+    assert facts is not None
+    return facts
 
 
 @pytest.mark.parametrize("chunked", [False, True])
@@ -233,7 +232,7 @@ def test_files_that_we_write_have_no_findings_and_the_leaves_of_their_scenes(
 def leaves_of(path: Path, change: Callable[[Scene], Scene]) -> list[str]:
     """Messages on a file whose original is its own leaves, changed."""
     original = change(read_scene(path))
-    return [found.message for found in leaves.check(examine_scene(path), original, facts_of(path))]
+    return [found.message for found in leaves.check(read_scene(path, validate=False), original, facts_of(path))]
 
 
 GOLDEN = FIXTURES / "golden" / "sh1-tree.rad"
@@ -266,7 +265,7 @@ def test_leaves_in_several_encodings_cannot_be_compared() -> None:
     facts = facts_of(GOLDEN)
     mixed = PropertyFacts("f16, f32", 1, 0.1, None, None)
     facts = replace(facts, properties=facts.properties | {"center": mixed})
-    (found,) = leaves.check(examine_scene(GOLDEN), read_scene(GOLDEN), facts)
+    (found,) = leaves.check(read_scene(GOLDEN, validate=False), read_scene(GOLDEN), facts)
     assert "center in several encodings" in found.message
 
 

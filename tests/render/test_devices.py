@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+import sparklod_cli as sparklod
 from sparklod_cli.cli import run
 from sparklod_cli.fitting.settings import FitSettings
 from sparklod_cli.render.backends import BackendError
@@ -91,6 +92,17 @@ def test_commands_take_a_device(device: str, tmp_path: Path, capsys: Capture) ->
     assert status == (device == "cuda")
     assert output.exists() == (device != "cuda")
     assert len(capsys.readouterr().err.splitlines()) == (device == "cuda")
+
+
+@pytest.mark.parametrize("backend", ["osmesa", "open3d"])
+def test_only_the_reference_takes_a_device(backend: str, tmp_path: Path, capsys: Capture) -> None:
+    output, file = tmp_path / "out.png", FIXTURES / "sh1.ply"
+    assert run(["render", str(file), "--backend", backend, "--device", "cuda", "-o", str(output)]) == 2
+    assert capsys.readouterr().err.splitlines()[-1] == f"error: --device cannot be used with --backend {backend}"
+    camera = sparklod.Camera.look_at([0, 0, -3], [0, 0, 0], fov_y=50, size=(8, 8))
+    settings = sparklod.RenderSettings(backend=backend, device="cuda")
+    with pytest.raises(ValueError, match=f"on cards, not {backend}"):
+        sparklod.render(sparklod.read(file), camera, settings=settings)
 
 
 def test_nothing_of_a_card_is_imported_without_one(tmp_path: Path) -> None:

@@ -44,7 +44,7 @@ def fill_rows(splats: Splats, rows: Rows, threads: int = 1) -> None:
         for part, column in places:
             rows[block, part] = column[block]
 
-    for_blocks(fill, len(rows), threads, _nothing)
+    for_blocks(fill, len(rows), threads)
 
 
 def splats_of(rows: Rows, threads: int = 1) -> Splats:
@@ -56,12 +56,8 @@ def splats_of(rows: Rows, threads: int = 1) -> Splats:
         for part, column in places:
             column[block] = rows[block, part]
 
-    for_blocks(fill, len(rows), threads, _nothing)
+    for_blocks(fill, len(rows), threads)
     return splats
-
-
-def _nothing(done: int) -> None:
-    """Report no progress."""
 
 
 def _places(splats: Splats) -> list[tuple[slice, Rows]]:

@@ -56,7 +56,7 @@ def pack(splats: Splats, *, threads: int = 1) -> dict[str, Words]:
         rows["rgba"][:, :3] = quantize.encode_unorm8(splats.rgb[part])
         rows["rgba"][:, 3] = quantize.encode_unorm8(splats.opacity[part])
 
-    for_blocks(encode, len(splats), threads, lambda _: None)
+    for_blocks(encode, len(splats), threads)
     return {"texture": texture}
 
 

@@ -69,7 +69,7 @@ def pack(splats: Splats, *, threads: int = 1) -> dict[str, Words]:
             some = words[:, 4 * index : 4 * index + 4]
             arrays[name][part, : some.shape[1]] = some
 
-    for_blocks(encode, len(splats), threads, lambda _: None)
+    for_blocks(encode, len(splats), threads)
     return arrays
 
 
@@ -112,7 +112,7 @@ def unpack(arrays: Mapping[str, NDArray[Any]], *, threads: int = 1) -> Splats:
             some = splats.sh[part, 4 * index : 4 * index + 4]
             some[:] = decode_sh(found[name][part, : some.shape[1]])
 
-    for_blocks(decode, len(splats), threads, lambda _: None)
+    for_blocks(decode, len(splats), threads)
     return splats
 
 

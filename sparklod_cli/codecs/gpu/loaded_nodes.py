@@ -63,7 +63,7 @@ def nodes(splats: Splats, tree: LodTree, layout: str, coding: FileCoding = PLAIN
             found.center[part] = splats.center[part].astype(np.float16)
             found.size[part] = (factor * ((x + y + z) / np.float32(3))).astype(np.float16)
 
-        for_blocks(measure, rows.stop - rows.start, threads, lambda _: None)
+        for_blocks(measure, rows.stop - rows.start, threads)
     return found
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ...model.gaussian import spark_size
 from ...model.lod_tree import MAX_CHILDREN, LodTree, Nodes
 from ...model.scene import Scene
-from ...model.splats import FloatArray, Splats
+from ...model.splats import Splats
 from ...support.errors import FormatError
 from ...support.parallel import for_blocks
 from ..spark_codings import Words, checked_words
@@ -27,16 +27,11 @@ NODE = np.dtype(
 assert NODE.itemsize == 16
 
 
-def pack(
-    splats: Splats, tree: LodTree, *, size: Callable[[Splats], FloatArray] = spark_size, threads: int = 1
-) -> dict[str, Words]:
+def pack(splats: Splats, tree: LodTree, *, threads: int = 1) -> dict[str, Words]:
     """Pack splats and their tree in the layout of Spark's traversal: "lod_tree" (N, 4) uint32.
 
     Spark measures splats after their coding: for the same words as Spark's, pass splats that were packed and unpacked
     by `ext_splats` or `packed_splats`. A coordinate or a size of 65520 or more becomes infinite, as in Spark.
-
-    Args:
-        size: computes (N,) feature sizes, world units: `spark_size`, or `design_size` of Spark's pages for comparison.
 
     Raises:
         FormatError: the numbers of nodes and splats differ.
@@ -49,11 +44,11 @@ def pack(
     def encode(part: slice) -> None:
         rows = words[part].view(NODE)[:, 0]
         rows["center"] = splats.center[part]
-        rows["size"] = size(splats.take(part))
+        rows["size"] = spark_size(splats.take(part))
         rows["child_count"] = tree.child_count[part]
         rows["child_start"] = tree.child_start[part]
 
-    for_blocks(encode, len(splats), threads, lambda _: None)
+    for_blocks(encode, len(splats), threads)
     return {"lod_tree": words}
 
 

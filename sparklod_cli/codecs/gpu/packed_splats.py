@@ -72,7 +72,7 @@ def pack(splats: Splats, encoding: SplatEncoding = DEFAULT, *, threads: int = 1)
             sh = splats.sh[part, COEFFICIENTS[degree - 1] : COEFFICIENTS[degree]].reshape(len(rows), -1)
             arrays[f"sh{degree}"][part] = encode_sh(sh, SH_BITS[degree], encoding.sh_max(degree))
 
-    for_blocks(encode, len(splats), threads, lambda _: None)
+    for_blocks(encode, len(splats), threads)
     return arrays
 
 
@@ -117,7 +117,7 @@ def unpack(arrays: Mapping[str, NDArray[Any]], encoding: SplatEncoding = DEFAULT
             sh = decode_sh(found[f"sh{degree}"][part], SH_BITS[degree], encoding.sh_max(degree), 3 * (2 * degree + 1))
             splats.sh[part, COEFFICIENTS[degree - 1] : COEFFICIENTS[degree]] = sh.reshape(len(rows), -1, 3)
 
-    for_blocks(decode, len(splats), threads, lambda _: None)
+    for_blocks(decode, len(splats), threads)
     return splats
 
 

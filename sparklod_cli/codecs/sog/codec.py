@@ -82,9 +82,8 @@ def open_content(source: Source) -> Content:
         return sorted(steps, key=lambda step: (step.texture == "shN", -files.bytes_of(step.texture, step.index)))
 
     def unpacked() -> Iterator[bytes]:
-        for number, step in enumerate(in_order(), 1):
+        for step in in_order():
             yield files.pixels(step.texture, step.index, count).tobytes()
-            source.progress("reading", number * count, len(steps) * count, "texel")
 
     def fill(target: Target, threads: int, progress: Progress) -> None:
         if palette is not None:
@@ -105,7 +104,7 @@ def open_content(source: Source) -> Content:
         for number, _ in enumerate(ordered_map(work, enumerate(in_order()), threads), 1):
             progress("reading", number * count, len(steps) * count, "texel")
         rows = Target(target.splats)
-        for_blocks(lambda part: _finish(center_tables, rows.rows(part)), len(target.splats), threads, lambda done: None)
+        for_blocks(lambda part: _finish(center_tables, rows.rows(part)), len(target.splats), threads)
 
     antialiased = version == 2 and (meta.root.get("antialias") is True or meta.root.get("model") == "antialiased")
     header = {"version": version, "palette": palette.entries if palette is not None else 0, "bytes": files.size}

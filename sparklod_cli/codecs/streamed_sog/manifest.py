@@ -13,12 +13,12 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from ...support.errors import FormatError, VersionError
+from ...support.errors import VersionError
 from ...support.untrusted import quoted_value
 from .. import quantize
 from ..file_names import MANIFEST
 from ..file_notes import FileNote, read_note
-from ..json_trees import parse_manifest, place_of
+from ..json_trees import nodes_of, parse_manifest, place_of, wrong
 
 #: The version that is read and written. A manifest from before versions has none.
 VERSION = 1
@@ -126,10 +126,10 @@ def parse(data: bytes) -> Manifest:
     levels = _integer(root.get("lodLevels"), "lodLevels", 1, MAX_LEVELS)
     filenames = root.get("filenames")
     if not isinstance(filenames, list) or not all(isinstance(name, str) for name in filenames):
-        raise _wrong("filenames", filenames, "a list of paths")
+        raise wrong(MANIFEST, "filenames", filenames, "a list of paths")
     environment = root.get("environment")
     if environment is not None and not isinstance(environment, str):
-        raise _wrong("environment", environment, "a path")
+        raise wrong(MANIFEST, "environment", environment, "a path")
     nodes = _nodes(root.get("tree"), levels, len(filenames))
     head = {key: value for key, value in root.items() if key not in ("lodLevels", "filenames", "environment", "tree")}
     return Manifest(levels, tuple(filenames), nodes, environment, head)
@@ -138,50 +138,30 @@ def parse(data: bytes) -> Manifest:
 def _nodes(tree: Any, levels: int, files: int) -> tuple[ManifestNode, ...]:
     """Return the nodes of a tree, however deep, root first and depth first."""
     keys = {str(level): level for level in range(levels)}
-    parents, children = list[int](), list[list[int]]()
-    values = list[tuple[Bound | None, dict[int, Run] | None, Any]]()
-    waiting = [(tree, -1)]  # a value, and the number of its parent
-
-    def place() -> str:
-        return place_of("tree", number, parents.__getitem__, children.__getitem__)
-
-    while waiting:
-        value, parent = waiting.pop()
-        number = len(values)
-        if number == MAX_NODES:
-            raise FormatError(f"the tree of {MANIFEST} has more than {MAX_NODES:,} nodes")
-        parents.append(parent)
-        children.append([])
-        if parent >= 0:
-            children[parent].append(number)
-        if not isinstance(value, dict):
-            raise _wrong(place(), value, "a node")
-        below, lods = value.get("children", []), value.get("lods")
-        if not isinstance(below, list):
-            raise _wrong(f"{place()}.children", below, "a list")
+    rows, too_many = [], f"the tree of {MANIFEST} has more than {MAX_NODES:,} nodes"
+    for value, parent, children, place in nodes_of(tree, "tree", MANIFEST, "a node", MAX_NODES, too_many):
+        lods = value.get("lods")
         runs = None if lods is None else _runs(lods, keys, files, place)
-        values.append((_bound(value.get("bound")), runs, value.get("errors")))
-        waiting.extend((each, number) for each in reversed(below))
-    rows = zip(values, children, parents, strict=True)
+        rows.append((_bound(value.get("bound")), children, runs, value.get("errors"), parent))
     return tuple(
-        ManifestNode(bound, tuple(below), runs, errors, parent) for (bound, runs, errors), below, parent in rows
+        ManifestNode(bound, tuple(children), runs, errors, parent) for bound, children, runs, errors, parent in rows
     )
 
 
 def _runs(lods: Any, keys: Mapping[str, int], files: int, place: Callable[[], str]) -> dict[int, Run]:
     """Return the runs of a region by detail level; `keys` has the levels by their names."""
     if not isinstance(lods, dict):
-        raise _wrong(f"{place()}.lods", lods, "an object of runs")
+        raise wrong(MANIFEST, f"{place()}.lods", lods, "an object of runs")
     runs = dict[int, Run]()
     for key, value in lods.items():
         if key not in keys:
-            raise _wrong(f"{place()}.lods", key, f"of the levels 0 to {len(keys) - 1}")
+            raise wrong(MANIFEST, f"{place()}.lods", key, f"of the levels 0 to {len(keys) - 1}")
         if not isinstance(value, dict):
-            raise _wrong(f"{place()}.lods.{key}", value, "a run")
+            raise wrong(MANIFEST, f"{place()}.lods.{key}", value, "a run")
         for name, most in (("file", files - 1), ("offset", MAX_RUN), ("count", MAX_RUN)):
             number = value.get(name)
             if type(number) is not int or not 0 <= number <= most:
-                raise _wrong(f"{place()}.lods.{key}.{name}", number, f"a whole number from 0 to {most:,}")
+                raise wrong(MANIFEST, f"{place()}.lods.{key}.{name}", number, f"a whole number from 0 to {most:,}")
         runs[keys[key]] = Run(value["file"], value["offset"], value["count"])
     return runs
 
@@ -201,14 +181,8 @@ def _bound(value: Any) -> Bound | None:
 
 def _integer(value: Any, place: str, least: int, most: int) -> int:
     if type(value) is not int or not least <= value <= most:
-        raise _wrong(place, value, f"a whole number from {least} to {most:,}")
+        raise wrong(MANIFEST, place, value, f"a whole number from {least} to {most:,}")
     return value
-
-
-def _wrong(place: str, value: Any, expected: str) -> FormatError:
-    if value is None:
-        return FormatError(f"{MANIFEST} has no {place}, which must be {expected}")
-    return FormatError(f"{place} of {MANIFEST} is {quoted_value(value)}, not {expected}")
 
 
 def serialise(manifest: Manifest) -> bytes:

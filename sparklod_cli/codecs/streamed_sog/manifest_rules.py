@@ -17,6 +17,7 @@ from ...support.progress import Progress, silent
 from ...support.units import count_of
 from ...support.untrusted import quoted_value
 from ..content import OpenCompanion
+from ..json_trees import leads_away
 from ..scene_files import Chunk
 from ..sog import texel_codings
 from ..splat_bounds import count_outside
@@ -106,11 +107,6 @@ def file_violations(manifest: Manifest, files: Mapping[str, Chunk | str]) -> Ite
 
 def _kind_of(file: Chunk) -> str:
     return f"SH degree {file.sh_degree} and {'' if file.antialiased else 'no '}antialias"
-
-
-def leads_away(name: str) -> bool:
-    """Return True if a name means something else than a file in the manifest's folder or in one below."""
-    return any(part in ("", ".", "..") for part in name.split("/")) or any(mark in name for mark in "\\:\0?#")
 
 
 def _nodes(manifest: Manifest) -> Iterator[RuleViolation]:

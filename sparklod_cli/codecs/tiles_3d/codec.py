@@ -29,6 +29,7 @@ from .axes import to_tileset, turned
 from .tile_writer import encode_files as encode_files
 from .tileset import MAX_TILESET, Tileset, read_whole
 from .tileset_rules import matrices_of, matrix_of, read_violations, violations, volumes_of
+from .volumes import Volume
 
 #: Note of scenes whose splats have the coordinates of their tileset.
 NOT_PLACED = "the transform of the tileset, its place on the Earth, is not applied"
@@ -73,7 +74,7 @@ def decode_tiles(
     sizes = dict(zip(held, (chunk.bytes for chunk in chunks), strict=True))
     check_rules(violations(tileset))
     volumes = volumes_of(tileset)
-    boxes = [volume.bounds() for number in order if (volume := volumes[number]) is not None]
+    boxes = [volume.bounds() for number in order if isinstance(volume := volumes[number], Volume)]
     if len(boxes) < len(order):
         raise error_of("tiles.volumes", "a bounding volume of it is a region, of which no box is made")
     errors = np.array([float(tileset.tiles[number].record["geometricError"]) for number in order])

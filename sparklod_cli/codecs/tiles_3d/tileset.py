@@ -17,7 +17,7 @@ from ...support.untrusted import quoted_value
 from ..content import OpenCompanion
 from ..file_names import TILESET
 from ..file_notes import FileNote, read_note
-from ..json_trees import parse_manifest, place_of
+from ..json_trees import nodes_of, parse_manifest, place_of, wrong
 from ..validation import error_of
 
 #: The version that is written, and the one before it, which is read, too.
@@ -136,40 +136,16 @@ def parse(data: bytes, file: str = "") -> Tileset:
 
 def _tiles(root: Any, called: str, file: str) -> tuple[TileRecord, ...]:
     """Return the tiles of a file, root first and depth first."""
-    records, uris = list[Mapping[str, Any]](), list[str | None]()
-    parents, children = list[int](), list[list[int]]()
-    waiting = [(root, -1)]
-    while waiting:
-        value, parent = waiting.pop()
-        number = len(records)
-        if number == MAX_TILES:
-            raise FormatError(f"{called} has more than {MAX_TILES:,} tiles")
-        parents.append(parent)
-        children.append([])
-        if parent >= 0:
-            children[parent].append(number)
-
-        def wrong(key: str, value: Any, expected: str, number: int = number) -> FormatError:
-            place = place_of("root", number, parents.__getitem__, children.__getitem__) + key
-            if value is None:
-                return FormatError(f"{called} has no {place}, which must be {expected}")
-            return FormatError(f"{place} of {called} is {quoted_value(value)}, not {expected}")
-
-        if not isinstance(value, dict):
-            raise wrong("", value, "a tile")
-        below, content = value.get("children", []), value.get("content")
-        if not isinstance(below, list):
-            raise wrong(".children", below, "a list")
+    rows, too_many = [], f"{called} has more than {MAX_TILES:,} tiles"
+    for value, parent, children, place in nodes_of(root, "root", called, "a tile", MAX_TILES, too_many):
+        content = value.get("content")
         if content is not None and not isinstance(content, dict):
-            raise wrong(".content", content, "an object")
+            raise wrong(called, f"{place()}.content", content, "an object")
         uri = None if content is None else content.get("uri")
         if content is not None and not isinstance(uri, str):
-            raise wrong(".content.uri", uri, "a path")
-        records.append({key: each for key, each in value.items() if key != "children"})
-        uris.append(uri)
-        waiting.extend((each, number) for each in reversed(below))
-    rows = zip(records, uris, children, parents, strict=True)
-    return tuple(TileRecord(record, uri, tuple(below), parent, file) for record, uri, below, parent in rows)
+            raise wrong(called, f"{place()}.content.uri", uri, "a path")
+        rows.append(({key: each for key, each in value.items() if key != "children"}, uri, children, parent))
+    return tuple(TileRecord(record, uri, tuple(children), parent, file) for record, uri, children, parent in rows)
 
 
 def read_whole(data: bytes, open_companion: OpenCompanion | None) -> Tileset:

@@ -15,6 +15,7 @@ from ...support.progress import Progress, silent
 from ...support.units import count_of
 from ...support.untrusted import quoted_value
 from ..glb.codec import COMPRESSION, EXTENSION
+from ..json_trees import leads_away
 from ..scene_files import Chunk, SceneFiles
 from ..splat_bounds import LOOSE_BOUND, count_outside
 from ..validation import RuleViolation
@@ -100,11 +101,6 @@ def _unread(tileset: Tileset, number: int, tile: TileRecord) -> Iterator[RuleVio
         yield broken("transform", f"{text}, not 16 finite numbers that end with 1")
 
 
-def leads_away(name: str) -> bool:
-    """Return True if a name means something else than a file in the tileset's folder or in one below."""
-    return any(part in ("", ".", "..") for part in name.split("/")) or any(mark in name for mark in "\\:\0?#")
-
-
 def _numbers(record: Mapping[str, object]) -> list[float] | None:
     """Return the numbers of a transform; None where it is none."""
     numbers = record.get("transform")
@@ -138,16 +134,13 @@ def depths_of(tileset: Tileset) -> list[int]:
     return depths
 
 
-def volumes_of(tileset: Tileset) -> list[Volume | None]:
-    """Return the bounding volume of each tile in the axes of the tileset; None where it has none that is known."""
-    volumes = list[Volume | None]()
-    for tile, matrix in zip(tileset.tiles, matrices_of(tileset), strict=True):
-        try:
-            volume = volume_of(tile.record.get("boundingVolume"))
-        except ValueError:
-            volume = None
-        volumes.append(None if volume is None else volume.moved(matrix))
-    return volumes
+def volumes_of(tileset: Tileset) -> list[Volume | str | None]:
+    """Return the bounding volume of each tile in the axes of the tileset; as `volume_of` where it has none."""
+    volumes = (volume_of(tile.record.get("boundingVolume")) for tile in tileset.tiles)
+    return [
+        volume.moved(matrix) if isinstance(volume, Volume) else volume
+        for volume, matrix in zip(volumes, matrices_of(tileset), strict=True)
+    ]
 
 
 def violations(tileset: Tileset) -> Iterator[RuleViolation]:
@@ -192,16 +185,15 @@ def _number(value: object) -> float | None:
 
 def _volumes(tileset: Tileset) -> Iterator[RuleViolation]:
     volumes = volumes_of(tileset)
-    for number, tile in enumerate(tileset.tiles):
-        try:
-            volume_of(tile.record.get("boundingVolume"))
-        except ValueError as error:
-            yield broken("volumes", f"the bounding volume of {tileset.place(number)} is {error}")
+    for number, (tile, own) in enumerate(zip(tileset.tiles, volumes, strict=True)):
+        if isinstance(own, str):
+            yield broken("volumes", f"the bounding volume of {tileset.place(number)} is {own}")
             continue
-        own, above = volumes[number], volumes[tile.parent] if tile.parent >= 0 else None
-        if own is not None and above is not None and not above.holds(own, ROUNDING * max(own.size, above.size)):
-            text = f"the bounding volume of {tileset.place(number)} reaches out of that of the tile above"
-            yield broken("inside", text, fatal=False)
+        above = volumes[tile.parent] if tile.parent >= 0 else None
+        if own is None or not isinstance(above, Volume) or above.holds(own, ROUNDING * max(own.size, above.size)):
+            continue
+        text = f"the bounding volume of {tileset.place(number)} reaches out of that of the tile above"
+        yield broken("inside", text, fatal=False)
 
 
 def _errors(tileset: Tileset) -> Iterator[RuleViolation]:
@@ -318,7 +310,7 @@ def scan_splats(
             yield RuleViolation("values.non-finite", text, fatal=False)
             continue
         volume = volumes[number]
-        outside = 0 if volume is None else _outside(splats, volume, to_tileset(chunk.up))
+        outside = _outside(splats, volume, to_tileset(chunk.up)) if isinstance(volume, Volume) else 0
         if outside:
             text = f"{count_of(outside, 'splat')} of {tileset.place(number)} lie outside of its bounding volume"
             yield broken("extents", text, fatal=False)

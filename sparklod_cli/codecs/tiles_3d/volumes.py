@@ -83,25 +83,21 @@ class Volume:
         return float(np.abs(self.center).max() + self.reach(np.eye(3)).max())
 
 
-def volume_of(value: Any) -> Volume | None:
-    """Return the volume of a "boundingVolume"; None for a region, whose numbers are angles.
-
-    Raises:
-        ValueError: it is none; says why.
-    """
+def volume_of(value: Any) -> Volume | str | None:
+    """Return the volume of a "boundingVolume"; None for a region, whose numbers are angles; a text on what is none."""
     kind = next((kind for kind in KINDS if isinstance(value, dict) and kind in value), None)
     if kind is None:
-        raise ValueError("none of box, sphere and region")
+        return "none of box, sphere and region"
     numbers = value[kind]
     if not isinstance(numbers, list) or len(numbers) != KINDS[kind]:
-        raise ValueError(f"a {kind} that has not {KINDS[kind]} numbers")
+        return f"a {kind} that has not {KINDS[kind]} numbers"
     if not all(type(each) in (int, float) and math.isfinite(each) and abs(each) <= LARGEST for each in numbers):
-        raise ValueError(f"a {kind} with something else than finite numbers")
+        return f"a {kind} with something else than finite numbers"
     found = np.array(numbers, np.float64)
     if kind == "box":
         return Volume(found[:3], found[3:].reshape(3, 3))
     if kind == "region":
         return None
     if found[3] < 0:
-        raise ValueError("a sphere with a radius below 0")
+        return "a sphere with a radius below 0"
     return Volume(found[:3], np.empty((0, 3)), float(found[3]))

@@ -34,7 +34,7 @@ def splats_with(count: int, **columns: Any) -> Splats:
 
 
 def sized(size: np.ndarray) -> Splats:
-    """Opaque splats that are spheres of this size by either rule."""
+    """Opaque splats that are spheres of this size."""
     return splats_with(len(size), scale=(size / 2)[:, None], opacity=1)
 
 
@@ -50,13 +50,11 @@ def test_a_node_is_four_words_of_these_bytes() -> None:
     assert packed["lod_tree"][0].tolist() == [x | y << 16, z | size << 16, 65535, 2**32 - 1]
 
 
-def test_both_node_sizes_are_those_worked_out_by_hand() -> None:
+def test_node_sizes_are_those_worked_out_by_hand() -> None:
     splats = splats_with(3, scale=[0.25, 0.5, 0.75], opacity=[0.3, 1, linear_opacity(np.float32(3))])
     np.testing.assert_allclose(gaussian.spark_size(splats), [1, 1, 2.4], rtol=1e-6)
-    np.testing.assert_allclose(gaussian.design_size(splats), [1.5, 1.5, 4.5], rtol=1e-6)
-    leaves = links([0, 0, 0], [0, 0, 0])
-    sizes = lod_tree.unpack(lod_tree.pack(splats, leaves, size=gaussian.design_size)).size
-    np.testing.assert_array_equal(sizes, [1.5, 1.5, 4.5])
+    sizes = lod_tree.unpack(lod_tree.pack(splats, links([0, 0, 0], [0, 0, 0]))).size
+    np.testing.assert_array_equal(sizes, np.float16([1, 1, 2.4]))
 
 
 def test_sizes_keep_and_reach_their_error() -> None:
