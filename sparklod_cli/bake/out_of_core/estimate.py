@@ -67,6 +67,13 @@ def out_of_core_bytes(
     return PROCESS + max(window, block, OF_ORDER * splats, arranging)
 
 
+def windows_within(memory: int | None, splats: int, sh_degree: int, threads: int) -> int:
+    """Return how many windows of nodes the memory of a bake holds at once: no more than threads, and at least one."""
+    if memory is None:
+        return threads
+    return max(1, min(threads, (memory - PROCESS) // OF_WINDOW.of(min(2 * splats, WINDOW), sh_degree)))
+
+
 def scratch_bytes(method: str, splats: int, sh_degree: int) -> int:
     """Return bytes that the scratch folder takes at its peak, without what is unpacked of the input.
 

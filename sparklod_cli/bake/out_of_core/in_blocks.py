@@ -47,6 +47,7 @@ class InBlocks:
     Attributes:
         job: of all tasks; `build` and `order` add what they find out.
         block_splats: of a block, about.
+        windows: nodes that the memory holds at once while they are encoded, in windows of `WINDOW_NODES`.
         progress: called with how much of a stage is done.
     """
 
@@ -55,6 +56,7 @@ class InBlocks:
     clock: Clock
     engine: Engine
     block_splats: int
+    windows: int
     progress: Progress
 
     def build(self) -> BuiltTree:
@@ -102,7 +104,7 @@ class InBlocks:
         """Encode the windows of the tree; whatever interrupts the rest finds its output published, or a part of it."""
         job = dataclasses.replace(self.job, encoder=encoder)
         tasks = [
-            Task(encoded_of(window), encode, (window,), weight=part.stop - part.start)
+            Task(encoded_of(window), encode, (window,), weight=part.stop - part.start, together=self.windows)
             for window, part in enumerate(blocks_of(encoder.count, WINDOW_NODES))
         ]
         self.engine.run("encoding", tasks, job, self.progress)

@@ -103,7 +103,8 @@ def blocks_for(
     ):
         settings = dataclasses.replace(settings, rgba=settings.rgba and settings.rgba.absolute())
         job = Job(store, stream, settings, output.needed, output.in_chunks)
-        yield InBlocks(job, output, clock, engine or LocalEngine(threads), block_splats, progress)
+        windows = estimate.windows_within(memory, splats, degree, threads)
+        yield InBlocks(job, output, clock, engine or LocalEngine(threads), block_splats, windows, progress)
 
 
 def has_published(source: Source, target: Place, settings: BakeSettings, resources: Resources) -> bool:

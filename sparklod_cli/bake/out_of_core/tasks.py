@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from ...support import machine
-from ...support.progress import Progress
+from ...support.parallel import ordered_map
+from ...support.progress import Progress, silent
 
 
 @dataclass(frozen=True)
@@ -20,6 +21,7 @@ class Task:
         arguments: small, and can be pickled.
         needs: names of the tasks that must be done before.
         weight: how much work it is, splats.
+        together: how many tasks like it one process has memory for, if they need none of each other.
     """
 
     name: str
@@ -27,6 +29,7 @@ class Task:
     arguments: tuple[Any, ...] = ()
     needs: tuple[str, ...] = ()
     weight: int = 1
+    together: int = 1
 
 
 class Engine(Protocol):
@@ -54,12 +57,17 @@ class LocalEngine:
     def run(self, stage: str, tasks: Sequence[Task], job: Any, progress: Progress) -> None:
         """Run tasks as `Engine.run`; an error of a task is raised as it is."""
         total, done = sum(task.weight for task in tasks), 0
-        for task in tasks:
+        together = min([self.threads, *(task.together for task in tasks)])
+
+        def run(task: Task) -> int:
             if not job.store.has(task.name):
-                within = _share_of(progress, stage, done, task.weight, total)
-                task.run(job, *task.arguments, threads=self.threads, progress=within)
+                within = _share_of(progress, stage, done, task.weight, total) if together == 1 else silent
+                task.run(job, *task.arguments, threads=self.threads // together, progress=within)
                 machine.release_memory()  # for the next one, which may need most
-            done += task.weight
+            return task.weight
+
+        for weight in ordered_map(run, tasks, together):
+            done += weight
             progress(stage, done, total, "splat")
 
 

@@ -45,6 +45,14 @@ def test_the_most_splats_in_memory_fill_it(method: str, splats: int, degree: int
     assert estimate.most_in_memory(memory - 1, method, degree) == splats - 1
 
 
+@given(st.integers(1, 10**9), st.integers(0, MAX_SH_DEGREE), st.integers(0, 1 << 40), st.integers(1, 64))
+def test_windows_that_are_encoded_together_fit(splats: int, degree: int, memory: int, threads: int) -> None:
+    windows = estimate.windows_within(memory, splats, degree, threads)
+    window = estimate.OF_WINDOW.of(min(2 * splats, estimate.WINDOW), degree)
+    assert 1 <= windows <= threads
+    assert windows == 1 or estimate.PROCESS + windows * window <= memory
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_five_million_splats_are_baked_in_600_mb(method: str) -> None:
     estimate.block_splats_within(600_000_000, method, 5_000_000, 0, in_chunks=True, threads=2)

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
-from sparklod_cli.bake.out_of_core import nodes, order
+from sparklod_cli.bake.out_of_core import nodes, order, store
 from sparklod_cli.bake.out_of_core.in_blocks import InBlocks
 from sparklod_cli.bake.out_of_core.job import Job
 from sparklod_cli.bake.out_of_core.store import Store
@@ -40,7 +40,7 @@ def _small_windows() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(order, "WINDOW_NODES", 64)
         patch.setattr(nodes, "WINDOW_NODES", 64)
-        patch.setattr(nodes, "GAP", 5)
+        patch.setattr(store, "GAP", 5)
         patch.setattr(families, "FIRST_BAND", 16)
         patch.setattr(order, "MERGED", 20)
         patch.setattr(order, "PROBES", 5)
@@ -50,7 +50,7 @@ def _small_windows() -> Iterator[None]:
 def built(folder: str, splats: Splats, how: BakeSettings, block: int, engine: Loop, *, in_chunks: bool) -> BuiltTree:
     """A tree in a store, of blocks of about so many splats."""
     job = Job(Store(Path(folder)), stream_of(Scene(splats)), how, ALL, in_chunks)
-    blocks = InBlocks(job, BakeOutput(), Clock(), engine, block, silent)
+    blocks = InBlocks(job, BakeOutput(), Clock(), engine, block, 1, silent)
     tree = blocks.build()
     blocks.order(tree)
     return tree

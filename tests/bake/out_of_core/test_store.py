@@ -15,6 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays_of
 
+from sparklod_cli.bake.out_of_core import store as store_module
 from sparklod_cli.bake.out_of_core.store import Store
 from sparklod_cli.support.errors import ScratchError
 from tests.conftest import IS_ROOT
@@ -59,6 +60,21 @@ def test_what_is_put_is_got(tmp_path_factory: pytest.TempPathFactory, arrays: di
         assert store.shape("stage/1", name) == array.shape
         if array.ndim:
             assert store.rows("stage/1", name, 1, 3).tobytes() == array[1:3].tobytes()
+
+
+@given(st.sets(st.integers(0, 1999), min_size=1), st.sampled_from([0, 5, 128]))
+def test_some_rows_are_those_of_the_whole_array(
+    tmp_path_factory: pytest.TempPathFactory, some: set[int], gap: int
+) -> None:
+    array, index = np.arange(4000, dtype=np.float32).reshape(-1, 2), np.array(sorted(some), np.int64)
+    store = Store(tmp_path_factory.mktemp("scratch"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(store_module, "GAP", gap)
+        store.put("stage/1", {"key": np.zeros(3), "rows": array})
+        store.traffic.read = 0
+        assert np.array_equal(store.rows_at("stage/1", "rows", index), array[index])
+        assert store.traffic.read >= 8 * len(index)
+        assert gap or store.traffic.read == 8 * len(index)
 
 
 def test_arrays_that_are_not_contiguous_are_put_as_they_look(store: Store) -> None:

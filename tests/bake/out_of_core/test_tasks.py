@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -74,6 +75,22 @@ def test_what_is_done_is_not_done_again(store: Store, error: type[BaseException]
     LocalEngine(threads=2).run("building", tasks(), SumJob(store), silent)
     assert store.get("sum")["value"].tolist() == [SUM]
     assert [int(store.get(f"number/{number}")["value"][1]) for number in range(COUNT)] == [1, 1, 1, 2, 2, 2]
+
+
+def test_tasks_that_memory_holds_together_share_the_threads(store: Store) -> None:
+    numbers = [dataclasses.replace(task, together=2) for task in tasks()[:-1]]
+    done: list[int] = []
+    LocalEngine(threads=4).run("encoding", numbers, SumJob(store), lambda stage, now, total, unit: done.append(now))
+    found = [store.get(task.name)["value"].tolist() for task in numbers]
+    assert found == [[number**2, 2] for number in range(COUNT)]
+    assert done == [100 * (number + 1) for number in range(COUNT)]
+
+
+def test_an_error_of_one_of_them_is_raised(store: Store) -> None:
+    numbers = [dataclasses.replace(task, together=2) for task in tasks()[:-1]]
+    with pytest.raises(MemoryError):
+        LocalEngine(threads=2).run("encoding", numbers, SumJob(store, 3, MemoryError), silent)
+    assert "number/3" not in store.names()
 
 
 def test_progress_rises_to_its_total_and_counts_what_was_done_before(store: Store) -> None:
