@@ -90,7 +90,7 @@ def warm_up(*, processes: int, progress: Progress = silent) -> int:
     # A module's kernels share code, which one process compiles once.
     modules = [list(group) for _, group in itertools.groupby(wanted, lambda unit: unit.kernel.__module__)]
     left, cache = iter(modules), jit.CACHE_FOLDER.parent.resolve()
-    children = [_Child(left, cache) for _ in range(min(processes, len(modules)))]
+    children = [CompilingProcess(left, cache) for _ in range(min(processes, len(modules)))]
     with ThreadPoolExecutor(len(children)) as pool:
         running = {pool.submit(child.run) for child in children}
         try:
@@ -109,7 +109,7 @@ def warm_up(*, processes: int, progress: Progress = silent) -> int:
     return len(wanted)
 
 
-class _Child:
+class CompilingProcess:
     """Child process that compiles the kernels of one module after the other.
 
     Args:

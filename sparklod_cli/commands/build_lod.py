@@ -230,18 +230,20 @@ def _job_of(
     ctx: click.Context, options: BuildLodOptions, console: Console, engine: ClusterEngine | None
 ) -> tuple[Make, Callable[..., None]]:
     """Return a function that makes the outputs of inputs, and one that reports an output; loads numpy."""
-    console.announce_compiling()
     files, threads = options.files, options.general.threads
     shared: dict[str, Any] = {"overwrite": files.overwrite, "progress": console.progress}
     if files.unlod:
+        console.announce_compiling()
         from ..extract_leaves import extract_leaves
 
         how: dict[str, Any] = {"suffix": files.suffix, "options": options.write_options(), "threads": threads}
         return _one_by_one(functools.partial(extract_leaves, **how, **shared)), report_extracted
     from ..bake.flow import bake
     from ..bake.stage_shares import stage_shares
+    from ..compile_ahead import jobs_of
 
     settings = options.bake_settings(ctx)
+    console.announce_compiling(*jobs_of(settings))
     make: Callable[..., Baked | None] = bake
     if files.skip_existing is not None:
         from ..bake.skipping import bake_unless_there

@@ -8,9 +8,9 @@ import os
 import sys
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from time import monotonic
+from time import monotonic, time
 from types import TracebackType
-from typing import Any, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
 import click
 
@@ -20,6 +20,9 @@ from ..support.progress import StagedProgress
 from ..support.stdout import silence
 from ..support.units import count_of as count_of
 from ..support.units import format_size
+
+if TYPE_CHECKING:
+    from ..compile_ahead import CompileAhead
 
 #: Columns of reports for people, of the names that their rows begin with, and by which messages go on indented.
 WIDTH, NAMES, INDENT = 80, 13, 4
@@ -230,7 +233,7 @@ class Console:
             bar = self._bar
             if bar is None:
                 bar = self._open_bar(total=1.0, desc=stage, initial=reached, bar_format=JOB_BAR, smoothing=0)
-                bar.initial, bar.start_t = 0, bar.start_t - (now - self._start)  # the rate is that of the whole job
+            bar.initial, bar.start_t = 0, time() - (now - self._start)  # the rate is that of the whole job
             bar.update(reached - bar.n)
             if bar.desc != stage:
                 bar.set_description_str(stage)
@@ -249,14 +252,17 @@ class Console:
             amount = f"{format_size(done)} of {format_size(total)}" if unit == "B" else f"{done:,} of {total:,} {unit}s"
             self.say(f"{stage}: {amount} ({100 * done / total:.0f} %), {now - self._start:.0f} s")
 
-    def announce_compiling(self) -> None:
+    def announce_compiling(self, *jobs: str) -> None:
         """Announce the first kernel that is compiled, show a bar, and print at the end how long all of them took.
 
         What is wrong with the cache is wrong for every kernel, and printed once.
+
+        Args:
+            jobs: of `compile_ahead.JOBS`, whose kernels another process compiles meanwhile.
         """
         from ..support import jit
 
-        begun: list[str] = []
+        ahead: list[CompileAhead] = []
         seconds: list[float] = []
         troubles: set[str] = set()
 
@@ -265,17 +271,21 @@ class Console:
 
         def begin(name: str) -> None:
             interrupts.leave_if_lost()
-            if not begun:
+            if not ahead:
+                from ..compile_ahead import CompileAhead
                 from ..warmup import missing
 
-                advance = f"once; sparklod warmup compiles all {len(missing())} in advance"
+                absent = missing()
+                ahead.append(CompileAhead(absent, jobs, name))
+                self._ended.callback(ahead[0].close)
+                advance = f"once; sparklod warmup compiles all {len(absent)} in advance"
                 often = advance if jit.CACHE_FOLDER else "in every run: no cache can be written"
                 self.say(f"Compiling kernels for this machine, half a minute or less ({often}) ...")
-            begun.append(name)
             show()
 
         def end(duration: float) -> None:
             seconds.append(duration)
+            self._start += duration  # which tells nothing of the time that a job takes
             show()
 
         def say_once(trouble: str) -> None:
@@ -286,7 +296,8 @@ class Console:
         def close() -> None:
             stop()
             if seconds:
-                self.say(f"compiled {count_of(len(seconds), 'kernel')} in {sum(seconds):.1f} s")
+                count = len(seconds) + sum(each.compiled for each in ahead)
+                self.say(f"compiled {count_of(count, 'kernel')} in {sum(seconds):.1f} s")
 
         stop = jit.listen(begin, end, say_once)
         self._ended.callback(close)

@@ -125,7 +125,7 @@ def _draw(ctx: click.Context, options: RenderOptions) -> None:
     with general.console() as console:
         from ..api.jobs import draw_files
 
-        console.announce_compiling()
+        console.announce_compiling("pictures")
 
         def place(path: CameraPath) -> tuple[PictureOutput, PictureSettings]:
             return _place(ctx, options, instances, path)

@@ -37,7 +37,7 @@ def compare(ctx: click.Context, options: RenderOptions) -> int:
 
     keep_apart(ctx, files_read(options, instances))
     with options.general.console() as console:
-        console.announce_compiling()
+        console.announce_compiling("pictures")
         start = time.perf_counter()
 
         def ready(path: CameraPath, scenes: Scenes) -> None:

@@ -208,12 +208,13 @@ def simplify(ctx: click.Context, /, **_: Any) -> None:
     files, general = options.files, options.general
     _check(ctx, files, as_json=general.as_json)
     with general.console() as console:
-        console.announce_compiling()
         from ..bake.flow import bake
         from ..bake.settings import Resources
         from ..bake.stage_shares import stage_shares
+        from ..compile_ahead import jobs_of
 
         settings = options.settings(ctx)
+        console.announce_compiling(*jobs_of(settings))
         with console.job(stage_shares(settings)):
             baked = bake(
                 files.source,

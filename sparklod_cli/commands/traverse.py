@@ -196,7 +196,7 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
             check_scenes(ctx, scenes)
             keep_apart(ctx, {**besides, "indices_out": outputs.index_files(path.numbers, len(instances))})
 
-        console.announce_compiling()
+        console.announce_compiling("cuts")
         screen = outputs.table.on_stdout and is_terminal(sys.stdout)
         with options.cameras.usage_errors():
             traversed = traverse_files(

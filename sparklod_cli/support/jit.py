@@ -164,7 +164,22 @@ def load_numba() -> ModuleType:
     return jit_numba
 
 
-# Who is told of compilations, and of a cache that does not work
+# Another process that compiles kernels, and who is told of compilations and of a cache that does not work
+
+_claim: Callable[[Kernel], None] | None = None
+
+
+def claim_by(claim: Callable[[Kernel], None] | None) -> None:
+    """Call a function before each kernel is loaded or compiled that Python calls for the first time; None for none."""
+    global _claim
+    _claim = claim
+
+
+def claim(kernel: Kernel) -> None:
+    """Have no other process compile a kernel."""
+    if _claim is not None:
+        _claim(kernel)
+
 
 _listeners: list[tuple[Begun, Done, Trouble]] = []
 

@@ -44,6 +44,7 @@ def dispatcher_of(kernel: jit.Kernel) -> Any:
             kernel.built = inner if _has_wrapper(kernel) else _calling(inner, kernel.py_func)
             if kernel.declared:
                 _keep(kernel.built, kernel.py_func)
+                jit.claim(kernel)
         return kernel.built
 
 
