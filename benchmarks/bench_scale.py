@@ -118,7 +118,7 @@ def bake(scene: Path, folder: Path, method: str, way: str, limit: int, hours: fl
     wall = time.perf_counter() - start
     result: dict[str, Any] = {"wall": round(wall, 2), "limit": 0 if way == "memory" else limit}
     lines = [line for line in out.splitlines() if line.startswith("{")]
-    if child.returncode or len(lines) < 2:
+    if child.returncode or len(lines) < 2 or not output.exists():
         result["error"] = errors.strip().splitlines()[-1:] or [f"exit status {child.returncode}"]
     else:
         report, figures = map(json.loads, lines[-2:])

@@ -286,7 +286,7 @@ def parts_of(
     """Yield all families in parts of at most `most`, of which none comes before the one that has its parent.
 
     The largest families are the first part. What is left are subtrees below them: those that are near each other are
-    parts together, and one that is too large is divided like the tree. All of it takes some 40 bytes a family.
+    parts together, and one that is too large is divided like the tree. It takes some 25 bytes a family.
 
     Args:
         parent: (F,) int32 the family that has each one's parent, which comes before it; -1 for that of the root.
@@ -306,14 +306,24 @@ def parts_of(
     largest = _largest(limit[members], most)
     yield members[largest]
     rest = members[~largest]
-    roots, of_root, weight = np.unique(_roots(parent, rest), return_inverse=True, return_counts=True)
-    group = np.empty(len(roots), np.int32)
-    for number, some in enumerate(_neighbours(center[rest[roots]], weight, np.arange(len(roots)), most)):
-        group[some] = number
-    of_family = group[of_root]
-    order = np.argsort(of_family, kind="stable")
-    for found in np.split(rest[order], np.cumsum(np.bincount(of_family))[:-1]):
-        yield from parts_of(parent, center, limit, most, found)
+    del members, largest
+    root = _roots(parent, rest)
+    roots = np.flatnonzero(root == np.arange(len(rest), dtype=np.int32))
+    number_of = np.empty(len(rest), np.int32)
+    number_of[roots] = np.arange(len(roots), dtype=np.int32)
+    root = number_of[root]
+    del number_of
+    weight = np.zeros(len(roots), np.int64)
+    for part in blocks_of(len(root), most):  # as bincount copies what it counts to int64
+        weight += np.bincount(root[part], minlength=len(roots))
+    group, groups = np.empty(len(roots), np.int32), 0
+    for some in _neighbours(center[rest[roots]], weight, np.arange(len(roots)), most):
+        group[some] = groups
+        groups += 1
+    of_family = group[root]
+    del root, roots, weight, group
+    for number in range(groups):
+        yield from parts_of(parent, center, limit, most, rest[of_family == number])
 
 
 def _largest(limit: FloatArray, most: int) -> NDArray[np.bool_]:
@@ -327,9 +337,12 @@ def _largest(limit: FloatArray, most: int) -> NDArray[np.bool_]:
 
 def _roots(parent: Index, members: Index) -> Index:
     """Return the (N,) place, among ascending members, of the highest ancestor of each that is a member."""
-    above = parent[members]
-    at = np.minimum(np.searchsorted(members, above), len(members) - 1).astype(np.int32)
-    root = np.where(members[at] == above, at, np.arange(len(members), dtype=np.int32))
+    own, place = np.arange(len(members), dtype=np.int32), np.full(len(parent) + 1, -1, np.int32)
+    place[members] = own
+    root = place[parent[members]]  # -1, of no parent, is the place behind all
+    del place
+    np.copyto(root, own, where=root < 0)
+    del own
     for part in blocks_of(len(root), _ROWS):
         while not np.array_equal(higher := root[root[part]], root[part]):
             root[part] = higher

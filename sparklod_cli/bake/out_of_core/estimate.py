@@ -29,8 +29,9 @@ OF_WINDOW, WINDOW = SplatBytes(230, 50), 1 << 19
 #: Out of core, a splat of the whole scene while its nodes are put in order, before and after that for streaming.
 OF_ORDER = 20
 
-#: Families a splat of the input, and bytes of each while parts of them are put in the order for streaming.
-FAMILIES, OF_FAMILY = 0.4, 40
+#: Families a splat of the input, bytes of each while parts of them are put in the order for streaming, and besides
+#: while they are divided into parts. Measured with 40 million.
+FAMILIES, OF_FAMILY, OF_DIVIDED = 0.4, 60, 28
 
 
 def default_memory() -> int | None:
@@ -63,7 +64,8 @@ def out_of_core_bytes(
     window = OF_WINDOW.of(min(2 * splats, WINDOW), sh_degree)
     block = BUILDERS[method].in_block.of(min(splats, block_splats), sh_degree)
     families = int(FAMILIES * splats) if in_chunks else 0
-    arranging = family_bytes(threads) * min(families, MOST_FAMILIES) + OF_FAMILY * families
+    part = family_bytes(threads) * min(families, MOST_FAMILIES)
+    arranging = OF_FAMILY * families + max(part, OF_DIVIDED * families if families > MOST_FAMILIES else 0)
     return PROCESS + max(window, block, OF_ORDER * splats, arranging)
 
 

@@ -92,11 +92,11 @@ def put_order(job: Job, *, threads: int, progress: Progress) -> None:
         if arranged is not None:
             sequence = arranged
     start = links.starts(sequence)
-    at = links.families_at(start)
-    for window, part in enumerate(blocks_of(links.nodes, WINDOW_NODES)):
+    at, nodes = links.families_at(start), links.nodes
+    for window, part in enumerate(blocks_of(nodes, WINDOW_NODES)):
         _put_window(job, window, part, links, sequence, start, at)
-        progress("ordering", links.nodes + part.stop, 2 * links.nodes, "node")
-    job.store.put(ORDER, {"counts": np.array([links.nodes, levels], np.int64)})
+        progress("ordering", nodes + part.stop, 2 * nodes, "node")
+    job.store.put(ORDER, {"counts": np.array([nodes, levels], np.int64)})
 
 
 def _by_key(job: Job, links: _Links, progress: Progress) -> NDArray[np.uint32]:
@@ -146,15 +146,17 @@ def _arranged(
     """
     place = np.empty(len(by_place), np.int32)
     place[by_place] = np.arange(len(by_place), dtype=np.int32)
-    above = links.parent[by_place]
-    parent = np.where(above < 0, np.int32(-1), place[above])
-    del place, above
-    size, count = _of_all(job, "size")[by_place], links.count[by_place]
+    parent = links.parent[by_place]
+    inner = parent >= 0
+    parent[inner] = place[parent[inner]]
+    del inner
+    size, count = _of_all(job, "size", place), links.count[by_place]
     depth, _ = find_limits(parent, size)
     levels = int(depth.max()) + 2
     del depth
     if job.in_chunks:
-        center = _of_all(job, "center")[by_place]
+        center = _of_all(job, "center", place)
+        del place
         order = family_order(parent, count, center, size, most=MOST_FAMILIES, progress=progress)
         return levels, by_place[order].astype(np.uint32)
     if BUILDERS[job.settings.method].in_bands:
@@ -162,10 +164,17 @@ def _arranged(
     return levels, None
 
 
-def _of_all(job: Job, key: str) -> FloatArray:
-    """Return a column of the families of all stages."""
-    parts = [job.store.get(families_of(stage), [key])[key] for stage in range(len(job.families))]
-    return np.concatenate(parts)
+def _of_all(job: Job, key: str, place: NDArray[np.int32]) -> FloatArray:
+    """Return a column of the families of all stages, each at its place."""
+    column, begin = None, 0
+    for stage, length in enumerate(job.families):
+        part = job.store.get(families_of(stage), [key])[key]
+        if column is None:
+            column = np.empty((len(place), *part.shape[1:]), part.dtype)
+        column[place[begin : begin + length]] = part
+        begin += length
+    assert column is not None
+    return column
 
 
 def _put_window(
