@@ -31,7 +31,7 @@ OF_ORDER = 20
 
 #: Families a splat of the input, bytes of each while parts of them are put in the order for streaming, and besides
 #: while they are divided into parts. Measured with 40 million.
-FAMILIES, OF_FAMILY, OF_DIVIDED = 0.4, 60, 28
+FAMILIES, OF_FAMILY, OF_DIVIDED = 0.4, 62, 28
 
 
 def default_memory() -> int | None:
