@@ -1,4 +1,4 @@
-"""How the time of a bake is divided among its stages, for one progress bar that tells the time left."""
+"""Shares of the stages of a bake in its time, for one progress bar that tells the time left."""
 
 from __future__ import annotations
 

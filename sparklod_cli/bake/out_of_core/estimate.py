@@ -31,7 +31,7 @@ OF_ORDER = 20
 
 #: Families a splat of the input, bytes of each while parts of them are put in the order for streaming, and besides
 #: while they are divided into parts. Measured with 40 million.
-FAMILIES, OF_FAMILY, OF_DIVIDED = 0.4, 62, 28
+FAMILIES, OF_FAMILY, OF_DIVIDED = 0.4, 40, 50
 
 
 def default_memory() -> int | None:
@@ -71,9 +71,10 @@ def out_of_core_bytes(
 
 def windows_within(memory: int | None, splats: int, sh_degree: int, threads: int) -> int:
     """Return how many windows of nodes the memory of a bake holds at once: no more than threads, and at least one."""
-    if memory is None:
+    window = OF_WINDOW.of(min(2 * splats, WINDOW), sh_degree)
+    if memory is None or not window:
         return threads
-    return max(1, min(threads, (memory - PROCESS) // OF_WINDOW.of(min(2 * splats, WINDOW), sh_degree)))
+    return max(1, min(threads, (memory - PROCESS) // window))
 
 
 def scratch_bytes(method: str, splats: int, sh_degree: int) -> int:

@@ -45,7 +45,7 @@ def test_the_most_splats_in_memory_fill_it(method: str, splats: int, degree: int
     assert estimate.most_in_memory(memory - 1, method, degree) == splats - 1
 
 
-@given(st.integers(1, 10**9), st.integers(0, MAX_SH_DEGREE), st.integers(0, 1 << 40), st.integers(1, 64))
+@given(st.integers(0, 10**9), st.integers(0, MAX_SH_DEGREE), st.integers(0, 1 << 40), st.integers(1, 64))
 def test_windows_that_are_encoded_together_fit(splats: int, degree: int, memory: int, threads: int) -> None:
     windows = estimate.windows_within(memory, splats, degree, threads)
     window = estimate.OF_WINDOW.of(min(2 * splats, estimate.WINDOW), degree)
