@@ -58,7 +58,7 @@ def main() -> None:
     if limit:
         from sparklod_cli.bake.out_of_core import estimate
 
-        estimate.in_memory_bytes = lambda *_: 1 << 62  # out of core, also where that is not needed
+        estimate.in_memory_bytes = lambda *_, **__: 1 << 62  # out of core, also where that is not needed
         record_tasks(tasks)
     from sparklod_cli.cli import run
 

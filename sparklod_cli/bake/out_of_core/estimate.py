@@ -16,8 +16,15 @@ from ...support.units import format_size
 #: are estimates. Chosen.
 MEMORY_SHARE = 0.75
 
+#: Factor of the memory that an error asks for, since `format_size` rounds by up to 5 %.
+ENOUGH = 1.05
+
 #: Bytes of a process with numba and all kernels, before it has read anything.
 PROCESS = 200_000_000
+
+#: Bytes of a splat of the input while its tree is refined, besides the tree, and of the pictures for that. Measured
+#: with up to 700,000 nodes.
+OF_REFINED, PICTURES = SplatBytes(500, 40), 310_000_000
 
 #: Most and least splats of a block. More make a block no faster, and fewer make its margins too large a part of it.
 MOST_BLOCK_SPLATS, LEAST_BLOCK_SPLATS = 1 << 21, 1 << 16
@@ -40,14 +47,16 @@ def default_memory() -> int | None:
     return None if available is None else int(MEMORY_SHARE * available)
 
 
-def in_memory_bytes(method: str, splats: int, sh_degree: int) -> int:
-    """Return bytes that a bake in memory takes at its peak."""
-    return PROCESS + BUILDERS[method].in_memory.of(splats, sh_degree)
+def in_memory_bytes(method: str, splats: int, sh_degree: int, *, refines: bool = False) -> int:
+    """Return bytes that a bake in memory takes at its peak; `refines` if its tree is refined."""
+    refining = PICTURES + OF_REFINED.of(splats, sh_degree) if refines else 0
+    return PROCESS + BUILDERS[method].in_memory.of(splats, sh_degree) + refining
 
 
-def most_in_memory(memory: int, method: str, sh_degree: int) -> int:
+def most_in_memory(memory: int, method: str, sh_degree: int, *, refines: bool = False) -> int:
     """Return the most splats whose bake in memory takes at most so many bytes."""
-    return max(memory - PROCESS, 0) // BUILDERS[method].in_memory.of(1, sh_degree)
+    fixed, one = (in_memory_bytes(method, splats, sh_degree, refines=refines) for splats in (0, 1))
+    return max(memory - fixed, 0) // (one - fixed)
 
 
 def out_of_core_bytes(
@@ -104,6 +113,6 @@ def block_splats_within(
         if size < LEAST_BLOCK_SPLATS:
             raise OutOfMemoryError(
                 f"{format_size(memory)} of memory is too little even out of core; give --memory"
-                f" {format_size(1.02 * needed(LEAST_BLOCK_SPLATS))} or more"
+                f" {format_size(ENOUGH * needed(LEAST_BLOCK_SPLATS))} or more"
             )
     return size

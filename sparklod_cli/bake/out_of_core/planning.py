@@ -127,7 +127,7 @@ def fits_in_memory(source: Source, settings: BakeSettings, memory: int | None) -
         return True
     if header is None or memory is None:
         return True
-    return estimate.in_memory_bytes(settings.method, header.count, header.sh_degree) <= memory
+    return _in_memory_bytes(header, settings) <= memory
 
 
 def _header_of(source: Source) -> SceneStream | None:
@@ -151,7 +151,7 @@ def _reason(
     is_left: bool,
 ) -> str | None:
     """Return why a bake goes out of core, as the end of a sentence; None if it does not."""
-    needed = estimate.in_memory_bytes(settings.method, header.count, header.sh_degree)
+    needed = _in_memory_bytes(header, settings)
     if memory is not None and needed > memory:
         allowed = "may take" if resources.memory is None else "--memory gives it"
         return f"it would take about {format_size(needed)} of memory and {allowed} {format_size(memory)}"
@@ -160,6 +160,12 @@ def _reason(
     if resources.resume and is_left:
         return "it was interrupted there"
     return "blocks were asked for" if resources.block_splats else None
+
+
+def _in_memory_bytes(header: SceneStream, settings: BakeSettings) -> int:
+    """Return bytes that a bake in memory takes."""
+    refines = settings.refine is not None
+    return estimate.in_memory_bytes(settings.method, header.count, header.sh_degree, refines=refines)
 
 
 def _as_a_whole(settings: BakeSettings) -> str | None:
@@ -181,14 +187,15 @@ def _check_memory(header: SceneStream, settings: BakeSettings, memory: int | Non
     Args:
         whole: of `_as_a_whole`.
     """
-    needed = estimate.in_memory_bytes(settings.method, header.count, header.sh_degree)
+    needed = _in_memory_bytes(header, settings)
     if memory is None or needed <= memory:
         return
-    most = estimate.most_in_memory(memory, settings.method, header.sh_degree)
+    refines = settings.refine is not None
+    most = estimate.most_in_memory(memory, settings.method, header.sh_degree, refines=refines)
     raise OutOfMemoryError(
         f"{whole}, not in blocks: {count_of(header.count, 'splat')} would take about"
         f" {format_size(needed)} of memory, and {format_size(memory)} are enough for {most:,}; give --memory"
-        f" {format_size(1.02 * needed)} or more if the machine has it, or fewer splats"
+        f" {format_size(estimate.ENOUGH * needed)} or more if the machine has it, or fewer splats"
     )
 
 

@@ -38,11 +38,11 @@ def test_more_splats_and_more_coefficients_take_more(method: str, splats: int, d
     assert estimate.block_splats_within(None, method, splats, degree) == estimate.MOST_BLOCK_SPLATS
 
 
-@given(*CASES)
-def test_the_most_splats_in_memory_fill_it(method: str, splats: int, degree: int) -> None:
-    memory = estimate.in_memory_bytes(method, splats, degree)
-    assert estimate.most_in_memory(memory, method, degree) == splats
-    assert estimate.most_in_memory(memory - 1, method, degree) == splats - 1
+@given(*CASES, st.booleans())
+def test_the_most_splats_in_memory_fill_it(method: str, splats: int, degree: int, refines: bool) -> None:
+    memory = estimate.in_memory_bytes(method, splats, degree, refines=refines)
+    assert estimate.most_in_memory(memory, method, degree, refines=refines) == splats
+    assert estimate.most_in_memory(memory - 1, method, degree, refines=refines) == splats - 1
 
 
 @given(st.integers(0, 10**9), st.integers(0, MAX_SH_DEGREE), st.integers(0, 1 << 40), st.integers(1, 64))

@@ -22,6 +22,7 @@ DEMO = FIXTURES / "demo.ply"
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     """A process and blocks so small that little scenes do not fit into the memory that is given."""
     monkeypatch.setattr(estimate, "PROCESS", 0)
+    monkeypatch.setattr(estimate, "PICTURES", 0)
     monkeypatch.setattr(estimate, "WINDOW", 0)
     monkeypatch.setattr(estimate, "FAMILIES", 0)
     monkeypatch.setattr(estimate, "LEAST_BLOCK_SPLATS", 1 << 12)
