@@ -127,7 +127,7 @@ class CompileAhead:
     def _run(self, process: CompilingProcess) -> None:
         try:
             process.run()
-        except SparklodError:  # it was stopped, or the command will compile the kernel itself and say what is wrong
+        except (OSError, SparklodError):  # it was stopped, or the command will compile the kernel and say what is wrong
             pass
         finally:
             with self._changed:
