@@ -36,9 +36,9 @@ def spark(spark_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator
     process.close()
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")  # an engine draws its page again and again as long as that is open
 def page(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
-    """Spark in a browser, started once for all tests."""
+    """Spark in a browser, started once for the tests of a module."""
     chromium = shutil.which("chromium")
     if chromium is None:
         pytest.skip("Chromium is not installed (Debian's package chromium)")

@@ -61,9 +61,9 @@ def engines_dir(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPat
     return npm.folder_with(PACKAGES, variable="ENGINES_DIR", request=request, tmp_path_factory=tmp_path_factory)
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")  # an engine draws its page again and again as long as that is open
 def browser(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    """The browser, started once for all tests."""
+    """The browser, started once for the tests of a module."""
     chromium = shutil.which("chromium")
     if chromium is None:
         pytest.skip("Chromium is not installed (Debian's package chromium)")
