@@ -47,7 +47,7 @@ class InBlocks:
     Attributes:
         job: of all tasks; `build` and `order` add what they find out.
         block_splats: of a block, about.
-        windows: nodes that the memory holds at once while they are encoded, in windows of `WINDOW_NODES`.
+        windows: how many windows of nodes are encoded at once.
         progress: called with how much of a stage is done.
     """
 

@@ -166,14 +166,10 @@ def _arranged(
 
 def _of_all(job: Job, key: str, place: NDArray[np.int32]) -> FloatArray:
     """Return a column of the families of all stages, each at its place."""
-    column, begin = None, 0
+    column, begin = np.empty((len(place), *job.store.shape(families_of(0), key)[1:]), np.float32), 0
     for stage, length in enumerate(job.families):
-        part = job.store.get(families_of(stage), [key])[key]
-        if column is None:
-            column = np.empty((len(place), *part.shape[1:]), part.dtype)
-        column[place[begin : begin + length]] = part
+        column[place[begin : begin + length]] = job.store.get(families_of(stage), [key])[key]
         begin += length
-    assert column is not None
     return column
 
 
