@@ -63,7 +63,7 @@ AREA_OF_MINORS = f32(4 * math.pi / math.sqrt(3))
 LOG2_E = f32(math.log2(math.e))
 
 
-@kernel(inline=True)
+@kernel(inline_late=True)
 def on_plane(axx, ayy, axy, bxx, byy, bxy, x, y, density_a, density_b):
     """Return coverage on a plane, divided by 2 pi, of two Gaussians' overlap, and of both; float32.
 
@@ -203,6 +203,7 @@ def find_partners_in_cells(lanes, count, cell, place, largest, cost, best, at):
 def merge_span(nodes, is_first, rows, largest, begin, end, made, owner, row):
     """Merge the nodes of whole cells, those from `begin` to `end`; see `merge_in_cells`."""
     size = end - begin
+    columns = rows.shape[1]  # not WIDTH where loops over nodes are inside: LLVM takes long to unroll so many
     lanes = np.empty((WIDTH, size + PADDING), np.float32)
     a, b = np.ones(WIDTH * GROUP, np.float32), np.ones(WIDTH * GROUP, np.float32)
     cell, place, at = np.empty(size, np.int32), np.empty(size, np.int32), np.empty(size, np.int32)
@@ -236,12 +237,12 @@ def merge_span(nodes, is_first, rows, largest, begin, end, made, owner, row):
             pairs += (at[i] > place[i]) & (at[j] == place[i])
         for start in range(0, pairs, GROUP):
             some = min(GROUP, pairs - start)
-            for column in range(WIDTH):
+            for column in range(columns):
                 for k in range(some):
                     a[column * GROUP + k] = lanes[column, first[start + k]]
                     b[column * GROUP + k] = lanes[column, second[start + k]]
             unite(a, b)
-            for column in range(WIDTH):
+            for column in range(columns):
                 for k in range(some):
                     lanes[column, first[start + k]] = a[column * GROUP + k]
         merges[:] = 0
@@ -272,7 +273,7 @@ def merge_span(nodes, is_first, rows, largest, begin, end, made, owner, row):
                 families += 1
             else:
                 members[own] = 0
-        for column in range(WIDTH):
+        for column in range(columns):
             for i in range(left):
                 lanes[column, i] = lanes[column, kept[i]]
         count = left

@@ -284,7 +284,8 @@ def split_sets(start, stop, families, sets, sequence, set_of, root, weight, spar
             axis, share = choose_split(nodes, greatest, size, chunks)
             room = share * size
         if roots == 1 or not mark_first_part(families, members, root, weight, axis, room):
-            mark_first_part(families, members, root, weight, SIZE, room)
+            axis = SIZE  # a variable, since the constant has a type of its own, which is compiled once more
+            mark_first_part(families, members, root, weight, axis, room)
         lengths[i] = move_first_part(members, root, weight, spare[begin:end])
 
 
