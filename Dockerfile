@@ -2,14 +2,16 @@
 #
 #   docker build -t sparklod .                          # x86-64-v3: processors with AVX2, since about 2013 to 2015
 #   docker build -t sparklod --build-arg CPU=generic .  # any, also arm64
+#   docker build -t sparklod:cuda --build-arg EXTRAS=cuda .  # with what draws on NVIDIA cards
 #   docker run --rm --user "$(id -u):$(id -g)" -v "$PWD:/data" sparklod build-lod scene.ply
 #
-# What takes long is container/install, which runs outside of containers, too; the image itself has not been built yet.
+# What takes long is container/install, which runs outside of containers, too; no image has been built yet. Of CUDA, a
+# host has the driver and NVIDIA's container toolkit (`docker run --gpus all`); everything else comes with the extra.
 ARG PYTHON=3.12
 FROM python:${PYTHON}-slim AS build
-ARG CPU=x86-64-v3
+ARG CPU=x86-64-v3 EXTRAS=
 COPY . /src
-RUN /src/container/install /src /opt/sparklod "$CPU"
+RUN /src/container/install /src /opt/sparklod "$CPU" "$EXTRAS"
 
 FROM python:${PYTHON}-slim
 ARG CPU=x86-64-v3
