@@ -20,6 +20,7 @@ from scenes import load
 import sparklod_cli as sparklod
 from sparklod_cli import Splats
 from sparklod_cli.codecs import spz
+from sparklod_cli.codecs.content import decode_file
 from sparklod_cli.codecs.gpu import packed_splats
 from sparklod_cli.codecs.options import DEFAULTS, RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import codec as rad
@@ -50,13 +51,13 @@ class Way:
 def through_spz(tree: sparklod.Tree) -> tuple[Splats, int]:
     """Through our LoD SPZ."""
     data = b"".join(spz.encode(tree, threads=2))
-    return spz.decode(io.BytesIO(data), threads=2).splats, len(data)
+    return decode_file(spz, io.BytesIO(data), threads=2).splats, len(data)
 
 
 def through_rad(tree: sparklod.Tree, options: WriteOptions = DEFAULTS) -> tuple[Splats, int]:
     """Through RAD."""
     data = b"".join(rad.encode(tree, options, threads=2))
-    return rad.decode(io.BytesIO(data), threads=2).splats, len(data)
+    return decode_file(rad, io.BytesIO(data), threads=2).splats, len(data)
 
 
 def through_sparks_encodings(tree: sparklod.Tree) -> tuple[Splats, int]:

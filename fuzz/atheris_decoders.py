@@ -16,6 +16,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import BinaryIO
 
+from sparklod_cli.codecs.content import decode_file
 from sparklod_cli.codecs.formats import FORMATS, HEAD, sniff
 from sparklod_cli.support.errors import FormatError, SparklodError
 
@@ -38,9 +39,10 @@ def decode(data: bytes) -> None:
             raise FormatError("there is no such file")
         return io.BytesIO(files[name])
 
-    more = {"open_companion": open_companion} if form.companions else {}
     with contextlib.suppress(SparklodError):
-        scene = form.codec().decode(io.BytesIO(body), threads=1, **more)
+        scene = decode_file(
+            form.codec(), io.BytesIO(body), open_companion=open_companion if form.companions else None, threads=1
+        )
         if scene.tree is not None:
             scene.tree.validate()
 

@@ -12,8 +12,8 @@ from PIL import Image
 
 from sparklod_cli.commands.inspect_text import finding_line
 from sparklod_cli.inspection import report
-from sparklod_cli.io import open_stream, read_levels, read_scene
-from sparklod_cli.model.scene import Scene
+from sparklod_cli.io import open_stream, read_parts, read_scene
+from sparklod_cli.model.scene import DetailScene, Scene
 from sparklod_cli.model.selection import Selection
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.model.streams import collected
@@ -58,8 +58,10 @@ def check_stream(path: Path, threads: int) -> None:
 def check_levels(path: Path, threads: int) -> None:
     """Checks that the detail levels of a scene can be drawn, or are refused; a file of another format is."""
     try:
-        scene = read_levels(path, threads=threads)
+        scene = read_parts(path, threads=threads)
     except FormatError:
+        return
+    if not isinstance(scene, DetailScene):
         return
     check_scene(scene.scene())
     if not np.isfinite(scene.bounds).all():

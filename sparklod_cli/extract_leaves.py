@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .codecs.formats import WRITABLE
-from .codecs.losses import settled_with_losses
+from .codecs.losses import Losses, settled_with_losses
 from .codecs.options import WriteOptions
 from .codecs.spz import like
 from .codecs.validation import check_scene
@@ -20,17 +20,14 @@ from .support.errors import FormatError, memory_errors_translated
 from .support.progress import Progress, silent
 
 
-@dataclass(frozen=True)
-class Extracted:
+@dataclass(frozen=True, kw_only=True)
+class Extracted(Losses):
     """Result of extracting the leaves of a tree.
 
     Attributes:
         format: of the input, for display.
         nodes, splats: of its tree, and those of them that are leaves, which were written.
         seconds: by stage (read, write).
-        clamped: by the column of `Splats`, the number of splats with a value that the output cannot hold.
-        drops_sh: the output has no SH, and some splats do.
-        up_lost: the axis that points up, which the format cannot note; None where nothing is lost.
     """
 
     format: str
@@ -40,9 +37,6 @@ class Extracted:
     bytes: int
     seconds: dict[str, float]
     output_format: str
-    clamped: dict[str, int]
-    drops_sh: bool
-    up_lost: str | None = None
 
 
 def leaves_of(scene: Scene) -> Scene:

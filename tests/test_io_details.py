@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sparklod_cli.io import companions, read_levels, read_scene
+from sparklod_cli.io import companions, read_parts, read_scene
 from sparklod_cli.io.details import detail_files, detail_sink
 from sparklod_cli.io.identity import files_of
 from sparklod_cli.io.local_files import leads_away
@@ -247,7 +247,7 @@ def test_an_output_at_an_address_is_read_from_there(address: Address) -> None:
     detail_sink(address, overwrite=False)(pieces(files | {"lod-meta.json": (GOLDEN / "lod-meta.json").read_bytes()}))
     for place in (address, address.parent):
         np.testing.assert_array_equal(read_scene(place).splats.center, read_scene(GOLDEN).splats.center)
-    assert read_levels(address.parent).counts.tolist() == read_levels(GOLDEN).counts.tolist()
+    assert read_parts(address.parent).counts.tolist() == read_parts(GOLDEN).counts.tolist()
 
 
 # --- Files that are read together -------------------------------------------------------------------------------------

@@ -19,7 +19,7 @@ from .arguments import ProgressLike, file_path, progress_callback, scene_like
 from .files import naming, pack
 
 if TYPE_CHECKING:
-    from ..bake.detail_output import DetailOutput
+    from ..bake.parts_output import DetailOutput
     from ..codecs.options import RadOptions, SogOptions
     from ..lod.detail_rule import DetailSettings
     from ..support.progress import Progress
@@ -89,7 +89,7 @@ def write(
         TypeError: an option is of another type.
         ValueError: an option is out of its range, or is of another format.
     """
-    from ..bake.detail_output import DetailOutput
+    from ..bake.parts_output import DetailOutput
     from ..codecs.formats import WRITABLE, ending_of
     from ..codecs.options import RadOptions, SogOptions, WriteOptions
     from ..codecs.splat_encoding import SplatEncoding

@@ -60,15 +60,12 @@ def output_of(
     Raises:
         OutputError: see `io.writing.scene_sink` and `io.details.detail_sink`.
     """
+    if settings.detail is not None or settings.tiles is not None:  # which most bakes do without
+        from ..io.details import detail_sink
+        from .parts_output import DetailOutput, TileOutput
     if settings.detail is not None:
-        from ..io.details import detail_sink  # what most bakes do without
-        from .detail_output import DetailOutput
-
         return DetailOutput(settings.detail, settings.options, detail_sink(target, overwrite=overwrite))
     if settings.tiles is not None:
-        from ..io.details import detail_sink
-        from .tile_output import TileOutput
-
         return TileOutput(settings.tiles, settings.options, detail_sink(target, overwrite=overwrite))
     if settings.simplify is not None:
         from .simplifying import SimplifiedOutput, Simplifier

@@ -61,7 +61,8 @@ def frame_looking(
     try:
         return Frame(look_at(eye, target, up), lens, time, name, Axes.OPENGL_C2W)
     except ValueError as error:
-        raise CameraPathError(f"the camera at {_spell(eye)} {error}") from None
+        place = ", ".join(f"{value:g}" for value in np.asarray(eye))
+        raise CameraPathError(f"the camera at {place} {error}") from None
 
 
 def orbit(count: int, center: ArrayLike, distance: float, elevation: float, up: ArrayLike) -> Sampled:
@@ -191,10 +192,6 @@ def _front(up: Matrix) -> Matrix:
     """(3,) direction from which a scene is seen first: -z if -y is up, +z if y is up, -y if z is up."""
     across = np.cross([1.0, 0.0, 0.0], up)
     return normalized(across if np.linalg.norm(across) > 1e-6 else np.cross([0.0, 1.0, 0.0], up))
-
-
-def _spell(point: ArrayLike) -> str:
-    return ", ".join(f"{value:g}" for value in np.asarray(point))
 
 
 def centripetal_knots(points: Matrix) -> Matrix:

@@ -21,7 +21,7 @@ from ..support.parallel import blocks_of, ordered_map
 from ..support.progress import Progress
 from ..support.untrusted import ZIP_ERRORS, quoted, quoted_value
 from . import quantize
-from .content import Content, Source, Target, decoder
+from .content import Content, Source, Target
 from .stream import Positioned
 from .tensor_pickle import Tensor, unpickled
 
@@ -56,15 +56,11 @@ class TensorColumn:
     decode: Callable[[FloatArray], FloatArray]
 
 
-def _quat_of_wxyz(wxyz: FloatArray) -> FloatArray:
-    return normalized_quat(wxyz)[:, [1, 2, 3, 0]]
-
-
 #: The tensors of every checkpoint: scales are logarithms, opacities logits, rotations not normalized.
 COLUMNS = (
     TensorColumn(("means", "means"), "center", 3, np.asarray),
     TensorColumn(("scales", "scales"), "scale", 3, quantize.decode_log),
-    TensorColumn(("quats", "quats"), "quat_xyzw", 4, _quat_of_wxyz),
+    TensorColumn(("quats", "quats"), "quat_xyzw", 4, lambda wxyz: normalized_quat(wxyz)[:, [1, 2, 3, 0]]),
     TensorColumn(("opacities", "opacities"), "opacity", 1, quantize.decode_logit),
     TensorColumn(("sh0", "features_dc"), "rgb", 3, quantize.decode_dc),
     TensorColumn(("shN", "features_rest"), "sh", None, np.asarray),
@@ -135,9 +131,6 @@ def open_content(source: Source) -> Content:
             progress("reading", part.stop, len(target.splats), "splat")
 
     return Content(count[0], degree, "checkpoint", fill)
-
-
-decode = decoder(open_content)
 
 
 def _tensors_of(root: Any) -> tuple[Mapping[str, Tensor], int]:

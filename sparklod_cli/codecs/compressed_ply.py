@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +15,8 @@ from ..support.errors import FormatError
 from ..support.progress import Progress
 from ..support.units import count_of
 from . import quantize
-from .content import Content, Source, Target, decoder
-from .ply_header import PlyHeader, read_header
+from .content import Content, Source, Target
+from .ply_header import PlyHeader, offset_of, read_header
 from .stream import Positioned, Rows, decode_rows, rows_between, size_of
 
 #: Splats of a chunk, which share bounds.
@@ -43,7 +43,7 @@ def open_content(source: Source) -> Content:
     header = read_header(source.file)
     count, coefficients = _checked(header)
     trailing = header.check_size(size)
-    degree, file = degree_of(coefficients), Positioned(source.file)
+    degree, file = degree_of(coefficients), source.file
     bounds = _read_bounds(file, header, -(-count // CHUNK_SPLATS))
 
     def fill(target: Target, threads: int, progress: Progress) -> None:
@@ -74,9 +74,6 @@ def open_content(source: Source) -> Content:
     return Content(count, kept, "compressed PLY", fill, header.mode == "mip", notes_on_degree(degree), facts)
 
 
-decode = decoder(open_content)
-
-
 def _within(bounds: FloatArray | None, part: slice, unit: FloatArray) -> FloatArray:
     """Scale (n, 3) values 0..1 of the splats in `part` to their chunks' bounds, (chunks, 6): low and high xyz."""
     if bounds is None:
@@ -87,14 +84,14 @@ def _within(bounds: FloatArray | None, part: slice, unit: FloatArray) -> FloatAr
     return quantize.between(unit, low, high)
 
 
-def _rows(file: Positioned, header: PlyHeader, name: str, start: int, stop: int) -> Iterator[Rows]:
-    offset, row_type = header.offset(name), header.row_type(name)
-    if offset is None or row_type is None:
+def _rows(file: BinaryIO, header: PlyHeader, name: str, start: int, stop: int) -> Iterator[Rows]:
+    row_type = header.row_type(name)
+    if row_type is None:
         raise FormatError("compressed PLY cannot have list properties")
-    return rows_between(file, offset, row_type, start, stop, header.count(name))
+    return rows_between(Positioned(file), offset_of(file, header, name), row_type, start, stop, header.count(name))
 
 
-def _read_bounds(file: Positioned, header: PlyHeader, chunks: int) -> dict[str, FloatArray | None]:
+def _read_bounds(file: BinaryIO, header: PlyHeader, chunks: int) -> dict[str, FloatArray | None]:
     rows = np.concatenate([rows for _, rows in _rows(file, header, "chunk", 0, chunks)] or [np.empty(0)])
     have = rows.dtype.names or ()
     return {

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..model import streams
 from ..model.lod_tree import LodTree
-from ..model.scene import PLAIN, FileCoding, Scene
+from ..model.scene import PLAIN, FileCoding, Scene, facts_of
 from ..model.splats import COLUMNS, Splats
 from ..support.errors import HasTreeError
 from ..support.progress import Progress, silent
@@ -130,8 +130,7 @@ class Content:
             tree = LodTree(np.empty(self.count, np.uint16), np.empty(self.count, np.uint32))
         splats = make(self.count, self.sh_degree)
         self.fill(Target(splats, 0, tree, columns), threads, progress)
-        about = self.antialiased, self.format, self.notes, dict(self.header), self.chunk_bytes, self.coding(), self.up
-        scene = Scene(splats, tree, *about)
+        scene = Scene(splats, tree, chunk_bytes=self.chunk_bytes, coding=self.coding(), **facts_of(self))
         return with_valid_tree(scene) if validate else scene
 
     def stream(self, threads: int) -> streams.SceneStream:
@@ -155,22 +154,18 @@ class Content:
 
         if not self.count:  # there is nothing to read, but the data may be corrupt
             block(0, 0)
-        about = self.antialiased, self.format, self.notes, dict(self.header), self.up
-        return streams.SceneStream(self.count, self.sh_degree, read, *about)
+        return streams.SceneStream(self.count, self.sh_degree, read, **facts_of(self) | {"header": dict(self.header)})
 
 
-def decoder(open_content: Callable[[Source], Content]) -> Callable[..., Scene]:
-    """Return the function that reads a whole scene from a file: `decode(file, *, beside, threads, progress)`."""
-
-    def decode(
-        file: BinaryIO,
-        *,
-        open_companion: OpenCompanion | None = None,
-        threads: int = 1,
-        progress: Progress = silent,
-        **more: Any,
-    ) -> Scene:
-        content = open_content(Source(file, open_companion, threads=threads))
-        return content.scene(threads=threads, progress=progress, **more)
-
-    return decode
+def decode_file(
+    codec: Any,
+    file: BinaryIO,
+    *,
+    open_companion: OpenCompanion | None = None,
+    threads: int = 1,
+    progress: Progress = silent,
+    **more: Any,
+) -> Scene:
+    """Read a whole scene from an open file by the module of its format; `more` is passed on to `Content.scene`."""
+    content: Content = codec.open_content(Source(file, open_companion, threads=threads))
+    return content.scene(threads=threads, progress=progress, **more)

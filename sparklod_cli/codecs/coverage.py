@@ -1,4 +1,4 @@
-"""Keeps what a splat covers when its scales are rounded: its opacity makes up for them.
+"""Compensates opacity for rounded scales, so that a splat covers as much as before.
 
 A code of a scale is off by 3 % and more, so that a splat gets up to 7 % larger or smaller, and with it what it adds to
 a picture. See docs/decisions/08-rounding.md.

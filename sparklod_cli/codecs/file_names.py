@@ -75,11 +75,6 @@ def is_of_streamed_sog(name: str) -> bool:
     return is_in_manifest(name) or (is_chunk_folder(folder) and sog_image_number(file) is not None)
 
 
-def tile_name(level: int, number: int, suffix: str = ".glb") -> str:
-    """Return the name of the file of a tile in the folder `TILES`; of a nested tileset with the suffix ".json"."""
-    return f"{level}-{number}{suffix}"
-
-
 def is_of_tileset(name: str) -> bool:
     """Return True if a file could be of an output of 3D Tiles: a tile or a nested tileset in their folder."""
     return _TILE.fullmatch(name) is not None

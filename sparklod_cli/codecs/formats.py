@@ -9,7 +9,7 @@ import re
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import PurePath
-from typing import Any
+from typing import Any, Literal
 
 from ..support import defaults
 
@@ -39,12 +39,10 @@ class Format:
             only the suffix decides.
         companions: its files refer to others beside them, which the `open_companion` of a source opens.
         folders: those may be in folders there.
-        detailed: its files have several detail levels. Its module also has `decode_levels(file, *,
-            threads, progress, beside) -> DetailScene`, and `encode_files(scene, options, settings, *, threads,
-            progress)`, which
-            gives the names and contents of the files of one.
-        tiled: its files have tiles that replace each other. Its module also has `decode_tiles(file, *, threads,
-            progress, open_companion) -> TileScene`, and `encode_files(scene, options, *, threads, progress)` as above.
+        parts: what viewers draw some of instead of splats chosen one by one: "levels" of detail, or "tiles" that
+            replace each other; None if its files have neither. Its module then has `decode_parts(file, *, threads,
+            progress, open_companion)`, which gives a `DetailScene` or a `TileScene`, and `encode_files` of such a
+            scene, as above.
         bare: its files hold nothing but splats, so that nothing can be noted in them, see `file_notes`.
     """
 
@@ -57,8 +55,7 @@ class Format:
     unbundled: str | None = None
     companions: bool = False
     folders: bool = False
-    detailed: bool = False
-    tiled: bool = False
+    parts: Literal["levels", "tiles"] | None = None
     bare: bool = False
 
     @property
@@ -99,7 +96,7 @@ FORMATS = (
         rb"\s*\{.*?\"lodLevels\"\s*:",
         companions=True,
         folders=True,
-        detailed=True,
+        parts="levels",
     ),
     Format(
         "3D Tiles",
@@ -108,7 +105,7 @@ FORMATS = (
         rb"\s*\{.*?\"geometricError\"\s*:",
         companions=True,
         folders=True,
-        tiled=True,
+        parts="tiles",
     ),
     # A zip that begins with NAME/data.pkl; SOG is a zip, too.
     Format("checkpoint", "checkpoint", (".pt", ".ckpt"), rb"PK\x03\x04.{26}[^/]{1,200}/data\.pkl"),

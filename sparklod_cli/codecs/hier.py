@@ -21,7 +21,7 @@ from ..support.errors import FormatError, TruncatedError
 from ..support.parallel import BLOCK_ROWS, blocks_of, ordered_map
 from ..support.progress import Progress
 from . import quantize
-from .content import Content, Source, Target, decoder
+from .content import Content, Source, Target
 from .stream import Positioned, rows_between, size_of
 
 #: Before the columns, the number of splats, negative where numbers are halves; before the nodes, their number.
@@ -129,9 +129,6 @@ def open_content(source: Source) -> Content:
 
     trailing = {"trailing_bytes": size - end}
     return Content(len(leaves), DEGREE, "HIER", fill, header=trailing, block=BLOCK_ROWS)
-
-
-decode = decoder(open_content)
 
 
 def _count(file: Positioned, at: int, size: int) -> int:

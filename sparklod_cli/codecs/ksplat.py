@@ -20,7 +20,7 @@ from ..support.errors import FormatError, TruncatedError, VersionError
 from ..support.progress import Progress
 from ..support.units import count_of
 from . import quantize
-from .content import Content, Source, Target, decoder
+from .content import Content, Source, Target
 from .stream import Positioned, Rows, decode_rows, rows_between, size_of
 
 HEADER = np.dtype(
@@ -153,9 +153,6 @@ def open_content(source: Source) -> Content:
 
     facts = {"level": level, "sections": len(sections), "trailing_bytes": size - end}
     return Content(count, max(degrees, default=0), "KSPLAT", fill, header=facts)
-
-
-decode = decoder(open_content)
 
 
 def _centers(section: KsplatSection, part: slice, codes: NDArray[np.uint16]) -> FloatArray:

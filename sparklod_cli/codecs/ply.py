@@ -26,7 +26,7 @@ from ..support.progress import Progress, silent
 from ..support.untrusted import quoted
 from . import quantize
 from .clamps import CodeRange
-from .content import Content, Scratch, Source, Target, decoder
+from .content import Content, Scratch, Source, Target
 from .file_notes import comment_of, read_comment
 from .options import DEFAULTS, WriteOptions
 from .ply_header import PlyHeader, offset_of, read_header
@@ -63,7 +63,8 @@ def open_content(source: Source) -> Content:
     facts = {"properties": len(_row_type(header).names or ()), "ascii": int(header.text)}
     facts |= {"big_endian": int(header.byte_order == ">"), "trailing_bytes": header.check_size(size)}
     degree, count = degree_of(coefficients), header.count("vertex")
-    disks = _are_disks(header)
+    # Splats of 2D Gaussian Splatting have two scales, or a third that does not count.
+    disks = header.mode == "2dgs" or ACROSS not in (_row_type(header).names or ())
     unpack = _unpacking(_row_type(header), coefficients, disks=disks)
     rows = _rows(file, header, source.scratch)
 
@@ -75,14 +76,6 @@ def open_content(source: Source) -> Content:
     notes = notes_on_degree(degree) + noted.problems
     notes += ("its disks (2D Gaussian Splatting) are read as splats a thousandth as thick",) if disks else ()
     return Content(count, min(degree, MAX_SH_DEGREE), "PLY", fill, header.mode == "mip", notes, facts, noted.up)
-
-
-decode = decoder(open_content)
-
-
-def _are_disks(header: PlyHeader) -> bool:
-    """Return True for splats of 2D Gaussian Splatting, which have two scales, or a third that does not count."""
-    return header.mode == "2dgs" or ACROSS not in (_row_type(header).names or ())
 
 
 def _unpacking(row_type: np.dtype[Any], coefficients: int, *, disks: bool) -> Callable[[NDArray[Any], Splats], None]:

@@ -54,18 +54,6 @@ class PlyHeader:
         has_list = any(isinstance(prop, PlyListProperty) for prop in element.properties)
         return None if has_list else np.dtype(element.dtype(self.byte_order))
 
-    def offset(self, name: str) -> int | None:
-        """Return where the rows of an element begin in a binary file; None if lists come before them."""
-        at = self.size
-        for other, (_, count) in self.elements.items():
-            if other == name:
-                break
-            row_type = self.row_type(other)
-            if row_type is None:
-                return None
-            at += count * row_type.itemsize
-        return at
-
     def check_size(self, size: int) -> int:
         """Check that a file of `size` bytes can hold all rows, before memory is allocated for them.
 

@@ -36,10 +36,12 @@ def _ext(scene: Scene, threads: int) -> Splats:
 
 
 def _file(form: str, scene: Scene, threads: int) -> Splats:
+    from .content import decode_file
+
     codec = WRITABLE[form].codec()
     options = WriteOptions(compression_level=1)  # the bytes live for a moment only, so they need not be small
     data = b"".join(codec.encode(scene, options, threads=threads))
-    splats: Splats = codec.decode(io.BytesIO(data), threads=threads).splats
+    splats: Splats = decode_file(codec, io.BytesIO(data), threads=threads).splats
     return splats
 
 

@@ -14,7 +14,7 @@ from ..support.errors import FormatError, TruncatedError
 from ..support.progress import Progress, silent
 from . import quantize
 from .clamps import CodeRange
-from .content import Content, Source, Target, decoder
+from .content import Content, Source, Target
 from .options import DEFAULTS, WriteOptions
 from .stream import Positioned, decode_rows, encode_rows, rows_between, size_of
 
@@ -57,9 +57,6 @@ def open_content(source: Source) -> Content:
         decode_rows(rows, decode_part, count, threads, progress)
 
     return Content(count, 0, "SPLAT", fill)
-
-
-decode = decoder(open_content)
 
 
 def importance_order(splats: Splats) -> NDArray[np.intp]:

@@ -25,7 +25,7 @@ from ..support.progress import Progress, silent
 from . import clamps, compression, coverage, quantize
 from .clamps import CodeRange
 from .compression import DataRun
-from .content import Source, decoder
+from .content import Source
 from .encoder import Encoded, Encoder, Get, results, windows_of
 from .file_notes import comment_of
 from .options import DEFAULTS, WriteOptions
@@ -276,9 +276,6 @@ def sh_codes(sh: FloatArray, is_leaf: NDArray[np.bool_] | None, sh_bits: int) ->
     if is_leaf is not None and sh_bits > quantize.LEAST_SH_BITS:
         codes[~is_leaf] = quantize.encode_sh(sh[~is_leaf], quantize.LEAST_SH_BITS)
     return codes
-
-
-decode = decoder(open_content)
 
 
 def held(options: WriteOptions, sh_degree: int) -> Sequence[CodeRange]:

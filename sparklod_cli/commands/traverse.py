@@ -121,7 +121,7 @@ class FrameTable:
         table = TableOutput(
             path=None if self.output == DASH else self.output,
             form=None if nowhere else table_form("--output", self.output, self.form),
-            columns=columns.select(timing=not self.no_timing),
+            columns=[each for each in columns.COLUMNS if each.name not in columns.TIMING or not self.no_timing],
             overwrite=self.overwrite,
         )
         return FrameOutputs(table, self.indices_out, self.padded, self.plot, self.overwrite)

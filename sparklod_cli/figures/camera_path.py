@@ -88,13 +88,9 @@ def picture_of_path(scene: PathScene, *, size: tuple[int, int] = (1600, 1000)) -
     title = f"Cut of {count_of(len(splats), 'splat')}"
     said = [f"{drawn}; white: the path and the frusta of {min(len(cameras), MOST_FRUSTA)} of {len(cameras):,} frames"]
     if frame is not None:
-        title += f" of {_called(cameras[frame], frame)}"
+        title += f" of frame {frame} at {cameras[frame].time:.3f} s"
         said.append("pink: its frustum")
     return write_png(pixels, title, ["; ".join(said)], coloring, eye, low, high)
-
-
-def _called(camera: Camera, frame: int) -> str:
-    return f"frame {frame} at {camera.time:.3f} s"
 
 
 def _above(cameras: Sequence[Camera], low: Points, high: Points, size: tuple[int, int]) -> Viewpoint:

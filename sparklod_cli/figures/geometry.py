@@ -83,9 +83,9 @@ def evenly(count: int, most: int) -> NDArray[np.int64]:
     return np.arange(count) if count <= most else np.arange(most) * count // most
 
 
-def level_of_step(size: float, base: float = DEFAULT_BASE) -> int:
-    """Return the voxel level of Quick-LoD for a design size, 2 * max(scale); its cells have edges of base ** level."""
-    return math.ceil(math.log(size, base) - 1e-9)
+def level_of_step(size: float) -> int:
+    """Return the voxel level of Quick-LoD for a design size, 2 * max(scale); its cells have edges of 1.5 ** level."""
+    return math.ceil(math.log(size, DEFAULT_BASE) - 1e-9)
 
 
 def cells(center: FloatArray, step: float) -> Points:

@@ -138,13 +138,13 @@ def popping(a: Image, b: Image, a_before: Image, b_before: Image) -> float:
     return 255 * math.sqrt(float(np.mean(change * change)))
 
 
-def worst_tile(a: Image, b: Image, size: int = TILE) -> Tile:
+def worst_tile(a: Image, b: Image) -> Tile:
     """Return the tile with the lowest PSNR, the first of several. Tiles at the right and lower edge may be smaller.
 
     Args:
         a, b: (H, W, C) of the same shape, 0..1.
     """
-    error = _squared_error(a, b).mean(axis=2)
+    error, size = _squared_error(a, b).mean(axis=2), TILE
     height, width = error.shape
     down, across = np.arange(0, height, size), np.arange(0, width, size)
     sums = np.add.reduceat(np.add.reduceat(error, down, axis=0), across, axis=1)

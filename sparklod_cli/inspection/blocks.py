@@ -113,7 +113,7 @@ class ReportBlocks:
     @classmethod
     def of_file(cls, file: RadFile, *, threads: int = 1, progress: Progress = silent) -> ReportBlocks:
         """Chunks of a file. The first time they are read, all of their columns are unpacked, to find damage."""
-        header, noted, again = file.header, file.header.noted, False
+        header, again = file.header, False
 
         def mapped(work: Callable[[Block], Any], columns: Collection[str], _: int) -> Iterator[Any]:
             nonlocal again
@@ -122,16 +122,7 @@ class ReportBlocks:
                 yield work(Block(start, splats, tree))
                 progress("reading", start + len(splats), header.count, "splat")
 
-        about = Scene(
-            Splats.zeros(0, header.max_sh),
-            antialiased=noted.antialiased,
-            format=file.format,
-            notes=noted.problems,
-            header=file.about,
-            chunk_bytes=file.chunk_bytes,
-            up=noted.up,
-        )
-        return cls(about, header.count, header.lod_tree, mapped, in_memory=False)
+        return cls(file.scene, header.count, header.lod_tree, mapped, in_memory=False)
 
 
 @dataclass(frozen=True)

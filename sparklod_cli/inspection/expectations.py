@@ -30,7 +30,7 @@ NAMES: dict[str, Callable[[dict[str, Any]], Any]] = {
     "depth": lambda report: report["tree"]["depth"],
     "sh": lambda report: report["sh_degree"],
     "lod": lambda report: report["tree"] is not None,
-    "chunk_bytes": lambda report: _chunked(report)["max"],
+    "chunk_bytes": lambda report: _streamed(report)["chunk_bytes" if report["rad"] else "file_bytes"]["max"],
     "first_bytes": lambda report: _streamed(report)["first_bytes"],
     "chunked": lambda report: report["rad"]["chunked"],
     "palette": lambda report: report["rad"]["palette"],
@@ -95,7 +95,8 @@ class Expectations:
             if getattr(self, key) is not None
         ]
         for name, expected in self.values.items():
-            ends = [(sign, expected[end]) for end, sign in (("min", ">="), ("max", "<=")) if _is_range(expected, end)]
+            ranged = expected if isinstance(expected, dict) else {}
+            ends = [(sign, ranged[end]) for end, sign in (("min", ">="), ("max", "<=")) if end in ranged]
             found += [Condition.of(name, sign, bound) for sign, bound in ends or [("==", expected)]]
         return found + [parse_assertion(text) for text in self.asserts]
 
@@ -112,10 +113,6 @@ def parse_assertion(text: str) -> Condition:
         name = printable(condition.name, QUOTED)
         raise BadAssertionError(f"{text!r}: there is no {name!r} in a report{near(condition.name, known)}")
     return condition
-
-
-def _is_range(expected: Any, end: str) -> bool:
-    return isinstance(expected, dict) and end in expected
 
 
 def read(path: Path) -> Expectations:
@@ -189,11 +186,6 @@ def _streamed(report: dict[str, Any]) -> Any:
     return report["rad"] or report["streamed_sog"] or report["tiles"]
 
 
-def _chunked(report: dict[str, Any]) -> Any:
-    """Sizes of what a viewer fetches at a time."""
-    return _streamed(report)["chunk_bytes" if report["rad"] else "file_bytes"]
-
-
 def check(report: Report, expected: Expectations) -> list[Finding]:
     """Return findings for the expectations that a report does not meet; none for a file that could not be read."""
     if report.format is None:
@@ -214,5 +206,5 @@ def check(report: Report, expected: Expectations) -> list[Finding]:
 
 
 def _text(value: Any) -> str:
-    """As a report writes it, no longer than a line of a log."""
+    """Return a value as text, no longer than a line of a log."""
     return number_text(value) if is_number(value) else printable(json.dumps(value), QUOTED)

@@ -11,6 +11,7 @@ from typing import Any
 from ..codecs.spz_streams import KNOWN_FLAGS
 from ..codecs.tiles_3d.codec import NOT_PLACED
 from ..io import opened, read_arrays, read_scene, size_of_input
+from ..io.rad_file import FORMAT as RAD
 from ..io.rad_file import RadFile
 from ..model.scene import Scene
 from ..model.sh import COEFFICIENTS
@@ -185,11 +186,11 @@ def inspect(
 def _surveyed(path: Path, check: bool, threads: int, progress: Progress) -> HeaderScan | None:
     """Return what the headers of a file tell; None for formats of which they tell little."""
     with opened(path) as (file, form, more):
-        if form.name == "RAD":
+        if form.name == RAD:
             return rad.survey(file, more["open_companion"], check=check)
-        survey = {"Streamed SOG": streamed_sog.survey, "3D Tiles": tiles.survey}.get(form.name)
-        if survey is None:
+        if form.parts is None:
             return None
+        survey = {"levels": streamed_sog.survey, "tiles": tiles.survey}[form.parts]
         return survey(file, more["open_companion"], check=check, threads=threads, progress=progress)
 
 

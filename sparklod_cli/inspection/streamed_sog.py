@@ -14,8 +14,7 @@ from ..codecs.streamed_sog.manifest_rules import level_counts, scan_files, scan_
 from ..support.printable import MOST, printable
 from ..support.progress import Progress, silent
 from ..support.untrusted import LARGEST
-from .findings import ChunkBytes, Head, HeaderScan
-from .quantiles import quantiles_of
+from .findings import ChunkBytes, Head, HeaderScan, quantiles_of
 from .values import Box
 
 
@@ -82,7 +81,7 @@ def survey(
 
 
 def _head(manifest: Manifest, chunks: Mapping[str, Chunk], facts: StreamedSogFacts) -> Head:
-    """As reading level 0 and the environment gives it."""
+    """Return what a reader of level 0 and the environment finds."""
     read = [chunks[name] for name in _names_of(manifest, 0)]
     count = facts.levels[0].splats
     if manifest.environment is not None:

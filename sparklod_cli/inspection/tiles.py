@@ -25,8 +25,7 @@ from ..model.georeference import EarthPlace, place_of
 from ..model.transforms import common
 from ..support.printable import MOST, printable
 from ..support.progress import Progress, silent
-from .findings import ChunkBytes, Head, HeaderScan
-from .quantiles import quantiles_of
+from .findings import ChunkBytes, Head, HeaderScan, quantiles_of
 
 #: Distance from the centre of the Earth, metres, from which on a transform places a tileset on it. Chosen.
 ON_EARTH = 1e6
@@ -92,7 +91,7 @@ def survey(
 
 
 def _head(tileset: Tileset, chunks: Mapping[int, Chunk]) -> Head:
-    """As reading the tiles without children gives it."""
+    """Return what a reader of the tiles without children finds."""
     read = [chunk for number, chunk in chunks.items() if not tileset.tiles[number].children]
     return Head(
         f"3D Tiles {tileset.head['asset']['version']} of {read[0].format}" if read else "3D Tiles",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -234,7 +234,7 @@ class TreeColumns:
 
     @classmethod
     def of(cls, blocks: ReportBlocks) -> TreeColumns:
-        """For the nodes of some blocks, none of which has been added."""
+        """Return columns for the nodes of some blocks, none of which has been added."""
         count, tree = blocks.count, blocks.about.tree
         size = np.empty(count, np.float32)
         if tree is None:
@@ -296,12 +296,12 @@ def examine_blocks(
     """
     tree, size = columns.tree, columns.size
     depth, limit = find_depths(tree.child_count, tree.child_start, size)
-    sums, (coarse, split), parents = _at_once(
-        threads,
+    work: list[Callable[[], Any]] = [
         functools.partial(sum_by_depth, depth, tree.child_count, size),
         functools.partial(_coarse_cut, tree, limit),
         functools.partial(find_parents, tree.child_count, tree.child_start) if check else lambda: None,
-    )
+    ]
+    sums, (coarse, split), parents = ordered_map(lambda each: each(), work, threads)
     nodes, ends, logs, children = sums
     with np.errstate(divide="ignore", invalid="ignore"):
         means = np.exp(logs / nodes)
@@ -333,11 +333,6 @@ def examine_blocks(
     found += leaves_of_d.finding("tree.leaf-opacity", node_text(leaves_of_d, "is a leaf with D > 1"))
     found += size_findings(blocks, tree, parent, size, scale_ends, threads)
     return facts, found if in_chunks else [*found, *order_findings(parent, limit, threads)]
-
-
-def _at_once(threads: int, *work: Callable[[], Any]) -> Iterator[Any]:
-    """Return the results of the functions."""
-    return ordered_map(lambda each: each(), work, threads)
 
 
 def _coarse_cut(tree: LodTree, limit: FloatArray) -> tuple[NDArray[np.int64], int]:

@@ -6,15 +6,13 @@ What most jobs need is imported here; `rad_file` and `details` are imported by t
 from .local_files import companions, is_file_name
 from .reading import (
     MAX_TEXT,
-    format_of,
     opened,
     read_arrays,
-    read_levels,
+    read_parts,
     read_rgba,
     read_scene,
     read_stored,
     read_text,
-    read_tiles,
     read_together,
     size_of_input,
 )

@@ -27,12 +27,11 @@ from ..codecs.file_names import (
 from ..codecs.sog.sog_container import MAX_META, companion_names
 from ..codecs.streamed_sog.manifest import MAX_MANIFEST, Manifest, parse
 from ..codecs.tiles_3d import tileset
-from ..support import atomic, atomic_set
 from ..support.addresses import Address, Place
 from ..support.errors import FormatError, OutputError
 from .local_files import companions, in_folder, reason_of
 from .reading import opened
-from .writing import Files, SinkTogether, check_header, send_together
+from .writing import Files, SinkTogether, check_header, real_target, write_set
 
 
 @dataclass(frozen=True)
@@ -94,7 +93,7 @@ def detail_sink(path: Place, *, overwrite: bool) -> SinkTogether:
     Raises:
         OutputError: it is no place for several files, a folder is in the way, or see `check_writable`.
     """
-    target, files = _target(path), _files_of(path)
+    target, files = real_target(path), _files_of(path)
     check_header(path, overwrite=overwrite)
     former = _former(target, files)
     folders = [] if isinstance(target, Path) else folders_of(_standing(target, files))
@@ -103,14 +102,14 @@ def detail_sink(path: Place, *, overwrite: bool) -> SinkTogether:
     return functools.partial(_write, path, overwrite=overwrite)
 
 
-def detail_files(path: Path) -> list[Path]:
+def detail_files(path: Place) -> list[Place]:
     """Return the files beside a manifest that are called as those of an output there, whether it names them or not."""
-    target = Path(os.path.realpath(path))
+    target = real_target(path)
     return [target.parent / name for name in _standing(target, _files_of(path))]
 
 
 def _write(path: Place, files: Files, *, overwrite: bool) -> int:
-    target = _target(path)
+    target = real_target(path)
     former = _former(target, _files_of(path))
 
     def placed() -> Iterator[tuple[str, Iterable[bytes]]]:
@@ -123,32 +122,12 @@ def _write(path: Place, files: Files, *, overwrite: bool) -> int:
                     _check_folder(target, folder, former)
             yield name if folders else target.name, pieces
 
-    if isinstance(target, Address):
-        return send_together(target, placed(), former=[target.parent / name for name in former], overwrite=overwrite)
-    try:
-        with atomic.created(target.parent):
-            return atomic_set.write(
-                target.parent,
-                placed(),
-                overwrite=overwrite,
-                outdated=lambda names: [name for name in former if name not in names],
-            )
-    except FileExistsError as error:
-        taken = Path(error.filename or target)
-        if taken.exists() and not taken.is_file():
-            raise OutputError(f"{taken} is in the way; move it away, or name another output") from None
-        raise OutputError(f"{taken} exists, add --overwrite to replace it") from None
-    except OSError as error:
-        raise OutputError(f"cannot write {path}: {reason_of(error)}") from None
+    return write_set(path, placed(), former=former, overwrite=overwrite)
 
 
 def _files_of(path: Place) -> FileSet:
     """Return the names of the files beside a manifest; a manifest of another name is that of a Streamed SOG."""
     return FILE_SETS.get(path.name, FILE_SETS[MANIFEST])
-
-
-def _target(path: Place) -> Place:
-    return path if isinstance(path, Address) else Path(os.path.realpath(path))
 
 
 def _check_folder(target: Place, folder: str, former: Iterable[str]) -> None:

@@ -121,7 +121,7 @@ def _named_in(path: Path) -> list[Path]:
         file.seek(0)
         if head.startswith(rad_header.MAGIC):
             return _companion_paths(path, rad_header.read_header(file).filenames)
-        if form is not None and form.tiled:
+        if form is not None and form.parts == "tiles":
             return _tiles_of(path, file.read(MAX_TILESET + 1))
         if form is not None and form.folders:
             metas = _companion_paths(path, parse(file.read(MAX_MANIFEST + 1)).names(), folders=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -15,7 +15,7 @@ from ..codecs.rad.rad_header import RadHeader, read_header
 from ..codecs.rad.rad_reader import RadReader, decoded_bytes, file_of
 from ..codecs.validation import check_rules
 from ..model.lod_tree import LodTree
-from ..model.scene import FileCoding
+from ..model.scene import FileCoding, Scene
 from ..model.splats import FloatArray, Splats
 from ..support.errors import UnreadableError
 from ..support.machine import available_memory
@@ -38,12 +38,10 @@ class RadFile:
     Attributes:
         path: of the file.
         header: of the file.
-        about: the numbers that `Scene.header` has.
     """
 
     path: Path
     header: RadHeader
-    about: Mapping[str, int]
     _reader: RadReader = field(repr=False)
 
     @classmethod
@@ -57,17 +55,21 @@ class RadFile:
             if found is None:
                 return None
             reader = RadReader.open(*found)
-        return cls(path, reader.header, reader.facts, reader)
+        return cls(path, reader.header, reader)
 
     @property
-    def format(self) -> str:
-        """As `Scene.format`."""
-        return self.header.format
-
-    @property
-    def chunk_bytes(self) -> tuple[int, ...]:
-        """Sizes of the chunks in the file."""
-        return tuple(entry.bytes for entry in self.header.chunks)
+    def scene(self) -> Scene:
+        """Scene as it is known before any chunk is read: without splats, and without its tree."""
+        header = self.header
+        return Scene(
+            Splats.empty(0, header.max_sh),
+            antialiased=header.noted.antialiased,
+            format=header.format,
+            notes=header.noted.problems,
+            header=self._reader.facts,
+            chunk_bytes=tuple(entry.bytes for entry in header.chunks),
+            up=header.noted.up,
+        )
 
     @property
     def fits(self) -> bool:

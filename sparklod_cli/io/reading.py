@@ -67,50 +67,20 @@ def read_stored(path: Place) -> Stored:
     return found
 
 
-def read_levels(path: Place, *, threads: int = 1, progress: Progress = silent) -> DetailScene:
-    """Read a scene at all its detail levels.
+def read_parts(path: Place, *, threads: int = 1, progress: Progress = silent) -> DetailScene | TileScene | None:
+    """Read a scene with all its detail levels or tiles; None where its format has neither.
 
     Args:
-        path: of the lod-meta.json of a Streamed SOG, or of the folder that holds it.
+        path: of the lod-meta.json of a Streamed SOG, of the tileset.json of 3D Tiles, or of the folder that holds it.
 
     Raises:
-        UnknownFormatError: its format has no detail levels.
         FormatError: as `read_scene`.
     """
     with opened(path) as (file, form, more):
-        if not form.detailed:
-            known = " and ".join(form.name for form in FORMATS if form.detailed)
-            raise UnknownFormatError(f"{form.name} has no detail levels; {known} has")
-        scene: DetailScene = form.codec().decode_levels(file, threads=threads, progress=progress, **more)
+        if form.parts is None:
+            return None
+        scene: DetailScene | TileScene = form.codec().decode_parts(file, threads=threads, progress=progress, **more)
     return scene
-
-
-def read_tiles(path: Place, *, threads: int = 1, progress: Progress = silent) -> TileScene:
-    """Read a scene with all its tiles.
-
-    Args:
-        path: of the tileset.json of 3D Tiles, or of the folder that holds it.
-
-    Raises:
-        UnknownFormatError: its format has no tiles.
-        FormatError: as `read_scene`.
-    """
-    with opened(path) as (file, form, more):
-        if not form.tiled:
-            known = " and ".join(form.name for form in FORMATS if form.tiled)
-            raise UnknownFormatError(f"{form.name} has no tiles; {known} has")
-        scene: TileScene = form.codec().decode_tiles(file, threads=threads, progress=progress, **more)
-    return scene
-
-
-def format_of(path: Place) -> Format:
-    """Return the format of a file, or of what a folder stands for.
-
-    Raises:
-        FormatError: it cannot be read, or is of no known format.
-    """
-    with opened(path) as (_, form, _):
-        return form
 
 
 @contextlib.contextmanager
@@ -149,7 +119,7 @@ def opened(path: Place) -> Iterator[tuple[BinaryIO, Format, dict[str, Any]]]:
 
 @contextlib.contextmanager
 def readable() -> Iterator[None]:
-    """Yield an `OSError` of the body, which reads a file, becomes an `UnreadableError`."""
+    """Turn an `OSError` of the body, which reads a file, into an `UnreadableError`."""
     try:
         yield
     except OSError as error:

@@ -192,7 +192,7 @@ def _digest(path: Place) -> str:
 
 @contextlib.contextmanager
 def _room(folder: Path | None) -> Iterator[None]:
-    """Yield an `OSError` of the body becomes an `OutputError`."""
+    """Turn an `OSError` of the body into an `OutputError`."""
     try:
         yield
     except OSError as error:

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 from ..codecs.encoder import Get
 from ..codecs.formats import Format
@@ -26,9 +26,6 @@ from .local_files import number_of, reason_of
 if TYPE_CHECKING:
     from ..codecs.rad.rad_reader import RadReader
 
-
-#: Path or address of a header.
-_Header = TypeVar("_Header", Path, Address)
 
 #: Schemes of addresses that are only read.
 READ_ONLY = ("http", "https")
@@ -115,26 +112,29 @@ def write_stdout(pieces: Iterable[bytes]) -> int:
     return size
 
 
-def chunk_files(path: Path) -> list[Path]:
-    """Return the existing files beside a header whose names match its pattern, in the order of their numbers."""
-    target = Path(os.path.realpath(path))
-    try:
-        return _numbered(target, (each.name for each in target.parent.iterdir()))
-    except OSError:
-        return []
+def chunk_files(path: Place) -> list[Place]:
+    """Return the existing files beside a header whose names match its pattern, in the order of their numbers.
 
-
-def _chunks_at(address: Address) -> list[Address]:
-    """Return those at an address."""
+    Raises:
+        OutputError: the service does not list those at an address.
+    """
+    target = real_target(path)
     try:
-        return _numbered(address, (name for name in address.parent.files() if "/" not in name))
+        if isinstance(target, Address):
+            names = [name for name in target.parent.files() if "/" not in name]
+        else:
+            names = [each.name for each in target.parent.iterdir()]
     except OSError as error:
-        raise OutputError(f"cannot list {address.parent}: {reason_of(error)}") from None
-
-
-def _numbered(header: _Header, names: Iterable[str]) -> list[_Header]:
-    numbers = {number_of(name, header.name): header.parent / name for name in names}
+        if isinstance(target, Path):
+            return []
+        raise OutputError(f"cannot list {target.parent}: {reason_of(error)}") from None
+    numbers = {number_of(name, target.name): target.parent / name for name in names}
     return [numbers[number] for number in sorted(number for number in numbers if number is not None)]
+
+
+def real_target(path: Place) -> Place:
+    """Return where the files of an output go: where a symbolic link leads."""
+    return path if isinstance(path, Address) else Path(os.path.realpath(path))
 
 
 def write_together(path: Place, files: Files, *, overwrite: bool) -> int:
@@ -152,21 +152,35 @@ def write_together(path: Place, files: Files, *, overwrite: bool) -> int:
         OutputError: a file exists and `overwrite` is not set, or the file system, or the service, refused something.
     """
     check_together(path, overwrite=overwrite)
-    target = path if isinstance(path, Address) else Path(os.path.realpath(path))
+    target = real_target(path)
     placed = ((target.name if number_of(name, target.name) is None else name, pieces) for name, pieces in files)
+    return write_set(path, placed, former=[each.name for each in chunk_files(target)], overwrite=overwrite)
+
+
+def write_set(path: Place, files: Files, *, former: Sequence[str], overwrite: bool) -> int:
+    """Write a file and those that it names, all or none of them, and return their size; make their folder.
+
+    Args:
+        path: of the last file; where it is a symbolic link, all files go to where that leads.
+        files: names, with the folders that they are in there, and contents; the last one is the name of the target.
+        former: names of files of a former output, which are removed where no new one has their name.
+
+    Raises:
+        OutputError: see `write_together`.
+    """
+    target = real_target(path)
     if isinstance(target, Address):
-        return send_together(target, placed, former=_chunks_at(target), overwrite=overwrite)
-    header = target
+        return send_together(target, files, former=[target.parent / name for name in former], overwrite=overwrite)
     try:
-        with atomic.created(header.parent):
+        with atomic.created(target.parent):
             return atomic_set.write(
-                header.parent,
-                placed,
+                target.parent,
+                files,
                 overwrite=overwrite,
-                outdated=lambda names: (each.name for each in chunk_files(header) if each.name not in names),
+                outdated=lambda names: [name for name in former if name not in names],
             )
     except FileExistsError as error:
-        raise _taken(Path(error.filename or header)) from None
+        raise _taken(Path(error.filename or target)) from None
     except OSError as error:
         raise OutputError(f"cannot write {path}: {reason_of(error)}") from None
 
@@ -193,12 +207,8 @@ def check_header(path: Place, *, overwrite: bool) -> None:
 def check_together(path: Place, *, overwrite: bool) -> None:
     """Raise `OutputError` where a header, or a file that it names, cannot be written."""
     check_header(path, overwrite=overwrite)
-    if isinstance(path, Address):
-        for address in [] if overwrite else _chunks_at(path):
-            raise _taken(address)
-        return
-    for each in chunk_files(path):
-        if not overwrite or _is_no_file(each):
+    for each in [] if overwrite and isinstance(path, Address) else chunk_files(path):
+        if not overwrite or (isinstance(each, Path) and _is_no_file(each)):
             raise _taken(each)
 
 
@@ -311,7 +321,7 @@ def scene_sink(path: Place, form: Format, *, chunked: bool = False, overwrite: b
     Raises:
         OutputError: see `sink` and `sink_together`. Writing raises that, too, and what the codec raises.
     """
-    stem = path.stem if isinstance(path, Address) else Path(os.path.realpath(path)).stem
+    stem = real_target(path).stem
     if chunked or path.name.lower() == form.unbundled:
         return SceneSink(form, None, sink_together(path, overwrite=overwrite), stem)
     return SceneSink(form, sink(path, overwrite=overwrite), None, stem)

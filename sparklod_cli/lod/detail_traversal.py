@@ -17,8 +17,7 @@ from ..model.scene import DetailScene
 from ..model.splats import Splats
 from .detail_choice import Chains, Distances, Distant, Levels, RegionBounds, choose
 from .detail_rule import LEAST_BASE_DISTANCE, DetailRule
-from .splat_forest import SplatForest
-from .traversal import CutView, TreeCut, TreeInstance, views_of
+from .traversal import CutView, SplatForest, TreeCut, TreeInstance, views_of
 
 #: Priorities of files, whole numbers: for regions of which nothing is drawn, for those at another level, and for what
 #: comes next. The environment is asked for before all others.

@@ -122,18 +122,13 @@ def band_order(parent: Index, count: NDArray[np.uint16], size: FloatArray) -> In
     if not len(parent):
         return np.empty(0, np.int32)
     depth, limit = find_limits(parent, np.fmax(size, np.float32(0)))
-    levels = _levels(depth)
+    levels = np.split(np.argsort(depth, kind="stable"), np.cumsum(np.bincount(depth))[:-1])
     by_size = np.argsort(-limit, kind="stable")  # parents first, where they are as large
     band = np.empty(len(parent), np.int32)
     before = np.cumsum(count[by_size], dtype=np.int64) - count[by_size]
     ends = [FIRST_BAND * BAND_GROWTH**k for k in range(max(1, math.ceil(math.log2(len(before)))) + 1)]
     band[by_size] = np.searchsorted(ends, before, side="right")
     return np.lexsort((_depth_first(parent, levels), band)).astype(np.int32)
-
-
-def _levels(depth: Index) -> list[NDArray[np.int64]]:
-    """Return the families of each depth, ascending."""
-    return np.split(np.argsort(depth, kind="stable"), np.cumsum(np.bincount(depth))[:-1])
 
 
 def _depth_first(parent: Index, levels: list[NDArray[np.int64]]) -> NDArray[np.int64]:

@@ -136,7 +136,7 @@ class _Nodes:
         return cls(rows, size, level, family, rank, np.ones(count, np.int64), np.zeros(count, np.int64))
 
     def pending(self, splats: Splats) -> Pending:
-        """With how they are drawn."""
+        """Return these nodes with the splats that they are drawn as."""
         return Pending.of(splats, **vars(self))
 
 

@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 
 from ..model.splats import Splats
 from ..model.tile_scene import TileScene
-from .splat_forest import SplatForest
 from .tiles import PIXEL_ERROR
-from .traversal import CutView, TreeCut, TreeInstance, views_of
+from .traversal import CutView, SplatForest, TreeCut, TreeInstance, views_of
 
 #: Requests under way at a time: CesiumJS's, to one server.
 FETCHERS = 18

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import threading
 import time
@@ -13,7 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..model.foveation import Cones, Foveation, Frustum
+from ..model.gaussian import spark_size
 from ..model.lod_tree import CHUNK_BITS, CHUNK_NODES, Nodes
+from ..model.splats import Splats
 from .kernels import cut_arrays, pixel_scale
 from .kernels.cut import find_cut
 
@@ -82,7 +85,7 @@ class Forest:
             fill_nodes(self.nodes[start : start + len(tree.size)], tree)
 
     def _make_room(self, counts: Sequence[int], make: Callable[..., NDArray[Any]]) -> None:
-        """For trees of so many nodes."""
+        """Make arrays for trees of so many nodes."""
         self.node_base = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
         chunks = [-(-count // CHUNK_NODES) for count in counts]
         self.chunk_base = np.concatenate([[0], np.cumsum(chunks)]).astype(np.int64)
@@ -111,6 +114,32 @@ class Forest:
             present: (chunks,) bool that it was found with.
         """
         return False
+
+
+class SplatForest(Forest):
+    """Scenes of which viewers draw whole runs of splats: splats as nodes, for statistics of cuts; chunks are files.
+
+    Args:
+        splats: of each scene.
+        coarse: of each, (N,) bool, true for splats that finer ones replace; the others count as leaves.
+        files: number of files of each.
+    """
+
+    def __init__(self, splats: Sequence[Splats], coarse: Sequence[NDArray[np.bool_]], files: Sequence[int]) -> None:
+        self._splats, self._coarse = splats, coarse
+        self.node_base = np.cumsum([0, *map(len, splats)]).astype(np.int64)
+        self.chunk_base = np.cumsum([0, *files]).astype(np.int64)
+
+    @functools.cached_property
+    def nodes(self) -> NDArray[np.void]:  # type: ignore[override]  # made when the first statistics are asked for
+        """(N,) `pixel_scale.NODE` of all scenes."""
+        nodes = np.zeros(int(self.node_base[-1]), pixel_scale.NODE)
+        for splats, coarse, start in zip(self._splats, self._coarse, self.node_base.tolist(), strict=False):
+            part = nodes[start : start + len(splats)]
+            part["x"], part["y"], part["z"] = splats.center.T
+            part["size"] = spark_size(splats)
+            part["child_count"] = coarse
+        return nodes
 
 
 def fill_nodes(rows: NDArray[np.void], nodes: Nodes) -> None:

@@ -157,7 +157,7 @@ class Margins:
             last = _first_part(float(below), edge, shift[axis]) + PARTS - 1 if has_below else 0
             first = _first_part(float(above), edge, shift[axis]) if has_above else 0
             self._below[axis] = _last_of_part(last, edge) if has_below else -INFINITY
-            self._above[axis] = _first_of_part(first, edge) if has_above else INFINITY
+            self._above[axis] = np.nextafter(_last_of_part(first - 1, edge), INFINITY) if has_above else INFINITY
 
     @property
     def are_closed(self) -> bool:
@@ -188,8 +188,3 @@ def _last_of_part(part: int, edge: float) -> np.float32:
     while near < FLOAT_MAX and math.floor(float(after := np.nextafter(near, INFINITY)) / edge) <= part:
         near = after
     return near
-
-
-def _first_of_part(part: int, edge: float) -> np.float32:
-    """Return the least float32 in a part of an axis or in one above it."""
-    return np.nextafter(_last_of_part(part - 1, edge), INFINITY)

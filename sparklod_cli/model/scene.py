@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -264,4 +265,9 @@ class DetailScene:
         splats = self.splats.take(self.level(0))
         if self.environment is not None:
             splats = Splats.concat([splats, self.environment])
-        return Scene(splats, None, self.antialiased, self.format, self.notes, self.header, up=self.up)
+        return Scene(splats, **facts_of(self))
+
+
+def facts_of(source: Any) -> dict[str, Any]:
+    """Return what a scene of any kind says of its file, by the names of the attributes that all of them have."""
+    return {name: getattr(source, name) for name in ("antialiased", "format", "notes", "header", "up")}

@@ -14,7 +14,7 @@ from ..support.errors import SparklodError
 from ..support.progress import Progress, silent
 from ..support.units import count_of
 from .lod_tree import LodTree
-from .scene import Scene
+from .scene import Scene, facts_of
 from .sh import COEFFICIENTS
 from .splats import COLUMNS, Splats
 from .transforms import Transform, common, rotated
@@ -76,7 +76,7 @@ def collected(stream: SceneStream, progress: Progress = silent) -> Scene:
         for name in COLUMNS:
             getattr(splats, name)[part] = getattr(block, name)
         progress("reading", done, stream.count, "splat")
-    return Scene(splats, None, stream.antialiased, stream.format, stream.notes, stream.header, up=stream.up)
+    return Scene(splats, **facts_of(stream))
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from .scene import Bounds, Counts, Scene
+from .scene import Bounds, Counts, Scene, facts_of
 from .splats import Splats
 
 
@@ -90,6 +90,5 @@ class TileScene:
 
     def scene(self) -> Scene:
         """Return full detail as a plain scene: the splats of the tiles without children."""
-        held = np.repeat(self.is_leaf, self.counts)
-        splats = self.splats.take(np.flatnonzero(held))
-        return Scene(splats, None, self.antialiased, self.format, self.notes, self.header, up=self.up)
+        splats = self.splats.take(np.repeat(self.is_leaf, self.counts))
+        return Scene(splats, **facts_of(self))

@@ -15,7 +15,7 @@ from ..io.details import LevelFiles
 from ..lod import detail_rule, tile_traversal
 from ..lod.detail_traversal import DetailFiles
 from ..model.lod_tree import CHUNK_NODES, LodTree, Nodes
-from ..model.scene import DetailScene, FileCoding, Scene
+from ..model.scene import DetailScene, FileCoding, Scene, facts_of
 from ..model.splats import COLUMNS, Splats
 from ..model.tile_scene import TileScene
 
@@ -45,7 +45,7 @@ class LoadedScene:
 
     @property
     def name(self) -> str:
-        """For messages and titles: that of the file."""
+        """Name in messages and titles: that of the file."""
         return self.file.name if self.file is not None else UNNAMED
 
     @property
@@ -230,18 +230,13 @@ class LoadedTiles(LoadedRuns):
         return bytes_of(self.splats) * self.tiles.counts // max(1, self.count)
 
 
-def all_tiles(tiles: TileScene) -> Scene:
-    """Return the splats of all tiles as one plain scene."""
-    return Scene(tiles.splats, None, tiles.antialiased, tiles.format, tiles.notes, tiles.header, up=tiles.up)
-
-
-def whole_scene(detail: DetailScene) -> Scene:
-    """Return all levels and the environment as one plain scene."""
-    splats = detail.splats
-    if detail.environment is not None:
-        degree = min(splats.sh_degree, detail.environment.sh_degree)
-        splats = Splats.concat([part.with_max_sh(degree) for part in (splats, detail.environment)])
-    return Scene(splats, None, detail.antialiased, detail.format, detail.notes, detail.header, up=detail.up)
+def whole_scene(parts: DetailScene | TileScene) -> Scene:
+    """Return all tiles, or all levels and the environment, as one plain scene."""
+    splats = parts.splats
+    if isinstance(parts, DetailScene) and parts.environment is not None:
+        degree = min(splats.sh_degree, parts.environment.sh_degree)
+        splats = Splats.concat([part.with_max_sh(degree) for part in (splats, parts.environment)])
+    return Scene(splats, **facts_of(parts))
 
 
 def files_of(found: LevelFiles) -> DetailFiles:

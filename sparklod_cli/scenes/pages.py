@@ -19,7 +19,7 @@ from ..lod.traversal import Forest, fill_nodes
 from ..model.balls import USED, Balls, balls_of
 from ..model.instances import Instance
 from ..model.lod_tree import CHUNK_BITS, CHUNK_NODES, LodTree, Nodes
-from ..model.scene import FileCoding, Scene
+from ..model.scene import FileCoding
 from ..model.splats import COLUMNS, Splats
 from ..support.errors import SparklodError, TreeError
 from ..support.machine import available_memory
@@ -272,23 +272,6 @@ class PagedScene(LoadedScene):
     def rows(self, index: Index) -> Splats:
         """Return some splats, in the space of the scene, by their indices, ascending."""
         return self.pages.splats(index)
-
-
-def empty_scene(file: RadFile) -> Scene:
-    """Return what is known of the scene of a file before its chunks are read."""
-    tree = LodTree(np.zeros(0, np.uint16), np.zeros(0, np.uint32))
-    header = file.header
-    splats = Splats.empty(0, header.max_sh)
-    return Scene(
-        splats,
-        tree,
-        header.noted.antialiased,
-        file.format,
-        header.noted.problems,
-        dict(file.about),
-        file.chunk_bytes,
-        up=header.noted.up,
-    )
 
 
 def sampled_balls(instances: Sequence[Instance], scenes: Sequence[LoadedScene]) -> Balls:

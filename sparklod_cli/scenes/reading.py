@@ -7,13 +7,15 @@ from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from ..codecs.formats import PRECISIONS
 from ..codecs.rounding import after
-from ..io import format_of, read_levels, read_scene, read_tiles, size_of_input
+from ..io import read_parts, read_scene, size_of_input
 from ..io.details import read_level_files
 from ..io.rad_file import RadFile
 from ..model.instances import Instance, Source
-from ..model.lod_tree import CHUNK_NODES
+from ..model.lod_tree import CHUNK_NODES, LodTree
 from ..model.scene import DetailScene, Scene
 from ..model.selection import Selection, describe
 from ..model.splats import COLUMNS
@@ -28,14 +30,13 @@ from .loaded_scene import (
     LoadedRuns,
     LoadedScene,
     LoadedTiles,
-    all_tiles,
     bytes_of,
     files_in_memory,
     files_of,
     nodes_of,
     whole_scene,
 )
-from .pages import PagedScene, Pages, empty_scene
+from .pages import PagedScene, Pages
 
 
 def read_scenes(
@@ -77,7 +78,7 @@ def read_scenes(
         pages = _pages(source, precision, threads) if paged and through is None else None
         if pages is not None:
             assert file is not None
-            empty = empty_scene(pages.file)
+            empty = replace(pages.file.scene, tree=LodTree(np.zeros(0, np.uint16), np.zeros(0, np.uint32)))
             entry: LoadedScene = PagedScene(file, size_of_input(file) or 0, empty, empty.splats, chunks, pages=pages)
         elif (runs := _runs(source, threads, progress)) is not None:
             entry = _loaded_runs(file, runs, through, chunks, threads)
@@ -112,12 +113,8 @@ def _runs(source: Source, threads: int, progress: Progress) -> DetailScene | Til
     if not isinstance(source, Path):
         return source
     try:
-        form = None if source == DASH else format_of(source)
-        read = None if form is None else read_levels if form.detailed else read_tiles if form.tiled else None
-        if read is None:
-            return None
         with memory_errors_translated():
-            return read(source, threads=threads, progress=progress)
+            return None if source == DASH else read_parts(source, threads=threads, progress=progress)
     except SparklodError as error:
         raise type(error)(f"{source}: {error}") from None
 
@@ -125,7 +122,7 @@ def _runs(source: Source, threads: int, progress: Progress) -> DetailScene | Til
 def _loaded_runs(
     file: Path | None, found: DetailScene | TileScene, through: str | None, chunks: int, threads: int
 ) -> LoadedRuns:
-    scene = whole_scene(found) if isinstance(found, DetailScene) else all_tiles(found)
+    scene = whole_scene(found)
     if not len(scene.splats):
         raise InvalidSplatsError(f"{file or UNNAMED}: it has no splats")
     drawn = after(through, file or Path(UNNAMED), scene, threads)

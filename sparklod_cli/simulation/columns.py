@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
-from ..support.errors import SparklodError
-from ..support.printable import near
 from ..tables.columns import FRAME, Column
 
 COLUMNS = (
@@ -139,25 +135,3 @@ EMPTY = {
     **dict.fromkeys(("projected_px_p50", "projected_px_p95"), "no splat is inside the frustum on any frame"),
     **dict.fromkeys((column.name for column in LOADING), "it needs --bandwidth, and a --chunk-cache that suffices"),
 }
-
-
-class UnknownColumnError(SparklodError):
-    """There is no column of that name."""
-
-
-def select(names: Sequence[str] = (), *, timing: bool = True) -> tuple[Column, ...]:
-    """Return the columns of these names, in this order; without names all columns, in the order of `COLUMNS`.
-
-    Args:
-        names: of columns; a repeated one is taken once.
-        timing: include the columns that differ from run to run (`TIMING`).
-
-    Raises:
-        UnknownColumnError: there is no column of that name; suggests similar ones.
-    """
-    every = {column.name: column for column in COLUMNS}
-    for name in names:
-        if name not in every:
-            raise UnknownColumnError(f"there is no column {name!r}{near(name, every)}")
-    chosen = dict.fromkeys(names) if names else every
-    return tuple(every[name] for name in chosen if timing or name not in TIMING)

@@ -162,7 +162,7 @@ def _shown(path: Path, folder: str) -> ShownFile:
     name = f"{folder}/{path.name}"
     files = {name: path.resolve()}
     if form.folders:
-        companions = _tileset_files(path) if form.tiled else _manifest_files(path)
+        companions = _tileset_files(path) if form.parts == "tiles" else _manifest_files(path)
         files |= {f"{folder}/{each}": _inside(path, path.parent / each) for each in companions}
     elif header is not None:
         files |= {f"{folder}/{chunk}": companion for chunk, companion in _chunk_files(path, header)}

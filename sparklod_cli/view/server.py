@@ -13,7 +13,6 @@ import socket
 import socketserver
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -226,15 +225,15 @@ class Handler(BaseHTTPRequestHandler):
             span = span_of(wanted, found.st_size)
             if span is None:
                 self._send_span(HTTPStatus.OK, headers, file if body else None, 0, found.st_size)
-            elif not span.count:
+            elif not span:
                 self._refuse(
                     HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE,
                     f"the file has {found.st_size} bytes",
                     {"Content-Range": f"bytes */{found.st_size}"},
                 )
             else:
-                headers["Content-Range"] = f"bytes {span.first}-{span.first + span.count - 1}/{found.st_size}"
-                self._send_span(HTTPStatus.PARTIAL_CONTENT, headers, file, span.first, span.count)
+                headers["Content-Range"] = f"bytes {span.start}-{span[-1]}/{found.st_size}"
+                self._send_span(HTTPStatus.PARTIAL_CONTENT, headers, file, span.start, len(span))
 
     def _send_span(
         self, status: HTTPStatus, headers: Mapping[str, str], file: BinaryIO | None, first: int, count: int
@@ -276,21 +275,8 @@ class Handler(BaseHTTPRequestHandler):
         self.server.log(f"{self.address_string()} {format % arguments}")
 
 
-@dataclass(frozen=True)
-class Span:
-    """Bytes of a file.
-
-    Attributes:
-        first: of them, from 0.
-        count: how many; 0 where the file has none of those that are asked for.
-    """
-
-    first: int
-    count: int
-
-
-def span_of(text: str | None, size: int) -> Span | None:
-    """Return the bytes that a Range header asks for; None where the whole file is sent.
+def span_of(text: str | None, size: int) -> range | None:
+    """Return the bytes of a file that a Range header asks for, none if it has none of them; None for the whole file.
 
     That is where there is no header, or where it is one that a server may ignore: of another unit, with several
     ranges, or broken.
@@ -304,10 +290,9 @@ def span_of(text: str | None, size: int) -> Span | None:
         end = _number(last) if last else max(begin, size)
         if end < begin:
             return None
-        return Span(begin, max(0, min(end, size - 1) - begin + 1))
+        return range(begin, max(begin, min(end + 1, size)))
     if last:
-        count = min(_number(last), size)
-        return Span(size - count, count)
+        return range(size - min(_number(last), size), size)
     return None
 
 

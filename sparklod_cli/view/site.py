@@ -9,9 +9,7 @@ import dataclasses
 import hashlib
 import json
 import math
-import os
 import re
-import tempfile
 from base64 import b64decode
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -21,11 +19,10 @@ from pathlib import Path
 from typing import Any
 
 from .. import __version__
+from ..cameras.formats.source import Files
 from ..cameras.formats.table import NAMES
 from ..cameras.frame import Settings as CameraSettings
-from ..cameras.path import CameraPath
-from ..cameras.sources import read_path
-from ..io import write_whole
+from ..cameras.path import CameraPath, read
 from ..io.local_files import leads_away
 from ..support.errors import CameraPathError
 from ..support.untrusted import parse_json, quoted_value
@@ -55,22 +52,15 @@ def parse_drop(body: bytes, settings: CameraSettings) -> dict[str, Any]:
     """
     contents = _contents(body)
     first = next((names[0] for names in NAMES if names[0] in contents), next(iter(contents)))
-    # Open3D reads files itself, and COLMAP's lie beside each other: they are read from a folder, as always.
-    with tempfile.TemporaryDirectory(prefix="sparklod-") as folder:
-        for name, data in contents.items():
-            write_whole(Path(folder, name), [data], overwrite=True)
-        try:
-            return frames_of(_read(Path(folder, first), settings))
-        except CameraPathError as error:
-            raise CameraPathError(str(error).replace(f"{folder}{os.sep}", "")) from None
-
-
-def _read(path: Path, settings: CameraSettings) -> CameraPath:
-    """Return the cameras of a file; those that have up axes of their own keep them."""
+    beside = next((names for names in NAMES if first in names), ())
+    dropped = Files(Path(first), {name: contents[name] for name in (first, *beside) if name in contents})
     if settings.up is not None:
         with contextlib.suppress(CameraPathError):
-            return read_path(path, settings=settings)
-    return read_path(path, settings=dataclasses.replace(settings, up=None))
+            return frames_of(read(dropped, settings=settings))
+    try:
+        return frames_of(read(dropped, settings=dataclasses.replace(settings, up=None)))
+    except CameraPathError as error:
+        raise CameraPathError(f"{first}: {error}") from None
 
 
 def _contents(body: bytes) -> Mapping[str, bytes]:

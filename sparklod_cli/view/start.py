@@ -6,9 +6,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..cameras import framing
 from ..cameras.camera import Camera, Matrix
@@ -16,10 +17,12 @@ from ..cameras.frame import DEFAULT_FOV_Y, Settings
 from ..cameras.sources import SingleViews, WholeScene
 from ..codecs.rad.rad_header import RadHeader
 from ..codecs.rad.rad_reader import count_leaves, file_of, read_chunk
-from ..io import read_levels, read_scene, read_tiles
+from ..io import read_parts, read_scene
 from ..io.local_files import open_plain, reason_of
 from ..model.balls import USED, Balls, balls_of
+from ..model.scene import DetailScene
 from ..model.splats import Splats
+from ..model.tile_scene import TileScene
 from ..support.defaults import ELEVATION
 from ..support.errors import InvalidSplatsError, SparklodError, UnreadableError
 from ..support.progress import Progress, silent
@@ -44,7 +47,7 @@ BELOW = 8
 
 @dataclass(frozen=True)
 class Extent:
-    """Return the extent of a file, for the first view.
+    """Extent of a splat file, for the first view.
 
     Attributes:
         splats: how many, nodes where it is a tree.
@@ -94,10 +97,9 @@ def extent_of(shown: ShownFile, *, threads: int = 1, progress: Progress = silent
     try:
         if shown.header is not None and shown.header.lod_tree and len(shown.header.chunks) > 1:
             return _coarse_extent(shown, shown.header)
-        if shown.format == "3D Tiles":
-            return _tiles_extent(shown.path, threads, progress)
-        if shown.format == "Streamed SOG":
-            return _detail_extent(shown.path, threads, progress)
+        parts = read_parts(shown.path, threads=threads, progress=progress)
+        if parts is not None:
+            return _parts_extent(parts)
         scene = read_scene(shown.path, columns=USED, threads=threads, progress=progress)
     except SparklodError as error:
         raise type(error)(f"{shown.path}: {error}") from None
@@ -132,22 +134,17 @@ def _coarse_extent(shown: ShownFile, header: RadHeader) -> Extent:
     return Extent(header.count, leaves, balls, (smallest / BELOW, largest), header.noted.up)
 
 
-def _detail_extent(path: Path, threads: int, progress: Progress) -> Extent:
-    """Return the extent of a scene at several detail levels, without its environment, which is all around."""
-    scene = read_levels(path, threads=threads, progress=progress)
-    coarsest = scene.splats.take(scene.level(scene.levels - 1))
-    balls = balls_of(coarsest, slice(None), np.eye(4))
-    return Extent(len(scene.splats), int(scene.counts[:, 0].sum()), balls, _sizes(scene.splats), scene.up, scene.levels)
-
-
-def _tiles_extent(path: Path, threads: int, progress: Progress) -> Extent:
-    """Return the extent of 3D Tiles by the coarsest level that has splats."""
-    scene = read_tiles(path, threads=threads, progress=progress)
-    first = int(scene.level[np.argmax(scene.counts > 0)])
-    coarse = np.repeat(np.isin(np.arange(scene.tiles), scene.at_level(first)), scene.counts)
+def _parts_extent(scene: DetailScene | TileScene) -> Extent:
+    """Return the extent by the coarsest level that has splats; without an environment, which is all around."""
+    coarse: NDArray[Any] | slice
+    if isinstance(scene, DetailScene):
+        coarse, leaves, levels = scene.level(scene.levels - 1), scene.counts[:, 0].sum(), scene.levels
+    else:
+        first = int(scene.level[np.argmax(scene.counts > 0)])
+        coarse = np.repeat(np.isin(np.arange(scene.tiles), scene.at_level(first)), scene.counts)
+        leaves, levels = scene.counts[scene.is_leaf].sum(), int(scene.level.max()) + 1
     balls = balls_of(scene.splats, coarse, np.eye(4))
-    leaves, levels = int(scene.counts[scene.is_leaf].sum()), int(scene.level.max()) + 1
-    return Extent(len(scene.splats), leaves, balls, _sizes(scene.splats), scene.up, levels)
+    return Extent(len(scene.splats), int(leaves), balls, _sizes(scene.splats), scene.up, levels)
 
 
 def _sizes(splats: Splats) -> tuple[float, float]:
@@ -161,7 +158,7 @@ def _sizes(splats: Splats) -> tuple[float, float]:
 
 
 def start_of(extents: Sequence[Extent], view: tuple[Point, Point] | None, up: Point, fov: float) -> Start:
-    """Return the extent of some files together.
+    """Return the first look at some files together.
 
     Args:
         view: eye and target, where they are given; else the whole scene is in view, from its front.

@@ -20,7 +20,7 @@ from sparklod_cli.codecs.gpu import lod_tree
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
 from sparklod_cli.fitting import cameras, fit
 from sparklod_cli.fitting.settings import SHARES, FitSettings
-from sparklod_cli.io import read_levels, read_scene, scene_sink
+from sparklod_cli.io import read_parts, read_scene, scene_sink
 from sparklod_cli.lod.detail_rule import DetailSettings
 from sparklod_cli.lod.traversal import Forest, Traversal, TreeInstance
 from sparklod_cli.model.scene import Scene
@@ -122,7 +122,7 @@ def test_cuts_spend_their_budget(fitted: Scene, share: float) -> None:
 def test_levels_can_be_cut_of_it(folder: Path, baked: Baked) -> None:
     settings = BakeSettings(method="quality", detail=DetailSettings(levels=(0.5, 0.2)), suffix=".json", converts=True)
     bake(folder / "fitted.rad", folder / "web" / "lod-meta.json", settings)
-    levels = read_levels(folder / "web" / "lod-meta.json")
+    levels = read_parts(folder / "web" / "lod-meta.json")
     assert len(levels.counts[0]) == 3
     assert levels.splats.opacity.max() <= 1
 

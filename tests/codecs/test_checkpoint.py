@@ -14,6 +14,7 @@ import pytest
 
 from fixtures import by_hand_checkpoint
 from sparklod_cli.codecs import checkpoint
+from sparklod_cli.codecs.content import decode_file
 from sparklod_cli.codecs.tensor_pickle import Tensor, unpickled
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.sh import SH_C0
@@ -26,7 +27,7 @@ SCENE = Scene(random_splats(50, sh_degree=1))
 
 
 def decode(data: bytes) -> Scene:
-    scene: Scene = checkpoint.decode(io.BytesIO(data))
+    scene: Scene = decode_file(checkpoint, io.BytesIO(data))
     return scene
 
 

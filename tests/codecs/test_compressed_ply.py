@@ -13,6 +13,7 @@ import pytest
 
 from fixtures import by_hand_compressed_ply
 from sparklod_cli.codecs import compressed_ply
+from sparklod_cli.codecs.content import decode_file
 from sparklod_cli.io import read_scene
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS
@@ -25,7 +26,7 @@ GOLDEN = FIXTURES / "golden" / "sh3-compressed.ply"
 
 
 def decode(data: bytes) -> Scene:
-    return compressed_ply.decode(io.BytesIO(data))
+    return decode_file(compressed_ply, io.BytesIO(data))
 
 
 def by_words(bounds: list[float], *rows: tuple[int, int, int, int], sh: bytes = b"") -> bytes:

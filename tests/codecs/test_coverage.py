@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sparklod_cli.codecs import coverage, quantize, spz
+from sparklod_cli.codecs.content import decode_file
 from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.codecs.rad import codec as rad
 from sparklod_cli.lod import quick
@@ -103,7 +104,7 @@ def test_what_shrinks_to_the_largest_code_does_not_get_dense() -> None:
 
 
 def again(codec: ModuleType, scene: Scene, options: WriteOptions) -> Scene:
-    decoded: Scene = codec.decode(io.BytesIO(b"".join(codec.encode(scene, options))))
+    decoded: Scene = decode_file(codec, io.BytesIO(b"".join(codec.encode(scene, options))))
     return decoded
 
 

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 from fixtures import by_hand, by_hand_sog
+from sparklod_cli.codecs.content import decode_file
 from sparklod_cli.codecs.formats import FORMATS, HEAD, Format, sniff
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.support.errors import FormatError
@@ -73,7 +74,7 @@ def _compile_kernels() -> None:
     """Decodes a file of the format that needs kernels, which may have to be compiled: nothing that a file can help."""
     form = format_of("golden/sh3-v2.sog", content("golden/sh3-v2.sog"))
     assert form is not None
-    form.codec().decode(io.BytesIO(content("golden/sh3-v2.sog")))
+    decode_file(form.codec(), io.BytesIO(content("golden/sh3-v2.sog")))
 
 
 def attempt(name: str, data: bytes, *, files: Mapping[str, bytes] | None = None, threads: int = 1) -> str:
@@ -93,7 +94,7 @@ def attempt(name: str, data: bytes, *, files: Mapping[str, bytes] | None = None,
     _compile_kernels()
     start = time.process_time()
     try:
-        scene = form.codec().decode(io.BytesIO(data), threads=threads, **more)
+        scene = decode_file(form.codec(), io.BytesIO(data), threads=threads, **more)
     except FormatError as error:
         assert "\n" not in str(error)
         result = str(error)

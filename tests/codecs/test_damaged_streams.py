@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from fixtures import by_hand_sog
-from sparklod_cli.codecs.content import Source
+from sparklod_cli.codecs.content import Source, decode_file
 from sparklod_cli.model import streams
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.support.errors import FormatError, HasTreeError
@@ -56,7 +56,7 @@ def compare(name: str, data: bytes) -> str:
         stream = codec.open_content(Source(io.BytesIO(data), scratch=in_memory, **more)).stream(1)
         return Splats.concat([Splats.empty(0, stream.sh_degree), *stream.blocks()])
 
-    whole, found = outcome(lambda: codec.decode(io.BytesIO(data), **more).splats), outcome(streamed)
+    whole, found = outcome(lambda: decode_file(codec, io.BytesIO(data), **more).splats), outcome(streamed)
     if found is None:
         return "tree"
     if isinstance(whole, Splats) and isinstance(found, Splats):

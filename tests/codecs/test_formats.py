@@ -33,12 +33,11 @@ def test_a_codec_has_the_signatures_of_all(form: Format) -> None:
         written = {"scene": False, "options": False, "threads": True, "progress": True}
         assert parameters(codec.encode) == written
         assert parameters(codec.settled) == {"scene": False, "options": False}
-    assert hasattr(codec, "encode_files") == (form.unbundled is not None or form.detailed or form.tiled)
-    for name, has in (("decode_levels", form.detailed), ("decode_tiles", form.tiled)):
-        assert hasattr(codec, name) == has
-        if has:
-            named = {"threads": True, "progress": True, "open_companion": True}
-            assert parameters(getattr(codec, name)) == {"file": False} | named
+    assert hasattr(codec, "encode_files") == (form.unbundled is not None or form.parts is not None)
+    assert hasattr(codec, "decode_parts") == (form.parts is not None)
+    if form.parts is not None:
+        named = {"threads": True, "progress": True, "open_companion": True}
+        assert parameters(codec.decode_parts) == {"file": False} | named
     assert hasattr(codec, "encoder") == hasattr(codec, "needed") == form.trees
     if form.trees:
         assert parameters(codec.needed) == {"options": False}

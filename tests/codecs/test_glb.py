@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from fixtures import by_hand_glb
+from sparklod_cli.codecs.content import decode_file
 from sparklod_cli.codecs.glb import codec as glb
 from sparklod_cli.codecs.glb.placement import TURNS
 from sparklod_cli.codecs.options import PROFILES, WriteOptions
@@ -34,7 +35,7 @@ def written(scene: Scene, profile: str = "khronos", threads: int = 1) -> bytes:
 
 
 def read(data: bytes) -> Scene:
-    scene = glb.decode(io.BytesIO(data))
+    scene = decode_file(glb, io.BytesIO(data))
     assert isinstance(scene, Scene)
     return scene
 

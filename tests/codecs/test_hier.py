@@ -11,6 +11,7 @@ import pytest
 
 from fixtures import by_hand_hier
 from sparklod_cli.codecs import hier
+from sparklod_cli.codecs.content import decode_file
 from sparklod_cli.codecs.formats import sniff
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.support.errors import FormatError, TruncatedError
@@ -25,7 +26,7 @@ DEPTH, PARENT, START, LEAVES, MERGED, FIRST_CHILD, CHILDREN = range(7)
 
 
 def decode(data: bytes) -> Scene:
-    scene: Scene = hier.decode(io.BytesIO(data))
+    scene: Scene = decode_file(hier, io.BytesIO(data))
     return scene
 
 

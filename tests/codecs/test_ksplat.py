@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli.codecs import ksplat
+from sparklod_cli.codecs.content import decode_file
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.support.errors import FormatError
 from tests.conftest import FIXTURES
@@ -19,7 +20,7 @@ SECTION = 4096
 
 
 def decode(data: bytes) -> Scene:
-    return ksplat.decode(io.BytesIO(data))
+    return decode_file(ksplat, io.BytesIO(data))
 
 
 def headers(level: int, splats: int, *sections: dict[str, float], sh_range: tuple[float, float] = (0, 0)) -> bytes:

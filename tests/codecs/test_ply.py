@@ -16,6 +16,7 @@ from plyfile import PlyData, PlyElement
 
 from fixtures import by_hand
 from sparklod_cli.codecs import ply
+from sparklod_cli.codecs.content import decode_file
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
@@ -34,7 +35,7 @@ def columns(count: int = 5, sh_degree: int = 0) -> dict[str, np.ndarray]:
 
 
 def decode(data: bytes) -> Scene:
-    return ply.decode(io.BytesIO(data))
+    return decode_file(ply, io.BytesIO(data))
 
 
 def assert_same(one: Scene, other: Scene) -> None:
@@ -308,7 +309,7 @@ def test_a_count_must_be_digits(count: str) -> None:
 def test_a_count_of_too_many_digits_is_refused(digits: int) -> None:
     head = b"ply\nformat binary_little_endian 1.0\nelement vertex " + b"9" * digits + b"\nend_header\n"
     with pytest.raises(FormatError, match=f"announces a count of {digits:,} digits"):
-        ply.decode(io.BytesIO(head))
+        decode_file(ply, io.BytesIO(head))
 
 
 def test_space_around_the_words_of_a_header_does_not_matter() -> None:
@@ -382,7 +383,7 @@ def test_scales_and_opacities_of_0_are_written_finite_and_come_back() -> None:
     splats.scale[:, 1] = [0, 1e-45, 1e38, 1]
     data = encode(splats)
     assert all(np.isfinite(vertices(data)[name]).all() for name in ("opacity", "scale_1"))
-    back = ply.decode(io.BytesIO(data)).splats
+    back = decode_file(ply, io.BytesIO(data)).splats
     np.testing.assert_allclose(back.opacity, splats.opacity, atol=1e-7)
     assert back.opacity[:2].tolist() == [0, 1]
     np.testing.assert_allclose(back.scale[:, 1], splats.scale[:, 1], rtol=1e-4, atol=2e-45)
@@ -392,7 +393,7 @@ def test_scales_and_opacities_of_0_are_written_finite_and_come_back() -> None:
 def test_a_file_that_was_read_is_written_the_same() -> None:
     """All that the file has but normals and the lengths of rotations, to float32's precision."""
     given = splat_columns(50, sh_degree=3)
-    rows = vertices(encode(ply.decode(io.BytesIO(by_hand.ply(given))).splats))
+    rows = vertices(encode(decode_file(ply, io.BytesIO(by_hand.ply(given))).splats))
     for name, values in given.items():
         np.testing.assert_allclose(rows[name], values, rtol=2e-5, atol=2e-6, err_msg=name)
 
@@ -402,7 +403,7 @@ def test_threads_do_not_change_a_byte_of_ply(count: int) -> None:
     scene = Scene(random_splats(max(count, 1), sh_degree=1).take(slice(count)))
     one = b"".join(ply.encode(scene))
     assert b"".join(ply.encode(scene, threads=3)) == one
-    back = ply.decode(io.BytesIO(one)).splats
+    back = decode_file(ply, io.BytesIO(one)).splats
     assert len(back) == count
     for column in COLUMNS:
         np.testing.assert_allclose(getattr(back, column), getattr(scene.splats, column), rtol=1e-5, atol=1e-6)

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli.codecs import coverage, spz
+from sparklod_cli.codecs.content import decode_file
 from sparklod_cli.codecs.formats import FORMATS
 from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.codecs.rad import codec as rad
@@ -98,8 +99,8 @@ def assert_close(back: Splats, source: Splats, allowed: Precision) -> None:
 def test_writing_a_decoded_scene_again_changes_nothing(name: str, version: int, lod: bool) -> None:
     """SPZ of SPZ: whatever was rounded once stays where it is (rotations beyond half a turn excepted)."""
     options = spz.settled(scene(name), WriteOptions(spz_version=version))
-    once = spz.decode(io.BytesIO(b"".join(spz.encode(scene(name, lod=lod), options))))
-    twice = spz.decode(io.BytesIO(b"".join(spz.encode(once, options))))
+    once = decode_file(spz, io.BytesIO(b"".join(spz.encode(scene(name, lod=lod), options))))
+    twice = decode_file(spz, io.BytesIO(b"".join(spz.encode(once, options))))
     for column in COLUMNS:
         if column != "quat_xyzw":
             np.testing.assert_array_equal(getattr(twice.splats, column), getattr(once.splats, column), column)
@@ -109,7 +110,7 @@ def test_writing_a_decoded_scene_again_changes_nothing(name: str, version: int, 
 @pytest.mark.parametrize("codec", [spz, rad])
 def test_whether_a_scene_is_antialiased_is_kept(codec: ModuleType, antialiased: bool) -> None:
     data = b"".join(codec.encode(Scene(scene("sh0").splats, antialiased=antialiased)))
-    assert codec.decode(io.BytesIO(data)).antialiased is antialiased
+    assert decode_file(codec, io.BytesIO(data)).antialiased is antialiased
 
 
 @pytest.mark.parametrize(("form", "way"), CASES)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli.codecs import splat
+from sparklod_cli.codecs.content import decode_file
 from sparklod_cli.io import read_scene
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
@@ -33,7 +34,7 @@ ROWS = (
 
 
 def decode(data: bytes) -> Splats:
-    return splat.decode(io.BytesIO(data)).splats
+    return decode_file(splat, io.BytesIO(data)).splats
 
 
 def encode(splats: Splats, **more: object) -> bytes:

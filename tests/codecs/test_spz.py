@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 
 from fixtures import by_hand
 from sparklod_cli.codecs import clamps, quantize, spz
+from sparklod_cli.codecs.content import decode_file
 from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.codecs.spz_extensions import MOST_BYTES
 from sparklod_cli.codecs.statistics import Statistics
@@ -46,7 +47,7 @@ SMALLEST_THREE = [[0, 0, 0, 1], [511 * PART, 0, 0, 0.5**0.5], [-256 * PART, REST
 
 def golden(name: str) -> Scene:
     with (GOLDEN / f"{name}.spz").open("rb") as file:
-        return spz.decode(file)
+        return decode_file(spz, file)
 
 
 @pytest.mark.parametrize(
@@ -129,7 +130,7 @@ def test_threads_do_not_change_a_file(version: int, threads: int) -> None:
         b"".join(spz.encode(scene, WriteOptions(spz_version=version), threads=count)) for count in (1, threads)
     )
     assert one == many
-    decoded = [spz.decode(io.BytesIO(one), threads=count).splats for count in (1, threads)]
+    decoded = [decode_file(spz, io.BytesIO(one), threads=count).splats for count in (1, threads)]
     for column in COLUMNS:
         np.testing.assert_array_equal(getattr(decoded[0], column), getattr(decoded[1], column), column)
 
@@ -154,7 +155,7 @@ def test_the_most_bits_are_the_most_that_fit(reach: float) -> None:
     bits = spz.largest_fractional_bits(float(np.abs(splats.center).max()))
     assert round(reach * 2.0**bits) <= spz.LAST_CODE == 2**23 - 2
     assert bits == 24 or round(reach * 2.0 ** (bits + 1)) > spz.LAST_CODE
-    back = spz.decode(io.BytesIO(b"".join(spz.encode(Scene(splats), WriteOptions(fractional_bits=bits)))))
+    back = decode_file(spz, io.BytesIO(b"".join(spz.encode(Scene(splats), WriteOptions(fractional_bits=bits)))))
     assert np.abs(back.splats.center.astype(np.float64) - splats.center).max() <= 0.5 * 2.0**-bits
 
 
@@ -231,7 +232,7 @@ def test_version_4_notes_what_is_up_as_a_coordinate_system(up: str) -> None:
         (44,),
         by_hand.spz_extension(0xADBE0003, struct.pack("<I", system)),
     )
-    assert spz.decode(io.BytesIO(data)).up == up
+    assert decode_file(spz, io.BytesIO(data)).up == up
 
 
 def test_version_4_notes_no_x_axis() -> None:
@@ -264,7 +265,7 @@ def test_settled_options_are_settled_and_write_the_same_bytes() -> None:
 
 
 def test_options_default_to_those_of_the_file() -> None:
-    scene = spz.decode(io.BytesIO(b"".join(spz.encode(Scene(random_splats(9)), WriteOptions(2, 9)))))
+    scene = decode_file(spz, io.BytesIO(b"".join(spz.encode(Scene(random_splats(9)), WriteOptions(2, 9)))))
     assert spz.like(scene.header, WriteOptions()) == WriteOptions(2, 9)
     assert spz.like(scene.header, WriteOptions(3, 0, 7)) == WriteOptions(3, 0, 7)
     assert spz.like({"version": 4, "fractional_bits": 12}, WriteOptions()) == WriteOptions(3, 12)
@@ -357,7 +358,7 @@ REFUSED: dict[str, tuple[Callable[[], bytes], str]] = {
 def test_broken_spz_is_refused_with_a_reason(what: str) -> None:
     make, reason = REFUSED[what]
     with pytest.raises(FormatError, match=reason):
-        spz.decode(io.BytesIO(make()))
+        decode_file(spz, io.BytesIO(make()))
 
 
 KNOWN, UNKNOWN = 0xADBE0003, 0x12340001
@@ -386,7 +387,10 @@ EXTENSIONS: dict[str, tuple[bytes, str | None, list[str]]] = {
 def test_extension_records_say_what_is_up(what: str, version: int) -> None:
     records, up, notes = EXTENSIONS[what]
     data = zstd(flags=0x02, extension=records) if version == 4 else gzipped(version, flags=0x02, more=records)
-    scene, plain = spz.decode(io.BytesIO(data)), spz.decode(io.BytesIO(zstd() if version == 4 else gzipped(version)))
+    scene, plain = (
+        decode_file(spz, io.BytesIO(data)),
+        decode_file(spz, io.BytesIO(zstd() if version == 4 else gzipped(version))),
+    )
     for column in COLUMNS:
         np.testing.assert_array_equal(getattr(scene.splats, column), getattr(plain.splats, column), column)
     assert scene.up == up
@@ -399,15 +403,15 @@ def test_extension_records_say_what_is_up(what: str, version: int) -> None:
 def test_records_beyond_a_megabyte_are_left_out(version: int) -> None:
     records = record(UNKNOWN, bytes(MOST_BYTES)) + EXTENSIONS["y down"][0]
     data = zstd(flags=0x02, extension=records) if version == 4 else gzipped(flags=0x02, more=records)
-    scene = spz.decode(io.BytesIO(data))
+    scene = decode_file(spz, io.BytesIO(data))
     assert scene.up is None
     assert "bytes of its extensions are no records that can be read" in scene.notes[-1]
 
 
 def test_extension_records_without_the_flag_say_nothing() -> None:
-    scene = spz.decode(io.BytesIO(zstd(extension=EXTENSIONS["y down"][0])))
+    scene = decode_file(spz, io.BytesIO(zstd(extension=EXTENSIONS["y down"][0])))
     assert (scene.up, scene.notes) == (None, ())
 
 
 def test_more_streams_than_are_known_are_allowed() -> None:
-    assert len(spz.decode(io.BytesIO(zstd(streams=[*by_hand.hand_streams(4, 0), b"more"]))).splats) == 3
+    assert len(decode_file(spz, io.BytesIO(zstd(streams=[*by_hand.hand_streams(4, 0), b"more"]))).splats) == 3

@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sparklod_cli.codecs import quantize, spz, statistics
+from sparklod_cli.codecs.content import decode_file
 from sparklod_cli.codecs.options import DEFAULTS, RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import codec as rad
 from sparklod_cli.codecs.statistics import (
@@ -252,7 +253,7 @@ def test_leaves_decide_and_merged_splats_keep_the_fewest() -> None:
     bits = spz.settled(scene, DEFAULTS).sh_bits
     assert bits is not None and bits > 4
     assert bits == spz.settled(Scene(splats), DEFAULTS).sh_bits
-    back = spz.decode(io.BytesIO(b"".join(spz.encode(scene)))).splats.sh
+    back = decode_file(spz, io.BytesIO(b"".join(spz.encode(scene)))).splats.sh
     for rows, kept in ((tree.is_leaf, bits), (~tree.is_leaf, 4)):
         np.testing.assert_array_equal(back[rows], quantize.decode_sh(quantize.encode_sh(nodes.sh[rows], kept)))
 
@@ -260,7 +261,7 @@ def test_leaves_decide_and_merged_splats_keep_the_fewest() -> None:
 def test_bits_may_be_given() -> None:
     scene = Scene(random_splats(50, sh_degree=2))
     for bits in range(4, 9):
-        back = spz.decode(io.BytesIO(b"".join(spz.encode(scene, WriteOptions(sh_bits=bits))))).splats.sh
+        back = decode_file(spz, io.BytesIO(b"".join(spz.encode(scene, WriteOptions(sh_bits=bits))))).splats.sh
         assert math.log2(np.abs(back - scene.splats.sh).max()) < -bits
     with pytest.raises(ValueError, match="sh_bits is 3, not 4 to 8"):
         spz.settled(scene, WriteOptions(sh_bits=3))

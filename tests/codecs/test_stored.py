@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli.codecs import spz
+from sparklod_cli.codecs.content import decode_file
 from sparklod_cli.codecs.encoder import results
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import codec as rad
@@ -52,7 +53,7 @@ def others(splats: Splats, kept: np.ndarray) -> Splats:
 def check(form: object, data: bytes, options: WriteOptions | None = None) -> Scene:
     """What is written over the nodes of a file has those that are kept, bit for bit, and the others nearly."""
     codec: Callable = form  # type: ignore[assignment]
-    before = codec.decode(io.BytesIO(data))
+    before = decode_file(codec, io.BytesIO(data))
     assert before.tree is not None
     kept = before.tree.is_leaf.copy()
     kept[1::3] = True
@@ -63,13 +64,13 @@ def check(form: object, data: bytes, options: WriteOptions | None = None) -> Sce
     windows = list(results(encoder, scene, 2, lambda *_: None, "encoding"))
     get = lambda number, name: windows[number][name]  # noqa: E731
     written = b"".join(encoder.pieces(get, threads=2, progress=lambda *_: None))
-    after = codec.decode(io.BytesIO(written))
+    after = decode_file(codec, io.BytesIO(written))
     assert after.antialiased == before.antialiased
     assert after.tree is not None
     for name in ("child_count", "child_start"):
         assert np.array_equal(getattr(after.tree, name), getattr(before.tree, name))
     assert same_rows(after.splats, before.splats)[kept].all()
-    plain = codec.decode(io.BytesIO(b"".join(codec.encode(scene, settled))))
+    plain = decode_file(codec, io.BytesIO(b"".join(codec.encode(scene, settled))))
     assert same_rows(after.splats, plain.splats)[~kept].all()
     return after
 
@@ -86,8 +87,8 @@ def test_an_spz_keeps_any_code_of_a_rotation(version: int, sh_degree: int) -> No
     for name in {"rotations", "sh"} & {*result}:
         result[name] = rng.integers(0, 256, result[name].shape, dtype=np.uint8)
     data = b"".join(encoder.pieces(lambda number, name: result[name], threads=1, progress=lambda *_: None))
-    read = spz.decode(io.BytesIO(data))
-    again = spz.decode(io.BytesIO(b"".join(spz.encode(read, like(read.header, WriteOptions())))))
+    read = decode_file(spz, io.BytesIO(data))
+    again = decode_file(spz, io.BytesIO(b"".join(spz.encode(read, like(read.header, WriteOptions())))))
     assert not same_rows(again.splats, read.splats).all()  # or there would be no need of codes
     after = check(spz, data)
     assert after.header["version"] == version
@@ -104,7 +105,7 @@ def test_a_choice_of_another_coding_is_heeded() -> None:
     scene = tree_of()
     data = b"".join(spz.encode(scene))
     stored = spz.stored(io.BytesIO(data))
-    bits = spz.decode(io.BytesIO(data)).header["fractional_bits"]
+    bits = decode_file(spz, io.BytesIO(data)).header["fractional_bits"]
     asked = WriteOptions(spz_version=2, fractional_bits=bits - 1)
     assert stored.like(asked) == asked
     encoder = stored.keeping(spz.encoder(scene, spz.settled(scene, asked)), np.ones(len(scene), bool))
@@ -145,13 +146,13 @@ def test_a_rad_of_other_chunks_keeps_its_codes() -> None:
 def test_a_property_in_another_encoding_is_encoded_anew() -> None:
     scene = tree_of()
     data = b"".join(rad.encode(scene))
-    before, stored = rad.decode(io.BytesIO(data)), rad.stored(io.BytesIO(data))
+    before, stored = decode_file(rad, io.BytesIO(data)), rad.stored(io.BytesIO(data))
     settled = rad.settled(before, stored.like(WriteOptions(rad=RadOptions(rgb="f16"))))
     assert settled.rad.rgb == "f16"
     encoder = stored.keeping(rad.encoder(before, settled), np.ones(len(before), bool))
     made = list(results(encoder, before, 1, lambda *_: None, "encoding"))
     pieces = encoder.pieces(lambda number, name: made[number][name], threads=1, progress=lambda *_: None)
-    after = rad.decode(io.BytesIO(b"".join(pieces)))
+    after = decode_file(rad, io.BytesIO(b"".join(pieces)))
     assert np.abs(after.splats.rgb - before.splats.rgb).max() > 0
     for name in {*COLUMNS} - {"rgb"}:
         assert np.array_equal(getattr(after.splats, name), getattr(before.splats, name)), name

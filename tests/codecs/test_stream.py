@@ -12,6 +12,7 @@ import pytest
 
 from fixtures import by_hand
 from sparklod_cli.codecs import ply, splat, spz
+from sparklod_cli.codecs.content import decode_file
 from sparklod_cli.codecs.formats import HEAD, sniff
 from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.codecs.stream import rows_of
@@ -58,7 +59,7 @@ def test_decoding_takes_little_memory_beside_the_splats(kind: str) -> None:
     assert form is not None
     codec = form.codec()
     tracemalloc.start()
-    scene = codec.decode(file)
+    scene = decode_file(codec, file)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     decoded = sum(getattr(scene.splats, name).nbytes for name in COLUMNS)

@@ -12,6 +12,7 @@ import pytest
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.cameras.path import CameraPath
 from sparklod_cli.codecs import ply
+from sparklod_cli.codecs.content import decode_file
 from sparklod_cli.fitting import cameras, optimiser
 from sparklod_cli.fitting import fit as fit_module
 from sparklod_cli.fitting.fit import fit
@@ -36,7 +37,7 @@ STEPS = 160
 def demo() -> tuple[Splats, LodTree]:
     """A quality tree of the demo scene: things with texture, and a ground."""
     with (FIXTURES / "demo.ply").open("rb") as file:
-        splats = ply.decode(file).splats
+        splats = decode_file(ply, file).splats
     return quality.build(splats.with_max_sh(0))
 
 

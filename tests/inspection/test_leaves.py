@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from sparklod_cli.cli import run
 from sparklod_cli.codecs import ply, spz
+from sparklod_cli.codecs.content import decode_file
 from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.inspection import leaves
 from sparklod_cli.inspection.findings import Finding
@@ -118,7 +119,7 @@ def tree_of(splats: Splats, **options: int) -> Scene:
 
 
 def coded(scene: Scene, **options: int) -> Scene:
-    return spz.decode(BytesIO(b"".join(spz.encode(scene, WriteOptions(**options)))))
+    return decode_file(spz, BytesIO(b"".join(spz.encode(scene, WriteOptions(**options)))))
 
 
 @given(st.integers(1, 60), st.integers(0, 24), st.integers(0, 3), st.integers(0, 2**32 - 1))

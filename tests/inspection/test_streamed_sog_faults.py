@@ -20,7 +20,7 @@ from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.codecs.streamed_sog import codec
 from sparklod_cli.codecs.streamed_sog.manifest_rules import ERRORS, WARNINGS
 from sparklod_cli.inspection.report import Report, ReportSettings, inspect
-from sparklod_cli.io import read_levels
+from sparklod_cli.io import read_parts
 from sparklod_cli.io.details import detail_sink
 from sparklod_cli.lod import detail_levels, quick
 from sparklod_cli.lod.detail_rule import DetailSettings
@@ -263,7 +263,7 @@ def test_what_is_fatal_is_an_error_and_the_reader_gives_the_same_code(name: str,
         assert found and found <= expected
         assert all(finding.severity == "error" for finding in report.findings or [])
         with pytest.raises(FormatError) as refused:
-            read_levels(path)
+            read_parts(path)
         assert refused.value.code.removeprefix("streamed-sog.") in expected | {"chunk-files"}
 
 

@@ -13,7 +13,7 @@ from sparklod_cli.cli import run
 from sparklod_cli.codecs.streamed_sog.manifest import MAX_MANIFEST
 from sparklod_cli.inspection import html
 from sparklod_cli.inspection.report import Report, ReportSettings, inspect
-from sparklod_cli.io import read_levels, read_scene
+from sparklod_cli.io import read_parts, read_scene
 from tests.conftest import Capture
 from tests.inspection.streamed_sog_files import COUNTS, Folder, Node, folder, regions
 
@@ -60,7 +60,7 @@ def test_splats_and_values_are_those_of_full_detail_and_the_environment(path: Pa
 
 
 def test_regions_have_quantiles_of_splats_and_edges(path: Path, report: Report) -> None:
-    detail = read_levels(path)
+    detail = read_parts(path)
     edges = np.ptp(detail.bounds, axis=1).max(axis=1)
     for name, values in (("region_splats", detail.counts[:, 0]), ("region_edge", edges)):
         found = report.value_at(f"streamed_sog.{name}")

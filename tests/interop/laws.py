@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sparklod_cli.codecs import coverage, spz
+from sparklod_cli.codecs.content import decode_file
 from sparklod_cli.codecs.options import DEFAULTS, WriteOptions
 from sparklod_cli.model.gaussian import lod_opacity
 from sparklod_cli.model.lod_tree import LodTree
@@ -78,8 +79,8 @@ def check_tree(got: ExtSplats, tree: LodTree) -> None:
 
 
 def check_decoded(got: ExtSplats, data: bytes) -> Scene:
-    """Asserts that Spark reads the same numbers as `spz.decode`, within the precision of ExtSplats."""
-    scene = spz.decode(io.BytesIO(data))
+    """Asserts that Spark reads the same numbers as `decode_file`, within the precision of ExtSplats."""
+    scene = decode_file(spz, io.BytesIO(data))
     splats = scene.splats
     np.testing.assert_array_equal(got.center, splats.center)  # float32 in both
     within(got.rgb, splats.rgb, HALF * np.abs(splats.rgb) + TINY)
@@ -140,7 +141,7 @@ def check(spark: Spark, scene: Scene, options: WriteOptions = DEFAULTS, *, threa
     decoded = check_decoded(got, data)
     assert (decoded.tree is None) == (scene.tree is None)
     if scene.tree is not None:
-        check_tree(got, scene.tree)  # the tree that was written, and not only what spz.decode reads
+        check_tree(got, scene.tree)  # the tree that was written, and not only what `decode_file` reads
     check_close(got, scene.splats, raw[4], raw[13])
     check_sh(spark, data, scene.splats)
     return got

@@ -17,6 +17,7 @@ import pytest
 
 from sparklod_cli.cli import run
 from sparklod_cli.codecs import coverage
+from sparklod_cli.codecs.content import decode_file
 from sparklod_cli.codecs.gpu import packed_splats
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import codec as rad
@@ -213,7 +214,7 @@ def check_close(spark: Spark, path: Path, scene: Scene, options: RadOptions) -> 
     center = splats.center.astype(np.float64)
     step = HALF * np.abs(center) + TINY if chosen.center.startswith("f16") else 0
     within(got.center, center, step + (0 if chosen.center_bits is None else 2.0**-chosen.center_bits / 2))
-    held = rad.decode(io.BytesIO(path.read_bytes())).splats.scale
+    held = decode_file(rad, io.BytesIO(path.read_bytes())).splats.scale
     blur = 0.0 if chosen.center_bits is None else 2.0**-chosen.center_bits
     opacity = coverage.compensated(
         splats.opacity, splats.scale, held, blur

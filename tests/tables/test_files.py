@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sparklod_cli.simulation.columns import COLUMNS, select
+from sparklod_cli.simulation.columns import COLUMNS
 from sparklod_cli.support.errors import SparklodError
 from sparklod_cli.support.optional import install_hint
 from sparklod_cli.tables.columns import Cell, Column, Row
@@ -27,6 +27,11 @@ pytestmark = pytest.mark.slow
 NAMES = st.none() | st.text(min_size=1, max_size=20)
 INTS = st.none() | st.integers(-(2**53), 2**53)
 FLOATS = st.none() | st.floats(-1e9, 1e9)
+
+
+def named(names: list[str]) -> list[Column]:
+    """The columns of these names, in this order."""
+    return [next(column for column in COLUMNS if column.name == name) for name in names]
 
 
 def encoded(rows: Sequence[Row], form: str, columns: Sequence[Column] = COLUMNS) -> bytes:
@@ -112,7 +117,7 @@ def test_a_table_of_no_rows_is_read_as_none(form: str) -> None:
 def test_csv_names_are_no_formulas_and_numbers_stay_numbers(start: str) -> None:
     name = f"{start}cmd|' /C calc'!A0"
     rows = [row(0, name=name, churn=-0.25)]
-    columns = select(["name", "churn"])
+    columns = named(["name", "churn"])
     (read,) = csv.reader(io.StringIO(encoded(rows, "csv", columns).decode().partition("\n")[2], newline=""))
     assert read == [f"'{name}", "-0.2500"]
     assert json.loads(encoded(rows, "json", columns))["data"] == [{"name": name, "churn": -0.25}]
@@ -123,7 +128,7 @@ def test_csv_quotes_names_and_leaves_empty_cells() -> None:
         row(0, name='the "red", door', churn=None, selected=12, budget_used=1 / 3),
         row(1, name="two\r\nlines", churn=0.25, selected=13, budget_used=0.0),
     ]
-    columns = select(["frame", "time_s", "name", "selected", "budget_used", "churn"])
+    columns = named(["frame", "time_s", "name", "selected", "budget_used", "churn"])
     assert encoded(rows, "csv", columns).decode() == (
         "frame,time_s,name,selected,budget_used,churn\n"
         '0,0.000000,"the ""red"", door",12,0.3333,\n'
@@ -153,7 +158,7 @@ def test_rows_are_written_before_all_are_known(form: str) -> None:
 
 @pytest.mark.parametrize("form", FORMS)
 def test_an_empty_name_is_no_name(form: str) -> None:
-    columns = select(["frame", "name"])
+    columns = named(["frame", "name"])
     assert encoded([row(0, name="")], form, columns) == encoded([row(0, name=None)], form, columns)
 
 

@@ -14,7 +14,7 @@ import pytest
 
 import sparklod_cli as sparklod
 from sparklod_cli.codecs.rad.rad_header import RadChunkEntry, RadHeader, pack_header, read_chunk_header
-from sparklod_cli.io import read_levels, read_tiles
+from sparklod_cli.io import read_parts
 from sparklod_cli.support.errors import CameraPathError, FormatError, SparklodError
 from sparklod_cli.view.files import shown_files
 from tests.conftest import FIXTURES
@@ -76,7 +76,7 @@ def test_streamed_sog_is_shown_by_playcanvas_with_all_its_files(name: str) -> No
     site = prepared([GOLDEN / name])
     settings = settings_of(GOLDEN / name)
     (file,) = settings["files"]
-    scene = read_levels(GOLDEN / name)
+    scene = read_parts(GOLDEN / name)
     assert (settings["engine"], file["url"], file["levels"]) == ("playcanvas", "data/0/lod-meta.json", scene.levels)
     assert (file["splats"], file["leaves"]) == (len(scene.splats), int(scene.counts[:, 0].sum()))
     folder = GOLDEN / "sh1-streamed-sog"
@@ -88,7 +88,7 @@ def test_streamed_sog_is_shown_by_playcanvas_with_all_its_files(name: str) -> No
 def test_streamed_sog_is_framed_without_its_environment(tmp_path: Path) -> None:
     shutil.copytree(GOLDEN / "sh1-streamed-sog", tmp_path / "web")
     start = settings_of(tmp_path / "web")["start"]
-    coarse = read_levels(tmp_path / "web")
+    coarse = read_parts(tmp_path / "web")
     level = coarse.splats.take(coarse.level(coarse.levels - 1))
     assert np.linalg.norm(np.subtract(start["center"], np.median(level.center, axis=0))) < start["radius"]
     manifest = json.loads((tmp_path / "web" / "lod-meta.json").read_text())
@@ -100,7 +100,7 @@ def test_streamed_sog_is_framed_without_its_environment(tmp_path: Path) -> None:
 def test_3d_tiles_are_shown_by_cesium_with_all_their_tiles(tileset: Path, packages: Path) -> None:
     settings = settings_of(tileset, spark_dir=packages)
     (file,) = settings["files"]
-    scene = read_tiles(tileset)
+    scene = read_parts(tileset)
     assert (settings["engine"], file["url"], file["up"]) == ("cesium", "data/0/tileset.json", "-y")
     assert (file["splats"], file["leaves"], file["levels"]) == (len(scene.splats), 300, int(scene.level.max()) + 1)
     names = {f"data/0/{each.relative_to(tileset.parent).as_posix()}" for each in tileset.parent.rglob("*.*")}

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ...codecs.encoder import Encoder, Get
 from ...codecs.statistics import Statistics
 from ...lod.builders import BUILDERS
-from ...lod.stage_records import NO_FAMILY, Pending, StageFamilies
+from ...lod.stage_records import NO_FAMILY, Pending
 from ...model.selection import SelectionTally
 from ...model.splats import Splats
 from ...support.parallel import blocks_of
@@ -170,7 +170,8 @@ def build_stage(job: Job, number: int, *, threads: int, progress: Progress) -> N
         pending = _begun(job, stage, threads)
         families, left = builder.advance(pending, stage.region, number, job.plan, progress=progress)
         del pending
-        _put_families(job, number, families, threads)
+        columns = dict(vars(families))
+        job.store.put(families_of(number), {"rows": rows_of(columns.pop("nodes"), threads), **columns})
         statistics = [Statistics.of(families.nodes, families.family == NO_FAMILY, job.needed)]
         if stage.region is None:
             root, family = left.root()
@@ -217,8 +218,3 @@ def block_of(job: Job, block: int, threads: int) -> tuple[Splats, NDArray[np.int
         index[here] += job.selected[part]
         at = here.stop
     return splats_of(rows, threads), index
-
-
-def _put_families(job: Job, number: int, families: StageFamilies, threads: int) -> None:
-    columns = dict(vars(families))
-    job.store.put(families_of(number), {"rows": rows_of(columns.pop("nodes"), threads), **columns})

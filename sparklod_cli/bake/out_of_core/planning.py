@@ -71,10 +71,20 @@ def blocks_for(
         folder = absolute(folder)  # other processes work in folders of their own
     store = Store(folder)
     is_left = bool(store.names())
-    why = _reason(header, settings, memory, resources, engine, is_left=is_left)
-    whole = _as_a_whole(settings)
+    needed = _in_memory_bytes(header, settings)
+    whole, why = _as_a_whole(settings), None
+    if memory is not None and needed > memory:
+        if whole is not None:
+            raise _too_large(header, settings, needed, memory, whole)
+        allowed = "may take" if resources.memory is None else "--memory gives it"
+        why = f"it would take about {format_size(needed)} of memory and {allowed} {format_size(memory)}"
+    elif engine is not None:
+        why = "a cluster was asked for"
+    elif resources.resume and is_left:
+        why = "it was interrupted there"
+    elif resources.block_splats:
+        why = "blocks were asked for"
     if why is not None and whole is not None:
-        _check_memory(header, settings, memory, whole)
         say(f"{name_of(source)}: goes on in memory, although {why}: {whole}")
         why = None
     work = functools.partial(at_work, store, resume=resources.resume, overwrite=overwrite, say=say)
@@ -90,12 +100,12 @@ def blocks_for(
     block_splats = resources.block_splats or estimate.block_splats_within(
         memory, settings.method, splats, degree, in_chunks=output.in_chunks, threads=threads
     )
-    needed = estimate.scratch_bytes(settings.method, splats, degree)
+    scratch = estimate.scratch_bytes(settings.method, splats, degree)
     if isinstance(folder, Path):
-        _check_room(folder, needed)
+        _check_room(folder, scratch)
     say(
         f"{name_of(source)}: goes out of core, as {why}; {count_of(splats, 'splat')} in blocks of up to"
-        f" {block_splats:,}, scratch of about {format_size(needed)} in {folder}"
+        f" {block_splats:,}, scratch of about {format_size(scratch)} in {folder}"
     )
     with (
         work(fingerprint(), block_splats) as block_splats,
@@ -141,27 +151,6 @@ def _header_of(source: Source) -> SceneStream | None:
         return None
 
 
-def _reason(
-    header: SceneStream,
-    settings: BakeSettings,
-    memory: int | None,
-    resources: Resources,
-    engine: Engine | None,
-    *,
-    is_left: bool,
-) -> str | None:
-    """Return why a bake goes out of core, as the end of a sentence; None if it does not."""
-    needed = _in_memory_bytes(header, settings)
-    if memory is not None and needed > memory:
-        allowed = "may take" if resources.memory is None else "--memory gives it"
-        return f"it would take about {format_size(needed)} of memory and {allowed} {format_size(memory)}"
-    if engine is not None:
-        return "a cluster was asked for"
-    if resources.resume and is_left:
-        return "it was interrupted there"
-    return "blocks were asked for" if resources.block_splats else None
-
-
 def _in_memory_bytes(header: SceneStream, settings: BakeSettings) -> int:
     """Return bytes that a bake in memory takes."""
     refines = settings.refine is not None
@@ -181,18 +170,15 @@ def _as_a_whole(settings: BakeSettings) -> str | None:
     return None if settings.detail is None else "detail levels are made of a whole tree"
 
 
-def _check_memory(header: SceneStream, settings: BakeSettings, memory: int | None, whole: str) -> None:
-    """Raise `OutOfMemoryError` where a bake that cannot go out of core would take more memory than it may.
+def _too_large(header: SceneStream, settings: BakeSettings, needed: int, memory: int, whole: str) -> OutOfMemoryError:
+    """Return the error for a bake that cannot go out of core and needs more memory than it may take.
 
     Args:
         whole: of `_as_a_whole`.
     """
-    needed = _in_memory_bytes(header, settings)
-    if memory is None or needed <= memory:
-        return
     refines = settings.refine is not None
     most = estimate.most_in_memory(memory, settings.method, header.sh_degree, refines=refines)
-    raise OutOfMemoryError(
+    return OutOfMemoryError(
         f"{whole}, not in blocks: {count_of(header.count, 'splat')} would take about"
         f" {format_size(needed)} of memory, and {format_size(memory)} are enough for {most:,}; give --memory"
         f" {format_size(estimate.ENOUGH * needed)} or more if the machine has it, or fewer splats"

@@ -136,7 +136,8 @@ def at_work(
         try:
             yield block_splats
         except BaseException as error:
-            if _is_hopeless(error) or store.names() in ([], [RECIPE]):
+            hopeless = isinstance(error, HOPELESS) and not isinstance(error, UnreadableError)
+            if hopeless or store.names() in ([], [RECIPE]):
                 _clear(store)
             elif not isinstance(error, ScratchError):
                 say(f"what is done stays in {store}; run it again with --resume to go on")
@@ -189,10 +190,6 @@ def _resumed(
 def _folder_of(store: Store) -> Path | None:
     """Return the folder of a store on this machine."""
     return store.folder if isinstance(store.folder, Path) else None
-
-
-def _is_hopeless(error: BaseException) -> bool:
-    return isinstance(error, HOPELESS) and not isinstance(error, UnreadableError)
 
 
 @contextlib.contextmanager

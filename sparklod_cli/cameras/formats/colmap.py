@@ -103,7 +103,7 @@ def parse(files: Files, settings: Settings) -> Parsed:
     else:
         cameras = dict(_text_cameras(files.contents.get("cameras.txt", b"")))
     data = _images(files)
-    images = _text_images(data) if _is_text(data) else _binary_images(data)
+    images = _binary_images(data) if b"\0" in data[: 1 << 16] else _text_images(data)
     notes = [] if cameras else ["Without a cameras.txt or cameras.bin beside it, its lenses are unknown."]
     frames = []
     used = set()
@@ -123,10 +123,6 @@ def _natural(name: str) -> list[tuple[int, str]]:
     """Return a key that sorts 9 before 10 in names."""
     parts = [(part.lstrip("0") if index % 2 else part) for index, part in enumerate(re.split(r"([0-9]+)", name))]
     return [(len(part) if index % 2 else 0, part) for index, part in enumerate(parts)]
-
-
-def _is_text(data: bytes) -> bool:
-    return b"\0" not in data[: 1 << 16]
 
 
 #: An image: number, number of its camera, rotation w x y z, translation x y z, and name.

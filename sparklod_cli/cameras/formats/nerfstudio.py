@@ -35,7 +35,7 @@ def parse(files: Files, settings: Settings) -> Parsed:
 
 
 def _frame(item: Json, size: tuple[int, int] | None) -> Frame:
-    """Return the field of view is vertical, in degrees, as in three.js; its aspect is that of the size."""
+    """Return a frame, whose field of view is vertical, in degrees, as in three.js; its aspect is that of the size."""
     fov = math.radians(item.get("fov").number()) if item.has("fov") else None
     matrix = np.array(item.get("camera_to_world").matrix(4)).reshape(4, 4)
     return Frame(matrix, Intrinsics(size, fov=fov))

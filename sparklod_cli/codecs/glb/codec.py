@@ -26,7 +26,7 @@ from ...support.progress import Progress, silent
 from ...support.untrusted import quoted_value
 from .. import quantize, spz
 from ..clamps import SPZ, CodeRange
-from ..content import Content, Source, Target, decoder
+from ..content import Content, Source, Target
 from ..file_notes import note_of, read_note
 from ..options import CESIUM, DEFAULTS, KHRONOS, WriteOptions
 from ..stream import Positioned, encode_rows
@@ -135,9 +135,6 @@ def open_content(source: Source) -> Content:
     antialiased = content.antialiased or noted.antialiased
     content = dataclasses.replace(content, notes=notes, antialiased=antialiased, up=noted.up)
     return content if transform.is_identity else placed(content, transform)
-
-
-decode = decoder(open_content)
 
 
 def _primitive(file: GlbFile) -> tuple[int, dict[str, Any]]:

@@ -18,7 +18,7 @@ from ...model.lod_tree import LodTree
 from ...model.scene import Scene
 from ...model.splats import COLUMNS, Splats
 from ...support.progress import Progress, silent
-from ..content import OpenCompanion, decoder
+from ..content import OpenCompanion
 from ..encoder import results
 from ..options import DEFAULTS, WriteOptions
 from ..quantize import Bytes
@@ -39,8 +39,6 @@ from .rad_reader import read_chunk as read_chunk
 
 #: Bytes of chunks that wait in memory for their header; beyond, they wait on disk.
 SPOOLED = 1 << 26
-
-decode = decoder(open_content)
 
 
 def encode(

@@ -117,10 +117,6 @@ def _encode_signed(values: FloatArray, low: float, high: float) -> NDArray[Any]:
     return steps.astype(np.int8).view(np.uint8)
 
 
-def _signed_table(low: float, high: float) -> FloatArray:
-    return _ALL.view(np.int8) / np.float32(127) * np.float32(high)
-
-
 def _encode_log(values: NDArray[Any], low: float, high: float) -> NDArray[Any]:
     with np.errstate(divide="ignore"):
         return np.minimum(np.log(values.astype(np.float64)), LARGEST_LOG_F16).astype(np.float32)
@@ -146,7 +142,7 @@ def _decode_octahedral(codes: Bytes, count: int, numbers: int, low: float, high:
 
 _F32, _F16 = _plain("<f4"), _plain("<f2", LARGEST_F16)
 _R8 = _by_table(splat_encoding.encode_linear, functools.partial(splat_encoding.decode_linear, _ALL))
-_S8 = _by_table(_encode_signed, _signed_table)
+_S8 = _by_table(_encode_signed, lambda low, high: _ALL.view(np.int8) / np.float32(127) * np.float32(high))
 
 #: By name. Largest errors inside the range of the codes, apart from that of float32:
 #: f16, f16_lebytes: 2 ** -11 of a number, or 2 ** -25 if that is more. r8, r8_delta: (max - min) / 510.

@@ -105,7 +105,7 @@ class RadHeader:
 
     @property
     def format(self) -> str:
-        """As `Scene.format`."""
+        """Name of the format, see `Scene.format`."""
         return "RAD" + " LoD" * self.lod_tree
 
     @property

@@ -20,7 +20,7 @@ from ...support.parallel import for_blocks, ordered_map
 from ...support.progress import Progress
 from .. import quantize
 from ..compression import check_promise
-from ..content import Content, Source, Target, decoder
+from ..content import Content, Source, Target
 from ..file_notes import read_note
 from ..kernels import texels
 from ..stream import Positioned
@@ -110,9 +110,6 @@ def open_content(source: Source) -> Content:
     header = {"version": version, "palette": palette.entries if palette is not None else 0, "bytes": files.size}
     note = read_note(meta.root.get("asset"))
     return Content(count, degree, f"SOG {version}", fill, antialiased, note.problems, header, note.up)
-
-
-decode = decoder(open_content)
 
 
 def _steps(meta: Meta, version: int, palette: SogPalette | None) -> list[Step]:

@@ -140,7 +140,7 @@ def encode_files(
     makers: dict[str, Callable[[], Texture]] = {
         "means": functools.partial(_means, words, low, high, order),
         "scales": functools.partial(_scales, splats.scale, order),
-        "quats": functools.partial(_quats, splats.quat_xyzw, order),
+        "quats": lambda: Texture({}, [_per_splat(codings.encode_quat(splats.quat_xyzw[order]))]),
         "sh0": functools.partial(_sh0, splats, order),
     }
     if splats.sh_degree:
@@ -196,10 +196,6 @@ def _grows(scale: FloatArray, codes: NDArray[np.uint8], book: FloatArray) -> boo
         if np.any(values[codes[block]] > most):
             return True
     return False
-
-
-def _quats(quat_xyzw: FloatArray, order: Order) -> Texture:
-    return Texture({}, [_per_splat(codings.encode_quat(quat_xyzw[order]))])
 
 
 def _sh0(splats: Splats, order: Order) -> Texture:

@@ -1,6 +1,6 @@
 """Streamed SOG: a manifest, lod-meta.json, and unpacked SOG scenes beside it, each with runs of one detail level.
 
-As a scene it is full detail, level 0, and the environment; `decode_levels` reads all levels.
+As a scene it is full detail, level 0, and the environment; `decode_parts` reads all levels.
 """
 
 from __future__ import annotations
@@ -11,21 +11,20 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from ...model.scene import Bounds, Counts, DetailScene
+from ...model.scene import Bounds, Counts, DetailScene, facts_of
 from ...model.sh import COEFFICIENTS
 from ...support.errors import FormatError
 from ...support.progress import Progress, silent
 from ...support.units import count_of
 from ...support.untrusted import quoted_value
 from ..compression import check_promise
-from ..content import Content, OpenCompanion, Source, decoder
+from ..content import Content, OpenCompanion, Source
 from ..file_names import MANIFEST
 from ..scene_files import Chunk, Piece
 from ..stream import size_of
 from ..validation import check_rules, error_of
-from .chunks import chunk_files
 from .manifest import MAX_MANIFEST, VERSION, Manifest, parse
-from .manifest_rules import run_violations, violations
+from .manifest_rules import chunk_files, run_violations, violations
 from .streamed_writer import encode_files as encode_files
 
 Index = NDArray[np.int64]
@@ -42,10 +41,7 @@ def open_content(source: Source) -> Content:
     return _open(source, full_detail=True)[1]
 
 
-decode = decoder(open_content)
-
-
-def decode_levels(
+def decode_parts(
     file: BinaryIO, *, threads: int = 1, progress: Progress = silent, open_companion: OpenCompanion | None = None
 ) -> DetailScene:
     """Read all detail levels, in whatever order the runs lie in the chunks.
@@ -62,8 +58,7 @@ def decode_levels(
     if layout.manifest.environment is not None:
         total = int(layout.counts.sum())
         splats, environment = splats.take(slice(0, total)), splats.take(slice(total, None))
-    about = scene.antialiased, scene.format, scene.notes, scene.header, scene.up
-    return DetailScene(splats, layout.counts, bounds, children, errors, environment, *about)
+    return DetailScene(splats, layout.counts, bounds, children, errors, environment, **facts_of(scene))
 
 
 @dataclass(frozen=True, eq=False)

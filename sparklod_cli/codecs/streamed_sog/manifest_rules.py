@@ -17,12 +17,13 @@ from ...support.progress import Progress, silent
 from ...support.units import count_of
 from ...support.untrusted import quoted_value
 from ..content import OpenCompanion
+from ..file_names import MANIFEST
 from ..json_trees import leads_away
-from ..scene_files import Chunk
+from ..scene_files import Chunk, SceneFiles
+from ..sog import codec as sog
 from ..sog import texel_codings
 from ..splat_bounds import count_outside
 from ..validation import RuleViolation
-from .chunks import chunk_files
 from .manifest import MAX_MANIFEST, Bound, Manifest, ManifestNode, Run, parse
 
 #: Meaning of each code; the text of a violation has the values. Values of the wrong kind, which
@@ -252,6 +253,13 @@ CELLS = 1 << 10
 #: Share of a run's splats that may come after one that they precede, since codes move centres into the next cell: in
 #: files of splat-transform it is up to 0.009, in no order at all 0.5. And the least number of them that is told of.
 OUT_OF_ORDER, FEW = 0.05, 16
+
+
+def chunk_files(open_companion: OpenCompanion | None) -> SceneFiles:
+    """Return the SOG scenes beside a manifest, which names the meta.json of each."""
+    return SceneFiles(
+        open_companion, MANIFEST, "streamed-sog.chunk-files", lambda name, source: sog.open_content(source)
+    )
 
 
 def scan_files(

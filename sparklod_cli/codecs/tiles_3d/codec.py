@@ -1,6 +1,6 @@
 """3D Tiles: a tileset.json and a GLB for each tile, whose children replace it by more splats.
 
-As a scene it is full detail, the tiles without children; `decode_tiles` reads all tiles. Tilesets of other programs are
+As a scene it is full detail, the tiles without children; `decode_parts` reads all tiles. Tilesets of other programs are
 read if their tiles are listed one by one, replace their parents, and have GLBs with splats.
 """
 
@@ -12,6 +12,7 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from ...model.scene import facts_of
 from ...model.sh import COEFFICIENTS
 from ...model.tile_scene import TileScene
 from ...model.transforms import common
@@ -19,17 +20,16 @@ from ...support.errors import FormatError
 from ...support.progress import Progress, silent
 from ...support.untrusted import quoted_value
 from ..compression import check_promise
-from ..content import Content, OpenCompanion, Source, decoder
+from ..content import Content, OpenCompanion, Source
 from ..file_names import TILESET
 from ..glb import codec as glb
 from ..glb.placement import transform_of
 from ..scene_files import Chunk, SceneFiles
 from ..validation import check_rules, error_of
-from .axes import to_tileset, turned
 from .tile_writer import encode_files as encode_files
 from .tileset import MAX_TILESET, Tileset, read_whole
 from .tileset_rules import matrices_of, matrix_of, read_violations, violations, volumes_of
-from .volumes import Volume
+from .volumes import Volume, to_tileset, turned
 
 #: Note of scenes whose splats have the coordinates of their tileset.
 NOT_PLACED = "the transform of the tileset, its place on the Earth, is not applied"
@@ -51,10 +51,7 @@ def open_content(source: Source) -> Content:
     return _open(source, tileset, wanted)[0]
 
 
-decode = decoder(open_content)
-
-
-def decode_tiles(
+def decode_parts(
     file: BinaryIO, *, threads: int = 1, progress: Progress = silent, open_companion: OpenCompanion | None = None
 ) -> TileScene:
     """Read all tiles, those with most edges to the root last. The level of a tile is the number of these edges.
@@ -78,7 +75,6 @@ def decode_tiles(
     if len(boxes) < len(order):
         raise error_of("tiles.volumes", "a bounding volume of it is a region, of which no box is made")
     errors = np.array([float(tileset.tiles[number].record["geometricError"]) for number in order])
-    about = scene.antialiased, scene.format, scene.notes, scene.header, scene.up
     return TileScene(
         scene.splats,
         parent,
@@ -88,7 +84,7 @@ def decode_tiles(
         turned(np.array(boxes), to_tileset(scene.up).T),
         np.array([sizes.get(number, 0) for number in order], np.int64),
         _root_transform(tileset),
-        *about,
+        **facts_of(scene),
     )
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import Any
@@ -14,13 +16,12 @@ from ...model.tile_scene import TileScene
 from ...support.errors import FormatError
 from ...support.parallel import ordered_map
 from ...support.progress import Progress, silent
-from ..file_names import TILES, TILESET, tile_name
+from ..file_names import TILES, TILESET
 from ..file_notes import note_of
 from ..glb import codec as glb
 from ..options import CESIUM, WriteOptions
-from .axes import to_tileset, turned
 from .tileset import CONTENT_GLTF, REPLACE, VERSION
-from .volumes import LARGEST
+from .volumes import LARGEST, to_tileset, turned
 
 #: Tiles of a tileset file from which on its subtrees go to files of their own, each of at most as many; and the least
 #: tiles for which such a file is made. A tile takes some 300 bytes of JSON. Chosen.
@@ -67,11 +68,8 @@ def encode_files(
 
 def tile_names(scene: TileScene) -> list[str]:
     """Return the name of each tile, its level and its number there, without a suffix."""
-    seen, names = dict[int, int](), list[str]()
-    for level in scene.level.tolist():
-        names.append(tile_name(level, seen.setdefault(level, 0), ""))
-        seen[level] += 1
-    return names
+    numbers = defaultdict[int, Iterator[int]](itertools.count)
+    return [f"{level}-{next(numbers[level])}" for level in scene.level.tolist()]
 
 
 def _tilesets(

@@ -19,9 +19,8 @@ from ..json_trees import leads_away
 from ..scene_files import Chunk, SceneFiles
 from ..splat_bounds import LOOSE_BOUND, count_outside
 from ..validation import RuleViolation
-from .axes import to_tileset
 from .tileset import CONTENT_GLTF, OLD_VERSION, REPLACE, SPLATS, UNREAD, VERSION, TileRecord, Tileset
-from .volumes import Volume, volume_of
+from .volumes import Volume, to_tileset, volume_of
 
 #: Meaning of each code; the text of a violation has the values. Values of the wrong kind, which the parser refuses,
 #: have the codes "container.corrupt" and "container.version", as in other formats.

@@ -1,4 +1,8 @@
-"""Bounding volumes of tiles: boxes and spheres, in the axes of their tileset; of regions nothing is known here."""
+"""Bounding volumes of tiles, boxes and spheres, and the axes of tilesets; of regions nothing is known here.
+
+z is up in a tileset and its bounding volumes, y in the glTF content of its tiles, which a viewer turns when it loads
+it: (x, y, z) becomes (x, -z, y). Facts: 3D Tiles 1.1, "glTF transforms".
+"""
 
 from __future__ import annotations
 
@@ -8,6 +12,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from ...model.scene import Bounds
+from ..glb.placement import rotation_of_up
 
 Vector = NDArray[np.float64]
 
@@ -101,3 +108,27 @@ def volume_of(value: Any) -> Volume | str | None:
     if found[3] < 0:
         return "a sphere with a radius below 0"
     return Volume(found[:3], np.empty((0, 3)), float(found[3]))
+
+
+#: The turn from the axes of glTF to those of tilesets, of column vectors.
+Y_TO_Z = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+
+
+def to_tileset(up: str | None) -> NDArray[np.float64]:
+    """Return the (3, 3) rotation from the axes of splats in a GLB of ours, of which `up` is up, to the tileset's.
+
+    Its entries are 0, 1 and -1, so that boxes stay boxes.
+    """
+    return Y_TO_Z @ rotation_of_up(up)
+
+
+def turned(bounds: Bounds, rotation: NDArray[np.float64]) -> Bounds:
+    """Return (..., 2, 3) corners of the boxes around turned ones.
+
+    Args:
+        bounds: (..., 2, 3) lowest and highest corners.
+        rotation: (3, 3), of column vectors.
+    """
+    middle, half = bounds.mean(axis=-2), (bounds[..., 1, :] - bounds[..., 0, :]) / 2
+    center, reach = middle @ rotation.T, half @ np.abs(rotation).T
+    return np.stack([center - reach, center + reach], axis=-2)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import struct
-import sys
 import warnings
 from pathlib import Path
 from typing import Any
@@ -20,14 +19,12 @@ from sparklod_cli.cameras.formats.table import FORMATS
 from sparklod_cli.cameras.frame import Settings
 from sparklod_cli.cameras.path import read
 from sparklod_cli.support.errors import CameraPathError
-from sparklod_cli.support.optional import install_hint
 from tests.cameras.formats.test_same_cameras import CASES
 from tests.cameras.known import FOLDER, files_at, text_file
 
 EYE = np.eye(4).tolist()
 
-#: Open3D's own reader is behind checks of ours, which are what breaks first.
-NAMES = [name for name in CASES if not name.startswith("open3d")]
+NAMES = list(CASES)
 
 
 def own(fields: str) -> str:
@@ -193,7 +190,7 @@ def check_any(files: Files, form: str | None) -> None:
 HUGE = [0.0, -0.0, 5e-324, 1e-300, -1e308, 1e308, 1.7e308, 9223372036854775808, 1.5]
 
 
-@pytest.mark.parametrize("name", [name for name in NAMES if "open3d" not in name and "binary" not in name])
+@pytest.mark.parametrize("name", [name for name in NAMES if "binary" not in name])
 def test_a_number_of_any_size_gives_cameras_or_an_error(name: str) -> None:
     """Each number of a file by turns becomes each of `HUGE`."""
     whole = files_at(FOLDER / name)
@@ -249,7 +246,7 @@ def test_any_value_replaced_by_another_gives_cameras_or_an_error(name: str, data
         check_any(text_file(json.dumps(root)), form)
 
 
-@pytest.mark.parametrize("form", [form.name for form in FORMATS if form.name != "open3d"])
+@pytest.mark.parametrize("form", [form.name for form in FORMATS])
 def test_every_parser_refuses_files_of_other_formats(form: str) -> None:
     for name, (other, *_) in CASES.items():
         if other != form:
@@ -257,7 +254,7 @@ def test_every_parser_refuses_files_of_other_formats(form: str) -> None:
                 read(files_at(FOLDER / name), format=form)
 
 
-@pytest.mark.parametrize("form", [None, *(form.name for form in FORMATS if form.name != "open3d")])
+@pytest.mark.parametrize("form", [None, *(form.name for form in FORMATS)])
 @pytest.mark.parametrize("content", ["", "\n", "#", "\ufeff"])
 def test_every_parser_refuses_an_empty_file(form: str | None, content: str) -> None:
     for name in ("path.json", "path.csv", "images.txt"):
@@ -309,25 +306,11 @@ TRAJECTORY = '{"class_name": "PinholeCameraTrajectory", "parameters": [%s]}'
         ("x.log", "0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1\n0 0 0 1\n", "line 4 has 3 numbers, not 4"),
         ("x.log", "0 0 1\n1 0 0 0\n0 1 0 0\n", "it ends inside a pose"),
         ("x.log", "0 0 1\n1 0 0 nan\n0 1 0 0\n", "line 2 has 'nan'"),
-        ("x.trajectory", TRAJECTORY % "", "rename it to .json or .log"),
+        ("x.log", "0 0 1\n" + 4 * "1 0 0 0\n", "it has a matrix that cannot be inverted"),
+        ("x.json", "0 0 1\n", "it is not JSON"),
+        ("x.trajectory", TRAJECTORY % "", "it has no cameras"),
     ],
 )
-def test_broken_files_do_not_reach_open3d(name: str, content: str, said: str) -> None:
-    """It would take them for whole ones."""
+def test_a_broken_trajectory_of_open3d_is_refused(name: str, content: str, said: str) -> None:
     with pytest.raises(CameraPathError, match=said):
         read(text_file(content, name), format="open3d")
-
-
-def test_a_missing_open3d_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setitem(sys.modules, "open3d", None)
-    with pytest.raises(
-        CameraPathError, match=f"the package open3d, which is not installed: {re.escape(install_hint('render'))}"
-    ):
-        read(files_at(FOLDER / "open3d.json"))
-    broken = tmp_path / "open3d"
-    broken.mkdir()
-    (broken / "__init__.py").write_text("raise ImportError('libGL.so.1: cannot open shared object file')")
-    monkeypatch.delitem(sys.modules, "open3d")
-    monkeypatch.syspath_prepend(tmp_path)
-    with pytest.raises(CameraPathError, match=r"Open3D, which does not load: libGL.so.1: cannot open"):
-        read(files_at(FOLDER / "open3d.json"))

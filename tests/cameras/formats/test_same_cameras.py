@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -53,13 +51,8 @@ CASES = {
 }
 
 
-def case(name: str) -> Any:
-    missing = name.startswith("open3d") and importlib.util.find_spec("open3d") is None
-    return pytest.param(name, marks=pytest.mark.skipif(missing, reason="open3d is not installed"))
-
-
 @pytest.mark.parametrize("named", [False, True], ids=["by-content", "by-name"])
-@pytest.mark.parametrize("name", [case(name) for name in CASES])
+@pytest.mark.parametrize("name", CASES)
 def test_every_format_gives_the_known_cameras(name: str, named: bool) -> None:
     form, count, settings, second = CASES[name]
     path = read_fixture(name, settings, format=form if named else None)

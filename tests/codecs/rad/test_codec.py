@@ -15,6 +15,7 @@ import pytest
 from fixtures import by_hand_rad
 from sparklod_cli import __version__
 from sparklod_cli.codecs import clamps
+from sparklod_cli.codecs.content import decode_file
 from sparklod_cli.codecs.options import DEFAULTS, RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import codec as rad
 from sparklod_cli.codecs.rad import rad_options
@@ -59,7 +60,7 @@ def written(scene: Scene, threads: int = 1, **options: object) -> bytes:
 
 
 def read(data: bytes) -> Scene:
-    return rad.decode(io.BytesIO(data))
+    return decode_file(rad, io.BytesIO(data))
 
 
 def assert_same(one: Splats, other: Splats, names: tuple[str, ...] = COLUMNS) -> None:
@@ -124,7 +125,7 @@ def test_columns_that_are_not_asked_for_are_0_but_damage_to_them_is_found() -> N
     data = bytearray(WHOLE.read_bytes())
     data[data.index(b'"r8_delta"') + 1] = ord("s")
     with pytest.raises(FormatError, match="rgb"):
-        rad.decode(io.BytesIO(bytes(data)), columns=("center",))
+        decode_file(rad, io.BytesIO(bytes(data)), columns=("center",))
 
 
 def test_a_chunk_alone_says_what_to_give_instead() -> None:
@@ -134,7 +135,7 @@ def test_a_chunk_alone_says_what_to_give_instead() -> None:
 
 def test_chunks_in_files_are_not_read_from_standard_input() -> None:
     with pytest.raises(FormatError, match="chunks are in files beside it"):
-        rad.decode(io.BytesIO(CHUNKED.read_bytes()))
+        decode_file(rad, io.BytesIO(CHUNKED.read_bytes()))
 
 
 @pytest.mark.parametrize("name", ["../sh3-0.radc", "/sh3-0.radc", "folder/sh3-0.radc", "missing.radc", ".."])
@@ -282,7 +283,7 @@ def test_threads_do_not_change_a_palette_and_chunk_files_have_it_in_the_first(sh
     assert written(shared, 1, sh_codes=20) == written(shared, 2, sh_codes=20)
     options = WriteOptions(rad=RadOptions(sh_codes=20))
     files = {name: b"".join(pieces) for name, pieces in rad.encode_chunked(shared, options, "scene")}
-    back = rad.decode(io.BytesIO(files["scene.rad"]), open_companion=lambda name: io.BytesIO(files[name]))
+    back = decode_file(rad, io.BytesIO(files["scene.rad"]), open_companion=lambda name: io.BytesIO(files[name]))
     assert_same(back.splats, read(written(shared, sh_codes=20)).splats)
 
 

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from fixtures import by_hand_rad
+from sparklod_cli.codecs.content import decode_file
 from sparklod_cli.codecs.rad import codec as rad
 from sparklod_cli.codecs.rad.rad_header import read_header
 from sparklod_cli.codecs.rad.rad_layout import RANGES
@@ -105,7 +106,7 @@ def with_property(name: str, piece: bytes) -> bytes:
 )
 def test_data_that_are_not_those_of_the_splats_say_what_they_are(piece: bytes, message: str) -> None:
     with pytest.raises(FormatError, match=message):
-        rad.decode(io.BytesIO(with_property("rgb", piece)), validate=False)
+        decode_file(rad, io.BytesIO(with_property("rgb", piece)), validate=False)
 
 
 def test_a_deflate_bomb_is_not_unpacked() -> None:
@@ -114,7 +115,7 @@ def test_a_deflate_bomb_is_not_unpacked() -> None:
     data = with_property("rgb", bomb)
     tracemalloc.start()
     with pytest.raises(FormatError, match="more than the 72 bytes"):
-        rad.decode(io.BytesIO(data), validate=False)
+        decode_file(rad, io.BytesIO(data), validate=False)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 4e6
@@ -131,7 +132,7 @@ def test_a_header_that_promises_too_much_is_refused_before_memory_is_asked_for(c
     data = by_hand_rad.headed(b"RAD0", header) + chunk
     tracemalloc.start()
     with pytest.raises(PromiseError, match="more than a file of"):
-        rad.decode(io.BytesIO(data))
+        decode_file(rad, io.BytesIO(data))
     file = io.BytesIO(data)
     known = read_header(file)
     with pytest.raises(PromiseError, match="more than a file of"):
@@ -149,7 +150,7 @@ def test_a_chunk_that_ends_beyond_its_file_is_refused_before_memory_is_asked_for
     with pytest.raises(FormatError, match="cut short"):
         rad.read_chunk(file, known.chunks[0], known)
     with pytest.raises(FormatError, match=r"cut short|inside"):
-        rad.decode(io.BytesIO(data))
+        decode_file(rad, io.BytesIO(data))
 
 
 def test_a_label_beyond_the_palette_is_named() -> None:
@@ -168,4 +169,4 @@ def test_a_range_that_float32_cannot_hold_is_refused_without_a_warning() -> None
     ranged = next(number for number, each in enumerate(fields["properties"]) if each["encoding"] in RANGES)
     text = json.dumps(replaced(fields, ("properties", ranged, "max"), 1e39)).encode()
     with pytest.raises(FormatError, match=r"its max is 1e\+39$"):
-        rad.decode(io.BytesIO(by_hand_rad.joined(PARTS | {"0.json": text}, PARTS)))
+        decode_file(rad, io.BytesIO(by_hand_rad.joined(PARTS | {"0.json": text}, PARTS)))

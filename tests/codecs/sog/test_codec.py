@@ -17,6 +17,7 @@ import pytest
 from PIL import Image
 
 from fixtures import by_hand_sog
+from sparklod_cli.codecs.content import decode_file
 from sparklod_cli.codecs.sog import codec as sog
 from sparklod_cli.io import read_scene
 from sparklod_cli.model.scene import Scene
@@ -35,7 +36,7 @@ Files = dict[str, bytes]
 
 
 def decode(files: Mapping[str, bytes], **zipped: Any) -> Scene:
-    return sog.decode(io.BytesIO(by_hand_sog.zipped(files, **zipped)))
+    return decode_file(sog, io.BytesIO(by_hand_sog.zipped(files, **zipped)))
 
 
 def with_meta(meta: Mapping[str, Any], files: Mapping[str, bytes] = FILES) -> Files:
@@ -174,7 +175,7 @@ def test_a_comment_and_bytes_before_the_zip_make_no_difference(tmp_path: Path) -
     file = io.BytesIO(by_hand_sog.zipped(FILES))
     with zipfile.ZipFile(file, "a") as archive:
         archive.comment = b"made by hand"
-    assert_same(sog.decode(io.BytesIO(file.getvalue())), read_scene(FOLDER))
+    assert_same(decode_file(sog, io.BytesIO(file.getvalue())), read_scene(FOLDER))
 
 
 @pytest.mark.parametrize("path", ["", "meta.json"])

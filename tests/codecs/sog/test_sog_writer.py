@@ -14,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import sparklod_cli
+from sparklod_cli.codecs.content import decode_file
 from sparklod_cli.codecs.options import SogOptions, WriteOptions
 from sparklod_cli.codecs.sog import codec as sog
 from sparklod_cli.codecs.sog import sog_container, sog_writer
@@ -39,7 +40,7 @@ def meta_of(scene: Scene, **how: Any) -> dict[str, Any]:
 def back(scene: Scene, **how: Any) -> Splats:
     """What is read of the files of a scene, in its order."""
     files = files_of(scene, in_order=True, **how)
-    return sog.decode(io.BytesIO(files["meta.json"]), open_companion=lambda name: io.BytesIO(files[name])).splats
+    return decode_file(sog, io.BytesIO(files["meta.json"]), open_companion=lambda name: io.BytesIO(files[name])).splats
 
 
 @pytest.mark.parametrize("degree", range(4))
@@ -70,7 +71,7 @@ def test_whether_a_scene_is_antialiased_is_kept_in_both_spellings(antialiased: b
     for spelling in ("antialias", "model"):
         files = files_of(scene)
         files["meta.json"] = json.dumps({key: value for key, value in meta.items() if key != spelling}).encode()
-        read = sog.decode(io.BytesIO(files["meta.json"]), open_companion=lambda name: io.BytesIO(files[name]))  # noqa: B023
+        read = decode_file(sog, io.BytesIO(files["meta.json"]), open_companion=lambda name: io.BytesIO(files[name]))  # noqa: B023
         assert read.antialiased is antialiased
 
 
@@ -96,7 +97,7 @@ def test_threads_do_not_change_a_byte() -> None:
 
 def test_neighbours_in_a_file_are_neighbours_in_space() -> None:
     scene = Scene(random_splats(4000))
-    found = sog.decode(io.BytesIO(b"".join(sog.encode(scene)))).splats.center
+    found = decode_file(sog, io.BytesIO(b"".join(sog.encode(scene)))).splats.center
     kept = back(scene).center
     steps = [np.median(np.linalg.norm(np.diff(each, axis=0), axis=1)) for each in (found, kept)]
     assert steps[0] < steps[1] / 5
@@ -106,8 +107,8 @@ def test_neighbours_in_a_file_are_neighbours_in_space() -> None:
 
 @pytest.mark.parametrize("name", ["sh0", "sh1", "sh2", "sh3", "flat", "needle", "coincident", "huge", "one"])
 def test_writing_a_decoded_scene_again_changes_next_to_nothing(name: str) -> None:
-    once = sog.decode(io.BytesIO(b"".join(sog.encode(read_scene(FIXTURES / f"{name}.ply")))))
-    twice = sog.decode(io.BytesIO(b"".join(sog.encode(once))))
+    once = decode_file(sog, io.BytesIO(b"".join(sog.encode(read_scene(FIXTURES / f"{name}.ply")))))
+    twice = decode_file(sog, io.BytesIO(b"".join(sog.encode(once))))
     for column in COLUMNS:
         one, two = getattr(once.splats, column), getattr(twice.splats, column)
         if column == "quat_xyzw":  # of two components that are nearly the largest, the other one may be left out

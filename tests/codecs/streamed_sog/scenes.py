@@ -58,6 +58,4 @@ def open_companion(files: Mapping[str, bytes]) -> Callable[[str], BinaryIO]:
 
 def levels_of(files: Mapping[str, bytes], *, threads: int = 1) -> DetailScene:
     """What is read of files."""
-    return codec.decode_levels(
-        io.BytesIO(files["lod-meta.json"]), threads=threads, open_companion=open_companion(files)
-    )
+    return codec.decode_parts(io.BytesIO(files["lod-meta.json"]), threads=threads, open_companion=open_companion(files))

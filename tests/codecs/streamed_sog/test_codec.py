@@ -13,13 +13,14 @@ import numpy as np
 import pytest
 
 from fixtures import by_hand_sog, by_hand_streamed_sog
+from sparklod_cli.codecs.content import decode_file
 from sparklod_cli.codecs.scene_files import SceneFiles
 from sparklod_cli.codecs.streamed_sog import codec
-from sparklod_cli.io import open_stream, read_levels, read_scene
+from sparklod_cli.io import open_stream, read_parts, read_scene
 from sparklod_cli.model import streams
 from sparklod_cli.model.scene import DetailScene, Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
-from sparklod_cli.support.errors import FormatError, UnknownFormatError
+from sparklod_cli.support.errors import FormatError
 from tests.codecs.cases import linear
 from tests.codecs.test_round_trip import assert_close
 from tests.codecs.writers import sog_precision
@@ -45,7 +46,7 @@ def with_meta(change: Callable[[Any], object], files: dict[str, bytes] | None = 
 
 
 def scene_of(files: dict[str, bytes]) -> Scene:
-    return codec.decode(io.BytesIO(files["lod-meta.json"]), open_companion=open_companion(files))
+    return decode_file(codec, io.BytesIO(files["lod-meta.json"]), open_companion=open_companion(files))
 
 
 def assert_same(one: Splats, other: Splats) -> None:
@@ -64,7 +65,7 @@ def first_leaf(meta: Any) -> Any:
 
 
 def test_the_golden_folder() -> None:
-    scene = read_levels(GOLDEN)
+    scene = read_parts(GOLDEN)
     assert scene.counts.tolist() == [[25, 9], [20, 7], [15, 0]]
     assert scene.children.tolist() == [[-1, 1], [-2, -3]]
     assert scene.errors is not None
@@ -91,7 +92,7 @@ def test_the_golden_folder() -> None:
 
 def test_full_detail_is_level_0_and_the_environment() -> None:
     whole = read_scene(GOLDEN)
-    assert_same(whole.splats, read_levels(GOLDEN / "lod-meta.json").scene().splats)
+    assert_same(whole.splats, read_parts(GOLDEN / "lod-meta.json").scene().splats)
     assert len(whole) == 60 + 6
     assert whole.format == "Streamed SOG 1"
     assert (whole.tree, whole.antialiased, whole.notes) == (None, False, ())
@@ -262,13 +263,12 @@ def test_a_broken_image_is_named_with_its_chunk() -> None:
 
 
 def test_other_files_have_no_detail_levels() -> None:
-    with pytest.raises(UnknownFormatError, match="SOG has no detail levels; Streamed SOG has"):
-        read_levels(FIXTURES / "golden" / "sh1-sog")
+    assert read_parts(FIXTURES / "golden" / "sh1-sog") is None
 
 
 def test_without_other_files_the_first_one_is_named() -> None:
     with pytest.raises(FormatError, match=r"names '0_0/meta.json', but other files cannot be opened here"):
-        codec.decode(io.BytesIO(golden()["lod-meta.json"]))
+        decode_file(codec, io.BytesIO(golden()["lod-meta.json"]))
 
 
 def test_a_chunk_that_changes_meanwhile_is_refused() -> None:
@@ -282,12 +282,13 @@ def test_a_chunk_that_changes_meanwhile_is_refused() -> None:
         return open_companion(files)(name)
 
     with pytest.raises(FormatError, match=r"'0_0/meta.json' was changed while it was read; start again"):
-        codec.decode(io.BytesIO(golden()["lod-meta.json"]), open_companion=changing)
+        decode_file(codec, io.BytesIO(golden()["lod-meta.json"]), open_companion=changing)
 
 
 def test_progress_ends_with_all_splats() -> None:
     told = list[tuple[int, int]]()
-    codec.decode(
+    decode_file(
+        codec,
         io.BytesIO(golden()["lod-meta.json"]),
         threads=2,
         open_companion=open_companion(golden()),

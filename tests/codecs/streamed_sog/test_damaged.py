@@ -29,7 +29,7 @@ pytestmark = pytest.mark.filterwarnings("error")  # they would go to standard er
 def levels(data: bytes, files: dict[str, bytes]) -> bool:
     """Whether all levels can be read."""
     try:
-        scene = codec.decode_levels(io.BytesIO(data), open_companion=open_companion(files))
+        scene = codec.decode_parts(io.BytesIO(data), open_companion=open_companion(files))
     except FormatError as error:
         assert "\n" not in str(error)
         return False

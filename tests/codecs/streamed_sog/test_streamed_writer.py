@@ -14,7 +14,7 @@ from sparklod_cli.codecs.options import DEFAULTS
 from sparklod_cli.codecs.sog import codec as sog
 from sparklod_cli.codecs.streamed_sog import codec
 from sparklod_cli.codecs.streamed_sog.manifest import parse
-from sparklod_cli.io import read_levels, read_scene
+from sparklod_cli.io import read_parts, read_scene
 from sparklod_cli.io.details import detail_sink
 from sparklod_cli.model import morton
 from sparklod_cli.model.scene import DetailScene, Scene
@@ -157,7 +157,7 @@ def test_an_output_is_read_by_its_folder_and_by_its_manifest(tmp_path: Path) -> 
     assert detail_sink(tmp_path / "lod-meta.json", overwrite=False)(files) == sum(
         path.stat().st_size for path in tmp_path.rglob("*") if path.is_file()
     )
-    whole, levels = read_scene(tmp_path), read_levels(tmp_path / "lod-meta.json", threads=2)
+    whole, levels = read_scene(tmp_path), read_parts(tmp_path / "lod-meta.json", threads=2)
     for column in COLUMNS:
         np.testing.assert_array_equal(getattr(levels.scene().splats, column), getattr(whole.splats, column), column)
     assert len(whole) == 96 + 6

@@ -14,10 +14,11 @@ import numpy as np
 import pytest
 
 from fixtures import by_hand_glb, by_hand_tiles
+from sparklod_cli.codecs.content import decode_file
 from sparklod_cli.codecs.options import PROFILES, WriteOptions
 from sparklod_cli.codecs.tiles_3d import codec, tile_writer
 from sparklod_cli.codecs.tiles_3d.volumes import LARGEST
-from sparklod_cli.io import open_stream, read_scene, read_tiles
+from sparklod_cli.io import open_stream, read_parts, read_scene
 from sparklod_cli.lod import quality
 from sparklod_cli.lod.tile_settings import TileSettings
 from sparklod_cli.lod.tiles import make
@@ -25,7 +26,7 @@ from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.model.tile_scene import TileScene
 from sparklod_cli.model.transforms import AXES, Transform
-from sparklod_cli.support.errors import FormatError, UnknownFormatError, VersionError
+from sparklod_cli.support.errors import FormatError, VersionError
 from tests.codecs.cases import linear
 from tests.codecs.streamed_sog.scenes import open_companion
 from tests.conftest import FIXTURES
@@ -48,13 +49,13 @@ def files_of(scene: TileScene, profile: str | None = None, **more: Any) -> Files
 
 
 def scene_of(files: Files) -> Scene:
-    scene = codec.decode(io.BytesIO(files["tileset.json"]), open_companion=open_companion(files))
+    scene = decode_file(codec, io.BytesIO(files["tileset.json"]), open_companion=open_companion(files))
     assert isinstance(scene, Scene)
     return scene
 
 
 def tiles_of(files: Files) -> TileScene:
-    return codec.decode_tiles(io.BytesIO(files["tileset.json"]), open_companion=open_companion(files))
+    return codec.decode_parts(io.BytesIO(files["tileset.json"]), open_companion=open_companion(files))
 
 
 def two_tiles(**more: Any) -> Files:
@@ -181,14 +182,13 @@ def test_the_golden_file_is_read() -> None:
     order = np.argsort(expected.center[:, 0], kind="stable")
     for path in (GOLDEN, GOLDEN / "tileset.json"):
         assert_close(read_scene(path).splats, expected.take(order), 2e-6, 1e-6)
-    made = read_tiles(GOLDEN)
+    made = read_parts(GOLDEN)
     assert made.parent.tolist() == [-1, 0, 0, 2] and made.counts.tolist() == [10, 25, 12, 35]
     assert made.errors.tolist() == [1, 0, 0.5, 0]
     with open_stream(GOLDEN / "tileset.json", threads=2) as stream:
         blocks = [block for start in range(0, 60, 7) for block in stream.read(start, min(start + 7, 60))]
     assert_close(Splats.concat(blocks), expected.take(order), 2e-6, 1e-6)
-    with pytest.raises(UnknownFormatError, match="PLY has no tiles; 3D Tiles has"):
-        read_tiles(FIXTURES / "sh1.ply")
+    assert read_parts(FIXTURES / "sh1.ply") is None
 
 
 def test_transforms_of_tiles_are_applied_but_for_that_of_the_root() -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sparklod_cli.io import read_scene, read_tiles
+from sparklod_cli.io import read_parts, read_scene
 from tests.commands.build_lod.runs import SMALL, build
 from tests.commands.build_lod.test_streamed_sog import TREE, files, written
 from tests.conftest import Capture
@@ -29,7 +29,7 @@ def test_what_is_reported_is_what_the_files_hold(town: Path, tmp_path: Path, cap
     city = tmp_path / "new" / "city"
     assert build(town, "-o", city / "tileset.json", "--tile-splats", 100, "--json") == 0
     record = json.loads(capsys.readouterr().out)
-    made = read_tiles(city)
+    made = read_parts(city)
     tiles = record["tiles"]
     assert (record["output_format"], record["method"], record["splats"]) == ("3d-tiles", "quality", 2_000)
     assert record["bytes"] == sum(map(len, files(city).values()))
@@ -58,7 +58,7 @@ def test_the_format_names_the_folder(tmp_path: Path, capsys: Capture) -> None:
 )
 def test_a_tileset_stands_where_it_is_put(options: list[Any], origin: list[float], tmp_path: Path) -> None:
     assert build(SMALL, "-o", tmp_path / "tileset.json", *options) == 0
-    np.testing.assert_allclose(read_tiles(tmp_path).transform[:3, 3], origin, atol=1e-6)
+    np.testing.assert_allclose(read_parts(tmp_path).transform[:3, 3], origin, atol=1e-6)
 
 
 def test_up_is_turned_once(tmp_path: Path) -> None:
@@ -66,7 +66,7 @@ def test_up_is_turned_once(tmp_path: Path) -> None:
     assert build(SMALL, "--up", "z", "-o", tmp_path / "turned" / "tileset.json", "--method", "quick") == 0
     assert build(SMALL, "--up", "z", "-o", tmp_path / "tree.rad", "--rad-center", "f32") == 0
     assert build(tmp_path / "tree.rad", "-o", tmp_path / "kept" / "tileset.json") == 0
-    turned, kept = (read_tiles(tmp_path / name) for name in ("turned", "kept"))
+    turned, kept = (read_parts(tmp_path / name) for name in ("turned", "kept"))
     assert turned.up == kept.up == "y"
     low, high = (read_scene(SMALL).splats.center[:, 2].min(), read_scene(SMALL).splats.center[:, 2].max())
     for name in ("turned", "kept"):

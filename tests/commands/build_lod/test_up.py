@@ -14,7 +14,7 @@ import sparklod_cli as api
 from sparklod_cli.api.viewing import prepare
 from sparklod_cli.cli import run
 from sparklod_cli.images.metrics import psnr
-from sparklod_cli.io import read_levels, read_scene
+from sparklod_cli.io import read_parts, read_scene
 from sparklod_cli.model.transforms import AXES
 from tests.commands.build_lod.runs import SMALL, build
 from tests.conftest import Capture
@@ -72,7 +72,7 @@ def test_inspect_and_view_say_which_axis_is_up(name: str, turned: Path, tmp_path
     assert run(["inspect", str(turned / name)]) == 0
     assert "y is up" in capsys.readouterr().out
     if name.endswith(".json"):
-        assert read_levels(turned / name).up == "y"
+        assert read_parts(turned / name).up == "y"
         return
     assert shown_up(turned / name) == [0, 1, 0]
     assert shown_up(turned / name, up=(0.0, -1.0, 0.0)) == [0, -1, 0]

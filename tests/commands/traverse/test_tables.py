@@ -207,8 +207,6 @@ def test_notes_on_a_camera_file_are_printed(tmp_path: Path, capsys: Capture) -> 
 
 @pytest.mark.parametrize("path", sorted(CAMERAS.iterdir()), ids=lambda path: path.name)
 def test_every_camera_format_can_be_traversed(path: Path, capsys: Capture) -> None:
-    if path.name.startswith("open3d"):
-        pytest.importorskip("open3d")
     assert traverse(TREE, "--camera-path", path, "-q") == 0
     out, err = capsys.readouterr()
     assert len(table(out)) >= 3

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.codecs.file_names import TILESET
-from sparklod_cli.io import read_scene, read_tiles
+from sparklod_cli.io import read_parts, read_scene
 from sparklod_cli.lod.settings import pixel_limit
 from sparklod_cli.lod.tile_settings import TileSettings
 from sparklod_cli.lod.tile_traversal import choose
@@ -94,10 +94,10 @@ def check(shown: Shown, ours: NDArray[np.float32]) -> None:
 def chosen(file: Path, camera: Camera) -> list[str]:
     """The names of the tiles that our traversal draws, in order."""
     names, frontier = list[str](), [json.loads(file.read_text(encoding="utf-8"))["root"]]
-    while frontier:  # in the order of `read_tiles`
+    while frontier:  # in the order of `read_parts`
         names += (tile["content"]["uri"] for tile in frontier)
         frontier = [child for tile in frontier for child in tile.get("children", ())]
-    scene, limit = read_tiles(file), PIXEL_ERROR * pixel_limit(camera.fov_y, camera.height)
+    scene, limit = read_parts(file), PIXEL_ERROR * pixel_limit(camera.fov_y, camera.height)
     found = choose(scene, view_of(camera), np.eye(4), limit, np.ones(scene.tiles, np.bool_))
     return sorted(names[tile] for tile in np.flatnonzero(found.drawn))
 

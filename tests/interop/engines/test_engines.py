@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 import sparklod_cli
-from sparklod_cli.io import read_levels
+from sparklod_cli.io import read_parts
 from sparklod_cli.model.scene import Scene
 from tests.conftest import ROOT
 from tests.interop.engines import PACKAGES, recipes
@@ -121,7 +121,7 @@ def test_the_page_of_playcanvas_draws_far_levels_brighter_than_the_engine_by_its
     browser: Browser, shot: Shot, tmp_path: Path
 ) -> None:
     """Beside full detail, from three times as far: the page has a line about `antiAlias`."""
-    levels = read_levels(shot.file)
+    levels = read_parts(shot.file)
     pose = shot.camera.camera_to_world.copy()
     middle = np.median(shot.splats.center, axis=0)
     pose[:3, 3] = middle + 3 * (pose[:3, 3] - middle)

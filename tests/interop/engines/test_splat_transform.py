@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sparklod_cli.io import read_levels, read_scene
+from sparklod_cli.io import read_parts, read_scene
 from sparklod_cli.model.splats import Splats
 from tests.conftest import FIXTURES
 from tests.interop.engines.conftest import Shot, counts_of
@@ -40,7 +40,7 @@ def in_order(splats: Splats) -> Splats:
 
 
 def test_it_reads_every_level(splat_transform: SplatTransform, shot: Shot) -> None:
-    theirs, scene = splat_transform.levels(shot.file), read_levels(shot.file)
+    theirs, scene = splat_transform.levels(shot.file), read_parts(shot.file)
     assert [len(level) for level in theirs] == counts_of(shot.file)
     for level, splats in enumerate(theirs):
         check_same(scene.splats.take(scene.level(level)), splats)
@@ -49,7 +49,7 @@ def test_it_reads_every_level(splat_transform: SplatTransform, shot: Shot) -> No
 def test_it_reads_the_levels_of_the_file_written_by_hand(splat_transform: SplatTransform) -> None:
     """Which has spherical harmonics."""
     file = FIXTURES / "golden" / "sh1-streamed-sog" / "lod-meta.json"
-    scene = read_levels(file)
+    scene = read_parts(file)
     for level, splats in enumerate(splat_transform.levels(file)):
         check_same(scene.splats.take(scene.level(level)), splats)
 

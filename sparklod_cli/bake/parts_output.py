@@ -1,21 +1,24 @@
-"""Writing a tree as a Streamed SOG: its regions at several detail levels, their errors, and chunk files."""
+"""Writing a tree as parts that viewers choose: a Streamed SOG of regions at several levels, and 3D Tiles."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+
+import numpy as np
 
 from ..codecs.file_names import ENVIRONMENT, folders_of
 from ..codecs.options import WriteOptions
 from ..io.writing import Files, SinkTogether
 from ..lod.detail_rule import DetailSettings
+from ..lod.tile_settings import TileSettings
 from ..model.scene import DetailScene, Scene
 from ..model.splats import Splats
+from ..model.tile_scene import TileScene
 from ..support.progress import Progress
 from ..support.threads import on_threads
 from .output import BakeOutput, Encode
-from .records import BuiltTree, Clock, WrittenDetail, WrittenLevel, WrittenTree
+from .records import BuiltTree, Clock, WrittenDetail, WrittenLevel, WrittenTiles, WrittenTree
 
 
 def detail_levels(
@@ -61,17 +64,15 @@ class DetailOutput(BakeOutput):
 
         made = detail_levels(scene, environment, self.settings, clock, threads=threads, progress=progress)
         names: list[str] = []
-        files = encode_files(made, self.options, self.settings, threads=threads, progress=progress)
-        size = self.sink(_noted(files, names))
+
+        def noted(files: Files) -> Files:
+            for name, pieces in files:
+                names.append(name)
+                yield name, pieces
+
+        size = self.sink(noted(encode_files(made, self.options, self.settings, threads=threads, progress=progress)))
         clock.end("write")
         return WrittenTree(output_format="streamed-sog", bytes=size, detail=_written_detail(made, names))
-
-
-def _noted(files: Files, names: list[str]) -> Iterator[tuple[str, Iterable[bytes]]]:
-    """Yield the same files; their names are added to a list."""
-    for name, pieces in files:
-        names.append(name)
-        yield name, pieces
 
 
 def _written_detail(made: DetailScene, names: list[str]) -> WrittenDetail:
@@ -86,3 +87,35 @@ def _written_detail(made: DetailScene, names: list[str]) -> WrittenDetail:
         chunks=len({*folders_of(names)} - {ENVIRONMENT}),
         environment=0 if made.environment is None else len(made.environment),
     )
+
+
+@dataclass(frozen=True)
+class TileOutput(BakeOutput):
+    """3D Tiles."""
+
+    settings: TileSettings
+    options: WriteOptions
+    sink: SinkTogether
+
+    def write(self, tree: BuiltTree, encode: Encode, clock: Clock, threads: int, progress: Progress) -> WrittenTree:
+        """Make the tiles of a tree and write them."""
+        from ..codecs.tiles_3d.codec import encode_files
+        from ..lod.tiles import make
+
+        scene = tree.scene
+        assert scene.tree is not None
+        with on_threads(threads):
+            made = make(scene.splats, scene.tree, self.settings, progress=progress)
+        made = dataclasses.replace(made, antialiased=scene.antialiased, up=scene.up)
+        clock.end("tiles")
+        size = self.sink(encode_files(made, self.options, threads=threads, progress=progress))
+        clock.end("write")
+        return WrittenTree(output_format="3d-tiles", bytes=size, tiles=_written(made))
+
+
+def _written(made: TileScene) -> WrittenTiles:
+    """Return the statistics of tiles that were written."""
+    levels = int(made.level.max()) + 1
+    splats = tuple(int(made.counts[made.at_level(level)].sum()) for level in range(levels))
+    placed = not np.array_equal(made.transform, np.eye(4))
+    return WrittenTiles(made.tiles, levels, splats, float(made.errors[0]), placed)
