@@ -8,7 +8,6 @@ import tempfile
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from ...support import machine
@@ -80,7 +79,6 @@ def cluster(
     settings: ClusterSettings,
     *,
     memory: int | None = None,
-    scratch: Path | None = None,
     say: Callable[[str], None] = lambda text: None,
 ) -> Iterator[ClusterEngine]:
     """Yield an engine on a cluster, which is left alone at the end, or ended if it was started here.
@@ -88,7 +86,6 @@ def cluster(
     Args:
         memory: bytes that workers of our own share, or that a task of a cluster that runs may take; None for the part
             of what is available, or of the memory of a worker, that is usual.
-        scratch: folder for files of workers of our own; one for temporary files unless given.
         say: is told the address of the dashboard of a cluster that runs, whether anybody can give it tasks, and of
             workers that are lost.
 
@@ -101,7 +98,7 @@ def cluster(
         stack.enter_context(_quiet())
         if settings.scheduler is None:
             threads = max(1, thread_count(settings.threads) // settings.workers)
-            client = stack.enter_context(_started(settings.workers, threads, memory, scratch))
+            client = stack.enter_context(_started(settings.workers, threads, memory))
             shared = default_memory() if memory is None else memory
             limit = None if shared is None else shared // settings.workers
         else:
@@ -161,7 +158,7 @@ def _credentials(address: str) -> Any:
 
 
 @contextlib.contextmanager
-def _started(workers: int, threads: int, memory: int | None, scratch: Path | None) -> Iterator[Any]:
+def _started(workers: int, threads: int, memory: int | None) -> Iterator[Any]:
     """Yield a client of processes on this machine, which answer nobody else: other users reach their ports."""
     import dask
     from distributed import Client, LocalCluster, Security
@@ -169,7 +166,7 @@ def _started(workers: int, threads: int, memory: int | None, scratch: Path | Non
     with optional_import("processes know each other by certificates of cryptography", "sparklod[cluster]"):
         security = Security.temporary()  # for this cluster alone; workers get the key through pipes
     with contextlib.ExitStack() as stack:
-        folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="sparklod-", dir=scratch))
+        folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="sparklod-"))
         # An argument of LocalCluster reaches its workers only, and the scheduler has a folder, too.
         stack.enter_context(dask.config.set(OWN_CONFIG | {"temporary-directory": folder}))
         try:

@@ -34,13 +34,13 @@ SAID: list[str] = []
 
 @pytest.fixture(scope="module")
 def engine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ClusterEngine]:
-    scratch, temporary = tmp_path_factory.mktemp("workers"), tmp_path_factory.mktemp("temporary")
+    temporary = tmp_path_factory.mktemp("temporary")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tempfile, "tempdir", str(temporary))
-        with cluster(ClusterSettings(workers=2, threads=2), scratch=scratch, say=SAID.append) as started:
-            assert list(scratch.iterdir())
+        with cluster(ClusterSettings(workers=2, threads=2), say=SAID.append) as started:
+            assert list(temporary.iterdir())
             yield started
-    assert not list(scratch.iterdir()) and not list(temporary.iterdir())
+    assert not list(temporary.iterdir())
 
 
 @pytest.fixture
