@@ -142,7 +142,7 @@ def refused(error: SparklodError) -> bool:
 
 
 @given(scenes(), st.sampled_from(METHODS), st.sampled_from(TREE_SPZ_VERSIONS), BITS)
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100)
 def test_baked_files_pass_inspect_check(splats: Splats, method: str, version: int, bits: int | None) -> None:
     with tempfile.TemporaryDirectory() as folder:
         how = BakeSettings(method=method, options=WriteOptions(spz_version=version, fractional_bits=bits))
@@ -155,7 +155,6 @@ def test_baked_files_pass_inspect_check(splats: Splats, method: str, version: in
 
 
 @given(scenes(), st.sampled_from(METHODS), st.booleans(), st.sampled_from([None, None, 2, 65_536]))
-@settings(max_examples=80, deadline=None)
 def test_baked_rad_passes_inspect_check(splats: Splats, method: str, chunked: bool, codes: int | None) -> None:
     assume(np.abs(splats.center).max() < 1e38)  # beyond, what is merged of two splats may be infinitely large
     with tempfile.TemporaryDirectory() as folder:
@@ -202,7 +201,6 @@ def test_a_coordinate_is_written_up_to_the_last_but_one_code(bits: int | None, m
 
 
 @given(scenes(), st.sampled_from(METHODS), st.sampled_from(list(ENCODINGS)))
-@settings(max_examples=100, deadline=None)
 def test_every_encoding_and_every_report_of_an_extreme_scene_is_made_without_a_warning(
     splats: Splats, method: str, encoding: str
 ) -> None:
@@ -248,7 +246,7 @@ def raw_file(rng: np.random.Generator, kind: str) -> bytes:
     st.sampled_from([None, *ENCODINGS]),
     st.booleans(),
 )
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60)
 def test_any_numbers_are_baked_refused_and_reported_without_a_warning(
     seed: int, kind: str, method: str, encoding: str | None, drop: bool
 ) -> None:
@@ -294,7 +292,6 @@ def test_a_bake_of_the_town_passes_the_recipe_for_ci(method: str, tmp_path: Path
 
 
 @given(st.integers(2, 300), st.integers(0, 2**32 - 1), st.sampled_from([0.01, 1.0, 30.0]), st.sampled_from(METHODS))
-@settings(max_examples=100, deadline=None)
 def test_bakes_of_random_scenes_pass_the_recipe_for_ci(count: int, seed: int, extent: float, method: str) -> None:
     with tempfile.TemporaryDirectory() as folder:
         passes(file_of(folder, random_splats(count, seed=seed, extent=extent)), method)

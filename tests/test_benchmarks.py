@@ -5,8 +5,8 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import json
+import runpy
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -23,12 +23,19 @@ BENCHMARKS = [*sorted(path.stem for path in (ROOT / "benchmarks").glob("bench_*.
 
 
 @pytest.mark.parametrize("name", BENCHMARKS)
-def test_a_benchmark_prints_its_help(name: str) -> None:
+def test_a_benchmark_prints_its_help(
+    name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", [name, "--help"])
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
     of_tests = name in ("bench_engines", "bench_spark_pictures")  # which import the tests' programs
-    place = ["-m", f"benchmarks.{name}"] if of_tests else [f"benchmarks/{name}.py"]
-    done = subprocess.run([sys.executable, *place, "--help"], cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.startswith("usage: ")
+    with pytest.raises(SystemExit) as ended:
+        if of_tests:
+            runpy.run_module(f"benchmarks.{name}", run_name="__main__")
+        else:
+            runpy.run_path(str(ROOT / "benchmarks" / f"{name}.py"), run_name="__main__")
+    assert not ended.value.code
+    assert capsys.readouterr().out.startswith("usage: ")
 
 
 @pytest.mark.parametrize(("workers", "seconds"), [(1, 16), (2, 10), (3, 8), (64, 8)])

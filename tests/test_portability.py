@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import ctypes
+import json
 import os
 import subprocess
 import sys
@@ -18,9 +19,10 @@ from tests.conftest import FIXTURES, ROOT
 
 PACKAGE = Path(sparklod_cli.__file__).parent
 
-#: Runs the command line without what Windows lacks. The standard library needs the name of the system and O_NONBLOCK.
+#: Runs command lines without what Windows lacks, and says at last on standard error how each ended. The standard
+#: library needs the name of the system and O_NONBLOCK.
 PROGRAM = """
-import ctypes, os, signal, sys
+import ctypes, json, os, signal, sys
 for name in ("O_TMPFILE", "O_CLOEXEC", "O_NOFOLLOW", "O_DIRECTORY", "fchmod", "fork", "geteuid", "getuid", "killpg",
              "pread", "pwrite", "posix_fadvise", "register_at_fork", "sched_getaffinity", "sysconf"):
     if hasattr(os, name):
@@ -31,7 +33,7 @@ for name in ("fcntl", "grp", "pwd", "resource", "termios"):
     sys.modules[name] = None
 from sparklod_cli.cli import run
 {more}
-sys.exit(run(sys.argv[1:]))
+print([run(command) for command in json.loads(sys.argv[1])], file=sys.stderr)
 """
 
 #: Lets a scene of 27,800 splats be too large for 3.2 MB of memory.
@@ -52,28 +54,30 @@ NEWER = {
 }
 
 
-def elsewhere(*arguments: object, more: str = "") -> subprocess.CompletedProcess[bytes]:
+def elsewhere(*commands: tuple[object, ...], more: str = "") -> tuple[list[int], subprocess.CompletedProcess[bytes]]:
+    """Return how commands ended, and the process that ran them."""
     environment = os.environ | {"PYTHONIOENCODING": "cp1252", "PYTHONPATH": str(ROOT), "PYTHONUTF8": "0"}
-    command = [sys.executable, "-c", PROGRAM.replace("{more}", more), *map(str, arguments)]
-    return subprocess.run(command, env=environment, capture_output=True, timeout=300, check=False)
+    words = json.dumps([[*map(str, command)] for command in commands])
+    line = [sys.executable, "-c", PROGRAM.replace("{more}", more), words]
+    done = subprocess.run(line, env=environment, capture_output=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr.decode()
+    return json.loads(done.stderr.splitlines()[-1]), done
 
 
 @pytest.mark.parametrize("output", ["out.spz", "out.rad", "set/lod-meta.json"])
 def test_bakes_do_without_what_windows_lacks(output: str, tmp_path: Path) -> None:
     target = tmp_path / output
-    for more in ((), ("--overwrite",)):
-        done = elsewhere("build-lod", FIXTURES / "sh1.ply", "-o", target, *more)
-        assert done.returncode == 0, done.stderr.decode()
-    assert elsewhere("inspect", target, "--check").returncode == 0
-    assert elsewhere("build-lod", FIXTURES / "sh1.ply", "-o", target).returncode == 1  # it exists
+    bake = "build-lod", FIXTURES / "sh1.ply", "-o", target
+    codes, done = elsewhere(bake, (*bake, "--overwrite"), ("inspect", target, "--check"), bake)
+    assert codes == [0, 0, 0, 1], done.stderr.decode()  # at last, it exists
     assert not list(tmp_path.rglob(".*"))
 
 
 def test_bakes_out_of_core_do_without_it_too(tmp_path: Path) -> None:
     target = tmp_path / "out.rad"
     arguments = ("build-lod", FIXTURES / "demo.ply", "-o", target, "--memory", "3.2M", "-v")
-    done = elsewhere(*arguments, more=SMALL_BLOCKS)
-    assert done.returncode == 0, done.stderr.decode()
+    codes, done = elsewhere(arguments, more=SMALL_BLOCKS)
+    assert codes == [0], done.stderr.decode()
     assert b"out of core" in done.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["out.rad"]
 
@@ -81,11 +85,9 @@ def test_bakes_out_of_core_do_without_it_too(tmp_path: Path) -> None:
 def test_consoles_without_utf8_show_escapes(tmp_path: Path) -> None:
     scene = tmp_path / "caf\u00e9 \u96ea.ply"
     scene.write_bytes((FIXTURES / "sh1.ply").read_bytes())
-    done = elsewhere("inspect", scene)
-    assert done.returncode == 0, done.stderr
+    codes, done = elsewhere(("inspect", scene), ("build-lod", scene, "-o", tmp_path / "\u96ea" / "out.txt"))
+    assert codes == [0, 2], done.stderr
     assert "caf\u00e9 \\u96ea.ply" in done.stdout.decode("cp1252")
-    done = elsewhere("build-lod", scene, "-o", tmp_path / "\u96ea" / "out.txt")
-    assert done.returncode == 2
     assert "Traceback" not in done.stderr.decode("cp1252")
 
 

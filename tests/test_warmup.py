@@ -179,6 +179,7 @@ def test_the_children_import_nothing_from_the_working_directory(
     assert warmup.warm_up(processes=1) == len(few)
 
 
+@pytest.mark.slow
 def test_the_tests_say_that_they_compile(tmp_path: Path) -> None:
     assert jit.CACHE_FOLDER is not None
     ignore = shutil.ignore_patterns(f"{start_of(texels.look_up_words.py_func)}*")

@@ -36,7 +36,7 @@ def test_stages_come_in_the_order_of_their_shares(output: str, out_of_core: bool
     stages: dict[str, None] = {}
     resources = Resources(block_splats=1 << 16 if out_of_core else None)
     bake(
-        FIXTURES / "demo.ply",
+        FIXTURES / "sh1.ply",
         tmp_path / output,
         settings,
         resources=resources,

@@ -91,6 +91,7 @@ def limited(folder: Path, room: int, small: object, large: object, command: str)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="memory is limited and counted as Linux does")
+@pytest.mark.slow
 @pytest.mark.parametrize("name", COMMANDS)
 def test_a_file_too_large_for_memory_is_one_error_that_names_it(
     name: str, large: tuple[Path, Path], tmp_path: Path

@@ -1,4 +1,7 @@
-"""Full disks and read-only folders: each is an error of one line, and no file has the final name."""
+"""Full disks and read-only folders: each is an error of one line, and no file has the final name.
+
+Standard output that is full or closed is in tests/support/test_stdout.py.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.faults.runs import CHUNKED, DEMO, SMALL, TREE, WRITERS, mounted, said_one_error, shell, sparklod
+from tests.faults.runs import CHUNKED, DEMO, SMALL, TREE, WRITERS, mounted, said_one_error, sparklod
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(sys.platform == "win32", reason="Windows has other file systems")]
 
@@ -80,30 +83,6 @@ def test_a_full_device_is_one_error_that_names_it(name: str) -> None:
     line = said_one_error(done.stderr)
     assert "no space left" in line
     assert str(FULL) in line
-
-
-#: Commands that write to standard output.
-PRINTERS = {
-    "build-lod": ["build-lod", SMALL, "-o", "-"],
-    "build-lod --json": ["build-lod", SMALL, "-o", "/dev/null", "--overwrite", "--json"],
-    "traverse": ["traverse", TREE, "--orbit", "3"],
-    "render": ["render", TREE, "--size", "16x12", "-o", "-"],
-    "inspect": ["inspect", TREE],
-    "inspect --json": ["inspect", TREE, "--json"],
-}
-
-
-@needs_full
-@pytest.mark.parametrize("name", PRINTERS)
-def test_a_full_standard_output_is_one_error(name: str) -> None:
-    done = shell('"$@" > /dev/full', *PRINTERS[name])
-    assert done.returncode == 1
-    errors = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
-    assert len(errors) == 1
-    assert "standard output" in errors[0]
-    assert "no space left" in errors[0]
-    assert "Traceback" not in done.stderr
-    assert "Exception ignored" not in done.stderr
 
 
 @pytest.mark.parametrize("name", ["build-lod", "build-lod in chunks", "traverse"])

@@ -19,8 +19,8 @@ pytestmark = [pytest.mark.slow, pytest.mark.skipif(sys.platform == "win32", reas
 CASES = {
     "build-lod": [*WRITERS["build-lod"][0], "demo.spz"],
     "build-lod in chunks": [*CHUNKED, "demo.rad"],
-    "many cuts": ["traverse", TREE, "--orbit", "200", "--indices-out", "cuts", "-o", "table.csv"],
-    "many pictures": ["render", TREE, "--orbit", "40", "--size", "96x64", "-o", "out.%04d.png"],
+    "many cuts": ["traverse", TREE, "--orbit", "80", "--indices-out", "cuts", "-o", "table.csv"],
+    "many pictures": ["render", TREE, "--orbit", "16", "--size", "96x64", "-o", "out.%04d.png"],
 }
 
 

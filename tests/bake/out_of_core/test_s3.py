@@ -69,7 +69,7 @@ def test_the_command_bakes_from_bucket_to_bucket(bucket: str, options: list[str]
 
 def test_workers_share_a_scratch_folder_in_a_bucket(bucket: str, tmp_path: Path) -> None:
     Address(f"{bucket}/demo.ply").write([DEMO.read_bytes()])
-    resources = Resources(block_splats=6000, scratch_dir=Address(f"{bucket}/scratch"))
+    resources = Resources(block_splats=14_000, scratch_dir=Address(f"{bucket}/scratch"))
     target = Address(f"{bucket}/demo-lod.spz")
     pytest.importorskip("distributed", reason="the extra cluster is not installed")
     with cluster(ClusterSettings(workers=2, threads=2)) as engine:

@@ -84,7 +84,7 @@ def chain(nodes: int) -> bytes:
     return b"".join(spz.encode(Scene(splats, LodTree(count, start)), WriteOptions(compression_level=1)))
 
 
-@pytest.mark.parametrize("nodes", [999, 1000, 1001, 50_000])
+@pytest.mark.parametrize("nodes", [1000, 1001, 50_000])
 def test_the_report_of_a_deep_chain_is_bounded(nodes: int, tmp_path: Path, capsys: Capture) -> None:
     """Reports do not grow with the levels of a tree, and say how many they leave out."""
     path, page = tmp_path / "chain.spz", tmp_path / "page.html"

@@ -68,7 +68,6 @@ MODES: dict[str, tuple[str, ...]] = {
     "Streamed SOG": ("--keyframes", "0,0,7:0,0,20 0,0,1:0,0,20", "--every", "10", "--budget", "200"),
     "3D Tiles": ("--orbit", "3", "--distance", "9"),
     "a summary": ("--orbit", "3", "--distance", "2", "--json"),
-    "a summary and a table": ("--orbit", "3", "--distance", "2", "--json", "-o", "out.csv"),
 }
 
 #: What is looked at in place of trees.
@@ -111,7 +110,7 @@ def test_every_option_of_traverse_is_used_or_refused(
     )  # takes seconds, and has its tests
     for name, data in trees.items():
         (tmp_path / name).write_bytes(data)
-    write_streamed(tmp_path / "web", row_of_regions(8, 4), together=4)
+    write_streamed(tmp_path / "web", row_of_regions(8, 4), together=8)
     tiled(random_splats(900), tmp_path / "city", TileSettings(tile_splats=200))
     (tmp_path / "scene.json").write_text(json.dumps({"instances": [{"file": "tree.spz", "scale": 3}]}))
     inputs = {path.name for path in tmp_path.iterdir()}

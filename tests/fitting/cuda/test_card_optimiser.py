@@ -19,7 +19,7 @@ from tests.scenes import random_splats
 
 pytestmark = MARKS
 
-COUNT, SHARE, STEPS = 60, 0.3, 2
+COUNT, SHARE, STEPS = 40, 0.3, 2
 
 #: Largest difference of a column after STEPS, over its largest change. Chosen: the first steps of Adam are as long for
 #: derivatives that are next to nothing, whose sign is that of rounding.
@@ -28,7 +28,7 @@ MOST = 0.02
 
 @pytest.fixture(autouse=True)
 def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cameras, "SIZE", (32, 16))
+    monkeypatch.setattr(cameras, "SIZE", (16, 10))
 
 
 def nodes_of(kind: str) -> FittedNodes:
