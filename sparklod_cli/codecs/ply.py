@@ -44,6 +44,9 @@ COLUMNS: tuple[tuple[str, tuple[str, ...], Coding, Coding], ...] = (
 )
 REQUIRED = tuple(name for _, names, _, _ in COLUMNS for name in names)
 
+#: Missing properties that an error names.
+FEW = 4
+
 #: The scale that disks (2D Gaussian Splatting) lack or do not use, across their plane, and what they get in its place,
 #: over the smaller of their two scales: less than a pixel wherever a disk is smaller than a picture, and above 0, which
 #: formats of logarithms do not hold. Chosen.
@@ -130,7 +133,8 @@ def _checked_coefficients(header: PlyHeader) -> int:
     missing = [name for name in REQUIRED if name not in have]
     if missing and missing != [ACROSS]:
         what = "a point cloud or a mesh, not Gaussian splats" if "x" in have else "not Gaussian splats"
-        raise NotSplatsError(f"{what}: its vertices have no {', '.join(missing)}")
+        more = f" and {len(missing) - FEW} more" if len(missing) > FEW else ""
+        raise NotSplatsError(f"{what}: its vertices have no {', '.join(missing[:FEW])}{more}")
     rest = sum(1 for name in have if re.fullmatch(r"f_rest_\d+", name))
     expected = {f"f_rest_{index}" for index in range(rest)}
     if rest % 3 or not expected.issubset(have):

@@ -253,7 +253,7 @@ class Console:
             self.say(f"{stage}: {amount} ({100 * done / total:.0f} %), {now - self._start:.0f} s")
 
     def announce_compiling(self, *jobs: str) -> None:
-        """Announce the first kernel that is compiled, show a bar, and print at the end how long all of them took.
+        """Announce the first kernel that is compiled, show which one it is, and print at the end how long all took.
 
         What is wrong with the cache is wrong for every kernel, and printed once.
 
@@ -266,9 +266,6 @@ class Console:
         seconds: list[float] = []
         troubles: set[str] = set()
 
-        def show() -> None:
-            self.progress("compiling", len(seconds), 0, "kernel")  # how many a command needs is not known
-
         def begin(name: str) -> None:
             interrupts.leave_if_lost()
             if not ahead:
@@ -278,15 +275,19 @@ class Console:
                 absent = missing()
                 ahead.append(CompileAhead(absent, jobs, name))
                 self._ended.callback(ahead[0].close)
-                advance = f"once; sparklod warmup compiles all {len(absent)} in advance"
+                advance = f"kept for later runs; sparklod warmup compiles all {len(absent)} in advance"
                 often = advance if jit.CACHE_FOLDER else "in every run: no cache can be written"
-                self.say(f"Compiling kernels for this machine, half a minute or less ({often}) ...")
-            show()
+                self.say(f"Compiling kernels for this machine, up to a minute ({often}) ...")
+            if self._bars:
+                # How many a command needs is not known.
+                text = f"compiling: kernel {len(seconds) + 1}, {sum(seconds):.0f} s so far"
+                self._open_bar(desc=text, bar_format="{desc}")
 
         def end(duration: float) -> None:
             seconds.append(duration)
             self._start += duration  # which tells nothing of the time that a job takes
-            show()
+            self._logged += duration
+            self.clear()
 
         def say_once(trouble: str) -> None:
             if trouble not in troubles:

@@ -265,7 +265,7 @@ MOMENTS = {
     "churn": ("{} of the splats pop", "share"),
     "bytes": ("{} are fetched", "bytes"),
     "coarsest": ("coarsest: {} times the pixel limit", "plain"),
-    "missing": ("{} splats are drawn too coarse", "count"),
+    "missing": ("splats drawn too coarse: {}", "count"),
     "incomplete": ("{} until it is complete", "seconds"),
     "overdraw": ("{} splats cover a pixel", "fixed"),
 }

@@ -140,7 +140,7 @@ class TransformOptions:
 
     up: str = option(
         "Axis of the input that points up; the scene is turned so that it becomes +y, which the output notes for"
-        " render, traverse and view. Scenes as trained are mostly -y.",
+        " render, traverse and view. y turns nothing; scenes as trained are mostly -y.",
         defaults.UP_AXES,
         defaults.UP_AXES[0],
         heading=COMMON,
