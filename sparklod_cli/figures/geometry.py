@@ -84,7 +84,7 @@ def evenly(count: int, most: int) -> NDArray[np.int64]:
 
 
 def level_of_step(size: float) -> int:
-    """Return the voxel level of Quick-LoD for a design size, 2 * max(scale); its cells have edges of 1.5 ** level."""
+    """Return the voxel level of Quick-LoD for a design size, 2 * max(scale); cells are DEFAULT_BASE ** level wide."""
     return math.ceil(math.log(size, DEFAULT_BASE) - 1e-9)
 
 

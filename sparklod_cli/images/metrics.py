@@ -144,14 +144,14 @@ def worst_tile(a: Image, b: Image) -> Tile:
     Args:
         a, b: (H, W, C) of the same shape, 0..1.
     """
-    error, size = _squared_error(a, b).mean(axis=2), TILE
+    error = _squared_error(a, b).mean(axis=2)
     height, width = error.shape
-    down, across = np.arange(0, height, size), np.arange(0, width, size)
+    down, across = np.arange(0, height, TILE), np.arange(0, width, TILE)
     sums = np.add.reduceat(np.add.reduceat(error, down, axis=0), across, axis=1)
-    pixels = np.minimum(height - down, size)[:, None] * np.minimum(width - across, size)
+    pixels = np.minimum(height - down, TILE)[:, None] * np.minimum(width - across, TILE)
     mean = sums / pixels
     row, column = divmod(int(np.argmax(mean)), len(across))
-    return Tile(psnr_of(float(mean[row, column])), column * size, row * size)
+    return Tile(psnr_of(float(mean[row, column])), column * TILE, row * TILE)
 
 
 def ssim(a: Image, b: Image) -> float:

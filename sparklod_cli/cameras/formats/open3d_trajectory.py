@@ -49,9 +49,9 @@ def _frame(camera: Json) -> Frame:
 def _frames_of_log(lines: list[str]) -> list[Frame]:
     rows: list[list[float]] = []
     for number, line in enumerate(lines, 1):
-        words = line.split()
         if line.startswith("#"):
             continue
+        words = line.split()
         count = 4 if len(rows) % LOG_LINES else 3
         if len(words) != count:
             raise CameraPathError(f"line {number} has {len(words)} numbers, not {count}")
