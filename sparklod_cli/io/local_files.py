@@ -77,12 +77,26 @@ for _name in ("O_BINARY", "O_CLOEXEC", "O_NOFOLLOW", "O_NONBLOCK"):
 
 
 def open_plain(path: Path) -> BinaryIO:
-    """Open a file for reading; `OSError` where it is a link, a folder, a pipe or a device, or does not exist."""
-    descriptor = os.open(path, _FLAGS)
-    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-        os.close(descriptor)
-        raise OSError(f"{path} is not a plain file")
-    return os.fdopen(descriptor, "rb")
+    """Open a file for reading.
+
+    Args:
+        path: absolute, without links: as `Path.resolve` gave it.
+
+    Raises:
+        OSError: it does not exist, it is a folder, a pipe or a device, or it or a folder above it has become a link.
+    """
+    file = os.fdopen(os.open(path, _FLAGS), "rb")
+    try:
+        found = os.fstat(file.fileno())
+        if not stat.S_ISREG(found.st_mode):
+            raise OSError(f"{path} is not a plain file")
+        # Only the last part of a path is not followed by opening it. The file is compared, as a link may come and go.
+        if path.resolve() != path or not os.path.samestat(found, path.lstat()):
+            raise OSError(f"{path} has become a link")
+    except OSError:
+        file.close()
+        raise
+    return file
 
 
 #: The splat file that a folder stands for: the first of these that is there.

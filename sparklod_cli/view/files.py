@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import functools
 import os
+import posixpath
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,9 +20,11 @@ from ..codecs.formats import FORMATS, HEAD, sniff
 from ..codecs.glb.codec import open_content as open_glb
 from ..codecs.glb.glb_container import MAGIC as GLB_MAGIC
 from ..codecs.rad.rad_header import MAGIC, RadHeader, read_header
+from ..codecs.sog.sog_container import MAX_META, image_names
+from ..codecs.streamed_sog.manifest import MAX_MANIFEST, parse
 from ..codecs.tiles_3d.tileset import MAX_TILESET, read_whole
-from ..io.details import read_level_files
-from ..io.local_files import companion_path, companions, in_folder, open_named, open_plain, reason_unreadable
+from ..io.local_files import companion_path, in_folder, open_named, open_plain, reason_unreadable
+from ..io.reading import ZIP
 from ..model.lod_tree import CHUNK_NODES
 from ..support.errors import FormatError, NotSplatsError, UnknownFormatError, UnreadableError
 from ..support.printable import printable
@@ -58,6 +61,9 @@ MEDIA_TYPES = {
     ".webp": "image/webp",
 }
 BYTES = "application/octet-stream"
+
+#: Suffixes of the files that a splat file may name.
+PARTS = (".json", ".sog", ".webp", ".glb", ".radc", ".rad")
 
 #: By name, with / between folders: bytes, or the real path of a file.
 Resources = Mapping[str, bytes | Path]
@@ -194,12 +200,18 @@ def _chunk_files(path: Path, header: RadHeader) -> Iterator[tuple[str, Path]]:
 
 
 def _manifest_files(path: Path) -> list[str]:
-    """Return the names of all files that a manifest and its chunks refer to; `FormatError` where a chunk is missing."""
-    files = dict.fromkeys(companion.relative_to(path.parent).as_posix() for companion in companions(path, ()))
-    missing = next((name for name in read_level_files(path).manifest.names() if name not in files), None)
-    if missing is not None:
-        raise FormatError(f"its chunk file {quoted_value(missing)} is missing")
-    return list(files)
+    """Return the names of all files that readers of a Streamed SOG open; `FormatError` where one is missing."""
+    with open_plain(path.resolve()) as file:
+        manifest = parse(file.read(MAX_MANIFEST + 1))
+    names = dict.fromkeys(manifest.read_names())
+    for name in list(names):
+        if not (path.parent / name).is_file():
+            raise FormatError(f"its chunk file {quoted_value(name)} is missing")
+        with open_named(path, name, folders=True) as file:
+            data = file.read(MAX_META + 1)
+        if not data.startswith(ZIP):
+            names |= dict.fromkeys(posixpath.join(posixpath.dirname(name), image) for image in image_names(data))
+    return list(names)
 
 
 def _tileset_files(path: Path) -> list[str]:
@@ -212,8 +224,20 @@ def _tileset_files(path: Path) -> list[str]:
 
 
 def _inside(path: Path, companion: Path) -> Path:
-    """Return the real path of a file that another one names; `FormatError` where a link leads out of its folder."""
+    """Return the real path of a file that another one names.
+
+    The author of a manifest is a stranger, and chooses which of the files beside it are published.
+
+    Raises:
+        FormatError: it is not called like a part of a scene, is in a hidden folder, or a link leads out of its folder.
+    """
+    name = companion.relative_to(path.parent)
+    if name.suffix.lower() not in PARTS or any(part.startswith(".") for part in name.parts):
+        raise FormatError(
+            f"it names {quoted_value(name.as_posix())}, which is not called like a part of a scene"
+            f" ({', '.join(PARTS)}); nothing is published"
+        )
     real = companion.resolve()
-    if real.parent != path.parent.resolve() / companion.relative_to(path.parent).parent:
+    if real.parent != path.parent.resolve() / name.parent:
         raise FormatError(f"{quoted_value(companion.name)}, which it names, is a link to another folder; copy it there")
     return real

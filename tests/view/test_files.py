@@ -6,6 +6,7 @@ import io
 import json
 import os
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -211,6 +212,72 @@ def test_a_link_that_the_user_names_is_followed_once(tmp_path: Path) -> None:
     (tmp_path / "link.spz").symlink_to(TREE)
     (shown,) = shown_files([tmp_path / "link.spz"])
     assert list(shown.files.items()) == [("data/0/link.spz", TREE.resolve())]
+
+
+# --- what a stranger's manifest cannot have published
+
+
+@pytest.fixture
+def web(tmp_path: Path) -> Path:
+    """A Streamed SOG in a folder with a secret key and a secret file."""
+    shutil.copytree(GOLDEN / "sh1-streamed-sog", tmp_path / "web")
+    (tmp_path / "web" / ".ssh").mkdir()
+    (tmp_path / "web" / ".ssh" / "id_rsa").write_text("secret")
+    (tmp_path / "web" / "0_0" / "secret.env").write_text("secret")
+    return tmp_path / "web" / "lod-meta.json"
+
+
+def edit(path: Path, change: Callable[[dict[str, Any]], None]) -> None:
+    root = json.loads(path.read_text())
+    change(root)
+    path.write_text(json.dumps(root))
+
+
+def test_a_file_that_no_region_refers_to_is_not_published(web: Path) -> None:
+    before = set(shown_files([web])[0].files)
+    edit(web, lambda root: root["filenames"].append(".ssh/id_rsa"))
+    assert set(shown_files([web])[0].files) == before
+
+
+def test_a_file_that_is_no_image_of_the_scene_is_not_published(web: Path) -> None:
+    before = set(shown_files([web])[0].files)
+    edit(web.parent / "0_0" / "meta.json", lambda meta: meta["means"]["files"].append("secret.env"))
+    edit(web.parent / "0_0" / "meta.json", lambda meta: meta.update(other={"files": ["secret.env"]}))
+    assert set(shown_files([web])[0].files) == before
+
+
+@pytest.mark.parametrize("name", ["secret.env", ".ssh/id_rsa", ".ssh/id.json", "../web/0_0/meta.json"])
+def test_a_chunk_that_is_not_called_like_one_is_refused(web: Path, name: str) -> None:
+    shutil.copy(web.parent / "0_0" / "meta.json", web.parent / ".ssh" / "id.json")
+    shutil.copytree(web.parent / "0_0", web.parent, dirs_exist_ok=True)
+    for secret in ("secret.env", ".ssh/id_rsa"):
+        shutil.copy(web.parent / "0_0" / "meta.json", web.parent / secret)
+    for image in (web.parent / "0_0").glob("*.webp"):
+        shutil.copy(image, web.parent / ".ssh")
+    edit(web, lambda root: root["filenames"].__setitem__(0, name))
+    with pytest.raises(FormatError, match=r"not called like a part of a scene|not a file beside it"):
+        shown_files([web])
+
+
+@pytest.mark.parametrize("chunk", ["means", "sh0"])
+def test_an_image_that_is_a_text_is_refused(web: Path, chunk: str) -> None:
+    (web.parent / "0_0" / "secret.webp").write_text("secret")
+    edit(web.parent / "0_0" / "meta.json", lambda meta: meta[chunk]["files"].__setitem__(0, "secret.webp"))
+    with pytest.raises(FormatError, match=r"'secret\.webp' is not a WebP image"):
+        prepared([web])
+
+
+def test_a_tileset_that_is_not_read_is_refused(tileset: Path, tmp_path: Path, packages: Path) -> None:
+    shutil.copytree(tileset.parent, tmp_path / "web")
+    (tmp_path / "web" / "secret.json").write_text('{"secret": 1}')
+    root = tmp_path / "web" / "tileset.json"
+
+    def hide(found: dict[str, Any]) -> None:
+        found["root"] = {**found["root"], "content": {"uri": "secret.json"}, "children": [found["root"]]}
+
+    edit(root, hide)
+    with pytest.raises(FormatError, match="a nested tileset and children beside it, which is not read"):
+        prepared([root], spark_dir=packages)
 
 
 # --- the first look

@@ -197,6 +197,22 @@ def test_a_file_that_became_a_link_a_pipe_or_nothing_is_gone(tmp_path: Path) -> 
         assert ask(server, "/data/0/scene.spz").status == 404
 
 
+@pytest.mark.skipif(os.name != "posix", reason="POSIX only")
+def test_a_folder_that_became_a_link_is_not_followed(tmp_path: Path) -> None:
+    shutil.copytree(FIXTURES / "golden" / "sh1-streamed-sog", tmp_path / "web")
+    (tmp_path / "outside").mkdir()
+    (tmp_path / "outside" / "meta.json").write_text("not yours")
+    with serving(prepared([tmp_path / "web"])) as server:
+        target = "/data/0/0_0/meta.json"
+        assert ask(server, target).status == 200
+        (tmp_path / "web" / "0_0").rename(tmp_path / "web" / "before")
+        (tmp_path / "web" / "0_0").symlink_to(tmp_path / "outside")
+        assert ask(server, target).status == 404
+        (tmp_path / "web" / "0_0").unlink()
+        (tmp_path / "web" / "before").rename(tmp_path / "web" / "0_0")
+        assert ask(server, target).status == 200
+
+
 def test_a_name_with_anything_in_it_is_served(tmp_path: Path) -> None:
     path = tmp_path / os.fsdecode("50 % of ümläut?#&\\'\"<b>\xff.spz".encode("utf-8", "surrogateescape"))
     path.write_bytes(TREE.read_bytes())

@@ -22,7 +22,7 @@ from ...support.units import count_of
 from ...support.untrusted import ZIP_ERRORS, parse_json, quoted, quoted_value
 from ..compression import check_promise
 from ..content import OpenCompanion
-from ..file_names import META
+from ..file_names import META, SOG_IMAGES
 from ..stream import size_of
 
 Texels = NDArray[np.uint8]
@@ -204,8 +204,22 @@ def _finite(value: Any, way: tuple[str | int, ...]) -> float:
     return float(value)
 
 
+def image_names(data: bytes) -> list[str]:
+    """Return the images of a scene that a meta.json names, texture by texture.
+
+    Raises:
+        FormatError: it lacks one.
+    """
+    return _image_names(Meta(data))
+
+
+def _image_names(meta: Meta) -> list[str]:
+    images = {texture: len(files) for texture, files in SOG_IMAGES.items() if texture != "shN" or meta.has("shN")}
+    return [meta.name(texture, "files", index) for texture, count in images.items() for index in range(count)]
+
+
 def companion_names(data: bytes) -> list[str]:
-    """Return the files that a meta.json names, as far as it can be parsed; otherwise none."""
+    """Return all files that a meta.json names, images or not, as far as it can be parsed; otherwise none."""
     try:
         root = Meta(data).root
     except FormatError:
@@ -232,14 +246,8 @@ class SogFiles:
         if len(data) > MAX_META:
             raise FormatError(f"{META} has more than {MAX_META:,} bytes, too many for a SOG")
         self.meta = Meta(data)
-        self._sizes = {} if self._archive else {name: self._companion_size(name) for name in self._names()}
+        self._sizes = {} if self._archive else {name: self._companion_size(name) for name in _image_names(self.meta)}
         self.size += sum(self._sizes.values())
-
-    def _names(self) -> list[str]:
-        textures = {"means": 2, "scales": 1, "quats": 1, "sh0": 1} | ({"shN": 2} if self.meta.has("shN") else {})
-        return [
-            self.meta.name(texture, "files", index) for texture, count in textures.items() for index in range(count)
-        ]
 
     def _open_companion(self, name: str) -> BinaryIO:
         if self._companion is None:
