@@ -25,11 +25,13 @@ class FileNote:
     Attributes:
         antialiased, up: as in `Scene`.
         problems: what is ignored of it, as sentences for `Scene.notes`.
+        is_ours: sparklod wrote the file.
     """
 
     antialiased: bool = False
     up: str | None = None
     problems: tuple[str, ...] = ()
+    is_ours: bool = False
 
 
 def note_of(*, antialiased: bool = False, up: str | None = None) -> dict[str, Any]:
@@ -51,7 +53,7 @@ def read_note(note: Any) -> FileNote:
     if up is not None and not (isinstance(up, str) and up in AXES):
         problems = (f"its up axis {quoted_value(up)} is ignored; it is none of {', '.join(AXES)}",)
         up = None
-    return FileNote(note.get("antialiased") is True, up, problems)
+    return FileNote(note.get("antialiased") is True, up, problems, is_ours=True)
 
 
 def read_comment(comment: str | bytes | None) -> FileNote:

@@ -18,7 +18,11 @@ def test_a_note_is_json_that_names_its_writer_and_comes_back(antialiased: bool, 
     assert comment.isascii()
     assert "\n" not in comment
     assert "\0" not in comment
-    assert read_comment(comment) == read_note(note_of(antialiased=antialiased, up=up)) == FileNote(antialiased, up)
+    assert (
+        read_comment(comment)
+        == read_note(note_of(antialiased=antialiased, up=up))
+        == FileNote(antialiased, up, is_ours=True)
+    )
 
 
 def test_what_is_not_known_is_not_noted() -> None:
@@ -36,13 +40,16 @@ def test_what_is_not_known_is_not_noted() -> None:
         '{"antialiased": true, "up": "y"}',
         '{"generator": "another", "antialiased": true, "up": "y"}',
         '{"generator": ["sparklod "], "antialiased": true, "up": "y"}',
-        '{"generator": "sparklod 1", "antialiased": "yes", "up": null}',
         '["sparklod 1", "antialiased"]',
         "[" * 10_000,
     ],
 )
 def test_comments_of_others_say_nothing(comment: str | bytes | None) -> None:
     assert read_comment(comment) == FileNote()
+
+
+def test_values_of_other_kinds_say_nothing() -> None:
+    assert read_comment('{"generator": "sparklod 1", "antialiased": "yes", "up": null}') == FileNote(is_ours=True)
 
 
 @pytest.mark.parametrize("up", ["Y", "--help", "", 1, True, [], ["y"], {"y": 1}, "y" * 1000, "\x1b[31m"])

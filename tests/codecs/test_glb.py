@@ -115,6 +115,27 @@ def test_the_axis_that_points_up_is_turned_to_y_in_the_node_and_noted(up: str | 
     np.testing.assert_allclose(back.splats.center, SPLATS.center, atol=0.01)
 
 
+@pytest.mark.parametrize(
+    ("asset", "node", "up"),
+    [
+        ({}, {}, "y"),
+        ({}, {"rotation": TURNS["z"]}, "y"),
+        ({"generator": "another 1", "extras": {"up": "z"}}, {}, "y"),
+        ({"generator": "sparklod 1"}, {}, None),  # nobody knew it
+        ({"generator": "sparklod 1", "extras": {"up": "z"}}, {"rotation": TURNS["z"]}, "z"),
+        (
+            {"generator": "sparklod 1", "extras": {"up": "z"}},
+            {"rotation": TURNS["x"]},
+            "y",
+        ),  # turned by another program
+        ({"generator": "sparklod 1", "extras": {"up": "z"}}, {}, "y"),
+    ],
+)
+def test_y_is_up_unless_sparklod_wrote_the_file(asset: dict[str, Any], node: dict[str, Any], up: str | None) -> None:
+    back = read(by_hand_glb.glb(**linear(SPLATS), asset={"version": "2.0"} | asset, nodes=[{"mesh": 0} | node]))
+    assert back.up == up
+
+
 def test_nodes_place_the_splats_of_others() -> None:
     half = TURNS["-z"]
     nodes = [{"children": [1], "translation": [1, 2, 3]}, {"mesh": 0, "rotation": half, "scale": [2, 2, 2]}]

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from fixtures import by_hand_glb, by_hand_tiles
+from sparklod_cli.codecs.glb.placement import TURNS
 from sparklod_cli.codecs.options import PROFILES, WriteOptions
 from sparklod_cli.codecs.tiles_3d import tile_writer, tileset_rules
 from sparklod_cli.codecs.tiles_3d.tileset_rules import ERRORS, WARNINGS
@@ -79,7 +80,7 @@ def squeezed(tileset: Node) -> None:
 
 def up(axis: str) -> bytes:
     asset = {"version": "2.0", "generator": "sparklod 0", "extras": {"up": axis}}
-    return by_hand_glb.glb(**columns(20), asset=asset)
+    return by_hand_glb.glb(**columns(20), asset=asset, nodes=[{"mesh": 0, "rotation": TURNS[axis]}])
 
 
 NAMES = {"extensionsUsed": ["KHR_gaussian_splatting"]}

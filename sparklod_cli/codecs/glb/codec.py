@@ -97,10 +97,10 @@ def sh_attributes(degree: int) -> list[Attribute]:
 
 
 def open_content(source: Source) -> Content:
-    """Open a GLB with one primitive of splats, in one node, whose transform is applied.
+    """Open a GLB with one primitive of splats, in one node, whose transform is applied; y is up, as glTF demands.
 
     A file of sparklod that notes the axis which points up is read in the axes of its splats, without the turn of the
-    node that makes that axis y.
+    node that makes that axis y. In one without that note, the axis is unknown, as it was when the file was written.
 
     Raises:
         FormatError: the file is no GLB, has no splats or several primitives of them, or is cut short or corrupt.
@@ -112,8 +112,10 @@ def open_content(source: Source) -> Content:
     asset = asset if isinstance(asset, dict) else {}
     extras = asset.get("extras")
     noted = read_note({**(extras if isinstance(extras, dict) else {}), "generator": asset.get("generator")})
-    if noted.up is not None and is_turn_of(transform, noted.up):
-        transform = Transform()
+    up = None if noted.is_ours else "y"
+    if noted.up is not None:
+        is_turn = is_turn_of(transform, noted.up)
+        transform, up = (Transform(), noted.up) if is_turn else (transform, "y")
     inner = extension.get("extensions")
     packed = inner.get(COMPRESSION) if isinstance(inner, dict) else None
     if packed is not None:
@@ -133,7 +135,7 @@ def open_content(source: Source) -> Content:
         if extension.get(name, usual) != usual
     )
     antialiased = content.antialiased or noted.antialiased
-    content = dataclasses.replace(content, notes=notes, antialiased=antialiased, up=noted.up)
+    content = dataclasses.replace(content, notes=notes, antialiased=antialiased, up=up)
     return content if transform.is_identity else placed(content, transform)
 
 
@@ -196,7 +198,7 @@ def _plain_content(file: GlbFile, primitive: dict[str, Any], source: Source) -> 
 
 
 def placed(content: Content, transform: Transform) -> Content:
-    """Return the content with its splats transformed as they are read."""
+    """Return the content with its splats transformed as they are read; its `up` is that of the transformed ones."""
     axes = ("center", "scale", "quat_xyzw", "sh")
 
     def fill(target: Target, threads: int, progress: Progress) -> None:
@@ -207,7 +209,7 @@ def placed(content: Content, transform: Transform) -> Content:
             if getattr(turned, name) is not column:
                 column[...] = getattr(turned, name)
 
-    return dataclasses.replace(content, fill=fill, up=None)
+    return dataclasses.replace(content, fill=fill)
 
 
 def profile_of(options: WriteOptions) -> str:

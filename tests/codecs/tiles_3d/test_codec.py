@@ -196,6 +196,7 @@ def test_transforms_of_tiles_are_applied_but_for_that_of_the_root() -> None:
     matrix = [0, 2, 0, 0, -2, 0, 0, 0, 0, 0, 2, 0, 0, 0, 5, 1]
     files = child(transform=matrix)
     plain, moved = scene_of(two_tiles()).splats.center, scene_of(files).splats.center
+    assert scene_of(two_tiles()).up == scene_of(files).up == tiles_of(files).up == "y"
     x, y, z = plain.T  # of glTF: y is up, so that its z is -y of the tileset
     np.testing.assert_allclose(moved, np.stack([2 * z, 2 * y + 5, -2 * x], axis=1), atol=1e-5)
     of_root = changed(lambda tileset: tileset["root"].update(transform=matrix))
