@@ -18,7 +18,7 @@ from ..support.parallel import ordered_map
 from ..support.progress import Progress
 from .inflate import COMMENTED_HEAD, PLAIN_HEAD
 
-#: Bytes of a block that one thread deflates, or inflates, by itself, and bytes that are read at a time. That blocks of
+#: Bytes of a block that one thread deflates by itself, and bytes that are read at a time. That blocks of
 #: this size refer to none before them costs 0.05 to 0.2 % of a file (docs/decisions/05-spz.md).
 BLOCK, PIECE = 1 << 19, 1 << 17
 
@@ -68,7 +68,7 @@ def gzip_member(
     """Return one gzip member, piece by piece; the same bytes for any number of threads, and however the data are cut.
 
     Blocks are deflated separately, without a reference to one before, and end on a byte boundary with an empty stored
-    block, so that together they are one deflate stream, which `inflate.Inflate` reads on several threads.
+    block, so that together they are one deflate stream.
 
     Args:
         pieces: bytes, or contiguous arrays, asked for a few blocks ahead.

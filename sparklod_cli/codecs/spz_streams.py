@@ -181,13 +181,13 @@ def _open(source: Source) -> tuple[Content, Layout, Iterator[StreamRows]]:
     if plain:
         layout, rows, extensions = _read_v4(file, size, header)
     else:
-        inflate = Inflate(file, source.threads)
+        inflate = Inflate(file)
         layout, rows = _read_gzip(inflate, size, header)
         note = read_comment(inflate.comment)
         if layout.flags & EXTENSIONS:  # they follow the streams, which are read again
             extensions = _extensions_behind(inflate, layout)
             file.seek(0)
-            layout, rows = _read_gzip(Inflate(file, source.threads), size, header)
+            layout, rows = _read_gzip(Inflate(file), size, header)
 
     def unpacked() -> Iterator[bytes]:
         for _, _, codes in rows:
@@ -294,7 +294,6 @@ def _extensions_behind(inflate: Inflate, layout: Layout) -> Extensions:
             return Extensions()
         left -= len(piece)
     data = bytes(inflate.read(MOST_BYTES))
-    inflate.close()
     return read_extensions(data, len(data))
 
 
