@@ -9,7 +9,7 @@ from pathlib import Path
 from ..cameras.frame import Settings, direction_of
 from ..cameras.sources import read_path
 from ..model.transforms import common
-from ..support.errors import SparklodError, memory_errors_translated
+from ..support.errors import NotSplatsError, SparklodError, memory_errors_translated
 from ..support.progress import Progress, silent
 from ..view.export import check_folder as check_folder
 from ..view.export import export as export
@@ -49,9 +49,13 @@ def prepare(
             no CesiumJS.
 
     Raises:
-        SparklodError: a file or a library is missing or broken, or the camera makes no sense.
+        SparklodError: a file or a library is missing or broken, the camera makes no sense, or a site that is written
+            holds a file that Spark does not read.
     """
     shown = shown_files(paths)
+    for file in shown:
+        if file.note is not None and not served:  # a page that is served says so itself
+            raise NotSplatsError(f"{file.path.parent / file.note}")
     engine = shown[0].engine
     if budget is not None and engine == "cesium":
         raise SparklodError(f"{shown[0].path}: CesiumJS has no budget of splats; leave out --budget")

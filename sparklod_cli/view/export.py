@@ -35,6 +35,8 @@ def check_folder(folder: Path, site: Site | None = None, *, overwrite: bool) -> 
         site: that will be written; its files must lie elsewhere.
     """
     try:
+        if folder.suffix.lower() in (".html", ".htm") and not folder.is_dir():
+            raise OutputError(f"{folder} names a page, but --export writes a folder; give {folder.with_suffix('')}")
         if folder.exists() and not folder.is_dir():
             raise OutputError(f"{folder} is a file; name a folder for the site")
         if folder.is_dir() and any(folder.iterdir()):

@@ -45,7 +45,10 @@ SPARK_TYPES = {
 OTHER_ENGINES = {"Streamed SOG": "playcanvas", "GLB": "playcanvas", "3D Tiles": "cesium"}
 
 #: How files begin that sparklod reads and Spark 2.2.0 does not, and what they are.
-UNREAD = ((rb"NGSP", "SPZ version 4"), (rb"ply\s+format (?!binary_little)", "PLY that is ascii or big-endian"))
+UNREAD = (
+    (rb"NGSP", "SPZ version 4"),
+    (rb"ply\s+((comment|obj_info)\b.*\s+)*format\s+(?!binary_little)", "PLY that is ascii or big-endian"),
+)
 
 #: What can show files, and its name for display.
 ENGINES = {"spark": "Spark", "playcanvas": "PlayCanvas", "cesium": "CesiumJS"}
@@ -182,7 +185,9 @@ def _note(name: str, head: bytes, header: RadHeader | None) -> str | None:
     for beginning, what in UNREAD:
         if re.match(beginning, head):
             return f"{name}: Spark 2.2.0 does not read {what}; bake it first with sparklod build-lod"
-    if header is not None and header.chunked and header.lod_tree and header.chunk_size != CHUNK_NODES:
+    if header is not None and header.chunked and not header.lod_tree:
+        return f"{name}: Spark streams trees only; bake it first with sparklod build-lod"
+    if header is not None and header.chunked and header.chunk_size != CHUNK_NODES:
         return (
             f"{name}: Spark streams chunks of {CHUNK_NODES:,} nodes, not of {header.chunk_size:,}; write it anew with"
             " sparklod build-lod"

@@ -7,16 +7,22 @@ from pathlib import Path
 
 import pytest
 
+from sparklod_cli.cli import run
 from sparklod_cli.support.errors import OutputError
 from sparklod_cli.view import export as exporting
 from sparklod_cli.view.export import check_folder, export
 from sparklod_cli.view.site import Site
-from tests.view.conftest import CHUNKED, TREE, prepared
+from tests.conftest import FIXTURES
+from tests.view.conftest import TREE, prepared
 
 
 @pytest.fixture(scope="module")
-def static() -> Site:
-    return prepared([TREE, CHUNKED], served=False)
+def static(tmp_path_factory: pytest.TempPathFactory) -> Site:
+    """A site with a file of one part, and with one of two."""
+    chunked = tmp_path_factory.mktemp("chunked") / "chunked.rad"
+    command = ["build-lod", str(FIXTURES / "sh1.ply"), "--format", "rad-chunked", "-o", str(chunked), "-q"]
+    assert run(command) == 0
+    return prepared([TREE, chunked], served=False)
 
 
 def everything(folder: Path) -> dict[str, bytes]:
@@ -75,6 +81,29 @@ def test_what_is_no_site_is_never_replaced(static: Site, tmp_path: Path, content
     with pytest.raises(OutputError, match="holds something else than a site"):
         export(static, folder, overwrite=True)
     assert {path.name: path.read_text() for path in folder.iterdir()} == content
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        ("golden/hand-v4.spz", "Spark 2.2.0 does not read SPZ version 4; bake it first with sparklod build-lod"),
+        ("sh1-ascii.ply", "Spark 2.2.0 does not read PLY that is ascii or big-endian; bake it first"),
+        ("golden/sh3-rad/sh3.rad", "Spark streams chunks of 65,536 nodes, not of 24; write it anew"),
+    ],
+)
+def test_what_spark_does_not_read_is_not_exported(
+    name: str, reason: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["view", str(TREE), str(FIXTURES / name), "--export", str(tmp_path / "site")]) == 1
+    assert f"error: {FIXTURES / name}: {reason}" in capfd.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_page_is_no_name_of_a_folder(static: Site, tmp_path: Path) -> None:
+    with pytest.raises(
+        OutputError, match=rf"page\.html names a page, but --export writes a folder; give {tmp_path}/page$"
+    ):
+        export(static, tmp_path / "page.html", overwrite=False)
 
 
 def test_an_empty_folder_is_filled(static: Site, tmp_path: Path) -> None:
