@@ -48,8 +48,9 @@ FILES = {
     )
 }
 
-#: Packages that do not load where a page may not evaluate text: Knockout, in CesiumJS, looks for `this` so.
-EVALUATING = {CESIUM}
+#: Packages that need a page which may evaluate text and hold styles: CesiumJS, in which Knockout looks for `this` so,
+#: and which writes the styles of its credits into the page.
+LENIENT = {CESIUM}
 
 #: What the page and Spark call modules, and what those names begin or are.
 NAMES = {

@@ -27,7 +27,7 @@ from ..io.local_files import leads_away
 from ..support.errors import CameraPathError
 from ..support.untrusted import parse_json, quoted_value
 from .files import Resources, ShownFile
-from .libraries import EVALUATING, Libraries
+from .libraries import LENIENT, Libraries
 from .start import Extent, Start
 
 #: Bytes of a request with camera files, in base64: COLMAP's images.txt of a large scene has 50 MB.
@@ -100,7 +100,7 @@ def frames_of(path: CameraPath) -> dict[str, Any]:
 INDEX = "index.html"
 PAGE = (
     *("boot.js", "view.js", "spark.js", "scene.js", "sizes.js", "playcanvas.js", "cesium.js", "file_state.js"),
-    *("controls.js", "panel.js", "player.js", "paths.js", "text.js"),
+    *("faults.js", "controls.js", "panel.js", "player.js", "paths.js", "text.js"),
     "style.css",
 )
 
@@ -192,6 +192,7 @@ def _file(shown: ShownFile, extent: Extent) -> dict[str, Any]:
         "leaves": extent.leaves,
         "levels": extent.levels,
         "up": extent.up,
+        "layout": extent.layout,
         "chunks": None if shown.header is None else len(shown.header.chunks),
         "first_bytes": None if shown.header is None else sum(entry.bytes for entry in shown.header.chunks[:1]),
         "paged": shown.paged,
@@ -204,13 +205,15 @@ def _index(template: str, title: str, libraries: Libraries) -> str:
     import_map = json.dumps(libraries.import_map(), indent=1).replace("<", "\\u003c")
     digest = base64.b64encode(hashlib.sha256(import_map.encode()).digest()).decode()
     scripts = ["'self'", f"'sha256-{digest}'", "'wasm-unsafe-eval'", *libraries.integrity]
-    if EVALUATING & libraries.versions.keys():
+    styles = ["'self'"]
+    if LENIENT & libraries.versions.keys():
         scripts.append("'unsafe-eval'")
+        styles.append("'unsafe-inline'")
     policy = {
         "default-src": ["'none'"],
         "script-src": scripts,
         "worker-src": ["'self'", "blob:", "data:"],
-        "style-src": ["'self'"],
+        "style-src": styles,
         "img-src": ["'self'", "data:", "blob:"],
         "connect-src": ["'self'", "data:", "blob:"],
         "base-uri": ["'none'"],

@@ -15,11 +15,12 @@ from ..cameras import framing
 from ..cameras.camera import Camera, Matrix
 from ..cameras.frame import DEFAULT_FOV_Y, Settings
 from ..cameras.sources import SingleViews, WholeScene
+from ..codecs.gpu.layout_loss import MOST_PAGED_DEGREE, sample_loss
 from ..codecs.rad.rad_header import RadHeader
 from ..codecs.rad.rad_reader import count_leaves, file_of, read_chunk
 from ..io import read_parts, read_scene
 from ..io.local_files import open_plain, reason_of
-from ..model.balls import USED, Balls, balls_of
+from ..model.balls import Balls, balls_of
 from ..model.scene import DetailScene
 from ..model.splats import Splats
 from ..model.tile_scene import TileScene
@@ -56,6 +57,7 @@ class Extent:
         sizes: (2,) the range of the feature sizes of its splats, but for a few at either end, world units.
         up: as in `Scene`.
         levels: detail levels; None without.
+        layout: in which Spark is to hold the splats, "ext" or "packed".
     """
 
     splats: int
@@ -64,6 +66,7 @@ class Extent:
     sizes: tuple[float, float]
     up: str | None
     levels: int | None = None
+    layout: str = "ext"
 
 
 @dataclass(frozen=True)
@@ -100,7 +103,7 @@ def extent_of(shown: ShownFile, *, threads: int = 1, progress: Progress = silent
         parts = read_parts(shown.path, threads=threads, progress=progress)
         if parts is not None:
             return _parts_extent(parts)
-        scene = read_scene(shown.path, columns=USED, threads=threads, progress=progress)
+        scene = read_scene(shown.path, threads=threads, progress=progress)
     except SparklodError as error:
         raise type(error)(f"{shown.path}: {error}") from None
     except OSError as error:
@@ -108,7 +111,14 @@ def extent_of(shown: ShownFile, *, threads: int = 1, progress: Progress = silent
     leaves = None if scene.tree is None else np.flatnonzero(scene.tree.is_leaf)
     index = slice(None) if leaves is None else leaves
     balls = balls_of(scene.splats, index, np.eye(4))
-    return Extent(len(scene.splats), None if leaves is None else len(leaves), balls, _sizes(scene.splats), scene.up)
+    return Extent(
+        len(scene.splats),
+        None if leaves is None else len(leaves),
+        balls,
+        _sizes(scene.splats),
+        scene.up,
+        layout=_layout(shown, scene.splats),
+    )
 
 
 def _coarse_extent(shown: ShownFile, header: RadHeader) -> Extent:
@@ -131,7 +141,15 @@ def _coarse_extent(shown: ShownFile, header: RadHeader) -> Extent:
     cut = np.flatnonzero((count == 0) | (start + count > len(chunk.splats)))
     smallest, largest = _sizes(chunk.splats)
     balls = balls_of(chunk.splats, cut, np.eye(4))
-    return Extent(header.count, leaves, balls, (smallest / BELOW, largest), header.noted.up)
+    sizes = smallest / BELOW, largest
+    return Extent(header.count, leaves, balls, sizes, header.noted.up, layout=_layout(shown, chunk.splats))
+
+
+def _layout(shown: ShownFile, splats: Splats) -> str:
+    """Return the layout in which Spark shows these splats of a file best, or at all."""
+    if shown.paged and splats.sh_degree > MOST_PAGED_DEGREE:
+        return "packed"
+    return sample_loss(splats).better
 
 
 def _parts_extent(scene: DetailScene | TileScene) -> Extent:

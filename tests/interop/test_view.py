@@ -28,7 +28,10 @@ from sparklod_cli import read, write
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.cameras.pose import look_at
 from sparklod_cli.cli import run
+from sparklod_cli.lod import quick
 from sparklod_cli.lod.tile_settings import TileSettings
+from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.splats import Splats
 from sparklod_cli.view.libraries import CDN, CESIUM, MODULES, PACKAGES, PLAYCANVAS, THREE, VERSIONS
 from tests.conftest import FIXTURES
 from tests.interop import npm
@@ -38,6 +41,7 @@ from tests.interop.engines.conftest import engines_dir as engines_dir
 from tests.interop.engines.likeness import like_cesium
 from tests.interop.node import Node
 from tests.interop.pictures import psnr
+from tests.scenes import random_splats
 from tests.signals import heed_signals
 from tests.tiled import tiled
 
@@ -372,6 +376,32 @@ def test_a_rad_tree_is_paged(tab: Tab, packages: Path, trees: Path, tmp_path: Pa
         assert (state["paged"], state["chunks"], state["meshes"], state["faults"]) == ([True, False], "1 of 1", 2, [])
         tab.ask("fill", id="budget", value="0")  # of both together
         assert 0 < tab.settled()["drawn"] <= 1_000
+
+
+def test_a_rad_tree_with_sh_of_degree_3_is_paged_whole(tab: Tab, packages: Path, tmp_path: Path) -> None:
+    """Spark 2.2.0 has no texture for the second array of degree 3 of paged ExtSplats, and stops at the first chunk."""
+    near, far = random_splats(3_000, sh_degree=3, extent=0.02), random_splats(56_000, sh_degree=3, seed=1)
+    splats = Splats.concat([near, replace(far, center=far.center + np.float32([0, 0, -20]))])
+    splats = replace(splats, sh=splats.sh * np.float32(0.3))  # weak ones lose less as ExtSplats, if these can be had
+    write(tmp_path / "sh3.rad", Scene(*quick.build(splats)))
+    with Served(packages, tmp_path / "sh3.rad", "--look-at", "0,0,0.06:0,0,0", "--budget", 4_000) as url:
+        tab.open(url)
+        tab.until(lambda state: state["chunks"] == "2 of 2")
+        state = tab.settled()
+        assert (state["faults"], state["errors"], state["message"]) == ([], [], None)
+        theirs = tab.picture(tmp_path / "page.png")
+        ours = rendered(tmp_path / "sh3.rad", state["camera"].split(), tmp_path / "r.png", 4_000)
+        assert theirs.max(axis=2).mean() > 0.05, "the picture is empty"
+        assert psnr(theirs - ours) >= LEAST
+
+
+@pytest.mark.parametrize("how", ["rejection", "console", "event"])
+def test_errors_of_the_engine_are_listed_in_the_panel(how: str, shown: Tab) -> None:
+    shown.ask("fail", how=how, text=f"offset is out of bounds by {how}")
+    found = f"RangeError: offset is out of bounds by {how}"
+    shown.until(lambda state: found in state["errors"])
+    shown.ask("fail", how=how, text=f"offset is out of bounds by {how}")
+    shown.until(lambda state: f"{found} (2 times)" in state["errors"])
 
 
 def test_an_exported_site_works_without_sparklod_and_without_ranges(

@@ -18,6 +18,7 @@
 //   {do: 'fill', id, value}   fills a field, or moves a slider
 //   {do: 'drag', dx, dy}      drags the scene by pixels
 //   {do: 'drop', name, text}  drops a file onto the page
+//   {do: 'fail', how, text}   has a script of the page fail: 'rejection', 'console' or 'event'
 import { createRequire } from 'node:module';
 import { join, resolve } from 'node:path';
 import { createInterface } from 'node:readline';
@@ -41,7 +42,10 @@ async function open({ url, width, height, without = [], hold = false }) {
     const released = new Promise((done) => (release = async () => (done(), {})));
     await tab.route('**/data/**', (route) => released.then(() => route.continue()));
   }
-  tab.on('console', (message) => console.error(message.text()));
+  tab.on('console', (message) => {
+    console.error(message.text());
+    if (message.type() === 'error') faults.push(message.text());
+  });
   tab.on('pageerror', (error) => faults.push(String(error)));
   await tab.goto(url);
   return {};
@@ -89,6 +93,7 @@ const state = async () => {
       files: [...document.querySelectorAll('#files small')].map((each) => each.textContent),
       legend: document.getElementById('legend').hidden ? null : text('legend-marks'),
       path: document.getElementById('path').hidden ? null : text('path-name'),
+      errors: [...document.querySelectorAll('#faults li')].map((each) => each.textContent),
       message: document.getElementById('message').hidden ? null : text('message-text'),
       playing: player.playing,
       time: player.time,
@@ -161,7 +166,22 @@ async function drop({ name, text }) {
   return {};
 }
 
-const requests = { open, release: () => release(), settle, state, message, picture, screenshot, click, targets, middle, press, fill, drag, drop };
+/** Fails as engines do: in code that nobody waits for, on the console, or in a call of the browser's. */
+const fail = ({ how, text }) =>
+  tab.evaluate(
+    ([way, said]) => {
+      const ways = {
+        rejection: () => void Promise.reject(new RangeError(said)),
+        console: () => console.error('frameUpdate error', new RangeError(said)),
+        event: () => void setTimeout(() => { throw new RangeError(said); }),
+      };
+      ways[way]();
+      return {};
+    },
+    [how, text],
+  );
+
+const requests = { open, fail, release: () => release(), settle, state, message, picture, screenshot, click, targets, middle, press, fill, drag, drop };
 for await (const line of createInterface({ input: process.stdin })) {
   const { do: name, ...request } = JSON.parse(line);
   const answer = await requests[name](request).catch((error) => ({ error: String(error?.message ?? error) }));

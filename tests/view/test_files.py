@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +15,15 @@ import numpy as np
 import pytest
 
 import sparklod_cli as sparklod
+from fixtures import by_hand_rad
 from sparklod_cli.codecs.rad.rad_header import RadChunkEntry, RadHeader, pack_header, read_chunk_header
 from sparklod_cli.io import read_parts
+from sparklod_cli.lod import quick
+from sparklod_cli.model.scene import Scene
 from sparklod_cli.support.errors import CameraPathError, FormatError, SparklodError
 from sparklod_cli.view.files import shown_files
 from tests.conftest import FIXTURES
+from tests.scenes import random_splats
 from tests.view.conftest import CHUNKED, TREE, prepared
 
 GOLDEN = FIXTURES / "golden"
@@ -159,6 +164,23 @@ def test_what_spark_does_not_read_is_noted(name: str, note: str | None) -> None:
     (shown,) = shown_files([FIXTURES / name])
     assert (shown.note or "").startswith("" if note is None else f"{shown.name}: {note}")
     assert (shown.note is None) == (note is None)
+
+
+@pytest.mark.parametrize("line", ["comment made by hand", "obj_info 1", "comment format binary_little_endian 1.0"])
+def test_a_ply_is_ascii_whatever_comes_before_its_format(line: str, tmp_path: Path) -> None:
+    data = (FIXTURES / "sh1-ascii.ply").read_bytes()
+    (tmp_path / "a.ply").write_bytes(data.replace(b"ply\n", f"ply\n{line}\n".encode(), 1))
+    (shown,) = shown_files([tmp_path / "a.ply"])
+    assert shown.note is not None and "ascii" in shown.note
+
+
+def test_chunk_files_without_a_tree_are_noted(tmp_path: Path) -> None:
+    splats = random_splats(3)
+    columns = {name: getattr(splats, name) for name in ("center", "scale", "opacity", "rgb", "sh")}
+    for name, data in by_hand_rad.rad(**columns, quat_wxyz=splats.quat_xyzw[:, [3, 0, 1, 2]], stem="scene").items():
+        (tmp_path / name).write_bytes(data)
+    (shown,) = shown_files([tmp_path / "scene.rad"])
+    assert shown.note == "scene.rad: Spark streams trees only; bake it first with sparklod build-lod"
 
 
 def test_the_size_counts_chunk_files() -> None:
@@ -379,3 +401,17 @@ def test_a_glb_is_shown_by_playcanvas_unless_it_has_spz_inside() -> None:
 def test_a_format_that_no_engine_of_the_page_reads_is_refused() -> None:
     with pytest.raises(FormatError, match=r"gsplat\.pt: Spark does not read checkpoint; bake it first with sparklod"):
         shown_files([GOLDEN / "sh2-gsplat.pt"])
+
+
+@pytest.mark.parametrize(
+    ("name", "sh_degree", "strength", "layout"),
+    [("a.rad", 2, 1, "packed"), ("b.rad", 2, 0.01, "ext"), ("c.rad", 3, 0.01, "packed"), ("d.spz", 3, 0, "ext")],
+)
+def test_the_page_knows_the_layout_in_which_spark_loses_least(
+    name: str, sh_degree: int, strength: float, layout: str, tmp_path: Path
+) -> None:
+    """Pages of ExtSplats cannot have SH of degree 3; a file that is loaded whole can."""
+    splats, tree = quick.build(random_splats(200, sh_degree=sh_degree))
+    sparklod.write(tmp_path / name, Scene(replace(splats, sh=splats.sh * np.float32(strength)), tree))
+    (file,) = settings_of(tmp_path / name)["files"]
+    assert file["layout"] == layout

@@ -56,7 +56,7 @@ def test_a_folder_needs_no_other_host(packages: Path, engine: str, shown: dict[s
     site = prepared([shown[engine]], spark_dir=packages)
     mapped, policy = page_of(site)
     assert "http" not in json.dumps(mapped) + policy
-    assert ("'unsafe-eval'" in policy) == (engine == "cesium")
+    assert ("'unsafe-eval'" in policy) == ("'unsafe-inline'" in policy) == (engine == "cesium")
     for url in mapped["imports"].values():
         name = url.removeprefix("./")
         assert any(each == name or (url.endswith("/") and each.startswith(name)) for each in site.resources)

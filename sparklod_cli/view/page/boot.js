@@ -1,5 +1,8 @@
 // Starts the page, or says why it cannot start: no WebGL 2, or no libraries.
+import { watchFaults } from './faults.js';
 import { fail, starting } from './panel.js';
+
+watchFaults();
 
 const read = async (name) => {
   const response = await fetch(name);

@@ -73,6 +73,12 @@ export function listFiles(shown, onShow) {
   };
 }
 
+/** Lists errors of the engine. */
+export function listFaults(texts) {
+  element('faults').hidden = !texts.length;
+  element('faults').replaceChildren(...texts.map((text) => Object.assign(document.createElement('li'), { textContent: text })));
+}
+
 /** Fills the legend of the levels. */
 export function drawLegend({ colors, marks, text }) {
   const filled = (tag, fill) => (value) => {

@@ -38,7 +38,7 @@ export class ShownFile {
     this.say(`loading ${size(0)} of ${size(file.bytes)}`);
     const pages = file.paged && (file.chunked || (await hasRanges(url)));
     const progress = (event) => this.loading && this.say(`loading ${size(event.loaded)} of ${size(file.bytes)}`);
-    const atOnce = { fileType: file.type, extSplats: true, onProgress: progress, lod: this.builds || undefined };
+    const atOnce = { fileType: file.type, extSplats: file.layout === 'ext', onProgress: progress, lod: this.builds || undefined };
     if (pages) this.say(`loading the first chunk, ${size(file.first_bytes)} of ${size(file.bytes)}`);
     const mesh = new SplatMesh({ url, objectModifier: this.modifier, ...(pages ? { paged: true, fileType: 'rad' } : atOnce) });
     this.mesh = mesh;

@@ -5,10 +5,11 @@ import { ShownFile } from './scene.js';
 import { SizeColors } from './sizes.js';
 
 export class Stage {
-  constructor(canvas, { sizes }) {
+  constructor(canvas, { start: { sizes }, files }) {
     this.renderer = new WebGLRenderer({ canvas, antialias: false });
-    // Rounding would show in large scenes: all splats are kept in 32 bytes.
-    this.spark = new SparkRenderer({ renderer: this.renderer, accumExtSplats: true, pagedExtSplats: true });
+    // All paged files share the layout of the pages.
+    const pagedExtSplats = files.every(({ paged, layout }) => !paged || layout === 'ext');
+    this.spark = new SparkRenderer({ renderer: this.renderer, accumExtSplats: true, pagedExtSplats });
     this.group = new Group();
     this.scene = new Scene();
     this.scene.add(this.spark, this.group);

@@ -22,7 +22,7 @@ class View {
   constructor(settings, Stage) {
     this.settings = settings;
     this.canvas = element('canvas');
-    this.stage = new Stage(this.canvas, settings.start);
+    this.stage = new Stage(this.canvas, settings);
     this.camera = new PerspectiveCamera(settings.start.fov, 1, 0.01, 1000);
     this.turned = new Quaternion(); // from the splats to what is drawn
     this.radius = settings.start.radius;

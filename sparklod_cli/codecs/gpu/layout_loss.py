@@ -1,0 +1,94 @@
+"""Loss of splats in the two layouts in which Spark can hold them, and the layout that loses less.
+
+ExtSplats clip SH: a coefficient keeps between half and all of its largest channel. PackedSplats have centres of float16
+and clamp base colours to 0..1 and SH to -1..1. So strong SH look better as PackedSplats, colours beyond 0..1 and
+places far from the origin as ExtSplats.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...model.splats import Splats
+from ...model.transforms import sh_basis
+from . import ext_splats, packed_splats
+
+#: Most splats of a sample, evenly spaced: losses are means. Chosen; takes about 0.2 s.
+SAMPLE = 1 << 15
+
+#: Directions in which colours are compared, the corners of a cube.
+_DIRECTIONS = np.array(np.meshgrid(*[(-1.0, 1.0)] * 3)).reshape(3, -1).T / np.sqrt(3)
+
+#: Squared change of colour that stands for a displacement by a splat's own size: a third of its opacity, since
+#: neighbours have similar colours. Chosen.
+_DISPLACED = 0.1
+
+#: Highest SH degree that pages of ExtSplats can have: Spark 2.2.0 has no texture for the second array of degree 3.
+MOST_PAGED_DEGREE = 2
+
+
+@dataclass(frozen=True)
+class LayoutLoss:
+    """Sums over splats, weighted by opacity and size.
+
+    Attributes:
+        weight: sum of weights.
+        ext, packed: sums of squared changes of displayed colour, 0..1, as ExtSplats and as PackedSplats.
+    """
+
+    weight: float = 0.0
+    ext: float = 0.0
+    packed: float = 0.0
+
+    @classmethod
+    def of(cls, splats: Splats) -> LayoutLoss:
+        """Sums of all valid splats among these."""
+        splats = splats.take(
+            np.flatnonzero(~np.logical_or.reduce([np.zeros(len(splats), np.bool_), *splats.invalid().values()]))
+        )
+        opacity = np.minimum(splats.opacity, 1).astype(np.float64)
+        size = splats.scale.mean(axis=1, dtype=np.float64)
+        weight = opacity * size
+        seen = _colors(splats)
+
+        def loss(held: Splats) -> float:
+            changes = np.square(_colors(held) - seen).mean(axis=(1, 2))
+            moved = np.linalg.norm(held.center.astype(np.float64) - splats.center, axis=1)
+            changes += _DISPLACED * np.square(np.minimum(1, moved / np.maximum(size, np.finfo(np.float64).tiny)))
+            return float((np.square(opacity) * changes) @ weight)
+
+        ext = loss(ext_splats.unpack(ext_splats.pack(splats)))
+        return cls(float(weight.sum()), ext, loss(packed_splats.unpack(packed_splats.pack(splats))))
+
+    @classmethod
+    def total(cls, parts: Iterable[LayoutLoss]) -> LayoutLoss:
+        """Sums over several parts."""
+        every = list(parts)
+        return cls(*(sum(getattr(part, name) for part in every) for name in ("weight", "ext", "packed")))
+
+    @property
+    def better(self) -> str:
+        """Layout that loses less, "ext" or "packed"; "ext", which has the finer codes, where both lose the same."""
+        return "packed" if self.packed < self.ext else "ext"
+
+    def psnr(self, layout: str) -> float:
+        """Loss as a PSNR of the colours of splats, dB; infinite without any loss."""
+        loss = getattr(self, layout)
+        return float(10 * np.log10(self.weight / loss)) if loss else np.inf
+
+
+def sample_loss(splats: Splats) -> LayoutLoss:
+    """Return the loss of an evenly spaced sample of splats."""
+    return LayoutLoss.of(splats.take(slice(0, None, max(1, -(-len(splats) // SAMPLE)))))
+
+
+def _colors(splats: Splats) -> NDArray[np.float64]:
+    """Return (N, directions, 3) displayed colours, 0 or more."""
+    colors = np.repeat(splats.rgb[:, None].astype(np.float64), len(_DIRECTIONS), axis=1)
+    if splats.sh_degree:
+        colors += np.einsum("dk,nkc->ndc", sh_basis(_DIRECTIONS, splats.sh_degree), splats.sh)
+    return np.maximum(colors, 0)
