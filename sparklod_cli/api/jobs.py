@@ -305,6 +305,7 @@ def traverse_files(
     except ValueError as error:
         raise UnfitError(str(error)) from None
     ready(path, scenes)
+    outputs.check_frames(path.numbers, len(files.instances))
     progress = files.progress if bar else silent
     loading = None if streaming.network.instant else Loader(scenes, settings, streaming).load(path.cameras[0])
     frames = write_frames(simulation, path, outputs, threads=files.threads, progress=progress, passed=passed)

@@ -9,7 +9,7 @@ from types import NoneType
 from typing import TYPE_CHECKING
 
 from ..codecs.file_names import MANIFEST
-from ..io import scene_sink, write_whole
+from ..io import scene_sink, sink
 from ..io.details import detail_sink
 from ..model.scene import Scene
 from ..support.defaults import DEFAULT_COMPRESSION
@@ -162,7 +162,8 @@ def _write_arrays(path: Path, scene: Scene, encoding: str, *, overwrite: bool, t
     if path.suffix.lower() not in (NPZ, *RAW_SUFFIXES):
         known = ", ".join((NPZ, *RAW_SUFFIXES))
         raise FormatError(f"{path}: arrays are written as {known}, which the name does not end in")
+    save = sink(path, overwrite=overwrite)
     with naming(path):
         arrays = pack(scene, encoding, threads=threads)
     pieces = dump.encode_raw(arrays) if path.suffix.lower() in RAW_SUFFIXES else dump.encode_npz(arrays)
-    return Written(path, encoding, write_whole(path, pieces, overwrite=overwrite))
+    return Written(path, encoding, save(pieces))

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ..io.identity import Identity, content_of, files_of, identity_of, stamp_of
-from ..io.writing import sink
+from ..io.writing import check_writable, sink
 from ..support.addresses import Address, Place, size_of
 from ..support.errors import OutputError, UnreadableError
 from ..support.untrusted import parse_json
@@ -42,6 +42,8 @@ def bake_unless_there(
     """
     note_path = target.parent / f"{target.name}{SUFFIX}"
     former = _former(note_path)
+    if not target.exists():
+        check_writable(target, overwrite=overwrite)  # before all inputs are read
     files = [*(file for place in places_of(source) for file in files_of(place)), *files_named_in(settings)]
     seen = [identity_of(file) for file in files]
     fingerprint = _fingerprint(source, settings, files, seen, {} if verify else former)
@@ -55,6 +57,7 @@ def bake_unless_there(
             return None
         if not overwrite:
             raise OutputError(f"{target} is there, but {'; '.join(differences)}; add --overwrite to bake it anew")
+    write_note = sink(note_path, overwrite=True)
     _remove(note_path)  # so that it never stands beside an output that it does not tell of
     baked = bake(source, target, settings, overwrite=overwrite, **how)
     if baked.refine is not None and not baked.refine.is_complete:
@@ -65,7 +68,7 @@ def bake_unless_there(
         "inputs": inputs,
         "output": {_within(target, file): _record_of(file) for file in files_of(target)},
     }
-    sink(note_path, overwrite=True)([json.dumps(note, indent=1).encode() + b"\n"])
+    write_note([json.dumps(note, indent=1).encode() + b"\n"])
     return baked
 
 

@@ -14,7 +14,7 @@ import click
 from ..codecs.options import SogOptions, WriteOptions
 from ..lod.tile_settings import TileSettings
 from ..support import interrupts
-from ..support.addresses import Place
+from ..support.addresses import Address, Place
 from ..support.errors import SparklodError
 from ..support.printable import MOST, shortened
 from ..support.stdin import DASH, name_of
@@ -200,6 +200,8 @@ def _check(ctx: click.Context, options: BuildLodOptions, named: list[Path]) -> N
             )
     elif DASH in inputs:
         raise click.UsageError(NAMELESS)
+    elif files.output_dir is None:
+        _require_places(inputs)
     targets = [output] if output is not None else [files.target(source) for source in inputs]
     if files.may_replace_inputs and not files.is_merged:
         targets = [target for source, target in zip(inputs, targets, strict=True) if not is_same_place(source, target)]
@@ -224,6 +226,13 @@ def _check(ctx: click.Context, options: BuildLodOptions, named: list[Path]) -> N
         options.tree.check(ctx, only_cuts=files.manifest is not None)
     if DASH in inputs:
         exclude(ctx, of_clusters, "standard input, which workers cannot read; save it to a file first")
+
+
+def _require_places(inputs: Sequence[Place]) -> None:
+    """Raise a `click.UsageError` where an output would be named after an address that is only read."""
+    for source in inputs:
+        if isinstance(source, Address) and source.is_read_only:
+            raise click.UsageError(f"nothing can be written beside {source}; name the output with -o or --output-dir")
 
 
 def _job_of(

@@ -121,7 +121,7 @@ def _draw(ctx: click.Context, options: RenderOptions) -> None:
     budget = None if options.cut.full else options.cut.one_budget()
     instances = options.inputs.instances()
     # What is wrong with the output is said before much is read.
-    _output(ctx, options, options.cameras.least_count())
+    _output(ctx, options, options.cameras.least_count()).try_place()
     with general.console() as console:
         from ..api.jobs import draw_files
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..io import check_writable
+from ..io import check_free, check_writable
 from .defaults import MOVING, SHEETS, STILL, SUFFIXES
 
 #: Formats with an alpha channel.
@@ -47,7 +47,13 @@ class PictureOutput:
     def check(self, numbers: Sequence[int], *, overwrite: bool) -> None:
         """Raise an `OutputError` if a file cannot be written; called before any work is done."""
         for path in self.paths(numbers):
-            check_writable(path, overwrite=overwrite)
+            check_free(path, overwrite=overwrite)
+        self.try_place()
+
+    def try_place(self) -> None:
+        """Raise an `OutputError` if no file can be written there, whatever the numbers of frames."""
+        if self.name is not None:
+            check_writable(self.path(), overwrite=True)
 
 
 def output_for(name: Path | None, default: Path, cameras: int, *, sheet: bool) -> PictureOutput:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import functools
 import os
+import shutil
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -21,14 +23,12 @@ from ..support.errors import OutputError, StdoutError
 from ..support.progress import Progress, silent
 from ..support.stdin import DASH
 from ..support.stdout import ReaderGoneError, guarded
+from ..support.units import format_size
 from .local_files import number_of, reason_of
 
 if TYPE_CHECKING:
     from ..codecs.rad.rad_reader import RadReader
 
-
-#: Schemes of addresses that are only read.
-READ_ONLY = ("http", "https")
 
 #: Writes the pieces of an output and returns how many bytes it wrote.
 Sink = Callable[[Iterable[bytes]], int]
@@ -41,26 +41,65 @@ SinkTogether = Callable[[Files], int]
 
 
 def check_writable(path: Place, *, overwrite: bool) -> None:
-    """Raise `OutputError` where an output cannot be written, as far as that can be told before work goes into it.
+    """Raise `OutputError` where an output cannot be written, before work goes into it.
 
-    Folders on the way to it that do not exist are no error: `write_whole` makes them.
+    At an address, its service has to answer; whether it lets files be written is not tried, as others would see them.
     """
+    check_free(path, overwrite=overwrite)
+    if isinstance(path, Path) and not _is_no_file(path):
+        try_place(path)
+    elif isinstance(path, Path) and not os.access(path, os.W_OK):
+        raise OutputError(f"cannot write {path}: {os.strerror(errno.EACCES).lower()}")
+
+
+def check_free(path: Place, *, overwrite: bool) -> None:
+    """Raise `OutputError` where an output is a folder or exists, or where nothing can be written by its name."""
     try:
         if isinstance(path, Address):
-            scheme = path.url.split("://", 1)[0].lower()
-            if scheme in READ_ONLY:
-                raise OutputError(f"cannot write {path}: {scheme}:// is for reading; write a file and upload that")
+            if path.is_read_only:
+                raise OutputError(f"cannot write {path}: {path.scheme}:// is for reading; write a file and upload that")
         elif path.is_dir():
             raise OutputError(f"{path} is a directory")
         if path.is_file() and not overwrite:
             raise _taken(path)
-        if isinstance(path, Path):
-            path.exists()  # raises where its name is too long
-            nearest = next(folder for folder in path.absolute().parents if folder.exists())
-            if not nearest.is_dir():
-                raise OutputError(f"cannot write {path}: {nearest} is a file, not a folder")
+        if isinstance(path, Path) and not _is_no_file(path):
+            _nearest_folder(path)
     except OSError as error:
         raise OutputError(f"cannot write {path}: {reason_of(error)}") from None
+
+
+def try_place(path: Path, *, least: int = 0) -> None:
+    """Raise `OutputError` where a file, or a folder, cannot be written or replaced; leave nothing there.
+
+    Permission and room are tried by a temporary file in its folder, or in the nearest one on the way to it that
+    exists: `write_whole` makes the others.
+
+    Args:
+        least: bytes that it will take at least.
+    """
+    try:
+        target, nearest = Path(os.path.realpath(path)), _nearest_folder(path)
+        for name in target.relative_to(nearest).parts:
+            with contextlib.suppress(FileNotFoundError):
+                (nearest / name).lstat()  # raises where the file system takes no such name
+        atomic.attempt(nearest)
+        if os.path.lexists(target):
+            atomic.check_replaceable(target)
+        free = shutil.disk_usage(nearest).free if least else 0
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {reason_of(error)}") from None
+    if least > free:
+        raise OutputError(
+            f"cannot write {path}: it takes {format_size(least)} or more, and {format_size(free)} are free there"
+        )
+
+
+def _nearest_folder(path: Path) -> Path:
+    """Return the nearest folder on the way to a file; raise `OutputError` where something else is in its place."""
+    nearest = next(folder for folder in Path(os.path.realpath(path)).parents if os.path.lexists(folder))
+    if not nearest.is_dir():
+        raise OutputError(f"cannot write {path}: {nearest} is a file, not a folder")
+    return nearest
 
 
 def write_whole(path: Place, pieces: Iterable[bytes], *, overwrite: bool) -> int:
@@ -71,7 +110,7 @@ def write_whole(path: Place, pieces: Iterable[bytes], *, overwrite: bool) -> int
     Raises:
         OutputError: it exists and `overwrite` is not set, or the file system, or the service, refused something.
     """
-    check_writable(path, overwrite=overwrite)
+    check_free(path, overwrite=overwrite)
     try:
         if isinstance(path, Address):
             return path.write(pieces)
@@ -235,7 +274,7 @@ def send_together(address: Address, files: Files, *, former: Sequence[Address], 
     Raises:
         OutputError: the header exists and `overwrite` is not set, or a file cannot be sent.
     """
-    check_writable(address, overwrite=overwrite)
+    check_free(address, overwrite=overwrite)
     sent, size = list[Address](), 0
     try:
         address.unlink(missing_ok=True)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..io import check_writable, write_whole
+from ..io import check_free, check_writable, write_whole
 from ..support.progress import Progress, silent
 from ..tables.output import Filter, TableOutput
 from .summary import Lookout
@@ -50,6 +50,11 @@ class FrameOutputs:
             load_matplotlib()
         if self.indices is not None:
             check_writable(self.indices / "0.npy", overwrite=True)
+
+    def check_frames(self, numbers: Sequence[int], instances: int) -> None:
+        """Raise an `OutputError` if an index file of a frame exists and may not be replaced."""
+        for file in self.index_files(numbers, instances):
+            check_free(file, overwrite=self.overwrite)
 
     def index_files(self, numbers: Sequence[int], instances: int) -> Iterator[Path]:
         """Yield the index files that will be written for frames of these numbers."""

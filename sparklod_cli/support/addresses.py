@@ -27,6 +27,9 @@ ADDRESS = re.compile(r"((?:[A-Za-z][A-Za-z0-9+.-]*::)*[A-Za-z][A-Za-z0-9+.-]+):/
 #: Bytes that are asked for at once by those who read little at a time; a request takes as long as some megabytes.
 READ_AHEAD = 1 << 23
 
+#: Schemes of addresses that are only read.
+READ_ONLY = ("http", "https")
+
 
 @dataclass(frozen=True)
 class Address:
@@ -50,6 +53,16 @@ class Address:
     def __truediv__(self, name: str) -> Address:
         path, query = _cut(self.url)
         return Address(f"{path.rstrip('/')}/{name}{query}")
+
+    @property
+    def scheme(self) -> str:
+        """The one that names its service; of a chained address (simplecache::https://) the last."""
+        return self.url.split("://", 1)[0].rpartition("::")[2].lower()
+
+    @property
+    def is_read_only(self) -> bool:
+        """Whether its service takes no files."""
+        return self.scheme in READ_ONLY
 
     @property
     def name(self) -> str:

@@ -7,6 +7,7 @@ name, and is locked while its writer is alive, so that the next run can recognis
 from __future__ import annotations
 
 import contextlib
+import errno
 import functools
 import os
 import re
@@ -95,6 +96,8 @@ _FLAGS = os.O_RDWR | getattr(os, "O_BINARY", 0) | getattr(os, "O_CLOEXEC", 0) | 
 
 _COPY_BYTES = 1 << 20  # per read when a file is copied
 
+_TRIED_BYTES = 4096  # a block of most file systems: less may fit into a full one
+
 
 def write(target: Path, pieces: Iterable[bytes | memoryview], *, overwrite: bool, sync: bool = True) -> int:
     """Write a file that appears only when it is complete, and return its size in bytes.
@@ -125,6 +128,43 @@ def write(target: Path, pieces: Iterable[bytes | memoryview], *, overwrite: bool
             file.seek(0)
             _write_named(target, iter(lambda: file.read(_COPY_BYTES), b""), overwrite, sync)
     return size
+
+
+def attempt(folder: Path) -> None:
+    """Try to write a file in a folder, as `write` does, and leave nothing behind.
+
+    Raises:
+        OSError: the file system refuses it, or is full.
+    """
+    target = folder / unique(PARTS)
+    descriptor, temporary = _open_unnamed(target, overwrite=False), None
+    if descriptor is None:
+        temporary, descriptor = _open_part(target, overwrite=False)
+    try:
+        with os.fdopen(descriptor, "w+b") as file:
+            file.write(bytes(_TRIED_BYTES))
+    finally:
+        if temporary is not None:
+            temporary.unlink(missing_ok=True)
+
+
+def check_replaceable(path: Path) -> None:
+    """Raise `OSError` where a file or folder cannot be replaced, though others can be written beside it.
+
+    Something is mounted on it, it belongs to another user in a folder such as /tmp, or it is marked as immutable.
+    """
+    status, folder = path.lstat(), path.parent.stat()
+    if os.path.ismount(path):  # `Path.is_mount` is False of files
+        raise OSError(errno.EBUSY, os.strerror(errno.EBUSY), str(path))
+    is_shared = hasattr(os, "geteuid") and folder.st_mode & stat.S_ISVTX
+    if is_shared and os.geteuid() not in (0, status.st_uid, folder.st_uid):
+        raise PermissionError(errno.EPERM, os.strerror(errno.EPERM), str(path))
+    if stat.S_ISREG(status.st_mode):
+        try:
+            os.close(os.open(path, _FLAGS | getattr(os, "O_NONBLOCK", 0)))
+        except OSError as error:  # a file that is only read may be replaced
+            if error.errno == errno.EPERM:
+                raise
 
 
 def fill(file: BinaryIO, pieces: Iterable[bytes | memoryview], *, sync: bool = True) -> int:

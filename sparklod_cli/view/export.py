@@ -8,7 +8,7 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
-from ..io import read_text, write_whole
+from ..io import read_text, try_place, write_whole
 from ..io.local_files import open_plain, reason_of
 from ..support.errors import OutputError, SparklodError
 from ..support.progress import Progress, silent
@@ -49,6 +49,7 @@ def check_folder(folder: Path, site: Site | None = None, *, overwrite: bool) -> 
         real = folder.resolve()
     except OSError as error:
         raise OutputError(f"cannot write {folder}: {reason_of(error)}") from None
+    try_place(folder, least=0 if site is None else _total(site))
     for content in site.resources.values() if site is not None else ():
         if isinstance(content, Path) and content.is_relative_to(real):
             raise OutputError(f"{folder} holds {content.name}, which is to be shown; name another folder")
@@ -79,8 +80,7 @@ def export(site: Site, folder: Path, *, overwrite: bool, progress: Progress = si
     check_folder(folder, site, overwrite=overwrite)
     real = folder.resolve()
     part = real.with_name(PARTS.format(secrets.token_hex(8)))
-    total = sum(_size(content) for content in site.resources.values())
-    done = 0
+    total, done = _total(site), 0
     try:
         real.parent.mkdir(parents=True, exist_ok=True)
         part.mkdir()
@@ -94,6 +94,10 @@ def export(site: Site, folder: Path, *, overwrite: bool, progress: Progress = si
     finally:
         shutil.rmtree(part, ignore_errors=True)
     return done
+
+
+def _total(site: Site) -> int:
+    return sum(_size(content) for content in site.resources.values())
 
 
 def _size(content: bytes | Path) -> int:
