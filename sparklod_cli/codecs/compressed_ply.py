@@ -16,6 +16,7 @@ from ..support.progress import Progress
 from ..support.units import count_of
 from . import quantize
 from .content import Content, Source, Target
+from .left_out import HARMLESS, left_out
 from .ply_header import PlyHeader, offset_of, read_header
 from .stream import Positioned, Rows, decode_rows, rows_between, size_of
 
@@ -70,8 +71,21 @@ def open_content(source: Source) -> Content:
 
     facts = {"chunks": header.count("chunk"), "color_bounds": int(bounds["color"] is not None)}
     facts["trailing_bytes"] = trailing
-    kept = min(degree, MAX_SH_DEGREE)
-    return Content(count, kept, "compressed PLY", fill, header.mode == "mip", notes_on_degree(degree), facts)
+    kept, notes = min(degree, MAX_SH_DEGREE), notes_on_degree(degree) + _left_out(header)
+    return Content(count, kept, "compressed PLY", fill, header.mode == "mip", notes, facts)
+
+
+def _left_out(header: PlyHeader) -> tuple[str, ...]:
+    """Return the notes on properties and elements that are left out."""
+    read = {"vertex": {*VERTEX}, "chunk": {name for names in BOUNDS.values() for name in names}}
+    properties = [
+        each.name
+        for name, names in read.items()
+        for each in header.elements[name][0].properties
+        if each.name not in names | HARMLESS
+    ]
+    elements = [name for name, (_, count) in header.elements.items() if count and name not in {*read, "sh"}]
+    return left_out("property", "properties", properties) + left_out("element", "elements", elements)
 
 
 def _within(bounds: FloatArray | None, part: slice, unit: FloatArray) -> FloatArray:

@@ -1,6 +1,6 @@
 """PLY of 3D Gaussian Splatting, as Inria's code, nerfstudio, gsplat, splat-transform and others write it.
 
-A vertex is a splat, with scalar properties in any order; properties that are not in the table are ignored.
+A vertex is a splat, with scalar properties in any order; notes name the properties and elements that are left out.
 """
 
 from __future__ import annotations
@@ -8,9 +8,9 @@ from __future__ import annotations
 import functools
 import re
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from itertools import islice
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,8 +28,9 @@ from . import quantize
 from .clamps import CodeRange
 from .content import Content, Scratch, Source, Target
 from .file_notes import comment_of, read_comment
+from .left_out import HARMLESS, left_out
 from .options import DEFAULTS, WriteOptions
-from .ply_header import PlyHeader, offset_of, read_header
+from .ply_header import PlyHeader, first_value, offset_of, read_header
 from .stream import Positioned, Rows, decode_rows, encode_rows, rows_between, size_of
 
 Coding = Callable[[FloatArray], FloatArray]
@@ -44,13 +45,39 @@ COLUMNS: tuple[tuple[str, tuple[str, ...], Coding, Coding], ...] = (
 )
 REQUIRED = tuple(name for _, names, _, _ in COLUMNS for name in names)
 
+SCALES = ("scale_0", "scale_1", "scale_2")
+
+#: Colours of 0 to 255 that are read where those of SH are missing, as in files of nerfstudio's --ply-color-mode rgb.
+PLAIN_RGB = ("red", "green", "blue")
+
+#: Standard deviation, in world units, of the filter with which Mip-Splatting smooths each splat when it draws it, and
+#: which is in the scales and opacities of its "fused" files already. Facts: its scene/gaussian_model.py.
+FILTER = "filter_3D"
+FILTERED = f"the 3D filter of Mip-Splatting ({FILTER}) is applied to its scales and opacities"
+
+#: The element of Apple's SHARP whose value is 1 where colours are linear and 0 where they are sRGB.
+COLOR_SPACE = "color_space"
+
+#: Precedes the names of properties that CloudCompare writes.
+PREFIX = "scalar_"
+
 #: Missing properties that an error names.
 FEW = 4
 
-#: The scale that disks (2D Gaussian Splatting) lack or do not use, across their plane, and what they get in its place,
-#: over the smaller of their two scales: less than a pixel wherever a disk is smaller than a picture, and above 0, which
-#: formats of logarithms do not hold. Chosen.
-ACROSS, THIN = "scale_2", np.float32(1e-3)
+#: Third scale of disks (2D Gaussian Splatting), across their plane, over the smaller of their two scales: less than a
+#: pixel wherever a disk is smaller than a picture, and above 0, which formats of logarithms do not hold. Chosen.
+THIN = np.float32(1e-3)
+
+#: Numbers that are none as C libraries of Windows write them: "-nan(ind)", "1.#QNAN", "-1.#INF00".
+WINDOWS_NAN = re.compile(rb"(?<!\S)([+-]?)(?:nan\([^\s()]*\)|1[.,]#(inf)?\w*)(?!\S)", re.IGNORECASE)
+
+
+class _Column(NamedTuple):
+    """A column of `Splats`, the properties of a file that it consists of, and their decode."""
+
+    name: str
+    parts: tuple[str, ...]
+    decode: Coding
 
 
 def open_content(source: Source) -> Content:
@@ -62,49 +89,110 @@ def open_content(source: Source) -> Content:
     file = source.file
     size = size_of(file)
     header = read_header(file)
-    coefficients = _checked_coefficients(header)
-    facts = {"properties": len(_row_type(header).names or ()), "ascii": int(header.text)}
+    row_type = _row_type(header)
+    names = row_type.names or ()
+    columns = _columns(names, header.mode)
+    coefficients = _checked_coefficients(names)
+    rest = [f"f_rest_{index}" for index in range(3 * coefficients)]
+    facts = {"properties": len(names), "ascii": int(header.text)}
     facts |= {"big_endian": int(header.byte_order == ">"), "trailing_bytes": header.check_size(size)}
     degree, count = degree_of(coefficients), header.count("vertex")
-    # Splats of 2D Gaussian Splatting have two scales, or a third that does not count.
-    disks = header.mode == "2dgs" or ACROSS not in (_row_type(header).names or ())
-    unpack = _unpacking(_row_type(header), coefficients, disks=disks)
-    rows = _rows(file, header, source.scratch)
+    unpack = _unpacking(names, columns, rest)
+    needed = {part for column in columns for part in column.parts} | {*rest, FILTER}
+    rows = _rows(file, header, needed, source.scratch)
 
     def fill(target: Target, threads: int, progress: Progress) -> None:
         some = rows(target.start, target.stop)
         decode_rows(some, lambda part, rows: unpack(rows, target.rows(part)), count, threads, progress)
 
     noted = read_comment(header.note)
-    notes = notes_on_degree(degree) + noted.problems
-    notes += ("its disks (2D Gaussian Splatting) are read as splats a thousandth as thick",) if disks else ()
+    notes = notes_on_degree(degree) + noted.problems + _notes(file, header, names, needed)
     return Content(count, min(degree, MAX_SH_DEGREE), "PLY", fill, header.mode == "mip", notes, facts, noted.up)
 
 
-def _unpacking(row_type: np.dtype[Any], coefficients: int, *, disks: bool) -> Callable[[NDArray[Any], Splats], None]:
+def _notes(file: BinaryIO, header: PlyHeader, names: Collection[str], needed: Collection[str]) -> tuple[str, ...]:
+    """Return the notes on data that is read in another way than it is written, and on data that is left out."""
+    notes, harmless = tuple[str, ...](), HARMLESS
+    if SCALES[1] in needed and SCALES[2] not in needed:
+        notes += ("its disks (2D Gaussian Splatting) are read as splats a thousandth as thick",)
+        harmless = HARMLESS | {SCALES[2]}
+    notes += (FILTERED,) if FILTER in names else ()
+    elements = [name for name, (_, count) in header.elements.items() if count and name != "vertex"]
+    space = first_value(file, header, COLOR_SPACE) if COLOR_SPACE in elements else None
+    if space is not None:
+        elements.remove(COLOR_SPACE)
+        notes += (f"its colours are linear ({COLOR_SPACE}), and are read as sRGB: too dark",) if space else ()
+    properties = {*names} - {*needed} - harmless
+    return notes + left_out("property", "properties", properties) + left_out("element", "elements", elements)
+
+
+def _columns(names: Collection[str], mode: str) -> list[_Column]:
+    """Return the columns that vertices with these properties fill.
+
+    Splats with one scale are balls, which need no rotation; those with two are disks, see `THIN`.
+
+    Raises:
+        NotSplatsError: splats need more properties.
+    """
+    have, columns = {*names}, list[_Column]()
+    widths = (2, 1) if mode == "2dgs" else (3, 2, 1)
+    scales = SCALES[: next((width for width in widths if have.issuperset(SCALES[:width])), 3)]
+    if SCALES[2] in have and len(scales) < 2:
+        scales = SCALES  # one is missing
+    for name, parts, decode, _ in COLUMNS:
+        if name == "rgb" and have.isdisjoint(parts) and have.issuperset(PLAIN_RGB):
+            columns.append(_Column(name, PLAIN_RGB, lambda values: values / np.float32(255)))
+        elif name == "scale":
+            columns.append(_Column(name, scales, decode))
+        elif name != "quat_xyzw" or len(scales) > 1 or not have.isdisjoint(parts):
+            columns.append(_Column(name, parts, decode))
+    missing = [part for column in columns for part in column.parts if part not in have]
+    if missing:
+        what = "a point cloud or a mesh, not Gaussian splats" if "x" in have else "not Gaussian splats"
+        if not have.isdisjoint(REQUIRED[3:]):
+            what = "Gaussian splats that are not complete"
+        more = f" and {len(missing) - FEW} more" if len(missing) > FEW else ""
+        raise NotSplatsError(f"{what}: its vertices have no {', '.join(missing[:FEW])}{more}")
+    return columns
+
+
+def _unpacking(
+    names: Sequence[str], columns: Sequence[_Column], rest: Sequence[str]
+) -> Callable[[NDArray[Any], Splats], None]:
     """Return the function that fills the columns of splats from rows."""
-    names = list(row_type.names or ())
-    places = {
-        column: _run([names.index(name) for name in parts if not (disks and name == ACROSS)])
-        for column, parts, _, _ in COLUMNS
-    }
-    rest = _run([names.index(f"f_rest_{index}") for index in range(3 * coefficients)])  # all of red's come first
+    places = {column.name: _run([names.index(part) for part in column.parts]) for column in columns}
+    of_rest = _run([names.index(name) for name in rest])  # all of red's come first
+    scales = next(len(column.parts) for column in columns if column.name == "scale")
+    smoothing = names.index(FILTER) if FILTER in names else None
 
     # Converters write infinite logits and logarithms for an opacity of 0 or 1 and a scale of 0.
     @np.errstate(over="ignore", invalid="ignore")
     def unpack(rows: NDArray[Any], splats: Splats) -> None:
         matrix = _matrix(rows)
-        for column, _, decode_column, _ in COLUMNS:
-            out = getattr(splats, column)
-            if disks and column == "scale":
-                out = out[:, :2]
-            out[...] = decode_column(matrix[:, places[column]]).reshape(out.shape)
-        if disks:
+        for column in columns:
+            out = getattr(splats, column.name)
+            if column.name == "scale":
+                out = out[:, :scales]
+            out[...] = column.decode(matrix[:, places[column.name]]).reshape(out.shape)
+        if scales == 1:
+            splats.scale[:, 1:] = splats.scale[:, :1]
+        if "quat_xyzw" not in places:
+            splats.quat_xyzw[:] = (0, 0, 0, 1)
+        if smoothing is not None:
+            _smooth(splats.scale[:, :2] if scales == 2 else splats.scale, splats.opacity, matrix[:, smoothing])
+        if scales == 2:
             splats.scale[:, 2] = THIN * splats.scale[:, :2].min(axis=1)
-        sh = matrix[:, rest].reshape(len(rows), 3, coefficients)
+        sh = matrix[:, of_rest].reshape(len(rows), 3, len(rest) // 3)
         splats.sh[:] = sh[:, :, : splats.sh.shape[1]].transpose(0, 2, 1)
 
     return unpack
+
+
+def _smooth(scale: FloatArray, opacity: FloatArray, size: FloatArray) -> None:
+    """Convolve splats with balls of a standard deviation, (N,), as `FILTER` says; their integrals stay."""
+    smooth = np.hypot(scale, size[:, None])
+    opacity *= np.divide(scale, smooth, out=np.ones_like(smooth), where=smooth > 0).prod(axis=1)
+    scale[...] = smooth
 
 
 def _matrix(rows: NDArray[Any]) -> FloatArray:
@@ -125,31 +213,33 @@ def _run(places: list[int]) -> slice | list[int]:
     return run if places == list(range(run.start, run.stop)) else places
 
 
-def _checked_coefficients(header: PlyHeader) -> int:
-    """Check that the vertices are splats, and return the number of SH coefficients per channel."""
-    if "vertex" not in header.elements:
-        raise NotSplatsError("its PLY header has no element vertex")
-    have = _row_type(header).names or ()
-    missing = [name for name in REQUIRED if name not in have]
-    if missing and missing != [ACROSS]:
-        what = "a point cloud or a mesh, not Gaussian splats" if "x" in have else "not Gaussian splats"
-        more = f" and {len(missing) - FEW} more" if len(missing) > FEW else ""
-        raise NotSplatsError(f"{what}: its vertices have no {', '.join(missing[:FEW])}{more}")
-    rest = sum(1 for name in have if re.fullmatch(r"f_rest_\d+", name))
-    expected = {f"f_rest_{index}" for index in range(rest)}
-    if rest % 3 or not expected.issubset(have):
+def _checked_coefficients(names: Collection[str]) -> int:
+    """Check the names of the SH properties, and return the number of coefficients per channel."""
+    rest = sum(1 for name in names if re.fullmatch(r"f_rest_\d+", name))
+    if rest % 3 or not {f"f_rest_{index}" for index in range(rest)}.issubset(names):
         raise FormatError(f"{rest} f_rest properties; expected f_rest_0, f_rest_1 and so on, a multiple of 3")
     return rest // 3
 
 
 def _row_type(header: PlyHeader) -> np.dtype[Any]:
+    """Return the type of a vertex: in ascii files of floats alone, without `PREFIX` before names."""
+    if "vertex" not in header.elements:
+        raise NotSplatsError("its PLY header has no element vertex")
     row_type = header.row_type("vertex")
     if row_type is None:
         raise NotSplatsError("its vertices have list properties, which splats do not have")
-    return row_type
+    fields = []
+    for name in row_type.names or ():
+        plain, kind = name.removeprefix(PREFIX), row_type[name]
+        if header.text and kind.itemsize < 8:
+            kind = np.dtype("<f4")  # programs write "200.0" where the header announces a whole number
+        fields.append((name if plain in (row_type.names or ()) else plain, kind))
+    return np.dtype(fields)
 
 
-def _rows(file: BinaryIO, header: PlyHeader, scratch: Scratch | None) -> Callable[[int, int], Iterator[Rows]]:
+def _rows(
+    file: BinaryIO, header: PlyHeader, needed: Collection[str], scratch: Scratch | None
+) -> Callable[[int, int], Iterator[Rows]]:
     """Return the function that reads the vertices from a number to another."""
     row_type, count = _row_type(header), header.count("vertex")
 
@@ -158,11 +248,11 @@ def _rows(file: BinaryIO, header: PlyHeader, scratch: Scratch | None) -> Callabl
         if not header.text:
             return Positioned(file), offset_of(file, header, "vertex")
         assert scratch is not None
-        return Positioned(scratch(lambda: (rows.tobytes() for _, rows in _text_rows(file, header)))), 0
+        return Positioned(scratch(lambda: (rows.tobytes() for _, rows in _text_rows(file, header, needed)))), 0
 
     def between(start: int, stop: int) -> Iterator[Rows]:
         if header.text and scratch is None:
-            return _text_rows(file, header)
+            return _text_rows(file, header, needed)
         source, offset = once()
         return rows_between(source, offset, row_type, start, stop, count, "vertices")
 
@@ -170,7 +260,7 @@ def _rows(file: BinaryIO, header: PlyHeader, scratch: Scratch | None) -> Callabl
     return between
 
 
-def _text_rows(file: BinaryIO, header: PlyHeader) -> Iterator[Rows]:
+def _text_rows(file: BinaryIO, header: PlyHeader, needed: Collection[str]) -> Iterator[Rows]:
     """Read the vertices of an ascii file in blocks; plyfile's own reader takes value by value in Python."""
     row_type, vertices = _row_type(header), header.count("vertex")
     file.seek(header.size)
@@ -185,10 +275,28 @@ def _text_rows(file: BinaryIO, header: PlyHeader) -> Iterator[Rows]:
         if not all(map(bytes.strip, lines)):  # numpy would skip them
             raise FormatError(f"an empty line among the vertices after vertex {part.start:,}")
         try:
-            rows = np.loadtxt(lines, dtype=row_type, ndmin=1, comments=None)
+            rows = _parsed(lines, row_type, needed)
         except ValueError as error:
             raise FormatError(f"bad PLY data after vertex {part.start:,}: {quoted(error)}") from None
         yield part, rows
+
+
+def _parsed(lines: list[bytes], row_type: np.dtype[Any], needed: Collection[str]) -> NDArray[Any]:
+    """Parse vertices; where that fails, again without properties that nobody needs, and with `WINDOWS_NAN`."""
+    load = functools.partial(np.loadtxt, dtype=row_type, ndmin=1, comments=None)
+    try:
+        return load(lines)
+    except ValueError:
+        are_needed = [name in needed for name in row_type.names or ()]
+        return load([_mended(line, are_needed) for line in lines])
+
+
+def _mended(line: bytes, are_needed: Sequence[bool]) -> bytes:
+    """Return a line with 0 for each value that nobody needs, and nan or inf for each `WINDOWS_NAN`."""
+    words = WINDOWS_NAN.sub(lambda match: match[1] + (match[2] or b"nan"), line).split()
+    if len(words) != len(are_needed):
+        return line
+    return b" ".join(word if is_needed else b"0" for word, is_needed in zip(words, are_needed, strict=True))
 
 
 def settled(scene: Scene, options: WriteOptions) -> WriteOptions:

@@ -136,6 +136,18 @@ def offset_of(file: BinaryIO, header: PlyHeader, name: str) -> int:
     return at
 
 
+def first_value(file: BinaryIO, header: PlyHeader, name: str) -> float | None:
+    """Return the first value of an element that has rows; None in ascii files and files of lists, read row by row."""
+    if header.text or any(header.row_type(other) is None for other in header.elements):
+        return None
+    row_type = np.dtype(header.elements[name][0].dtype(header.byte_order))
+    file.seek(offset_of(file, header, name))
+    data = file.read(row_type.itemsize)
+    if len(data) < row_type.itemsize:
+        raise TruncatedError(f"cut short inside its element {name}")
+    return float(np.frombuffer(data, row_type)[0][0])
+
+
 def _skip_row(file: BinaryIO, element: PlyElement, byte_order: str) -> None:
     for each in element.properties:
         if not isinstance(each, PlyListProperty):

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ..codecs.ply import FILTERED
 from ..codecs.spz_streams import KNOWN_FLAGS
 from ..codecs.tiles_3d.codec import NOT_PLACED
 from ..io import opened, read_arrays, read_scene, size_of_input
@@ -271,7 +272,7 @@ def _report(path: Path, head: Head | None, surveyed: HeaderScan | None) -> Repor
 
 def _container_findings(scene: Scene) -> list[Finding]:
     header = scene.header
-    findings = [Finding("container.left-out", note) for note in scene.notes if note != NOT_PLACED]
+    findings = [Finding("container.left-out", note) for note in scene.notes if note not in (FILTERED, NOT_PLACED)]
     unknown = header.get("flags", 0) & ~KNOWN_FLAGS
     if unknown:
         findings.append(Finding("container.flags", f"the header sets flags {unknown:#04x}, which have no meaning"))

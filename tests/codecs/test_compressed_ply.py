@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from plyfile import PlyData, PlyElement
 
 from fixtures import by_hand_compressed_ply
 from sparklod_cli.codecs import compressed_ply
@@ -181,3 +182,23 @@ def test_broken_compressed_ply_is_refused_with_a_reason(what: str) -> None:
     make, reason = REFUSED[what]
     with pytest.raises(FormatError, match=reason):
         decode(make())
+
+
+def test_what_is_left_out_of_compressed_ply_is_named() -> None:
+    plain = PlyData.read(GOLDEN)
+    rows = plain["vertex"].data
+    labelled = np.empty(len(rows), [*rows.dtype.descr, ("label_0", "u1"), ("nx", "f4")])
+    for name in rows.dtype.names:
+        labelled[name] = rows[name]
+    vertex = PlyElement.describe(labelled, "vertex")
+    camera, none = (PlyElement.describe(np.zeros(count, [("id", "i4")]), f"camera_{count}") for count in (1, 0))
+    others = [each for each in plain.elements if each.name != "vertex"]
+    file = io.BytesIO()
+    PlyData([others[0], vertex, *others[1:], camera, none]).write(file)
+    scene = decode(file.getvalue())
+    assert scene.notes == ("its property label_0 is left out", "its element camera_1 is left out")
+    assert decode(GOLDEN.read_bytes()).notes == ()
+    for column in COLUMNS:
+        np.testing.assert_array_equal(
+            getattr(scene.splats, column), getattr(decode(GOLDEN.read_bytes()).splats, column)
+        )

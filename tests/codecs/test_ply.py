@@ -20,7 +20,7 @@ from sparklod_cli.codecs.content import decode_file
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
-from sparklod_cli.support.errors import FormatError
+from sparklod_cli.support.errors import FormatError, NotSplatsError
 from tests.conftest import FIXTURES
 from tests.scenes import random_splats, splat_columns
 
@@ -188,12 +188,193 @@ def test_a_quaternion_of_zeros_in_ply_is_not_a_number() -> None:
     assert np.isnan(quats).any(axis=1).tolist() == [False, False, True, False, False]
 
 
-def test_the_table_names_what_is_required() -> None:
-    for name in set(ply.REQUIRED) - {ply.ACROSS}:
-        given = columns()
+@pytest.mark.parametrize("name", sorted({*ply.REQUIRED} - {"scale_2"}))
+def test_a_property_that_is_missing_is_named(name: str) -> None:
+    given = columns()
+    del given[name]
+    with pytest.raises(NotSplatsError, match=rf"^Gaussian splats that are not complete: its vertices have no {name}$"):
+        decode(by_hand.ply(given))
+
+
+@pytest.mark.parametrize(
+    ("left", "text"),
+    [
+        (("f_dc_0", "f_dc_1", "f_dc_2"), "complete: its vertices have no f_dc_0, f_dc_1, f_dc_2$"),
+        (
+            ("opacity", "scale_0", "scale_1", "scale_2"),
+            "complete: its vertices have no opacity, scale_0, scale_1, scale_2$",
+        ),
+        (("rot_0", "rot_1", "rot_2", "rot_3"), "complete: its vertices have no rot_1, rot_2, rot_3, rot_0$"),
+        (ply.REQUIRED[3:], "a point cloud or a mesh, not Gaussian splats: its vertices have no f_dc_0, .* and 7 more$"),
+    ],
+)
+def test_splats_without_some_properties_are_no_point_cloud(left: tuple[str, ...], text: str) -> None:
+    with pytest.raises(NotSplatsError, match=text):
+        decode(by_hand.ply({name: values for name, values in columns().items() if name not in left}))
+
+
+def test_colours_without_splats_are_a_point_cloud() -> None:
+    given = {name: columns()[name] for name in "xyz"} | {name: [9] * 5 for name in ply.PLAIN_RGB}
+    with pytest.raises(NotSplatsError, match="a point cloud or a mesh, not Gaussian splats"):
+        decode(by_hand.ply(given, types=dict.fromkeys(ply.PLAIN_RGB, "u1")))
+
+
+@pytest.mark.parametrize("text", [False, True], ids=["binary", "ascii"])
+@pytest.mark.parametrize("kind", ["u1", "f4", "i4"])
+def test_colours_of_point_clouds_stand_in_for_those_of_sh(kind: str, text: bool) -> None:
+    plain = {"red": [0, 1, 51, 128, 255], "green": [255] * 5, "blue": [0, 0, 0, 0, 102]}
+    given = {name: values for name, values in columns().items() if not name.startswith("f_dc")} | plain
+    scene = decode(by_hand.ply(given, text=text, types=dict.fromkeys(plain, kind)))
+    np.testing.assert_allclose(scene.splats.rgb, np.transpose(list(plain.values())) / 255, atol=1e-7)
+    assert scene.notes == ()
+    # Beside colours of SH they are a copy for viewers of point clouds.
+    both = decode(by_hand.ply(columns() | plain, text=text, types=dict.fromkeys(plain, kind)))
+    np.testing.assert_array_equal(both.splats.rgb, decode(by_hand.ply(columns(), text=text)).splats.rgb)
+    assert both.notes == ()
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_splats_of_one_scale_are_balls(turned: bool) -> None:
+    left = {"scale_1", "scale_2"} | (set() if turned else {"rot_0", "rot_1", "rot_2", "rot_3"})
+    scene = decode(by_hand.ply({name: values for name, values in columns().items() if name not in left}))
+    whole = decode(by_hand.ply(columns())).splats
+    np.testing.assert_array_equal(scene.splats.scale, np.repeat(whole.scale[:, :1], 3, axis=1))
+    np.testing.assert_array_equal(scene.splats.quat_xyzw, whole.quat_xyzw if turned else [[0, 0, 0, 1]] * 5)
+    assert scene.notes == ()
+
+
+def test_names_of_cloudcompare_are_read() -> None:
+    given = columns(sh_degree=1)
+    renamed = {name if len(name) <= 2 else f"scalar_{name}": values for name, values in given.items()}
+    scene = decode(by_hand.ply(renamed | {"scalar_label": [1] * 5}))
+    assert_same(scene, decode(by_hand.ply(given)))
+    assert scene.notes == ("its property label is left out",)
+    assert_same(decode(by_hand.ply(given | {"scalar_x": [7] * 5, "scalar_opacity": [7] * 5})), scene)
+
+
+# --- Data that are left out, and the filter of Mip-Splatting ---
+
+
+@pytest.mark.parametrize("text", [False, True], ids=["binary", "ascii"])
+@pytest.mark.parametrize(
+    ("names", "note"),
+    [
+        (["label"], "its property label is left out"),
+        (["trbf_scale", "trbf_center"], "its properties trbf_center and trbf_scale are left out"),
+        (
+            [f"motion_{index}" for index in (3, 8, 1, 0, 2, 4, 5, 6, 7)] + ["omega_1", "omega_0", "t"],
+            "its properties motion_0 to motion_8, omega_0, omega_1 and t are left out",
+        ),
+        (
+            [f"{letter}_" for letter in "abcdefghijk"],
+            "its properties a_, b_, c_, d_, e_, f_, g_, h_ and 3 more are left out",
+        ),
+        (["normal_x", "state", "alpha"], None),
+    ],
+)
+def test_properties_that_are_left_out_are_named(names: list[str], note: str | None, text: bool) -> None:
+    scene = decode(by_hand.ply(columns() | {name: [1] * 5 for name in names}, text=text))
+    assert_same(scene, decode(by_hand.ply(columns(), text=text)))
+    assert scene.notes == ((note,) if note else ())
+
+
+def test_names_cannot_control_a_terminal() -> None:
+    (note,) = decode(edited("property float ny", f"property float \x1b[31m{'a' * 900}")).notes
+    assert note.isprintable() and len(note) < 100
+
+
+@pytest.mark.parametrize("text", [False, True], ids=["binary", "ascii"])
+def test_elements_that_are_left_out_are_named(text: bool) -> None:
+    empty = PlyElement.describe(np.empty(0, [("a", "i4")]), "none")
+    scene = decode(by_hand.ply(columns(), text=text, before=[some_cameras(), empty], after=[some_faces()]))
+    assert scene.notes == ("its elements camera and face are left out",)
+
+
+@pytest.mark.parametrize(("value", "notes"), [(0, 0), (1, 1)])
+def test_the_colour_space_of_sharp_is_read(value: int, notes: int) -> None:
+    space = PlyElement.describe(np.array([(value,)], [("color_space", "u1")]), "color_space")
+    scene = decode(by_hand.ply(columns(), after=[space]))
+    assert len(scene.notes) == notes and all("linear" in note for note in scene.notes)
+    for other in (
+        by_hand.ply(columns(), after=[space], text=True),
+        by_hand.ply(columns(), after=[space], before=[some_faces()]),
+    ):
+        assert "color_space" in decode(other).notes[0] and "left out" in decode(other).notes[0]
+
+
+def smoothed(log_scale: list[float], logit: float, size: float) -> tuple[list[float], float]:
+    """Returns scales and opacity of a splat as Mip-Splatting draws it, number by number."""
+    scales = [math.exp(each) for each in log_scale]
+    after = [math.sqrt(scale**2 + size**2) for scale in scales]
+    before_2, after_2 = (math.prod(scale**2 for scale in each) for each in (scales, after))
+    return after, math.sqrt(before_2 / after_2) / (1 + math.exp(-logit))
+
+
+@pytest.mark.parametrize("text", [False, True], ids=["binary", "ascii"])
+@pytest.mark.parametrize("scales", [1, 2, 3])
+def test_the_filter_of_mip_splatting_is_applied(scales: int, text: bool) -> None:
+    given = columns() | {"filter_3D": np.array([0, 1e-3, 0.5, 1, 20])}
+    for name in ply.SCALES[scales:]:
         del given[name]
-        with pytest.raises(FormatError, match=rf"not Gaussian splats: its vertices have no {name}$"):
-            decode(by_hand.ply(given))
+    scene = decode(by_hand.ply(given, text=text, types="f8"))
+    splats = scene.splats
+    for row in range(5):
+        log_scale = [given[ply.SCALES[min(axis, scales - 1)]][row] for axis in range(2 if scales == 2 else 3)]
+        scale, opacity = smoothed(log_scale, given["opacity"][row], given["filter_3D"][row])
+        np.testing.assert_allclose(splats.scale[row, : len(scale)], scale, rtol=1e-5)
+        np.testing.assert_allclose(splats.opacity[row], opacity, rtol=1e-5)
+    assert ply.FILTERED in scene.notes and not any("left out" in note for note in scene.notes)
+
+
+@pytest.mark.filterwarnings("error")
+def test_the_filter_leaves_splats_without_size_as_they_are() -> None:
+    given = columns() | {"filter_3D": np.array([0, 0, 1, np.nan, -1])}
+    for name in ply.SCALES:
+        given[name][:3] = [-np.inf, 1000, -np.inf]
+    splats = decode(by_hand.ply(given)).splats
+    assert splats.scale[0].tolist() == [0, 0, 0] and splats.opacity[0] > 0
+    assert splats.scale[2].tolist() == [1, 1, 1] and splats.opacity[2] == 0
+    assert splats.invalid()["non_finite"].tolist() == [False, True, False, True, False]
+
+
+# --- Numbers that are none ---
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("word", ["-nan(ind)", "-1.#IND00", "1.#QNAN", "none", "200.0", "0x10", "-inf", "1e999"])
+def test_words_in_properties_that_nobody_needs_do_not_matter(word: str) -> None:
+    given = columns() | {"red": [7] * 5, "label": [7] * 5}
+    data = by_hand.ply(given, text=True, types={"nx": "u1", "label": "i4", "red": "u1"})
+    lines = data.split(b"\n")
+    for at in (-2, -4):
+        words = lines[at].split()
+        for name in ("nx", "ny", "red", "label"):
+            words[list(given).index(name)] = word.encode()
+        lines[at] = b" ".join(words)
+    assert_same(decode(b"\n".join(lines)), decode(data))
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(
+    ("word", "value"),
+    [
+        *[
+            (word, np.nan)
+            for word in ("-nan(ind)", "nan(snan)", "NaN(0x7f)", "-nan", "1.#QNAN", "-1.#IND", "1.#SNAN00")
+        ],
+        *[(word, np.nan) for word in ("-1.#J", "1.#R", "1,#QNAN0")],
+        *[("1.#INF", np.inf), ("-1.#INF00", -np.inf), ("-inf", -np.inf), ("Infinity", np.inf)],
+    ],
+)
+def test_numbers_of_windows_that_are_none_are_read(word: str, value: float) -> None:
+    given = columns()
+    given["y"][2] = value
+    data = by_hand.ply(columns(), text=True)
+    lines = data.split(b"\n")
+    words = lines[-4].split()
+    words[1] = word.encode()
+    lines[-4] = b" ".join(words)
+    np.testing.assert_array_equal(decode(b"\n".join(lines)).splats.center, decode(by_hand.ply(given)).splats.center)
 
 
 def edited(old: str, new: str, data: bytes | None = None) -> bytes:
@@ -232,6 +413,8 @@ REFUSED: dict[str, tuple[Callable[[], bytes], str]] = {
     "a short row": (lambda: TEXT[:-3].rsplit(b" ", 2)[0], "bad PLY data"),
     "rows of spaces": (lambda: TEXT[: TEXT.index(b"end_header") + 11] + (b" " * 60 + b"\n") * 5, "an empty line"),
     "a word": (lambda: TEXT[:-5] + b" nul\n", "bad PLY data"),
+    "a word like none": (lambda: TEXT[:-5] + b" 1.#2.5\n", "bad PLY data"),
+    "two words in one": (lambda: TEXT[:-5] + b" nan(ind)2\n", "bad PLY data"),
 }
 
 
