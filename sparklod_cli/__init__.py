@@ -18,11 +18,14 @@ from typing import Any
 
 __version__ = "0.2.0"
 
+# By the loader, as the package may be in a zip.
+_stubs = __spec__.loader.get_data(str(Path(__file__).with_suffix(".pyi"))).decode()  # type: ignore[union-attr]
+
 #: Module of each public name, as `__init__.pyi` has it. It is imported when the name is first used (PEP 562), so that
 #: importing the package loads neither numpy nor numba.
 _HOMES = {
     words[3]: words[1]
-    for words in map(str.split, Path(__file__).with_suffix(".pyi").read_text("utf-8").splitlines())
+    for words in map(str.split, _stubs.splitlines())
     if words[:1] == ["from"] and words[1].startswith(".")
 }
 

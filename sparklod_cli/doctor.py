@@ -147,8 +147,9 @@ def _print_kernels() -> None:
     from .support import jit
 
     jit.load_numba()
+    folder = jit.CACHE_FOLDER or next(iter(jit.READ_FOLDERS), None)
     about = {
-        "folder": None if jit.CACHE_FOLDER is None else str(jit.CACHE_FOLDER.resolve()),
+        "folder": None if folder is None else str(folder.resolve()),
         "wanted": len(warmup.units()),
         "missing": len(warmup.missing()),
     }

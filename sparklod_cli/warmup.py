@@ -44,12 +44,8 @@ class Unit(NamedTuple):
     @property
     def is_cached(self) -> bool:
         """Whether the cache has its machine code."""
-        folder = jit.CACHE_FOLDER
-        if folder is None:
-            return False
-        return KernelCache(self.kernel.py_func, folder, jit.report_trouble).is_cached(
-            self.kernel.signatures[self.number]
-        )
+        cache = KernelCache(self.kernel.py_func, jit.CACHE_FOLDER, jit.READ_FOLDERS, jit.report_trouble)
+        return cache.is_cached(self.kernel.signatures[self.number])
 
 
 def units() -> list[Unit]:
@@ -82,11 +78,11 @@ def warm_up(*, processes: int, progress: Progress = silent) -> int:
     Raises:
         SparklodError: no cache can be written, or a kernel cannot be compiled.
     """
-    if jit.CACHE_FOLDER is None:
-        raise SparklodError("no cache can be written; set NUMBA_CACHE_DIR to a folder that can be written")
     wanted = missing()
     if not wanted:
         return 0
+    if jit.CACHE_FOLDER is None:
+        raise SparklodError("no cache can be written; set NUMBA_CACHE_DIR to a folder that can be written")
     # A module's kernels share code, which one process compiles once.
     modules = [list(group) for _, group in itertools.groupby(wanted, lambda unit: unit.kernel.__module__)]
     left, cache = iter(modules), jit.CACHE_FOLDER.parent.resolve()

@@ -49,10 +49,11 @@ def warmup(ctx: click.Context, /, **_: Any) -> None:
         start = time.perf_counter()
         compiled = warm_up(processes=options.jobs, progress=console.progress)
         seconds = time.perf_counter() - start
+        folder = jit.CACHE_FOLDER or jit.READ_FOLDERS[0]
         console.say(
-            f"compiled {count_of(compiled, 'kernel')} in {seconds:.1f} s, kept in {jit.CACHE_FOLDER}"
+            f"compiled {count_of(compiled, 'kernel')} in {seconds:.1f} s, kept in {folder}"
             if compiled
-            else f"all kernels are in {jit.CACHE_FOLDER}"
+            else f"all kernels are in {folder}"
         )
         if options.as_json:
-            print_json({"compiled": compiled, "seconds": round(seconds, 2), "cache": str(jit.CACHE_FOLDER)})
+            print_json({"compiled": compiled, "seconds": round(seconds, 2), "cache": str(folder)})

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import functools
 import os
+import sys
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,15 +13,18 @@ from types import ModuleType
 from typing import Any
 
 from .jit_types import as_declared, example
-from .kernel_cache import SETTINGS, Trouble, cache_folder
-from .threads import run_ranges
+from .kernel_cache import Trouble, cache_folders
+from .threads import MOST_THREADS, run_ranges
 
 #: Called with the name of a kernel when its compilation begins, and with its duration in seconds when it ends.
 Begun = Callable[[str], None]
 Done = Callable[[float], None]
 
-#: The folder for compiled code; None if kernels have to be compiled in every process.
-CACHE_FOLDER = cache_folder(Path(__file__))
+#: The folder for compiled code, None if none can be written; and folders of compiled code that is only read.
+CACHE_FOLDER, READ_FOLDERS, _distrusted = cache_folders(Path(__file__))
+
+#: File of settings that numba reads in the current folder.
+SETTINGS = Path(".numba_config.yaml")
 
 
 def prefetch(array: Any, index: int) -> None:
@@ -83,6 +88,7 @@ class Kernel:
     @functools.cached_property
     def signatures(self) -> list[tuple[Any, ...]]:
         """Numba's types of the arguments of each declared signature, as `dispatcher.compile` takes them."""
+        load_numba()
         import numba
 
         first = (numba.int64,) if self.options.ranges else ()  # a range has two ends, its number of rows is declared
@@ -137,30 +143,59 @@ def _is_disabled() -> bool:
         return False
 
 
+def check_numba_settings() -> None:
+    """Refuse settings that numba would read when it is imported, unless it has been.
+
+    A file of settings can name libraries, which numba loads. The current folder may be somebody else's: an unpacked
+    archive, a shared folder.
+
+    Raises:
+        SparklodError: there is such a file, or a variable has a value that numba cannot use.
+    """
+    if "numba" in sys.modules:
+        return
+    from .errors import SparklodError  # here, so that no kernel depends on its source
+
+    if os.path.lexists(SETTINGS):
+        raise SparklodError(
+            f"{SETTINGS} in the current folder can have numba load other programs' code; remove it, or work in another"
+            " folder; NUMBA_ variables of the environment have the same effect"
+        )
+    if (threads := os.environ.get("NUMBA_NUM_THREADS")) is None:
+        return
+    if not threads.strip():  # such as $SLURM_CPUS_PER_TASK outside of a job
+        del os.environ["NUMBA_NUM_THREADS"]
+    elif not (threads.isdecimal() and 1 <= int(threads) <= MOST_THREADS):
+        raise SparklodError(
+            f"NUMBA_NUM_THREADS is {threads[:40]!r}; set it to a whole number from 1 to {MOST_THREADS:,}, or unset it"
+        )
+
+
+@functools.cache
 def load_numba() -> ModuleType:
     """Import `jit_numba` and, with it, numba.
 
     Raises:
         ImportError: numba is missing or broken.
         MemoryError: LLVM does not fit into memory.
-        SparklodError: numba's settings in the current folder are malformed.
+        SparklodError: see `check_numba_settings`.
     """
+    check_numba_settings()
     try:
-        from . import jit_numba
+        with warnings.catch_warnings(record=True) as caught:
+            from . import jit_numba
     except ImportError:
         raise
-    except Exception as error:  # of the parser, or of numba where values are of no type that it knows
+    except Exception as error:
         reasons = f"{error} {error.__cause__} {error.__context__}"  # llvmlite: its library is not there
         if "failed to map segment" in reasons or "annot allocate memory" in reasons:
             raise MemoryError from error
-        if not SETTINGS.exists():
-            raise
-        from .errors import SparklodError  # here, so that no kernel depends on its source
-
-        raise SparklodError(
-            f"{SETTINGS} in the current folder, which numba reads, is malformed"
-            f" ({' '.join(str(error).split())}); correct it, remove it, or work in another folder"
-        ) from None
+        raise
+    for warning in caught:
+        if warning.category is RuntimeWarning:  # of a variable; a traceback follows
+            report_trouble(" ".join(str(warning.message).partition("\n")[0].split()))
+    for text in _distrusted:
+        report_trouble(text)
     return jit_numba
 
 

@@ -85,8 +85,8 @@ def _has_wrapper(kernel: jit.Kernel) -> bool:
 
 def _keep(dispatcher: Any, function: Callable[..., Any]) -> None:
     """Have a dispatcher keep machine code in the cache."""
-    if jit.CACHE_FOLDER is not None:
-        dispatcher._cache = KernelCache(function, jit.CACHE_FOLDER, jit.report_trouble)
+    if jit.CACHE_FOLDER is not None or jit.READ_FOLDERS:
+        dispatcher._cache = KernelCache(function, jit.CACHE_FOLDER, jit.READ_FOLDERS, jit.report_trouble)
 
 
 class _ApartCompiler(Compiler):

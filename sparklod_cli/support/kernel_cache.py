@@ -1,4 +1,7 @@
-"""The cache of compiled kernels, which survives damage, full disks and races between processes."""
+"""The cache of compiled kernels, which survives damage, full disks and races between processes.
+
+Its files are pickles: whoever writes one runs code as its reader. See `is_trusted` for those that are read.
+"""
 
 from __future__ import annotations
 
@@ -8,10 +11,11 @@ import hashlib
 import os
 import pickle
 import re
+import stat
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 PACKAGE = Path(__file__).parents[1]
 
@@ -34,8 +38,11 @@ NEUTRAL = (
     "NUMBA_THREADING_LAYER_PRIORITY",
 )
 
-#: File of settings that numba reads in the working directory.
-SETTINGS = Path(".numba_config.yaml")
+#: Permissions of new folders: others can read what the superuser compiled for them, and would not trust anybody else.
+SHARED, OWN = 0o755, 0o700
+
+#: Permissions to write that users have who are not the owner.
+OTHERS = 0o022
 
 #: An import of another module of the package at the top level of a module: dots, module, names.
 _IMPORT = re.compile(rb"^from (\.+)([\w.]*) import (\([^)]*\)|[^\n#]*)", re.MULTILINE)
@@ -73,26 +80,70 @@ def digest_of(paths: Iterable[Path]) -> str:
     return hashlib.sha256(b"".join(_content(path) for path in sorted(paths))).hexdigest()[:16]
 
 
-def cache_folder(source: Path) -> Path | None:
-    """Create the folder for compiled code and return it; None if none is writable.
+class CacheFolders(NamedTuple):
+    """Folders for compiled code.
 
-    It is in NUMBA_CACHE_DIR or, where that is not set, in the package, or in the user's cache directory.
+    Attributes:
+        written: where new code is stored, and read first; None if no folder can be written.
+        read: folders that can be read only, such as those of a read-only image.
+        distrusted: a message for each folder that other users can write, which is not used.
+    """
+
+    written: Path | None
+    read: tuple[Path, ...] = ()
+    distrusted: tuple[str, ...] = ()
+
+
+def cache_folders(source: Path) -> CacheFolders:
+    """Return the folders for compiled code, and create the one for new code.
+
+    They are in NUMBA_CACHE_DIR or, where that is not set, in the package and in the user's cache directory.
 
     Args:
-        source: module that compiles. The name of the folder is a digest of it and of all that it imports.
+        source: module that compiles. The name of the folders is a digest of it and of all that it imports.
     """
+    if not source.is_file():
+        return CacheFolders(None)  # in a zip: there is no source to make a digest of
     given = os.environ.get("NUMBA_CACHE_DIR")
     places = [Path(given)] if given else [PACKAGE / "__pycache__"]
     if not given:
         with contextlib.suppress(RuntimeError):  # no home directory
             places.append(Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sparklod")
+    read, distrusted = list[Path](), list[str]()
     for place in places:
         folder = place / f"kernels-{digest_of(sources_of(source))}"
         with contextlib.suppress(OSError):
-            folder.mkdir(parents=True, exist_ok=True)
-            if os.access(folder, os.W_OK):
-                return folder
-    return None
+            place.mkdir(parents=True, exist_ok=True)
+            folder.mkdir(SHARED if _user() == 0 else OWN, exist_ok=True)
+        with contextlib.suppress(OSError):
+            if not is_trusted(folder):
+                distrusted.append(_distrusting(folder))
+            elif os.access(folder, os.W_OK):
+                return CacheFolders(folder, tuple(read), tuple(distrusted))
+            else:
+                read.append(folder)
+    return CacheFolders(None, tuple(read), tuple(distrusted))
+
+
+def _distrusting(folder: Path) -> str:
+    return (
+        f"compiled code in {folder} is not used: another user owns it or can write it; remove it, or set"
+        " NUMBA_CACHE_DIR to a folder of your own"
+    )
+
+
+def _user() -> int | None:
+    """Return the number of the user; None on systems where files have no owners."""
+    return os.geteuid() if hasattr(os, "geteuid") else None
+
+
+def is_trusted(path: Path) -> bool:
+    """Return True if only this user, the superuser or the owner of the package can have written a file or folder.
+
+    The owner of the package need not be distrusted, as its code runs anyway.
+    """
+    status, user = path.stat(), _user()
+    return user is None or (status.st_uid in (0, user, PACKAGE.stat().st_uid) and not status.st_mode & OTHERS)
 
 
 def stem_of(function: Callable[..., Any]) -> str:
@@ -122,9 +173,8 @@ def _machine() -> str:
         except RuntimeError:  # LLVM does not know them, and numba does not use them
             features = ""
     variables = {key: value for key, value in os.environ.items() if key.startswith("NUMBA_") and key not in NEUTRAL}
-    settings = SETTINGS.read_bytes() if SETTINGS.is_file() else b""
     host = binding.get_process_triple(), name, features
-    return _digest(host, sorted(variables.items()), settings, numba.__version__, sys.version)
+    return _digest(host, sorted(variables.items()), numba.__version__, sys.version)
 
 
 def _digest(*values: Any) -> str:
@@ -152,17 +202,32 @@ class KernelCache:
 
     Args:
         function: the Python function.
-        folder: folder of the files.
+        folder: where files are written, and read first; None if no folder can be written.
+        read: further folders, which are only read.
         trouble: called with a one-line message if the cache cannot be used.
     """
 
-    def __init__(self, function: Callable[..., Any], folder: Path, trouble: Trouble) -> None:
-        self._function, self._folder, self._trouble = function, folder, trouble
+    def __init__(
+        self, function: Callable[..., Any], folder: Path | None, read: Sequence[Path], trouble: Trouble
+    ) -> None:
+        self._function, self._folder, self._read, self._trouble = function, folder, read, trouble
         self.cache_path = str(folder)
 
-    def path(self, signature: Any) -> Path:
-        """Return the file for a signature, which is a tuple of numba's types."""
-        return self._folder / f"{start_of(self._function)}-{_digest(str(signature))}{SUFFIX}"
+    def name(self, signature: Any) -> str:
+        """Return the name of the file for a signature, which is a tuple of numba's types."""
+        return f"{start_of(self._function)}-{_digest(str(signature))}{SUFFIX}"
+
+    def _content(self, signature: Any) -> tuple[Path, bytes] | None:
+        """Return the first file for a signature that can be read and trusted, and its content."""
+        name = self.name(signature)
+        for folder in (*([] if self._folder is None else [self._folder]), *self._read):
+            path = folder / name
+            with contextlib.suppress(OSError):
+                if path.is_file():  # not a pipe or a device
+                    if is_trusted(path) or not folder.stat().st_mode & (stat.S_IXGRP | stat.S_IXOTH):
+                        return path, path.read_bytes()
+                    self._trouble(_distrusting(folder))
+        return None
 
     def load_overload(self, signature: Any, target_context: Any) -> Any:
         """Load the compiled function; return None if it has to be compiled."""
@@ -170,13 +235,10 @@ class KernelCache:
 
         from .errors import out_of_memory  # here, so that no kernel depends on its source
 
-        path = self.path(signature)
-        try:
-            content = path.read_bytes() if path.is_file() else None  # not a pipe or a device
-        except OSError:
-            content = None
-        if content is None:
+        found = self._content(signature)
+        if found is None:
             return None
+        path, content = found
         target_context.refresh()
         try:
             if is_whole(content):
@@ -192,15 +254,15 @@ class KernelCache:
 
     def save_overload(self, signature: Any, compiled: Any) -> None:
         """Write a compiled function to its file, if it can be cached."""
-        if compiled.lifted or compiled.library.has_dynamic_globals:
+        if self._folder is None or compiled.lifted or compiled.library.has_dynamic_globals:
             return
         from numba.core.serialize import dumps
 
         from . import atomic  # here, so that no kernel depends on its source
 
-        path, content = self.path(signature), dumps(compiled._reduce())
+        path, content = self._folder / self.name(signature), dumps(compiled._reduce())
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
+            path.parent.mkdir(OWN, parents=True, exist_ok=True)  # another process may have removed it
             atomic.write(path, [_checksum(content), content], overwrite=True)
         except OSError as error:
             reason = (error.strerror or str(error)).lower()
@@ -208,7 +270,5 @@ class KernelCache:
 
     def is_cached(self, signature: Any) -> bool:
         """Return True if there is a whole file for a signature."""
-        with contextlib.suppress(OSError):
-            path = self.path(signature)
-            return path.is_file() and is_whole(path.read_bytes())
-        return False
+        found = self._content(signature)
+        return found is not None and is_whole(found[1])

@@ -6,8 +6,16 @@ a module. Its option `-P` is unknown to Python 3.10, and `-I` ignores PYTHONPATH
 
 from __future__ import annotations
 
+import contextlib
+import os
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+
+from .errors import SparklodError
+
+#: Variable by which Python 3.11 and its children search the current folder for no module.
+SAFE_PATH = "PYTHONSAFEPATH"
 
 
 def program_command(program: str) -> list[str]:
@@ -20,3 +28,29 @@ def module_command(name: str, *arguments: str) -> list[str]:
     """Return the command line that runs a module as `python -m` does, or a package that has a `__main__`."""
     program = f"import runpy; runpy.run_module({name!r}, run_name='__main__', alter_sys=True)"
     return [*program_command(program), *arguments]
+
+
+@contextlib.contextmanager
+def without_current_folder() -> Iterator[None]:
+    """Have processes that other packages start by `python -c` search the current folder for no module.
+
+    Those of `multiprocessing` get the folders of this process later, after modules of the standard library.
+
+    Raises:
+        SparklodError: Python 3.10 would execute a file in the current folder.
+    """
+    if sys.version_info < (3, 11):
+        for path in Path().iterdir():
+            name = path.name.partition(".")[0]
+            is_module = path.suffix in (".py", ".pyc", ".so", ".pyd") or (path / "__init__.py").exists()
+            if is_module and name in sys.stdlib_module_names:
+                raise SparklodError(f"Python 3.10 would execute {path} of the current folder; work in another folder")
+    before = os.environ.get(SAFE_PATH)
+    os.environ[SAFE_PATH] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[SAFE_PATH]
+        else:
+            os.environ[SAFE_PATH] = before

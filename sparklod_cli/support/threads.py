@@ -22,6 +22,9 @@ PARALLEL_ROWS = 4096
 #: Chosen: a range costs some 10 microseconds.
 RANGES = 8
 
+#: Largest NUMBA_NUM_THREADS. Chosen: more than machines have processors, fewer than systems refuse to start.
+MOST_THREADS = 1024
+
 #: The number of threads of each Python thread, as `count`; not set where it is `most_threads`.
 _setting = threading.local()
 

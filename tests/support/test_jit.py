@@ -20,7 +20,7 @@ import pytest
 from sparklod_cli.support import jit
 from sparklod_cli.support.jit import prefetch as jit_prefetch
 from sparklod_cli.support.jit_types import Type, as_declared, b1, example, f4, fields, i8, out, u2, u4
-from sparklod_cli.support.kernel_cache import cache_folder, sources_of
+from sparklod_cli.support.kernel_cache import cache_folders, sources_of
 from sparklod_cli.warmup import Unit, units
 from tests.conftest import ROOT
 
@@ -38,11 +38,12 @@ def test_a_kernel_works_where_no_cache_can_be_written(monkeypatch: pytest.Monkey
 
 def test_the_cache_is_where_the_environment_says(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "given"))
-    given = cache_folder(Path(jit.__file__))
+    given = cache_folders(Path(jit.__file__)).written
     assert given is not None
     assert given.parent == tmp_path / "given"
     monkeypatch.setenv("NUMBA_CACHE_DIR", "/dev/null/no/folder")
-    assert cache_folder(Path(jit.__file__)) is None
+    assert cache_folders(Path(jit.__file__)) == (None, (), ())
+    assert cache_folders(Path(jit.__file__).parent / "not-there.py") == (None, (), ())  # as in a zip
 
 
 def imported(path: Path) -> set[Path]:
@@ -165,20 +166,41 @@ def test_kernels_run_without_compilation() -> None:
     assert float(done.stdout) == pytest.approx(12.566, abs=1e-3)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("content", [b"a: [b\n", b"- a\n", b"\xff\xfe"])
-def test_malformed_settings_of_numba_are_an_error_that_names_them(content: bytes, tmp_path: Path) -> None:
-    pytest.importorskip("yaml")  # without which numba reads no settings
-    (tmp_path / ".numba_config.yaml").write_bytes(content)
-    code = (
-        "import sys; sys.path.insert(0, sys.argv[1]); from sparklod_cli.support import errors, jit\n"
-        "try: jit.load_numba()\n"
-        "except errors.SparklodError as error: print(error)"
-    )
-    command = [sys.executable, "-c", code, str(ROOT)]
-    said = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True).stdout
-    assert said.startswith(".numba_config.yaml in the current folder, which numba reads, is malformed (")
-    assert said.count("\n") == 1
+LOADS = """
+import sys
+sys.path.insert(0, sys.argv[1])
+from sparklod_cli.support import errors, jit
+try:
+    jit.load_numba()
+except errors.SparklodError as error:
+    print(error)
+else:
+    print("loaded")
+"""
+
+
+def loaded(folder: Path, **variables: str) -> str:
+    """What a process in a folder says of loading numba, in one line."""
+    command = [sys.executable, "-c", LOADS, str(ROOT)]
+    environment = {**os.environ, **variables}
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=True)
+    assert (done.stdout.count("\n"), done.stderr) == (1, "")
+    return done.stdout.strip()
+
+
+def test_settings_of_numba_in_the_current_folder_are_refused(tmp_path: Path) -> None:
+    (tmp_path / ".numba_config.yaml").write_text("CUDA_DRIVER: ./a.so\n")
+    assert loaded(tmp_path).startswith(".numba_config.yaml in the current folder can have numba load")
+
+
+@pytest.mark.parametrize("threads", ["0", "-1", "abc", "1.5", "100000"])
+def test_a_number_of_threads_that_numba_cannot_use_is_named(threads: str, tmp_path: Path) -> None:
+    assert loaded(tmp_path, NUMBA_NUM_THREADS=threads).startswith(f"NUMBA_NUM_THREADS is '{threads}'; set it to")
+
+
+@pytest.mark.parametrize("variables", [{"NUMBA_NUM_THREADS": ""}, {"NUMBA_NUM_THREADS": "1"}, {"NUMBA_OPT": "abc"}])
+def test_other_settings_of_numba_print_no_traceback(variables: dict[str, str], tmp_path: Path) -> None:
+    assert loaded(tmp_path, **variables) == "loaded"
 
 
 def test_compilations_are_reported_but_not_nested_ones(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,9 +14,9 @@ from typing import Any
 
 import pytest
 
-from sparklod_cli.support import atomic, jit
+from sparklod_cli.support import atomic, jit, kernel_cache
 from sparklod_cli.support.jit_types import f8
-from sparklod_cli.support.kernel_cache import SUFFIX, is_whole, start_of
+from sparklod_cli.support.kernel_cache import SUFFIX, cache_folders, is_trusted, is_whole, start_of
 from sparklod_cli.warmup import units
 from tests.conftest import ROOT
 
@@ -95,21 +95,83 @@ print(kernel_cache.start_of(fast_math.exp2.py_func))
     assert start() != start("another")
 
 
-def test_settings_in_a_file_for_numba_count(tmp_path: Path) -> None:
-    code = """
-from pathlib import Path
-from sparklod_cli.support import fast_math, kernel_cache
-print(kernel_cache.start_of(fast_math.exp2.py_func))
-"""
-    found = []
-    for settings in ("", "opt: 1\n"):
-        if settings:
-            (tmp_path / ".numba_config.yaml").write_text(settings)
-        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-        command = [sys.executable, "-c", code]
-        done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
-        found.append(done.stdout)
-    assert found[0] != found[1]
+posix = pytest.mark.skipif(os.name != "posix", reason="POSIX only")
+
+
+@posix
+@pytest.mark.parametrize("mode", [0o777, 0o775, 0o707])
+def test_a_folder_that_others_can_write_is_not_used(mode: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    folder = cache_folders(Path(jit.__file__)).written
+    assert folder is not None
+    folder.chmod(mode)
+    written, read, (message,) = cache_folders(Path(jit.__file__))
+    assert (written, read) == (None, ())
+    assert message.startswith(f"compiled code in {folder} is not used: another user owns it or can write it")
+    folder.chmod(0o755)
+    assert cache_folders(Path(jit.__file__)) == (folder, (), ())
+
+
+@posix
+@pytest.mark.parametrize(("user", "owner", "trusted"), [(7, 0, True), (7, 7, True), (7, 8, False), (0, 7, False)])
+def test_what_another_user_owns_is_not_trusted(
+    user: int, owner: int, trusted: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if os.geteuid() != 0:
+        pytest.skip("only root can give files away")
+    (tmp_path / "file").touch(0o644)
+    os.chown(tmp_path / "file", owner, owner)
+    monkeypatch.setattr(os, "geteuid", lambda: user)
+    assert is_trusted(tmp_path / "file") is trusted
+    monkeypatch.setattr(kernel_cache, "PACKAGE", tmp_path / "package")
+    (tmp_path / "package").mkdir()
+    os.chown(tmp_path / "package", owner, owner)
+    assert is_trusted(tmp_path / "file")
+
+
+@posix
+def test_a_new_folder_is_readable_by_others_only_if_the_superuser_made_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for user, mode in ((0, 0o755), (os.geteuid() or 7, 0o700)):
+        monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / str(user)))
+        monkeypatch.setattr(os, "geteuid", lambda user=user: user)
+        cache_folders(Path(jit.__file__))
+        (folder,) = (tmp_path / str(user)).iterdir()
+        assert folder.stat().st_mode & 0o777 == mode
+
+
+@posix
+@pytest.mark.parametrize(("folder", "is_read"), [(0o700, True), (0o755, False)])
+def test_a_file_that_others_can_write_is_not_read_unless_they_cannot_reach_it(
+    folder: int, is_read: bool, cache: Cache
+) -> None:
+    assert cache.compiles()
+    cache.folder.chmod(folder)
+    for path in cache.files():
+        path.chmod(0o666)
+    assert cache.compiles() is not is_read
+    assert bool(cache.told) is not is_read
+
+
+def test_a_cache_that_can_only_be_read_is_read(cache: Cache, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert cache.compiles()
+    monkeypatch.setattr(jit, "CACHE_FOLDER", None)
+    assert cache.compiles()
+    monkeypatch.setattr(jit, "READ_FOLDERS", (cache.folder,))
+    before = cache.files()
+    assert not cache.compiles()
+    assert cache.compiles(2)  # another signature, which is stored nowhere
+    assert (cache.files(), cache.told) == (before, [])
+
+
+@posix
+def test_a_folder_that_cannot_be_written_is_read_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    folder = cache_folders(Path(jit.__file__)).written
+    assert folder is not None
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    assert cache_folders(Path(jit.__file__)) == (None, (folder,), ())
 
 
 def test_memory_that_runs_out_is_no_damage(cache: Cache, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -11,13 +12,17 @@ import pytest
 
 import sparklod_cli
 from sparklod_cli import doctor
-from sparklod_cli.support.python_process import module_command, program_command
+from sparklod_cli.support.errors import SparklodError
+from sparklod_cli.support.python_process import module_command, program_command, without_current_folder
 from tests.conftest import ROOT
 
 pytestmark = pytest.mark.slow
 
 #: Modules of each kind that a process may import: of the package, of the standard library, and of others.
-PLANTED = ("sparklod_cli", "json", "runpy", "numpy", "numba", "moderngl", "open3d", "vtkmodules", "imageio_ffmpeg")
+PLANTED = (
+    *("sparklod_cli", "json", "runpy", "multiprocessing", "pickle", "numpy", "numba", "dask", "distributed"),
+    *("moderngl", "open3d", "vtkmodules", "imageio_ffmpeg"),
+)
 
 
 def probe_opengl() -> None:
@@ -58,8 +63,17 @@ def start_warmup() -> None:
     )
 
 
+def start_workers() -> None:
+    pytest.importorskip("distributed")
+    from sparklod_cli.bake.out_of_core.cluster import ClusterSettings, cluster
+
+    with cluster(ClusterSettings(workers=1, threads=1)):
+        pass
+
+
 #: All that starts a process of Python, by the module that does.
 STARTED: dict[str, list[Callable[[], object]]] = {
+    "bake/out_of_core/cluster": [start_workers],
     "doctor": [check_kernels, find_ffmpeg],
     "figures/pyvista_scene": [probe_pyvista],
     "render/gl/context": [probe_opengl],
@@ -79,6 +93,27 @@ def test_nothing_in_the_current_folder_is_executed(
     monkeypatch.chdir(tmp_path)
     start()
     assert not (tmp_path / "executed").exists(), (tmp_path / "executed").read_text()
+
+
+def test_python_dash_m_does_not_execute_the_current_folder(tmp_path: Path) -> None:
+    (tmp_path / "numpy.py").write_text(f"open({str(tmp_path / 'executed')!r}, 'w')")
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    scene = str(ROOT / "fixtures" / "sh1-ascii.ply")
+    command = [sys.executable, "-m", "sparklod_cli", "inspect", scene]
+    subprocess.run(command, cwd=tmp_path, env=environment, check=True, capture_output=True)
+    assert not (tmp_path / "executed").exists()
+
+
+@pytest.mark.skipif(sys.version_info >= (3, 11), reason="Python 3.11 has PYTHONSAFEPATH")
+def test_python_3_10_refuses_a_folder_that_its_workers_would_execute(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with without_current_folder():
+        pass
+    (tmp_path / "multiprocessing.py").touch()
+    with pytest.raises(SparklodError, match=r"would execute multiprocessing\.py"), without_current_folder():
+        pass
 
 
 def test_every_process_of_python_is_started_in_this_way() -> None:

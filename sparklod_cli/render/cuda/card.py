@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...support.jit import check_numba_settings
 from ...support.optional import optional_import
 from ..backends import BackendError
 
@@ -51,6 +52,7 @@ def find_card() -> Card:
     Raises:
         BackendError: there is none, or it cannot be used; in one line that says why.
     """
+    check_numba_settings()
     with optional_import("the device cuda takes numba-cuda", "cuda", BackendError):
         from numba import cuda
     from ...support.jit_cuda import SIMULATED
