@@ -6,23 +6,27 @@ A zip has `NAME/data.pkl`, a pickle that describes tensors, and `NAME/data/KEY`,
 
 from __future__ import annotations
 
+import math
 import zipfile
-from collections.abc import Callable, Mapping
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, BinaryIO
 
 import numpy as np
 
 from ..model.gaussian import normalized_quat
-from ..model.sh import COEFFICIENTS
+from ..model.sh import COEFFICIENTS, notes_on_degree
 from ..model.splats import FloatArray
+from ..support.defaults import MAX_SH_DEGREE
 from ..support.errors import FormatError, NotSplatsError, TruncatedError
 from ..support.parallel import blocks_of, ordered_map
 from ..support.progress import Progress
 from ..support.untrusted import ZIP_ERRORS, quoted, quoted_value
 from . import quantize
 from .content import Content, Source, Target
-from .stream import Positioned
+from .left_out import HARMLESS, left_out
+from .stream import Positioned, size_of
 from .tensor_pickle import Tensor, unpickled
 
 #: Bytes of data.pkl at most. That of nerfstudio, with the state of its optimisers, has some 50,000. Chosen.
@@ -37,6 +41,10 @@ LOCAL_HEADER, LENGTHS = 30, slice(26, 30)
 
 #: Where nerfstudio has the tensors in "pipeline", the newest first.
 PREFIXES = ("_model.gauss_params.", "_model.")
+
+#: Entries of a checkpoint, and parts of names of tensors, that belong to the training and not to the scene.
+TRAINING = {"optimizer", "optimizers", "scheduler", "schedulers", "scaler", "scalers", "strategy_state"}
+TRAINING |= {"psnr", "ssim", "lpips", "device_indicator", "device_indicator_param"}
 
 
 @dataclass(frozen=True)
@@ -97,22 +105,25 @@ def open_content(source: Source) -> Content:
         FormatError: the file is cut short or corrupt, has no splats, or tensors of other shapes or types.
     """
     archive = _TensorArchive(source.file)
-    tensors, program = _tensors_of(archive.root())
+    root = archive.root()
+    tensors, program = _tensors_of(root)
     missing = [each.names[program] for each in COLUMNS if each.names[program] not in tensors]
     if missing:
-        raise FormatError(f"its splats have no {', '.join(missing)}, as trainings with another colour model")
+        why = ", as trainings with another colour model" if {*missing} <= {"sh0", "shN"} else ""
+        raise FormatError(f"its splats have no {', '.join(missing)}{why}")
     count = tensors[COLUMNS[0].names[program]].size[:1]
     stored = []
     for each in COLUMNS:
         name = each.names[program]
         tensor = tensors[name]
-        values = int(np.prod(tensor.size[1:], dtype=np.float64)) if tensor.size else 0
+        values = math.prod(tensor.size[1:]) if tensor.size else 0
         widths = [each.width] if each.width else [3 * terms for terms in COEFFICIENTS]
         if tensor.size[:1] != count or values not in widths:
             raise FormatError(f"its tensor {name} has the shape {tensor.size}, which is not one of splats")
         offset, pitch = archive.place_of(name, tensor)
         stored.append(_StoredColumn(each, np.dtype((tensor.type, (values,))), offset, pitch))
-    degree = COEFFICIENTS.index(values // 3)
+    degree, known = COEFFICIENTS.index(values // 3), {each.names[program] for each in COLUMNS} | HARMLESS
+    notes = notes_on_degree(degree) + left_out("tensor", "tensors", _others(root, known))
     positioned = Positioned(source.file)
     # Without SH nerfstudio trains logits of colours.
     decode_plain = quantize.decode_logit if program and not degree else None
@@ -124,13 +135,13 @@ def open_content(source: Source) -> Content:
                 out = getattr(target.splats, each.of.column)[part]
                 decode = decode_plain if decode_plain and each.of.column == "rgb" else each.of.decode
                 values = each.read(positioned, target.start + part.start, target.start + part.stop)
-                out[...] = decode(values).reshape(out.shape)
+                out[...] = decode(values[:, : math.prod(out.shape[1:])]).reshape(out.shape)  # no SH above degree 3
             return part
 
         for part in ordered_map(read, blocks_of(len(target.splats)), threads):
             progress("reading", part.stop, len(target.splats), "splat")
 
-    return Content(count[0], degree, "checkpoint", fill)
+    return Content(count[0], min(degree, MAX_SH_DEGREE), "checkpoint", fill, notes=notes)
 
 
 def _tensors_of(root: Any) -> tuple[Mapping[str, Tensor], int]:
@@ -139,29 +150,55 @@ def _tensors_of(root: Any) -> tuple[Mapping[str, Tensor], int]:
     if isinstance(splats, dict):
         return {name: each for name, each in splats.items() if isinstance(each, Tensor)}, 0
     entries = pipeline if isinstance(pipeline, dict) else {}
-    named = {str(name): each for name, each in entries.items() if isinstance(each, Tensor)}
     for prefix in PREFIXES:
-        found = {name.removeprefix(prefix): each for name, each in named.items() if name.startswith(prefix)}
+        found = {
+            name.removeprefix(prefix): each
+            for name, each in entries.items()
+            if isinstance(each, Tensor) and name.startswith(prefix)
+        }
         if "means" in found:
             return found, 1
     raise NotSplatsError("a checkpoint of PyTorch without splats of gsplat (splats) or nerfstudio (pipeline)")
+
+
+def _others(root: Mapping[str, Any], known: Collection[str]) -> Iterator[str]:
+    """Yield names for the tensors of a scene whose names are not known, one for all of a module."""
+    walked = set[int]()  # a pickle may have a dict in many places
+    for key, value in root.items():
+        entries = value if isinstance(value, dict) else {key: value}
+        if id(entries) in walked:
+            continue
+        walked.add(id(value))
+        for name, each in entries.items():
+            parts = name.removeprefix("_model.").removeprefix("gauss_params.").split(".")
+            label = parts[0] if key in ("splats", "pipeline") else key
+            is_of_scene = label not in known and TRAINING.isdisjoint((key, *parts))
+            if is_of_scene and isinstance(each, Tensor) and 0 not in each.size:
+                yield label
 
 
 class _TensorArchive:
     """The zip of a checkpoint.
 
     Raises:
-        FormatError: it is no zip.
+        FormatError: it is no zip, or has several pickles or members of one name.
     """
 
     def __init__(self, file: BinaryIO) -> None:
-        self._file = file
+        self._file, self._size = file, size_of(file)
         try:
             self._zip = zipfile.ZipFile(file)
-            self._names = set(self._zip.namelist())
+            names = Counter(self._zip.namelist())
         except ZIP_ERRORS as error:
             raise FormatError(f"not a complete zip archive: {quoted(error)}") from None
-        self._folder = next((name[: -len("data.pkl")] for name in self._names if name.endswith("/data.pkl")), "")
+        pickles = sum(count for name, count in names.items() if name.endswith("/data.pkl"))
+        if pickles > 1:
+            raise FormatError(f"its zip has {pickles:,} checkpoints; give each in a file of its own")
+        twice = next((name for name, count in names.items() if count > 1), None)
+        if twice is not None:
+            raise FormatError(f"corrupt: its zip has several members {quoted_value(twice)}")
+        self._names = names.keys()
+        self._folder = next((name[: -len("data.pkl")] for name in names if name.endswith("/data.pkl")), "")
 
     def _member(self, name: str) -> zipfile.ZipInfo:
         if self._folder + name not in self._names:
@@ -202,11 +239,12 @@ class _TensorArchive:
         """
         if tensor.type is None:
             raise FormatError(f"its tensor {name} has no numbers of 16, 32 or 64 bits with a point")
-        member, values = self._member(f"data/{tensor.key}"), int(np.prod(tensor.size, dtype=np.float64))
+        member, values = self._member(f"data/{tensor.key}"), math.prod(tensor.size)
         pitch, rows = tensor.pitch, tensor.size[0] if tensor.size else 1
         if pitch is None or pitch > MOST_PITCH:
             raise FormatError(f"the values of its tensor {name} are not in order; save it with .contiguous()")
         end = tensor.first + (values and (rows - 1) * pitch + values // rows)
-        if tensor.first < 0 or end * tensor.type.itemsize > member.file_size:
+        offset, size = self._offset(member), end * tensor.type.itemsize
+        if size > member.file_size or offset + size > self._size:
             raise TruncatedError(f"cut short, or corrupt: its tensor {name} announces {values:,} values")
-        return self._offset(member) + tensor.first * tensor.type.itemsize, pitch * tensor.type.itemsize
+        return offset + tensor.first * tensor.type.itemsize, pitch * tensor.type.itemsize

@@ -11,7 +11,7 @@ from ..support.printable import printable
 MOST_NAMED, MOST_NAME = 8, 40
 
 #: Properties that say nothing of a splat: normals, colours for viewers of point clouds, the state of an editor.
-HARMLESS = {"nx", "ny", "nz", "normal_x", "normal_y", "normal_z", "red", "green", "blue", "alpha", "state"}
+HARMLESS = {"nx", "ny", "nz", "normal_x", "normal_y", "normal_z", "normals", "red", "green", "blue", "alpha", "state"}
 
 #: Members of a family, names that count up, from which its first and last name stand for all.
 FAMILY = 3

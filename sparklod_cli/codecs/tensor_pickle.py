@@ -1,4 +1,9 @@
-"""Pickles that describe tensors of PyTorch, read as data: nothing that they name is imported or called."""
+"""Pickles that describe tensors of PyTorch, read as data: nothing that they name is imported or called.
+
+A pickle is a program for a stack machine. What one can bring about is bounded here: the number of its steps, each of
+which takes time in proportion to the bytes of its argument and the values that it takes from the stack, the axes of a
+tensor, and the size of a number. Texts and names are those that stand in the pickle, never made from other objects.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +15,15 @@ from typing import Any
 import numpy as np
 
 from ..support.errors import FormatError
+
+#: Steps of a pickle at most. That of nerfstudio, with the states of optimisers and metrics, takes some 15,000. Chosen.
+MOST_STEPS = 1 << 18
+
+#: Axes of a tensor at most; those of splats have three. Chosen.
+MOST_AXES = 8
+
+#: Bits of a number that means something: sizes, strides and offsets of PyTorch have 64.
+MOST_BITS = 64
 
 #: Types of numbers by PyTorch's names of storages.
 STORAGES: dict[str, np.dtype[Any]] = {
@@ -72,23 +86,34 @@ class _Global:
     name: str
 
 
+@dataclass(frozen=True)
+class _Storage:
+    """Numbers that a persistent identifier names; attributes as those of `Tensor`."""
+
+    type: np.dtype[Any] | None
+    key: str
+
+
 def unpickled(data: bytes) -> Any:
     """Return the object of a pickle: dicts, lists, tuples, plain values, tensors; other objects become None.
 
-    Entries of dicts whose keys are no texts or integers are left out.
+    Entries of dicts whose keys are no texts are left out. Lists and tuples may contain themselves, and each other many
+    times: do not walk through them.
 
     Raises:
-        FormatError: the pickle is corrupt, or has opcodes that PyTorch does not write.
+        FormatError: the pickle is corrupt, takes too many steps, or has opcodes that PyTorch does not write.
     """
     machine = _Machine()
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about strange escapes in texts
-            for opcode, argument, _ in pickletools.genops(data):
+            for step, (opcode, argument, _) in enumerate(pickletools.genops(data)):
                 if opcode.name == "STOP":
                     return machine.stack.pop()
+                if step == MOST_STEPS:
+                    raise FormatError(f"its pickle takes more than {MOST_STEPS:,} steps, which PyTorch does not write")
                 machine.run(opcode.name, argument)
-    except (IndexError, KeyError, TypeError, ValueError, OverflowError) as error:
+    except (IndexError, KeyError, ValueError) as error:  # of an empty stack, of an empty place, and of `pickletools`
         raise FormatError("corrupt: its pickle cannot be read") from error
     raise FormatError("corrupt: its pickle has no end")
 
@@ -105,7 +130,8 @@ class _Machine:
         """Carry out one opcode."""
         stack = self.stack
         if opcode in VALUES:
-            stack.append(argument)
+            is_long = type(argument) is int and argument.bit_length() > MOST_BITS
+            stack.append(None if is_long else argument)
         elif opcode in CONSTANTS:
             stack.append(CONSTANTS[opcode])
         elif opcode == "EMPTY_DICT":
@@ -127,7 +153,7 @@ class _Machine:
         elif opcode == "GLOBAL":
             stack.append(_Global(argument))
         elif opcode == "STACK_GLOBAL":
-            stack.append(_Global(" ".join(map(str, self._popped(2)))))
+            stack.append(_named(*self._popped(2)))
         elif opcode == "BINPERSID":
             stack.append(_storage(stack.pop()))
         elif opcode in ("REDUCE", "NEWOBJ"):
@@ -163,14 +189,20 @@ def _extend(container: Any, values: list[Any]) -> None:
         container.extend(values)
     elif isinstance(container, dict):
         pairs = zip(values[::2], values[1::2], strict=True)
-        container.update((key, value) for key, value in pairs if isinstance(key, (str, int)))
+        # Texts alone: their hashes are seeded, but those of integers can be made to collide.
+        container.update((key, value) for key, value in pairs if isinstance(key, str))
 
 
-def _storage(pid: Any) -> tuple[np.dtype[Any] | None, str] | None:
-    """Return type and key of the storage that a persistent identifier names."""
+def _named(module: Any, name: Any) -> _Global | None:
+    """Return a function or class by the texts of its module and name."""
+    return _Global(f"{module} {name}") if isinstance(module, str) and isinstance(name, str) else None
+
+
+def _storage(pid: Any) -> _Storage | None:
+    """Return the storage that a persistent identifier names."""
     if not (isinstance(pid, tuple) and len(pid) >= 3 and pid[0] == "storage" and isinstance(pid[1], _Global)):
         return None
-    return STORAGES.get(pid[1].name), str(pid[2])
+    return _Storage(STORAGES.get(pid[1].name), pid[2]) if isinstance(pid[2], str) else None
 
 
 def _called(function: Any, arguments: Any) -> Any:
@@ -178,13 +210,19 @@ def _called(function: Any, arguments: Any) -> Any:
     name = function.name if isinstance(function, _Global) else ""
     if name == "collections OrderedDict":
         return {}
+    if not isinstance(arguments, tuple):
+        return None
     if name == "torch._utils _rebuild_parameter":
         return arguments[0]
-    if name != "torch._utils _rebuild_tensor_v2":
+    return _tensor(*arguments[:4]) if name == "torch._utils _rebuild_tensor_v2" and len(arguments) >= 4 else None
+
+
+def _tensor(storage: Any, first: Any, size: Any, stride: Any) -> Tensor | None:
+    """Return a tensor by the arguments of its function; None for one of many axes."""
+    if not (isinstance(storage, _Storage) and isinstance(size, tuple) and isinstance(stride, tuple)):
+        raise ValueError("no storage, size or stride")
+    if len(size) > MOST_AXES:
         return None
-    storage, first, size, stride = arguments[:4]
-    numbers = (first, *size, *stride)
-    if storage is None or len(size) != len(stride) or not all(isinstance(each, int) and each >= 0 for each in numbers):
-        raise ValueError
-    kind, key = storage
-    return Tensor(kind, key, first, tuple(size), tuple(stride))
+    if len(size) != len(stride) or not all(type(each) is int and each >= 0 for each in (first, *size, *stride)):
+        raise ValueError("sizes that are no whole numbers")  # True is an instance of int
+    return Tensor(storage.type, storage.key, first, size, stride)
