@@ -22,6 +22,7 @@ SEED = 1
 #: Names of the targets; each is a module in `fuzz/targets/`.
 TARGETS = (
     "decoders",
+    "checkpoints",
     "trees",
     "builds",
     "outputs",

@@ -19,6 +19,7 @@ from fixtures import by_hand, by_hand_rad, by_hand_sog
 
 from .case import Rng
 from .mutate import INTEGERS, json_mutated, mutated, pick, text_mutated
+from .pickles import pickle_mutated
 
 FIXTURES = Path(__file__).resolve().parents[1] / "fixtures"
 
@@ -132,9 +133,11 @@ def mutated_scene(rng: Rng, data: bytes, other: bytes) -> tuple[str, bytes]:
 
 
 def mutated_part(rng: Rng, name: str, data: bytes) -> bytes:
-    """Changes a part of a splat file by its kind: the structure of JSON, the pixels of an image, a header's text."""
+    """Changes a part of a splat file by its kind: the structure of JSON, opcodes, the pixels of an image, or text."""
     if name.endswith(".json") and rng.integers(4):
         return json_mutated(rng, data)
+    if name.endswith("data.pkl") and rng.integers(8):
+        return pickle_mutated(rng, data)
     if name.endswith(".webp") and rng.integers(3):
         return _picture(rng, data)
     if name == "text" and rng.integers(3):
