@@ -118,7 +118,12 @@ class Selection:
             raise InvalidSplatsError("it has no splats")
         if tally.first_invalid is not None and not self.drop_invalid:
             counts = {kind: count for kind, count in tally.dropped.items() if kind in INVALID}
-            text = describe_counts(counts, tally.count, tally.first_invalid)
+            text, invalid = describe_counts(counts, tally.count, tally.first_invalid), sum(counts.values())
+            if 2 * invalid >= tally.count:
+                raise InvalidSplatsError(f"{text}: without them little of the scene is left, so export it again")
+            if not tally.selected:
+                others = {reason: count for reason, count in tally.dropped.items() if reason not in INVALID}
+                raise InvalidSplatsError(f"{text}, and no other splat is left ({describe(others)})")
             raise InvalidSplatsError(f"{text}, add --on-invalid drop to leave them out")
         if not tally.selected:
             raise InvalidSplatsError(f"no splat is left of {tally.count:,} ({describe(tally.dropped)})")

@@ -31,6 +31,26 @@ def test_values_that_are_not_finite_are_an_error_or_dropped(name: str, value: fl
     assert np.array_equal(kept.center, np.delete(splats.center, 4, axis=0))
 
 
+@pytest.mark.parametrize(("invalid", "advised"), [(1, True), (4, True), (5, False), (9, False), (10, False)])
+@pytest.mark.parametrize("kind", ["center", "scale"])
+def test_splats_are_left_out_by_advice_only_where_most_stay(invalid: int, advised: bool, kind: str) -> None:
+    splats = random_splats(10)
+    for row in range(invalid):
+        splats = with_value(splats, kind, row, -1 if kind == "scale" else np.nan)
+    with pytest.raises(InvalidSplatsError) as caught:
+        Selection().apply(splats)
+    assert ("--on-invalid drop" in str(caught.value)) is advised
+    assert ("export it again" in str(caught.value)) is not advised
+
+
+def test_no_advice_empties_a_scene() -> None:
+    splats = with_value(random_splats(10), "opacity", 3, np.nan)
+    with pytest.raises(InvalidSplatsError, match=r"1 of 10 .* and no other splat is left \(9 cropped\)$"):
+        Selection(min_box=(100, 100, 100)).apply(splats)
+    with pytest.raises(InvalidSplatsError, match="add --on-invalid drop to leave them out"):
+        Selection(min_box=tuple(splats.center[0].tolist()), max_box=tuple(splats.center[0].tolist())).apply(splats)
+
+
 def test_huge_finite_numbers_are_finite() -> None:
     splats = dataclasses.replace(random_splats(3), center=np.full((3, 3), 3e38, np.float32))
     kept, dropped = Selection().apply(splats)
