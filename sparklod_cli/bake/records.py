@@ -138,12 +138,14 @@ class WrittenSet(Losses):
 
     Attributes:
         splats, share: how many, and their share of full detail.
+        faint: number of merged splats whose opacity is too low to be drawn.
         psnr: mean over the cameras and a black and a white background, dB; None where it was not measured.
         refine: result of fitting it; None without `--refine`.
     """
 
     splats: int
     share: float
+    faint: int
     psnr: float | None
     refine: Refined | None
 

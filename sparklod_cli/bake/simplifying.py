@@ -19,11 +19,13 @@ from ..codecs.options import WriteOptions
 from ..fitting.settings import FitSettings
 from ..io.writing import SceneSink
 from ..lod.detail_levels import RefinementOrder, with_plain_opacity
+from ..model.falloff import MIN_ALPHA
 from ..model.scene import Scene
 from ..model.splats import Splats
 from ..support.errors import FormatError, SparklodError
 from ..support.progress import Progress
 from ..support.threads import on_threads
+from ..support.units import count_of
 from .output import BakeOutput, Encode
 from .records import BuiltTree, Clock, WrittenSet, WrittenTree
 from .refining import Refined, fit_settings, refined
@@ -143,9 +145,16 @@ class Fidelity:
 
 @dataclass(frozen=True)
 class Chosen:
-    """A simplified scene, with its PSNR and how it was fitted, where either was asked for."""
+    """A simplified scene.
+
+    Attributes:
+        faint: number of merged splats that no viewer draws: they stand for splats far apart, and what these cover
+            leaves hardly any opacity to one as large as all of them and the gaps between.
+        psnr, refine: PSNR and how the scene was fitted, where either was asked for.
+    """
 
     scene: Scene
+    faint: int
     psnr: float | None
     refine: Refined | None
 
@@ -189,12 +198,12 @@ class Simplifier:
             bytes_of: size of the file of a scene.
 
         Raises:
-            FormatError, SparklodError: see `count_for` and `Fidelity`.
+            FormatError, SparklodError: see `count_for` and `Fidelity`; or nothing could be seen of the cut.
             KeyboardInterrupt: see `refining.refined`.
         """
         assert tree.tree is not None
         progress("simplifying", 0, 1, "cut")
-        order = RefinementOrder(tree.splats, tree.tree)
+        order, is_leaf = RefinementOrder(tree.splats, tree.tree), tree.tree.is_leaf
         tree = dataclasses.replace(tree, splats=with_plain_opacity(tree.splats))
 
         def cut(count: int) -> Scene:
@@ -208,12 +217,20 @@ class Simplifier:
             psnr_of=lambda count: 0.0 if fidelity is None else fidelity.psnr(order.cut(count)),
             progress=progress,
         )
+        fixed, is_seen = order.cut(count), tree.splats.opacity >= MIN_ALPHA
+        faint = int(np.count_nonzero(~is_seen[fixed] & ~is_leaf[fixed]))
+        if faint and not is_seen[fixed].any() and is_seen[is_leaf].any():
+            raise SparklodError(
+                f"nothing could be seen of {count_of(len(fixed), 'splat')}: merged across wide gaps, their opacity is"
+                f" {tree.splats.opacity[fixed].max():.1g} at most, and viewers draw none"
+                f" below {MIN_ALPHA:.1g}; keep more splats"
+            )
         if self.refine is None:
-            return Chosen(cut(count), measured, None)
-        fixed = order.cut(count)
+            return Chosen(cut(count), faint, measured, None)
         fitted, report = refined(tree, self.refine, fixed=fixed, threads=threads, progress=progress, say=self.say)
         measured = None if fidelity is None else fidelity.fitted(fixed, fitted.splats)
-        return Chosen(dataclasses.replace(fitted, splats=fitted.splats.take(fixed), tree=None), measured, report)
+        scene = dataclasses.replace(fitted, splats=fitted.splats.take(fixed), tree=None)
+        return Chosen(scene, faint, measured, report)
 
 
 @dataclass(frozen=True)
@@ -238,7 +255,9 @@ class SimplifiedOutput(BakeOutput):
         clock.end("write")
         count = len(chosen.scene)
         share = round(count / tree.splats, 6)
-        made = WrittenSet(**vars(losses), splats=count, share=share, psnr=chosen.psnr, refine=chosen.refine)
+        made = WrittenSet(
+            **vars(losses), splats=count, share=share, faint=chosen.faint, psnr=chosen.psnr, refine=chosen.refine
+        )
         return WrittenTree(output_format=self.form.name, bytes=size, simplified=made)
 
     def _bytes(self, scene: Scene, *, options: WriteOptions, threads: int) -> int:

@@ -8,11 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import sparklod_cli as sparklod
 from sparklod_cli.cli import run
 from sparklod_cli.codecs import ply
 from sparklod_cli.codecs.formats import WRITABLE
 from sparklod_cli.io import read_scene
 from sparklod_cli.model.scene import Scene
+from sparklod_cli.support.errors import SparklodError
 from tests.conftest import FIXTURES, Capture
 from tests.scenes import random_splats
 
@@ -80,6 +82,54 @@ def test_one_line_says_what_was_written(source: Path, tmp_path: Path, capsys: Ca
     first, second, *_ = capsys.readouterr().err.splitlines()
     assert first.startswith(f"{source}  1,000 splats, SH 1  ->  {target}  500 splats (50 %), 16.0 kB, ")
     assert second.strip().startswith("SPLAT holds no reflections (SH)")
+
+
+def far_apart(path: Path, count: int, *, size: float = 0.01, opacity: float = 0.9) -> Path:
+    """Writes splats that are much smaller than the gaps between them."""
+    splats = random_splats(count, sh_degree=0)
+    splats.center[:] = 3 * np.arange(3 * count).reshape(count, 3) ** 2 % 101
+    splats.scale[:], splats.opacity[:] = size, opacity
+    path.write_bytes(b"".join(ply.encode(Scene(splats))))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "goal", "most"),
+    [*[(f"small{ending}", "--to", "50%") for ending in (".ply", ".sog", ".spz")], ("small.splat", "--max-bytes", "33")],
+)
+def test_a_set_of_which_nothing_is_seen_is_an_error(
+    name: str, goal: str, most: str, tmp_path: Path, capsys: Capture
+) -> None:
+    source, target = far_apart(tmp_path / "far.ply", 3), tmp_path / name
+    assert simplify(source, goal, most, "-o", target) == 1
+    err = capsys.readouterr().err
+    assert "nothing could be seen of 1 splat: merged across wide gaps, their opacity is 1e-06 at most" in err
+    assert "keep more splats" in err and err.count("\n") == 1
+    assert not target.exists()
+    with pytest.raises(SparklodError, match="nothing could be seen of 1 splat"):
+        sparklod.simplify(read_scene(source), to=1)
+
+
+def test_nothing_is_fitted_of_which_nothing_is_seen(tmp_path: Path, capsys: Capture) -> None:
+    source = far_apart(tmp_path / "far.ply", 3)
+    assert simplify(source, "--to", "1", "--refine", "40", "-o", tmp_path / "small.ply") == 1
+    assert "nothing could be seen of 1 splat" in capsys.readouterr().err
+
+
+def test_merged_splats_too_faint_to_be_drawn_are_counted(tmp_path: Path, capsys: Capture) -> None:
+    source, target = far_apart(tmp_path / "far.ply", 40), tmp_path / "small.ply"
+    assert simplify(source, "--to", "75%", "-o", target, "--json") == 0
+    out, err = capsys.readouterr()
+    faint = int(np.count_nonzero(read_scene(target).splats.opacity < 0.5 / 255))
+    assert json.loads(out)["simplified"]["faint"] == faint > 0
+    assert f"  {100 * faint / 30:.3g} % of the splats, merged across wide gaps, are too faint to be drawn; keep" in err
+
+
+def test_a_scene_that_is_faint_itself_is_simplified(tmp_path: Path, capsys: Capture) -> None:
+    source, target = far_apart(tmp_path / "faint.ply", 3, size=5, opacity=0.001), tmp_path / "small.ply"
+    assert simplify(source, "--to", "100%", "-o", target) == 0
+    assert "faint to be drawn" not in capsys.readouterr().err
+    assert simplify(source, "--to", "1", "-o", target, "-f") == 0
 
 
 def test_several_inputs_are_one_scene(source: Path, tmp_path: Path) -> None:
