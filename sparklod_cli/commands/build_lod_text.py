@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from ..support.addresses import Place
 from ..support.stdin import DASH, name_of
-from ..support.units import format_size
+from ..support.units import format_size, percent_of
 from .console import Console, count_of, size_of
 
 if TYPE_CHECKING:
@@ -108,21 +108,21 @@ def _contents(baked: Baked) -> str:
 def _refined(refined: Refined) -> str:
     """Return a phrase on the PSNR of cuts before and after the fitting, on held-out cameras."""
     gains = [
-        f"{100 * share:.3g} % {before:.2f} -> {refined.psnr_after[share]:.2f}"
+        f"{percent_of(share)} {before:.2f} -> {refined.psnr_after[share]:.2f}"
         for share, before in refined.psnr_before.items()
     ]
     seen = f"held-out PSNR {', '.join(gains)} dB" if refined.psnr_before else "no held-out camera sees anything of it"
     early = "" if refined.is_complete else ", interrupted"
     return (
         f"refined in {count_of(refined.steps, 'step')}{early}: {seen};"
-        f" {100 * refined.kept:.3g} % of the splats fitted have new values"
+        f" {percent_of(refined.kept)} of the splats fitted have new values"
     )
 
 
 def _levels(detail: WrittenDetail) -> str:
     """Return the detail levels after full detail, and how far they are from it."""
     levels = (
-        f"{level.splats:,} splats ({100 * level.share:.3g} %, error at most {level.worst_error:.2g})"
+        f"{level.splats:,} splats ({percent_of(level.share)}, error at most {level.worst_error:.2g})"
         for level in detail.levels[1:]
     )
     return f"levels below full detail: {', '.join(levels)}"
@@ -151,13 +151,14 @@ def _consequences(baked: Baked) -> str:
     for clamp in baked.clamps:
         if matters(clamp.column, above=clamp.above, visible=clamp.visible, leaves=baked.splats):
             text = CONSEQUENCES[clamp.column, clamp.above]
-            shares[text] = max(shares.get(text, 0.0), 100 * clamp.visible / baked.splats)
+            shares[text] = max(shares.get(text, 0.0), clamp.visible / baked.splats)
     if not shares:
         return ""
     form, more = (
         ("SPZ", "--format rad keeps more of them") if baked.chunks is None else ("RAD", "-v says what keeps them")
     )
-    return f"{' and '.join(f'{share:.2g} % of {text}' for text, share in shares.items())} than {form} can hold; {more}"
+    losses = " and ".join(f"{percent_of(share, 2)} of {text}" for text, share in shares.items())
+    return f"{losses} than {form} can hold; {more}"
 
 
 def _clamped(clamp: Clamp, baked: Baked) -> str:
@@ -166,7 +167,7 @@ def _clamped(clamp: Clamp, baked: Baked) -> str:
 
     form, table = ("SPZ", CLAMPED_BY_SPZ) if baked.chunks is None else ("RAD", CLAMPED_BY_RAD)
     name, advice = table[clamp.column, clamp.above]
-    share = f"{count_of(clamp.splats, 'node')} ({100 * clamp.splats / baked.nodes:.3g} %)"
+    share = f"{count_of(clamp.splats, 'node')} ({percent_of(clamp.splats / baked.nodes)})"
     name += f" of degree {clamp.degree}" if clamp.degree else ""
     where, way = ("above", "up") if clamp.above else ("below", "down")
     where = "beyond ±" if clamp.both else f"{where} "
@@ -196,10 +197,13 @@ def report_simplified(console: Console, source: Source, target: Place, baked: Ba
     measured = "" if made.psnr is None else f", PSNR {made.psnr:.2f} dB"
     console.say(
         f"{name_of(source)}  {count_of(baked.splats, 'splat')}, SH {baked.sh_degree}  ->  {_name(target)} "
-        f" {count_of(made.splats, 'splat')} ({100 * made.share:.3g} %){measured}, {size_of(baked.bytes)},"
+        f" {count_of(made.splats, 'splat')} ({percent_of(made.share)}){measured}, {size_of(baked.bytes)},"
         f" {_total(baked.seconds)}"
     )
     _report_tree(console, baked, made.refine)
+    if made.faint > LEAST_SHARE * made.splats:
+        share = percent_of(made.faint / made.splats)
+        console.say(f"  {share} of the splats, merged across wide gaps, are too faint to be drawn; keep more splats")
     _report_losses(console, made, made.splats, baked.output_format)
     console.detail(f"  {baked.format}; {_stages(baked.seconds)}")
 
@@ -208,7 +212,7 @@ def _report_losses(console: Console, losses: Extracted | WrittenSet, splats: int
     """Print what a format without a tree does not hold."""
     lines = ["holds no reflections (SH)"] if losses.drops_sh else []
     lines += [
-        f"clamps the {COLUMNS[column]} of {100 * count / splats:.3g} % of the splats"
+        f"clamps the {COLUMNS[column]} of {percent_of(count / splats)} of the splats"
         for column, count in losses.clamped.items()
         if count >= LEAST_SHARE * splats
     ]

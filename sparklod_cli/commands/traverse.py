@@ -14,6 +14,7 @@ import click
 from ..simulation.streaming_settings import StreamingSettings
 from ..support.printable import printable
 from ..support.stdin import DASH
+from ..support.units import percent_of
 from ..tables.files import FORMS
 from .console import WIDTH, Console, count_of, for_screen, is_terminal, print_json, rows, size_of
 from .option_groups import COMMON, check_declared, command, exclude, flag, option, refuse, values_of
@@ -217,8 +218,9 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
         if written.note:
             console.say(f"{outputs.plot}: {written.note}")
         if written.in_front < LEAST_IN_FRONT:
+            share = percent_of(written.in_front, 2)
             console.say(
-                f"warning: only {written.in_front:.1%} of the splats lie in front of the cameras; path and scene may"
+                f"warning: only {share} of the splats lie in front of the cameras; path and scene may"
                 " not share their axes (--camera-axes, --world-transform, --up)"
             )
         on_stdout = table.summary_on_stdout(as_json=general.as_json)

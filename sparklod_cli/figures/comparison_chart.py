@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..images.pixels import FAINT
+from ..support.units import percent_of
 from ..tables.columns import Row
 from ..tables.statistics import numbers
 from .charts import BLUE, GREEN, INDIGO, ORANGE, PINK, YELLOW, Axes, FrameColumns, draw, head, stacked
@@ -68,7 +69,7 @@ def _by_budget(
     axes.plot(share, cells.mean(axis=1), "o-", color=GREEN, linewidth=1.8, markersize=5, label="mean")
     axes.set_xscale("log")
     axes.set_xticks(share)
-    axes.xaxis.set_major_formatter(lambda value, place: f"{100 * value:.3g} %")
+    axes.xaxis.set_major_formatter(lambda value, place: percent_of(value))
     axes.xaxis.set_minor_locator(matplotlib.ticker.NullLocator())
     axes.set_title(title)
     axes.set_ylabel(unit)

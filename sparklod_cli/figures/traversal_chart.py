@@ -14,6 +14,7 @@ from PIL import Image
 
 from ..images.pixels import FAINT, INK
 from ..support.errors import SparklodError
+from ..support.units import percent_of
 from ..tables.columns import Row
 from ..tables.statistics import numbers, totals
 from .camera_path import PathScene as PathScene
@@ -107,7 +108,7 @@ def _churn(axes: Axes, frames: FrameColumns, matplotlib: ModuleType) -> Series:
     values = frames.column("churn")
     axes.fill_between(frames.x, 0, values, color=ORANGE, alpha=0.25, linewidth=0)
     axes.plot(frames.x, values, color=ORANGE, linewidth=1.2)
-    axes.yaxis.set_major_formatter(lambda value, place: f"{100 * value:.3g} %")
+    axes.yaxis.set_major_formatter(lambda value, place: percent_of(value))
     _from_zero(axes, values)
     axes.set_ylabel("share of splats")
     return values

@@ -16,6 +16,7 @@ from ..render.devices import uses_card
 from ..render.settings import RasterSettings
 from ..support.progress import Progress, silent
 from ..support.threads import on_threads
+from ..support.units import percent_of
 from .cameras import HELD_OUT, TRAINING, Place, placed, split_path
 from .nodes import FittedNodes, FittedSet, Index
 from .optimiser import Optimiser, Schedule, default_steps
@@ -193,7 +194,7 @@ class _Fitting:
         """Return what the steps so far gained, for display."""
         stage, before = self._stages[-1], self._before
         after = stage.psnr_after
-        changes = (f"{100 * share:.3g} % {before[share]:.2f} -> {after[share]:.2f} dB" for share in after)
+        changes = (f"{percent_of(share)} {before[share]:.2f} -> {after[share]:.2f} dB" for share in after)
         return f"{stage.name}: {', '.join(changes)}"
 
     def finish(self, is_complete: bool) -> tuple[Splats, FitReport]:

@@ -21,6 +21,12 @@ def count_of(count: int, noun: str, plural: str | None = None) -> str:
     return f"{count:,} {noun if count == 1 else plural or noun + 's'}"
 
 
+def percent_of(share: float, digits: int = 3) -> str:
+    """Return a share as "12.3 %" with so many significant digits, never with an exponent."""
+    text = f"{float(f'{100 * share:.{digits}g}'):,.9f}"
+    return f"{text.rstrip('0').rstrip('.')} %"
+
+
 def format_size(size: float) -> str:
     """Return a number of bytes as "12.3 GB", "350 MB" or "2 kB", of powers of 1000."""
     for name, power in (("GB", 10**9), ("MB", 10**6)):

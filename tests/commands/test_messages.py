@@ -121,6 +121,16 @@ def test_what_is_clamped_is_said_in_a_line_and_with_verbose_in_detail(
     assert "--scale" not in err
 
 
+def test_a_loss_of_all_splats_is_a_hundred_percent(tmp_path: Path, capsys: Capture) -> None:
+    splats = random_splats(1_000)
+    splats.scale[:], splats.opacity[:] = 1e-6, 0.5
+    source = tmp_path / "dots.ply"
+    source.write_bytes(b"".join(ply.encode(Scene(splats))))
+    assert run(["build-lod", str(source)]) == 0
+    err = capsys.readouterr().err
+    assert "  100 % of splats are smaller than SPZ can hold" in err and "e+" not in err
+
+
 @pytest.mark.parametrize("column", [slice(0, 1), slice(0, 3)])
 @pytest.mark.parametrize("count", [0, 1, 2, 300])
 def test_the_note_and_inspect_go_by_one_rule(count: int, column: slice, tmp_path: Path, capsys: Capture) -> None:

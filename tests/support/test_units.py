@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sparklod_cli.support.units import parse_bandwidth, parse_count, parse_size, parse_time
+from sparklod_cli.support.units import parse_bandwidth, parse_count, parse_size, parse_time, percent_of
 
 
 @pytest.mark.parametrize(
@@ -105,3 +105,22 @@ def test_other_texts_are_refused_in_one_line(parse: Callable[[str], float]) -> N
 def test_any_text_is_understood_or_refused(parse: Callable[[str], float], text: str) -> None:
     with contextlib.suppress(ValueError):
         assert parse(text) >= 0
+
+
+@pytest.mark.parametrize(
+    ("share", "digits", "text"),
+    [
+        (0.123456, 3, "12.3 %"),
+        (0.995, 2, "100 %"),
+        (0.99949, 3, "99.9 %"),
+        (1.0, 2, "100 %"),
+        (1.0, 3, "100 %"),
+        (12.5, 3, "1,250 %"),
+        (1000.0, 2, "100,000 %"),
+        (2e-7, 3, "0.00002 %"),
+        (0.0, 3, "0 %"),
+        (0.5, 2, "50 %"),
+    ],
+)
+def test_shares_have_no_exponent(share: float, digits: int, text: str) -> None:
+    assert percent_of(share, digits) == text

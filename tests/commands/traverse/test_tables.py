@@ -186,7 +186,7 @@ AWAY = "axes (--camera-axes, --world-transform, --up)"
 def test_cameras_that_look_away_give_a_warning(capsys: Capture) -> None:
     assert traverse(TOWN, "--look-at", "0,-1,-9:0,-1,-20", "--budget", "4k") == 0
     err = capsys.readouterr().err
-    assert err.startswith("warning: only 0.0% of the splats lie in front of the cameras")
+    assert err.startswith("warning: only 0 % of the splats lie in front of the cameras")
     assert err.endswith(f"{AWAY}\n")
     assert traverse(TOWN, "--look-at", "0,-1,-9:0,-1,-20", "--budget", "4k", "-q") == 0
     assert capsys.readouterr().err == ""
