@@ -32,6 +32,9 @@ ENVIRONMENT_FILE = f"{ENVIRONMENT}/env.sog"
 #: The manifest of 3D Tiles, and the folder of its other files: tiles, by level and number, and nested tilesets.
 TILESET, TILES = "tileset.json", "tiles"
 
+#: Files that name all others of a scene in a folder, or in a zip, which stands for it.
+FIRST_FILES = (MANIFEST, TILESET, META)
+
 _ALL_IMAGES = [name for names in SOG_IMAGES.values() for name in names]
 _TILE = re.compile(re.escape(TILES) + r"/(?:0|[1-9]\d{0,8})-(?:0|[1-9]\d{0,8})\.(?:glb|json)", re.ASCII)
 _CHUNK_FOLDER = re.compile(r"(?:0|[1-9]\d{0,8})_(?:0|[1-9]\d{0,8})", re.ASCII)

@@ -6,15 +6,19 @@ Imports nothing heavy: `--help` names them.
 from __future__ import annotations
 
 import re
+from collections.abc import Collection
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import PurePath
-from typing import Any, Literal
+from typing import Any, BinaryIO, Literal
 
 from ..support import defaults
+from ..support.json_text import keys_of_object
+from .lookalikes import lookalike_of
 
-#: Bytes at the beginning of a file by which its format is recognized.
-HEAD = 1 << 16
+#: Bytes at the beginning of a file by which its format is recognized, and of a JSON object, whose first value may be
+#: long.
+HEAD, JSON_HEAD = 1 << 16, 1 << 22
 
 
 @dataclass(frozen=True)
@@ -35,8 +39,9 @@ class Format:
             `encoder.Encoder`, and `stored(file)`, with `open_companion` where it has companions, the `encoder.Stored`
             of a file.
         suffixes: lower case, with the dot.
-        beginning: a regular expression that the first bytes of its files match; None if any bytes are possible, so that
-            only the suffix decides.
+        beginning: a regular expression that the first bytes of its files match; None if there is none.
+        keys: that its files have at the top level, which are JSON objects; empty if they are not. Without `beginning`
+            and `keys`, any bytes are possible, so that only the suffix decides.
         companions: its files refer to others beside them, which the `open_companion` of a source opens.
         folders: those may be in folders there.
         parts: what viewers draw some of instead of splats chosen one by one: "levels" of detail, or "tiles" that
@@ -57,6 +62,12 @@ class Format:
     folders: bool = False
     parts: Literal["levels", "tiles"] | None = None
     bare: bool = False
+    keys: tuple[str, ...] = ()
+
+    @property
+    def unmarked(self) -> bool:
+        """Whether its files may begin with any bytes."""
+        return self.beginning is None and not self.keys
 
     @property
     def endings(self) -> tuple[str, ...]:
@@ -69,9 +80,10 @@ class Format:
         """Import the module."""
         return import_module(f".{self.module}", __package__)
 
-    def begins(self, head: bytes) -> bool:
-        """Return True if the first bytes of a file match this format."""
-        return self.beginning is not None and re.match(self.beginning, head, re.DOTALL) is not None
+    def begins(self, head: bytes, keys: Collection[str]) -> bool:
+        """Return True if a file is of this format by its first bytes, or by the `keys` of the object in them."""
+        by_bytes = self.beginning is not None and re.match(self.beginning, head, re.DOTALL) is not None
+        return by_bytes or (bool(self.keys) and set(self.keys) <= set(keys))
 
 
 #: The formats in the order in which they are tried: compressed PLY is PLY too. A .splat file begins with any float, a
@@ -88,24 +100,25 @@ FORMATS = (
     Format("SPZ", "spz", (".spz",), rb"\x1f\x8b\x08[\0-\x1f]|NGSP", writable=True, trees=True),
     # RADC begins a chunk, which the codec refuses with what to give instead.
     Format("RAD", "rad.codec", (".rad",), rb"RAD[0C]", writable=True, trees=True, companions=True),
-    # Its manifest; a meta.json of SOG is JSON, too.
     Format(
         "Streamed SOG",
         "streamed_sog.codec",
         (".json",),
-        rb"\s*\{.*?\"lodLevels\"\s*:",
+        None,
         companions=True,
         folders=True,
         parts="levels",
+        keys=("lodLevels",),
     ),
     Format(
         "3D Tiles",
         "tiles_3d.codec",
         (".json",),
-        rb"\s*\{.*?\"geometricError\"\s*:",
+        None,
         companions=True,
         folders=True,
         parts="tiles",
+        keys=("geometricError",),
     ),
     # A zip that begins with NAME/data.pkl; SOG is a zip, too.
     Format("checkpoint", "checkpoint", (".pt", ".ckpt"), rb"PK\x03\x04.{26}[^/]{1,200}/data\.pkl"),
@@ -114,10 +127,11 @@ FORMATS = (
         "SOG",
         "sog.codec",
         (".sog", ".json"),
-        rb"PK\x03\x04|\s*\{\s*\"\w+\"\s*:",
+        rb"PK\x03\x04",
         writable=True,
         unbundled="meta.json",
         companions=True,
+        keys=("means", "quats"),
     ),
     Format("GLB", "glb.codec", (".glb",), rb"glTF", writable=True),
     # Version 0.1 on, as a float denormal, and fewer than 2 ** 24 sections, which as a float would be, too.
@@ -153,11 +167,22 @@ def ending_of(name: str) -> str:
     return name if any(name == form.unbundled for form in FORMATS) else PurePath(name).suffix
 
 
-def sniff(head: bytes, suffix: str) -> Format | None:
-    """Return the format of a file by its first `HEAD` bytes, or else by its suffix; None if it has no known format.
+def head_of(file: BinaryIO) -> bytes:
+    """Read the bytes at the beginning of a file by which its format is recognized, and return to it."""
+    head = file.read(HEAD)
+    if len(head) == HEAD and keys_of_object(head) and sniff(head, "") is None:
+        head += file.read(JSON_HEAD - HEAD)
+    file.seek(0)
+    return head
 
-    The suffix decides only for formats that may begin with any bytes.
+
+def sniff(head: bytes, suffix: str) -> Format | None:
+    """Return the format of a file by its first bytes, see `head_of`, or else by its suffix; None if that is not known.
+
+    The suffix decides only for formats that may begin with any bytes, and not of files that are known to be other.
     """
-    by_content = (form for form in FORMATS if form.begins(head))
-    by_suffix = (form for form in FORMATS if form.beginning is None and suffix.lower() in form.suffixes)
-    return next(by_content, None) or next(by_suffix, None)
+    keys = keys_of_object(head)
+    by_content = next((form for form in FORMATS if form.begins(head, keys)), None)
+    if by_content is not None or lookalike_of(head) is not None:
+        return by_content
+    return next((form for form in FORMATS if form.unmarked and suffix.lower() in form.suffixes), None)

@@ -24,12 +24,14 @@ from ..codecs.file_names import (
     is_of_streamed_sog,
     is_of_tileset,
 )
+from ..codecs.scene_files import SceneFiles
 from ..codecs.sog.sog_container import MAX_META, companion_names
 from ..codecs.streamed_sog.manifest import MAX_MANIFEST, Manifest, parse
+from ..codecs.streamed_sog.manifest_rules import chunk_files
 from ..codecs.tiles_3d import tileset
 from ..support.addresses import Address, Place
 from ..support.errors import FormatError, OutputError
-from .local_files import companions, in_folder, reason_of
+from .local_files import reason_of
 from .reading import opened
 from .writing import Files, SinkTogether, check_header, real_target, write_set
 
@@ -196,12 +198,16 @@ def read_level_files(path: Path) -> LevelFiles:
     Raises:
         FormatError: it cannot be read, or is no such manifest.
     """
-    first = path if path.is_file() else path / in_folder(path).name
-    with opened(first) as (file, _, _):
+    with opened(path) as (file, _, more):
         data = file.read(MAX_MANIFEST + 1)
-    manifest = parse(data)
-    sizes: dict[Path, int] = {}
-    for each in companions(first, ()):
-        sizes[each.parent] = sizes.get(each.parent, 0) + each.stat().st_size
-    folders = [(first.parent / name).parent for name in manifest.names()]
-    return LevelFiles(manifest, len(data), tuple(sizes.get(folder, 0) for folder in folders))
+        manifest, beside = parse(data), chunk_files(more["open_companion"])
+        sizes = tuple(_size_of_chunk(beside, name) for name in manifest.names())
+    return LevelFiles(manifest, len(data), sizes)
+
+
+def _size_of_chunk(beside: SceneFiles, name: str) -> int:
+    """Return the bytes of a chunk file and its images; 0 where it cannot be read, which reading its splats reports."""
+    try:
+        return beside.open(name).bytes
+    except FormatError:
+        return 0

@@ -5,13 +5,16 @@ from __future__ import annotations
 import functools
 import itertools
 import os
+import shlex
 import stat
+from collections import Counter
 from collections.abc import Collection, Iterable
 from pathlib import Path, PurePath
 from typing import BinaryIO
 
-from ..codecs.file_names import MANIFEST, META, TILESET, rad_chunk_number, sog_image_number
-from ..codecs.formats import HEAD, sniff
+from ..codecs.file_names import FIRST_FILES, MANIFEST, META, TILESET, rad_chunk_number, sog_image_number
+from ..codecs.formats import FORMATS, head_of, sniff
+from ..codecs.lookalikes import POINTER, SHORT, is_pointer
 from ..support.addresses import Place
 from ..support.errors import FormatError, UnreadableError
 from ..support.printable import near
@@ -99,17 +102,13 @@ def open_plain(path: Path) -> BinaryIO:
     return file
 
 
-#: The splat file that a folder stands for: the first of these that is there.
-IN_FOLDERS = (MANIFEST, TILESET, META)
-
-
 def companions(path: Path, sets: Collection[Collection[str]]) -> list[Path]:
     """Return the files that are read together with one, as far as can be told; nothing is raised."""
     try:
         folder = path if path.is_dir() else path.parent
         first: Path | None = path
         if path.is_dir():
-            first = next((folder / name for name in IN_FOLDERS if (folder / name).is_file()), None)
+            first = next((folder / name for name in FIRST_FILES if (folder / name).is_file()), None)
             names = [*([] if first is None else [first.name]), *itertools.chain(*sets)]
         else:
             names = list(itertools.chain(*(names for names in sets if path.name in names)))
@@ -124,7 +123,7 @@ def companions(path: Path, sets: Collection[Collection[str]]) -> list[Path]:
 def _named_in(path: Path) -> list[Path]:
     """Return the files that a splat file names: images of a SOG, chunks of a RAD, all of a Streamed SOG or 3D Tiles."""
     with path.open("rb") as file:
-        head = file.read(HEAD)
+        head = head_of(file)
         form = sniff(head, "")
         if form is not None and not form.companions:
             return []
@@ -132,7 +131,6 @@ def _named_in(path: Path) -> list[Path]:
         from ..codecs.streamed_sog.manifest import MAX_MANIFEST, parse
         from ..codecs.tiles_3d.tileset import MAX_TILESET
 
-        file.seek(0)
         if head.startswith(rad_header.MAGIC):
             return _companion_paths(path, rad_header.read_header(file).filenames)
         if form is not None and form.parts == "tiles":
@@ -157,8 +155,7 @@ def _images_of(path: Path) -> list[Path]:
 
     if not path.is_file() or path.stat().st_size > MAX_META:
         return []
-    data = path.read_bytes()
-    return _companion_paths(path, companion_names(data)) if data.lstrip().startswith(b"{") else []
+    return _companion_paths(path, companion_names(path.read_bytes()))
 
 
 def _companion_paths(path: Path, names: Iterable[str], *, folders: bool = False) -> list[Path]:
@@ -170,14 +167,30 @@ def in_folder(folder: Place) -> Place:
     """Return the splat file that a folder stands for: a manifest of Streamed SOG or 3D Tiles, or a SOG's meta.json.
 
     Raises:
-        UnreadableError: the folder holds none.
+        UnreadableError: the folder holds none, or several.
     """
-    path = next((folder / name for name in IN_FOLDERS if (folder / name).is_file()), None)
-    if path is None:
+    found = [name for name in FIRST_FILES if (folder / name).is_file()]
+    if len(found) > 1:
+        raise UnreadableError(f"cannot be read: is a directory with {' and '.join(found)}; give one of them")
+    if not found:
+        scans = _scans_in(folder) if isinstance(folder, Path) else ""
         raise UnreadableError(
-            f"cannot be read: is a directory, without the {META} of an unpacked SOG, a {MANIFEST} or a {TILESET}"
+            f"cannot be read: is a directory, without the {META} of an unpacked SOG, a {MANIFEST} or a {TILESET}{scans}"
         )
-    return path
+    return folder / found[0]
+
+
+def _scans_in(folder: Path) -> str:
+    """Return what to give instead of a folder of splat files, to stand at the end of an error; empty without any."""
+    known = {suffix for form in FORMATS for suffix in form.suffixes} - {PurePath(META).suffix}
+    with os.scandir(folder) as entries:
+        files = [entry.name for entry in itertools.islice(entries, MOST_NAMES) if entry.is_file()]
+    suffixes = Counter(suffix for name in files if (suffix := PurePath(name).suffix).lower() in known)
+    if not suffixes:
+        return ""
+    suffix, count = suffixes.most_common(1)[0]
+    only = next(name for name in files if name.endswith(suffix))
+    return f"; give {shlex.quote(str(folder))}/{f'*{suffix}' if count > 1 else shlex.quote(only)}"
 
 
 def companion_path(first: Path, name: str) -> Path:
@@ -199,9 +212,14 @@ def open_named(first: Place, name: str, *, folders: bool = False) -> BinaryIO:
     try:
         if path.exists() and not path.is_file():
             raise FormatError(f"{quoted_value(name)}, which it names, is not a file")
-        return path.open("rb")
+        file = path.open("rb")
     except OSError as error:
         raise FormatError(f"{quoted_value(name)}, which it names, cannot be read: {reason_of(error)}") from None
+    if is_pointer(file.read(SHORT)):
+        file.close()
+        raise FormatError(f"{quoted_value(name)}, which it names, is {POINTER}")
+    file.seek(0)
+    return file
 
 
 def _check_name(name: str, *, folders: bool = False) -> None:

@@ -10,24 +10,23 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 from ..codecs import rgba
-from ..codecs.content import Content, Source
+from ..codecs.content import Content, OpenCompanion, Source
 from ..codecs.encoder import Stored
-from ..codecs.formats import FORMATS, HEAD, NPZ, RAW_SUFFIXES, Format, sniff
+from ..codecs.formats import FORMATS, NPZ, RAW_SUFFIXES, Format, head_of, sniff
+from ..codecs.lookalikes import POINTER, SHORT, is_pointer, lookalike_of
+from ..codecs.zip_folder import ZIP, ZipFolder
 from ..model.scene import DetailScene, Scene
 from ..model.splats import COLUMNS, FloatArray
 from ..model.tile_scene import TileScene
 from ..support.addresses import Place, size_of
 from ..support.errors import FormatError, UnknownFormatError, UnreadableError
+from ..support.json_text import decoded_text
 from ..support.progress import Progress, silent
 from ..support.stdin import DASH, spooled
 from .local_files import in_folder, open_named, reason_unreadable
 
 if TYPE_CHECKING:
     from ..codecs.gpu import dump
-
-
-#: How a .npz begins, which is a zip.
-ZIP = b"PK\x03\x04"
 
 
 def read_scene(
@@ -96,25 +95,42 @@ def opened(path: Place) -> Iterator[tuple[BinaryIO, Format, dict[str, Any]]]:
         if path != DASH and path.exists() and not path.is_file():
             raise UnreadableError("it is a pipe or a device; save it to a file first")
         with file_of(path) as file:
-            head = file.read(HEAD)
-            file.seek(0)
-            if not head:
-                raise UnreadableError("the file is empty")
-            form = sniff(head, path.suffix)
-            if form is None:
-                names = ", ".join(form.name for form in FORMATS)
-                unmarked = " or ".join(ending for each in FORMATS if each.beginning is None for ending in each.suffixes)
-                hint = f"; {unmarked} is not recognised by its content: pass it as a file" if path == DASH else ""
-                if path.suffix.lower() in RAW_SUFFIXES:
-                    hint = "; words alone, as --encoding writes them by this suffix, do not tell what they are"
-                raise UnknownFormatError(f"not a splat file that sparklod reads ({names}){hint}")
-            if head.startswith(ZIP) and path.suffix.lower() == NPZ:
-                raise UnknownFormatError(
-                    "it holds arrays for a viewer and no scene; use the file that they were made of, or unpack them in"
-                    " Python"
-                )
-            open_companion = functools.partial(open_named, path, folders=form.folders)
+            head = head_of(file)
+            form = recognised(head, path)
+            open_companion: OpenCompanion = functools.partial(open_named, path, folders=form.folders)
+            if head.startswith(ZIP) and form.companions:
+                folder = ZipFolder(file)
+                file.seek(0)
+                if folder.first != form.unbundled:  # a folder of another format in a zip
+                    file, open_companion = folder.open(folder.first), folder.open
+                    form = recognised(head_of(file), Path(folder.first))
             yield file, form, {"open_companion": open_companion} if form.companions else {}
+
+
+def recognised(head: bytes, path: Place) -> Format:
+    """Return the format of a file by its first bytes, see `head_of`, or else by its suffix.
+
+    Raises:
+        FormatError: it is empty, or of no known format.
+    """
+    if not head:
+        raise UnreadableError("the file is empty")
+    form = sniff(head, path.suffix)
+    if form is None:
+        lookalike = lookalike_of(head)
+        if lookalike is not None:
+            raise UnknownFormatError(f"not a splat file, but {lookalike}")
+        names = ", ".join(form.name for form in FORMATS)
+        unmarked = " or ".join(ending for each in FORMATS if each.unmarked for ending in each.suffixes)
+        hint = f"; {unmarked} is not recognised by its content: pass it as a file" if path == DASH else ""
+        if path.suffix.lower() in RAW_SUFFIXES:
+            hint = "; words alone, as --encoding writes them by this suffix, do not tell what they are"
+        raise UnknownFormatError(f"not a splat file that sparklod reads ({names}){hint}")
+    if head.startswith(ZIP) and path.suffix.lower() == NPZ:
+        raise UnknownFormatError(
+            "it holds arrays for a viewer and no scene; use the file that they were made of, or unpack them in Python"
+        )
+    return form
 
 
 @contextlib.contextmanager
@@ -169,7 +185,7 @@ MAX_TEXT = 1 << 24
 def read_text(path: Path) -> str:
     """Return a text file of at most `MAX_TEXT` bytes; `UnreadableError`, naming it, where that cannot be."""
     try:
-        return str(_read_up_to(path, MAX_TEXT), "utf-8-sig")
+        return decoded_text(_read_up_to(path, MAX_TEXT))
     except (OSError, ValueError) as error:
         reason = reason_unreadable(error) if isinstance(error, OSError) else "it is not text"
         raise UnreadableError(f"{path} cannot be read: {reason}") from None
@@ -211,6 +227,9 @@ def read_rgba(path: Path, count: int, rows: slice | None = None) -> FloatArray:
         if path.exists() and not path.is_file():
             raise FormatError("cannot be read: it is a directory, a pipe or a device")
         with path.open("rb") as file:
+            if is_pointer(file.read(SHORT)):
+                raise FormatError(f"cannot be read: it is {POINTER}")
+            file.seek(0)
             return rgba.decode(file, count, rows)
     except OSError as error:
         raise FormatError(f"{path} cannot be read: {reason_unreadable(error)}") from None
@@ -225,4 +244,7 @@ def _read_up_to(path: Path, limit: int) -> bytes:
         raise UnreadableError(f"{path} cannot be read: it is a pipe or a device; save it to a file first")
     if path.stat().st_size > limit:
         raise UnreadableError(f"{path} is larger than {limit >> 20:,} MiB, which nothing of its kind is")
-    return path.read_bytes()
+    data = path.read_bytes()
+    if is_pointer(data):
+        raise UnreadableError(f"{path} cannot be read: it is {POINTER}")
+    return data

@@ -11,6 +11,7 @@ import zipfile
 import zlib
 from typing import Any
 
+from .json_text import decoded_text
 from .printable import printable
 
 #: Maximum nesting depth, so that code can recurse through values; real files have a few levels.
@@ -39,7 +40,7 @@ def parse_json(data: str | bytes, *, keep_surrogates: bool = False, depth: int =
     1e999 are accepted, so callers must check that numbers are finite.
 
     Args:
-        data: the text, or its bytes in UTF-8.
+        data: the text, or its bytes, see `decoded_text`.
         keep_surrogates: keep lone surrogates, with which Python represents file names that are not UTF-8; otherwise
             they become U+FFFD, so that all texts can be printed and written.
         depth: most nesting; Python's own parser manages some hundreds.
@@ -48,7 +49,7 @@ def parse_json(data: str | bytes, *, keep_surrogates: bool = False, depth: int =
         ValueError: the text is not JSON, or too deeply nested; the message is one line.
     """
     try:
-        text = data if isinstance(data, str) else str(data, "utf-8-sig")
+        text = data.removeprefix("\ufeff") if isinstance(data, str) else decoded_text(data)
         value = json.loads(text, parse_int=_whole)
     except RecursionError:
         raise _too_deep(depth) from None

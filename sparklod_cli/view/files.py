@@ -16,17 +16,18 @@ from urllib.parse import quote
 
 from ..codecs.content import Source
 from ..codecs.file_names import META
-from ..codecs.formats import FORMATS, HEAD, sniff
+from ..codecs.formats import head_of
 from ..codecs.glb.codec import open_content as open_glb
 from ..codecs.glb.glb_container import MAGIC as GLB_MAGIC
 from ..codecs.rad.rad_header import MAGIC, RadHeader, read_header
 from ..codecs.sog.sog_container import MAX_META, image_names
 from ..codecs.streamed_sog.manifest import MAX_MANIFEST, parse
 from ..codecs.tiles_3d.tileset import MAX_TILESET, read_whole
+from ..codecs.zip_folder import ZIP, ZipFolder
 from ..io.local_files import companion_path, in_folder, open_named, open_plain, reason_unreadable
-from ..io.reading import ZIP
+from ..io.reading import recognised
 from ..model.lod_tree import CHUNK_NODES
-from ..support.errors import FormatError, NotSplatsError, UnknownFormatError, UnreadableError
+from ..support.errors import FormatError, NotSplatsError, UnreadableError
 from ..support.printable import printable
 from ..support.untrusted import quoted_value
 
@@ -149,23 +150,20 @@ def _named(path: Path, folder: str) -> ShownFile:
 def _shown(path: Path, folder: str) -> ShownFile:
     if path.is_dir():
         return _shown(path / in_folder(path).name, folder)
-    if path.name == META:
-        raise NotSplatsError("Spark does not read an unpacked SOG; zip its files into a .sog")
     if path.exists() and not path.is_file():
         raise UnreadableError("it is a pipe or a device; save it to a file first")
     header = None
     with open_plain(path.resolve()) as file:
-        head = file.read(HEAD)
-        file.seek(0)
+        head = head_of(file)
+        form = recognised(head, path)
         if head.startswith(MAGIC):
             header = read_header(file)
         elif head.startswith(GLB_MAGIC) and open_glb(Source(file)).format != "GLB":
             raise NotSplatsError("PlayCanvas does not read the SPZ in it; write it with --glb-profile khronos")
-    if not head:
-        raise UnreadableError("the file is empty")
-    form = sniff(head, path.suffix)
-    if form is None:
-        raise UnknownFormatError(f"not a splat file that sparklod reads ({', '.join(form.name for form in FORMATS)})")
+        elif form.unbundled == META and not head.startswith(ZIP):
+            raise NotSplatsError("Spark does not read an unpacked SOG; zip its files into a .sog")
+        elif form.unbundled == META and (first := ZipFolder(file).first) != META:
+            raise NotSplatsError(f"viewers do not read {first} in a zip; unzip it, and give the folder")
     if form.name not in SPARK_TYPES | OTHER_ENGINES:
         raise NotSplatsError(f"Spark does not read {form.name}; bake it first with sparklod build-lod")
     name = f"{folder}/{path.name}"

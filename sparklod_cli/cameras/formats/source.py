@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ...support.errors import CameraPathError
+from ...support.json_text import decoded_text
 from ...support.untrusted import LARGEST, parse_json
 from ..camera import Matrix
 from ..frame import Frame
@@ -39,7 +40,7 @@ class Files:
     def text(self) -> str | None:
         """The first file as text; None if it is not text."""
         try:
-            text = self.data.decode("utf-8-sig")
+            text = decoded_text(self.data)
         except UnicodeDecodeError:
             return None
         return None if "\0" in text else text

@@ -6,7 +6,6 @@ import contextlib
 import io
 import math
 import struct
-import threading
 import zipfile
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -17,13 +16,14 @@ from numpy.typing import NDArray
 from PIL import Image
 from PIL.WebPImagePlugin import WebPImageFile
 
-from ...support.errors import ChecksumError, FormatError, NotSplatsError
+from ...support.errors import FormatError, NotSplatsError
 from ...support.units import count_of
-from ...support.untrusted import ZIP_ERRORS, parse_json, quoted, quoted_value
+from ...support.untrusted import parse_json, quoted_value
 from ..compression import check_promise
 from ..content import OpenCompanion
 from ..file_names import META, SOG_IMAGES
 from ..stream import size_of
+from ..zip_folder import PIECE, ZipFolder
 
 Texels = NDArray[np.uint8]
 
@@ -42,9 +42,6 @@ Pixels = NDArray[np.uint32]
 
 #: Reads the next `size` bytes, or fewer, of which none are left at the end.
 Read = Callable[[int], bytes]
-
-#: Bytes that are read at a time.
-PIECE = 1 << 20
 
 #: Bytes that are read of any file at first: the headers of the file and of its first chunk, and what tells its sides.
 START = 30
@@ -124,9 +121,6 @@ def encode_webp(image: Texels) -> bytes:
 
 #: Largest meta.json, bytes; codebooks take 15,000.
 MAX_META = 1 << 22
-
-#: Compression methods of a zip that SOG uses, and the flag of an encrypted member.
-METHODS, ENCRYPTED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED), 1
 
 #: Permissions of the members of a zip that is written, and the system that has them, 3 for Unix.
 MODE, UNIX = 0o100644 << 16, 3
@@ -240,9 +234,11 @@ class SogFiles:
         self.size = size_of(file)
         zipped = file.read(2) == b"PK"
         file.seek(0)
-        self._archive = _Archive(file, self.size) if zipped else None
+        self._archive = ZipFolder(file) if zipped else None
+        if self._archive is not None and self._archive.first != META:
+            raise NotSplatsError(f"a zip archive with {self._archive.first}, which a SOG has not")
         self._companion = open_companion
-        data = self._archive.read(META) if self._archive else file.read(MAX_META + 1)
+        data = (self._archive.open(META) if self._archive else file).read(MAX_META + 1)
         if len(data) > MAX_META:
             raise FormatError(f"{META} has more than {MAX_META:,} bytes, too many for a SOG")
         self.meta = Meta(data)
@@ -290,56 +286,6 @@ class SogFiles:
         """Return the bytes of an image, as they are stored."""
         name = self.meta.name(texture, "files", index)
         return self._archive.bytes_of(name) if self._archive else self._sizes[name]
-
-
-class _Archive:
-    """Zip with a meta.json, possibly inside a folder, and files beside it."""
-
-    def __init__(self, file: BinaryIO, size: int) -> None:
-        self._size, self._lock = size, threading.Lock()
-        try:
-            self._zip = zipfile.ZipFile(file)
-        except ZIP_ERRORS as error:
-            raise FormatError(f"not a complete zip archive: {quoted(error)}") from None
-        names = [name for name in self._zip.namelist() if name == META or name.endswith("/" + META)]
-        if not names:
-            raise NotSplatsError(f"a zip archive without {META} is not a SOG")
-        self._folder = min(names, key=len).removesuffix(META)
-
-    def _member(self, name: str) -> zipfile.ZipInfo:
-        try:
-            return self._zip.getinfo(self._folder + name)
-        except KeyError:
-            raise FormatError(f"{META} names {quoted_value(name)}, which is not in the archive") from None
-
-    def bytes_of(self, name: str) -> int:
-        """Return the bytes of a member as it is stored."""
-        return self._member(name).compress_size
-
-    def read(self, name: str) -> bytes:
-        """Return the content of a member."""
-        with self.opened(name) as file:
-            return b"".join(iter(lambda: file.read(PIECE), b""))
-
-    @contextlib.contextmanager
-    def opened(self, name: str) -> Iterator[IO[bytes]]:
-        """Open a member, whose checksum is checked at the end, also if its content turns out to be corrupt."""
-        member = self._member(name)
-        if member.compress_type not in METHODS or member.flag_bits & ENCRYPTED:
-            raise FormatError(f"{quoted_value(name)} is encrypted, or compressed by a method that SOG does not use")
-        check_promise(member.file_size, self._size)
-        try:
-            with self._lock:
-                opened = self._zip.open(member)
-            with opened as file:
-                try:
-                    yield file
-                finally:
-                    while file.read(PIECE):
-                        pass
-        except ZIP_ERRORS as error:
-            kind = ChecksumError if "CRC" in str(error) else FormatError
-            raise kind(f"{quoted_value(name)} cannot be unpacked: {quoted(error)}") from None
 
 
 def zipped(files: Iterable[tuple[str, bytes]]) -> Iterator[bytes]:

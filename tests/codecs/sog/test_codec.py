@@ -167,7 +167,12 @@ def test_folders_and_compression_of_the_zip_make_no_difference(folder: str, meth
 
 
 def test_other_files_in_the_zip_and_an_order_of_their_own_make_no_difference() -> None:
-    more = {"preview.png": b"no image", "old/meta.json": b"{}", **dict(reversed(FILES.items()))}
+    more = {
+        "preview.png": b"no image",
+        "old/means.webp": b"",
+        "__MACOSX/._meta.json": b"",
+        **dict(reversed(FILES.items())),
+    }
     assert_same(decode(more), read_scene(FOLDER))
 
 

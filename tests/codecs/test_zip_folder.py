@@ -1,0 +1,165 @@
+"""Zips of a scene's files: read as the folder that they are, or refused by name; never the first of several."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sparklod_cli.cli import run
+from sparklod_cli.codecs.zip_folder import ZipFolder
+from sparklod_cli.io import read_parts, read_scene
+from sparklod_cli.io.details import read_level_files
+from sparklod_cli.io.streams import open_stream
+from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.splats import COLUMNS
+from sparklod_cli.support.errors import FormatError, NotSplatsError
+from tests.conftest import FIXTURES, Capture
+
+GOLDEN = FIXTURES / "golden"
+SETS = {name: GOLDEN / name for name in ("sh1-sog", "sh1-streamed-sog", "sh1-tiles")}
+
+
+def files_in(folder: Path) -> dict[str, bytes]:
+    return {each.relative_to(folder).as_posix(): each.read_bytes() for each in folder.rglob("*") if each.is_file()}
+
+
+def zipped(path: Path, files: dict[str, bytes], *, method: int = zipfile.ZIP_STORED) -> Path:
+    with zipfile.ZipFile(path, "w", method) as archive:
+        for name, data in files.items():
+            archive.writestr(name, data)
+    return path
+
+
+def assert_same(found: Scene, expected: Scene) -> None:
+    assert (found.format, len(found.splats)) == (expected.format, len(expected.splats))
+    for column in COLUMNS:
+        np.testing.assert_array_equal(getattr(found.splats, column), getattr(expected.splats, column), column)
+
+
+WAYS: dict[str, Callable[[dict[str, bytes]], dict[str, bytes]]] = {
+    "as it is": lambda files: files,
+    "reversed": lambda files: dict(reversed(files.items())),
+    "in a folder": lambda files: {f"scene/{name}": data for name, data in files.items()},
+    "of Finder": lambda files: {f"s/{name}": data for name, data in files.items()} | {"__MACOSX/s/._meta.json": b"\0"},
+    "of Windows": lambda files: {name.replace("/", "\\"): data for name, data in files.items()},
+    "of here": lambda files: {f"./{name}": data for name, data in files.items()},
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("kind", SETS)
+def test_a_zip_is_read_as_its_folder(kind: str, way: str, tmp_path: Path) -> None:
+    for method in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        path = zipped(tmp_path / "scene.ssog", WAYS[way](files_in(SETS[kind])), method=method)
+        for threads in (1, 3):
+            assert_same(read_scene(path, threads=threads), read_scene(SETS[kind]))
+
+
+@pytest.mark.parametrize("kind", ["sh1-streamed-sog", "sh1-tiles"])
+def test_a_zip_has_the_levels_and_sizes_of_its_folder(kind: str, tmp_path: Path) -> None:
+    path = zipped(tmp_path / "scene.zip", files_in(SETS[kind]))
+    found, expected = read_parts(path), read_parts(SETS[kind])
+    assert found is not None
+    assert expected is not None
+    np.testing.assert_array_equal(found.splats.center, expected.splats.center)
+    np.testing.assert_array_equal(found.counts, expected.counts)
+    if kind == "sh1-streamed-sog":
+        assert read_level_files(path).sizes == read_level_files(SETS[kind]).sizes
+        assert min(read_level_files(path).sizes) > 0
+
+
+def test_bundles_in_a_zip_are_read(tmp_path: Path) -> None:
+    """Chunks that are .sog themselves, all in one folder, whose sizes are their own."""
+    files = files_in(SETS["sh1-streamed-sog"])
+    folders = sorted({name.partition("/")[0] for name in files if name.endswith("/meta.json")})
+    (tmp_path / "flat").mkdir()
+    manifest = files["lod-meta.json"]
+    for folder in folders:
+        members = {name.partition("/")[2]: data for name, data in files.items() if name.startswith(f"{folder}/")}
+        zipped(tmp_path / "flat" / f"{folder}.sog", members)
+        manifest = manifest.replace(f"{folder}/meta.json".encode(), f"{folder}.sog".encode())
+    (tmp_path / "flat" / "lod-meta.json").write_bytes(manifest)
+    path = zipped(tmp_path / "scene.ssog", files_in(tmp_path / "flat"))
+    assert_same(read_scene(path), read_scene(SETS["sh1-streamed-sog"]))
+    sizes = read_level_files(tmp_path / "flat").sizes
+    assert sizes == read_level_files(path).sizes
+    assert sizes == tuple((tmp_path / "flat" / name).stat().st_size for name in read_level_files(path).manifest.names())
+
+
+def test_commands_read_a_zipped_streamed_sog(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
+    monkeypatch.chdir(tmp_path)
+    zipped(tmp_path / "scene.ssog", files_in(SETS["sh1-streamed-sog"]))
+    count = len(read_scene(SETS["sh1-streamed-sog"]).splats)
+    assert run(["inspect", "--json", "scene.ssog"]) == 0
+    assert f'"splats": {count}' in capsys.readouterr().out
+    assert run(["build-lod", "scene.ssog", "-o", "tree.spz", "-q"]) == 0
+    tree = read_scene(Path("tree.spz")).tree
+    assert tree is not None
+    assert int(tree.is_leaf.sum()) == count
+    with open_stream(Path("scene.ssog")) as stream:
+        assert sum(map(len, stream.read(0, stream.count))) == count
+    assert run(["view", "scene.ssog", "--export", "site"]) == 1
+    assert "viewers do not read lod-meta.json in a zip; unzip it" in capsys.readouterr().err
+    assert not Path("site").exists()
+
+
+SOG, STREAMED, TILES = map(files_in, SETS.values())
+
+
+@pytest.mark.parametrize(
+    ("files", "named"),
+    [
+        ({"kitchen/meta.json": b"{}", "bath/meta.json": b"{}"}, "'kitchen/meta.json', 'bath/meta.json'"),
+        (SOG | {"old/meta.json": b"{}"}, "meta.json"),
+        (STREAMED | {"meta.json": b"{}"}, "'meta.json'"),
+        (STREAMED | {"tileset.json": b"{}"}, "'tileset.json'"),
+        (STREAMED | {"0_0/lod-meta.json": b"{}"}, "'0_0/lod-meta.json'"),
+        (TILES | {"tiles/meta.json": b"{}"}, "'tiles/meta.json'"),
+        ({f"{folder}/{name}": data for folder in "ab" for name, data in STREAMED.items()}, "'a/lod-meta.json'"),
+        ({f"{number}/meta.json": b"{}" for number in range(9)}, r"'0/meta.json', '1/meta.json', '2/meta.json', \.\.\."),
+    ],
+)
+def test_several_scenes_in_a_zip_are_refused_by_name(files: dict[str, bytes], named: str, tmp_path: Path) -> None:
+    for order in (files, dict(reversed(files.items()))):
+        with pytest.raises(NotSplatsError, match=r"a zip archive of several scenes \(.*\): unzip it") as caught:
+            read_scene(zipped(tmp_path / "scene.sog", order))
+        if order is files:
+            assert caught.match(named)
+
+
+def test_a_zip_of_a_folder_of_scans_is_said_to_be_unzipped(tmp_path: Path) -> None:
+    path = zipped(tmp_path / "scans.zip", {"scans/": b"", "scans/room.ply": b"ply\n"})
+    with pytest.raises(NotSplatsError, match=r"a zip archive \('scans/room.ply'\) without meta.json, .*: unzip it"):
+        read_scene(path)
+    with pytest.raises(NotSplatsError, match="unzip it"):
+        ZipFolder(io.BytesIO(zipped(path, {"x/": b""}).read_bytes()))
+
+
+def test_a_manifest_in_a_zip_is_held_to_its_format(tmp_path: Path) -> None:
+    for data, reason in ((b"{}", "not a splat file"), (b'{"lodLevels": 1}', "lod-meta.json has no filenames")):
+        with pytest.raises(FormatError, match=reason):
+            read_scene(zipped(tmp_path / "scene.zip", {"lod-meta.json": data}))
+    missing = {name: data for name, data in STREAMED.items() if not name.startswith("0_0/")}
+    with pytest.raises(FormatError, match="'0_0/meta.json', which is not in the archive"):
+        read_scene(zipped(tmp_path / "scene.zip", missing))
+    damaged = bytearray(zipped(tmp_path / "scene.zip", STREAMED).read_bytes())
+    at = damaged.index(b"RIFF", damaged.index(b"0_0/means_l.webp"))
+    damaged[at + 60] ^= 255
+    (tmp_path / "scene.zip").write_bytes(damaged)
+    with pytest.raises(FormatError, match="cannot be unpacked: Bad CRC"):
+        read_scene(tmp_path / "scene.zip")
+
+
+@pytest.mark.parametrize("others", [("tileset.json",), ("meta.json",), ("tileset.json", "meta.json")])
+def test_a_folder_of_several_scenes_is_refused_by_name(others: tuple[str, ...], tmp_path: Path) -> None:
+    for name, data in (STREAMED | dict.fromkeys(others, b"{}")).items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(data)
+    with pytest.raises(FormatError, match=f"a directory with lod-meta.json and {others[0]}.*; give one of them"):
+        read_scene(tmp_path)
+    assert_same(read_scene(tmp_path / "lod-meta.json"), read_scene(SETS["sh1-streamed-sog"]))
