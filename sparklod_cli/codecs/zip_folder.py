@@ -68,8 +68,12 @@ class ZipFolder:
             return io.BytesIO(b"".join(iter(lambda: file.read(PIECE), b"")))
 
     @contextlib.contextmanager
-    def opened(self, name: str) -> Iterator[IO[bytes]]:
-        """Open a member, whose checksum is checked at the end, also if its content turns out to be corrupt."""
+    def opened(self, name: str, *, whole: bool = True) -> Iterator[IO[bytes]]:
+        """Open a member, whose checksum is checked at the end, also if its content turns out to be corrupt.
+
+        Args:
+            whole: read what is left of it at the end; False where nothing but its beginning is needed.
+        """
         member = self._member(name)
         if member.compress_type not in METHODS or member.flag_bits & ENCRYPTED:
             raise FormatError(f"{quoted_value(name)} is encrypted, or compressed by a method that is not read")
@@ -81,7 +85,7 @@ class ZipFolder:
                 try:
                     yield file
                 finally:
-                    while file.read(PIECE):
+                    while whole and file.read(PIECE):
                         pass
         except ZIP_ERRORS as error:
             kind = ChecksumError if "CRC" in str(error) else FormatError

@@ -33,6 +33,7 @@ CODES: dict[str, tuple[str, str]] = {
     "container.members": (ERROR, "a second gzip member follows, and Spark stops after the first"),
     "container.trailing": (WARNING, "bytes follow the data that belong to nothing"),
     "container.flags": (WARNING, "the header sets flags or reserved bytes without a meaning"),
+    "container.lossy": (ERROR, "images of a SOG are compressed with losses, so that values are not those written"),
     "container.left-out": (WARNING, "the file holds data that sparklod does not read"),
     **{code: (ERROR, meaning) for code, meaning in RAD_ERRORS.items()},
     **{code: (WARNING, meaning) for code, meaning in RAD_WARNINGS.items()},

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ..codecs.ply import FILTERED
+from ..codecs.sog.codec import LOSSY
 from ..codecs.spz_streams import KNOWN_FLAGS
 from ..codecs.tiles_3d.codec import NOT_PLACED
 from ..io import opened, read_arrays, read_scene, size_of_input
@@ -209,7 +210,9 @@ def _of_blocks(
     ends, size = value_checks.ends_of(about.header), about.header.get("bytes", size)
     findings = _container_findings(about)
     if surveyed is not None:
-        size, findings = surveyed.facts.bytes, findings + surveyed.findings
+        of_files = {each.code for each in surveyed.findings}  # which say in which file
+        findings = [each for each in findings if each.code not in of_files] + surveyed.findings
+        size = surveyed.facts.bytes
     if surveyed is not None and surveyed.field == "rad":
         ends = rad.ends_of(surveyed.facts)
     nodes = tree.TreeColumns.of(blocks) if blocks.is_tree and blocks.count else None
@@ -272,7 +275,11 @@ def _report(path: Path, head: Head | None, surveyed: HeaderScan | None) -> Repor
 
 def _container_findings(scene: Scene) -> list[Finding]:
     header = scene.header
-    findings = [Finding("container.left-out", note) for note in scene.notes if note not in (FILTERED, NOT_PLACED)]
+    findings = [
+        Finding("container.lossy" if note.startswith(LOSSY) else "container.left-out", note)
+        for note in scene.notes
+        if note not in (FILTERED, NOT_PLACED)
+    ]
     unknown = header.get("flags", 0) & ~KNOWN_FLAGS
     if unknown:
         findings.append(Finding("container.flags", f"the header sets flags {unknown:#04x}, which have no meaning"))

@@ -145,7 +145,7 @@ def test_a_manifest_in_a_zip_is_held_to_its_format(tmp_path: Path) -> None:
         with pytest.raises(FormatError, match=reason):
             read_scene(zipped(tmp_path / "scene.zip", {"lod-meta.json": data}))
     missing = {name: data for name, data in STREAMED.items() if not name.startswith("0_0/")}
-    with pytest.raises(FormatError, match="'0_0/meta.json', which is not in the archive"):
+    with pytest.raises(FormatError, match=r"'0_0/meta\.json', which is not in the archive"):
         read_scene(zipped(tmp_path / "scene.zip", missing))
     damaged = bytearray(zipped(tmp_path / "scene.zip", STREAMED).read_bytes())
     at = damaged.index(b"RIFF", damaged.index(b"0_0/means_l.webp"))

@@ -79,6 +79,7 @@ FAULTS: dict[str, set[str]] = {
     "sog-cut.sog": {"container.corrupt"},  # a zip's table of contents is at its end
     "sog-missing-image.sog": {"container.corrupt"},
     "sog-not-an-image.sog": {"container.corrupt"},
+    "sog-lossy.sog": {"container.lossy"},
     "sog-version-3.sog": {"container.version"},
     "sog-promise.sog": {"container.promise"},
     "ksplat-cut.ksplat": {"container.cut-short"},
@@ -136,6 +137,7 @@ PLACES: dict[str, int | str] = {
     "spz4-short-frame.spz": "5 of 6 alphas",
     "spz4-zstd.spz": "stream scales",
     "sog-missing-image.sog": "scales.webp",
+    "sog-lossy.sog": "sh0.webp",
     "sog-not-an-image.sog": "quats.webp",
     "nan.ply": 0,
     "negative-scale.splat": 2,

@@ -18,6 +18,7 @@ from ...model.splats import FloatArray, Splats
 from ...support.errors import FormatError, VersionError
 from ...support.parallel import for_blocks, ordered_map
 from ...support.progress import Progress
+from ...support.untrusted import quoted_value
 from .. import quantize
 from ..compression import check_promise
 from ..content import Content, Source, Target
@@ -36,6 +37,9 @@ MAX_PALETTE = 1 << 16
 
 #: Most splats: a WebP image has at most this many texels.
 MAX_SPLATS = 1 << 28
+
+#: How the note on lossy images begins, which is a finding of its own.
+LOSSY = "its values are not those that were written, since its images are lossy WebP"
 
 #: Where the channels stand in a pixel.
 RED_GREEN_BLUE, ALPHA = np.array([16, 8, 0], np.uint32), np.array([24], np.uint32)
@@ -75,6 +79,8 @@ def open_content(source: Source) -> Content:
     degree = COEFFICIENTS.index(palette.coefficients) if palette is not None else 0
     check_promise(count * 4 * (14 + 3 * COEFFICIENTS[degree]), files.size)
     steps = _steps(meta, version, palette)
+    lossy = ", ".join(map(quoted_value, files.lossy()))
+    losses = (f"{LOSSY} ({lossy}): write it anew without losses",) if lossy else ()
     center_tables = codings.center_table(meta.numbers(3, "means", "mins"), meta.numbers(3, "means", "maxs"))
 
     def in_order() -> list[Step]:
@@ -99,7 +105,7 @@ def open_content(source: Source) -> Content:
                 pixels = np.frombuffer(data, np.uint32)
             problem = step.fill(target.splats, pixels)
             if problem is not None:
-                raise FormatError(problem)
+                raise FormatError("; ".join((problem, *losses)))
 
         for number, _ in enumerate(ordered_map(work, enumerate(in_order()), threads), 1):
             progress("reading", number * count, len(steps) * count, "texel")
@@ -109,7 +115,7 @@ def open_content(source: Source) -> Content:
     antialiased = version == 2 and (meta.root.get("antialias") is True or meta.root.get("model") == "antialiased")
     header = {"version": version, "palette": palette.entries if palette is not None else 0, "bytes": files.size}
     note = read_note(meta.root.get("asset"))
-    return Content(count, degree, f"SOG {version}", fill, antialiased, note.problems, header, note.up)
+    return Content(count, degree, f"SOG {version}", fill, antialiased, note.problems + losses, header, note.up)
 
 
 def _steps(meta: Meta, version: int, palette: SogPalette | None) -> list[Step]:

@@ -46,21 +46,29 @@ Read = Callable[[int], bytes]
 #: Bytes that are read of any file at first: the headers of the file and of its first chunk, and what tells its sides.
 START = 30
 
+#: Chunks that are looked at before that of the pixels: a colour profile, alpha, and some that are unknown.
+MOST_BEFORE = 16
+
 #: Flag of a WebP file's extended header.
 ANIMATED = 2
 
 
 @dataclass(frozen=True)
 class WebPHeader:
-    """First bytes of a WebP file, `start`, and the width and height in pixels in them."""
+    """First bytes of a WebP file, `start`, and the width and height in pixels in them.
+
+    Attributes:
+        lossy: its pixels are not those that were encoded.
+    """
 
     start: bytes
     width: int
     height: int
+    lossy: bool
 
 
 def read_header(read: Read, name: str) -> WebPHeader:
-    """Read the header of a file: its first chunk, of one of three kinds.
+    """Read the header of a file: its first chunk, of one of three kinds, and of an extended one those up to the pixels.
 
     Raises:
         FormatError: it is no still WebP image.
@@ -71,14 +79,27 @@ def read_header(read: Read, name: str) -> WebPHeader:
         if data[20] & ANIMATED:
             raise FormatError(f"{quoted_value(name)} is an animation, but SOG needs a still image")
         sides = int.from_bytes(data[24:27], "little"), int.from_bytes(data[27:30], "little")
-        return WebPHeader(data, 1 + sides[0], 1 + sides[1])
+        data, lossy = _up_to_pixels(data, read)
+        return WebPHeader(data, 1 + sides[0], 1 + sides[1], lossy)
     if kind == b"VP8L":  # 14 bits each, minus one, after a byte of signature
         bits = int.from_bytes(data[21:25], "little")
-        return WebPHeader(data, 1 + (bits & 0x3FFF), 1 + (bits >> 14 & 0x3FFF))
+        return WebPHeader(data, 1 + (bits & 0x3FFF), 1 + (bits >> 14 & 0x3FFF), False)
     if kind == b"VP8 ":  # 14 bits each, after a frame tag and a start code
         width, height = struct.unpack_from("<HH", data, 26)
-        return WebPHeader(data, width & 0x3FFF, height & 0x3FFF)
+        return WebPHeader(data, width & 0x3FFF, height & 0x3FFF, True)
     raise FormatError(f"{quoted_value(name)} is not a WebP image")
+
+
+def _up_to_pixels(data: bytes, read: Read) -> tuple[bytes, bool]:
+    """Read the chunks up to that of the pixels, and return all bytes so far, and whether the pixels are lossy."""
+    for _ in range(MOST_BEFORE):
+        head = read(8)
+        data += head
+        if len(head) < 8 or head[:4] in (b"VP8L", b"VP8 "):
+            return data, head[:4] == b"VP8 "
+        size = int.from_bytes(head[4:], "little")
+        data += read(size + size % 2)
+    return data, False
 
 
 def pixels_of(header: WebPHeader, read: Read, name: str) -> Pixels:
@@ -281,6 +302,17 @@ class SogFiles:
             if total < count:
                 raise FormatError(f"{quoted_value(name)} has {count_of(total, 'texel')} for {count_of(count, 'splat')}")
             return pixels_of(header, file.read, name)[:count]
+
+    def lossy(self) -> list[str]:
+        """Return the names of the images that are compressed with losses, as far as their headers can be read."""
+        return [name for name in _image_names(self.meta) if self._is_lossy(name)]
+
+    def _is_lossy(self, name: str) -> bool:
+        try:
+            with self._archive.opened(name, whole=False) if self._archive else self._open_companion(name) as file:
+                return read_header(file.read, name).lossy
+        except FormatError:  # which reading the splats reports
+            return False
 
     def bytes_of(self, texture: str, index: int) -> int:
         """Return the bytes of an image, as they are stored."""

@@ -155,6 +155,7 @@ def _open(source: Source, *, full_detail: bool) -> tuple[RegionLayout, Content]:
     regions, levels = layout.counts.shape
     header = {"version": VERSION, "levels": levels, "regions": regions, "bytes": size}
     antialiased, note = any(chunk.antialiased for chunk in chunks), manifest.noted
+    notes = dict.fromkeys((*note.problems, *(text for chunk in chunks for text in chunk.notes)))
     form = f"Streamed SOG {VERSION}"
     fill = beside.fill(chunks, degree, source.threads)
-    return layout, Content(count, degree, form, fill, antialiased, note.problems, header, note.up)
+    return layout, Content(count, degree, form, fill, antialiased, tuple(notes), header, note.up)

@@ -94,6 +94,7 @@ def file_violations(manifest: Manifest, files: Mapping[str, Chunk | str]) -> Ite
         if isinstance(found, str):
             yield broken("chunk-files", found)
         elif found is not None:
+            yield from _about(found)
             if end and found.count != end:
                 text = f"{quoted_value(name)} has {count_of(found.count, 'splat')}, but its runs end at {end:,}"
                 yield broken("runs", text)
@@ -104,6 +105,15 @@ def file_violations(manifest: Manifest, files: Mapping[str, Chunk | str]) -> Ite
     environment = None if manifest.environment is None else files.get(manifest.environment)
     if isinstance(environment, str):
         yield broken("environment", environment)
+    elif environment is not None:
+        yield from _about(environment)
+
+
+def _about(file: Chunk) -> Iterator[RuleViolation]:
+    """Yield what a chunk file notes of itself."""
+    for note in file.notes:
+        code = "container.lossy" if note.startswith(sog.LOSSY) else "container.left-out"
+        yield RuleViolation(code, f"{quoted_value(file.name)}: {note}", fatal=False)
 
 
 def _kind_of(file: Chunk) -> str:
