@@ -47,15 +47,20 @@ SECTION = np.dtype(
 #: side.
 LEVELS = (("<f4", "<f4", "<f4", 1), ("<u2", "<f2", "<f2", 32767), ("<u2", "<f2", "u1", 32767))
 
-#: Highest SH degree of the format.
-MAX_DEGREE = 2
+#: Highest SH degree: that of Spark's and splat-transform's readers; mkkellogg's own viewer writes up to 2.
+MAX_DEGREE = 3
 
 #: Bytes of SH mean -1.5..1.5 if the header gives no range.
 DEFAULT_SH = 1.5
 
 #: Place of coefficient k of channel c among the SH values of a splat: within a degree all of red come first.
 SH_PLACES = np.array(
-    [c * 3 + k for k in range(3) for c in range(3)] + [9 + c * 5 + k for k in range(5) for c in range(3)]
+    [
+        3 * COEFFICIENTS[degree - 1] + c * (2 * degree + 1) + k
+        for degree in range(1, MAX_DEGREE + 1)
+        for k in range(2 * degree + 1)
+        for c in range(3)
+    ]
 )
 
 

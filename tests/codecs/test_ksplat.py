@@ -62,6 +62,16 @@ def test_a_row_of_floats_is_decoded_as_worked_out_by_hand() -> None:
     np.testing.assert_array_equal(splats.sh[0] * 16, np.transpose([red, green, blue]))
 
 
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_within_a_degree_all_of_red_come_first(degree: int) -> None:
+    count = (degree + 1) ** 2 - 1
+    row = struct.pack(f"<10f4B{3 * count}f", *range(10), 0, 0, 0, 0, *range(3 * count))
+    sh = decode(headers(0, 1, {"splats": 1, "room": 1, "degree": degree}) + row).splats.sh[0]
+    bands = ((0, 1, 2), (3, 4, 5, 6, 7), (8, 9, 10, 11, 12, 13, 14))[:degree]
+    in_file = [sh[k, c] for band in bands for c in range(3) for k in band]
+    assert in_file == list(range(3 * count))
+
+
 BUCKETS = {"bucket_splats": 2, "buckets": 3, "width": 4.0, "bucket_bytes": 12, "steps": 32767, "full": 1, "partial": 2}
 CENTERS = struct.pack("<9f", 0, 0, 0, 10, 20, 30, -5, -5, -5)
 
@@ -131,7 +141,8 @@ REFUSED: dict[str, tuple[Callable[[], bytes], str]] = {
     "version 1.1": (lambda: edited(0, "B", 1), r"KSPLAT version 1\.1 is unknown"),
     "version 0.0": (lambda: edited(1, "B", 0), r"KSPLAT version 0\.0 is unknown"),
     "level 3": (lambda: edited(20, "H", 3), "compression level 3 is unknown"),
-    "degree 3": (lambda: edited(SECTION + 40, "H", 3), "KSPLAT has no SH degree 3"),
+    "degree 4": (lambda: edited(SECTION + 40, "H", 4), "KSPLAT has no SH degree 4"),
+    "degree 3 of fewer bytes": (lambda: edited(SECTION + 40, "H", 3), "cut short"),
     "a splat more": (lambda: edited(16, "I", 61), "its header announces 61 splats, its sections have 60"),
     "a splat less in a section": (lambda: edited(SECTION, "I", 35), "its header announces 60 splats"),
     "more splats than room": (lambda: edited(SECTION, "I", 37), "cut short"),

@@ -235,7 +235,10 @@ STREAMED_SOG = {
 # --- KSPLAT -----------------------------------------------------------------------------------------------------------
 
 #: For each section, the share of the splats at which it ends, and its SH degree.
-SECTIONS: Mapping[str, tuple[tuple[float, int], ...]] = {"": ((1.0, 2),), " sections": ((0.3, 1), (0.6, 0), (1.0, 2))}
+SECTIONS: Mapping[str, tuple[tuple[float, int], ...]] = {
+    "": ((1.0, 3),),
+    " sections": ((0.3, 1), (0.6, 0), (0.8, 3), (1.0, 2)),
+}
 SH_RANGE = (-0.9, 0.8)
 
 
@@ -272,12 +275,12 @@ def ksplat_precision(source: Scene, level: int, sections: str) -> Precision:
 
 
 def held_by_ksplat(splats: Splats, sections: str) -> Splats:
-    """Returns the splats with SH up to degree 2, and zeros where a section has a lower degree."""
+    """Returns the splats with zeros where the SH of a section have a lower degree."""
     cut = by_hand_ksplat.parts(len(splats), SECTIONS[sections])
     held = splats.with_max_sh(max(degree for _, degree in cut))
     sh = held.sh.copy()
     for part, degree in cut:
-        sh[part, (0, 3, 8)[degree] :] = 0
+        sh[part, (0, 3, 8, 15)[degree] :] = 0
     return dataclasses.replace(held, sh=sh)
 
 
