@@ -39,7 +39,7 @@ MAX_PALETTE = 1 << 16
 MAX_SPLATS = 1 << 28
 
 #: How the note on lossy images begins, which is a finding of its own.
-LOSSY = "its values are not those that were written, since its images are lossy WebP"
+LOSSY = "its images are lossy WebP"
 
 #: Where the channels stand in a pixel.
 RED_GREEN_BLUE, ALPHA = np.array([16, 8, 0], np.uint32), np.array([24], np.uint32)
@@ -80,7 +80,7 @@ def open_content(source: Source) -> Content:
     check_promise(count * 4 * (14 + 3 * COEFFICIENTS[degree]), files.size)
     steps = _steps(meta, version, palette)
     lossy = ", ".join(map(quoted_value, files.lossy()))
-    losses = (f"{LOSSY} ({lossy}): write it anew without losses",) if lossy else ()
+    losses = (f"{LOSSY} ({lossy}), so that values are not those written; encode them without losses",) if lossy else ()
     center_tables = codings.center_table(meta.numbers(3, "means", "mins"), meta.numbers(3, "means", "maxs"))
 
     def in_order() -> list[Step]:
