@@ -14,7 +14,7 @@ MAX_NESTING = 512
 
 
 def parse_manifest(data: bytes, called: str, most: int) -> dict[str, Any]:
-    """Return the object that a manifest is.
+    """Return the object that a manifest is, without keys whose value is null.
 
     Args:
         called: its name, for messages.
@@ -31,7 +31,12 @@ def parse_manifest(data: bytes, called: str, most: int) -> dict[str, Any]:
         raise FormatError(f"{called} is not JSON: {error}") from None
     if not isinstance(root, dict):
         raise FormatError(f"{called} is not an object")
-    return root
+    return _without_nulls(root)
+
+
+def _without_nulls(record: dict[str, Any]) -> dict[str, Any]:
+    """Return an object without keys whose value is null, which viewers take for missing."""
+    return {key: value for key, value in record.items() if value is not None}
 
 
 def place_of(
@@ -56,8 +61,8 @@ def nodes_of(
 ) -> Iterator[tuple[dict[str, Any], int, list[int], Callable[[], str]]]:
     """Yield the nodes of a tree, however deep, root first and depth first.
 
-    A node is its object, the number of its parent, -1 of the root, the numbers of its children, to which each is added
-    when it is reached, and a function that returns its place.
+    A node is its object, without keys whose value is null, the number of its parent, -1 of the root, the numbers of its
+    children, to which each is added when it is reached, and a function that returns its place.
 
     Args:
         tree: the value that should be the root.
@@ -87,7 +92,10 @@ def nodes_of(
 
         if not isinstance(value, dict):
             raise wrong(called, place(), value, kind)
+        value = _without_nulls(value)
         below = value.get("children", [])
+        if below == "" or below is False:  # which viewers take for missing, too
+            below = []
         if not isinstance(below, list):
             raise wrong(called, f"{place()}.children", below, "a list")
         yield value, parent, children[number], place

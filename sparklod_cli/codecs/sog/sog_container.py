@@ -163,8 +163,9 @@ class Meta:
             raise NotSplatsError(f"its {META} is not that of a SOG")
 
     def has(self, key: str) -> bool:
-        """Return True if there is such a key at the top level, with a value other than null."""
-        return self.root.get(key) is not None
+        """Return True if there is such a key at the top level, with a value that is not null, false, "" or empty."""
+        value = self.root.get(key)
+        return bool(value) or type(value) is int
 
     def _get(self, *way: str | int) -> Any:
         value = self.root

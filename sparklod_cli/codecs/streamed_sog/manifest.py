@@ -132,7 +132,7 @@ def parse(data: bytes) -> Manifest:
     filenames = root.get("filenames")
     if not isinstance(filenames, list) or not all(isinstance(name, str) for name in filenames):
         raise wrong(MANIFEST, "filenames", filenames, "a list of paths")
-    environment = root.get("environment")
+    environment = root.get("environment") or None  # viewers test for truth, and some writers leave "" where none is
     if environment is not None and not isinstance(environment, str):
         raise wrong(MANIFEST, "environment", environment, "a path")
     nodes = _nodes(root.get("tree"), levels, len(filenames))
@@ -146,7 +146,7 @@ def _nodes(tree: Any, levels: int, files: int) -> tuple[ManifestNode, ...]:
     rows, too_many = [], f"the tree of {MANIFEST} has more than {MAX_NODES:,} nodes"
     for value, parent, children, place in nodes_of(tree, "tree", MANIFEST, "a node", MAX_NODES, too_many):
         lods = value.get("lods")
-        runs = None if lods is None else _runs(lods, keys, files, place)
+        runs = _runs(lods, keys, files, place) if lods or lods == {} else None
         rows.append((_bound(value.get("bound")), children, runs, value.get("errors"), parent))
     return tuple(
         ManifestNode(bound, tuple(children), runs, errors, parent) for bound, children, runs, errors, parent in rows
