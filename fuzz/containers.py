@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import gzip
 import io
+import json
 import struct
 import zipfile
 import zlib
@@ -15,7 +16,7 @@ import numpy as np
 import zstandard
 from PIL import Image
 
-from fixtures import by_hand, by_hand_rad, by_hand_sog
+from fixtures import by_hand, by_hand_glb, by_hand_rad, by_hand_sog
 
 from .case import Rng
 from .mutate import INTEGERS, json_mutated, mutated, pick, text_mutated
@@ -61,6 +62,7 @@ FOLDERS = {
     "sh1-streamed-sog": (".", "lod-meta.json"),
     "sh1-tiles": (".", "tileset.json"),
     "sh3-rad": ("sh3.rad",),
+    "sh1-gltf": ("scene.gltf",),
 }
 
 
@@ -82,6 +84,9 @@ def split_file(data: bytes) -> tuple[Parts, Callable[[Parts], bytes]]:
         if data[:3] == b"RAD":
             rad = by_hand_rad.split(data)
             return rad, functools.partial(by_hand_rad.joined, original=rad)
+        if data[:4] == b"glTF":
+            root, content = by_hand_glb.split(data)
+            return {"glTF.json": json.dumps(root).encode(), "payload": content}, _glb
         if data[:4] == b"PK\x03\x04":
             with zipfile.ZipFile(io.BytesIO(data)) as archive:
                 return {name: archive.read(name) for name in archive.namelist()}, by_hand_sog.zipped
@@ -93,6 +98,11 @@ def split_file(data: bytes) -> tuple[Parts, Callable[[Parts], bytes]]:
 
 def _joined(parts: Parts) -> bytes:
     return b"".join(parts.values())
+
+
+def _glb(parts: Parts) -> bytes:
+    text, content = parts.values()
+    return by_hand_glb.container_of(text, content)
 
 
 def _gzipped(parts: Parts) -> bytes:

@@ -120,6 +120,15 @@ FORMATS = (
         parts="tiles",
         keys=("geometricError",),
     ),
+    # The same as JSON, whose keys stand in any order; a meta.json of SOG is JSON, too.
+    Format(
+        "glTF",
+        "glb.codec",
+        (".gltf",),
+        rb"(?:\xef\xbb\xbf)?\s*\{.*?\"(?:accessors|bufferViews|buffers|meshes)\"\s*:\s*\[",
+        companions=True,
+        folders=True,
+    ),
     # A zip that begins with NAME/data.pkl; SOG is a zip, too.
     Format("checkpoint", "checkpoint", (".pt", ".ckpt"), rb"PK\x03\x04.{26}[^/]{1,200}/data\.pkl"),
     # A zip, or its meta.json unpacked.
@@ -133,7 +142,7 @@ FORMATS = (
         companions=True,
         keys=("means", "quats"),
     ),
-    Format("GLB", "glb.codec", (".glb",), rb"glTF", writable=True),
+    Format("GLB", "glb.codec", (".glb",), rb"glTF", writable=True, companions=True, folders=True),
     # Version 0.1 on, as a float denormal, and fewer than 2 ** 24 sections, which as a float would be, too.
     Format("KSPLAT", "ksplat", (".ksplat",), rb"\0[\x01-\xff]\0\0...\0"),
     Format("HIER", "hier", (".hier",), None),

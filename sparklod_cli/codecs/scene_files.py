@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import BinaryIO
 
 from ..model.splats import COLUMNS, Splats
-from ..support.errors import FormatError
+from ..support.errors import FormatError, UnsupportedError
 from ..support.parallel import ordered_map
 from ..support.progress import Progress, silent
 from ..support.untrusted import quoted_value
@@ -160,9 +160,8 @@ class SceneFiles:
                 begin, end = end, end + chunk.rows
                 start, stop = max(target.start, begin), min(target.stop, end)
                 if start < stop:
-                    rows, splats = target.rows(slice(start, stop)), decoded(chunk, begin)
-                    for column in COLUMNS:
-                        getattr(rows, column)[:] = getattr(splats, column)[start - begin : stop - begin]
+                    part = decoded(chunk, begin).rows(slice(start - begin, stop - begin))
+                    copy_rows(part, target.rows(slice(start, stop)))
             if target.stop == count:
                 last.clear()
 
@@ -185,18 +184,24 @@ class SceneFiles:
         with opened as file:
             try:
                 yield Source(file, beside)
+            except UnsupportedError as error:  # the file is sound
+                raise UnsupportedError(f"{quoted_value(name)}: {error}") from None
             except FormatError as error:
                 raise error_of(self.code, f"{quoted_value(name)}: {error}") from None
 
 
 def _copy(out: Splats, piece: Piece, row: int, splats: Splats) -> None:
     """Copy a piece of a file to rows."""
-    source, target = slice(piece.start, piece.start + piece.count), slice(row, row + piece.count)
+    copy_rows(splats.rows(slice(piece.start, piece.start + piece.count)), out.rows(slice(row, row + piece.count)))
+
+
+def copy_rows(splats: Splats, out: Splats) -> None:
+    """Copy splats to as many rows; SH coefficients that they do not have become 0."""
     for name in COLUMNS:
         column = getattr(out, name)
         if name == "sh":
             has = splats.sh.shape[1]
-            column[target, has:] = 0
-            column[target, :has] = splats.sh[source]
+            column[:, has:] = 0
+            column[:, :has] = splats.sh
         else:
-            column[target] = getattr(splats, name)[source]
+            column[...] = getattr(splats, name)

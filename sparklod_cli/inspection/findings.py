@@ -27,6 +27,7 @@ CODES: dict[str, tuple[str, str]] = {
     "container.cut-short": (ERROR, "the file ends before all of its data"),
     "container.promise": (ERROR, "the header announces more than a file of this size can hold"),
     "container.version": (ERROR, "the version, compression level or SH degree does not exist in this format"),
+    "container.unsupported": (ERROR, "the file uses a part of its format that sparklod does not read"),
     "container.corrupt": (ERROR, "the data do not follow the format"),
     "container.checksum": (ERROR, "a checksum does not match"),
     "container.too-long": (ERROR, "a stream is longer than the header announces"),

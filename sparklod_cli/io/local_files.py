@@ -102,6 +102,10 @@ def open_plain(path: Path) -> BinaryIO:
     return file
 
 
+#: Formats whose buffers may be files.
+GLTF = ("GLB", "glTF")
+
+
 def companions(path: Path, sets: Collection[Collection[str]]) -> list[Path]:
     """Return the files that are read together with one, as far as can be told; nothing is raised."""
     try:
@@ -121,13 +125,15 @@ def companions(path: Path, sets: Collection[Collection[str]]) -> list[Path]:
 
 
 def _named_in(path: Path) -> list[Path]:
-    """Return the files that a splat file names: images of a SOG, chunks of a RAD, all of a Streamed SOG or 3D Tiles."""
+    """Return the files that a splat file names: images of a SOG, chunks of a RAD, all of the other formats."""
     with path.open("rb") as file:
         head = head_of(file)
         form = sniff(head, "")
         if form is not None and not form.companions:
             return []
-        from ..codecs.rad import rad_header  # what most jobs do without, as what follows
+        from ..codecs.content import Source  # what most jobs do without, as what follows
+        from ..codecs.glb.glb_container import GltfFile
+        from ..codecs.rad import rad_header
         from ..codecs.streamed_sog.manifest import MAX_MANIFEST, parse
         from ..codecs.tiles_3d.tileset import MAX_TILESET
 
@@ -135,6 +141,8 @@ def _named_in(path: Path) -> list[Path]:
             return _companion_paths(path, rad_header.read_header(file).filenames)
         if form is not None and form.parts == "tiles":
             return _tiles_of(path, file.read(MAX_TILESET + 1))
+        if form is not None and form.name in GLTF:
+            return _companion_paths(path, GltfFile(Source(file)).names(), folders=True)
         if form is not None and form.folders:
             metas = _companion_paths(path, parse(file.read(MAX_MANIFEST + 1)).names(), folders=True)
             return [*metas, *itertools.chain(*map(_images_of, metas))]
@@ -142,11 +150,10 @@ def _named_in(path: Path) -> list[Path]:
 
 
 def _tiles_of(path: Path, data: bytes) -> list[Path]:
-    """Return the files of the tiles of a tileset, and of the nested ones that it names."""
-    from ..codecs.tiles_3d.tileset import read_whole
+    """Return the files of the tiles of a tileset and of the nested ones that it names, and the buffers of these."""
+    from ..codecs.tiles_3d.codec import names_of
 
-    tileset = read_whole(data, functools.partial(open_named, path, folders=True))
-    return _companion_paths(path, tileset.names(), folders=True)
+    return _companion_paths(path, names_of(data, functools.partial(open_named, path, folders=True)), folders=True)
 
 
 def _images_of(path: Path) -> list[Path]:

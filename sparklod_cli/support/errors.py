@@ -55,6 +55,12 @@ class VersionError(FormatError):
     code = "container.version"
 
 
+class UnsupportedError(FormatError):
+    """A file uses a part of its format that sparklod does not read."""
+
+    code = "container.unsupported"
+
+
 class ChecksumError(FormatError):
     """A checksum does not match."""
 

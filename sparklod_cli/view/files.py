@@ -22,7 +22,8 @@ from ..codecs.glb.glb_container import MAGIC as GLB_MAGIC
 from ..codecs.rad.rad_header import MAGIC, RadHeader, read_header
 from ..codecs.sog.sog_container import MAX_META, image_names
 from ..codecs.streamed_sog.manifest import MAX_MANIFEST, parse
-from ..codecs.tiles_3d.tileset import MAX_TILESET, read_whole
+from ..codecs.tiles_3d.codec import names_of
+from ..codecs.tiles_3d.tileset import MAX_TILESET
 from ..codecs.zip_folder import ZIP, ZipFolder
 from ..io.local_files import companion_path, in_folder, open_named, open_plain, reason_unreadable
 from ..io.reading import recognised
@@ -67,7 +68,7 @@ MEDIA_TYPES = {
 BYTES = "application/octet-stream"
 
 #: Suffixes of the files that a splat file may name.
-PARTS = (".json", ".sog", ".webp", ".glb", ".radc", ".rad")
+PARTS = (".json", ".sog", ".webp", ".glb", ".gltf", ".bin", ".radc", ".rad")
 
 #: By name, with / between folders: bytes, or the real path of a file.
 Resources = Mapping[str, bytes | Path]
@@ -168,7 +169,7 @@ def _shown(path: Path, folder: str) -> ShownFile:
         raise NotSplatsError(f"Spark does not read {form.name}; bake it first with sparklod build-lod")
     name = f"{folder}/{path.name}"
     files = {name: path.resolve()}
-    if form.folders:
+    if form.parts is not None:
         companions = _tileset_files(path) if form.parts == "tiles" else _manifest_files(path)
         files |= {f"{folder}/{each}": _inside(path, path.parent / each) for each in companions}
     elif header is not None:
@@ -220,8 +221,8 @@ def _manifest_files(path: Path) -> list[str]:
 def _tileset_files(path: Path) -> list[str]:
     """Return the names of all files that a tileset refers to; `FormatError` where one is missing or elsewhere."""
     with open_plain(path.resolve()) as file:
-        tileset = read_whole(file.read(MAX_TILESET + 1), functools.partial(open_named, path, folders=True))
-    for name in (names := list(dict.fromkeys(tileset.names()))):
+        names = names_of(file.read(MAX_TILESET + 1), functools.partial(open_named, path, folders=True))
+    for name in names:
         open_named(path, name, folders=True).close()
     return names
 

@@ -73,7 +73,7 @@ def put(content: Content, directory: Path, form: str) -> Path:
     for name, data in content.items():
         (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).write_bytes(data)
-    return next((folder / name for name in content if name.endswith(".rad")), folder)
+    return next((folder / name for name in content if name.endswith(".rad") or name == "scene.gltf"), folder)
 
 
 def linear(source: Scene) -> dict[str, Array]:

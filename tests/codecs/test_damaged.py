@@ -42,7 +42,8 @@ FILES = (
     *("golden/sh1.hier", "golden/sh3-half.hier"),
     *("golden/sh2-gsplat.pt", "golden/sh1-nerfstudio.ckpt"),
     "golden/sh1-tree.rad",
-    *(f"golden/{name}.glb" for name in ("sh2", "sh1-quantized", "hand-spz")),
+    *(f"golden/{name}.glb" for name in ("sh2", "sh1-quantized", "hand-spz", "sh1-draft", "parts")),
+    *("golden/sh2.gltf", "golden/sh1-gltf/scene.gltf"),
 )
 GZIPPED = tuple(name for name in FILES if name.endswith(".spz") and "v4" not in name)
 ZIPPED = tuple(name for name in FILES if name.endswith(".sog"))
@@ -62,7 +63,7 @@ def content(name: str) -> bytes:
 def files_of(name: str) -> dict[str, bytes]:
     """All files of the folder of a manifest, and of the folders there."""
     folder = (FIXTURES / name).parent
-    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.glob("*/*")}
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.glob("*/*") if path.is_file()}
 
 
 def format_of(name: str, data: bytes) -> Format | None:
@@ -262,6 +263,7 @@ MAGICS = (
     *(b"ply\n", b"ply\r", b"ply\nelement chunk 1\nelement vertex 1\nproperty uint packed_position\n"),
     *(b"\x1f\x8b\x08\0", b"NGSP", b"PK\x03\x04", b'{"quats":1, "means":', b'{"lodLevels":'),
     b'{"asset":{},"geometricError":',
+    b'{"asset":{"version":"2.0"},"accessors":[',
     b"PK\x03\x04" + bytes(26) + b"archive/data.pkl",
     *(b"\0\1\0\0\1\0\0\0", b"\0\1\0\0\3" + bytes(4091)),
     *(b"RAD0", b"RAD0\40\0\0\0{", b"RADC"),

@@ -41,14 +41,11 @@ def read(data: bytes) -> Scene:
 
 
 def root_of(data: bytes) -> dict[str, Any]:
-    size = struct.unpack_from("<I", data, 12)[0]
-    root = json.loads(data[20 : 20 + size])
-    assert isinstance(root, dict)
-    return root
+    return by_hand_glb.split(data)[0]
 
 
 def content_of(data: bytes) -> bytes:
-    return data[28 + struct.unpack_from("<I", data, 12)[0] :]
+    return by_hand_glb.split(data)[1]
 
 
 def with_root(data: bytes, **changes: Any) -> bytes:
@@ -150,23 +147,32 @@ def test_nodes_place_the_splats_of_others() -> None:
     np.testing.assert_allclose(same.splats.center, back.splats.center, atol=1e-5)
 
 
+def chain(length: int, **fields: Any) -> list[dict[str, Any]]:
+    """Nodes each below the one before, of which the last has the splats."""
+    return [*({"children": [number + 1]} | fields for number in range(length - 1)), {"mesh": 0} | fields]
+
+
 @pytest.mark.parametrize(
     ("nodes", "text"),
     [
         ([{"mesh": 0, "scale": [1, 2, 1]}], "stretches, shears or mirrors"),
         ([{"mesh": 0, "scale": [-1, 1, 1]}], "stretches, shears or mirrors"),
-        ([{"mesh": 0, "scale": [0, 0, 0]}], "stretches, shears or mirrors"),
-        ([{"mesh": 0, "matrix": [0] * 16}], "stretches, shears or mirrors"),
+        ([{"mesh": 0, "scale": [0, 0, 0]}], "is singular"),
+        ([{"mesh": 0, "matrix": [0] * 16}], "is not affine"),
         ([{"mesh": 0, "matrix": [1] * 15}], "not 16 numbers"),
         ([{"mesh": 0, "rotation": [0, 0, 0, 0]}], "no unit quaternion"),
         ([{"mesh": 0, "translation": [1e300, 0, 0]}], "not 3 numbers up to"),
         ([{"mesh": 0, "translation": "far"}], "not 3 numbers up to"),
-        ([{"mesh": 0}, {"mesh": 0}], "2 nodes have its splats"),
+        (chain(40, scale=[1e12] * 3), "multiply to numbers beyond"),
+        (chain(40, translation=[1e12, 0, 0]), "multiply to numbers beyond"),
+        (chain(40, scale=[1e-12] * 3), "is singular"),
+        (chain(2, scale=[1e-10] * 3), r"the scale 1e-20 is out of range"),
         ([{"mesh": 0, "children": [1]}, {"children": [0]}], "linked in a circle"),
         ([{"mesh": 0, "children": [0]}], "linked in a circle"),
         ("none", "nodes of its JSON is no array of objects"),
     ],
 )
+@pytest.mark.filterwarnings("error")
 def test_nodes_that_cannot_be_followed_are_refused(nodes: Any, text: str) -> None:
     with pytest.raises(FormatError, match=text):
         read(by_hand_glb.glb(**linear(SPLATS), nodes=nodes))
@@ -201,7 +207,7 @@ def changed(what: str, index: int, **changes: Any) -> bytes:
         (changed("bufferViews", 0, byteStride=1 << 30), "stride of accessor 0 is"),
         (changed("bufferViews", 0, buffer=1), "there is no 1 among the 1 buffers"),
         (changed("buffers", 0, byteLength=100), "ends beyond its buffer"),
-        (changed("buffers", 0, uri="http://example.org/x.bin"), "in another file"),
+        (changed("buffers", 0, uri="http://example.org/x.bin"), "not a file below its folder"),
         (changed("meshes", 0, primitives=[]), "no primitive has the extension"),
         (b"glTF\1\0\0\0" + bytes(20), "version 1 is unknown"),
         (by_hand_glb.container({"meshes": [[]]}, b""), "no array of objects"),
@@ -237,7 +243,12 @@ def test_properties_of_other_kinds_are_noted() -> None:
     extension = meshes[0]["primitives"][0]["extensions"][by_hand_glb.NAME]
     extension |= {"colorSpace": "lin_rec709_display", "kernel": "custom"}
     notes = read(with_root(data, meshes=meshes)).notes
-    assert [note.split(" is read as ")[1] for note in notes] == ["ellipse", "srgb_rec709_display"]
+    assert [note.split(" is read as ")[1] for note in notes] == [
+        "ellipse",
+        "srgb_rec709_display, which makes its colours too dark",
+    ]
+    extension |= {"colorSpace": "BT.709-sRGB", "kernel": "ellipse"}  # as drafts called it
+    assert read(with_root(data, meshes=meshes)).notes == ()
 
 
 @pytest.mark.parametrize("profile", PROFILES)

@@ -343,6 +343,32 @@ GLB = {
     ),
 }
 
+
+def in_parts(source: Scene, **more: Any) -> bytes:
+    """Two primitives, each of a half of the splats."""
+    values = linear(source)
+    parts = [part for part in np.array_split(np.arange(len(source)), 2) if len(part)]
+    halves = [by_hand_glb.glb(**{name: column[part] for name, column in values.items()}) for part in parts]
+    return by_hand_glb.together(halves, **more)
+
+
+GLB |= {
+    "draft": Case("GLB", lambda source: by_hand_glb.glb(**linear(source), draft=True), exact),
+    "two nodes": Case("GLB", in_parts, exact),
+    "two primitives": Case("GLB", functools.partial(in_parts, one_mesh=True), exact),
+}
+
+
+def as_gltf(source: Scene, buffer: str) -> Content:
+    text, content = by_hand_glb.as_json(by_hand_glb.glb(**linear(source)), buffer)
+    return {"scene.gltf": text, "buffers/a b.bin": content}
+
+
+GLTF = {
+    "data within": Case("glTF", lambda source: by_hand_glb.as_json(by_hand_glb.glb(**linear(source)))[0], exact),
+    "file": Case("glTF", functools.partial(as_gltf, buffer="./buffers/a%20b.bin"), exact),
+}
+
 # --- 3D Tiles ---------------------------------------------------------------------------------------------------------
 
 
@@ -357,9 +383,25 @@ def as_tiles(source: Scene, *, nested: bool = False) -> Content:
     return by_hand_tiles.tileset_files(root, by_hand_glb.glb)
 
 
+def as_tiles_of_json(source: Scene) -> Content:
+    """Tiles of glTF as JSON, whose buffers are files beside them."""
+    files = as_tiles(source, nested=True)
+    assert isinstance(files, dict)
+    made: dict[str, bytes] = {}
+    for name, data in files.items():
+        path, suffix = name.rsplit(".", 1)
+        if suffix == "glb":
+            buffer = f"{path}.bin"
+            made[f"{path}.gltf"], made[buffer] = by_hand_glb.as_json(data, buffer.rsplit("/", 1)[-1])
+        else:
+            made[name] = data.replace(b".glb", b".gltf")
+    return made
+
+
 TILES = {
     "by hand": Case("3D Tiles 1.1 of GLB", as_tiles, exact),
     "nested": Case("3D Tiles 1.1 of GLB", functools.partial(as_tiles, nested=True), exact),
+    "JSON": Case("3D Tiles 1.1 of glTF", as_tiles_of_json, exact),
 }
 
 # --- Checkpoints ------------------------------------------------------------------------------------------------------
@@ -417,6 +459,7 @@ WRITERS: dict[str, dict[str, Case]] = {
     "SPLAT": SPLAT,
     "RAD": RAD,
     "GLB": GLB,
+    "glTF": GLTF,
     "3D Tiles": TILES,
     "checkpoint": CHECKPOINT,
     "HIER": HIER,

@@ -86,6 +86,7 @@ FAULTS: dict[str, set[str]] = {
     "ksplat-level-7.ksplat": {"container.version"},
     "ksplat-trailing.ksplat": {"container.trailing"},
     "ksplat-count.ksplat": {"container.corrupt"},
+    "glb-meshopt.glb": {"container.unsupported"},
     "splat-33-bytes.splat": {"container.cut-short"},
     "no-splats.ply": {"values.empty"},
     "no-splats.spz": {"values.empty"},

@@ -302,6 +302,21 @@ def test_a_tileset_that_is_not_read_is_refused(tileset: Path, tmp_path: Path, pa
         prepared([root], spark_dir=packages)
 
 
+def test_only_buffers_that_a_tile_is_read_from_are_published(tmp_path: Path, packages: Path) -> None:
+    shutil.copytree(GOLDEN / "sh1-gltf", tmp_path / "web")
+    box = {"box": [0, 0, 0, 9, 0, 0, 0, 9, 0, 0, 0, 9]}
+    root = {"boundingVolume": box, "geometricError": 0, "refine": "REPLACE", "content": {"uri": "scene.gltf"}}
+    tileset = {"asset": {"version": "1.1"}, "geometricError": 1, "root": root}
+    (tmp_path / "web" / "tileset.json").write_text(json.dumps(tileset))
+    (tmp_path / "web" / "secret.bin").write_text("secret")
+    edit(
+        tmp_path / "web" / "scene.gltf",
+        lambda gltf: gltf["buffers"].append({"uri": "secret.bin", "byteLength": 6}),
+    )
+    names = {name for name in prepared([tmp_path / "web"], spark_dir=packages).resources if name.startswith("data/")}
+    assert names == {"data/0/tileset.json", "data/0/scene.gltf", "data/0/buffers/sh1.bin"}
+
+
 # --- the first look
 
 

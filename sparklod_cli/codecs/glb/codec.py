@@ -1,204 +1,313 @@
-"""GLB with Gaussian splats: KHR_gaussian_splatting, plain or with SPZ inside.
+"""glTF with Gaussian splats: KHR_gaussian_splatting, plain or with SPZ inside, as GLB or as JSON.
 
 Profile "khronos" is the extension as it was ratified: an accessor for each attribute of a splat. Profile "cesium" is
 what CesiumJS reads, the draft KHR_gaussian_splatting_compression_spz_2: a buffer view with an SPZ file, and accessors
 without data. Both are read and written. Facts: extensions/2.0/Khronos/ of KhronosGroup/glTF.
+
+All primitives of splats are one scene, each where the nodes with its mesh put it.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import io
-from collections.abc import Callable, Iterator, Sequence
+from collections import ChainMap
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
-from ...model.gaussian import normalized_quat
-from ...model.scene import Scene
 from ...model.sh import COEFFICIENTS
 from ...model.splats import FloatArray, Splats
 from ...model.transforms import Transform
-from ...support.errors import FormatError, NotSplatsError
+from ...support.errors import FormatError, NotSplatsError, UnsupportedError
 from ...support.parallel import blocks_of, ordered_map
 from ...support.progress import Progress, silent
+from ...support.units import count_of
 from ...support.untrusted import quoted_value
-from .. import quantize, spz
-from ..clamps import SPZ, CodeRange
+from .. import spz
+from ..compression import check_promise
 from ..content import Content, Source, Target
-from ..file_notes import note_of, read_note
-from ..options import CESIUM, DEFAULTS, KHRONOS, WriteOptions
-from ..stream import Positioned, encode_rows
-from .glb_container import FLOAT, TYPES, Accessor, GlbFile, check_length, head_of
-from .placement import TURNS, is_turn_of, placement_of, rotation_of_up
+from ..file_notes import read_note
+from ..scene_files import copy_rows
+from . import log_scales
+from .attributes import (
+    COMPRESSION,
+    EXTENSION,
+    OLD_COMPRESSION,
+    POSITION,
+    SCALE,
+    Attribute,
+    attributes_of,
+    left_out,
+)
+from .glb_container import FLOAT, Accessor, GltfFile
+from .glb_writer import POINTS, PROPERTIES
+from .glb_writer import encode as encode
+from .glb_writer import extensions_of as extensions_of
+from .glb_writer import held as held
+from .glb_writer import settled as settled
+from .placement import Nodes, is_turn_of, transform_of
 
-EXTENSION, COMPRESSION = "KHR_gaussian_splatting", "KHR_gaussian_splatting_compression_spz_2"
+#: Extensions that a file may require, and how those begin that change no splats: materials and lights are ignored.
+READ = (EXTENSION, COMPRESSION, OLD_COMPRESSION, "KHR_mesh_quantization")
+INDIFFERENT = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_")
 
-#: glTF's number for primitives of points, and the target of vertex attributes.
-POINTS, ARRAY_BUFFER = 0, 34962
+#: Another name for the usual colour space, in drafts of the extension, and linear colours.
+DRAFT_COLORS, LINEAR_COLORS = "BT.709-sRGB", "lin_rec709_display"
 
-#: What the values of the extension mean, as they are written, and what other ones that are read mean for a picture.
-PROPERTIES = {
-    "kernel": "ellipse",
-    "colorSpace": "srgb_rec709_display",
-    "sortingMethod": "cameraDistance",
-    "projection": "perspective",
-}
+#: Most primitives of splats that nodes place. Chosen.
+MAX_PARTS = 1 << 14
 
-SIGNED, UNSIGNED = (5120, 5122), (5121, 5123)
-Coding = Callable[[FloatArray], FloatArray]
+#: Places of an accessor that are looked at, and values at each, to tell logarithms from scales. Chosen.
+PLACES, PLACE_ROWS = 64, 1 << 10
+
+#: Number of a mesh, and of a primitive of it.
+Key = tuple[int, int]
 
 
-@dataclass(frozen=True)
-class Attribute:
-    """An attribute of a splat.
+@dataclass(frozen=True, eq=False)
+class Part:
+    """Primitive of splats, and where a node puts it.
 
     Attributes:
-        semantic: its name in the file.
-        type: of its accessor.
-        integers: component types besides float that are read.
-        column: of `Splats`.
-        decode, encode: between values of the file and of the column.
-        term: number of the coefficient of SH; None for other columns.
+        key: of the primitive.
+        transform: to the scene.
     """
 
-    semantic: str
-    type: str
-    integers: tuple[int, ...]
-    column: str
-    decode: Coding = np.asarray
-    encode: Coding = np.asarray
-    term: int | None = None
-
-    def part_of(self, splats: Splats) -> FloatArray:
-        """Return the view of a column that it fills."""
-        column: FloatArray = getattr(splats, self.column)
-        return column if self.term is None else column[:, self.term]
-
-
-#: The attributes of every splat.
-ATTRIBUTES = (
-    Attribute("POSITION", "VEC3", (*SIGNED, *UNSIGNED), "center"),
-    Attribute(f"{EXTENSION}:ROTATION", "VEC4", SIGNED, "quat_xyzw", normalized_quat),
-    Attribute(f"{EXTENSION}:SCALE", "VEC3", SIGNED, "scale"),
-    Attribute(f"{EXTENSION}:OPACITY", "SCALAR", UNSIGNED, "opacity"),
-    Attribute(f"{EXTENSION}:SH_DEGREE_0_COEF_0", "VEC3", (), "rgb", quantize.decode_dc, quantize.encode_dc),
-)
-
-
-def sh_attributes(degree: int) -> list[Attribute]:
-    """Return the attributes of SH from degree 1 to a degree, each one coefficient."""
-    return [
-        Attribute(f"{EXTENSION}:SH_DEGREE_{each}_COEF_{order}", "VEC3", (), "sh", term=each * each - 1 + order)
-        for each in range(1, degree + 1)
-        for order in range(2 * each + 1)
-    ]
+    key: Key
+    transform: Transform
 
 
 def open_content(source: Source) -> Content:
-    """Open a GLB with one primitive of splats, in one node, whose transform is applied; y is up, as glTF demands.
+    """Open a glTF with primitives of splats, each placed by its nodes; y is up, as glTF demands.
 
     A file of sparklod that notes the axis which points up is read in the axes of its splats, without the turn of the
     node that makes that axis y. In one without that note, the axis is unknown, as it was when the file was written.
 
     Raises:
-        FormatError: the file is no GLB, has no splats or several primitives of them, or is cut short or corrupt.
+        FormatError: the file is no glTF, has no splats, uses something of glTF that is not read, or is cut short or
+            corrupt.
     """
-    file = GlbFile(source.file)
-    mesh, primitive = _primitive(file)
-    extension = primitive["extensions"][EXTENSION]
-    transform, asset = placement_of(file, mesh), file.root.get("asset")
+    file = GltfFile(source)
+    primitives = _primitives(file)
+    _check_required(file)
+    parts, notes = _parts(file, primitives)
+    asset = file.root.get("asset")
     asset = asset if isinstance(asset, dict) else {}
     extras = asset.get("extras")
     noted = read_note({**(extras if isinstance(extras, dict) else {}), "generator": asset.get("generator")})
     up = None if noted.is_ours else "y"
     if noted.up is not None:
-        is_turn = is_turn_of(transform, noted.up)
-        transform, up = (Transform(), noted.up) if is_turn else (transform, "y")
-    inner = extension.get("extensions")
-    packed = inner.get(COMPRESSION) if isinstance(inner, dict) else None
-    if packed is not None:
-        if not isinstance(packed, dict):
-            raise FormatError(f"{COMPRESSION} is {quoted_value(packed)}, not an object")
-        data = io.BytesIO(file.bytes_of(packed.get("bufferView")))
-        content = spz.open_content(dataclasses.replace(source, file=data, open_companion=None))
-        content = dataclasses.replace(content, format=f"GLB {content.format}", up=None)
-        if content.has_tree:
-            raise FormatError("the SPZ in it has a Level-of-Detail tree, which no glTF has")
-    else:
-        content = _plain_content(file, primitive, source)
-    notes = content.notes + noted.problems
-    notes += tuple(
-        f"its {name} {quoted_value(extension[name])} is read as {usual}"
-        for name, usual in PROPERTIES.items()
-        if extension.get(name, usual) != usual
+        is_turn = all(is_turn_of(part.transform, noted.up) for part in parts)
+        parts = [Part(part.key, Transform()) for part in parts] if is_turn else parts
+        up = noted.up if is_turn else "y"
+    opened = {
+        key: _opened(file, primitives[key], source, asset.get("generator"), alone=len(parts) == 1)
+        for key in dict.fromkeys(part.key for part in parts)
+    }
+    contents = [placed(opened[part.key], part.transform) for part in parts]
+    content = contents[0] if len(contents) == 1 else _joined(contents)
+    check_promise(content.count * 4 * (14 + 3 * COEFFICIENTS[content.sh_degree]), file.size)
+    return dataclasses.replace(
+        content,
+        format=("GLB" if file.is_binary else "glTF") + f" {content.format}" * bool(content.format),
+        antialiased=content.antialiased or noted.antialiased,
+        notes=tuple(dict.fromkeys([*notes, *content.notes, *noted.problems])),
+        header=ChainMap({"bytes": file.size}, cast("dict[str, int]", content.header)),  # to which reading adds
+        up=up,
     )
-    antialiased = content.antialiased or noted.antialiased
-    content = dataclasses.replace(content, notes=notes, antialiased=antialiased, up=up)
-    return content if transform.is_identity else placed(content, transform)
 
 
-def _primitive(file: GlbFile) -> tuple[int, dict[str, Any]]:
-    """Return the primitive with splats, and the number of its mesh."""
-    found = []
+def _primitives(file: GltfFile) -> dict[Key, dict[str, Any]]:
+    """Return the primitives of splats."""
+    found = dict[Key, dict[str, Any]]()
     for number, mesh in enumerate(file.items("meshes")):
         primitives = mesh.get("primitives", [])
-        for primitive in primitives if isinstance(primitives, list) else ():
-            extensions = primitive.get("extensions") if isinstance(primitive, dict) else None
-            if isinstance(extensions, dict) and isinstance(extensions.get(EXTENSION), dict):
-                found.append((number, primitive))
+        for order, primitive in enumerate(primitives if isinstance(primitives, list) else ()):
+            if isinstance(primitive, dict) and {EXTENSION, OLD_COMPRESSION} & _extensions(primitive).keys():
+                found[number, order] = primitive
     if not found:
         raise NotSplatsError(f"a glTF without splats: no primitive has the extension {EXTENSION}")
-    if len(found) > 1:
-        raise FormatError(f"{len(found)} primitives have splats; only one is read")
-    if found[0][1].get("mode", 4) != POINTS:
+    if any(primitive.get("mode", 4) != POINTS for primitive in found.values()):
         raise FormatError("its splats are no points: the mode of their primitive is not 0")
-    return found[0]
+    return found
 
 
-def _plain_content(file: GlbFile, primitive: dict[str, Any], source: Source) -> Content:
-    attributes = primitive.get("attributes")
-    if not isinstance(attributes, dict):
-        raise FormatError("its splats have no attributes")
-    missing = [each.semantic for each in ATTRIBUTES if each.semantic not in attributes]
-    if missing:
-        raise FormatError(f"its splats have no {', '.join(missing)}")
-    degree = 0
-    while degree < 3 and all(each.semantic in attributes for each in sh_attributes(degree + 1)):
-        degree += 1
-    listed = [each.semantic for each in sh_attributes(3) if each.semantic in attributes]
-    if len(listed) != COEFFICIENTS[degree]:
-        raise FormatError(f"SH of degree {degree + 1} are incomplete: {len(listed)} coefficients in all")
-    accessors = [
-        (each, file.accessor(attributes[each.semantic], each.type, (FLOAT, *each.integers)))
-        for each in (*ATTRIBUTES, *sh_attributes(degree))
+def _extensions(record: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Return the extensions of an object of the JSON; without those that are no objects."""
+    found = record.get("extensions")
+    return {name: each for name, each in found.items() if isinstance(each, dict)} if isinstance(found, dict) else {}
+
+
+def _check_required(file: GltfFile) -> None:
+    required = file.root.get("extensionsRequired", [])
+    for name in required if isinstance(required, list) else [required]:
+        if name not in READ and not str(name).startswith(INDIFFERENT):
+            raise UnsupportedError(f"it requires the extension {quoted_value(name)}, which is not read")
+
+
+def _parts(file: GltfFile, primitives: Mapping[Key, dict[str, Any]]) -> tuple[list[Part], list[str]]:
+    """Return where the primitives are, and notes on what is left out beside them."""
+    nodes, by_mesh, notes = Nodes(file), dict[int, list[Key]](), list[str]()
+    for key in primitives:
+        by_mesh.setdefault(key[0], []).append(key)
+    having, hidden = nodes.having(by_mesh)
+    if sum(len(by_mesh[nodes.records[node]["mesh"]]) for node in having) > MAX_PARTS:
+        raise UnsupportedError(f"its nodes place more than {MAX_PARTS:,} primitives of splats, which are not read")
+    parts, unknown = list[Part](), dict[str, None]()
+    for node in having:
+        record = nodes.records[node]
+        transform = transform_of(nodes.matrix(node))
+        parts += [Part(key, transform) for key in by_mesh[record["mesh"]]]
+        unknown |= dict.fromkeys(_extensions(record))
+    if hidden:
+        notes.append(f"left out: {count_of(hidden, 'node')} with splats outside of the scene that viewers show")
+    unplaced = len(by_mesh) - len({nodes.records[node]["mesh"] for node in having})
+    if having and unplaced:
+        notes.append(f"left out: {count_of(unplaced, 'mesh', 'meshes')} of splats that no node places")
+    others = sum(len(mesh["primitives"]) for mesh in file.items("meshes") if isinstance(mesh.get("primitives"), list))
+    others -= len(primitives)
+    if others:
+        notes.append(f"left out: {count_of(others, 'primitive')} without splats")
+    if file.root.get("animations"):
+        notes.append("left out: its animations")
+    if any(primitive.get("targets") for primitive in primitives.values()):
+        notes.append("left out: the morph targets of its splats")
+    for primitive in primitives.values():
+        unknown |= dict.fromkeys([*_extensions(primitive), *_extensions(_extensions(primitive).get(EXTENSION, {}))])
+    notes += [
+        f"the extension {quoted_value(name)} of its splats is not read"
+        for name in unknown
+        if name not in READ and not name.startswith(INDIFFERENT)
     ]
+    return parts or [Part(key, Transform()) for key in primitives], notes
+
+
+def _opened(file: GltfFile, primitive: dict[str, Any], source: Source, generator: object, *, alone: bool) -> Content:
+    """Open a primitive, where its mesh has it; `alone` if it is read once, as all of the scene."""
+    extensions = _extensions(primitive)
+    extension = extensions.get(EXTENSION, {})
+    packed = _extensions(extension).get(COMPRESSION, extensions.get(OLD_COMPRESSION))
+    if packed is None:
+        content = _plain_content(file, primitive, generator)
+    else:
+        view = packed.get("bufferView")
+
+        def unpacked(*, whole: bool = False) -> Content:
+            data = io.BytesIO(file.bytes_of(view))
+            scratch = None if whole else source.scratch
+            found = spz.open_content(dataclasses.replace(source, file=data, open_companion=None, scratch=scratch))
+            if found.has_tree:
+                raise UnsupportedError("the SPZ in it has a Level-of-Detail tree, which no glTF has")
+            return found
+
+        content = unpacked() if alone else _reopened(lambda: unpacked(whole=True))
+    notes = tuple(
+        f"its {name} {quoted_value(extension[name])} is read as {usual}"
+        + ", which makes its colours too dark" * (extension[name] == LINEAR_COLORS)
+        for name, usual in PROPERTIES.items()
+        if extension.get(name, usual) not in (usual, DRAFT_COLORS)
+    )
+    return dataclasses.replace(content, notes=content.notes + notes)
+
+
+def _plain_content(file: GltfFile, primitive: dict[str, Any], generator: object) -> Content:
+    names = primitive.get("attributes")
+    if not isinstance(names, dict):
+        raise FormatError("its splats have no attributes")
+    attributes, degree = attributes_of(names)
+    accessors = [(each, file.accessor(names[each.semantic], each.type, (FLOAT, *each.integers))) for each in attributes]
     count = accessors[0][1].count
     if any(accessor.count != count for _, accessor in accessors):
         raise FormatError(f"its attributes have different numbers of values, not all {count:,}")
-    positioned = Positioned(source.file)
+    notes = list(left_out(names, attributes))
+    scales, centers = (
+        _sampled(file, accessor)
+        for wanted in (SCALE, POSITION)
+        for each, accessor in accessors
+        if each.column == wanted.column
+    )
+    if log_scales.are_logs(scales, generator):
+        notes.append(log_scales.READ)
+        accessors = [
+            (log_scales.decoded(each) if each.column == SCALE.column else each, accessor)
+            for each, accessor in accessors
+        ]
+    elif doubt := log_scales.doubt_about(scales, centers, count):
+        notes.append(doubt)
 
     def fill(target: Target, threads: int, progress: Progress) -> None:
-        parts = blocks_of(len(target.splats))
+        with file.readers({accessor.buffer for _, accessor in accessors}) as readers:
 
-        @np.errstate(over="ignore", invalid="ignore")  # whether numbers are valid is for others to say
-        def read(item: tuple[slice, Attribute, Accessor]) -> slice:
-            part, attribute, accessor = item
-            out = attribute.part_of(target.splats)[part]
-            values = accessor.read(positioned, target.start + part.start, target.start + part.stop)
-            out[...] = attribute.decode(values).reshape(out.shape)
-            return part
+            @np.errstate(over="ignore", invalid="ignore")  # whether numbers are valid is for others to say
+            def read(item: tuple[slice, Attribute, Accessor]) -> slice:
+                part, attribute, accessor = item
+                out = attribute.part_of(target.splats)[part]
+                values = accessor.read(readers, target.start + part.start, target.start + part.stop)
+                out[...] = attribute.decode(values[:, slice(*attribute.components)]).reshape(out.shape)
+                return part
 
-        items = [(part, *each) for part in parts for each in accessors]
-        for part in ordered_map(read, items, threads):
-            progress("reading", part.stop, len(target.splats), "splat")
+            items = [(part, *each) for part in blocks_of(len(target.splats)) for each in accessors]
+            for part in ordered_map(read, items, threads):
+                progress("reading", part.stop, len(target.splats), "splat")
 
-    return Content(count, degree, "GLB", fill, header={"bytes": file.size})
+    return Content(count, degree, "", fill, notes=tuple(notes))
+
+
+def _sampled(file: GltfFile, accessor: Accessor) -> FloatArray:
+    """Return values from all over an accessor."""
+    rows = min(PLACE_ROWS, accessor.count)
+    starts = sorted({(accessor.count - rows) * place // (PLACES - 1) for place in range(PLACES)}) if rows else []
+    with file.readers([accessor.buffer]) as readers, np.errstate(over="ignore", invalid="ignore"):
+        values = [accessor.read(readers, start, start + rows) for start in starts]
+    return np.concatenate([np.empty((0, accessor.width), np.float32), *values])
+
+
+def _reopened(opened: Callable[[], Content]) -> Content:
+    """Return a content that is opened anew where rows of it are read; all are decoded, and kept until the last."""
+    content, held = opened(), list[Splats]()
+
+    def fill(target: Target, threads: int, progress: Progress) -> None:
+        if not held:
+            splats = Splats.empty(content.count, content.sh_degree)
+            opened().fill(Target(splats), threads, progress)
+            held.append(splats)
+        copy_rows(held[0].rows(slice(target.start, target.stop)), target.splats)
+        if target.stop == content.count:
+            held.clear()
+
+    return dataclasses.replace(content, fill=fill)
+
+
+def _joined(contents: Sequence[Content]) -> Content:
+    """Return the splats of several contents as one; SH coefficients that one does not have become 0."""
+    degree = max(content.sh_degree for content in contents)
+
+    def fill(target: Target, threads: int, progress: Progress) -> None:
+        end = 0
+        for content in contents:
+            begin, end = end, end + content.count
+            start, stop = max(target.start, begin), min(target.stop, end)
+            if start >= stop:
+                continue
+            rows = target.rows(slice(start, stop))
+            own = rows if content.sh_degree == degree else Splats.empty(stop - start, content.sh_degree)
+            content.fill(Target(own, start - begin, columns=target.columns), threads, silent)
+            if own is not rows:
+                copy_rows(own, rows)
+            progress("reading", stop - target.start, len(target.splats), "splat")
+
+    first, notes = contents[0], [note for content in contents for note in content.notes]
+    antialiased = any(content.antialiased for content in contents)
+    return Content(sum(content.count for content in contents), degree, first.format, fill, antialiased, tuple(notes))
 
 
 def placed(content: Content, transform: Transform) -> Content:
     """Return the content with its splats transformed as they are read; its `up` is that of the transformed ones."""
+    if transform.is_identity:
+        return content
     axes = ("center", "scale", "quat_xyzw", "sh")
 
     def fill(target: Target, threads: int, progress: Progress) -> None:
@@ -210,147 +319,3 @@ def placed(content: Content, transform: Transform) -> Content:
                 column[...] = getattr(turned, name)
 
     return dataclasses.replace(content, fill=fill)
-
-
-def profile_of(options: WriteOptions) -> str:
-    """Return the profile that is written, which nobody has to choose."""
-    return options.glb_profile or KHRONOS
-
-
-def extensions_of(profile: str) -> list[str]:
-    """Return the extensions of glTF that the files of a profile use."""
-    return [EXTENSION, COMPRESSION] if profile == CESIUM else [EXTENSION]
-
-
-def settled(scene: Scene, options: WriteOptions) -> WriteOptions:
-    """Return the options with nothing left open, those of SPZ, too, which the profile "cesium" has inside.
-
-    Raises:
-        FormatError: the scene is a tree, has an opacity above 1, which glTF forbids, or does not fit.
-    """
-    if scene.tree is not None:
-        raise FormatError("GLB holds no Level-of-Detail tree")
-    splats = scene.splats
-    most = float(splats.opacity.max(initial=0))
-    if most > 1:
-        raise FormatError(f"GLB holds no opacity above 1, and a splat has {most:g}; extract the leaves, or simplify")
-    if profile_of(options) == CESIUM:
-        return spz.settled(scene, options)
-    check_length(4 * len(splats) * (14 + 3 * splats.sh.shape[1]) + (1 << 16))
-    return options
-
-
-def held(options: WriteOptions, sh_degree: int) -> Sequence[CodeRange]:
-    """Return the values that the profile holds without clamping them: all, or those of SPZ."""
-    return SPZ if profile_of(options) == CESIUM else ()
-
-
-def encode(
-    scene: Scene, options: WriteOptions = DEFAULTS, *, threads: int = 1, progress: Progress = silent
-) -> Iterator[bytes]:
-    """Return the bytes of a GLB, piece by piece; its root node turns the axis that points up, where known, to y.
-
-    The same scene and options give the same bytes for any number of threads.
-
-    Raises:
-        FormatError: see `settled`.
-    """
-    options = settled(scene, options)
-    yield from (_encode_spz if profile_of(options) == CESIUM else _encode_plain)(scene, options, threads, progress)
-
-
-def _encode_plain(scene: Scene, options: WriteOptions, threads: int, progress: Progress) -> Iterator[bytes]:
-    splats, count = scene.splats, len(scene.splats)
-    attributes = [*ATTRIBUTES, *sh_attributes(splats.sh_degree)]
-    views, accessors, offset = [], [], 0
-    for number, each in enumerate(attributes):
-        size = TYPES[each.type]
-        views.append({"buffer": 0, "byteOffset": offset, "byteLength": 4 * size * count, "target": ARRAY_BUFFER})
-        accessors.append({"bufferView": number, **_accessor(each.type, count), **_bounds(each, splats)})
-        offset += 4 * size * count
-    root = _root(scene, attributes, accessors, views, offset, PROPERTIES, required=False)
-    yield head_of(root, offset)
-    for each in attributes:
-        column = each.part_of(splats)
-
-        def rows(part: slice, each: Attribute = each, column: FloatArray = column) -> bytes:
-            return np.ascontiguousarray(each.encode(column[part]), "<f4").tobytes()
-
-        yield from encode_rows(rows, count, threads, progress)
-
-
-def _encode_spz(scene: Scene, options: WriteOptions, threads: int, progress: Progress) -> Iterator[bytes]:
-    # The axis that points up is noted in `asset`.
-    plain = dataclasses.replace(scene, up=None)
-    data = b"".join(spz.encode(plain, options, threads=threads, progress=progress))
-    splats, count = scene.splats, len(scene.splats)
-    position, rotation, scale, *_ = ATTRIBUTES
-    color = Attribute("COLOR_0", "VEC4", UNSIGNED, "rgb")
-    attributes = [position, color, scale, rotation, *sh_attributes(splats.sh_degree)]
-    accessors = [{**_accessor(each.type, count), **_bounds(each, splats)} for each in attributes]
-    accessors[1] |= {"componentType": UNSIGNED[0], "normalized": True}  # as CesiumJS unpacks colours and opacities
-    views = [{"buffer": 0, "byteOffset": 0, "byteLength": len(data)}]
-    properties = {**PROPERTIES, "extensions": {COMPRESSION: {"bufferView": 0}}}
-    padding = bytes(-len(data) % 4)
-    root = _root(scene, attributes, accessors, views, len(data) + len(padding), properties, required=True)
-    yield head_of(root, len(data) + len(padding))
-    yield data + padding
-
-
-def _accessor(kind: str, count: int) -> dict[str, Any]:
-    return {"componentType": FLOAT, "count": count, "type": kind}
-
-
-def _bounds(attribute: Attribute, splats: Splats) -> dict[str, Any]:
-    """Return the bounds of positions, which glTF demands; JSON has their float32 values to the last bit."""
-    if attribute.column != "center" or not len(splats):
-        return {}
-    return {"min": splats.center.min(axis=0).tolist(), "max": splats.center.max(axis=0).tolist()}
-
-
-def _root(
-    scene: Scene,
-    attributes: Sequence[Attribute],
-    accessors: list[dict[str, Any]],
-    views: list[dict[str, Any]],
-    length: int,
-    properties: dict[str, Any],
-    *,
-    required: bool,
-) -> dict[str, Any]:
-    """Return the JSON of a file with one mesh of one primitive, in one node."""
-    note = note_of(antialiased=scene.antialiased, up=scene.up)
-    asset = {"version": "2.0", "generator": note.pop("generator")} | ({"extras": note} if note else {})
-    extensions = extensions_of(CESIUM if required else KHRONOS)
-    return {
-        "asset": asset,
-        "extensionsUsed": extensions,
-        **({"extensionsRequired": extensions} if required else {}),
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0} | _turn(scene.up, as_matrix=required)],
-        "meshes": [
-            {
-                "primitives": [
-                    {
-                        "attributes": {each.semantic: number for number, each in enumerate(attributes)},
-                        "mode": POINTS,
-                        "extensions": {EXTENSION: properties},
-                    }
-                ]
-            }
-        ],
-        "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{"byteLength": length}],
-    }
-
-
-def _turn(up: str | None, *, as_matrix: bool) -> dict[str, Any]:
-    """Return the turn of a node that makes an axis y. As content of a tile, CesiumJS reads nothing but a matrix."""
-    if as_matrix:
-        matrix = np.eye(4)
-        matrix[:3, :3] = rotation_of_up(up)
-        return {"matrix": matrix.T.ravel().tolist()}
-    turn = TURNS[up or "y"]
-    return {} if turn == TURNS["y"] else {"rotation": turn}

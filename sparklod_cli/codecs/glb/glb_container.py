@@ -1,13 +1,21 @@
-"""The container: chunks of a binary glTF, its JSON, and accessors, whose bounds are checked before they are read.
+"""The container: a glTF, binary or JSON, its buffers, and accessors, whose bounds are checked before they are read.
 
-Facts: the glTF 2.0 specification, sections 3.6 (binary data), 3.5 (nodes) and 4.4 (the GLB layout).
+Buffers are the BIN chunk, data within the JSON, or files beside it. Facts: the glTF 2.0 specification, sections 3.6
+(binary data), 3.5 (nodes) and 4.4 (the GLB layout).
 """
 
 from __future__ import annotations
 
+import base64
+import binascii
+import contextlib
+import io
 import json
+import posixpath
+import re
 import struct
-from collections.abc import Iterator, Mapping
+import urllib.parse
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, BinaryIO
 
@@ -15,20 +23,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...model.splats import FloatArray
-from ...support.errors import FormatError, NotSplatsError, TruncatedError, VersionError
+from ...support.errors import FormatError, TruncatedError, UnsupportedError, VersionError
 from ...support.untrusted import parse_json, quoted, quoted_value
+from ..content import Source
+from ..json_trees import leads_away
 from ..stream import Positioned, size_of
 
-#: The header of a file, magic, version and length, and of a chunk, length and type.
+#: The header of a binary file, magic, version and length, and of a chunk, length and type.
 HEADER, CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
 MAGIC, VERSION = b"glTF", 2
 JSON, BIN = b"JSON", b"BIN\0"
 
-#: Largest file, bytes: its length has 32 bits.
+#: Largest binary file, bytes: its length has 32 bits. No number of bytes in the JSON may be larger, either.
 LARGEST = (1 << 32) - 1
 
-#: Largest JSON chunk, bytes. That of splats takes some thousands; the meshes beside them may take more.
+#: Largest JSON, bytes, without the data within it. That of splats takes some thousands; the meshes beside them may
+#: take more.
 MAX_JSON = 1 << 22
+
+#: Largest JSON, bytes, with the data within it, which are in memory as a whole. Chosen.
+MAX_TEXT = 1 << 30
+
+#: Data within the JSON: base64 needs no escapes.
+_DATA = re.compile(rb'"data:[^"\\]*"')
 
 #: Component types: their numpy types.
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -42,11 +59,32 @@ MAX_STRIDE = 252
 
 
 @dataclass(frozen=True)
-class Accessor:
-    """Values of an attribute in a file.
+class Buffer:
+    """Bytes that buffer views are of.
 
     Attributes:
-        offset: of the first, in the file.
+        start, length: of them in the file.
+        name: of the file, from the folder of the JSON on; None for the file with the JSON.
+        data: the bytes themselves, where the JSON has them.
+    """
+
+    start: int
+    length: int
+    name: str | None = None
+    data: bytes | None = None
+
+
+#: Readers of buffers, by their numbers.
+Readers = Mapping[int, Positioned]
+
+
+@dataclass(frozen=True)
+class Accessor:
+    """Values of an attribute in a buffer.
+
+    Attributes:
+        buffer: number of the buffer.
+        offset: of the first value, in the file of the buffer.
         stride: bytes from one to the next.
         count: number of splats.
         width: components of each.
@@ -54,6 +92,7 @@ class Accessor:
         normalized: integers mean 0..1, or -1..1.
     """
 
+    buffer: int
     offset: int
     stride: int
     count: int
@@ -66,14 +105,14 @@ class Accessor:
         """Bytes of one value."""
         return self.width * self.dtype.itemsize
 
-    def read(self, file: Positioned, start: int, stop: int) -> FloatArray:
+    def read(self, readers: Readers, start: int, stop: int) -> FloatArray:
         """Return (stop - start, width) float32 values.
 
         Raises:
             TruncatedError: the file has become shorter.
         """
         length = (stop - start - 1) * self.stride + self.size
-        data = file.read(self.offset + start * self.stride, length)
+        data = readers[self.buffer].read(self.offset + start * self.stride, length)
         if len(data) < length:
             raise TruncatedError(f"cut short inside the values of splats {start:,} to {stop:,}")
         strides = self.stride, self.dtype.itemsize
@@ -84,34 +123,58 @@ class Accessor:
         return values
 
 
-class GlbFile:
-    """Chunks of a binary glTF.
+class GltfFile:
+    """JSON of a glTF file, and its buffers, which are opened when they are needed.
 
     Attributes:
-        size: bytes of the file.
+        is_binary: whether it is a GLB.
         root: its JSON.
 
     Raises:
-        FormatError: the file is no binary glTF 2, or cut short.
+        FormatError: the file is no glTF 2, or cut short.
     """
 
-    def __init__(self, file: BinaryIO) -> None:
-        self._file, self.size = file, size_of(file)
-        head = file.read(HEADER.size)
-        if len(head) < HEADER.size or head[:4] != MAGIC:
-            raise NotSplatsError("not a binary glTF file")
+    def __init__(self, source: Source) -> None:
+        self._file, self._open_companion = source.file, source.open_companion
+        self._size = size_of(self._file)
+        self._chunk: Buffer | None = None
+        self._buffers: dict[int, Buffer] = {}
+        self._arrays: dict[str, list[dict[str, Any]]] = {}
+        head = self._file.read(HEADER.size)
+        self.is_binary = head[:4] == MAGIC
+        if self.is_binary:
+            text = self._chunks(head)
+        else:
+            self._file.seek(0)
+            text = self._file.read(MAX_TEXT + 1)
+        if len(text) > MAX_TEXT:
+            raise UnsupportedError(
+                f"its JSON has more than the {MAX_TEXT:,} bytes that are read; write it as GLB, or its buffers as files"
+            )
+        self._data: list[memoryview] = []
+        self.root = self._parsed(text)
+        if not isinstance(self.root, dict):
+            raise FormatError("its JSON is no object")
+        asset = self.root.get("asset")
+        version = asset.get("version") if isinstance(asset, dict) else None
+        if not self.is_binary and not str(version).startswith(f"{VERSION}."):
+            raise VersionError(f"glTF version {quoted_value(version)} is unknown, only {VERSION} is read")
+
+    def _chunks(self, head: bytes) -> bytes:
+        """Return the JSON of a GLB, and note where its BIN chunk is."""
+        if len(head) < HEADER.size:
+            raise TruncatedError("cut short inside its header")
         _, version, length = HEADER.unpack(head)
         if version != VERSION:
             raise VersionError(f"binary glTF version {version} is unknown, only {VERSION} is read")
-        if length > self.size:
-            raise TruncatedError(f"cut short: its header announces {length:,} bytes, and it has {self.size:,}")
-        self._start = self._length = 0
+        if length > self._size:
+            raise TruncatedError(f"cut short: its header announces {length:,} bytes, and it has {self._size:,}")
         at, text = HEADER.size, b""
         for expected in (JSON, BIN):
             if at == length and expected == BIN:
                 break
-            file.seek(at)
-            head = file.read(CHUNK.size)
+            self._file.seek(at)
+            head = self._file.read(CHUNK.size)
             size, kind = CHUNK.unpack(head) if len(head) == CHUNK.size else (0, b"")
             if kind != expected:
                 raise FormatError(f"its {expected.decode().rstrip(chr(0))} chunk is missing")
@@ -119,44 +182,130 @@ class GlbFile:
             if at + size > length:
                 raise TruncatedError(f"cut short inside its {expected.decode().rstrip(chr(0))} chunk")
             if kind == JSON:
-                if size > MAX_JSON:
-                    raise FormatError(f"its JSON of {size:,} bytes is larger than the {MAX_JSON:,} that are read")
-                text = file.read(size)
+                text = self._file.read(min(size, MAX_TEXT + 1))
             else:
-                self._start, self._length = at, size
+                self._chunk = Buffer(at, size)
             at += size
+        return text
+
+    def _parsed(self, text: bytes) -> Any:
+        """Return the value of a JSON text, in which numbers stand for the data, so that it stays small."""
+        view = memoryview(text)
+
+        def number_of(match: re.Match[bytes]) -> bytes:
+            self._data.append(view[match.start() + 1 : match.end() - 1])
+            return b'"data:%d"' % (len(self._data) - 1)
+
+        short = _DATA.sub(number_of, text)
+        if len(short) > MAX_JSON:
+            raise UnsupportedError(f"its JSON of {len(short):,} bytes is larger than the {MAX_JSON:,} that are read")
         try:
-            self.root = parse_json(text)
+            return parse_json(short)
         except ValueError as error:
             raise FormatError(f"its JSON is broken: {quoted(error)}") from None
-        if not isinstance(self.root, dict):
-            raise FormatError("its JSON is no object")
+
+    @property
+    def size(self) -> int:
+        """Bytes of the file, and of those that its buffers are in, as far as they have been needed."""
+        named = {each.name: each.length for each in self._buffers.values() if each.name is not None}
+        return self._size + sum(named.values())
 
     def items(self, name: str) -> Iterator[dict[str, Any]]:
         """Yield the objects of an array of the JSON, such as "nodes"."""
-        found = self.root.get(name, [])
-        if not isinstance(found, list) or not all(isinstance(each, dict) for each in found):
-            raise FormatError(f"{name} of its JSON is no array of objects")
-        yield from found
+        yield from self._array(name)
+
+    def _array(self, name: str) -> list[dict[str, Any]]:
+        if name not in self._arrays:
+            found = self.root.get(name, [])
+            if not isinstance(found, list) or not all(isinstance(each, dict) for each in found):
+                raise FormatError(f"{name} of its JSON is no array of objects")
+            self._arrays[name] = found
+        return self._arrays[name]
 
     def item(self, name: str, index: Any) -> dict[str, Any]:
         """Return an object of an array of the JSON by its number."""
-        found = list(self.items(name))
+        found = self._array(name)
         if isinstance(index, bool) or not isinstance(index, int) or not 0 <= index < len(found):
             raise FormatError(f"there is no {quoted_value(index)} among the {len(found):,} {name} of its JSON")
         return found[index]
 
-    def view(self, index: Any) -> tuple[int, int, int | None]:
-        """Return offset in the file, bytes and stride of a buffer view, which lies within the BIN chunk."""
+    def names(self) -> Iterator[str]:
+        """Yield the files that its buffers are in, from its folder on."""
+        for buffer in self.items("buffers"):
+            uri = buffer.get("uri")
+            if isinstance(uri, str) and not uri.startswith("data:"):
+                yield _name_of(uri)
+
+    def buffer(self, index: Any) -> Buffer:
+        """Return a buffer, all of whose bytes are there.
+
+        Raises:
+            FormatError: its file cannot be opened, or is shorter than the buffer; its data are no base64.
+        """
+        record = self.item("buffers", index)
+        if index not in self._buffers:
+            found = self._found(index, record.get("uri"))
+            if found.length < whole(record, "byteLength"):
+                where = "the file" if found.name is None else quoted_value(found.name)
+                raise TruncatedError(
+                    f"buffer {index} has {record['byteLength']:,} bytes, of which {where} holds {found.length:,}"
+                )
+            self._buffers[index] = found
+        return self._buffers[index]
+
+    def _found(self, index: int, uri: Any) -> Buffer:
+        if uri is None:
+            extensions = self.item("buffers", index).get("extensions")
+            if isinstance(extensions, dict) and extensions:
+                name = quoted_value(next(iter(extensions)))
+                raise UnsupportedError(
+                    f"buffer {index} has no data but those of the extension {name}, which is not read"
+                )
+            if index or self._chunk is None:
+                raise FormatError(f"buffer {index} has no data: it is neither a BIN chunk nor names a file")
+            return self._chunk
+        if not isinstance(uri, str):
+            raise FormatError(f"the uri of buffer {index} is {quoted_value(uri)}, not a text")
+        if uri.startswith("data:"):
+            number = uri.removeprefix("data:")
+            known = number.isdecimal() and int(number) < len(self._data)
+            data = _unpacked(bytes(self._data[int(number)]) if known else uri.encode(), index)
+            return Buffer(0, len(data), data=data)
+        name = _name_of(uri)
+        if leads_away(name):
+            raise FormatError(f"buffer {index} is {quoted_value(uri)}, which is not a file below its folder")
+        with self._opened(name) as file:
+            return Buffer(0, size_of(file), name)
+
+    def _opened(self, name: str) -> BinaryIO:
+        if self._open_companion is None:
+            raise FormatError(f"its buffer is {quoted_value(name)}, but other files cannot be opened here")
+        return self._open_companion(name)
+
+    @contextlib.contextmanager
+    def readers(self, indices: Collection[int]) -> Iterator[Readers]:
+        """Yield readers of buffers, whose files are open until the end."""
+        found: dict[int, Positioned] = {}
+        with contextlib.ExitStack() as stack:
+            for index in indices:
+                buffer, file = self.buffer(index), self._file
+                if buffer.data is not None:
+                    file = io.BytesIO(buffer.data)
+                elif buffer.name is not None:
+                    file = stack.enter_context(self._opened(buffer.name))
+                found[index] = Positioned(file)
+            yield found
+
+    def view(self, index: Any) -> tuple[int, int, int, int | None]:
+        """Return buffer, offset in its file, bytes and stride of a buffer view, which lies within its buffer."""
         view = self.item("bufferViews", index)
-        buffer = self.item("buffers", view.get("buffer"))
-        if view["buffer"] != 0 or "uri" in buffer:
-            raise FormatError("its splats are in another file; only those in its BIN chunk are read")
+        number = whole(view, "buffer")
+        buffer = self.buffer(number)
         offset, length = whole(view, "byteOffset", 0), whole(view, "byteLength")
-        if offset + length > min(self._length, whole(buffer, "byteLength")):
+        if offset + length > whole(self.item("buffers", number), "byteLength"):
             raise FormatError(f"buffer view {index} ends beyond its buffer")
         stride = whole(view, "byteStride") if "byteStride" in view else None
-        return self._start + offset, length, stride
+        return number, buffer.start + offset, length, stride
 
     def accessor(self, index: Any, kind: str, components: tuple[int, ...]) -> Accessor:
         """Return an accessor, all of whose values lie within its buffer view.
@@ -177,9 +326,9 @@ class GlbFile:
                 f" {' or '.join(map(str, components))}"
             )
         if "sparse" in accessor or "bufferView" not in accessor:
-            raise FormatError(f"accessor {index} is sparse, or has no buffer view; such ones are not read")
+            raise UnsupportedError(f"accessor {index} is sparse, or has no buffer view; such ones are not read")
         dtype = np.dtype(COMPONENTS[component])
-        offset, length, stride = self.view(accessor["bufferView"])
+        buffer, offset, length, stride = self.view(accessor["bufferView"])
         count, inside = whole(accessor, "count"), whole(accessor, "byteOffset", 0)
         size = TYPES[kind] * dtype.itemsize
         step = size if stride is None else stride
@@ -188,13 +337,28 @@ class GlbFile:
         if count and inside + (count - 1) * step + size > length:
             raise FormatError(f"accessor {index} has {count:,} values, more than its buffer view holds")
         is_integer = component != FLOAT
-        return Accessor(offset + inside, step, count, TYPES[kind], dtype, is_integer and normalized is True)
+        return Accessor(buffer, offset + inside, step, count, TYPES[kind], dtype, is_integer and normalized is True)
 
     def bytes_of(self, index: Any) -> bytes:
         """Return the content of a buffer view."""
-        offset, length, _ = self.view(index)
-        self._file.seek(offset)
-        return self._file.read(length)
+        buffer, offset, length, _ = self.view(index)
+        with self.readers([buffer]) as readers:
+            return readers[buffer].read(offset, length)
+
+
+def _name_of(uri: str) -> str:
+    """Return the path that a relative address means, from the folder of the JSON on; it may lead out of that."""
+    return posixpath.normpath(urllib.parse.unquote(uri)) if uri else uri
+
+
+def _unpacked(uri: bytes, index: int) -> bytes:
+    """Return the data of an address that has them: data:TYPE;base64,DATA."""
+    kind, _, text = uri.partition(b",")
+    data = urllib.parse.unquote_to_bytes(text) if b"%" in text else text
+    try:
+        return base64.b64decode(data, validate=True) if kind.endswith(b";base64") else data
+    except binascii.Error as error:
+        raise FormatError(f"the data of buffer {index} are no base64: {error}") from None
 
 
 def whole(record: Mapping[str, Any], name: str, default: int | None = None) -> int:

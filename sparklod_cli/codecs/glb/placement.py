@@ -1,8 +1,9 @@
-"""Placement of the splats of a GLB: the transform of their node, and the turn that makes y the axis that points up."""
+"""Placement of the splats of a glTF: transforms of nodes, and the turn that makes y the axis that points up."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Collection, Container, Iterator
 from typing import Any
 
 import numpy as np
@@ -10,9 +11,11 @@ from numpy.typing import NDArray
 
 from ...model.gaussian import rotation_matrices
 from ...model.transforms import LARGEST, Transform
-from ...support.errors import FormatError
+from ...support.errors import FormatError, UnsupportedError
 from ...support.untrusted import quoted_value
-from .glb_container import GlbFile
+from .glb_container import GltfFile
+
+Matrix = NDArray[np.float64]
 
 #: Rotations x y z w that turn an axis to +y: about x, so that right stays right, but of x itself.
 HALF = math.sqrt(0.5)
@@ -25,41 +28,95 @@ TURNS = {
     "-x": (0.0, 0.0, -HALF, HALF),
 }
 
-#: Most nodes from the root to the splats; scenes of editors have some tens. Chosen.
-DEEPEST = 256
-
 #: How far axes of a node may be from right angles, and from one length, as a share: float32 leaves 1e-7. Chosen.
 SKEW = 1e-5
 
 
-def placement_of(file: GlbFile, mesh: int) -> Transform:
-    """Return the transform from the splats of a mesh to the scene; the identity where no node has it.
+class Nodes:
+    """Nodes of a glTF, and the scene that a viewer shows.
 
     Raises:
-        FormatError: several nodes have it, they are linked in a circle, or one stretches its content.
+        FormatError: the nodes are linked in a circle.
     """
-    nodes = list(file.items("nodes"))
-    having = [number for number, node in enumerate(nodes) if node.get("mesh") == mesh]
-    if len(having) > 1:
-        raise FormatError(f"{len(having)} nodes have its splats; only one is read")
-    parent: dict[int, int] = {}
-    for number, node in enumerate(nodes):
-        children = node.get("children", [])
-        for child in children if isinstance(children, list) else ():
-            if isinstance(child, int):
-                parent[child] = number
-    matrix, at = np.eye(4), having[0] if having else None
-    for _ in range(DEEPEST):
-        if at is None:
-            break
-        matrix = _matrix(nodes[at]) @ matrix
-        at = parent.get(at)
-    if at is not None:
-        raise FormatError(f"its nodes are linked in a circle, or more than {DEEPEST} deep")
-    return transform_of(matrix)
+
+    def __init__(self, file: GltfFile) -> None:
+        self.records = list(file.items("nodes"))
+        self._parent: dict[int, int] = {}
+        for number, node in enumerate(self.records):
+            children = node.get("children", [])
+            for child in children if isinstance(children, list) else ():
+                if isinstance(child, int) and 0 <= child < len(self.records):
+                    self._parent[child] = number
+        self._shown = _roots_of_scene(file)
+        self._is_shown: dict[int, bool] = {}
+        self._matrices: dict[int, Matrix] = {}
+
+    def having(self, meshes: Collection[int]) -> tuple[list[int], int]:
+        """Return the nodes with one of some meshes that a viewer shows, in order, and the number of those not shown.
+
+        All are shown where the file has no scene, or one without any of them.
+        """
+        wanted = set(meshes)
+        having = [
+            number
+            for number, node in enumerate(self.records)
+            if type(node.get("mesh")) is int and node["mesh"] in wanted
+        ]
+        for number in having:
+            for each in self._down_to(number, self._is_shown):
+                parent = self._parent.get(each)
+                self._is_shown[each] = each in self._shown if parent is None else self._is_shown[parent]
+        shown = [number for number in having if self._is_shown[number]]
+        return (shown, len(having) - len(shown)) if shown else (having, 0)
+
+    def matrix(self, number: int) -> Matrix:
+        """Return the (4, 4) matrix from a node to the scene, for column vectors.
+
+        Raises:
+            FormatError: a number of it is beyond `LARGEST`, or a node above has no transform that can be read.
+        """
+        for each in self._down_to(number, self._matrices):
+            own, parent = _matrix(self.records[each]), self._parent.get(each)
+            self._matrices[each] = own if parent is None else product(self._matrices[parent], own)
+        return self._matrices[number]
+
+    def _down_to(self, number: int, known: Container[int]) -> Iterator[int]:
+        """Yield the unknown ones of a node and those above it, the uppermost first."""
+        line, at = dict[int, None](), number
+        while at not in known:
+            if at in line:
+                raise FormatError("its nodes are linked in a circle")
+            line[at] = None
+            if at not in self._parent:
+                break
+            at = self._parent[at]
+        yield from reversed(line)
 
 
-def _matrix(node: dict[str, Any]) -> NDArray[np.float64]:
+def _roots_of_scene(file: GltfFile) -> frozenset[int]:
+    """Return the roots of the scene that a viewer shows, the first unless the file says otherwise."""
+    scenes = list(file.items("scenes"))
+    number = file.root.get("scene", 0)
+    if type(number) is not int or not 0 <= number < len(scenes):
+        return frozenset()
+    roots = scenes[number].get("nodes", [])
+    return frozenset(each for each in roots if type(each) is int) if isinstance(roots, list) else frozenset()
+
+
+def product(outer: Matrix, inner: Matrix) -> Matrix:
+    """Return the product of two (4, 4) matrices for column vectors.
+
+    Raises:
+        FormatError: a number of it is not finite, or beyond `LARGEST`.
+    """
+    with np.errstate(all="ignore"):
+        matrix = outer @ inner
+        if not (np.abs(matrix) <= LARGEST).all():
+            raise FormatError(f"transforms multiply to numbers beyond {LARGEST:g}")
+    return matrix
+
+
+def _matrix(node: dict[str, Any]) -> Matrix:
     """Return the (4, 4) matrix of a node for column vectors."""
     if "matrix" in node:
         return _numbers(node, "matrix", 16, ()).reshape(4, 4).T
@@ -73,7 +130,7 @@ def _matrix(node: dict[str, Any]) -> NDArray[np.float64]:
     return matrix
 
 
-def _numbers(node: dict[str, Any], name: str, count: int, default: tuple[float, ...]) -> NDArray[np.float64]:
+def _numbers(node: dict[str, Any], name: str, count: int, default: tuple[float, ...]) -> Matrix:
     values = node.get(name, default)
     numbers = isinstance(values, (list, tuple)) and all(type(value) in (int, float) for value in values)
     if not numbers or len(values) != count or not all(abs(value) <= LARGEST for value in values):
@@ -81,13 +138,26 @@ def _numbers(node: dict[str, Any], name: str, count: int, default: tuple[float, 
     return np.array(values, np.float64)
 
 
-def transform_of(matrix: NDArray[np.float64]) -> Transform:
-    """Return a (4, 4) matrix as a rotation, a uniform scale and a translation; `FormatError` where it is more."""
+def transform_of(matrix: Matrix) -> Transform:
+    """Return a (4, 4) matrix as a rotation, a uniform scale and a translation.
+
+    Raises:
+        FormatError: it is singular, or out of the range of a `Transform`.
+        UnsupportedError: it stretches, shears or mirrors.
+    """
     axes = matrix[:3, :3]
-    scale = float(np.cbrt(np.linalg.det(axes)))
-    is_affine = bool((matrix[3] == (0, 0, 0, 1)).all())
-    if not (is_affine and scale > 0 and np.abs(axes.T @ axes / scale**2 - np.eye(3)).max() <= SKEW):
-        raise FormatError("a node stretches, shears or mirrors its splats; only rotations and uniform scales are read")
+    with np.errstate(all="ignore"):
+        determinant = float(np.linalg.det(axes))
+        scale = float(np.cbrt(determinant))
+        is_even = scale > 0 and np.abs(axes.T @ axes / scale**2 - np.eye(3)).max() <= SKEW
+    if not (matrix[3] == (0, 0, 0, 1)).all() or not math.isfinite(determinant):
+        raise FormatError("the transform of its splats is not affine, or not of finite numbers")
+    if determinant == 0:
+        raise FormatError("the transform of its splats is singular: it makes their volume 0")
+    if not is_even:
+        raise UnsupportedError(
+            "a transform stretches, shears or mirrors its splats; only rotations and uniform scales are read"
+        )
     if abs(scale - 1) <= SKEW:
         scale = 1.0
     left, _, right = np.linalg.svd(axes)
@@ -98,7 +168,7 @@ def transform_of(matrix: NDArray[np.float64]) -> Transform:
         raise FormatError(f"the transform of its splats: {error}") from None
 
 
-def rotation_of_up(up: str | None) -> NDArray[np.float64]:
+def rotation_of_up(up: str | None) -> Matrix:
     """Return the (3, 3) turn of an axis to +y, exactly; the identity where it is unknown."""
     return np.rint(rotation_matrices(np.array([TURNS[up or "y"]]))[..., 0]) + 0.0  # no -0
 

@@ -1,11 +1,12 @@
 """3D Tiles: a tileset.json and a GLB for each tile, whose children replace it by more splats.
 
 As a scene it is full detail, the tiles without children; `decode_parts` reads all tiles. Tilesets of other programs are
-read if their tiles are listed one by one, replace their parents, and have GLBs with splats.
+read if their tiles are listed one by one, replace their parents, and have glTF, binary or JSON, with splats.
 """
 
 from __future__ import annotations
 
+import posixpath
 from collections.abc import Sequence
 from typing import BinaryIO
 
@@ -44,7 +45,7 @@ def open_content(source: Source) -> Content:
     Nothing is unpacked to `scratch`: where blocks are read, one tile at a time stays in memory.
 
     Raises:
-        FormatError: the file is no tileset, a tile is missing or no GLB of splats, or what it holds is not read.
+        FormatError: the file is no tileset, a tile is missing or no glTF of splats, or what it holds is not read.
     """
     tileset = _read(source.file, source.open_companion)
     wanted = [number for number, tile in enumerate(tileset.tiles) if not tile.children and tile.uri is not None]
@@ -86,6 +87,28 @@ def decode_parts(
         _root_transform(tileset),
         **facts_of(scene),
     )
+
+
+def names_of(data: bytes, open_companion: OpenCompanion) -> list[str]:
+    """Return the files that a tileset and the nested ones name, and those that their tiles are read from.
+
+    Paths begin in the folder of the tileset. A buffer that no splats are in is not among them.
+
+    Raises:
+        FormatError: a tileset or a tile cannot be opened, or is broken.
+    """
+    names = dict.fromkeys(read_whole(data, open_companion).names())
+    for name in [each for each in names if each.lower().endswith(".gltf")]:
+        opened = list[str]()
+
+        def open_buffer(buffer: str, folder: str = posixpath.dirname(name), opened: list[str] = opened) -> BinaryIO:
+            opened.append(posixpath.join(folder, buffer))
+            return open_companion(opened[-1])
+
+        with open_companion(name) as file:
+            glb.open_content(Source(file, open_buffer))
+        names |= dict.fromkeys(opened)
+    return list(names)
 
 
 def _read(file: BinaryIO, open_companion: OpenCompanion | None) -> Tileset:
@@ -145,7 +168,7 @@ def _open(source: Source, tileset: Tileset, wanted: Sequence[int]) -> tuple[Cont
 
 
 def tile_files(open_companion: OpenCompanion | None, matrices: dict[str, Matrix]) -> SceneFiles:
-    """Return the GLBs of tiles, each read where its (4, 4) transform puts it."""
+    """Return the glTF files of tiles, each read where its (4, 4) transform puts it."""
 
     def open_tile(name: str, source: Source) -> Content:
         content = glb.open_content(source)

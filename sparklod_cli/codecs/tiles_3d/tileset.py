@@ -36,7 +36,7 @@ MAX_TILESET = 1 << 25
 MAX_TILES, MAX_FILES = 1 << 17, 1 << 12
 
 #: Suffixes of the content of tiles that is read: nested tilesets, and splats.
-NESTED, SPLATS = ".json", ".glb"
+NESTED, SPLATS = ".json", (".glb", ".gltf")
 
 #: Keys of a tile for what is not read, and of extensions of tiles.
 UNREAD = ("implicitTiling", "contents")

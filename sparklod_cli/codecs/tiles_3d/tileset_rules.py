@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...model.splats import Splats
-from ...support.errors import FormatError
+from ...support.errors import FormatError, UnsupportedError
 from ...support.progress import Progress, silent
 from ...support.units import count_of
 from ...support.untrusted import quoted_value
-from ..glb.codec import COMPRESSION, EXTENSION
+from ..glb.attributes import COMPRESSION, EXTENSION
+from ..glb.placement import product
 from ..json_trees import leads_away
 from ..scene_files import Chunk, SceneFiles
 from ..splat_bounds import LOOSE_BOUND, count_outside
@@ -28,13 +29,13 @@ ERRORS = {
     "tiles.unread": "a tile has content, or children, of a kind that is not read",
     "tiles.refine": "the children of a tile do not replace it",
     "tiles.required": "a property that the specification demands is missing",
-    "tiles.transform": "a transform is not 16 finite numbers of an affine transform",
+    "tiles.transform": "a transform is not 16 numbers of an affine transform, or several multiply to too large ones",
     "tiles.volumes": "a bounding volume is none, or is not of finite numbers",
     "tiles.inside": "the bounding volume of a tile is not inside that of its parent",
     "tiles.extents": "splats of a tile lie outside of its bounding volume",
     "tiles.errors": "a geometric error is below 0, not finite, or larger than that of the tile above",
     "tiles.unrefined": "the geometric error of a tile with children is 0, so that no viewer refines it",
-    "tiles.files": "the file of a tile is missing, damaged or no GLB of splats, or its name leads elsewhere",
+    "tiles.files": "the file of a tile is missing, damaged or no glTF of splats, or its name leads elsewhere",
     "tiles.shared": "two tiles have the same file",
     "tiles.sh": "the SH degrees of tiles differ, and viewers take that of one for all",
     "tiles.kind": "the axes that point up in tiles differ",
@@ -73,6 +74,7 @@ def read_violations(tileset: Tileset) -> Iterator[RuleViolation]:
             yield broken("unread", f"{where} the extension {quoted_value(others[0])}, which is not read")
     for number, tile in enumerate(tileset.tiles):
         yield from _unread(tileset, number, tile)
+    yield from _product_violations(tileset)
 
 
 def _unread(tileset: Tileset, number: int, tile: TileRecord) -> Iterator[RuleViolation]:
@@ -89,8 +91,9 @@ def _unread(tileset: Tileset, number: int, tile: TileRecord) -> Iterator[RuleVio
     if name is not None and (leads_away(name) or ":" in (tile.uri or "")):
         text = f"{tileset.place(number)} has the content {quoted_value(tile.uri)}, which is not a file below its folder"
         yield broken("files", text)
-    elif name is not None and not tile.is_nested and posixpath.splitext(name)[1].lower() != SPLATS:
-        text = f"{tileset.place(number)} has the content {quoted_value(tile.uri)}; only {SPLATS} and tilesets are read"
+    elif name is not None and not tile.is_nested and posixpath.splitext(name)[1].lower() not in SPLATS:
+        text = f"{tileset.place(number)} has the content {quoted_value(tile.uri)}; only"
+        text += f" {', '.join(SPLATS)} and tilesets are read"
         yield broken("unread", text)
     elif tile.is_nested and (len(tile.children) != 1 or tileset.tiles[tile.children[0]].file == tile.file):
         text = f"{tileset.place(number)} has a nested tileset and children beside it, which is not read"
@@ -108,6 +111,18 @@ def _numbers(record: Mapping[str, object]) -> list[float] | None:
     if not all(type(each) in (int, float) and math.isfinite(each) for each in numbers):
         return None
     return numbers if numbers[3::4] == [0, 0, 0, 1] else None
+
+
+def _product_violations(tileset: Tileset) -> Iterator[RuleViolation]:
+    """Yield the tiles whose transforms, with those above them, are out of range."""
+    matrices = list[NDArray[np.float64]]()
+    for number, tile in enumerate(tileset.tiles):
+        own = matrix_of(tile.record)
+        try:
+            matrices.append(product(matrices[tile.parent] if tile.parent >= 0 else np.eye(4), own))
+        except FormatError as error:
+            yield broken("transform", f"{tileset.place(number)}: {error}")
+            return
 
 
 def matrix_of(record: Mapping[str, object]) -> NDArray[np.float64]:
@@ -221,6 +236,8 @@ def scan_files(tileset: Tileset, files: SceneFiles) -> tuple[dict[int, Chunk], l
             continue
         try:
             chunks[number] = files.open(name)
+        except UnsupportedError as error:
+            found.append(RuleViolation(error.code, str(error)))
         except FormatError as error:
             found.append(broken("files", str(error)))
     return chunks, [*found, *_kinds(tileset, chunks), *_counts(tileset, chunks)]

@@ -204,6 +204,10 @@ def test_transforms_of_tiles_are_applied_but_for_that_of_the_root() -> None:
     np.testing.assert_array_equal(tiles_of(of_root).transform[:3, 3], [0, 0, 5])
 
 
+FAR = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 1e300, 0, 0, 1]
+LARGE = [1e12, 0, 0, 0, 0, 1e12, 0, 0, 0, 0, 1e12, 0, 0, 0, 0, 1]
+
+
 @pytest.mark.parametrize(
     ("files", "match"),
     [
@@ -211,7 +215,7 @@ def test_transforms_of_tiles_are_applied_but_for_that_of_the_root() -> None:
         (child(extensions={"3DTILES_implicit_tiling": {}}), "has implicit tiling, which is not read"),
         (child(contents=[]), "has contents, which is not read"),
         (child(refine="ADD"), "has refine 'ADD'; only REPLACE is read"),
-        (child(content={"uri": "a.b3dm"}), r"has the content 'a\.b3dm'; only \.glb and tilesets are read"),
+        (child(content={"uri": "a.b3dm"}), r"has the content 'a\.b3dm'; only \.glb, \.gltf and tilesets are read"),
         (child(content={"uri": "https://x.example/a.glb"}), "is not a file below its folder"),
         (child(content={"uri": "../a.glb"}), "is not a file below its folder"),
         (child(content={"uri": "a.glb?v=1"}), "is not a file below its folder"),
@@ -220,6 +224,10 @@ def test_transforms_of_tiles_are_applied_but_for_that_of_the_root() -> None:
         (child(content=3), r"root\.children\[0\]\.content of tileset\.json is 3, not an object"),
         (child(children={}), "is {}, not a list"),
         (child(content={"uri": "tiles/0-0.glb"}, children=[{"content": {"uri": "tiles/0-0.glb"}}] * 2), "two tiles"),
+        (child(transform=LARGE, children=[{"transform": LARGE}]), "multiply to numbers"),
+        (child(transform=FAR), "multiply to numbers beyond"),
+        (child(transform=[0] * 15 + [1]), "is singular"),
+        (changed(lambda each: each["root"].update(transform=FAR)), "root: transforms multiply to numbers beyond"),
         (child(transform=[1] * 16), "transform of .* is .*, not 16 finite numbers"),
         (child(transform=[1, 0, 0, 0, 0, 2, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]), "stretches, shears or mirrors"),
         (child(content={"uri": "tileset.json"}), "names the tileset 'tileset.json' twice"),
@@ -230,6 +238,7 @@ def test_transforms_of_tiles_are_applied_but_for_that_of_the_root() -> None:
         (changed(lambda each: (each["root"].pop("content"), each["root"].pop("children"))), "no tile of it has splats"),
     ],
 )
+@pytest.mark.filterwarnings("error")
 def test_what_is_not_read_is_refused_by_name(files: Files, match: str) -> None:
     with pytest.raises(FormatError, match=match):
         scene_of(files)
