@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from .foveation import Foveation
 from .scene import DetailScene, Scene
 from .tile_scene import TileScene
-from .transforms import LARGEST, SKEW, Transform
+from .transforms import LARGEST, SKEW, Transform, scale_of
 
 Matrix = NDArray[np.float64]
 
@@ -38,7 +39,7 @@ class Instance:
 
     Raises:
         TypeError: the source is neither.
-        ValueError: the matrix has another shape.
+        ValueError: the matrix has another shape, a number that is not finite, or a determinant of 0 or less.
     """
 
     source: Source
@@ -55,6 +56,8 @@ class Instance:
         matrix = np.asarray(self.object_to_world, np.float64)
         if matrix.shape != (4, 4):
             raise ValueError(f"object_to_world has the shape {matrix.shape}; give (4, 4)")
+        if scale_of(matrix, math.inf) is None:
+            raise ValueError("object_to_world is no rotation, uniform scale and translation of finite numbers")
         object.__setattr__(self, "object_to_world", matrix)
 
     @property

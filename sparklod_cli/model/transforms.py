@@ -255,6 +255,19 @@ class Transform:
         return result
 
 
+def scale_of(matrix: Matrix, skew: float) -> float | None:
+    """Return the scale of a (4, 4) matrix of a rotation, a uniform scale and a translation; None for any other matrix.
+
+    Args:
+        skew: how far its axes may be from right angles, and from one length, as a share.
+    """
+    axes = matrix[:3, :3]
+    with np.errstate(all="ignore"):
+        scale = float(np.cbrt(np.linalg.det(axes)))
+        is_even = scale > 0 and np.isfinite(matrix).all() and np.abs(axes.T @ axes / scale**2 - np.eye(3)).max() <= skew
+    return scale if is_even and (matrix[3] == (0, 0, 0, 1)).all() else None
+
+
 def sh_rotations(rotation: Matrix, degree: int) -> list[Matrix]:
     """Return what a rotation multiplies the SH coefficients of each degree from 1 to `degree` by.
 

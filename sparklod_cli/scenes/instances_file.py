@@ -15,6 +15,7 @@ from ..cameras.pose import rotation_of
 from ..io import is_file_name, read_text
 from ..model.foveation import Cones, Foveation, Frustum
 from ..model.instances import TOTAL, Instance, Matrix, names_of
+from ..model.transforms import LARGEST, scale_of
 from ..support.errors import SparklodError
 from ..support.untrusted import parse_json, quoted_value, well_formed
 
@@ -23,9 +24,6 @@ KEYS = {"file": 0, "name": 0, "matrix": 16, "translation": 3, "rotation": 4, "sc
 
 #: How far the axes of a matrix may be from right angles and one length.
 SKEW = 1e-3
-
-#: No number is larger, and no scale smaller than its inverse: the squares of what they make must fit into a float32.
-LARGEST = 1e12
 
 #: Degrees of a whole cone.
 WIDEST = 180
@@ -97,11 +95,8 @@ def _matrix(data: Mapping[str, Any]) -> Matrix:
     if data.keys() & {"translation", "rotation", "scale"}:
         raise ValueError("has a matrix, and parts of one too")
     matrix = np.array(_numbers(data, "matrix", [])).reshape(4, 4)
-    axes = matrix[:3, :3]
-    with np.errstate(all="ignore"):
-        size = np.cbrt(np.linalg.det(axes))
-        right = size >= 1 / LARGEST and np.abs(axes.T @ axes / size**2 - np.eye(3)).max() <= SKEW
-    if not right or matrix[3].tolist() != [0, 0, 0, 1]:
+    found = scale_of(matrix, SKEW)
+    if found is None or found < 1 / LARGEST:
         raise ValueError("has a matrix that is no rotation, uniform scale and translation, row by row")
     return matrix
 

@@ -89,6 +89,18 @@ def test_the_largest_and_smallest_scales_of_an_instances_file_are_possible(scale
     assert Instance(scenes()[0], object_to_world=matrix).transform.scale == pytest.approx(scale)
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(
+    ("place", "value"),
+    [((0, 0), np.nan), ((0, 3), np.inf), ((1, 1), -1.0), ((2, 2), 0.0), ((3, 0), 1.0), ((0, 0), -1e300)],
+)
+def test_matrices_that_place_nothing_are_refused(place: tuple[int, int], value: float) -> None:
+    matrix = np.eye(4)
+    matrix[place] = value
+    with pytest.raises(ValueError, match="object_to_world is no rotation, uniform scale and translation"):
+        Instance(scenes()[0], object_to_world=matrix)
+
+
 @pytest.mark.parametrize(("flags", "written"), [((1, 0, 0), False), ((0, 0, 1), True), ((1, 1, 0), False)])
 def test_most_splats_say_whether_the_whole_is_antialiased(flags: Sequence[int], written: bool) -> None:
     counts = (10, 20, 31)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...model.gaussian import rotation_matrices
-from ...model.transforms import LARGEST, Transform
+from ...model.transforms import LARGEST, Transform, scale_of
 from ...support.errors import FormatError, UnsupportedError
 from ...support.untrusted import quoted_value
 from .glb_container import GltfFile
@@ -32,7 +32,7 @@ TURNS = {
 SKEW = 1e-5
 
 
-class Nodes:
+class GltfNodes:
     """Nodes of a glTF, and the scene that a viewer shows.
 
     Raises:
@@ -148,13 +148,12 @@ def transform_of(matrix: Matrix) -> Transform:
     axes = matrix[:3, :3]
     with np.errstate(all="ignore"):
         determinant = float(np.linalg.det(axes))
-        scale = float(np.cbrt(determinant))
-        is_even = scale > 0 and np.abs(axes.T @ axes / scale**2 - np.eye(3)).max() <= SKEW
     if not (matrix[3] == (0, 0, 0, 1)).all() or not math.isfinite(determinant):
         raise FormatError("the transform of its splats is not affine, or not of finite numbers")
     if determinant == 0:
         raise FormatError("the transform of its splats is singular: it makes their volume 0")
-    if not is_even:
+    scale = scale_of(matrix, SKEW)
+    if scale is None:
         raise UnsupportedError(
             "a transform stretches, shears or mirrors its splats; only rotations and uniform scales are read"
         )
