@@ -138,7 +138,7 @@ def build_lod(ctx: click.Context, /, **_: Any) -> None:
     """Bake splat files into Level-of-Detail files for Spark, PlayCanvas, SuperSplat, Babylon.js and CesiumJS.
 
     Reads PLY (also PlayCanvas's compressed PLY), SPZ, RAD, SOG (.sog, or a folder with a meta.json), Streamed SOG and
-    3D Tiles (their full detail), .splat, .ksplat, GLB, .hier (its full detail), and checkpoints of gsplat and
+    3D Tiles (their full detail), .splat, .ksplat, GLB, .gltf, .hier (its full detail), and checkpoints of gsplat and
     nerfstudio (.pt, .ckpt); merges splats into a tree, and writes the tree as SPZ with Spark's extension, or as RAD,
     which Spark streams, or cuts of it as 3D Tiles, which CesiumJS streams, or as Streamed SOG, which the others stream.
     An INPUT of - is standard input.

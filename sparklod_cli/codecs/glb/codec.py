@@ -48,7 +48,7 @@ from .glb_writer import encode as encode
 from .glb_writer import extensions_of as extensions_of
 from .glb_writer import held as held
 from .glb_writer import settled as settled
-from .placement import Nodes, is_turn_of, transform_of
+from .placement import GltfNodes, is_turn_of, transform_of
 
 #: Extensions that a file may require, and how those begin that change no splats: materials and lights are ignored.
 READ = (EXTENSION, COMPRESSION, OLD_COMPRESSION, "KHR_mesh_quantization")
@@ -68,7 +68,7 @@ Key = tuple[int, int]
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class PlacedPrimitive:
     """Primitive of splats, and where a node puts it.
 
     Attributes:
@@ -101,7 +101,7 @@ def open_content(source: Source) -> Content:
     up = None if noted.is_ours else "y"
     if noted.up is not None:
         is_turn = all(is_turn_of(part.transform, noted.up) for part in parts)
-        parts = [Part(part.key, Transform()) for part in parts] if is_turn else parts
+        parts = [PlacedPrimitive(part.key, Transform()) for part in parts] if is_turn else parts
         up = noted.up if is_turn else "y"
     opened = {
         key: _opened(file, primitives[key], source, asset.get("generator"), alone=len(parts) == 1)
@@ -148,19 +148,19 @@ def _check_required(file: GltfFile) -> None:
             raise UnsupportedError(f"it requires the extension {quoted_value(name)}, which is not read")
 
 
-def _parts(file: GltfFile, primitives: Mapping[Key, dict[str, Any]]) -> tuple[list[Part], list[str]]:
+def _parts(file: GltfFile, primitives: Mapping[Key, dict[str, Any]]) -> tuple[list[PlacedPrimitive], list[str]]:
     """Return where the primitives are, and notes on what is left out beside them."""
-    nodes, by_mesh, notes = Nodes(file), dict[int, list[Key]](), list[str]()
+    nodes, by_mesh, notes = GltfNodes(file), dict[int, list[Key]](), list[str]()
     for key in primitives:
         by_mesh.setdefault(key[0], []).append(key)
     having, hidden = nodes.having(by_mesh)
     if sum(len(by_mesh[nodes.records[node]["mesh"]]) for node in having) > MAX_PARTS:
         raise UnsupportedError(f"its nodes place more than {MAX_PARTS:,} primitives of splats, which are not read")
-    parts, unknown = list[Part](), dict[str, None]()
+    parts, unknown = list[PlacedPrimitive](), dict[str, None]()
     for node in having:
         record = nodes.records[node]
         transform = transform_of(nodes.matrix(node))
-        parts += [Part(key, transform) for key in by_mesh[record["mesh"]]]
+        parts += [PlacedPrimitive(key, transform) for key in by_mesh[record["mesh"]]]
         unknown |= dict.fromkeys(_extensions(record))
     if hidden:
         notes.append(f"left out: {count_of(hidden, 'node')} with splats outside of the scene that viewers show")
@@ -182,7 +182,7 @@ def _parts(file: GltfFile, primitives: Mapping[Key, dict[str, Any]]) -> tuple[li
         for name in unknown
         if name not in READ and not name.startswith(INDIFFERENT)
     ]
-    return parts or [Part(key, Transform()) for key in primitives], notes
+    return parts or [PlacedPrimitive(key, Transform()) for key in primitives], notes
 
 
 def _opened(file: GltfFile, primitive: dict[str, Any], source: Source, generator: object, *, alone: bool) -> Content:

@@ -16,8 +16,9 @@ from .attributes import Attribute
 #: Programs that wrote logarithms: gsbox up to version 4, and splat-transform before version 2.7, of June 2026.
 WRITERS = re.compile(r"gsbox v?[0-4]\.|splat-transform v?(?:1\.|2\.[0-6]\.)", re.ASCII)
 
-#: Share of splats whose scales are all below 0 from which on they are logarithms: broken files have a few. Chosen.
-NEGATIVE = 0.1
+#: Share of splats with a scale below 0 from which on scales are logarithms, since broken files have a few; and how far
+#: below 0 half of these must be, since linear scales of mirrored splats are small. Chosen.
+NEGATIVE, BELOW = 0.1, 0.1
 
 #: Largest ratio of the 99th to the first percentile of positive values that may be logarithms. That of linear scales of
 #: real scenes is above 100, that of their logarithms below 10. Chosen.
@@ -41,7 +42,9 @@ def are_logs(scales: FloatArray, generator: object) -> bool:
     """
     if isinstance(generator, str) and WRITERS.match(generator):
         return True
-    return len(scales) > 0 and float((scales < 0).all(axis=1).mean()) >= NEGATIVE
+    negative = scales[scales < 0]
+    share = float((scales < 0).any(axis=1).mean()) if len(scales) else 0.0
+    return share >= NEGATIVE and float(np.median(negative)) < -BELOW
 
 
 def decoded(attribute: Attribute) -> Attribute:
@@ -68,5 +71,5 @@ def doubt_about(scales: FloatArray, centers: FloatArray, count: int) -> str | No
         return None
     return (
         f"its scales, {low:.3g} to {high:.3g}, look like logarithms, as gsbox and splat-transform before version 2.7"
-        " write them, but are read as linear ones"
+        " write them, but are read as linear ones; if they are logarithms, write the file anew by a newer version"
     )
