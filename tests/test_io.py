@@ -31,7 +31,7 @@ def test_the_content_decides_the_format_whatever_the_suffix(kind: str, suffix: s
         (b"", "the file is empty"),
         (
             b"x",
-            r"not a splat file that sparklod reads \(.*, 3D Tiles, checkpoint, SOG, GLB, KSPLAT, HIER, SPLAT\)",
+            r"not a splat file that sparklod reads \(.*, 3D Tiles, glTF, checkpoint, SOG, GLB, KSPLAT, HIER, SPLAT\)",
         ),
         (b"plywood\n" * 99, "not a splat file"),
         (b"PLY\nformat ascii 1.0\n", "not a splat file"),

@@ -136,7 +136,7 @@ def test_more_splats_than_a_file_can_stand_for_are_refused() -> None:
     nodes = [{"mesh": 0} for _ in range(9_000)]
     with pytest.raises(PromiseError, match="more than a file of"):
         read(by_hand_glb.glb(**splats, nodes=nodes, scenes=[{"nodes": list(range(9_000))}]))
-    with pytest.raises(UnsupportedError, match="place more than 16,384 primitives"):
+    with pytest.raises(UnsupportedError, match="more than 16,384 primitives"):
         read(by_hand_glb.glb(**splats, nodes=nodes * 2, scenes=[{"nodes": list(range(18_000))}]))
 
 

@@ -103,11 +103,14 @@ def open_content(source: Source) -> Content:
         is_turn = all(is_turn_of(part.transform, noted.up) for part in parts)
         parts = [PlacedPrimitive(part.key, Transform()) for part in parts] if is_turn else parts
         up = noted.up if is_turn else "y"
-    opened = {
-        key: _opened(file, primitives[key], source, asset.get("generator"), alone=len(parts) == 1)
-        for key in dict.fromkeys(part.key for part in parts)
-    }
-    contents = [placed(opened[part.key], part.transform) for part in parts]
+    opened, contents, total = dict[Key, Content](), list[Content](), 0
+    for part in parts:
+        if part.key not in opened:
+            alone = len(parts) == 1
+            opened[part.key] = _opened(file, primitives[part.key], source, asset.get("generator"), alone=alone)
+        contents.append(placed(opened[part.key], part.transform))
+        total += contents[-1].count * 4 * (14 + 3 * COEFFICIENTS[contents[-1].sh_degree])
+        check_promise(total, file.size)
     content = contents[0] if len(contents) == 1 else _joined(contents)
     check_promise(content.count * 4 * (14 + 3 * COEFFICIENTS[content.sh_degree]), file.size)
     return dataclasses.replace(
@@ -154,8 +157,8 @@ def _parts(file: GltfFile, primitives: Mapping[Key, dict[str, Any]]) -> tuple[li
     for key in primitives:
         by_mesh.setdefault(key[0], []).append(key)
     having, hidden = nodes.having(by_mesh)
-    if sum(len(by_mesh[nodes.records[node]["mesh"]]) for node in having) > MAX_PARTS:
-        raise UnsupportedError(f"its nodes place more than {MAX_PARTS:,} primitives of splats, which are not read")
+    if max(len(primitives), sum(len(by_mesh[nodes.records[node]["mesh"]]) for node in having)) > MAX_PARTS:
+        raise UnsupportedError(f"it has more than {MAX_PARTS:,} primitives of splats, counted once for each node")
     parts, unknown = list[PlacedPrimitive](), dict[str, None]()
     for node in having:
         record = nodes.records[node]
