@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import sparklod_cli as sparklod
-from fixtures import by_hand_rad
+from fixtures import by_hand_glb, by_hand_rad
 from sparklod_cli.codecs.rad.rad_header import RadChunkEntry, RadHeader, pack_header, read_chunk_header
 from sparklod_cli.io import read_parts
 from sparklod_cli.lod import quick
@@ -112,6 +112,25 @@ def test_3d_tiles_are_shown_by_cesium_with_all_their_tiles(tileset: Path, packag
     names = {f"data/0/{each.relative_to(tileset.parent).as_posix()}" for each in tileset.parent.rglob("*.*")}
     site = prepared([tileset.parent], spark_dir=packages)
     assert {each for each in site.resources if each.startswith("data/")} == names
+
+
+@pytest.mark.parametrize("buffer", ["tile.bin", "data.env", ".ssh/tile.bin", "../tile.bin"])
+def test_the_buffers_of_tiles_are_shown_if_they_are_called_so(buffer: str, tmp_path: Path) -> None:
+    folder = tmp_path / "web" / "tiles"
+    (folder / ".ssh").mkdir(parents=True)
+    text, content = by_hand_glb.as_json((GOLDEN / "sh2.glb").read_bytes(), buffer)
+    (folder / "a.gltf").write_bytes(text)
+    (folder / buffer).write_bytes(content)
+    root = {"geometricError": 0, "boundingVolume": {"sphere": [0, 0, 0, 99]}, "content": {"uri": "tiles/a.gltf"}}
+    tileset = {"asset": {"version": "1.1"}, "geometricError": 1, "root": root}
+    (tmp_path / "web" / "tileset.json").write_text(json.dumps(tileset))
+    if buffer == "tile.bin":
+        (file,) = shown_files([tmp_path / "web"])
+        names = ("tileset.json", "tiles/a.gltf", "tiles/tile.bin")
+        assert list(file.files) == [f"data/0/{name}" for name in names]
+    else:
+        with pytest.raises(FormatError, match=r"not called like a part of a scene|not a file beside it"):
+            shown_files([tmp_path / "web"])
 
 
 def test_3d_tiles_have_no_budget(tileset: Path, packages: Path) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,8 +14,8 @@ from ...model.sh import COEFFICIENTS, notes_on_degree
 from ...model.splats import FloatArray, Splats
 from ...support.defaults import MAX_SH_DEGREE
 from ...support.errors import FormatError
-from ...support.untrusted import quoted_value
 from .. import quantize
+from ..left_out import left_out
 
 EXTENSION, COMPRESSION = "KHR_gaussian_splatting", "KHR_gaussian_splatting_compression_spz_2"
 
@@ -125,20 +125,11 @@ def _drafted(attribute: Attribute, names: Mapping[str, Any]) -> Attribute | None
 #: SH of higher degrees than any that is read.
 _HIGHER_SH = re.compile(rf"(?:{PREFIX}|{DRAFT_PREFIX})SH_DEGREE_(\d)_COEF_\d+", re.ASCII)
 
-#: Attributes named in a note; more are counted.
-MOST_NAMED = 5
 
-
-def left_out(names: Mapping[str, Any], read: Sequence[Attribute]) -> Iterator[str]:
-    """Yield notes on the attributes of a primitive that are not read."""
+def notes_on(names: Mapping[str, Any], read: Sequence[Attribute]) -> tuple[str, ...]:
+    """Return notes on the attributes of a primitive that are not read."""
     known = {each.semantic for each in read}
     others = [name for name in names if name not in known]
     degrees = {name: int(match[1]) for name in others if (match := _HIGHER_SH.fullmatch(name))}
-    yield from notes_on_degree(max(degrees.values(), default=0))
-    others = [name for name in others if name not in degrees]
-    if others:
-        listed = ", ".join(map(quoted_value, others[:MOST_NAMED]))
-        more = f" and {len(others) - MOST_NAMED:,} more" if len(others) > MOST_NAMED else ""
-        yield (
-            f"its attributes {listed}{more} are left out" if len(others) > 1 else f"its attribute {listed} is left out"
-        )
+    cut = notes_on_degree(max(degrees.values(), default=0))
+    return cut + left_out("attribute", "attributes", (name for name in others if name not in degrees))

@@ -30,6 +30,7 @@ from .. import spz
 from ..compression import check_promise
 from ..content import Content, Source, Target
 from ..file_notes import read_note
+from ..left_out import left_out
 from ..scene_files import copy_rows
 from . import log_scales
 from .attributes import (
@@ -40,7 +41,7 @@ from .attributes import (
     SCALE,
     Attribute,
     attributes_of,
-    left_out,
+    notes_on,
 )
 from .glb_container import FLOAT, Accessor, GltfFile
 from .glb_writer import POINTS, PROPERTIES
@@ -180,11 +181,9 @@ def _parts(file: GltfFile, primitives: Mapping[Key, dict[str, Any]]) -> tuple[li
         notes.append("left out: the morph targets of its splats")
     for primitive in primitives.values():
         unknown |= dict.fromkeys([*_extensions(primitive), *_extensions(_extensions(primitive).get(EXTENSION, {}))])
-    notes += [
-        f"the extension {quoted_value(name)} of its splats is not read"
-        for name in unknown
-        if name not in READ and not name.startswith(INDIFFERENT)
-    ]
+    notes += left_out(
+        "extension", "extensions", (name for name in unknown if name not in READ and not name.startswith(INDIFFERENT))
+    )
     return parts or [PlacedPrimitive(key, Transform()) for key in primitives], notes
 
 
@@ -225,7 +224,7 @@ def _plain_content(file: GltfFile, primitive: dict[str, Any], generator: object)
     count = accessors[0][1].count
     if any(accessor.count != count for _, accessor in accessors):
         raise FormatError(f"its attributes have different numbers of values, not all {count:,}")
-    notes = list(left_out(names, attributes))
+    notes = list(notes_on(names, attributes))
     scales, centers = (
         _sampled(file, accessor)
         for wanted in (SCALE, POSITION)
