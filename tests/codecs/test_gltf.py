@@ -417,6 +417,16 @@ def test_linear_scales_below_0_are_no_logarithms(broken: slice) -> None:
     assert back.notes == () and (back.splats.scale[broken, 0] < 0).all()
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("value", [-3e38, -np.inf, np.nan, 3e38, np.inf])
+def test_scales_of_any_size_are_looked_at_without_a_warning(value: float) -> None:
+    for splats in (SH0, random_splats(500)):
+        scales = np.full_like(splats.scale, value)
+        assert len(read(with_scales(splats, scales)).splats) == len(splats)
+        scales[::2] = 1.0
+        assert len(read(with_scales(splats, scales)).splats) == len(splats)
+
+
 def test_an_empty_primitive_has_no_scales_to_tell() -> None:
     data = by_hand_glb.split(A)[0]["accessors"]
     content = glb.open_content(Source(io.BytesIO(with_root(A, accessors=[each | {"count": 0} for each in data]))))

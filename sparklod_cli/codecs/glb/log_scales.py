@@ -44,7 +44,7 @@ def are_logs(scales: FloatArray, generator: object) -> bool:
         return True
     negative = scales[scales < 0]
     share = float((scales < 0).any(axis=1).mean()) if len(scales) else 0.0
-    return share >= NEGATIVE and float(np.median(negative)) < -BELOW
+    return share >= NEGATIVE and float((negative < -BELOW).mean()) >= 0.5
 
 
 def decoded(attribute: Attribute) -> Attribute:
