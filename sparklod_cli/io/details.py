@@ -24,10 +24,11 @@ from ..codecs.file_names import (
     is_of_streamed_sog,
     is_of_tileset,
 )
-from ..codecs.scene_files import SceneFiles
+from ..codecs.content import OpenCompanion
 from ..codecs.sog.sog_container import MAX_META, companion_names
+from ..codecs.stream import size_of
 from ..codecs.streamed_sog.manifest import MAX_MANIFEST, Manifest, parse
-from ..codecs.streamed_sog.manifest_rules import chunk_files
+from ..codecs.streamed_sog.manifest_rules import files_of_chunk
 from ..codecs.tiles_3d import tileset
 from ..support.addresses import Address, Place
 from ..support.errors import FormatError, OutputError
@@ -184,12 +185,18 @@ class LevelFiles:
     Attributes:
         manifest: as parsed.
         bytes: of the manifest.
-        sizes: bytes of the chunk files that it names, and then of the environment: each meta.json with its images.
+        requests: bytes of what a viewer asks for of each chunk file that it names, and then of the environment: of the
+            meta.json, and then of each of its images.
     """
 
     manifest: Manifest
     bytes: int
-    sizes: tuple[int, ...]
+    requests: tuple[tuple[int, ...], ...]
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Bytes of each chunk file, and of the environment."""
+        return tuple(map(sum, self.requests))
 
 
 def read_level_files(path: Path) -> LevelFiles:
@@ -200,14 +207,18 @@ def read_level_files(path: Path) -> LevelFiles:
     """
     with opened(path) as (file, _, more):
         data = file.read(MAX_MANIFEST + 1)
-        manifest, beside = parse(data), chunk_files(more["open_companion"])
-        sizes = tuple(_size_of_chunk(beside, name) for name in manifest.names())
-    return LevelFiles(manifest, len(data), sizes)
+        manifest, open_companion = parse(data), more["open_companion"]
+        requests = tuple(_requests_of(open_companion, name) for name in manifest.names())
+    return LevelFiles(manifest, len(data), requests)
 
 
-def _size_of_chunk(beside: SceneFiles, name: str) -> int:
-    """Return the bytes of a chunk file and its images; 0 where it cannot be read, which reading its splats reports."""
+def _requests_of(open_companion: OpenCompanion, name: str) -> tuple[int, ...]:
+    """Return the bytes of the files of a chunk; none where one cannot be read, which reading its splats reports."""
+    sizes = list[int]()
     try:
-        return beside.open(name).bytes
+        for each in files_of_chunk(open_companion, name):
+            with open_companion(each) as file:
+                sizes.append(size_of(file))
     except FormatError:
-        return 0
+        return ()
+    return tuple(sizes)

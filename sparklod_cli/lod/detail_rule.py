@@ -15,6 +15,9 @@ BUDGET_MODES = ("target", "limit")
 #: PlayCanvas's budget of splats, and the chunk files that it loads at a time, unless it is told otherwise.
 BUDGET, FETCHERS = 1_000_000, 2
 
+#: Requests to a host that browsers have under way at a time, by HTTP/1.1; a chunk file takes seven or eight.
+CONNECTIONS = 6
+
 #: The shortest base distance, world units.
 LEAST_BASE_DISTANCE = 0.1
 

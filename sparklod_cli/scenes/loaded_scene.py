@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar
@@ -132,8 +133,10 @@ def nodes_of(splats: Splats, tree: LodTree, coding: FileCoding, *, precision: st
 class LoadedRuns(LoadedScene):
     """A scene of which viewers draw whole runs of splats, each from a file that a manifest names."""
 
-    #: Requests that its viewer has under way at a time.
+    #: Chunk files that its viewer fetches at a time.
     fetchers: ClassVar[int]
+    #: Requests that a browser has under way at a time; None where the fetchers are the bound.
+    connections: ClassVar[int | None] = None
 
     @property
     def has_cuts(self) -> bool:
@@ -143,6 +146,11 @@ class LoadedRuns(LoadedScene):
     def manifest_bytes(self) -> int:
         """Bytes of the manifest, which is read before any other file; 0 for a scene in memory."""
         raise NotImplementedError
+
+    @property
+    def requests(self) -> Sequence[tuple[int, ...]]:
+        """For each file, bytes of the answer to a first request, and of those that follow it together."""
+        return [(size,) for size in self.chunk_bytes().tolist()]
 
     @property
     def chunks(self) -> int:
@@ -160,6 +168,7 @@ class LoadedDetail(LoadedRuns):
     """
 
     fetchers = detail_rule.FETCHERS
+    connections = detail_rule.CONNECTIONS
 
     detail: DetailScene = field(kw_only=True)
     files: DetailFiles = field(kw_only=True)
@@ -167,6 +176,10 @@ class LoadedDetail(LoadedRuns):
     @property
     def manifest_bytes(self) -> int:
         return self.files.manifest
+
+    @property
+    def requests(self) -> Sequence[tuple[int, ...]]:
+        return self.files.requests or super().requests
 
     @functools.cached_property
     def depth(self) -> NDArray[np.int32]:
@@ -248,7 +261,7 @@ def files_of(found: LevelFiles) -> DetailFiles:
             if run.count:
                 row[level] = run.file
     environment = None if manifest.environment is None else len(manifest.filenames)
-    return DetailFiles(of_run, np.array(found.sizes, np.int64), environment, found.bytes)
+    return DetailFiles(of_run, np.array(found.sizes, np.int64), environment, found.bytes, found.requests)
 
 
 def files_in_memory(detail: DetailScene) -> DetailFiles:

@@ -43,9 +43,13 @@ class Chunks:
             for a chunk, see `header_answers`; none unless given.
         rooted: whether trees are drawn from their first chunks on, which hold their roots; chunk files of Streamed SOG
             are drawn each for itself.
+        fetchers: chunks that a viewer fetches at a time, unless it is told otherwise.
+        connections: requests that are under way at a time; None for any number.
 
     Attributes:
         sizes: of each chunk, bytes.
+        requests: for each chunk, bytes of the answers that it takes: to a first request, and to those that follow it
+            together.
         firsts: the first chunk of each tree.
         roots: the chunks that are always wanted: the first of each tree if `rooted`.
 
@@ -60,8 +64,10 @@ class Chunks:
         *,
         rooted: bool = True,
         fetchers: int = FETCHERS,
+        connections: int | None = None,
     ) -> None:
         self.fetchers = fetchers
+        self.connections = connections
         self.sizes: list[int] = []
         self.firsts: list[int] = []
         self.headers = [tuple(each) for each in headers or [()] * len(sizes)]
@@ -74,6 +80,22 @@ class Chunks:
             self.firsts.append(len(self.sizes))
             self.sizes += column.tolist()
         self.roots = self.firsts if rooted else []
+        self.requests: list[tuple[int, ...]] = [(size,) for size in self.sizes]
+
+    @classmethod
+    def of_requests(
+        cls,
+        requests: Sequence[Sequence[tuple[int, ...]]],
+        headers: Sequence[Sequence[int]],
+        *,
+        fetchers: int,
+        connections: int | None,
+    ) -> Chunks:
+        """Return chunk files, for each scene, that take several requests each, and are drawn each for itself."""
+        sizes = [[sum(parts) for parts in of_scene] for of_scene in requests]
+        chunks = cls(sizes, headers, rooted=False, fetchers=fetchers, connections=connections)
+        chunks.requests = [parts or (0,) for of_scene in requests for parts in of_scene]
+        return chunks
 
     def __len__(self) -> int:
         return len(self.sizes)

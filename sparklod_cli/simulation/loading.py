@@ -157,8 +157,9 @@ def chunks_of(scenes: Scenes) -> Chunks:
     """Return the chunks of scenes with cuts, and what a viewer needs before it can ask for them."""
     if scenes.in_runs:
         manifests = [[loaded.manifest_bytes] if loaded.manifest_bytes else [] for loaded in scenes.in_runs]
-        sizes = [loaded.chunk_bytes() for loaded in scenes.in_runs]
-        return Chunks(sizes, manifests, rooted=False, fetchers=scenes.in_runs[0].fetchers)
+        requests = [loaded.requests for loaded in scenes.in_runs]
+        kind = type(scenes.in_runs[0])
+        return Chunks.of_requests(requests, manifests, fetchers=kind.fetchers, connections=kind.connections)
     return Chunks(
         [tree.chunk_bytes() for tree in scenes.trees],
         [header_answers(tree.header_bytes, tree.bytes) for tree in scenes.trees],

@@ -7,9 +7,17 @@ import math
 from collections import deque
 from collections.abc import Iterable
 from heapq import heappop, heappush
+from typing import NamedTuple
 
 from .chunk_cache import ChunkCache, Chunks
 from .streaming_settings import Network
+
+
+class _Request(NamedTuple):
+    """A request: `part` of `Chunks.requests` of a chunk, or the next answer with the header of tree -1 - chunk."""
+
+    chunk: int
+    part: int = 0
 
 
 class ChunkStream:
@@ -21,6 +29,9 @@ class ChunkStream:
     A free fetcher requests the most important admitted chunk that is neither resident nor under way. Requests are not
     cancelled, as in Spark; a chunk that is no longer wanted when it arrives goes into the cache if there
     is room, or in place of one that has not been used for longer. Decoding takes no time, and no request fails.
+
+    A chunk is there when all of its answers are (`Chunks.requests`): that to a first request, and those to the others,
+    which are asked for together then. A request waits for a free connection, in the order of the requests.
 
     Where a viewer needs headers first (`Chunks.headers`), they are requested at the start, all at once and besides the
     fetchers; a fetcher with a chunk of such a tree waits for its header, as in Spark.
@@ -47,21 +58,24 @@ class ChunkStream:
         self.cache = ChunkCache(chunks, capacity)
         self.now = start
         self._next = 0  # all admitted chunks before this one are resident or under way
-        self._under_way: set[int] = set()
-        # (Time of its first byte, chunk), in order, since all have the same latency. -1 - t is the header of tree t.
-        self._requested: deque[tuple[float, int]] = deque()
+        self._missing: dict[int, int] = {}  # of chunks under way, the answers that have not arrived
+        # (Time of its first byte, request), in order, since all have the same latency.
+        self._requested: deque[tuple[float, _Request]] = deque()
+        self._connections = chunks.connections or math.inf
+        self._queue: deque[_Request] = deque()  # requests that wait for a connection
         # For each tree whose header is under way, the answers that are still to come, and the chunks that wait for it.
         self._headers = {tree: answers for tree, answers in enumerate(chunks.headers) if answers}
         self._waiting: dict[int, tuple[int, ...]] = dict.fromkeys(self._headers, ())
-        self._requested.extend((start + self._network.latency, -1 - tree) for tree in self._headers)
         self.received = self._taken = 0
         # Concurrent transfers share the bandwidth equally. `_served` is the number of bytes that a transfer which began
         # with the first would have received at time `_since`; a transfer ends when that has grown by its size.
-        self._transfers: list[tuple[float, int, int]] = []  # heap of (`_served` at its end, number, chunk)
+        self._transfers: list[tuple[float, int, _Request]] = []  # heap of (`_served` at its end, number, request)
         self._served = 0.0
         self._since = start
         self._begun = 0
         self._arrived: list[int] = []
+        for tree in self._headers:
+            self._ask(start, _Request(-1 - tree))
 
     def advance(self, to_time: float) -> None:
         """Process all events up to a time in seconds; raise `ValueError` if it is in the past, or not finite."""
@@ -115,7 +129,7 @@ class ChunkStream:
     def _copy(self) -> ChunkStream:
         twin = copy.copy(self)
         twin.cache = self.cache.copy()
-        twin._under_way, twin._requested = self._under_way.copy(), self._requested.copy()
+        twin._missing, twin._requested, twin._queue = self._missing.copy(), self._requested.copy(), self._queue.copy()
         twin._transfers, twin._arrived = self._transfers.copy(), self._arrived.copy()
         twin._headers, twin._waiting = self._headers.copy(), self._waiting.copy()
         return twin
@@ -123,16 +137,29 @@ class ChunkStream:
     def _request(self, time: float) -> None:
         """Start requests on the free fetchers."""
         admitted = self.cache.admitted
-        while len(self._under_way) < self._fetchers and self._next < len(admitted):
+        while len(self._missing) < self._fetchers and self._next < len(admitted):
             chunk = admitted[self._next]
             self._next += 1
-            if chunk not in self.cache and chunk not in self._under_way:
-                self._under_way.add(chunk)
+            if chunk not in self.cache and chunk not in self._missing:
+                self._missing[chunk] = len(self._chunks.requests[chunk])
                 tree = self._chunks.tree_of(chunk)
                 if tree in self._waiting:
                     self._waiting[tree] += (chunk,)
                 else:
-                    self._requested.append((time + self._network.latency, chunk))
+                    self._ask(time, _Request(chunk))
+
+    def _ask(self, time: float, request: _Request) -> None:
+        """Send a request, once there is a connection for it."""
+        if len(self._requested) + len(self._transfers) < self._connections:
+            self._requested.append((time + self._network.latency, request))
+        else:
+            self._queue.append(request)
+
+    def _size(self, request: _Request) -> int:
+        """Return the bytes of the answer."""
+        if request.chunk < 0:
+            return self._headers[-1 - request.chunk][0]
+        return self._chunks.requests[request.chunk][request.part]
 
     def _step(self, until: float) -> bool:
         """Process the next event, the start or end of a transfer; False if there is none until a time."""
@@ -156,34 +183,41 @@ class ChunkStream:
             served = self._served + (time - self._since) * self._network.bandwidth / len(self._transfers)
             self._served = min(served, self._transfers[0][0])  # rounding must not exceed the next end
         self._since = time
-        _, chunk = self._requested.popleft()
+        _, request = self._requested.popleft()
         self._begun += 1
-        size = self._chunks.sizes[chunk] if chunk >= 0 else self._headers[-1 - chunk][0]
-        heappush(self._transfers, (self._served + size, self._begun, chunk))
+        heappush(self._transfers, (self._served + self._size(request), self._begun, request))
 
     def _end(self, time: float) -> None:
-        """Process the last byte of the transfer that ends next; its fetcher starts another request."""
-        self._served, _, chunk = heappop(self._transfers)
+        """Process the last byte of the transfer that ends next; its connection is free for another request."""
+        self._served, _, request = heappop(self._transfers)
         if not self._transfers:
             self._served = 0.0  # keeps the numbers small, for precision
         self._since = time
+        if self._queue:
+            self._ask(time, self._queue.popleft())
+        self.received += self._size(request)
+        chunk, part = request
         if chunk < 0:
             self._end_header(-1 - chunk, time)
             return
-        self.received += self._chunks.sizes[chunk]
-        self._under_way.remove(chunk)
+        self._missing[chunk] -= 1
+        if part == 0:
+            for other in range(1, len(self._chunks.requests[chunk])):
+                self._ask(time, _Request(chunk, other))
+        if self._missing[chunk]:
+            return
+        del self._missing[chunk]
         self._arrived.append(chunk)
         self.cache.arrive(chunk)
         self._request(time)
 
     def _end_header(self, tree: int, time: float) -> None:
         """Process an answer with the beginning of a file: request the next one, or the chunks that wait."""
-        answer, *rest = self._headers[tree]
-        self.received += answer
+        _, *rest = self._headers[tree]
         if rest:
             self._headers[tree] = tuple(rest)
-            requests: tuple[int, ...] = (-1 - tree,)
-        else:
-            del self._headers[tree]
-            requests = self._waiting.pop(tree)
-        self._requested.extend((time + self._network.latency, chunk) for chunk in requests)
+            self._ask(time, _Request(-1 - tree))
+            return
+        del self._headers[tree]
+        for chunk in self._waiting.pop(tree):
+            self._ask(time, _Request(chunk))

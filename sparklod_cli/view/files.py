@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import functools
 import os
-import posixpath
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -20,8 +19,8 @@ from ..codecs.formats import head_of
 from ..codecs.glb.codec import open_content as open_glb
 from ..codecs.glb.glb_container import MAGIC as GLB_MAGIC
 from ..codecs.rad.rad_header import MAGIC, RadHeader, read_header
-from ..codecs.sog.sog_container import MAX_META, image_names
 from ..codecs.streamed_sog.manifest import MAX_MANIFEST, parse
+from ..codecs.streamed_sog.manifest_rules import files_of_chunk
 from ..codecs.tiles_3d.codec import names_of
 from ..codecs.tiles_3d.tileset import MAX_TILESET
 from ..codecs.zip_folder import ZIP, ZipFolder
@@ -207,14 +206,11 @@ def _manifest_files(path: Path) -> list[str]:
     """Return the names of all files that readers of a Streamed SOG open; `FormatError` where one is missing."""
     with open_plain(path.resolve()) as file:
         manifest = parse(file.read(MAX_MANIFEST + 1))
-    names = dict.fromkeys(manifest.read_names())
-    for name in list(names):
+    names = dict[str, None]()
+    for name in manifest.read_names():
         if not (path.parent / name).is_file():
             raise FormatError(f"its chunk file {quoted_value(name)} is missing")
-        with open_named(path, name, folders=True) as file:
-            data = file.read(MAX_META + 1)
-        if not data.startswith(ZIP):
-            names |= dict.fromkeys(posixpath.join(posixpath.dirname(name), image) for image in image_names(data))
+        names |= dict.fromkeys(files_of_chunk(functools.partial(open_named, path, folders=True), name))
     return list(names)
 
 

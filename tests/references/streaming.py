@@ -58,6 +58,7 @@ class Fetch:
 
     asked: Fraction
     chunk: int
+    part: int
     latency: Fraction
     left: Fraction
 
@@ -69,6 +70,8 @@ class Twin:
     Attributes:
         opening: for each tree, the beginnings of its file that are still to come; their fetches have negative numbers.
         waiting: chunks that wait for them.
+        queued: chunks and numbers of their answers that wait for a connection.
+        missing: for each chunk under way, numbers of the answers that have not come.
         received: bytes of all that has come.
     """
 
@@ -81,6 +84,8 @@ class Twin:
     tied: bool = False  # rounding may have decided otherwise
     opening: list[list[int]] = field(init=False)
     waiting: list[int] = field(default_factory=list)
+    queued: list[tuple[int, int]] = field(default_factory=list)
+    missing: dict[int, set[int]] = field(default_factory=dict)
     received: int = 0
 
     def __post_init__(self) -> None:
@@ -89,14 +94,21 @@ class Twin:
             if answers:
                 self.fetch(-1 - tree)
 
-    def size(self, number: int) -> int:
-        return self.chunks.sizes[number] if number >= 0 else self.opening[-1 - number][0]
+    def size(self, number: int, part: int = 0) -> int:
+        return self.chunks.requests[number][part] if number >= 0 else self.opening[-1 - number][0]
 
     def tree(self, chunk: int) -> int:
-        return sum(root <= chunk for root in self.chunks.roots) - 1
+        return sum(first <= chunk for first in self.chunks.firsts) - 1
 
-    def fetch(self, number: int) -> None:
-        self.fetches.append(Fetch(self.now, number, Fraction(self.network.latency), Fraction(self.size(number))))
+    def fetch(self, number: int, part: int = 0) -> None:
+        self.queued.append((number, part))
+        self.connect()
+
+    def connect(self) -> None:
+        while self.queued and len(self.fetches) < (self.chunks.connections or math.inf):
+            number, part = self.queued.pop(0)
+            size = Fraction(self.size(number, part))
+            self.fetches.append(Fetch(self.now, number, part, Fraction(self.network.latency), size))
 
     def advance(self, to_time: Fraction) -> None:
         while True:
@@ -104,7 +116,7 @@ class Twin:
             rate = Fraction(self.network.bandwidth) / max(1, len(active))
             due = [fetch.left / rate for fetch in active]
             due += [fetch.latency for fetch in self.fetches if fetch.latency > 0]
-            ends = sorted((fetch.left / rate, fetch.asked, self.size(fetch.chunk)) for fetch in active)
+            ends = sorted((fetch.left / rate, fetch.asked, self.size(fetch.chunk, fetch.part)) for fetch in active)
             self.tied |= any(b[0] - a[0] <= TIE and a != b for a, b in itertools.pairwise(ends))
             self.tied |= any(abs(end[0] - (to_time - self.now)) <= TIE for end in ends)
             step = min([to_time - self.now, *due])
@@ -119,10 +131,18 @@ class Twin:
                 return
             for fetch in done[:1]:
                 self.fetches.remove(fetch)
-                self.received += self.size(fetch.chunk)
+                self.connect()
+                self.received += self.size(fetch.chunk, fetch.part)
                 if fetch.chunk < 0:
                     self.opened(-1 - fetch.chunk)
                     continue
+                self.missing[fetch.chunk].remove(fetch.part)
+                if fetch.part == 0:
+                    for part in sorted(self.missing[fetch.chunk]):
+                        self.fetch(fetch.chunk, part)
+                if self.missing[fetch.chunk]:
+                    continue
+                del self.missing[fetch.chunk]
                 self.arrivals.append((self.now, fetch.chunk))
                 self.cache.arrive(fetch.chunk)
                 self.ask()
@@ -143,9 +163,10 @@ class Twin:
 
     def ask(self) -> None:
         for place, chunk in enumerate(self.cache.requested):
-            under_way = [fetch.chunk for fetch in self.fetches if fetch.chunk >= 0] + self.waiting
+            under_way = self.missing
             is_free = place < self.cache.capacity and len(under_way) < self.network.fetchers
             if is_free and chunk not in self.cache.used and chunk not in under_way:
+                self.missing[chunk] = set(range(len(self.chunks.requests[chunk])))
                 if self.opening[self.tree(chunk)]:
                     self.waiting.append(chunk)
                 else:

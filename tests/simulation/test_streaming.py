@@ -43,14 +43,40 @@ def rest(stream: ChunkStream, requested: list[int]) -> list[tuple[float, int]]:
     return sorted(arrivals)
 
 
+#: What each chunk file takes: an answer, or one and several after it.
+file_requests = st.lists(
+    st.lists(st.lists(st.integers(1, 9999), min_size=1, max_size=4).map(tuple), min_size=1, max_size=4),
+    min_size=1,
+    max_size=3,
+)
+
+
 @settings(max_examples=400)  # what goes wrong here takes several steps that suit each other
 @given(st.data(), tree_sizes, headers, networks)
 @pytest.mark.slow
 def test_a_stream_does_what_its_twin_does(
     data: st.DataObject, sizes: list[list[int]], headers: list[list[int]], network: Network
 ) -> None:
-    chunks = Chunks(sizes, headers[: len(sizes)])
-    capacity = data.draw(st.none() | st.integers(len(sizes), len(chunks)))
+    check_twin(data, Chunks(sizes, headers[: len(sizes)]), network)
+
+
+@settings(max_examples=400)
+@given(st.data(), file_requests, headers, networks, st.none() | st.integers(1, 5))
+@pytest.mark.slow
+def test_a_stream_of_files_of_several_requests_does_what_its_twin_does(
+    data: st.DataObject,
+    requests: list[list[tuple[int, ...]]],
+    headers: list[list[int]],
+    network: Network,
+    connections: int | None,
+) -> None:
+    chunks = Chunks.of_requests(requests, headers[: len(requests)], fetchers=2, connections=connections)
+    check_twin(data, chunks, network)
+
+
+def check_twin(data: st.DataObject, chunks: Chunks, network: Network) -> None:
+    """Asserts that a stream agrees with its twin in what arrives, in which order and when."""
+    capacity = data.draw(st.none() | st.integers(len(chunks.firsts), len(chunks)))
     stream, twin = ChunkStream(chunks, network, capacity=capacity), Twin(chunks, network, NaiveCache(capacity))
     seen: list[int] = []
     for _ in range(data.draw(st.integers(1, 8))):
@@ -76,6 +102,30 @@ def test_a_stream_does_what_its_twin_does(
         twin.advance(twin.now + 1000)
         last = max((time for time, chunk in twin.arrivals[known:] if chunk in missing), default=Fraction(stream.now))
         assert complete_in == pytest.approx(float(last) - stream.now, rel=1e-9, abs=1e-9)
+
+
+def test_a_file_waits_for_its_first_request_then_for_the_others_and_for_connections() -> None:
+    """Three answers of 300 bytes at 100 bytes/s by two connections, each after half a second."""
+    chunks = Chunks.of_requests([[(100, 300, 300, 300)]], [()], fetchers=1, connections=2)
+    stream = ChunkStream(chunks, Network(100.0, 0.5))
+    # The first until 1.5 s, two more from 2 s to 8 s, both at once, the last from 8.5 s to 11.5 s.
+    assert stream.complete_in([0]) == pytest.approx(11.5)
+    free = Chunks.of_requests([[(100, 300, 300, 300)]], [()], fetchers=1, connections=None)
+    assert ChunkStream(free, Network(100.0, 0.5)).complete_in([0]) == pytest.approx(11.0)
+
+
+def test_images_of_a_second_file_slow_down_those_of_the_first() -> None:
+    """Two files at a time: the large image of the first shares the bandwidth with all of the second."""
+    small, large = (10, 100, 1000), (10, 1000, 1000)
+    alone = Chunks.of_requests([[small]], [()], fetchers=2, connections=6)
+    both = Chunks.of_requests([[small, large]], [()], fetchers=2, connections=6)
+    one, two = ChunkStream(alone, Network(1000.0)), ChunkStream(both, Network(1000.0))
+    assert one.complete_in([0]) == pytest.approx(1.11)
+    two.want([0, 1])
+    while not two.take_arrivals():
+        two.step()
+    # 20 bytes of both first requests, then four transfers of 100 bytes each, then three of 900 bytes.
+    assert two.now == pytest.approx(0.02 + 0.4 + 2.7)
 
 
 @given(st.data(), tree_sizes, networks)

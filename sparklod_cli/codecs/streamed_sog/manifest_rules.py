@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import posixpath
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from typing import Any, BinaryIO
@@ -22,8 +23,10 @@ from ..json_trees import leads_away
 from ..scene_files import Chunk, SceneFiles
 from ..sog import codec as sog
 from ..sog import texel_codings
+from ..sog.sog_container import MAX_META, image_names
 from ..splat_bounds import count_outside
 from ..validation import RuleViolation
+from ..zip_folder import ZIP
 from .manifest import MAX_MANIFEST, Bound, Manifest, ManifestNode, Run, parse
 
 #: Meaning of each code; the text of a violation has the values. Values of the wrong kind, which
@@ -270,6 +273,19 @@ def chunk_files(open_companion: OpenCompanion | None) -> SceneFiles:
     return SceneFiles(
         open_companion, MANIFEST, "streamed-sog.chunk-files", lambda name, source: sog.open_content(source)
     )
+
+
+def files_of_chunk(open_companion: OpenCompanion, name: str) -> list[str]:
+    """Return the files that a chunk is read from: its meta.json and then its images, or itself where it is bundled.
+
+    Raises:
+        FormatError: it cannot be opened, or is no meta.json.
+    """
+    with open_companion(name) as file:
+        data = file.read(MAX_META + 1)
+    if data.startswith(ZIP):
+        return [name]
+    return [name, *(posixpath.join(posixpath.dirname(name), image) for image in image_names(data))]
 
 
 def scan_files(
