@@ -368,6 +368,8 @@ class _Job:
             if not report.findings:
                 noun = "node" if report.tree is not None else "splat"
                 self.console.say(f"{name}: nothing is wrong with its {count_of(report.splats or 0, noun)}")
+                for hint in report.hints:
+                    self.console.say(f"{name}: {hint}")
         elif report.format is not None and not self.console.quiet:
             click.echo("\n".join(lines(name, plain)))
 

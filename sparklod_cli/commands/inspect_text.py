@@ -39,6 +39,8 @@ def lines(name: str, report: dict[str, Any]) -> Iterator[str]:
         yield from rows("takes", f"{report['bytes_per_splat']:.1f} bytes a {noun}{less}")
     for note in report["notes"]:
         yield from rows("note", note)
+    for hint in report["hints"]:
+        yield from rows("hint", hint)
     if report["rad"]:
         yield from _rad(report["rad"])
     if report["streamed_sog"]:

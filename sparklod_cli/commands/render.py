@@ -15,7 +15,7 @@ from .console import Console, count_of, print_json, size_of
 from .option_groups import COMMON, check_declared, command, exclude, flags_set, values_of
 from .options.cameras import PictureCameras
 from .options.common import General, json_flag
-from .options.cut import Inputs, PictureCut, PictureStreaming, check_scenes, viewed_files
+from .options.cut import Inputs, PictureCut, PictureStreaming, check_scenes, notes_on_loading, viewed_files
 from .options.pictures import Appearance, ComparisonOptions, PictureFiles, check_sizes
 from .paths import claim_stdout, keep_apart, name_outputs
 
@@ -132,7 +132,8 @@ def _draw(ctx: click.Context, options: RenderOptions) -> None:
 
         def ready(path: CameraPath, scenes: Scenes) -> None:
             check_scenes(ctx, scenes)
-            for note in (*path.notes, *scenes.notes, *_upside_down(options, scenes)):
+            loading = notes_on_loading(scenes, options.streaming.streaming.network)
+            for note in (*path.notes, *scenes.notes, *_upside_down(options, scenes), *loading):
                 console.say(note)
             console.detail(f"  read in {time.perf_counter() - start:.2f} s")
 

@@ -30,7 +30,7 @@ from .options.common import (
     report_outcomes,
     table_form,
 )
-from .options.cut import CutOptions, Inputs, check_scenes, viewed_files
+from .options.cut import CutOptions, Inputs, check_scenes, notes_on_loading, viewed_files
 from .paths import OutputPath, claim_stdout, keep_apart, name_outputs
 
 if TYPE_CHECKING:
@@ -192,9 +192,9 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
         from ..api.jobs import traverse_files
 
         def ready(path: CameraPath, scenes: Scenes) -> None:
-            for note in path.notes:
-                console.say(note)
             check_scenes(ctx, scenes)
+            for note in (*path.notes, *notes_on_loading(scenes, options.streaming.network)):
+                console.say(note)
             keep_apart(ctx, {**besides, "indices_out": outputs.index_files(path.numbers, len(instances))})
 
         console.announce_compiling("cuts")

@@ -267,7 +267,7 @@ def _figures(report: Mapping[str, Any]) -> str:
 
 def _findings(report: Mapping[str, Any]) -> str:
     findings = report.get("findings")
-    notes = "".join(f"<p>{text_of(note)}</p>" for note in report.get("notes") or ())
+    notes = "".join(f"<p>{text_of(note)}</p>" for note in (*(report.get("notes") or ()), *(report.get("hints") or ())))
     if not findings:
         return panel("Notes", notes)
     items = []

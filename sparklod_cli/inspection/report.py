@@ -83,6 +83,7 @@ class Report:
         bytes_per_splat: size over splats.
         compression_ratio: size of the decoded splats, as 4-byte floats, over that of the file.
         notes: data that the reader left out.
+        hints: settings of viewers that suit the file; none unless it was checked.
         rad: what the headers of a RAD file tell; None for other formats.
         streamed_sog: what the manifest of a Streamed SOG tells; None for other formats.
         tiles: what the tilesets and headers of 3D Tiles tell; None for other formats.
@@ -103,6 +104,7 @@ class Report:
     bytes_per_splat: float | None = None
     compression_ratio: float | None = None
     notes: list[str] = dataclasses.field(default_factory=list)
+    hints: list[str] = dataclasses.field(default_factory=list)
     rad: rad.RadFacts | None = None
     streamed_sog: streamed_sog.StreamedSogFacts | None = None
     tiles: tiles.TileFacts | None = None
@@ -171,7 +173,7 @@ def inspect(
             if file is not None and not (settings.at_once is None and file.fits):
                 blocks = ReportBlocks.of_file(file, threads=threads, progress=progress)
                 return _of_blocks(path, blocks, columns, size, settings, surveyed, threads), None
-        if surveyed is None and settings.at_once is not True:
+        if surveyed is None and settings.at_once is not True and not settings.check:
             # Only SPZ files are read by columns. None of their codes is invalid but positions of version 1.
             needed = OF_VALUES | (OF_STATISTICS if settings.values and settings.all_quantities else set())
             unread, columns = columns - needed, columns & needed
@@ -207,6 +209,7 @@ def _of_blocks(
 ) -> Report:
     """Return the report on a file that can be read, block by block."""
     about = blocks.about
+    degree = about.splats.sh_degree
     ends, size = value_checks.ends_of(about.header), about.header.get("bytes", size)
     findings = _container_findings(about)
     if surveyed is not None:
@@ -220,12 +223,13 @@ def _of_blocks(
     def examined(block: Block) -> tuple[Any, Any, Any]:
         return (
             None if nodes is None else nodes.add(block),
-            ValueTally.of(block, ends) if settings.values or settings.check else None,
+            ValueTally.of(block, ends, layouts=settings.check) if settings.values or settings.check else None,
             chunks.row_of(block) if settings.chunks else None,
         )
 
     opaque, tallies, rows = zip(*blocks.map(examined, columns, threads), strict=True) if blocks.count else ((), (), ())
     statistics = facts = table = None
+    hints: list[str] = []
     if settings.values:
         total = ValueTally.total(tallies)
         statistics = values.statistics_of(blocks, total, all_quantities=settings.all_quantities, threads=threads)
@@ -243,8 +247,9 @@ def _of_blocks(
         )
         findings += found
     if settings.check:
-        findings += value_checks.findings_about(ValueTally.total(tallies), ends, is_tree=blocks.is_tree)
-    degree = about.splats.sh_degree
+        total = ValueTally.total(tallies)
+        findings += value_checks.findings_about(total, ends, is_tree=blocks.is_tree)
+        hints = value_checks.hints_about(total.layouts, degree)
     head = Head(about.format, size or 0, blocks.count, degree, about.antialiased, about.up)
     report = _report(path, head, surveyed)
     return dataclasses.replace(
@@ -252,6 +257,7 @@ def _of_blocks(
         bytes=size,
         header=dict(about.header),
         notes=list(about.notes),
+        hints=hints,
         tree=facts,
         values=statistics,
         chunks=table,

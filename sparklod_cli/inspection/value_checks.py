@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from ..codecs import clamps, quantize
+from ..codecs.gpu.layout_loss import MOST_PAGED_DEGREE, LayoutLoss, sample_loss
 from ..model.scene import Scene
 from ..model.splats import COLUMNS, FloatArray
 from .blocks import Block, Mask, MaskTally, ReportBlocks, largest, merged, tallies
@@ -24,6 +25,13 @@ OF_INVALID = {
 
 #: Share of splats above which invisible ones are a finding: a few are the rounding of good files.
 MANY_INVISIBLE = 0.1
+
+#: Loss of colours in one of Spark's layouts, dB, below which pictures differ visibly, and by how much more than in the
+#: other it is worth a hint: twice the error. Chosen.
+VISIBLE_LOSS, LOSS_APART = 35, 6
+
+#: Splats of a block that stand for it where this loss is measured.
+BLOCK_SAMPLE = 4096
 
 #: Coordinates from this on become infinite in float16, which Spark's PackedSplats use.
 FLOAT16_END = 65_520
@@ -63,6 +71,7 @@ class ValueTally:
             `splats.INVALID`.
         valid: masks of valid splats, by the start of each block in which some are not.
         low, high: (3,) corners of the box of the centres of valid splats; infinite without any.
+        layouts: loss of a sample in Spark's layouts.
     """
 
     count: int
@@ -72,10 +81,15 @@ class ValueTally:
     valid: dict[int, Mask]
     low: FloatArray
     high: FloatArray
+    layouts: LayoutLoss = field(default_factory=LayoutLoss)
 
     @classmethod
-    def of(cls, block: Block, ends: Ends) -> ValueTally:
-        """Tallies of a block with the columns center, scale and opacity, and others that may be invalid."""
+    def of(cls, block: Block, ends: Ends, *, layouts: bool = False) -> ValueTally:
+        """Tallies of a block with the columns center, scale and opacity, and others that may be invalid.
+
+        Args:
+            layouts: measure the loss in Spark's layouts, which takes all columns.
+        """
         opacity, most = block.splats.opacity, largest(block.splats.scale)
         furthest, valid = largest(np.abs(block.splats.center)), block.valid
         checked = np.ones(len(opacity), np.bool_) if block.tree is None else block.tree.is_leaf
@@ -103,6 +117,7 @@ class ValueTally:
             {block.start: valid} if block.invalid else {},
             np.array([axis.min(initial=np.inf) for axis in center.T]),
             np.array([axis.max(initial=-np.inf) for axis in center.T]),
+            sample_loss(block.splats, BLOCK_SAMPLE) if layouts else LayoutLoss(),
         )
 
     @classmethod
@@ -121,6 +136,7 @@ class ValueTally:
             valid,
             low,
             high,
+            LayoutLoss.total(part.layouts for part in every),
         )
 
     def number(self, name: str) -> int:
@@ -161,3 +177,16 @@ def findings_about(values: ValueTally, ends: Ends, *, is_tree: bool) -> list[Fin
             report("values.scale-clamped", name, text)
     report("values.center-far", "far", f"a coordinate is {FLOAT16_END:,} or more, which float16 cannot hold")
     return findings
+
+
+def hints_about(loss: LayoutLoss, sh_degree: int) -> list[str]:
+    """Return a hint where one of Spark's layouts is visibly worse than the other."""
+    ext, packed = loss.psnr("ext"), loss.psnr("packed")
+    if min(ext, packed) >= VISIBLE_LOSS or abs(ext - packed) < LOSS_APART:
+        return []
+    if packed > ext:
+        text = f"Spark's ExtSplats clip the SH ({ext:.0f} dB; PackedSplats {packed:.0f} dB)"
+        return [f"{text}; leave out extSplats and pagedExtSplats"]
+    text = f"Spark's PackedSplats clamp colours or round centres ({packed:.0f} dB; ExtSplats {ext:.0f} dB)"
+    paged = " (pagedExtSplats of a paged file)" if sh_degree <= MOST_PAGED_DEGREE else ""
+    return [f"{text}; set extSplats{paged}"]

@@ -362,3 +362,25 @@ def test_no_code_but_positions_of_version_1_stands_for_an_invalid_splat(
     assert set(splats.invalid()) == ({"non_finite"} if version == 1 else set())
     splats = replace(splats, center=np.zeros_like(splats.center))
     assert splats.invalid() == {}
+
+
+@pytest.mark.parametrize(
+    ("rgb", "sh", "hint"),
+    [
+        (0.0, 1.0, ["Spark's ExtSplats clip the SH"]),
+        (0.0, 0.01, []),
+        (1.0, 0.01, ["Spark's PackedSplats clamp colours or round centres"]),
+    ],
+)
+@pytest.mark.parametrize("sh_degree", [2, 3])
+def test_a_check_hints_at_the_layout_of_spark_that_loses_less(
+    rgb: float, sh: float, hint: list[str], sh_degree: int, tmp_path: Path
+) -> None:
+    splats = random_splats(300, sh_degree=sh_degree)
+    splats = replace(splats, rgb=splats.rgb + np.float32(rgb), sh=splats.sh * np.float32(sh))
+    (tmp_path / "scene.ply").write_bytes(b"".join(ply.encode(Scene(splats))))
+    report, _ = inspect(tmp_path / "scene.ply", ReportSettings(check=True))
+    assert [each.partition(" (")[0] for each in report.hints] == hint
+    assert report.findings == []
+    assert all(("pagedExtSplats of" in each) == (sh_degree < 3) for each in report.hints if "clamp" in each)
+    assert inspect(tmp_path / "scene.ply", ReportSettings())[0].hints == []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -10,14 +11,17 @@ import numpy as np
 import pytest
 
 from sparklod_cli.codecs import spz
+from sparklod_cli.codecs.rounding import after
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quick
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
+from sparklod_cli.render.rasterizer import draw
 from sparklod_cli.render.settings import SORTS, RasterSettings
+from sparklod_cli.render.shading import shade
 from tests.conftest import FIXTURES
 from tests.interop.page import Page
-from tests.interop.pictures import Difference, cameras_around, compare
+from tests.interop.pictures import Difference, cameras_around, compare, psnr
 from tests.scenes import random_splats
 
 pytestmark = pytest.mark.slow
@@ -86,3 +90,28 @@ def test_spark_drops_splats_outside_the_clip_planes_as_we_do(page: Page, tmp_pat
     distance = float(np.linalg.norm(cameras[0].position))
     settings = RasterSettings(near=0.8 * distance, far=1.1 * distance)
     check(compare(page, written(tmp_path, Scene(splats)), cameras[:1], settings))
+
+
+@pytest.mark.parametrize("layout", ["Packed", "Ext"])
+def test_spark_clamps_bright_colours_of_packed_splats_before_it_adds_sh(
+    page: Page, tmp_path: Path, layout: str
+) -> None:
+    """So outdoor scenes are darker than in our pictures, which `--through packed` shows; ExtSplats are not."""
+    splats = random_splats(3_000, sh_degree=1)
+    splats = replace(splats, rgb=splats.rgb + np.float32(0.7), sh=np.full_like(splats.sh, 0.02))
+    splats.sh[:, 1] = -0.5  # of z: darker from where the camera is; a power of two, of which ExtSplats cut off nothing
+    cameras = cameras_around(splats.center, *SIZE)
+    file, settings = written(tmp_path, Scene(splats)), RasterSettings()
+    page.open(file, cameras[0], settings, layout=layout)
+    theirs = np.clip(page.draw(cameras[0], settings).exact[..., :3], 0, 1)
+    scene = read_scene(file)
+    held = after(layout.lower(), file, scene)
+    ours, through = (
+        np.clip(draw(shade([(some, np.eye(4))], cameras[0]), cameras[0], settings)[..., :3], 0, 1)
+        for some in (scene.splats, held)
+    )
+    assert psnr(theirs - through) >= LEAST_HELD
+    if layout == "Packed":
+        assert theirs.mean() < 0.96 * ours.mean()
+    else:
+        assert theirs.mean() == pytest.approx(ours.mean(), rel=0.02)

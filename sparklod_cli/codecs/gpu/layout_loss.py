@@ -45,24 +45,27 @@ class LayoutLoss:
     packed: float = 0.0
 
     @classmethod
+    @np.errstate(over="ignore", invalid="ignore")  # of numbers near the end of float32
     def of(cls, splats: Splats) -> LayoutLoss:
-        """Sums of all valid splats among these."""
+        """Sums of all splats among these that are valid, and whose losses are numbers."""
         splats = splats.take(
-            np.flatnonzero(~np.logical_or.reduce([np.zeros(len(splats), np.bool_), *splats.invalid().values()]))
+            np.flatnonzero(
+                ~np.logical_or.reduce([splats.scale.max(axis=1, initial=0) <= 0, *splats.invalid().values()])
+            )
         )
         opacity = np.minimum(splats.opacity, 1).astype(np.float64)
         size = splats.scale.mean(axis=1, dtype=np.float64)
-        weight = opacity * size
         seen = _colors(splats)
 
-        def loss(held: Splats) -> float:
+        def losses(held: Splats) -> NDArray[np.float64]:
             changes = np.square(_colors(held) - seen).mean(axis=(1, 2))
             moved = np.linalg.norm(held.center.astype(np.float64) - splats.center, axis=1)
-            changes += _DISPLACED * np.square(np.minimum(1, moved / np.maximum(size, np.finfo(np.float64).tiny)))
-            return float((np.square(opacity) * changes) @ weight)
+            return np.square(opacity) * (changes + _DISPLACED * np.square(np.minimum(1, moved / size)))
 
-        ext = loss(ext_splats.unpack(ext_splats.pack(splats)))
-        return cls(float(weight.sum()), ext, loss(packed_splats.unpack(packed_splats.pack(splats))))
+        ext = losses(ext_splats.unpack(ext_splats.pack(splats)))
+        packed = losses(packed_splats.unpack(packed_splats.pack(splats)))
+        weight = np.where(np.isfinite(ext + packed), opacity * size, 0)
+        return cls(float(weight.sum()), float(np.nan_to_num(ext) @ weight), float(np.nan_to_num(packed) @ weight))
 
     @classmethod
     def total(cls, parts: Iterable[LayoutLoss]) -> LayoutLoss:
@@ -81,9 +84,9 @@ class LayoutLoss:
         return float(10 * np.log10(self.weight / loss)) if loss else np.inf
 
 
-def sample_loss(splats: Splats) -> LayoutLoss:
-    """Return the loss of an evenly spaced sample of splats."""
-    return LayoutLoss.of(splats.take(slice(0, None, max(1, -(-len(splats) // SAMPLE)))))
+def sample_loss(splats: Splats, most: int = SAMPLE) -> LayoutLoss:
+    """Return the loss of an evenly spaced sample of splats, `most` at most."""
+    return LayoutLoss.of(splats.take(slice(0, None, max(1, -(-len(splats) // most)))))
 
 
 def _colors(splats: Splats) -> NDArray[np.float64]:

@@ -13,8 +13,9 @@ from ...codecs.formats import PRECISIONS
 from ...lod import detail_rule
 from ...lod.settings import FACTOR, LodSettings
 from ...model.foveation import Cones, Foveation, Frustum
-from ...simulation.streaming_settings import StreamingSettings
+from ...simulation.streaming_settings import Network, StreamingSettings
 from ...support import defaults
+from ...support.printable import printable
 from ...support.setting_fields import Quantity, Range
 from ...support.units import parse_time
 from ..option_groups import COMMON, argument, flag, option, parameters_of, refuse, require
@@ -255,3 +256,12 @@ def check_scenes(ctx: click.Context, scenes: Scenes) -> None:
             "is for Level-of-Detail files, and no file is one, so that all splats are drawn; bake one with build-lod"
         )
         refuse(ctx, (*CUTS, *LOADING, *DETAIL), plain)
+
+
+def notes_on_loading(scenes: Scenes, network: Network) -> list[str]:
+    """Return a note where trees would be streamed that viewers load whole."""
+    whole = dict.fromkeys(printable(loaded.name) for loaded in scenes.trees if not loaded.has_chunks)
+    if network.instant or not whole:
+        return []
+    names = ", ".join(whole)
+    return [f"{names}: loaded whole by viewers before they draw; the waits are those of a RAD with the same nodes"]

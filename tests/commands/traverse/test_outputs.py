@@ -10,6 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sparklod_cli.codecs.rad import codec as rad
+from sparklod_cli.io import read_scene
 from sparklod_cli.simulation.columns import LOADING
 from tests.commands.traverse.runs import ORBIT, OTHER, TOWN, TREE, scene_file, table, traverse
 from tests.conftest import FIXTURES, Capture
@@ -157,7 +159,8 @@ def test_a_walk_through_a_city_has_a_row_for_every_instance_and_frame(
     settings = ("--keyframes", keys, "--seconds", 299 / 90, "--fps", 30)
     network = ("--bandwidth", "20Mbit", "--latency", "60ms", "--budget", "100k")
     assert traverse("--scene", scene, *settings, *network, "--per-instance", "-o", tmp_path / "city.json") == 0
-    assert capsys.readouterr() == ("", "")
+    whole = "town.spz, demo-lod.spz, sh3-lod.spz: loaded whole by viewers before they draw"
+    assert capsys.readouterr() == ("", f"{whole}; the waits are those of a RAD with the same nodes\n")
     rows = json.loads((tmp_path / "city.json").read_text())["data"]
     frames, each = [row for row in rows if row["instance"] == "total"], {}
     assert (len(frames), len(rows)) == (300, 1800)
@@ -212,6 +215,17 @@ def test_assertions_can_be_about_it(text: str, code: int, capsys: Capture) -> No
     assert traverse(TOWN, *VIEW, *SLOW, "--assert", text, "--json") == code
     (held,) = json.loads(capsys.readouterr().out)["asserts"]
     assert held["held"] == (code == 0)
+
+
+def test_an_spz_is_said_to_be_loaded_whole_where_it_is_streamed(tmp_path: Path, capsys: Capture) -> None:
+    note = "town.spz: loaded whole by viewers before they draw; the waits are those of a RAD with the same nodes\n"
+    assert traverse(TOWN, *VIEW, *SLOW, "-o", tmp_path / "a.csv") == 0
+    assert note in capsys.readouterr().err
+    assert traverse(TOWN, *VIEW, "-o", tmp_path / "b.csv") == 0
+    assert note not in capsys.readouterr().err
+    (tmp_path / "town.rad").write_bytes(b"".join(rad.encode(read_scene(TOWN))))
+    assert traverse(tmp_path / "town.rad", *VIEW, *SLOW, "-o", tmp_path / "c.csv") == 0
+    assert "loaded whole" not in capsys.readouterr().err
 
 
 def test_without_a_network_nobody_waits(capsys: Capture) -> None:
