@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from ..codecs.content import OpenCompanion
 from ..codecs.file_names import (
     MANIFEST,
     META,
@@ -24,7 +25,6 @@ from ..codecs.file_names import (
     is_of_streamed_sog,
     is_of_tileset,
 )
-from ..codecs.content import OpenCompanion
 from ..codecs.sog.sog_container import MAX_META, companion_names
 from ..codecs.stream import size_of
 from ..codecs.streamed_sog.manifest import MAX_MANIFEST, Manifest, parse
