@@ -8,7 +8,7 @@ from pathlib import Path
 
 from ..cameras.frame import Settings, direction_of
 from ..cameras.sources import read_path
-from ..model.transforms import common
+from ..model.axes import common
 from ..support.errors import NotSplatsError, SparklodError, memory_errors_translated
 from ..support.progress import Progress, silent
 from ..view.export import check_folder as check_folder

@@ -46,7 +46,7 @@ class InMemory:
             nodes=None,
             output=self.output,
             format=scene.format,
-            notes=scene.notes,
+            notes=settings.notes_on(scene),
             read=len(scene),
             environment=read_environment(settings, threads=threads, progress=progress),
         )

@@ -12,8 +12,11 @@ from ..lod.budget import Budget
 from ..lod.builders import METHODS
 from ..lod.detail_rule import DetailSettings
 from ..lod.tile_settings import TileSettings
+from ..model.axes import line, rotated
+from ..model.scene import Scene
 from ..model.selection import Selection
-from ..model.transforms import Transform, rotated
+from ..model.streams import SceneStream
+from ..model.transforms import Transform
 from ..support.addresses import Place
 from ..support.defaults import DEFAULT_BASE, DEFAULT_GROWTH, MAX_SH_DEGREE
 
@@ -58,8 +61,8 @@ class BakeSettings:
         max_sh: the highest SH degree that is kept.
         selection: which splats are kept; its coordinates are those of the input.
         transform: turns, scales and moves the splats that are kept.
-        up: axis of the input that points up, one of `up_axis.AXES`, which `transform` may have turned to another; None
-            for the one that the input notes.
+        up: axis of the input that points up, one of `axes.AXES`, which `transform` may have turned to another; None
+            for that of the file.
         rgba: a file of colours and opacities that replace the splats' own, see `io.read_rgba`.
         suffix: of the format, one of `WRITABLE` that holds trees.
         options: how to write it.
@@ -100,9 +103,13 @@ class BakeSettings:
     converts: bool = False
     unused: tuple[str, ...] = ()
 
-    def up_of(self, noted: str | None) -> str | None:
-        """Return the axis of the output that points up, for the axis that the input notes."""
-        return rotated(self.up or noted, self.transform.rotation)
+    def up_of(self, found: str | None) -> str | None:
+        """Return the axis of the output that points up, for that of the input."""
+        return rotated(self.up or found, self.transform.rotation)
+
+    def notes_on(self, source: Scene | SceneStream) -> tuple[str, ...]:
+        """Return what a user should know of an input: its notes, and its axis if a specification names it."""
+        return source.notes + (line(source.up, source.up_by) if self.up is None else ())
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from typing import overload
 import numpy as np
 from numpy.typing import NDArray
 
-from ..model.transforms import AXES
+from ..model.axes import ASSUMED, AXES
 from ..support.errors import TooManyCamerasError
 from .camera import Camera, Matrix
 from .formats.table import Axes
@@ -35,13 +35,13 @@ MOST_PIXELS = 1e15
 #: Numbers of frames are below this, so that float64 holds them exactly.
 NUMBERED = 1 << 53
 
-#: Up axis of cameras without one: y points down in scenes as training leaves them.
-DEFAULT_UP: Point = (0.0, -1.0, 0.0)
+#: Up axis of cameras without one.
+DEFAULT_UP: Point = AXES[ASSUMED]
 
 
 def direction_of(up: str | None) -> Point:
-    """x, y, z of the up axis that a scene notes; `DEFAULT_UP` for None."""
-    return DEFAULT_UP if up is None else AXES[up]
+    """x, y, z of the up axis of a scene; that of `ASSUMED` for None."""
+    return AXES[up or ASSUMED]
 
 
 @dataclass(frozen=True)

@@ -87,7 +87,7 @@ class Content:
     Attributes:
         count: N splats.
         sh_degree: of the decoded splats.
-        format, antialiased, notes, up, chunk_bytes: as in `Scene`.
+        format, antialiased, notes, up, up_by, chunk_bytes: as in `Scene`.
         fill: reads and decodes the splats.
         header: as in `Scene`; reading all splats may add to it.
         coding: called when all splats have been read, returns `Scene.coding`.
@@ -107,6 +107,7 @@ class Content:
     chunk_bytes: tuple[int, ...] | None = None
     coding: Callable[[], FileCoding] = lambda: PLAIN
     block: int = 1
+    up_by: str = ""
 
     def scene(
         self,

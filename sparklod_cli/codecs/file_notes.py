@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from .. import __version__
-from ..model.transforms import AXES
+from ..model.axes import AXES, SPECIFIED
 from ..support.untrusted import parse_json, quoted_value
 
 #: How the "generator" of a note of sparklod begins; its version follows.
@@ -32,6 +32,12 @@ class FileNote:
     up: str | None = None
     problems: tuple[str, ...] = ()
     is_ours: bool = False
+
+    def axis_of(self, form: str) -> tuple[str | None, str]:
+        """Return `up` and `up_by` of a file: what it notes, or what a format of `SPECIFIED` says of those of others."""
+        if self.up is None and not self.is_ours:
+            return SPECIFIED[form], form
+        return self.up, ""
 
 
 def note_of(*, antialiased: bool = False, up: str | None = None) -> dict[str, Any]:

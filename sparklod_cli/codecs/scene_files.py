@@ -37,7 +37,7 @@ class Chunk:
     Attributes:
         name: path from the manifest's folder on.
         count: all its splats.
-        sh_degree, antialiased, up, format, notes: as of a scene.
+        sh_degree, antialiased, up, up_by, format, notes: as of a scene.
         bytes: of it and the files that it names.
         pieces: to read.
     """
@@ -51,6 +51,7 @@ class Chunk:
     up: str | None = None
     format: str = ""
     notes: tuple[str, ...] = ()
+    up_by: str = ""
 
     @property
     def rows(self) -> int:
@@ -96,6 +97,7 @@ class SceneFiles:
             content.up,
             content.format,
             content.notes,
+            content.up_by,
         )
 
     def read(

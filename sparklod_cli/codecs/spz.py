@@ -202,7 +202,8 @@ class SpzEncoder(Encoder):
             DataRun(stream.size * layout.count, WAYS.get(stream.name, compression.MIXED)) for stream in layout.streams()
         ]
         runs[0] = runs[0]._replace(size=runs[0].size + HEADER.size)
-        comment = "" if self.up is None else comment_of(up=self.up)
+        # A plain file without it would be one of another program, whose y is up.
+        comment = "" if self.up is None and self.tree else comment_of(up=self.up)
         level = self.options.compression_level
         yield from compression.gzip_member(data(), runs, level, threads, progress, comment=comment.encode())
 

@@ -56,11 +56,13 @@ class Extensions:
 
     Attributes:
         up: as in `Scene`, by the coordinate system.
+        has_system: they name a coordinate system, be it an unknown one.
         notes: what is left out of them, as sentences for `Scene.notes`.
     """
 
     up: str | None = None
     notes: tuple[str, ...] = ()
+    has_system: bool = False
 
 
 def read_extensions(data: bytes, size: int) -> Extensions:
@@ -70,13 +72,14 @@ def read_extensions(data: bytes, size: int) -> Extensions:
         data: the records, or their first `MOST_BYTES`.
         size: bytes of all of them.
     """
-    at, up, notes, unknown = 0, None, list[str](), dict[str, int]()
+    at, up, notes, unknown, has_system = 0, None, list[str](), dict[str, int](), False
     while at + RECORD.size <= len(data):
         kind, length = RECORD.unpack_from(data, at)
         payload = at + RECORD.size
         if length > size - payload:
             break
         at = payload + length
+        has_system |= kind == COORDINATE_SYSTEM
         if kind != COORDINATE_SYSTEM:
             name = TYPES.get(kind, f"{kind:#010x}")
             unknown[name] = unknown.get(name, 0) + length
@@ -95,7 +98,7 @@ def read_extensions(data: bytes, size: int) -> Extensions:
         notes.append(f"{len(names) - MOST_NAMED:,} more kinds of extensions are left out")
     if at < size:
         notes.append(f"the last {size - at:,} bytes of its extensions are no records that can be read")
-    return Extensions(up, tuple(notes))
+    return Extensions(up, tuple(notes), has_system)
 
 
 def extensions_of(up: str | None) -> bytes:

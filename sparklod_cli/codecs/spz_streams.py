@@ -5,6 +5,7 @@ Versions 1 to 3 are a header and streams in a gzip member, version 4 a plain hea
 
 from __future__ import annotations
 
+import dataclasses
 import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -223,6 +224,8 @@ def _open(source: Source) -> tuple[Content, Layout, Iterator[StreamRows]]:
     notes = notes_on_degree(layout.sh_degree) + note.problems + extensions.notes
     if header.get("unknown_streams"):
         notes += (f"{header['unknown_streams']} streams of an unknown kind are left out",)
+    note = dataclasses.replace(note, up=note.up or extensions.up)
+    up, up_by = (note.up, "") if layout.has_tree or extensions.has_system else note.axis_of("SPZ")
     content = Content(
         layout.count,
         min(layout.sh_degree, MAX_SH_DEGREE),
@@ -231,9 +234,10 @@ def _open(source: Source) -> tuple[Content, Layout, Iterator[StreamRows]]:
         bool(layout.flags & ANTIALIASED),
         notes,
         header,
-        note.up or extensions.up,
+        up,
         layout.has_tree,
         coding=lambda: CODING,
+        up_by=up_by,
     )
     return content, layout, rows
 

@@ -104,7 +104,7 @@ class BuildLodOptions:
             **self.tree.settings(only_cuts=files.manifest is not None),
             selection=self.selection.selection(),
             transform=self.transform.transform(),
-            up=self.transform.up if is_set(ctx, "up") else None,
+            up=self.transform.up,
             rgba=self.selection.rgba,
             suffix=files.suffix,
             options=self.write_options(),

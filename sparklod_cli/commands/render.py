@@ -132,8 +132,9 @@ def _draw(ctx: click.Context, options: RenderOptions) -> None:
 
         def ready(path: CameraPath, scenes: Scenes) -> None:
             check_scenes(ctx, scenes)
+            axes = scenes.axis_notes if options.cameras.take_up_of_files else ()
             loading = notes_on_loading(scenes, options.streaming.streaming.network)
-            for note in (*path.notes, *scenes.notes, *_upside_down(options, scenes), *loading):
+            for note in (*path.notes, *scenes.notes, *axes, *loading):
                 console.say(note)
             console.detail(f"  read in {time.perf_counter() - start:.2f} s")
 
@@ -158,21 +159,6 @@ def _draw(ctx: click.Context, options: RenderOptions) -> None:
 def fit_planes(ctx: click.Context) -> bool:
     """Return whether the near and the far plane may move apart, so that a view of the whole scene clips nothing."""
     return not flags_set(ctx, ["near", "far"])
-
-
-def _upside_down(options: RenderOptions, scenes: Scenes) -> list[str]:
-    """Return notes on files whose format has y up, where cameras assume that it is down.
-
-    The default stays: SPZ files converted from trained PLY often keep y down, and so do those of build-lod.
-    """
-    if scenes.up is not None or options.cameras.up is not None or options.cameras.camera_path is not None:
-        return []
-    plain = (loaded for loaded in scenes.loaded if loaded.scene.format.startswith("SPZ") and not loaded.is_tree)
-    return [
-        f"{loaded.name}: SPZ has y up by its specification, but cameras assume y down, as in trained scenes; give"
-        " --up y if the scene is upside down"
-        for loaded in plain
-    ]
 
 
 def _output(ctx: click.Context, options: RenderOptions, cameras: int) -> PictureOutput:

@@ -174,7 +174,7 @@ class SimplifyOptions:
             max_sh=files.max_sh,
             selection=self.selection.selection(),
             transform=self.transform.transform(),
-            up=self.transform.up if is_set(ctx, "up") else None,
+            up=self.transform.up,
             rgba=self.selection.rgba,
             suffix=files.suffix,
             options=dataclasses.replace(self.written, rad=rad, sog=SogOptions(codes)),

@@ -193,7 +193,8 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
 
         def ready(path: CameraPath, scenes: Scenes) -> None:
             check_scenes(ctx, scenes)
-            for note in (*path.notes, *notes_on_loading(scenes, options.streaming.network)):
+            axes = scenes.axis_notes if options.cameras.take_up_of_files else ()
+            for note in (*path.notes, *axes, *notes_on_loading(scenes, options.streaming.network)):
                 console.say(note)
             keep_apart(ctx, {**besides, "indices_out": outputs.index_files(path.numbers, len(instances))})
 

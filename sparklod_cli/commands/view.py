@@ -17,8 +17,8 @@ from ..support.setting_fields import Quantity, Range, whole
 from ..support.units import parse_count
 from .console import Console, count_of, print_json, size_of
 from .option_groups import COMMON, argument, check_declared, command, flag, option, values_of
-from .options.common import General, json_flag, overwrite_flag, quiet_flag, verbose_flag
-from .parameter_types import DIRECTION, VIEW
+from .options.common import General, json_flag, overwrite_flag, quiet_flag, up_option, verbose_flag
+from .parameter_types import VIEW
 from .paths import InputPath, OutputPath, keep_apart
 
 if TYPE_CHECKING:
@@ -62,11 +62,7 @@ class _Page:
         "Most splats of trees that are drawn, such as 500k.  [default: as Spark chooses for the device]",
         Quantity("N", parse_count, whole(1)),
     )
-    up: tuple[float, float, float] | None = option(
-        "Direction that is up, as an axis such as -y or as x,y,z.  [default: the axis that the files note, or -y, as"
-        " training leaves scenes]",
-        DIRECTION,
-    )
+    up: tuple[float, float, float] | None = up_option()
     fov: float | None = option(
         "Vertical field of view, in degrees.  [default: 60]", Range(above=0, below=180, unit="DEGREES")
     )

@@ -126,7 +126,7 @@ class Head:
         format: name for display.
         bytes: of all files together.
         splats: as reading gives them; nodes of a tree.
-        sh_degree, antialiased, up: of the splats.
+        sh_degree, antialiased, up, up_by: of the splats.
     """
 
     format: str
@@ -135,6 +135,7 @@ class Head:
     sh_degree: int
     antialiased: bool
     up: str | None
+    up_by: str = ""
 
 
 @dataclass(frozen=True)

@@ -78,7 +78,8 @@ class Report:
         format: name for display; None if the file could not be read.
         splats: number of splats, or nodes of a tree.
         sh_degree, antialiased: of the splats.
-        up: the axis that the file says points up: "y", "-z"; None where it does not say.
+        up: the axis that points up: "y", "-z"; None where it is unknown.
+        up_by: the format whose specification says so; empty where the file itself does, or nobody.
         header: fields of the header, which depend on the format.
         bytes_per_splat: size over splats.
         compression_ratio: size of the decoded splats, as 4-byte floats, over that of the file.
@@ -100,6 +101,7 @@ class Report:
     sh_degree: int | None = None
     antialiased: bool | None = None
     up: str | None = None
+    up_by: str = ""
     header: dict[str, int] = dataclasses.field(default_factory=dict)
     bytes_per_splat: float | None = None
     compression_ratio: float | None = None
@@ -250,7 +252,7 @@ def _of_blocks(
         total = ValueTally.total(tallies)
         findings += value_checks.findings_about(total, ends, is_tree=blocks.is_tree)
         hints = value_checks.hints_about(total.layouts, degree)
-    head = Head(about.format, size or 0, blocks.count, degree, about.antialiased, about.up)
+    head = Head(about.format, size or 0, blocks.count, degree, about.antialiased, about.up, about.up_by)
     report = _report(path, head, surveyed)
     return dataclasses.replace(
         report,

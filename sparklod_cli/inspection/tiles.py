@@ -21,8 +21,8 @@ from ..codecs.tiles_3d.tileset_rules import (
     scan_splats,
     violations,
 )
+from ..model.axes import common
 from ..model.georeference import EarthPlace, place_of
-from ..model.transforms import common
 from ..support.printable import MOST, printable
 from ..support.progress import Progress, silent
 from .findings import ChunkBytes, Head, HeaderScan, quantiles_of
@@ -100,6 +100,7 @@ def _head(tileset: Tileset, chunks: Mapping[int, Chunk]) -> Head:
         max((chunk.sh_degree for chunk in read), default=0),
         any(chunk.antialiased for chunk in read),
         common(chunk.up for chunk in read),
+        common(chunk.up_by for chunk in read) or "",
     )
 
 

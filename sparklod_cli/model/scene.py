@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..support.errors import InvalidSplatsError
+from .axes import AXES
 from .lod_tree import LodTree
 from .sh import COEFFICIENTS
 from .splats import Splats, describe_invalid
-from .transforms import AXES
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,8 @@ class Scene:
         header: numbers of the file's header that the splats do not tell, by name ("version", "fractional_bits").
         chunk_bytes: of each of its chunks in the file, where its format has chunks; None elsewhere.
         coding: how the file holds its scales; `PLAIN` where it has the very numbers.
-        up: the axis that points up, one of `transforms.AXES` ("y", "-z"); None where the file does not say.
+        up: the axis that points up, one of `axes.AXES` ("y", "-z"); None where it is unknown.
+        up_by: the format whose specification says so ("SPZ", "glTF"); empty where the file itself does, or nobody.
     """
 
     splats: Splats
@@ -93,6 +94,7 @@ class Scene:
     chunk_bytes: tuple[int, ...] | None = None
     coding: FileCoding = PLAIN
     up: str | None = None
+    up_by: str = ""
 
     def __post_init__(self) -> None:
         if self.up is not None and self.up not in AXES:
@@ -209,7 +211,7 @@ class DetailScene:
             to level; None where nobody measured it.
         environment: splats far outside, which are drawn whatever the levels are; None without.
         antialiased: trained with the opacity compensation of Mip-Splatting.
-        format, notes, header, up: as of `Scene`.
+        format, notes, header, up, up_by: as of `Scene`.
     """
 
     splats: Splats
@@ -223,6 +225,7 @@ class DetailScene:
     notes: tuple[str, ...] = ()
     header: Mapping[str, int] = field(default_factory=dict)
     up: str | None = None
+    up_by: str = ""
 
     def __post_init__(self) -> None:
         regions, levels = self.counts.shape
@@ -270,4 +273,4 @@ class DetailScene:
 
 def facts_of(source: Any) -> dict[str, Any]:
     """Return what a scene of any kind says of its file, by the names of the attributes that all of them have."""
-    return {name: getattr(source, name) for name in ("antialiased", "format", "notes", "header", "up")}
+    return {name: getattr(source, name) for name in ("antialiased", "format", "notes", "header", "up", "up_by")}

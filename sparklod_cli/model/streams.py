@@ -13,11 +13,12 @@ import numpy as np
 from ..support.errors import SparklodError
 from ..support.progress import Progress, silent
 from ..support.units import count_of
+from .axes import common, differing, rotated
 from .lod_tree import LodTree
 from .scene import Scene, facts_of
 from .sh import COEFFICIENTS
 from .splats import COLUMNS, Splats
-from .transforms import Transform, common, rotated
+from .transforms import Transform
 
 #: Splats of a block that a scene is read in, unless its format has other ones: some 30 MB with SH of degree 3.
 BLOCK_SPLATS = 1 << 17
@@ -30,7 +31,7 @@ class SceneStream:
     Attributes:
         count: N splats, as the files promise.
         sh_degree: of all blocks.
-        antialiased, format, notes, header, up: as in `Scene`.
+        antialiased, format, notes, header, up, up_by: as in `Scene`.
         read: called with the range of splats that are wanted, gives them in order in blocks of any length; may be
             called again. Formats that cannot be entered in the middle read and skip what comes before.
     """
@@ -43,6 +44,7 @@ class SceneStream:
     notes: tuple[str, ...] = ()
     header: Mapping[str, int] = field(default_factory=dict)
     up: str | None = None
+    up_by: str = ""
 
     def blocks(self) -> Iterator[Splats]:
         """Read all splats, in order."""
@@ -107,6 +109,8 @@ def merged(parts: Sequence[Placed]) -> SceneStream:
     degree = max(part.stream.sh_degree for part in parts)
     antialiased, notes = _antialiased(parts)
     notes += tuple(f"{part.name}: {note}" for part in parts for note in part.stream.notes)
+    axes = [rotated(part.stream.up, part.transform.rotation) for part in parts]
+    notes += tuple(f"{text}, so none is noted unless --up names it" for text in differing(axes))
     return SceneStream(
         firsts[-1],
         degree,
@@ -114,7 +118,8 @@ def merged(parts: Sequence[Placed]) -> SceneStream:
         antialiased,
         " and ".join(sorted({part.stream.format for part in parts})),
         tuple(dict.fromkeys(notes)),
-        up=common(rotated(part.stream.up, part.transform.rotation) for part in parts),
+        up=common(axes),
+        up_by=(common(part.stream.up_by for part in parts) or "") if axes == [part.stream.up for part in parts] else "",
     )
 
 

@@ -30,7 +30,7 @@ class TileScene:
         sizes: (T,) int64 bytes of the file of each tile, 0 without splats; None for a scene in memory.
         transform: (4, 4) float64 for column vectors, from the axes of the tileset, z up, to the Earth's (ECEF), metres;
             the identity where the scene has no place there.
-        antialiased, format, notes, header, up: as of `Scene`.
+        antialiased, format, notes, header, up, up_by: as of `Scene`.
     """
 
     splats: Splats
@@ -46,6 +46,7 @@ class TileScene:
     notes: tuple[str, ...] = ()
     header: Mapping[str, int] = field(default_factory=dict)
     up: str | None = None
+    up_by: str = ""
 
     def __post_init__(self) -> None:
         tiles = len(self.parent)

@@ -17,6 +17,7 @@ from ..lod.detail_traversal import DetailForest, DetailTraversal
 from ..lod.settings import LodSettings
 from ..lod.tile_traversal import TileForest, TileTraversal
 from ..lod.traversal import Forest, Traversal, TreeCut, TreeInstance
+from ..model.axes import common, lines_of, rotated
 from ..model.balls import Balls, balls_of
 from ..model.foveation import Foveation
 from ..model.gaussian import placed
@@ -24,7 +25,6 @@ from ..model.instances import Instance, Matrix
 from ..model.lod_tree import Nodes
 from ..model.scene import Scene
 from ..model.splats import Splats
-from ..model.transforms import common, rotated
 from ..support.units import count_of
 from .loaded_scene import Index, LoadedDetail, LoadedRuns, LoadedScene, LoadedTiles, nodes_of
 from .pages import PagedForest, PagedScene, sampled_balls
@@ -132,9 +132,22 @@ class Scenes:
 
     @property
     def up(self) -> str | None:
-        """The axis of the world that points up, one of `transforms.AXES`, where all files say the same; else None."""
-        placed = zip(self.instances, self.of_instance, strict=True)
-        return common(rotated(loaded.scene.up, at.transform.rotation) for at, loaded in placed)
+        """The axis of the world that points up, one of `axes.AXES`, where it is the same for all files; else None."""
+        return common(axis for _, axis, _ in self._axes)
+
+    @property
+    def axis_notes(self) -> list[str]:
+        """What to tell a user whose cameras take `up`."""
+        return lines_of(self._axes)
+
+    @property
+    def _axes(self) -> list[tuple[str, str | None, str]]:
+        """For each instance the name of its file, the axis of the world that is up, and which specification says so."""
+        axes = list[tuple[str, str | None, str]]()
+        for instance, loaded in zip(self.instances, self.of_instance, strict=True):
+            up = rotated(loaded.scene.up, instance.transform.rotation)
+            axes.append((loaded.name, up, loaded.scene.up_by if up == loaded.scene.up else ""))
+        return axes
 
     @functools.cached_property
     def trees(self) -> list[LoadedScene]:

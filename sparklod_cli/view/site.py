@@ -24,6 +24,7 @@ from ..cameras.formats.table import NAMES
 from ..cameras.frame import Settings as CameraSettings
 from ..cameras.path import CameraPath, read
 from ..io.local_files import leads_away
+from ..model.axes import lines_of
 from ..support.errors import CameraPathError
 from ..support.untrusted import parse_json, quoted_value
 from .files import Resources, ShownFile
@@ -178,6 +179,8 @@ def site_of(
     for file in shown:
         resources.update(file.files)
     notes = [file.note for file in shown if file.note is not None]
+    if cameras.up is None:
+        notes += lines_of((file.name, each.up, each.up_by) for file, each in zip(shown, extents, strict=True))
     return Site(resources, cameras, shown, [*libraries.notes(), *notes, *(path.notes if path else ())])
 
 

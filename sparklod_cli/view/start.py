@@ -55,7 +55,7 @@ class Extent:
         leaves: how many of a tree, or splats of full detail where there are levels; None without either.
         balls: what its splats cover; only the coarsest of a large RAD tree.
         sizes: (2,) the range of the feature sizes of its splats, but for a few at either end, world units.
-        up: as in `Scene`.
+        up, up_by: as in `Scene`.
         levels: detail levels; None without.
         layout: in which Spark is to hold the splats, "ext" or "packed".
     """
@@ -67,6 +67,7 @@ class Extent:
     up: str | None
     levels: int | None = None
     layout: str = "ext"
+    up_by: str = ""
 
 
 @dataclass(frozen=True)
@@ -118,6 +119,7 @@ def extent_of(shown: ShownFile, *, threads: int = 1, progress: Progress = silent
         _sizes(scene.splats),
         scene.up,
         layout=_layout(shown, scene.splats),
+        up_by=scene.up_by,
     )
 
 
@@ -162,7 +164,7 @@ def _parts_extent(scene: DetailScene | TileScene) -> Extent:
         coarse = np.repeat(np.isin(np.arange(scene.tiles), scene.at_level(first)), scene.counts)
         leaves, levels = scene.counts[scene.is_leaf].sum(), int(scene.level.max()) + 1
     balls = balls_of(scene.splats, coarse, np.eye(4))
-    return Extent(len(scene.splats), int(leaves), balls, _sizes(scene.splats), scene.up, levels)
+    return Extent(len(scene.splats), int(leaves), balls, _sizes(scene.splats), scene.up, levels, up_by=scene.up_by)
 
 
 def _sizes(splats: Splats) -> tuple[float, float]:

@@ -20,9 +20,10 @@ from sparklod_cli.codecs.glb import codec as glb
 from sparklod_cli.codecs.glb.placement import TURNS
 from sparklod_cli.codecs.options import PROFILES, WriteOptions
 from sparklod_cli.io import read_scene
+from sparklod_cli.model.axes import AXES
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
-from sparklod_cli.model.transforms import AXES, Transform
+from sparklod_cli.model.transforms import Transform
 from sparklod_cli.support.errors import FormatError
 from tests.conftest import FIXTURES
 from tests.scenes import random_splats

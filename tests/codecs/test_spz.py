@@ -67,7 +67,8 @@ def test_every_field_of_a_file_made_by_hand_is_decoded(
     splats = scene.splats
     assert (scene.format, scene.antialiased, scene.tree) == (format_name, antialiased, None)
     left_out = "SH degree 4 is cut to 3", "extension 0x12340001 (5 bytes) is left out"
-    assert (scene.up, scene.notes) == (("-y", left_out) if name.endswith("sh4") else (None, ()))
+    assert (scene.up, scene.notes) == (("-y", left_out) if name.endswith("sh4") else ("y", ()))
+    assert scene.up_by == ("" if name.endswith("sh4") else "SPZ")
     np.testing.assert_array_equal(splats.center, [[1.5, -2.25, 0.125], [0, -100, 2047], [-0.5, 0.25, -2048]])
     np.testing.assert_allclose(splats.opacity, [1, 0, 0.2], atol=1e-7)
     np.testing.assert_allclose(splats.rgb, RGB, atol=1e-6)
@@ -366,7 +367,7 @@ record = by_hand.spz_extension
 
 #: Extension records, the axis that they say points up, and a word for each note on them.
 EXTENSIONS: dict[str, tuple[bytes, str | None, list[str]]] = {
-    "none": (b"", None, []),
+    "none": (b"", "y", []),
     "y down": (record(KNOWN, b"\6\0\0\0"), "-y", []),
     "the first counts": (record(KNOWN, b"\x0c\0\0\0") + record(KNOWN, b"\6\0\0\0"), "z", []),
     "left-handed": (record(KNOWN, b"\x08\0\0\0"), "y", [r"left-handed \(RUF\)"]),
@@ -374,11 +375,11 @@ EXTENSIONS: dict[str, tuple[bytes, str | None, list[str]]] = {
     "beyond the last": (record(KNOWN, b"\x11\0\0\0"), None, ["system 17 is unknown"]),
     "beyond the last, often": (record(KNOWN, b"\x11\0\0\0") * 99, None, ["system 17 is unknown"]),
     "too short": (record(KNOWN, b"\6"), None, ["system 0 is unknown"]),
-    "a camera": (record(0xADBE0002, bytes(12)), None, [r"SPZ_ADOBE_safe_orbit_camera \(12 bytes\)"]),
+    "a camera": (record(0xADBE0002, bytes(12)), "y", [r"SPZ_ADOBE_safe_orbit_camera \(12 bytes\)"]),
     "others first": (record(UNKNOWN, b"x" * 9) * 2 + record(KNOWN, b"\4\0\0\0"), "y", [r"0x12340001 \(18 bytes\)"]),
-    "many": (b"".join(record(UNKNOWN + n, b"") for n in range(99)), None, [*["0 bytes"] * 8, "91 more kinds"]),
+    "many": (b"".join(record(UNKNOWN + n, b"") for n in range(99)), "y", [*["0 bytes"] * 8, "91 more kinds"]),
     "a payload past the end": (record(KNOWN, b"\6\0\0\0") + struct.pack("<II", UNKNOWN, 1), "-y", ["last 8 bytes"]),
-    "no records": (b"an extension", None, ["last 12 bytes"]),
+    "no records": (b"an extension", "y", ["last 12 bytes"]),
 }
 
 
@@ -393,7 +394,7 @@ def test_extension_records_say_what_is_up(what: str, version: int) -> None:
     )
     for column in COLUMNS:
         np.testing.assert_array_equal(getattr(scene.splats, column), getattr(plain.splats, column), column)
-    assert scene.up == up
+    assert (scene.up, scene.up_by) == (up, "SPZ" if up and records.find(struct.pack("<I", KNOWN)) < 0 else "")
     for note, pattern in zip(scene.notes, notes, strict=True):
         assert re.search(pattern, note)
         assert note.isprintable()
@@ -404,13 +405,13 @@ def test_records_beyond_a_megabyte_are_left_out(version: int) -> None:
     records = record(UNKNOWN, bytes(MOST_BYTES)) + EXTENSIONS["y down"][0]
     data = zstd(flags=0x02, extension=records) if version == 4 else gzipped(flags=0x02, more=records)
     scene = decode_file(spz, io.BytesIO(data))
-    assert scene.up is None
+    assert (scene.up, scene.up_by) == ("y", "SPZ")
     assert "bytes of its extensions are no records that can be read" in scene.notes[-1]
 
 
 def test_extension_records_without_the_flag_say_nothing() -> None:
     scene = decode_file(spz, io.BytesIO(zstd(extension=EXTENSIONS["y down"][0])))
-    assert (scene.up, scene.notes) == (None, ())
+    assert (scene.up, scene.up_by, scene.notes) == ("y", "SPZ", ())
 
 
 def test_more_streams_than_are_known_are_allowed() -> None:

@@ -239,7 +239,7 @@ def test_options_stand_under_headings_the_common_ones_first(name: str) -> None:
     command = command_of(name)
     groups = command.by_heading(click.Context(command))
     assert [*groups] == [COMMON, *HEADINGS[name], GENERAL]
-    assert len(groups[COMMON]) == 10
+    assert len(groups[COMMON]) == 11
     general = {"--threads", "--json", "--quiet", "--verbose", "--version", "--help-all", "--help"}
     assert {max(param.opts, key=len) for param in groups[GENERAL]} == general
 

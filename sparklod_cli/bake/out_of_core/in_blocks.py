@@ -76,7 +76,7 @@ class InBlocks:
             nodes=None,
             output=self.output,
             format=stream.format,
-            notes=stream.notes,
+            notes=settings.notes_on(stream),
             read=stream.count,
             splats=findings.tally.selected,
             dropped=findings.tally.dropped,

@@ -29,7 +29,7 @@ from ...support.untrusted import quoted_value
 from .. import spz
 from ..compression import check_promise
 from ..content import Content, Source, Target
-from ..file_notes import read_note
+from ..file_notes import FileNote, read_note
 from ..left_out import left_out
 from ..scene_files import copy_rows
 from . import log_scales
@@ -99,11 +99,12 @@ def open_content(source: Source) -> Content:
     asset = asset if isinstance(asset, dict) else {}
     extras = asset.get("extras")
     noted = read_note({**(extras if isinstance(extras, dict) else {}), "generator": asset.get("generator")})
-    up = None if noted.is_ours else "y"
     if noted.up is not None:
-        is_turn = all(is_turn_of(part.transform, noted.up) for part in parts)
-        parts = [PlacedPrimitive(part.key, Transform()) for part in parts] if is_turn else parts
-        up = noted.up if is_turn else "y"
+        if all(is_turn_of(part.transform, noted.up) for part in parts):
+            parts = [PlacedPrimitive(part.key, Transform()) for part in parts]
+        else:
+            noted = FileNote(noted.antialiased, problems=noted.problems)  # another program has turned it
+    up, up_by = noted.axis_of("glTF")
     opened, contents, total = dict[Key, Content](), list[Content](), 0
     for part in parts:
         if part.key not in opened:
@@ -121,6 +122,7 @@ def open_content(source: Source) -> Content:
         notes=tuple(dict.fromkeys([*notes, *content.notes, *noted.problems])),
         header=ChainMap({"bytes": file.size}, cast("dict[str, int]", content.header)),  # to which reading adds
         up=up,
+        up_by=up_by,
     )
 
 

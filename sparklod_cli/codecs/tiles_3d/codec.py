@@ -13,10 +13,10 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from ...model.axes import common
 from ...model.scene import facts_of
 from ...model.sh import COEFFICIENTS
 from ...model.tile_scene import TileScene
-from ...model.transforms import common
 from ...support.errors import FormatError
 from ...support.progress import Progress, silent
 from ...support.untrusted import quoted_value
@@ -164,7 +164,8 @@ def _open(source: Source, tileset: Tileset, wanted: Sequence[int]) -> tuple[Cont
     form = f"3D Tiles {tileset.head['asset']['version']} of {chunks[0].format}"
     header = {"tiles": len(chunks), "bytes": size}
     fill = beside.fill(chunks, degree, source.threads)
-    return Content(row, degree, form, fill, antialiased, notes, header, up), chunks
+    by = common(chunk.up_by for chunk in chunks) or ""
+    return Content(row, degree, form, fill, antialiased, notes, header, up, up_by=by), chunks
 
 
 def tile_files(open_companion: OpenCompanion | None, matrices: dict[str, Matrix]) -> SceneFiles:

@@ -138,11 +138,10 @@ class TransformOptions:
 
     HEADING: ClassVar[str] = "Rotation, scale and position"
 
-    up: str = option(
-        "Axis of the input that points up; the scene is turned so that it becomes +y, which the output notes for"
-        " render, traverse and view. y turns nothing; scenes as trained are mostly -y.",
+    up: str | None = option(
+        "Axis that is up in the input: turn it to +y, and note that in the output for render, traverse and view."
+        " y turns nothing; scenes as trained are mostly -y.  [default: note what the file says, and turn nothing]",
         defaults.UP_AXES,
-        defaults.UP_AXES[0],
         heading=COMMON,
     )
     rotate: tuple[float, ...] = option(
@@ -162,7 +161,8 @@ class TransformOptions:
         from ...model.transforms import Transform
 
         try:
-            return Transform.from_parts(up=self.up, rotate=self.rotate, scale=self.scale, translate=self.translate)
+            up = self.up or defaults.UP_AXES[0]
+            return Transform.from_parts(up=up, rotate=self.rotate, scale=self.scale, translate=self.translate)
         except ValueError as error:
             raise click.UsageError(str(error)) from None
 

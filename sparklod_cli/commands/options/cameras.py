@@ -16,8 +16,9 @@ from ...support.defaults import ELEVATION, ORBIT
 from ...support.errors import CameraPathError, TooManyCamerasError
 from ...support.setting_fields import Range, whole
 from ..option_groups import COMMON, flag, flag_of, is_set, option, refuse
-from ..parameter_types import DIRECTION, POINT, SIZE, VIEW, VIEWS
+from ..parameter_types import POINT, SIZE, VIEW, VIEWS
 from ..paths import InputPath, file_of
+from .common import up_option
 
 if TYPE_CHECKING:
     from ...cameras.camera import Matrix
@@ -100,11 +101,8 @@ class Cameras:
         f"Angle of --orbit and --dolly above that point, in degrees.  [default: {ELEVATION:g}]",
         Range(-89, 89, unit="DEGREES"),
     )
-    up: tuple[float, float, float] | None = option(
-        "Direction that is up, as an axis such as -y or as x,y,z, for cameras of which only eye and target are known."
-        "  [default: the axis that the files note, or -y, as training leaves scenes with y down; y in SuperSplat's"
-        " files]",
-        DIRECTION,
+    up: tuple[float, float, float] | None = up_option(
+        " For cameras of which only eye and target are known.", "; y in SuperSplat's camera files"
     )
     world_transform: str | None = option(
         "Transform from the world of the cameras to that of the splats: 16 numbers with commas between, row by row, or"
@@ -132,6 +130,11 @@ class Cameras:
     def source(self) -> str:
         """The source of cameras: one of `SOURCES`, or `AROUND`."""
         return next((name for name in SOURCES if getattr(self, name, None)), AROUND)
+
+    @property
+    def take_up_of_files(self) -> bool:
+        """Whether cameras are upright by the axis that the splat files have up."""
+        return self.up is None and self.camera_path is None
 
     @property
     def all_views(self) -> tuple[Any, ...]:

@@ -18,6 +18,7 @@ from ...support.setting_fields import whole
 from ...tables.files import FORMS
 from ..console import Console, Verbosity
 from ..option_groups import COMMON, flag, option
+from ..parameter_types import DIRECTION
 from ..paths import OutputPath, require_suffix
 
 if TYPE_CHECKING:
@@ -93,6 +94,21 @@ def output_option(help: str, *, addresses: bool = False) -> Any:
 def assert_option(help: str, **attributes: Any) -> Any:
     """Return the field of `--assert`, which can be given several times."""
     return option(help, flags=("--assert",), metavar="TEXT", multiple=True, **attributes)
+
+
+def up_option(about: str = "", besides: str = "") -> Any:
+    """Return the field of `--up` of cameras.
+
+    Args:
+        about: sentence of the help on cameras that it is for.
+        besides: another default, of some files.
+    """
+    return option(
+        f"Axis that is up, such as -y, or a direction x,y,z.{about}  [default: what the files or their formats say, or"
+        f" -y, as training leaves scenes{besides}]",
+        DIRECTION,
+        heading=COMMON,
+    )
 
 
 def plot_option(help: str, **attributes: Any) -> Any:

@@ -22,10 +22,11 @@ from sparklod_cli.io import open_stream, read_parts, read_scene
 from sparklod_cli.lod import quality
 from sparklod_cli.lod.tile_settings import TileSettings
 from sparklod_cli.lod.tiles import make
+from sparklod_cli.model.axes import AXES
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.model.tile_scene import TileScene
-from sparklod_cli.model.transforms import AXES, Transform
+from sparklod_cli.model.transforms import Transform
 from sparklod_cli.support.errors import FormatError, VersionError
 from tests.codecs.cases import linear
 from tests.codecs.streamed_sog.scenes import open_companion

@@ -20,7 +20,7 @@ from sparklod_cli.cli import run
 from sparklod_cli.codecs.rounding import ROUND_TRIPS
 from sparklod_cli.images.defaults import THUMBNAIL_SIZE, THUMBNAIL_SUPERSAMPLE
 from sparklod_cli.images.metrics import psnr
-from tests.commands.render.runs import AT, DEMO, FIXTURES, PLAIN, SIZE, TOWN, TREE, floats, pixels, render
+from tests.commands.render.runs import AT, DEMO, PLAIN, SIZE, TOWN, TREE, floats, pixels, render
 from tests.conftest import ROOT, Capture
 
 
@@ -83,17 +83,6 @@ def test_a_budget_can_be_a_share_of_the_leaves(tmp_path: Path, capsys: Capture) 
     assert render(*how, "--budget", "5%", "--lod-splat-scale", "0.5", "-o", tmp_path / "half.npy") == 0
     drawn = int(capsys.readouterr().err.split(" splats")[0].rsplit(" ", 1)[1].replace(",", ""))
     assert 0.9 * budget / 2 < drawn <= budget / 2
-
-
-def test_a_plain_spz_may_stand_on_its_head(tmp_path: Path, capsys: Capture) -> None:
-    file = FIXTURES / "golden" / "hand-v4.spz"
-    for number, (arguments, noted) in enumerate(
-        (((), True), (("--up", "0,1,0"), False), (("--look-at", "0,0,3:0,0,0"), True), (("-q",), False))
-    ):
-        assert render(file, "--size", "64x48", *arguments, "-o", tmp_path / f"{number}.png") == 0
-        assert ("--up y if the scene is upside down" in capsys.readouterr().err) == noted
-    assert render(TOWN, PLAIN, "--size", "64x48", "-o", tmp_path / "tree.png") == 0
-    assert "upside down" not in capsys.readouterr().err
 
 
 def test_a_comparison_shows_a_terminal_its_summary(monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
