@@ -137,7 +137,7 @@ class Scenes:
 
     @property
     def axis_notes(self) -> list[str]:
-        """What to tell a user whose cameras take `up`."""
+        """Lines for a user whose cameras take `up`: who says it, and whether files differ."""
         return lines_of(self._axes)
 
     @property
