@@ -68,7 +68,9 @@ def test_surrogates_can_be_kept() -> None:
     assert parse_json('["a\ud800"]') == ["a\ufffd"]
 
 
-@pytest.mark.parametrize("data", [b"\xff\xfe{\x00}\x00", b'"\xed\xa0\x80"', b"", b"{", b"[1,]", "\ufeff", "\0"])
+@pytest.mark.parametrize(
+    "data", [b"\xff\xfe{\x00", b"\xff\xfe{\x00}", b'"\xed\xa0\x80"', b"", b"{", b"[1,]", "\ufeff", "\0"]
+)
 def test_invalid_json_is_a_value_error_of_one_line(data: str | bytes) -> None:
     with pytest.raises(ValueError) as caught:
         parse_json(data)
