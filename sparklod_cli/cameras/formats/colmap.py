@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
 from ...support.errors import CameraPathError
 from ..frame import NO_LENS, Frame, Intrinsics, Settings
-from .source import Files, Parsed, finite, posed, side
+from .source import Files, Parsed, decoded, finite, posed, side, whole
+from .table import FORMATS
 
 #: An image of images.bin: number, rotation w x y z, translation x y z, and number of its camera; its name follows.
 IMAGE = struct.Struct("<I7dI")
@@ -23,10 +24,19 @@ COUNT = struct.Struct("<Q")
 #: Bytes of a point in an image: x, y, and the number of a 3D point.
 POINT = 24
 
-#: Values of an image in a line of images.txt; its points follow in the next line.
+#: Words of an image in a line of images.txt: those of `IMAGE` and its name, which may contain blanks.
 IMAGE_WORDS = 10
 
+#: Words of a point in a line of images.txt: x, y, and the number of a 3D point.
+POINT_WORDS = 3
+
 COMMENT = "# Image list with two lines of data per image"
+
+#: The comment of images.txt and cameras.txt that gives the number of their items.
+ANNOUNCED = re.compile(r"#\s*Number of (?:images|cameras):\s*(\d{1,18})\b", re.ASCII | re.IGNORECASE)
+
+#: Sets of files of a model.
+NAMES = next(form.names for form in FORMATS if form.name == "colmap")
 
 
 @dataclass(frozen=True)
@@ -80,37 +90,52 @@ Cameras = dict[int, tuple[Model, Intrinsics]]
 
 
 def recognises(files: Files) -> bool:
-    """Return whether the file begins with the comment of images.txt, or like images.bin with a rotation."""
-    data = _images(files)
-    if data.lstrip().startswith(COMMENT.encode()):
+    """Return whether its names or its first comment are COLMAP's, or it begins with an image and a rotation."""
+    if any(files.contents.keys() >= set(names) for names in NAMES):
         return True
-    if len(data) < COUNT.size + IMAGE.size:
+    if files.text is not None:
+        lines = (line for line in files.text.splitlines() if not _is_comment(line))
+        return files.text.lstrip().startswith(COMMENT) or _begins_with_rotation(next(lines, ""))
+    if len(files.data) < COUNT.size + IMAGE.size:
         return False
-    quat = IMAGE.unpack_from(data, COUNT.size)[1:5]
-    return 0 < COUNT.unpack_from(data)[0] <= len(data) // IMAGE.size and abs(sum(q * q for q in quat) - 1) < 1e-3
+    count = COUNT.unpack_from(files.data)[0]
+    return 0 < count <= len(files.data) // IMAGE.size and _is_unit(IMAGE.unpack_from(files.data, COUNT.size)[1:5])
 
 
-def _images(files: Files) -> bytes:
-    """Return the bytes of images.bin or images.txt, or else of the first file."""
-    named = (files.contents[name] for name in ("images.bin", "images.txt") if name in files.contents)
-    return next(named, files.data)
+def _begins_with_rotation(line: str) -> bool:
+    """Return whether a line of text is an image whose quaternion is of length 1."""
+    try:
+        return _is_unit(_text_image(line, "")[2])
+    except CameraPathError:
+        return False
+
+
+def _is_unit(quat: Iterable[float]) -> bool:
+    return abs(sum(q * q for q in quat) - 1) < 1e-3
+
+
+def _is_comment(line: str) -> bool:
+    return not line.strip() or line.lstrip().startswith("#")
 
 
 def parse(files: Files, settings: Settings) -> Parsed:
     """Return its images, sorted by name: COLMAP writes them in any order."""
+    cameras = None
     if "cameras.bin" in files.contents:
         cameras = dict(_binary_cameras(files.contents["cameras.bin"]))
-    else:
-        cameras = dict(_text_cameras(files.contents.get("cameras.txt", b"")))
-    data = _images(files)
-    images = _binary_images(data) if b"\0" in data[: 1 << 16] else _text_images(data)
-    notes = [] if cameras else ["Without a cameras.txt or cameras.bin beside it, its lenses are unknown."]
+    elif "cameras.txt" in files.contents:
+        cameras = _text_cameras(files.contents["cameras.txt"])
+    name = next((name for name in ("images.bin", "images.txt") if name in files.contents), None)
+    data = files.contents[name] if name else files.data
+    binary = name == "images.bin" or (name is None and files.text is None)
+    images = list(_binary_images(data)) if binary else _text_images(data)
+    notes = [] if cameras is not None else ["Without a cameras.txt or cameras.bin beside it, its lenses are unknown."]
     frames = []
     used = set()
     for image, camera, quat, position, name in images:
-        if cameras and camera not in cameras:
+        if cameras is not None and camera not in cameras:
             raise CameraPathError(f"image {image} has camera {camera}, which does not exist")
-        model, lens = cameras[camera] if cameras else (None, NO_LENS)
+        model, lens = cameras[camera] if cameras is not None else (None, NO_LENS)
         used.add(model)
         frames.append(Frame(posed(quat, position, f"image {image}"), lens, name=name))
     distorting = sorted(model.name for model in used if model and model.distorts)
@@ -129,25 +154,50 @@ def _natural(name: str) -> list[tuple[int, str]]:
 Image = tuple[int, int, list[float], list[float], str]
 
 
-def _text_images(data: bytes) -> Iterator[Image]:
-    lines = enumerate(_lines(data, "images.txt"), 1)
+def _text_images(data: bytes) -> list[Image]:
+    """Return the images of images.txt, with a line of points after each, after some, or after none.
+
+    The line after an image is read, since some programs leave out the lines of points, or the empty ones among them.
+    """
+    lines, announced = _lines(data, "images.txt")
+    images: list[Image] = []
+    points_may_follow = False
     for number, line in lines:
-        words = line.split(maxsplit=IMAGE_WORDS - 1)
-        if not words or words[0].startswith("#"):
+        if points_may_follow and _is_points(line):
+            points_may_follow = False
             continue
-        way = f"line {number} of images.txt"
-        if len(words) != IMAGE_WORDS:
-            raise CameraPathError(f"{way} has {len(words)} values, an image has {IMAGE_WORDS}")
-        image, *numbers, camera = (finite(word, way) for word in words[:9])
-        yield int(image), int(camera), numbers[:4], numbers[4:], words[9].strip()
-        next(lines, None)  # the points of the image; the line is empty without any
+        images.append(_text_image(line, f"line {number} of images.txt"))
+        points_may_follow = True
+    _check_count(len(images), announced, "images.txt", "images")
+    return images
 
 
-def _text_cameras(data: bytes) -> Iterator[tuple[int, tuple[Model, Intrinsics]]]:
-    for number, line in enumerate(_lines(data, "cameras.txt"), 1):
+def _text_image(line: str, way: str) -> Image:
+    words = line.split(maxsplit=IMAGE_WORDS - 1)
+    if len(words) != IMAGE_WORDS:
+        raise CameraPathError(f"{way} has {len(words)} values, an image has {IMAGE_WORDS}")
+    image, *numbers, camera = (finite(word, way) for word in words[:9])
+    return whole(image, way), whole(camera, way), numbers[:4], numbers[4:], words[9].strip()
+
+
+def _is_points(line: str) -> bool:
+    """Return whether a line has the points of an image: x, y and a whole number each. Its first four are judged.
+
+    A line of an image has a name; if that is a number, it has 10 words, which is no multiple of 3.
+    """
+    words = line.split(maxsplit=4 * POINT_WORDS)[: 4 * POINT_WORDS]
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError:
+        return False
+    return len(words) % POINT_WORDS == 0 and all(number.is_integer() for number in numbers[2::POINT_WORDS])
+
+
+def _text_cameras(data: bytes) -> Cameras:
+    lines, announced = _lines(data, "cameras.txt")
+    cameras: Cameras = {}
+    for number, line in lines:
         words = line.split()
-        if not words or words[0].startswith("#"):
-            continue
         way = f"line {number} of cameras.txt"
         if len(words) < 4:
             raise CameraPathError(f"{way} has {len(words)} values, a camera has more")
@@ -155,14 +205,27 @@ def _text_cameras(data: bytes) -> Iterator[tuple[int, tuple[Model, Intrinsics]]]
         if model is None:
             raise CameraPathError(f"{way} has a camera model {words[1][:30]!r}, which is unknown")
         key, width, height, *numbers = (finite(word, way) for word in (words[0], *words[2:]))
-        yield int(key), (model, lens_of(model, width, height, numbers, way))
+        cameras[whole(key, way)] = (model, lens_of(model, width, height, numbers, way))
+    _check_count(len(cameras), announced, "cameras.txt", "cameras")
+    return cameras
 
 
-def _lines(data: bytes, name: str) -> list[str]:
-    try:
-        return data.decode("utf-8-sig").splitlines()
-    except UnicodeDecodeError:
-        raise CameraPathError(f"{name} is not text") from None
+def _lines(data: bytes, name: str) -> tuple[list[tuple[int, str]], int | None]:
+    """Return the numbered lines of a file, and the count that its comments announce, None without one."""
+    text = decoded(data)
+    if text is None:
+        raise CameraPathError(f"{name} is not text")
+    lines = list(enumerate(text.splitlines(), 1))
+    announced = [int(match[1]) for _, line in lines if line.startswith("#") and (match := ANNOUNCED.match(line))]
+    return [row for row in lines if not _is_comment(row[1])], sum(announced) if announced else None
+
+
+def _check_count(count: int, announced: int | None, name: str, items: str) -> None:
+    if announced is not None and count != announced:
+        raise CameraPathError(
+            f"{name} has {count:,} {items}, but its comment announces {announced:,}: it may be cut short;"
+            " if it is complete, correct the comment"
+        )
 
 
 def _binary_images(data: bytes) -> Iterator[Image]:
@@ -176,6 +239,7 @@ def _binary_images(data: bytes) -> Iterator[Image]:
         reader.skip(points * POINT)
         way = f"image {image}"
         yield image, camera, [finite(x, way) for x in numbers[:4]], [finite(x, way) for x in numbers[4:]], name
+    reader.finish(count)
 
 
 def _binary_cameras(data: bytes) -> Iterator[tuple[int, tuple[Model, Intrinsics]]]:
@@ -190,6 +254,7 @@ def _binary_cameras(data: bytes) -> Iterator[tuple[int, tuple[Model, Intrinsics]
         model = MODELS[number]
         numbers = [finite(value, way) for value in reader.take(struct.Struct(f"<{model.count}d"))]
         yield key, (model, lens_of(model, width, height, numbers, way))
+    reader.finish(count)
 
 
 class _Reader:
@@ -220,6 +285,11 @@ class _Reader:
         self._at += size
         if self._at > len(self._data):
             raise CameraPathError(f"{self._name} ends before all of its data")
+
+    def finish(self, count: int) -> None:
+        """Check that the `count` items that were read are all of the file."""
+        if left := len(self._data) - self._at:
+            raise CameraPathError(f"{self._name} has {left:,} bytes after the {count:,} items that it announces")
 
 
 def lens_of(model: Model, width: float, height: float, numbers: list[float], way: str) -> Intrinsics:

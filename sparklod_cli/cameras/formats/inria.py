@@ -27,5 +27,4 @@ def _frame(item: Json) -> Frame:
         size = item.get("width").side(), item.get("height").side()
         focal = (item.get("fx").number(), item.get("fy").number()) if item.has("fx", "fy") else None
         lens = Intrinsics(size, focal)
-    name = item.get("img_name").text() if item.has("img_name") else ""
-    return Frame(pose(rotation, item.get("position").numbers(3)), lens, name=name)
+    return Frame(pose(rotation, item.get("position").numbers(3)), lens, name=item.label("img_name"))

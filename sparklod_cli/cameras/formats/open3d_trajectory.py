@@ -49,7 +49,7 @@ def _frame(camera: Json) -> Frame:
 def _frames_of_log(lines: list[str]) -> list[Frame]:
     rows: list[list[float]] = []
     for number, line in enumerate(lines, 1):
-        if line.startswith("#"):
+        if not line.strip() or line.startswith("#"):
             continue
         words = line.split()
         count = 4 if len(rows) % LOG_LINES else 3

@@ -31,6 +31,8 @@ def parse(files: Files, settings: Settings) -> Parsed:
     fps = root.get("fps").number() if root.has("fps") else None
     if fps is not None and not fps > 0:
         raise CameraPathError("fps is not positive")
+    if root.has("keyframes", "frames"):
+        raise CameraPathError("it has frames and keyframes; give one of them")
     if root.has("keyframes"):
         keys = [_key(item) for item in root.get("keyframes").items()]
         frames = between(keys, settings.fps or fps, settings.up_axis, lens)
@@ -52,7 +54,7 @@ def _axes(root: Json) -> Axes:
 def _frame(item: Json, default: Intrinsics, axes: Axes, settings: Settings) -> Frame:
     lens = _lens(item, default)
     time = item.get("time").number() if item.has("time") else None
-    name = item.get("name").text() if item.has("name") else ""
+    name = item.label("name")
     if item.has("eye"):
         up = item.get("up").numbers(3) if item.has("up") else settings.up_axis
         return frame_looking(item.get("eye").numbers(3), item.get("target").numbers(3), up, lens, time, name)

@@ -11,7 +11,7 @@ from typing import Any
 
 from ...support.errors import CameraPathError
 from ...support.json_text import decoded_text
-from ...support.untrusted import LARGEST, parse_json
+from ...support.untrusted import LARGEST, parse_json, quoted_value
 from ..camera import Matrix
 from ..frame import Frame
 from ..pose import pose, rotation_of
@@ -39,11 +39,7 @@ class Files:
     @cached_property
     def text(self) -> str | None:
         """The first file as text; None if it is not text."""
-        try:
-            text = decoded_text(self.data)
-        except UnicodeDecodeError:
-            return None
-        return None if "\0" in text else text
+        return decoded(self.data)
 
     @cached_property
     def json(self) -> Json | None:
@@ -157,6 +153,20 @@ class Json:
             raise CameraPathError(f"{self.way} is not a text")
         return self.value
 
+    def label(self, key: str) -> str:
+        """Return the text of a key that only names its object: of a number its digits, empty without the key."""
+        value = self.value.get(key) if isinstance(self.value, dict) else None
+        return value if isinstance(value, str) else "" if value is None else quoted_value(value)
+
+
+def decoded(data: bytes) -> str | None:
+    """Return the text of a file, see `decoded_text`; None if it is not text."""
+    try:
+        text = decoded_text(data)
+    except UnicodeDecodeError:
+        return None
+    return None if "\0" in text else text
+
 
 def posed(quat_wxyz: Sequence[float], position: Sequence[float], way: str) -> Matrix:
     """Return the (4, 4) pose of a quaternion and a position; `CameraPathError`, naming the place, for length 0."""
@@ -175,6 +185,13 @@ def finite(value: Any, way: str) -> float:
     if not abs(number) < LARGEST:
         raise CameraPathError(f"{way} has {brief(value)}, which is not a finite number")
     return number
+
+
+def whole(number: float, way: str) -> int:
+    """Return a whole number; `CameraPathError`, naming its place, for a fraction."""
+    if not number.is_integer():
+        raise CameraPathError(f"{way} has {number:g}, which is not a whole number")
+    return int(number)
 
 
 def brief(value: Any) -> str:

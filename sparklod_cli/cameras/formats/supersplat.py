@@ -6,6 +6,7 @@ the keys are interpolated as in SuperSplat.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable
 
@@ -51,7 +52,9 @@ def parse(files: Files, settings: Settings) -> Parsed:
     tracks = list(root.get("animTracks").items()) if root.has("animTracks") else []
     if tracks:
         fov = root.find("camera", "fov")
-        return _of_track(tracks[0], fov.number() if fov else FOV_TRACK, not root.has("version"), settings)
+        path = _of_track(tracks[0], fov.number() if fov else FOV_TRACK, not root.has("version"), settings)
+        notes = (f"Only the first of its {len(tracks):,} animations was read.",) if len(tracks) > 1 else ()
+        return dataclasses.replace(path, notes=notes)
     if root.has("cameras"):
         views = [camera.get("initial") for camera in root.get("cameras").items()]
     else:
@@ -81,22 +84,28 @@ def _of_track(track: Json, fov: float, first_version: bool, settings: Settings) 
 
 
 def _of_document(root: Json, settings: Settings) -> Parsed:
-    """Return the frames of a project; poses beyond the end of its time line are ignored."""
+    """Return the frames of a project; poses beyond the end of its time line are ignored, with a note."""
     line = root.get("timeline")
     count, rate = line.get("frames").number(), _positive(line, "frameRate", FRAME_RATE)
     fov = root.find("camera", "fov")
     keys = {}
-    sets = list(root.get("poseSets").items())[:1]  # SuperSplat writes one set or none
-    for index, pose in enumerate(pose for one in sets for pose in one.get("poses").items()):
+    late = 0
+    sets = list(root.get("poseSets").items())  # SuperSplat writes one set or none
+    for index, pose in enumerate(pose for one in sets[:1] for pose in one.get("poses").items()):
         frame = pose.get("frame").number() if pose.has("frame") else index * rate
         if frame < count:
             keys[frame] = _values(pose, fov.number() if fov else FOV_TRACK)
+        else:
+            late += 1
+    notes = [f"Only the first of its {len(sets):,} pose sets was read."] if len(sets) > 1 else []
+    if late:
+        notes.append(f"Poses beyond the end of its time line were ignored ({late:,}).")
     smoothness = line.get("smoothness").number() if line.has("smoothness") else 1.0
     looping = not line.has("loop") or line.get("loop").value is True
     times = np.array(sorted(keys))
     points = np.array([keys[time] for time in times]).reshape(-1, 7)
     curve = _curve(times, points, smoothness, count if looping else None, False)
-    return _sampled(curve, float(math.floor(count)), rate, settings)
+    return dataclasses.replace(_sampled(curve, float(math.floor(count)), rate, settings), notes=tuple(notes))
 
 
 def _whole(frames: float) -> float:

@@ -10,6 +10,9 @@ from .source import Files, Json, Parsed
 
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 
+#: Values of these without an effect. Others need not be numbers, as distortion is ignored.
+UNDISTORTED = (0, "", "0", "0.0")
+
 #: Beginnings of the names of camera models that a pinhole camera cannot replace.
 PANORAMAS = ("EQUIRECTANGULAR", "OMNIDIRECTIONAL", "VR180")
 
@@ -26,10 +29,10 @@ def parse(files: Files, settings: Settings) -> Parsed:
     root = files.object()
     items = list(root.get("frames").items())
     notes = []
-    model = root.get("camera_model").text() if root.has("camera_model") else ""
+    model = root.label("camera_model")
     if model.startswith(PANORAMAS):
         raise CameraPathError(f"its camera_model {model[:24]!r} is not that of a pinhole camera")
-    if any(place.has(key) and place.get(key).number() for place in (root, *items) for key in DISTORTION):
+    if any(place.has(key) and place.value[key] not in UNDISTORTED for place in (root, *items) for key in DISTORTION):
         notes.append("Its lens distortion was ignored.")
     if root.has("applied_transform"):
         notes.append("Its applied_transform was not undone.")
@@ -38,8 +41,7 @@ def parse(files: Files, settings: Settings) -> Parsed:
 
 def _frame(item: Json, root: Json) -> Frame:
     matrix = np.array([*item.get("transform_matrix").matrix(3, 4), 0, 0, 0, 1][:16]).reshape(4, 4)
-    name = item.get("file_path").text() if item.has("file_path") else ""
-    return Frame(matrix, _lens(item, root), name=name)
+    return Frame(matrix, _lens(item, root), name=item.label("file_path"))
 
 
 def _lens(item: Json, root: Json) -> Intrinsics:

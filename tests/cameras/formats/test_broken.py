@@ -289,7 +289,7 @@ def test_a_colmap_image_of_a_missing_camera_is_refused() -> None:
         b"9 EQUIRECTANGULAR 640 480 640 480\n": "which is not a pinhole camera",
         b"9 PINHOLE 0 480 600 600 320 240\n": "line 1 of cameras.txt of 0 is not a number of pixels",
         b"9 PINHOLE\n": "line 1 of cameras.txt has 2 values",
-        b"\xff\xfe": "cameras.txt is not text",
+        b"\xff\xfa": "cameras.txt is not text",
     }.items():
         with pytest.raises(CameraPathError, match=said):
             read(Files(Path("sparse"), {"images.txt": images, "cameras.txt": cameras}), format="colmap")
