@@ -112,7 +112,7 @@ def _versions() -> Iterator[Check]:
 def _packages() -> Iterator[Check]:
     try:
         for one in required_by(DISTRIBUTION):
-            advice = pip_install("--upgrade", f"{one.name}>={one.least}") if one.missing else ""
+            advice = pip_install(one.requirement, options=["--upgrade"]) if one.missing else ""
             yield Check(one.name, "problem" if one.missing else "ok", one.state, advice)
     except metadata.PackageNotFoundError:
         value = "sparklod itself is not installed, so nothing tells what it requires"
@@ -161,7 +161,9 @@ def _kernels() -> Iterator[Check]:
     try:
         about = json.loads(out.splitlines()[-1])
     except (IndexError, ValueError):
-        advice = f"{install_hint('', '--force-reinstall')}   # in a new virtual environment, if that does not help"
+        advice = (
+            f"{install_hint(options=['--force-reinstall'])}   # in a new virtual environment, if that does not help"
+        )
         yield Check("kernels", "problem", f"what bakes does not load: {_last_line(err, code)}", advice)
         return
     wanted, folder = about["wanted"], about["folder"]
@@ -206,7 +208,7 @@ def _memory() -> Iterator[Check]:
 
 def _opengl() -> Iterator[Check]:
     if not _is_installed("moderngl"):
-        yield Check("OpenGL", "note", "not tried without moderngl", install_hint("render"))
+        yield Check("OpenGL", "note", "not tried without moderngl", install_hint("render", package="moderngl"))
         return
     from .render.gl.context import PACKAGES, probe
 
@@ -222,7 +224,7 @@ def _opengl() -> Iterator[Check]:
 
 def _open3d() -> Iterator[Check]:
     if not _is_installed("open3d"):
-        yield Check("Open3D", "note", "not tried, since it is not installed", install_hint("render"))
+        yield Check("Open3D", "note", "not tried, since it is not installed", install_hint("render", package="open3d"))
         return
     try:
         from .render.open3d.child import PACKAGES
@@ -243,7 +245,8 @@ def _card() -> Iterator[Check]:
     if not _is_installed("numba-cuda"):
         has_driver = shutil.which("nvidia-smi") is not None
         advice = install_hint("cuda") if has_driver else ""
-        yield Check("NVIDIA card", "note" if has_driver else "ok", "not looked for without numba-cuda", advice)
+        value = "not tried without numba-cuda" if has_driver else "none: no driver is installed"
+        yield Check("NVIDIA card", "note" if has_driver else "ok", value, advice)
         return
     code, out, err = _run(program_command(CARD))
     if code:

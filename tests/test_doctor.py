@@ -65,7 +65,7 @@ def test_a_package_that_ends_its_process_is_a_problem(tmp_path: Path, monkeypatc
     (check,) = doctor._kernels()
     assert check.state == "problem"
     assert "what bakes does not load" in check.value
-    assert check.advice.startswith(install_hint("", "--force-reinstall"))
+    assert check.advice.startswith(install_hint(options=["--force-reinstall"]))
 
 
 def test_a_package_that_does_not_import_is_a_problem_with_its_reason(
@@ -81,8 +81,8 @@ def test_missing_and_old_packages_are_problems(monkeypatch: pytest.MonkeyPatch) 
     required = [Required("numpy", "1.26", "1.20"), Required("numba", "0.60", None), Required("click", "8.1", "8.5")]
     monkeypatch.setattr(doctor, "required_by", lambda name: iter(required))
     assert list(doctor._packages()) == [
-        Check("numpy", "problem", "1.20, older than 1.26", pip_install("--upgrade", "numpy>=1.26")),
-        Check("numba", "problem", "is missing", pip_install("--upgrade", "numba>=0.60")),
+        Check("numpy", "problem", "1.20, older than 1.26", pip_install("numpy>=1.26", options=["--upgrade"])),
+        Check("numba", "problem", "is missing", pip_install("numba>=0.60", options=["--upgrade"])),
         Check("click", "ok", "8.5"),
     ]
 

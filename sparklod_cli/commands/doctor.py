@@ -16,6 +16,9 @@ from .options.common import Messages, quiet_flag, verbose_flag
 if TYPE_CHECKING:
     from ..doctor import Check
 
+#: Beginning of the names of checks of extras.
+EXTRA = "extra "
+
 EXAMPLES = """\
   sparklod doctor
   sparklod doctor --quiet || exit 1      # in CI
@@ -48,9 +51,24 @@ def doctor(ctx: click.Context, /, **_: Any) -> None:
         else:
             for line in _lines(problems if messages.quiet else checks):
                 click.echo(line)
-        notes = sum(check.state == "note" for check in checks)
-        console.say(f"{count_of(len(problems), 'problem')}, {count_of(notes, 'note')}")
+        console.say(_summary(checks))
     ctx.exit(1 if problems else 0)
+
+
+def _summary(checks: list[Check]) -> str:
+    """Return the sentence that a person looks for: whether baking works, and what else there is to read above."""
+    problems = sum(check.state == "problem" for check in checks)
+    notes = [check.name for check in checks if check.state == "note"]
+    extras = [name.removeprefix(EXTRA) for name in notes if name.startswith(EXTRA)]
+    others = len(notes) - len(extras)
+    parts = [f"{count_of(problems, 'problem')} to solve before baking works"] if problems else []
+    if extras:
+        parts.append(f"{count_of(len(extras), 'optional extra')} not installed ({', '.join(extras)})")
+    if others:
+        parts.append(count_of(others, "other note" if extras else "note"))
+    if problems:
+        return "; ".join(parts)
+    return "; ".join(["OK: everything that baking needs works", *parts])
 
 
 def _lines(checks: list[Check]) -> list[str]:

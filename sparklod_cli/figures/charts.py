@@ -73,7 +73,7 @@ def load_matplotlib() -> ModuleType:
     Raises:
         SparklodError: it is not installed.
     """
-    with optional_import("charts are drawn by matplotlib", "render"):
+    with optional_import("--plot needs matplotlib", "render", package="matplotlib"):
         import matplotlib
         import matplotlib.backends.backend_agg
         import matplotlib.figure

@@ -138,7 +138,7 @@ def load_pyvista() -> ModuleType:
     if sys.platform == "linux" and not os.environ.get("DISPLAY"):
         # Without this VTK warns, and falls back to EGL only where the libraries of X are installed.
         os.environ.setdefault("VTK_DEFAULT_OPENGL_WINDOW", "vtkEGLRenderWindow")
-    with optional_import("pictures are drawn by pyvista", "render"):
+    with optional_import("pictures of trees need pyvista", "render", package="pyvista"):
         import pyvista
     try:
         subprocess.run(program_command(PROBE), check=True, capture_output=True, timeout=60)

@@ -52,7 +52,7 @@ def load_imageio(form: str) -> ModuleType:
     Raises:
         SparklodError: it is not installed.
     """
-    with optional_import(f".{form} is written by imageio", "video"):
+    with optional_import(f".{form} needs imageio", "video"):
         import imageio.v2
         import imageio_ffmpeg
 

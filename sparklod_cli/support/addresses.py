@@ -249,7 +249,7 @@ def _cut(url: str) -> tuple[str, str]:
 @functools.lru_cache(maxsize=64)
 def _system(url: str) -> tuple[Any, str]:
     """Return the file system that opens an address, and what the address is called there."""
-    with optional_import("addresses are opened by fsspec and packages for each service", "cloud"):
+    with optional_import("addresses need fsspec and the package of their service", "cloud"):
         import fsspec
 
         try:

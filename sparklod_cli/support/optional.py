@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import sys
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from .errors import SparklodError
@@ -17,8 +16,8 @@ _HOME = Path(__file__).parents[2]
 #: Name of this distribution, for pip.
 DISTRIBUTION = "sparklod"
 
-#: Variables that name the active environment, where "pip" is that of this interpreter.
-_ENVIRONMENTS = ("VIRTUAL_ENV", "CONDA_PREFIX")
+#: Files in the environment of a program that pipx or `uv tool` installed.
+_PIPX, _UV_TOOL = "pipx_metadata.json", "uv-receipt.toml"
 
 
 @contextlib.contextmanager
@@ -30,9 +29,9 @@ def optional_import(
     The import stays a statement, so that type checkers and import-linter see it.
 
     Args:
-        purpose: what takes the package, and which one: "charts are drawn by matplotlib".
+        purpose: what needs which package: "--plot needs matplotlib".
         extra: the extra that brings it: "render".
-        package: what pip installs, if no extra brings it.
+        package: name for pip, where one package of the extra suffices, or no extra brings it.
 
     Raises:
         SparklodError: the package is not installed, or does not load; of the class `error`.
@@ -40,20 +39,41 @@ def optional_import(
     try:
         yield
     except ImportError as reason:
-        hint = pip_install(package) if package else install_hint(extra)
-        raise error(f"{purpose}: {hint} ({reason})") from None
+        raise error(f"{purpose}: {install_hint(extra, package=package)} ({reason})") from None
 
 
-def pip_install(*arguments: str) -> str:
-    """Return a command line that has the pip of this interpreter install something."""
+def pip_install(*packages: str, options: Sequence[str] = ()) -> str:
+    """Return a command line that installs packages into the environment of this interpreter, whatever manages it."""
     import shlex
 
-    is_active = any(os.environ.get(name) == sys.prefix for name in _ENVIRONMENTS)
-    pip = ["pip"] if is_active else [sys.executable, "-m", "pip"]
-    return shlex.join([*pip, "install", *arguments])
+    environment = Path(sys.prefix)
+    if (environment / _PIPX).is_file():
+        if options:
+            return shlex.join(["pipx", "runpip", environment.name, "install", *options, *packages])
+        return shlex.join(["pipx", "inject", environment.name, *packages])
+    return shlex.join([*_pip(environment), *options, *packages])
 
 
-def install_hint(extra: str = "", *options: str) -> str:
+def _pip(environment: Path) -> list[str]:
+    """Return the words of a command line for the pip of an environment, or for uv where it has none."""
+    import shutil
+    from importlib.util import find_spec
+
+    is_of_uv = (environment / _UV_TOOL).is_file()
+    if is_of_uv or (find_spec("pip") is None and shutil.which("uv")):
+        return ["uv", "pip", "install", "--python", sys.executable]
+    beside = Path(sys.executable).with_name("pip")
+    if sys.prefix == sys.base_prefix or not beside.is_file():
+        return [sys.executable, "-m", "pip", "install"]
+    if shutil.which("pip") == str(beside):
+        return ["pip", "install"]
+    with contextlib.suppress(OSError):  # no current folder
+        if beside.is_relative_to(Path.cwd()):
+            return [str(beside.relative_to(Path.cwd())), "install"]
+    return [str(beside), "install"]
+
+
+def install_hint(extra: str = "", *, package: str = "", options: Sequence[str] = ()) -> str:
     """Return a command line that installs what this installation of sparklod, or one of its extras, requires.
 
     No package index is known to have sparklod. So the command names the checkout that it was installed from, or else
@@ -61,20 +81,27 @@ def install_hint(extra: str = "", *options: str) -> str:
 
     Args:
         extra: name of the extra; empty for what sparklod always requires.
+        package: the only package to install, in the version that the extra requires; empty for all of them.
+        options: of pip.
     """
     from importlib import metadata  # takes long to load
 
-    checkout = _checkout()
+    checkout = None if package or (Path(sys.prefix) / _PIPX).is_file() else _checkout()
     if checkout is not None:
         editable = ["-e"] if checkout == _HOME else []
-        return pip_install(*options, *editable, f"{checkout}[{extra}]" if extra else str(checkout))
+        return pip_install(*editable, f"{checkout}[{extra}]" if extra else str(checkout), options=options)
     try:
         required = list(required_by(DISTRIBUTION, extra))
     except metadata.PackageNotFoundError:
-        what = f"the extra {extra} of sparklod" if extra else "sparklod"
-        return f"install {what} with pip, from a checkout of its repository"
-    missing = [one for one in required if one.missing] or required
-    return pip_install(*options, *(f"{one.name}>={one.least}" if one.least else one.name for one in missing))
+        if not package:
+            what = f"the extra {extra} of sparklod" if extra else "sparklod"
+            return f"install {what} with pip, from a checkout of its repository"
+        required = []
+    if package:
+        requirements = [one.requirement for one in required if one.name == package][:1] or [package]
+    else:
+        requirements = [one.requirement for one in required if one.missing] or [one.requirement for one in required]
+    return pip_install(*dict.fromkeys(requirements), options=options)
 
 
 def _checkout() -> Path | None:
@@ -99,11 +126,18 @@ class Required:
     Attributes:
         least: the minimum version; empty for any.
         version: the installed version; None if it is not installed.
+        source: the requirement that brings it, for pip, if that is of another distribution: "imageio[ffmpeg]>=2.31".
     """
 
     name: str
     least: str
     version: str | None
+    source: str = ""
+
+    @property
+    def requirement(self) -> str:
+        """Return what pip installs to meet the requirement."""
+        return self.source or (f"{self.name}>={self.least}" if self.least else self.name)
 
     @property
     def missing(self) -> bool:
@@ -141,8 +175,10 @@ def required_by(distribution: str, extra: str = "") -> Iterator[Required]:
         try:
             version = metadata.version(requirement.name)
         except metadata.PackageNotFoundError:
-            yield Required(requirement.name, least, None)
-            continue
-        yield Required(requirement.name, least, version)
-        for inner in sorted(requirement.extras):
-            yield from required_by(requirement.name, inner)
+            version = None
+        extras = sorted(requirement.extras)
+        source = f"{requirement.name}[{','.join(extras)}]" + f">={least}" * bool(least) if extras else ""
+        yield Required(requirement.name, least, version, source)
+        if version is not None:
+            for inner in extras:
+                yield from (replace(one, source=source) for one in required_by(requirement.name, inner))

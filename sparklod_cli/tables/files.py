@@ -49,7 +49,7 @@ def load_pyarrow() -> ModuleType:
     Raises:
         SparklodError: it is not installed.
     """
-    with optional_import("Parquet is written by pyarrow", "parquet"):
+    with optional_import("Parquet needs pyarrow", "parquet"):
         import pyarrow
         import pyarrow.parquet
     return pyarrow

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import subprocess
@@ -18,6 +19,7 @@ from tests.conftest import ROOT, Capture
 
 FINE = Check("sparklod", "ok", "0.1.0")
 NOTE = Check("extra video", "note", "imageio is missing", "pip install imageio")
+MEMORY = Check("memory", "note", "1.0 of 2.0 GB are available", "free some")
 PROBLEM = Check("numba", "problem", "is \x1b[31mmissing", "pip install 'numba>=0.60'")
 
 
@@ -40,13 +42,34 @@ def test_columns_are_aligned_and_advice_is_below(monkeypatch: pytest.MonkeyPatch
         "problem numba        is \\x1b[31mmissing",
         "                     -> pip install 'numba>=0.60'",
     ]
-    assert captured.err == "1 problem, 1 note\n"
+    assert captured.err == "1 problem to solve before baking works; 1 optional extra not installed (video)\n"
 
 
 def test_notes_alone_are_no_failure(monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
     find(monkeypatch, FINE, NOTE)
     assert run(["doctor", "-v"]) == 0
-    assert capsys.readouterr().err == "checking everything\n0 problems, 1 note\n"
+    greeting = "OK: everything that baking needs works; 1 optional extra not installed (video)"
+    assert capsys.readouterr().err == f"checking everything\n{greeting}\n"
+
+
+@pytest.mark.parametrize(
+    ("checks", "said"),
+    [
+        ((FINE,), "OK: everything that baking needs works"),
+        ((FINE, MEMORY), "OK: everything that baking needs works; 1 note"),
+        (
+            (NOTE, dataclasses.replace(NOTE, name="extra cuda"), MEMORY, MEMORY),
+            "OK: everything that baking needs works; 2 optional extras not installed (video, cuda); 2 other notes",
+        ),
+        ((PROBLEM, PROBLEM, MEMORY), "2 problems to solve before baking works; 1 note"),
+    ],
+)
+def test_the_last_line_greets_or_warns(
+    checks: tuple[Check, ...], said: str, monkeypatch: pytest.MonkeyPatch, capsys: Capture
+) -> None:
+    find(monkeypatch, *checks)
+    run(["doctor"])
+    assert capsys.readouterr().err == f"{said}\n"
 
 
 def test_quiet_prints_problems_only(monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:

@@ -26,7 +26,9 @@ def test_a_chart_of_no_frames_is_an_error() -> None:
 
 def test_a_missing_matplotlib_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    with pytest.raises(SparklodError, match=re.escape(install_hint("render"))) as caught:
+    with pytest.raises(
+        SparklodError, match=f"--plot needs matplotlib: {re.escape(install_hint('render', package='matplotlib'))}"
+    ) as caught:
         plotted(flight(3))
     assert "\n" not in str(caught.value)
 
@@ -36,7 +38,7 @@ def test_without_pyvista_there_are_charts_alone(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setitem(sys.modules, "pyvista", None)
     both = plotted(flight(5), path_scene=path_scene())
     assert both.note is not None
-    assert install_hint("render") in both.note
+    assert install_hint("render", package="pyvista") in both.note
     assert both.png == plotted(flight(5)).png
 
 

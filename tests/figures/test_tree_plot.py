@@ -239,7 +239,7 @@ def fresh() -> Iterator[None]:
 class TestWhereNoneCanBeDrawn:
     def test_a_missing_pyvista_is_named(self, scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setitem(sys.modules, "pyvista", None)
-        with pytest.raises(SparklodError, match=re.escape(install_hint("render"))) as caught:
+        with pytest.raises(SparklodError, match=re.escape(install_hint("render", package="pyvista"))) as caught:
             plot(scene)
         assert "\n" not in str(caught.value)
 

@@ -177,6 +177,6 @@ def test_a_video_has_the_frames(size: tuple[int, int], form: str) -> None:
 @pytest.mark.parametrize("form", ["mp4", "webm"])
 def test_a_missing_imageio_is_named(form: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "imageio", None)
-    with pytest.raises(SparklodError, match=rf"^\.{form} is written by imageio: {re.escape(install_hint('video'))}"):
+    with pytest.raises(SparklodError, match=rf"^\.{form} needs imageio: {re.escape(install_hint('video'))}"):
         animation.check(form, 30)
     animation.check("gif", 30)

@@ -58,7 +58,7 @@ def test_what_the_extra_brings_is_named_where_it_is_missing(monkeypatch: pytest.
 
     monkeypatch.delattr(numba, "cuda", raising=False)
     monkeypatch.setitem(sys.modules, "numba.cuda", None)
-    with pytest.raises(BackendError, match=r"takes numba-cuda: .*install"):
+    with pytest.raises(BackendError, match=r"needs numba-cuda: .*install"):
         uses_card("cuda")
 
 

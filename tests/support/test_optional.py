@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import re
 import shlex
@@ -28,11 +29,22 @@ class Installed:
         return None if self._origin is None else json.dumps(self._origin)
 
 
+def environment(folder: Path, monkeypatch: pytest.MonkeyPatch, *files: str) -> Path:
+    """Has this interpreter seem to be that of an environment with pip and some more files; returns its folder."""
+    for name in ("bin/python", "bin/pip", *files):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).touch(0o755)
+    monkeypatch.setattr(sys, "prefix", str(folder))
+    monkeypatch.setattr(sys, "executable", str(folder / "bin/python"))
+    return folder
+
+
 @pytest.fixture
 def install(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> object:
     """Has sparklod seem to be installed from somewhere, in an active environment, with some packages missing."""
     monkeypatch.setattr(optional, "_HOME", tmp_path / "site-packages")
-    monkeypatch.setenv("VIRTUAL_ENV", sys.prefix)
+    environment(tmp_path / "venv", monkeypatch)
+    monkeypatch.setenv("PATH", str(tmp_path / "venv/bin"))
     required = [Required("numpy", "1.26", "2.0"), Required("pyvista", "0.45", None), Required("pandas", "", None)]
     monkeypatch.setattr(optional, "required_by", lambda name, extra="": iter(required))
     return lambda origin: monkeypatch.setattr(metadata, "distribution", lambda name: Installed(origin))
@@ -64,7 +76,7 @@ def test_elsewhere_the_missing_packages_are_named(install, origin: object) -> No
 def test_where_no_package_is_missing_all_are_named(install, monkeypatch: pytest.MonkeyPatch) -> None:
     install(None)
     monkeypatch.setattr(optional, "required_by", lambda name, extra="": iter([Required("numpy", "1.26", "2.0")]))
-    assert install_hint("", "--force-reinstall") == "pip install --force-reinstall 'numpy>=1.26'"
+    assert install_hint(options=["--force-reinstall"]) == "pip install --force-reinstall 'numpy>=1.26'"
 
 
 def test_a_copy_that_is_not_installed_names_the_extra(install, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -80,15 +92,38 @@ def test_the_hint_of_this_checkout_names_it() -> None:
     assert shlex.split(install_hint("video"))[-2:] == ["-e", f"{ROOT}[video]"]
 
 
-@pytest.mark.parametrize("name", ["VIRTUAL_ENV", "CONDA_PREFIX"])
-def test_the_pip_is_that_of_this_interpreter(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    for each in ("VIRTUAL_ENV", "CONDA_PREFIX"):
-        monkeypatch.delenv(each, raising=False)
-    assert pip_install("pandas") == f"{sys.executable} -m pip install pandas"
-    monkeypatch.setenv(name, "/another/environment")
-    assert pip_install("pandas") == f"{sys.executable} -m pip install pandas"
-    monkeypatch.setenv(name, sys.prefix)
+def test_the_pip_is_that_of_this_interpreter(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = environment(tmp_path / "a venv", monkeypatch)
+    monkeypatch.setenv("PATH", "/usr/bin")
+    assert pip_install("pandas") == f"'{folder}/bin/pip' install pandas"
+    monkeypatch.chdir(tmp_path)
+    assert pip_install("pandas", options=["--upgrade"]) == "'a venv/bin/pip' install --upgrade pandas"
+    monkeypatch.setenv("PATH", f"{folder}/bin:/usr/bin")
     assert pip_install("pandas>=2") == "pip install 'pandas>=2'"
+    (folder / "bin/pip").unlink()
+    assert pip_install("pandas") == f"'{folder}/bin/python' -m pip install pandas"
+
+
+def test_without_an_environment_pip_is_a_module_of_the_interpreter(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "prefix", sys.base_prefix)
+    assert pip_install("pandas") == f"{sys.executable} -m pip install pandas"
+
+
+def test_programs_of_uv_and_pipx_are_changed_by_these(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    uv = environment(tmp_path / "tools/sparklod", monkeypatch, "uv-receipt.toml")
+    python = f"{uv}/bin/python"
+    assert pip_install("a>=1", options=["--upgrade"]) == f"uv pip install --python {python} --upgrade 'a>=1'"
+    environment(tmp_path / "venvs/sparklod", monkeypatch, "pipx_metadata.json")
+    assert pip_install("a>=1", "b") == "pipx inject sparklod 'a>=1' b"
+    assert pip_install("a>=1", options=["--upgrade"]) == "pipx runpip sparklod install --upgrade 'a>=1'"
+    assert "inject sparklod" in install_hint("render")  # and not the checkout, which it could not inject
+
+
+def test_an_environment_of_uv_has_no_pip(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = environment(tmp_path / "venv", monkeypatch, "bin/uv")
+    monkeypatch.setenv("PATH", str(folder / "bin"))
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    assert pip_install("pandas") == f"uv pip install --python {folder}/bin/python pandas"
 
 
 def test_no_text_names_a_package_that_is_on_no_index() -> None:
@@ -97,7 +132,12 @@ def test_no_text_names_a_package_that_is_on_no_index() -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "hint"), [({"extra": "video"}, install_hint("video")), ({"package": "pandas"}, pip_install("pandas"))]
+    ("arguments", "hint"),
+    [
+        ({"extra": "video"}, install_hint("video")),
+        ({"package": "pandas"}, pip_install("pandas")),
+        ({"extra": "render", "package": "matplotlib"}, pip_install("matplotlib>=3.8")),
+    ],
 )
 def test_a_missing_package_says_what_to_install(
     arguments: dict[str, str], hint: str, monkeypatch: pytest.MonkeyPatch
@@ -158,7 +198,21 @@ def test_markers_decide_what_is_required() -> None:
 
 @pytest.mark.usefixtures("installed")
 def test_an_extra_requires_its_own_and_the_extras_of_those() -> None:
-    assert list(required_by("sparklod", "video")) == [Required("films", "2.31", "10.0"), Required("encoder", "3", None)]
+    source = "films[ffmpeg,other]>=2.31"
+    assert list(required_by("sparklod", "video")) == [
+        Required("films", "2.31", "10.0", source),
+        Required("encoder", "3", None, source),
+    ]
+
+
+@pytest.mark.usefixtures("installed")
+@pytest.mark.parametrize("films", ["10.0", "1.0", None])
+def test_a_hint_keeps_the_extras_of_requirements(films: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without [ffmpeg], whoever follows it gets the next hint."""
+    monkeypatch.setattr(optional, "_checkout", lambda: None)
+    monkeypatch.setitem(VERSIONS, "films", films) if films else monkeypatch.delitem(VERSIONS, "films")
+    assert shlex.split(install_hint("video"))[-1] == "films[ffmpeg,other]>=2.31"
+    assert shlex.split(install_hint("video", package="films"))[-1] == "films[ffmpeg,other]>=2.31"
 
 
 @pytest.mark.parametrize(

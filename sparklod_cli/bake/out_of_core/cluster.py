@@ -93,7 +93,7 @@ def cluster(
     Raises:
         SparklodError: there is no distributed, or no scheduler or worker answers.
     """
-    with optional_import("clusters are Dask's", "cluster"):
+    with optional_import("--workers and --scheduler need Dask", "cluster"):
         import distributed  # noqa: F401  # sets its loggers up
     with contextlib.ExitStack() as stack:
         stack.enter_context(_quiet())
@@ -164,7 +164,7 @@ def _started(workers: int, threads: int, memory: int | None) -> Iterator[Any]:
     import dask
     from distributed import Client, LocalCluster, Security
 
-    with optional_import("processes know each other by certificates of cryptography", "sparklod[cluster]"):
+    with optional_import("--workers needs cryptography", "cluster"):
         security = Security.temporary()  # for this cluster alone; workers get the key through pipes
     with contextlib.ExitStack() as stack:
         stack.enter_context(without_current_folder())  # until the end, as workers that are lost are started again

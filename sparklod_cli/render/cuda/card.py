@@ -53,7 +53,7 @@ def find_card() -> Card:
         BackendError: there is none, or it cannot be used; in one line that says why.
     """
     check_numba_settings()
-    with optional_import("the device cuda takes numba-cuda", "cuda", BackendError):
+    with optional_import("--device cuda needs numba-cuda", "cuda", BackendError):
         from numba import cuda
     from ...support.jit_cuda import SIMULATED
 
@@ -70,7 +70,7 @@ def find_card() -> Card:
     if capability < LEAST_CAPABILITY:
         raise BackendError(f"the NVIDIA card has compute capability {capability[0]}.{capability[1]}; it takes 5.0")
     if not cuda.is_available():
-        with optional_import("the device cuda takes NVVM, which compiles its kernels", "cuda", BackendError):
+        with optional_import("--device cuda needs NVVM, which compiles its kernels", "cuda", BackendError):
             raise ImportError("NVVM is missing")
     context = cuda.current_context()
     name = context.device.name

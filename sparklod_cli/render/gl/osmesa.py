@@ -199,7 +199,7 @@ def open_context() -> Any:
     Raises:
         BackendError: OpenGL is not available; names the packages to install.
     """
-    with optional_import("the backend osmesa needs moderngl", "render", BackendError):
+    with optional_import("the backend osmesa needs moderngl", "render", BackendError, package="moderngl"):
         import moderngl  # noqa: F401
     reasons = []
     for kind in contexts.PACKAGES:

@@ -108,7 +108,8 @@ class Painter:
         self._material = open3d.visualization.rendering.MaterialRecord()
         if not hasattr(self._material, "gaussian_splat_antialias"):
             raise RuntimeError(
-                f"Open3D {open3d.__version__} cannot draw splats: {pip_install('--upgrade', f'open3d>={VERSION}')}"
+                f"Open3D {open3d.__version__} cannot draw splats:"
+                f" {pip_install(f'open3d>={VERSION}', options=['--upgrade'])}"
             )
         self._material.shader = "gaussianSplat"
         self._material.gaussian_splat_sh_degree = 0

@@ -73,7 +73,7 @@ def test_missing_libraries_are_named(tmp_path: Path) -> None:
 
 def test_the_extra_that_brings_moderngl_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "moderngl", None)
-    with pytest.raises(BackendError, match=re.escape(install_hint("render"))):
+    with pytest.raises(BackendError, match=re.escape(install_hint("render", package="moderngl"))):
         osmesa.open_context.__wrapped__()
 
 
