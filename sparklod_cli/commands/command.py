@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import inspect
+import itertools
 import os
 import re
 from collections.abc import Iterable, Sequence
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -26,6 +28,15 @@ HELP = {"--help", "--help-all"}
 
 #: Columns of the longest option that has its help beside it, not below.
 TERM_WIDTH = 24
+
+#: Units that people put after a blank. They are no names of files.
+UNIT = re.compile(r"%|[kmgt]i?b?|ms|s|[kmg]bit(?:/s)?", re.IGNORECASE)
+
+#: The parameter of the output, and those with which a missing output is no mistake.
+OUTPUT, NO_OUTPUT = "output", ("output_dir", "scene")
+
+#: Suffixes that inputs and outputs of build-lod and simplify may share.
+TREES = (".spz", ".rad")
 
 #: What else people type, and what they mean by it.
 ALIASES = {
@@ -109,7 +120,17 @@ class Command(click.Command):
         options = [param for param in self.params if isinstance(param, Option) and param.bare is not None]
         bare = {name: f"{name}={param.bare}" for param in options for name in param.opts}
         end = args.index("--") if "--" in args else len(args)
-        return super().parse_args(ctx, [*(bare.get(arg, arg) for arg in args[:end]), *args[end:]])
+        refuse_lone_units(args[:end], ctx)
+        try:
+            rest = super().parse_args(ctx, [*(bare.get(arg, arg) for arg in args[:end]), *args[end:]])
+        except click.MissingParameter as error:
+            if error.param is None or error.param.name != OUTPUT:
+                raise
+            refuse_output_among_inputs(ctx, missing=True)
+            raise
+        if not ctx.resilient_parsing:
+            refuse_output_among_inputs(ctx)
+        return rest
 
     def by_heading(self, ctx: click.Context, *, whole: bool = True) -> dict[str, list[click.Parameter]]:
         """Return the options that the help lists, by heading, in the order of both.
@@ -162,6 +183,33 @@ def _print_help_all(ctx: click.Context, param: click.Parameter, value: bool) -> 
         assert isinstance(ctx.command, Command)
         click.echo(ctx.command.get_help(ctx, whole=True))
         ctx.exit()
+
+
+def refuse_lone_units(args: Sequence[str], ctx: click.Context) -> None:
+    """Raise a `click.UsageError` for a unit apart from its number, as in --to 10 %: it would be taken for an input."""
+    for before, unit in itertools.pairwise(args):
+        number = re.fullmatch(r"(?:-{1,2}[\w-]+=)?([0-9]+(?:\.[0-9]*)?)", before)
+        if number and UNIT.fullmatch(unit) and not os.path.exists(unit):  # noqa: PTH110
+            raise click.UsageError(f"{before} {unit} has a blank before its unit; write {before}{unit}", ctx)
+
+
+def refuse_output_among_inputs(ctx: click.Context, *, missing: bool = False) -> None:
+    """Raise a `click.UsageError` if the last input seems to be the output, as of cp: nothing has its name yet.
+
+    Args:
+        missing: the command must have an output, and has none.
+    """
+    if (not missing and OUTPUT not in ctx.params) or any(ctx.params.get(name) for name in (OUTPUT, *NO_OUTPUT)):
+        return
+    *others, last = ctx.params.get("inputs") or ctx.params.get("files") or (None,)
+    if not others or not isinstance(last, Path) or not last.suffix or last.exists():
+        return
+    alike = {other.suffix.lower() for other in others if other.suffix} - set(TREES if "inputs" in ctx.params else ())
+    if last.suffix.lower() in alike and not missing:
+        return  # a second input whose name is wrong
+    import shlex  # needed after a mistake only
+
+    raise click.UsageError(f"{last} does not exist; did you mean -o {shlex.quote(str(last))}?", ctx)
 
 
 class Group(click.Group):

@@ -14,7 +14,7 @@ from ..images.defaults import THUMBNAIL_SIZE, THUMBNAIL_SUPERSAMPLE
 from .console import Console, count_of, print_json, size_of
 from .option_groups import COMMON, check_declared, command, exclude, flags_set, values_of
 from .options.cameras import PictureCameras
-from .options.common import General, json_flag
+from .options.common import General, json_flag, question_budgets
 from .options.cut import Inputs, PictureCut, PictureStreaming, check_scenes, notes_on_loading, viewed_files
 from .options.pictures import Appearance, ComparisonOptions, PictureFiles, check_sizes
 from .paths import claim_stdout, keep_apart, name_outputs
@@ -125,6 +125,7 @@ def _draw(ctx: click.Context, options: RenderOptions) -> None:
     with general.console() as console:
         from ..api.jobs import draw_files
 
+        question_budgets(console, budget)
         console.announce_compiling("pictures")
 
         def place(path: CameraPath) -> tuple[PictureOutput, PictureSettings]:

@@ -12,7 +12,7 @@ import click
 
 from ..support.stdin import DASH
 from .console import Console, count_of, for_screen, is_terminal, print_json
-from .options.common import report_outcomes, table_form
+from .options.common import question_budgets, report_outcomes, table_form
 from .options.cut import check_scenes, viewed_files
 from .paths import Folder, keep_apart
 
@@ -37,6 +37,7 @@ def compare(ctx: click.Context, options: RenderOptions) -> int:
 
     keep_apart(ctx, files_read(options, instances))
     with options.general.console() as console:
+        question_budgets(console, *budgets)
         console.announce_compiling("pictures")
         start = time.perf_counter()
 

@@ -44,7 +44,7 @@ from .options.baking import (
     TreeOptions,
     memory_size,
 )
-from .options.common import General, overwrite_flag
+from .options.common import General, overwrite_flag, question_budgets
 from .paths import (
     NAMELESS,
     Folder,
@@ -214,6 +214,7 @@ def simplify(ctx: click.Context, /, **_: Any) -> None:
         from ..compile_ahead import jobs_of
 
         settings = options.settings(ctx)
+        question_budgets(console, files.to)
         console.announce_compiling(*jobs_of(settings))
         with console.job(stage_shares(settings)):
             baked = bake(

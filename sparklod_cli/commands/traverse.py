@@ -27,6 +27,7 @@ from .options.common import (
     output_option,
     overwrite_flag,
     plot_option,
+    question_budgets,
     report_outcomes,
     table_form,
 )
@@ -198,6 +199,7 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
                 console.say(note)
             keep_apart(ctx, {**besides, "indices_out": outputs.index_files(path.numbers, len(instances))})
 
+        question_budgets(console, budget)
         console.announce_compiling("cuts")
         screen = outputs.table.on_stdout and is_terminal(sys.stdout)
         with options.cameras.usage_errors():

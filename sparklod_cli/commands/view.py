@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import click
 
+from ..lod.budget import doubt
 from ..support.printable import printable
 from ..support.setting_fields import Quantity, Range, whole
 from ..support.units import parse_count
@@ -137,6 +138,8 @@ def view(ctx: click.Context, /, **_: Any) -> None:
             files, served=place.export is None, threads=general.threads, progress=console.progress, **vars(page)
         )
         console.clear()
+        if page.budget is not None and (question := doubt(page.budget, shares=False)):
+            console.say(question)
         for note in site.notes:
             console.say(note)
         if place.export is not None:
@@ -174,7 +177,7 @@ def _open(console: Console, url: str) -> None:
         os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")
     )
     if not has_display or not webbrowser.open(url):
-        console.say("no browser can be opened here; open the address above in one")
+        console.say(f"Could not open a browser; open this address yourself: {url}")
 
 
 def _report_export(console: Console, folder: Path, site: Site, size: int, *, as_json: bool) -> None:

@@ -93,7 +93,10 @@ def opened(path: Place) -> Iterator[tuple[BinaryIO, Format, dict[str, Any]]]:
         if path.is_dir():
             path = in_folder(path)
         if path != DASH and path.exists() and not path.is_file():
-            raise UnreadableError("it is a pipe or a device; save it to a file first")
+            raise UnreadableError(
+                "it is a pipe or a device; save it to a file, or give - to build-lod, simplify or inspect: - reads"
+                " standard input"
+            )
         with file_of(path) as file:
             head = head_of(file)
             form = recognised(head, path)

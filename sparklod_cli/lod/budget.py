@@ -6,10 +6,16 @@ import re
 from dataclasses import dataclass, replace
 from fractions import Fraction
 
-from ..support.units import parse_count
+from ..support.units import check_grouping, count_of, parse_count
 
 #: A share of the leaves, in percent, with at most nine digits after the point.
 SHARE = re.compile(r"([0-9]{1,3}(?:\.[0-9]{1,9})?|\.[0-9]{1,9})\s*%")
+
+#: A comma in digits that no list of budgets has: none begins with a zero.
+GROUPED_LIST = re.compile(r"[0-9],0")
+
+#: Counts below it are probably a share or thousands: they draw nothing that a person would recognise.
+FEW = 100
 
 #: The largest count: up to it, every table format stores integers exactly.
 LARGEST = 1 << 53
@@ -33,6 +39,11 @@ class Budget:
     scale: float = 1.0
     by_default: bool = False
 
+    @property
+    def question(self) -> str:
+        """Return a question about a count that is probably meant otherwise; empty for other budgets."""
+        return "" if self.count is None else doubt(self.count)
+
     @classmethod
     def of_count(cls, count: int) -> Budget:
         """Return a budget of this many splats."""
@@ -49,6 +60,12 @@ class Budget:
         return max(1, int(splats if self.scale == 1 else float(splats) * self.scale))
 
 
+def doubt(count: int, *, shares: bool = True) -> str:
+    """Return a question about a number of splats, as `Budget.question`; `shares` could be given instead."""
+    share = f" or {count}%" if shares else ""
+    return f"{count} means {count_of(count, 'splat')}; did you mean {count}k{share}?" if count < FEW else ""
+
+
 def parse_budget(text: str) -> Budget:
     """Return the budget of a text such as "5%" or "500k".
 
@@ -56,6 +73,7 @@ def parse_budget(text: str) -> Budget:
         ValueError: the text is neither a share nor a count, or is out of range (0, or a count beyond `LARGEST`).
     """
     text = text.strip()
+    check_grouping(text)
     found = SHARE.fullmatch(text)
     try:
         budget = Budget(text, Fraction(found[1]) / 100, None) if found else Budget(text, None, parse_count(text))
@@ -70,6 +88,8 @@ def parse_budget(text: str) -> Budget:
 
 def parse_budgets(text: str) -> tuple[Budget, ...]:
     """Return the budgets of a text such as "2%,5%,500k"; raise `ValueError` if one is invalid, or there is none."""
+    if GROUPED_LIST.search(text):
+        check_grouping(text)
     budgets = tuple(map(parse_budget, filter(None, map(str.strip, text.split(",")))))
     if not budgets:
         raise ValueError(f"{text!r} names no budget, such as 5% or 500k")

@@ -16,6 +16,10 @@ TIME = rf"{NUMBER}(?P<unit>ms|s)"
 BANDWIDTH = rf"{NUMBER}{PREFIX}(?P<unit>(?i:bits?|bytes?)|b|B)(?:/s|ps)?"
 
 
+#: Digits in groups of three: by country, one of the signs between them separates the decimals instead.
+GROUPED = re.compile(r"[0-9]{1,3}(?:([.,'_ \u00a0\u2019\u202f])[0-9]{3})(?:\1[0-9]{3})*")
+
+
 def count_of(count: int, noun: str, plural: str | None = None) -> str:
     """Return a text such as "1 node", "1,234 nodes", or "2 leaves" with a plural of its own."""
     return f"{count:,} {noun if count == 1 else plural or noun + 's'}"
@@ -89,9 +93,18 @@ def parse_size(text: str) -> int:
     return _whole(SIZE, text, "is not a size: whole bytes, such as 3000000, 3MB or 3MiB")
 
 
+def check_grouping(text: str) -> None:
+    """Raise `ValueError` for digits in groups, such as 500.000 or 500,000, which may mean 500 as well."""
+    if GROUPED.fullmatch(text.strip()):
+        digits = re.sub("[^0-9]", "", text)
+        also = f" or {digits[:-3]}k" if digits.endswith("000") else ""
+        raise ValueError(f"{text!r} has digits in groups; did you mean {digits}{also}?")
+
+
 def _whole(pattern: str, text: str, otherwise: str) -> int:
     from fractions import Fraction  # which takes milliseconds, and every command loads this module
 
+    check_grouping(text)
     match = re.fullmatch(pattern, text.strip())
     value = Fraction(match["number"]) * PREFIXES[match["prefix"].lower()] if match else Fraction(-1, 2)
     if value.denominator != 1:

@@ -343,7 +343,7 @@ def test_a_missing_package_is_reported_before_the_work(
     load_pyvista.cache_clear()
     assert run(command) == 1
     err = capsys.readouterr().err
-    assert f" by {package}: " in err
+    assert f" need{'s' if package != 'pyvista' else ''} {package}: " in err
     assert "missing.spz" not in err
     assert not any(tmp_path.iterdir())
 

@@ -7,6 +7,7 @@ from fractions import Fraction
 import pytest
 
 from sparklod_cli.lod.budget import LARGEST, Budget, parse_budget, parse_budgets
+from sparklod_cli.support.units import parse_count, parse_size
 
 
 def test_budgets_are_shares_or_counts() -> None:
@@ -35,3 +36,47 @@ def test_a_scale_multiplies_counts_and_shares(scale: float) -> None:
         assert Budget.of_count(5000).scaled(scale).of(leaves) == max(1, int(5000 * scale))
         assert parse_budget("25%").scaled(scale).of(leaves) == max(1, int(leaves / 4 * scale))
     assert parse_budget("40%").scaled(0.5).scaled(0.5).of(1000) == 100
+
+
+@pytest.mark.parametrize(
+    ("text", "meant"),
+    [
+        ("500.000", "500000 or 500k"),
+        ("500,000", "500000 or 500k"),
+        ("500 000", "500000 or 500k"),
+        ("500'000", "500000 or 500k"),
+        ("500_000", "500000 or 500k"),
+        ("1.000.000", "1000000 or 1000k"),
+        ("1,000,000", "1000000 or 1000k"),
+        ("1.500", "1500"),
+        ("1\u202f000", "1000 or 1k"),
+    ],
+)
+def test_digits_in_groups_are_refused_with_the_number_that_is_probably_meant(text: str, meant: str) -> None:
+    for parse in (parse_budget, parse_count, parse_size):
+        with pytest.raises(ValueError, match=rf"has digits in groups; did you mean {meant}\?$"):
+            parse(text)
+
+
+def test_lists_of_budgets_and_decimals_are_no_groups() -> None:
+    assert [budget.count for budget in parse_budgets("250,500")] == [250, 500]
+    for text in ("500,000", "1,000,000"):
+        with pytest.raises(ValueError, match="has digits in groups"):
+            parse_budgets(text)
+    assert [budget.text for budget in parse_budgets("2.125%,0.5k,1.500k")] == ["2.125%", "0.5k", "1.500k"]
+
+
+@pytest.mark.parametrize(
+    ("text", "question"),
+    [
+        ("1", "1 means 1 splat; did you mean 1k or 1%?"),
+        ("5", "5 means 5 splats; did you mean 5k or 5%?"),
+        ("99", "99 means 99 splats; did you mean 99k or 99%?"),
+        ("100", ""),
+        ("500k", ""),
+        ("5%", ""),
+        ("0.001%", ""),
+    ],
+)
+def test_a_count_that_cannot_be_meant_is_questioned(text: str, question: str) -> None:
+    assert parse_budget(text).question == question

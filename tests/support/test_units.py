@@ -82,7 +82,7 @@ def test_sizes_are_bytes(prefix: str, factor: float, unit: str, space: str) -> N
 
 
 #: Texts that are nothing, and for each parser others that it refuses, with what its error says.
-BAD = ["", "k", "Mbit", "-1", "-5ms", "-20Mbit", "nan", "inf", "1e999", "1,000", "٣", "1 2", "0x10", "a\nb"]
+BAD = ["", "k", "Mbit", "-1", "-5ms", "-20Mbit", "nan", "inf", "1e999", "1,00", "٣", "1 2", "0x10", "a\nb"]
 REFUSED = {
     parse_bandwidth: ("bandwidth", ["20", "20M", "0Mbit", "0.0B/s", "20ibit", "20iB/s", "20Mbit/h", "20Pbit"]),
     parse_time: ("is not a time", ["60", "0", "60us", "60 m", "infs", "60m s"]),

@@ -60,11 +60,11 @@ def test_json_names_the_address_and_the_files_and_quiet_nothing_else() -> None:
 
 def test_without_a_browser_it_says_so() -> None:
     with started(TREE) as process:
-        process.stdout.readline()
+        url = process.stdout.readline().strip()
         lines = [process.stderr.readline().strip() for _ in range(2)]
         process.terminate()
     assert sorted(lines) == [
-        "no browser can be opened here; open the address above in one",
+        f"Could not open a browser; open this address yourself: {url}",
         f"serving {TREE.name}; Ctrl-C ends it",
     ]
 

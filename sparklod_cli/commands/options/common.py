@@ -22,6 +22,7 @@ from ..parameter_types import DIRECTION
 from ..paths import OutputPath, require_suffix
 
 if TYPE_CHECKING:
+    from ...lod.budget import Budget
     from ...tables.assertions import Outcome
 
 #: Suffixes, without a point, of what is no table, whatever format is asked for: splats, pictures, pages and arrays.
@@ -156,3 +157,10 @@ def assert_errors() -> Iterator[None]:
         yield
     except BadAssertionError as error:
         raise click.UsageError(f"--assert {error}") from None
+
+
+def question_budgets(console: Console, *budgets: Budget | None) -> None:
+    """Print a question about each count of splats that is too small to be meant."""
+    for budget in budgets:
+        if budget is not None and (question := budget.question):
+            console.say(question)

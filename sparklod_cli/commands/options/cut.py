@@ -17,7 +17,7 @@ from ...simulation.streaming_settings import Network, StreamingSettings
 from ...support import defaults
 from ...support.printable import printable
 from ...support.setting_fields import Quantity, Range
-from ...support.units import parse_time
+from ...support.units import check_grouping, parse_time
 from ..option_groups import COMMON, argument, flag, option, parameters_of, refuse, require
 from ..paths import InputPath
 
@@ -158,6 +158,10 @@ class CutOptions:
 
         if self.budget is not None and len(self.budget) > 1:
             texts = ",".join(budget.text for budget in self.budget)
+            try:
+                check_grouping(texts)
+            except ValueError as error:
+                raise click.UsageError(f"--budget {error}") from None
             raise click.UsageError(f"--budget {texts} names several, which only render --compare takes; give one")
         if self.budget:
             budget = self.budget[0]
