@@ -85,7 +85,7 @@ def refined(
         )
     if not report.is_complete:
         if not report.kept:
-            say("stops before anything was gained, so there is no output")
+            say("Stopped before --refine improved anything; no file written.")
             raise KeyboardInterrupt
         say("interrupted; what the finished stages gained is written, and a second Ctrl-C ends without an output")
     seconds = round(time.perf_counter() - start, 4)

@@ -19,7 +19,7 @@ from ..support.printable import MOST, printable
 from ..support.progress import StagedProgress
 from ..support.stdout import silence
 from ..support.units import count_of as count_of
-from ..support.units import format_size
+from ..support.units import format_duration, format_size
 
 if TYPE_CHECKING:
     from ..compile_ahead import CompileAhead
@@ -239,8 +239,8 @@ class Console:
                 bar.set_description_str(stage)
         elif now - self._logged >= LOG_INTERVAL:
             self._logged = now
-            left = f", some {(now - self._start) * (1 / reached - 1):.0f} s left" if reached else ""
-            self.say(f"{stage}: {100 * reached:.0f} % done after {now - self._start:.0f} s{left}")
+            left = f", about {format_duration((now - self._start) * (1 / reached - 1))} left" if reached else ""
+            self.say(f"{stage}: {100 * reached:.0f} % done after {format_duration(now - self._start)}{left}")
 
     def _log_progress(self, stage: str, done: int, total: int, unit: str) -> None:
         """Print a line about a stage that takes long, every `LOG_INTERVAL` seconds."""
@@ -250,7 +250,7 @@ class Console:
         if now - self._logged >= LOG_INTERVAL and done < total:
             self._logged = now
             amount = f"{format_size(done)} of {format_size(total)}" if unit == "B" else f"{done:,} of {total:,} {unit}s"
-            self.say(f"{stage}: {amount} ({100 * done / total:.0f} %), {now - self._start:.0f} s")
+            self.say(f"{stage}: {amount} ({100 * done / total:.0f} %), {format_duration(now - self._start)}")
 
     def announce_compiling(self, *jobs: str) -> None:
         """Announce the first kernel that is compiled, show which one it is, and print at the end how long all took.

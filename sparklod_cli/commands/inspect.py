@@ -19,7 +19,7 @@ from ..support.setting_fields import Quantity, Range, whole
 from ..support.stdin import name_of
 from ..support.units import parse_size
 from .console import Console, count_of, size_of
-from .inspect_text import finding_line, lines
+from .inspect_text import finding_line, lines, verdict
 from .option_groups import COMMON, argument, command, flag, option, refuse, values_of
 from .options.common import General, assert_errors, assert_option, overwrite_flag, plot_option, quiet_flag, table_form
 from .paths import InputPath, OutputPath, keep_apart, name_outputs
@@ -279,7 +279,7 @@ def _report_settings(
         and not (drawn or everything or checks.holds or output.chunks_out),
         values=everything or drawn or printed,
         all_quantities=everything or output.html is not None,
-        check=checks.holds or field.startswith("findings"),
+        check=checks.holds or output.html is not None or field.startswith("findings"),
         chunks=output.chunks or output.chunks_out is not None or field.startswith("chunks"),
         at_once=True if drawn or output.histogram or checks.leaves_of is not None else None,
     )
@@ -337,7 +337,7 @@ class _Job:
             self.console.error(f"{name}: {inspected.problem}")
             status = max(status, 1)
         elif inspected.problem is not None:
-            self.console.say(f"{name}: no picture on the page: {inspected.problem}")
+            self.console.say(f"{name}: no plot of the tree on the page: {inspected.problem}")
         return status
 
     def _print_chunks(self, name: str, report: Report) -> int:
@@ -366,10 +366,11 @@ class _Job:
             for finding in report.findings or []:
                 click.echo(finding_line(name, finding, checks.style))
             if not report.findings:
-                noun = "node" if report.tree is not None else "splat"
-                self.console.say(f"{name}: nothing is wrong with its {count_of(report.splats or 0, noun)}")
+                self.console.say(f"{name}: {verdict(report)}")
                 for hint in report.hints:
                     self.console.say(f"{name}: {hint}")
+        elif report.format is not None and output.html is not None and not output.stats:
+            self.console.say(f"{name}: {verdict(report)}")
         elif report.format is not None and not self.console.quiet:
             click.echo("\n".join(lines(name, plain)))
 

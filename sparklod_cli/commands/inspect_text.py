@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +11,7 @@ from .console import count_of, rows, size_of
 
 if TYPE_CHECKING:
     from ..inspection.findings import Finding
+    from ..inspection.report import Report
 
 #: Numbers of children that get a row of their own.
 MOST_ROWS = 8
@@ -184,6 +186,15 @@ def _values(values: dict[str, Any]) -> Iterator[str]:
     bad = ", ".join(f"{count:,} {what}" for what, count in counts.items() if count)
     if bad:
         yield from rows("degenerate", bad)
+
+
+def verdict(report: Report) -> str:
+    """Return the result of a check in a few words: how many findings there are of each severity."""
+    findings = report.findings or []
+    if not findings:
+        noun = "node" if report.tree is not None else "splat"
+        return f"OK: {count_of(report.splats or 0, noun)}, no problems found"
+    return ", ".join(count_of(count, name) for name, count in Counter(each.severity for each in findings).items())
 
 
 def finding_line(file: str, found: Finding, style: str) -> str:

@@ -145,7 +145,7 @@ def _view(text: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Parse camera position and target."""
     eye, colon, target = text.partition(":")
     if not colon:
-        raise ValueError(f"{text!r} is not EYE:TARGET, x,y,z:x,y,z")
+        raise ValueError(f"{text!r} is not EYE:TARGET, x,y,z:x,y,z, such as 0,1,5:0,0,0")
     view = _numbers(eye), _numbers(target)
     if view[0] == view[1]:
         raise ValueError(f"{text!r} looks at its own eye; give a target elsewhere")

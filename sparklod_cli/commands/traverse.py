@@ -218,6 +218,8 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
         written, cameras_read = traversed.frames, len(traversed.path.cameras)
         console.clear()
         console.detail(f"  {cameras_read:,} frames of {traversed.path.format}, {time.perf_counter() - start:.2f} s")
+        if outputs.table.path is not None:
+            console.say(f"{outputs.table.path}  table of {count_of(cameras_read, 'frame')}")
         if written.note:
             console.say(f"{outputs.plot}: {written.note}")
         if written.in_front < LEAST_IN_FRONT:

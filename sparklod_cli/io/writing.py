@@ -138,8 +138,12 @@ def sink(path: Place, *, overwrite: bool) -> Sink:
     return functools.partial(write_whole, path, overwrite=overwrite)
 
 
-def write_stdout(pieces: Iterable[bytes]) -> int:
-    """Write to standard output and return the number of bytes; raise `StdoutError` if they cannot be written."""
+def write_stdout(pieces: Iterable[bytes], *, may_end: bool = False) -> int:
+    """Write to standard output and return the number of bytes; raise `StdoutError` if they cannot be written.
+
+    Args:
+        may_end: the first lines may be enough for a reader, such as head; otherwise its end is an error like others.
+    """
     size = 0
     with guarded():
         try:
@@ -147,6 +151,8 @@ def write_stdout(pieces: Iterable[bytes]) -> int:
                 size += sys.stdout.buffer.write(piece)
             sys.stdout.buffer.flush()
         except ReaderGoneError as error:
+            if may_end:
+                raise
             raise StdoutError(str(error)) from None
     return size
 

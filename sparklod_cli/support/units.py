@@ -39,6 +39,14 @@ def format_size(size: float) -> str:
     return f"{size / 1000:.0f} kB"
 
 
+def format_duration(seconds: float) -> str:
+    """Return a time as "12 s", "12 min" or "3 h 5 min"."""
+    if round(seconds) < 60:
+        return f"{seconds:.0f} s"
+    minutes = round(seconds / 60)
+    return f"{minutes} min" if minutes < 60 else f"{minutes // 60} h {minutes % 60} min"
+
+
 def parse_bandwidth(text: str) -> float:
     """Parse a bandwidth such as 20Mbit, 20Mbit/s, 20Mbps (bits) or 2.5MB/s, 2.5MBps, 2.5Mbyte (bytes) to bytes/s.
 

@@ -57,4 +57,4 @@ class TableOutput:
         if self.path is not None:
             write_whole(self.path, data, overwrite=self.overwrite)
         else:
-            write_stdout(passed(data) if passed is not None else data)
+            write_stdout(passed(data) if passed is not None else data, may_end=self.form != "parquet")

@@ -235,7 +235,7 @@ def test_a_log_gets_how_much_of_a_job_is_done_and_the_time_left(monkeypatch: pyt
     with Console(quiet=False, verbose=False) as console, console.job({"reading": 1, "writing": 3}):
         for stage, done in (("reading", 0), ("reading", 2), ("writing", 1), ("writing", 1)):
             console.progress(stage, done, 2, "splat")
-    lines = ["reading: 25 % done after 12 s, some 36 s left", "writing: 62 % done after 60 s, some 36 s left"]
+    lines = ["reading: 25 % done after 12 s, about 36 s left", "writing: 62 % done after 1 min, about 36 s left"]
     assert log.getvalue().splitlines() == lines
 
 

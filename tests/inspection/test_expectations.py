@@ -130,7 +130,7 @@ def test_every_option_passes_and_fails_with_its_code(
 ) -> None:
     assert run(["inspect", str(TREE), *map(str, holds)]) == 0
     out, err = capsys.readouterr()
-    assert (out, err) == ("", f"{TREE}: nothing is wrong with its 9 nodes\n")
+    assert (out, err) == ("", f"{TREE}: OK: 9 nodes, no problems found\n")
     assert run(["inspect", str(TREE), *map(str, fails)]) == 3
     out, err = capsys.readouterr()
     assert out.startswith(f"{TREE}: error: {code}: ")
@@ -193,7 +193,7 @@ def test_a_path_missing_in_one_file_does_not_stop_the_others(tmp_path: Path, cap
     assert run(["inspect", str(PLAIN), str(TREE), "--expect", str(path)]) == 3
     out, err = capsys.readouterr()
     assert "the report has no tree.depth" in out
-    assert f"{TREE}: nothing is wrong" in err
+    assert f"{TREE}: OK: 9 nodes" in err
 
 
 EVERY = Expectations(

@@ -9,7 +9,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sparklod_cli.support.units import parse_bandwidth, parse_count, parse_size, parse_time, percent_of
+from sparklod_cli.support.units import (
+    format_duration,
+    parse_bandwidth,
+    parse_count,
+    parse_size,
+    parse_time,
+    percent_of,
+)
 
 
 @pytest.mark.parametrize(
@@ -124,3 +131,19 @@ def test_any_text_is_understood_or_refused(parse: Callable[[str], float], text: 
 )
 def test_shares_have_no_exponent(share: float, digits: int, text: str) -> None:
     assert percent_of(share, digits) == text
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [
+        (0, "0 s"),
+        (12.4, "12 s"),
+        (59.9, "1 min"),
+        (60, "1 min"),
+        (742, "12 min"),
+        (3599, "1 h 0 min"),
+        (11_100, "3 h 5 min"),
+    ],
+)
+def test_durations_are_in_the_unit_that_fits(seconds: float, text: str) -> None:
+    assert format_duration(seconds) == text

@@ -200,7 +200,10 @@ class View {
       if (element(id).textContent !== text) element(id).textContent = text;
     };
     set('drawn', whole(this.stage.drawn));
-    if (this.frameTime) set('frame-time', `${this.frameTime.toFixed(1)} ms, ${Math.round(1000 / this.frameTime)} a second`);
+    if (this.frameTime) {
+      const digits = this.frameTime < 10 ? 1 : 0;
+      set('frame-time', `${this.frameTime.toFixed(digits)} ms (${Math.round(1000 / this.frameTime)} fps)`);
+    }
     const { chunks } = this.stage;
     element('chunks-row').hidden = !chunks;
     if (chunks) set('chunks', chunks.map(whole).join(' of '));

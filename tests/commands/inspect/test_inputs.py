@@ -90,7 +90,7 @@ def test_the_report_of_a_deep_chain_is_bounded(nodes: int, tmp_path: Path, capsy
     path, page = tmp_path / "chain.spz", tmp_path / "page.html"
     path.write_bytes(chain(nodes))
     left_out = max(0, nodes - 1000)
-    assert inspect(path, "--html", page) == 0
+    assert inspect(path, "--html", page, "--stats") == 0
     text = capsys.readouterr().out
     assert f"depth {nodes - 1}" in text
     assert f"and {nodes - 64:,} more" in text

@@ -12,6 +12,7 @@ import pytest
 from sparklod_cli.cli import run
 from sparklod_cli.figures import pyvista_scene, tree_plot
 from sparklod_cli.inspection.findings import CODES, Finding
+from sparklod_cli.support.errors import SparklodError
 from tests.commands.inspect.runs import BROKEN, CORRUPT, MISSING, NOTED, PLAIN, TREE, WARNED, inspect, records
 from tests.conftest import FIXTURES, ROOT, Capture
 
@@ -124,7 +125,7 @@ def test_findings_go_to_stdout_and_good_news_to_stderr(capsys: Capture) -> None:
         f"{BROKEN}: error: tree.orphan: node 9 has no parent",
         f"{WARNED}: warning: container.flags: the header sets flags 0x0c, which have no meaning",
     ]
-    assert err == f"{TREE}: nothing is wrong with its 9 nodes\n"
+    assert err == f"{TREE}: OK: 9 nodes, no problems found\n"
 
 
 def test_quiet_prints_only_what_options_name(capsys: Capture) -> None:
@@ -178,7 +179,10 @@ def test_the_paths_of_page_and_picture_are_printed(
     monkeypatch.setattr(pyvista_scene, "load_pyvista", lambda: None)  # which may be missing
     page, picture = tmp_path / "page.html", tmp_path / "picture.png"
     assert inspect(TREE, "--plot", picture, "--html", page) == 0
-    first, second = capsys.readouterr().err.splitlines()
+    out, err = capsys.readouterr()
+    assert out == ""  # the report is on the page
+    verdict, first, second = err.splitlines()
+    assert verdict == f"{TREE}: OK: 9 nodes, no problems found"
     assert first == f"{picture}  all leaves: 6 nodes, 0.4 kB"
     assert second == f"{page}  page of 1 file, {page.stat().st_size / 1e3:.1f} kB"
     assert inspect(TREE, TREE, "--html", page, "--overwrite") == 0
@@ -202,7 +206,7 @@ def test_every_finding_is_an_annotation_for_github(capsys: Capture) -> None:
     lines = out.splitlines()
     assert [line.split(" ")[0] for line in lines] == ["::error", "::error", "::warning", "::notice"]
     assert lines[1] == f"::error file={BROKEN},title=tree.orphan::node 9 has no parent"
-    assert err == f"{TREE}: nothing is wrong with its 9 nodes\n"
+    assert err == f"{TREE}: OK: 9 nodes, no problems found\n"
 
 
 def test_no_name_ends_an_annotation_or_begins_a_command(
@@ -306,3 +310,24 @@ def test_an_unknown_field_is_an_error(capsys: Capture) -> None:
     assert out == ""
     assert err.startswith("error: ")
     assert "the report has no tree.leafs" in err
+
+
+def test_the_page_has_the_report_and_the_terminal_a_verdict(
+    tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def absent() -> None:
+        raise SparklodError("no pyvista")
+
+    monkeypatch.setattr(pyvista_scene, "load_pyvista", absent)
+    page = tmp_path / "page.html"
+    assert inspect(WARNED, "--html", page) == 0
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.splitlines() == [
+        f"{WARNED}: 1 warning",
+        f"{WARNED}: no plot of the tree on the page: no pyvista",
+        f"{page}  page of 1 file, {page.stat().st_size / 1e3:.1f} kB",
+    ]
+    assert "container.flags" in page.read_text()
+    assert inspect(WARNED, "--html", page, "--overwrite", "--stats") == 0
+    assert "container.flags" not in capsys.readouterr().out  # the report, and no findings

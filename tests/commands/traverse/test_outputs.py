@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import subprocess
 import sys
 from pathlib import Path
 
@@ -158,9 +160,8 @@ def test_a_walk_through_a_city_has_a_row_for_every_instance_and_frame(
     keys = "-6,-2,-6:0,0,0 0,-1,-3:0,-0.5,0 5,-1,-2:8,-0.5,1 7,-1,4:9,0,1"
     settings = ("--keyframes", keys, "--seconds", 299 / 90, "--fps", 30)
     network = ("--bandwidth", "20Mbit", "--latency", "60ms", "--budget", "100k")
-    assert traverse("--scene", scene, *settings, *network, "--per-instance", "-o", tmp_path / "city.json") == 0
-    whole = "town.spz, demo-lod.spz, sh3-lod.spz: loaded whole by viewers before they draw"
-    assert capsys.readouterr() == ("", f"{whole}; the waits are those of a RAD with the same nodes\n")
+    assert traverse("--scene", scene, *settings, *network, "--per-instance", "-o", tmp_path / "city.json", "-q") == 0
+    assert capsys.readouterr() == ("", "")
     rows = json.loads((tmp_path / "city.json").read_text())["data"]
     frames, each = [row for row in rows if row["instance"] == "total"], {}
     assert (len(frames), len(rows)) == (300, 1800)
@@ -233,3 +234,25 @@ def test_without_a_network_nobody_waits(capsys: Capture) -> None:
     assert json.loads(capsys.readouterr().out)["loading"] is None
     assert traverse(TOWN, *VIEW, "--assert", "first_picture_s<1", "--json") != 0
     assert "first_picture_s is empty: it needs --bandwidth" in capsys.readouterr().err
+
+
+def test_a_table_is_confirmed_as_other_outputs_are(tmp_path: Path, capsys: Capture) -> None:
+    path = tmp_path / "t.csv"
+    assert traverse(TREE, "--orbit", "3", "--output", path) == 0
+    assert capsys.readouterr().err == f"{path}  table of 3 frames\n"
+    assert traverse(TREE, "--orbit", "3", "--output", path, "--overwrite", "-q") == 0
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs pipes that close")
+@pytest.mark.parametrize("more", [(), ("-o", "-"), ("-o", "-", "--format", "json")])
+def test_a_reader_that_has_enough_is_no_error(more: tuple[str, ...]) -> None:
+    """As of `sparklod traverse ... | head -1`."""
+    command = [sys.executable, "-m", "sparklod_cli", "traverse", str(TREE), "--orbit", "3000", *more]
+    reading, writing = os.pipe()
+    with subprocess.Popen(command, stdout=writing, stderr=subprocess.PIPE) as process:
+        os.close(writing)
+        os.read(reading, 1)
+        os.close(reading)
+        _, err = process.communicate()
+    assert (process.returncode, err) == (1, b"")
