@@ -366,13 +366,17 @@ class _Job:
             for finding in report.findings or []:
                 click.echo(finding_line(name, finding, checks.style))
             if not report.findings:
-                self.console.say(f"{name}: {verdict(report)}")
-                for hint in report.hints:
-                    self.console.say(f"{name}: {hint}")
+                self._say_verdict(name, report)
         elif report.format is not None and output.html is not None and not output.stats:
-            self.console.say(f"{name}: {verdict(report)}")
+            self._say_verdict(name, report)
         elif report.format is not None and not self.console.quiet:
             click.echo("\n".join(lines(name, plain)))
+
+    def _say_verdict(self, name: str, report: Report) -> None:
+        """Print the result of the check, and hints on a file without findings."""
+        self.console.say(f"{name}: {verdict(report)}")
+        for hint in () if report.findings else report.hints:
+            self.console.say(f"{name}: {hint}")
 
     def write_page(self) -> None:
         """Write the page, if there is an option for it."""
