@@ -32,16 +32,13 @@ class Lookalike(NamedTuple):
     keys: tuple[str, ...] = ()
 
 
-_GLTF = "a glTF in JSON, of which only the binary form is read; pack it into a .glb"
 _CAMERAS = "a file of cameras; give it as --camera-path"
 
 #: In the order in which they are tried.
 LOOKALIKES = (
     Lookalike(POINTER, rb"version https://git-lfs\.github\.com/spec/v1\s"),
     Lookalike("a web page, perhaps of a download that failed", rb"\s*<(?i:!doctype html|html)"),
-    Lookalike(_GLTF, keys=("asset", "meshes")),
-    Lookalike(_GLTF, keys=("asset", "nodes")),
-    Lookalike(_GLTF, keys=("asset", "buffers")),
+    Lookalike("a glTF without splats", keys=("asset", "nodes")),
     Lookalike(_CAMERAS, keys=("frames",)),
     Lookalike(_CAMERAS, keys=("cameras",)),
     Lookalike(_CAMERAS, keys=("keyframes",)),

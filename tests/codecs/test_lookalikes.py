@@ -35,8 +35,9 @@ def copied(folder: Path, manifest: str) -> Path:
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        (GLTF, "a glTF in JSON"),
-        ({"extensionsUsed": [], "asset": {"version": "2.0"}, "buffers": []}, "a glTF in JSON"),
+        (GLTF, "glTF without splats"),
+        ({"extensionsUsed": [], "asset": {"version": "2.0"}, "buffers": []}, "glTF without splats"),
+        ({"asset": {"version": "2.0"}, "nodes": []}, "a glTF without splats"),
         (CAMERAS, "a file of cameras; give it as --camera-path"),
         ({"camera_path": []}, "a file of cameras"),
         ([{"id": 0, "img_name": "a"}], "a JSON list; if it holds cameras, give it as --camera-path"),
