@@ -21,13 +21,15 @@ from ..support.progress import Progress, silent
 
 
 def scene_like(value: Any) -> Scene:
-    """Return a scene or a tree.
+    """Return a scene, or a tree that is valid.
 
     Raises:
         TypeError: it is anything else.
+        TreeError: the tree is broken.
     """
     if not isinstance(value, Scene):
         raise TypeError(f"it takes a scene or a tree, not {_kind(value)}; {_SCENES}")
+    value.check_tree()
     return value
 
 

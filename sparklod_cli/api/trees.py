@@ -111,6 +111,7 @@ def simplify(
     Raises:
         InvalidSplatsError: some splats are invalid and `selection` does not drop them, or none is left.
         SparklodError: no camera sees anything.
+        TreeError: the tree is broken.
         ValueError: not exactly one of `to` and `psnr` is given, or a number is out of its range.
     """
     goal = SimplifyGoal(None if to is None else budget_like(to), None, psnr)
@@ -167,6 +168,7 @@ def refine(
 
     Raises:
         FormatError: the scene has no tree.
+        TreeError: the tree is broken.
         InvalidSplatsError: a node has numbers that no splat has.
         ValueError: a number is out of its range, there are no cameras, or no such device.
         BackendError: there is no card that can be used.
@@ -220,7 +222,6 @@ def arrange_chunks(tree: Scene, *, threads: int | None = None, progress: Progres
     links = scene_like(tree).tree
     if links is None:
         raise FormatError("the scene has no Level-of-Detail tree; build_lod makes one")
-    links.validate()
     with on_threads(threads), progress_callback(progress) as callback, memory_errors_translated():
         from ..lod.chunk_order import arrange
 
@@ -233,6 +234,7 @@ def extract_leaves(tree: Scene) -> Scene:
 
     Raises:
         FormatError: the scene has no tree.
+        TreeError: the tree is broken.
     """
     from ..extract_leaves import leaves_of
 

@@ -90,8 +90,5 @@ def check_scene(scene: Scene, threads: int) -> None:
         InvalidSplatsError: a splat is invalid.
         TreeError: the tree is broken, or of another number of nodes.
     """
-    if scene.tree is not None:
-        if len(scene.tree) != len(scene.splats):
-            raise TreeError(f"the tree has {len(scene.tree):,} nodes, but there are {len(scene.splats):,} splats")
-        scene.tree.validate()
+    scene.check_tree()
     check_valid(scene.splats, threads)

@@ -3,16 +3,33 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..support.errors import TreeError
 from .gaussian import spark_size
-from .splats import FloatArray, Splats, read_only
+from .splats import FloatArray, Splats
 
 #: The most children of a node: child counts are uint16 in Spark's nodes and in SPZ files.
 MAX_CHILDREN = 65535
+
+#: Attributes of a tree that cannot change, and of one of these that is valid.
+_FROZEN, _VALID = "_frozen", "_valid"
+
+_Column = TypeVar("_Column", bound=NDArray[Any])
+
+
+def _unchanging(column: _Column) -> _Column:
+    """Return a column that nobody can write to, a copy where somebody could."""
+    part: Any = column
+    while isinstance(part, np.ndarray) and not part.flags.writeable:
+        part = part.base
+    if isinstance(part, (np.ndarray, memoryview, bytearray)):
+        column = column.copy()
+        column.flags.writeable = False
+    return column
 
 
 @dataclass(frozen=True)
@@ -39,9 +56,18 @@ class LodTree:
         return len(self.child_count)
 
     def frozen(self) -> LodTree:
-        """Return this tree with read-only columns, as `Splats.frozen`."""
-        count, start = read_only(self.child_count), read_only(self.child_start)
-        return self if count is self.child_count and start is self.child_start else LodTree(count, start)
+        """Return this tree, or one with copies of the columns that somebody can write to.
+
+        Kernels follow the links without looking where they lead: a tree must not change after `validate`.
+        """
+        if _FROZEN in self.__dict__:
+            return self
+        tree = LodTree(_unchanging(self.child_count), _unchanging(self.child_start))
+        tree.__dict__[_FROZEN] = True
+        return tree
+
+    def __reduce__(self) -> tuple[type[LodTree], tuple[Any, ...]]:
+        return LodTree, (self.child_count, self.child_start)  # a copy can be written to, and is validated again
 
     def rows(self, part: slice) -> LodTree:
         """Return views of some consecutive nodes."""
@@ -57,7 +83,12 @@ class LodTree:
         return np.where(self.is_leaf, np.uint32(0), self.child_start)
 
     def depths(self) -> NDArray[np.int32]:
-        """Return (M,) int32 number of edges from the root to each node, of a tree that `validate` accepts."""
+        """Return (M,) int32 number of edges from the root to each node.
+
+        Raises:
+            TreeError: the tree is broken.
+        """
+        self.validate()
         depth = np.zeros(len(self), np.int32)
         frontier = np.zeros(1, np.int64)
         level = 0
@@ -74,11 +105,13 @@ class LodTree:
         """Check that this is a single tree with root 0, in linear time.
 
         Each node but the root is the child of exactly one node, which comes before it. As in Spark, nothing is asked of
-        the `child_start` of a leaf.
+        the `child_start` of a leaf. A tree of `frozen` is validated once.
 
         Raises:
             TreeError: an invariant is violated; names the first node that violates it.
         """
+        if _VALID in self.__dict__:
+            return
         if len(self.child_count) != len(self.child_start):
             raise TreeError(f"{len(self.child_count)} child counts but {len(self.child_start)} child starts")
         if len(self) == 0:
@@ -96,6 +129,8 @@ class LodTree:
         )
         if expected[-1] != len(self):
             raise TreeError(f"node {expected[-1]} has no parent")
+        if _FROZEN in self.__dict__:
+            self.__dict__[_VALID] = True
 
     @staticmethod
     def _fail_at(nodes: NDArray[np.int64], what: str) -> None:

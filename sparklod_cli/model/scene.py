@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..support.errors import InvalidSplatsError
+from ..support.errors import InvalidSplatsError, TreeError
 from .axes import AXES
 from .lod_tree import LodTree
 from .sh import COEFFICIENTS
@@ -69,8 +69,9 @@ PLAIN = FileCoding((ScaleCoding(),), 1)
 class Scene:
     """Splats, and what a file says of them all.
 
-    The columns of splats and tree become read-only views, so that a scene cannot change after it was drawn. Arrays that
-    were passed in keep their flags; what is drawn after a write to one of them is undefined.
+    The columns of splats become read-only views, so that a scene cannot change after it was drawn. Arrays that were
+    passed in keep their flags; what is drawn after a write to one of them is undefined. The columns of the tree are
+    copied if they can be written to, so that a tree which was valid stays valid.
 
     Attributes:
         splats: N splats, in the order and the axes of the file.
@@ -102,6 +103,17 @@ class Scene:
         object.__setattr__(self, "splats", self.splats.frozen())
         if self.tree is not None:
             object.__setattr__(self, "tree", self.tree.frozen())
+
+    def check_tree(self) -> None:
+        """Check that the tree, if there is one, is valid and has a node for each splat.
+
+        Raises:
+            TreeError: it does not.
+        """
+        if self.tree is not None:
+            if len(self.tree) != len(self.splats):
+                raise TreeError(f"the tree has {len(self.tree):,} nodes, but there are {len(self.splats):,} splats")
+            self.tree.validate()
 
     @classmethod
     def from_arrays(
@@ -174,8 +186,11 @@ class Tree(Scene):
 
     def _facts(self) -> list[str]:
         nodes, leaves = len(self.splats), int(np.count_nonzero(self.tree.is_leaf))
-        depth = int(self.tree.depths().max(initial=0))
-        counts = [f"{nodes:,} node{'s' * (nodes != 1)}", f"{leaves:,} leaves", f"depth {depth}"]
+        try:
+            depth = f"depth {self.tree.depths().max()}"
+        except TreeError as error:
+            depth = f"broken: {error}"
+        counts = [f"{nodes:,} node{'s' * (nodes != 1)}", f"{leaves:,} leaves", depth]
         return [*counts, *super()._facts()[1:]]
 
 

@@ -156,8 +156,7 @@ def _read(source: Source, columns: Collection[str], threads: int, progress: Prog
         else:
             with memory_errors_translated():
                 scene = read_scene(source, columns=columns, threads=threads, progress=progress, validate=False)
-        if scene.tree is not None:
-            scene.tree.validate()
+        scene.check_tree()
     except TreeError as error:
         raise TreeError(f"{name}: its tree is broken: {error}") from None
     except SparklodError as error:
