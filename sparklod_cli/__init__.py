@@ -10,22 +10,42 @@ What `__all__` names is the public interface, described in docs/python.md. Nothi
 
 from __future__ import annotations
 
+import os
 import sys
-from importlib import import_module
-from pathlib import Path
-from types import ModuleType
-from typing import Any
+
+
+def _leave_current_folder() -> None:
+    """Take the current folder off the path, which `python -m sparklod_cli` puts first.
+
+    Python would execute a file there that has the name of any module. A checkout that is not installed goes last.
+    """
+    is_ours = sys.argv[:1] == ["-m"] and not {__name__, f"-m{__name__}"}.isdisjoint(sys.orig_argv)
+    if is_ours and not (sys.flags.isolated or getattr(sys.flags, "safe_path", False)):
+        home = os.path.dirname(__path__[0])  # noqa: PTH120 - pathlib would be looked for in the current folder
+        sys.path[:] = [*sys.path[1:], *([home] if home == sys.path[0] else [])]
+
+
+_leave_current_folder()
+
+from importlib import import_module  # noqa: E402
+from types import ModuleType  # noqa: E402
+from typing import Any  # noqa: E402
 
 __version__ = "0.2.0"
 
-# By the loader, as the package may be in a zip.
-_stubs = __spec__.loader.get_data(str(Path(__file__).with_suffix(".pyi"))).decode()  # type: ignore[union-attr]
+
+def _stub() -> bytes:
+    """Read `__init__.pyi`, which may be in a zip."""
+    loader: Any = __spec__.loader
+    stub: bytes = loader.get_data(os.path.join(__path__[0], "__init__.pyi"))  # noqa: PTH118
+    return stub
+
 
 #: Module of each public name, as `__init__.pyi` has it. It is imported when the name is first used (PEP 562), so that
 #: importing the package loads neither numpy nor numba.
 _HOMES = {
     words[3]: words[1]
-    for words in map(str.split, _stubs.splitlines())
+    for words in map(str.split, _stub().decode().splitlines())
     if words[:1] == ["from"] and words[1].startswith(".")
 }
 

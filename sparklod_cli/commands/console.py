@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import sys
+import threading
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from time import monotonic, time
@@ -223,6 +224,7 @@ class Console:
         from tqdm import tqdm
 
         self.clear()
+        tqdm.set_lock(threading.RLock())  # tqdm's own is for several processes, and may start one
         self._bar = tqdm(leave=False, file=sys.stderr, dynamic_ncols=True, **how)
         return self._bar
 

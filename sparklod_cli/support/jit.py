@@ -130,7 +130,11 @@ def kernel(
     def decorate(function: Callable[..., Any]) -> Any:
         if not _is_disabled():
             return Kernel(function, options, signatures)
-        return functools.wraps(function)(lambda rows, *more: function(0, rows, *more)) if ranges else function
+        if not signatures:  # only kernels call it
+            return function
+        from .interpreted import interpreted
+
+        return interpreted(function, ranges)
 
     return decorate
 
@@ -181,8 +185,11 @@ def load_numba() -> ModuleType:
         SparklodError: see `check_numba_settings`.
     """
     check_numba_settings()
+    from .python_process import safe_path  # here, so that no kernel depends on its source
+
     try:
-        with warnings.catch_warnings(record=True) as caught:
+        # Where processes are not forked, numba starts one when it is imported.
+        with safe_path(), warnings.catch_warnings(record=True) as caught:
             from . import jit_numba
     except ImportError:
         raise

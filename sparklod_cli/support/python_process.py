@@ -31,20 +31,12 @@ def module_command(name: str, *arguments: str) -> list[str]:
 
 
 @contextlib.contextmanager
-def without_current_folder() -> Iterator[None]:
+def safe_path() -> Iterator[None]:
     """Have processes that other packages start by `python -c` search the current folder for no module.
 
-    Those of `multiprocessing` get the folders of this process later, after modules of the standard library.
-
-    Raises:
-        SparklodError: Python 3.10 would execute a file in the current folder.
+    Those of `multiprocessing` get the folders of this process later, after modules of the standard library. Python 3.10
+    does not know the variable, see `check_current_folder`.
     """
-    if sys.version_info < (3, 11):
-        for path in Path().iterdir():
-            name = path.name.partition(".")[0]
-            is_module = path.suffix in (".py", ".pyc", ".so", ".pyd") or (path / "__init__.py").exists()
-            if is_module and name in sys.stdlib_module_names:
-                raise SparklodError(f"Python 3.10 would execute {path} of the current folder; work in another folder")
     before = os.environ.get(SAFE_PATH)
     os.environ[SAFE_PATH] = "1"
     try:
@@ -54,3 +46,11 @@ def without_current_folder() -> Iterator[None]:
             del os.environ[SAFE_PATH]
         else:
             os.environ[SAFE_PATH] = before
+
+
+def check_current_folder() -> None:
+    """Raise a `SparklodError` where Python 3.10 would execute a file in the current folder as of its own library."""
+    for path in Path().iterdir() if sys.version_info < (3, 11) else ():
+        is_module = path.suffix in (".py", ".pyc", ".so", ".pyd") or (path / "__init__.py").exists()
+        if is_module and path.name.partition(".")[0] in sys.stdlib_module_names:
+            raise SparklodError(f"Python 3.10 would execute {path} of the current folder; work in another folder")

@@ -129,7 +129,9 @@ def test_the_buffers_of_tiles_are_shown_if_they_are_called_so(buffer: str, tmp_p
         names = ("tileset.json", "tiles/a.gltf", "tiles/tile.bin")
         assert list(file.files) == [f"data/0/{name}" for name in names]
     else:
-        with pytest.raises(FormatError, match=r"not called like a part of a scene|not a file (?:beside it|below its folder)"):
+        with pytest.raises(
+            FormatError, match=r"not called like a part of a scene|not a file (?:beside it|below its folder)"
+        ):
             shown_files([tmp_path / "web"])
 
 

@@ -13,7 +13,7 @@ from typing import Any
 from ...support import machine
 from ...support.errors import SparklodError
 from ...support.optional import optional_import
-from ...support.python_process import without_current_folder
+from ...support.python_process import check_current_folder, safe_path
 from ...support.threads import thread_count
 from .cluster_engine import ClusterEngine
 from .cluster_pool import Connection
@@ -167,7 +167,8 @@ def _started(workers: int, threads: int, memory: int | None) -> Iterator[Any]:
     with optional_import("--workers needs cryptography", "cluster"):
         security = Security.temporary()  # for this cluster alone; workers get the key through pipes
     with contextlib.ExitStack() as stack:
-        stack.enter_context(without_current_folder())  # until the end, as workers that are lost are started again
+        check_current_folder()
+        stack.enter_context(safe_path())  # until the end, as workers that are lost are started again
         folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="sparklod-"))
         # An argument of LocalCluster reaches its workers only, and the scheduler has a folder, too.
         stack.enter_context(dask.config.set(OWN_CONFIG | {"temporary-directory": folder}))
