@@ -150,6 +150,7 @@ def _print_kernels() -> None:
     folder = jit.CACHE_FOLDER or next(iter(jit.READ_FOLDERS), None)
     about = {
         "folder": None if folder is None else str(folder.resolve()),
+        "distrusted": jit.DISTRUSTED,
         "wanted": len(warmup.units()),
         "missing": len(warmup.missing()),
     }
@@ -166,6 +167,8 @@ def _kernels() -> Iterator[Check]:
         )
         yield Check("kernels", "problem", f"what bakes does not load: {_last_line(err, code)}", advice)
         return
+    for text in about["distrusted"]:
+        yield Check("kernel cache", "problem", *text.split("; ", 1))
     wanted, folder = about["wanted"], about["folder"]
     if folder is None:
         advice = "set NUMBA_CACHE_DIR to a folder that can be written to"

@@ -16,7 +16,7 @@ from sparklod_cli.render.gl import context
 from sparklod_cli.support import jit, machine
 from sparklod_cli.support.optional import Required, install_hint, pip_install
 
-HEALTHY = {"folder": "/nowhere/kernels-1", "wanted": 35, "missing": 0}
+HEALTHY = {"folder": "/nowhere/kernels-1", "distrusted": [], "wanted": 35, "missing": 0}
 
 
 def answer(monkeypatch: pytest.MonkeyPatch, code: int = 0, out: str = "", err: str = "") -> None:
@@ -225,3 +225,10 @@ def test_an_unexpected_error_in_a_check_is_a_note(monkeypatch: pytest.MonkeyPatc
     assert checks["memory"].value == "cannot be looked at (ZeroDivisionError: by zero)"
     assert checks["kernels"].state == "problem"
     assert "Chromium" in checks
+
+
+def test_a_cache_that_others_can_write_is_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
+    about = HEALTHY | {"distrusted": ["compiled code in /nowhere is not used; remove it"]}
+    monkeypatch.setattr(doctor, "_run", lambda command: (0, json.dumps(about), ""))
+    check = next(iter(doctor._kernels()))
+    assert (check.state, check.value, check.advice) == ("problem", "compiled code in /nowhere is not used", "remove it")

@@ -20,8 +20,9 @@ from .threads import MOST_THREADS, run_ranges
 Begun = Callable[[str], None]
 Done = Callable[[float], None]
 
-#: The folder for compiled code, None if none can be written; and folders of compiled code that is only read.
-CACHE_FOLDER, READ_FOLDERS, _distrusted = cache_folders(Path(__file__))
+#: The folder for compiled code, None if none can be written; folders of compiled code that is only read; and messages
+#: on folders that are not used.
+CACHE_FOLDER, READ_FOLDERS, DISTRUSTED = cache_folders(Path(__file__))
 
 #: File of settings that numba reads in the current folder.
 SETTINGS = Path(".numba_config.yaml")
@@ -201,7 +202,7 @@ def load_numba() -> ModuleType:
     for warning in caught:
         if warning.category is RuntimeWarning:  # of a variable; a traceback follows
             report_trouble(" ".join(str(warning.message).partition("\n")[0].split()))
-    for text in _distrusted:
+    for text in DISTRUSTED:
         report_trouble(text)
     return jit_numba
 

@@ -116,7 +116,7 @@ def cache_folders(source: Path) -> CacheFolders:
             place.mkdir(parents=True, exist_ok=True)
             folder.mkdir(SHARED if _user() == 0 else OWN, exist_ok=True)
         with contextlib.suppress(OSError):
-            if not is_trusted(folder):
+            if not is_trusted(folder.stat()):
                 distrusted.append(_distrusting(folder))
             elif os.access(folder, os.W_OK):
                 return CacheFolders(folder, tuple(read), tuple(distrusted))
@@ -137,12 +137,12 @@ def _user() -> int | None:
     return os.geteuid() if hasattr(os, "geteuid") else None
 
 
-def is_trusted(path: Path) -> bool:
+def is_trusted(status: os.stat_result) -> bool:
     """Return True if only this user, the superuser or the owner of the package can have written a file or folder.
 
     The owner of the package need not be distrusted, as its code runs anyway.
     """
-    status, user = path.stat(), _user()
+    user = _user()
     return user is None or (status.st_uid in (0, user, PACKAGE.stat().st_uid) and not status.st_mode & OTHERS)
 
 
@@ -224,8 +224,10 @@ class KernelCache:
             path = folder / name
             with contextlib.suppress(OSError):
                 if path.is_file():  # not a pipe or a device
-                    if is_trusted(path) or not folder.stat().st_mode & (stat.S_IXGRP | stat.S_IXOTH):
-                        return path, path.read_bytes()
+                    with path.open("rb") as file:
+                        is_closed = not folder.stat().st_mode & (stat.S_IXGRP | stat.S_IXOTH)
+                        if is_closed or is_trusted(os.fstat(file.fileno())):
+                            return path, file.read()
                     self._trouble(_distrusting(folder))
         return None
 

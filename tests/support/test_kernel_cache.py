@@ -122,11 +122,11 @@ def test_what_another_user_owns_is_not_trusted(
     (tmp_path / "file").touch(0o644)
     os.chown(tmp_path / "file", owner, owner)
     monkeypatch.setattr(os, "geteuid", lambda: user)
-    assert is_trusted(tmp_path / "file") is trusted
+    assert is_trusted((tmp_path / "file").stat()) is trusted
     monkeypatch.setattr(kernel_cache, "PACKAGE", tmp_path / "package")
     (tmp_path / "package").mkdir()
     os.chown(tmp_path / "package", owner, owner)
-    assert is_trusted(tmp_path / "file")
+    assert is_trusted((tmp_path / "file").stat())
 
 
 @posix
