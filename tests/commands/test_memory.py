@@ -69,7 +69,7 @@ COMMANDS = {
     "--unlod": (16, "build-lod --unlod HERE -o {out}.spz"),
     "inspect": (16, "inspect HERE --stats --threads 2"),
     "inspect --check": (16, "inspect HERE --check"),
-    "traverse": (16, "traverse HERE --budget 5 --orbit 2 -o {out}.csv"),
+    "traverse": (16, "traverse HERE --budget 100 --orbit 2 -o {out}.csv"),
     "render": (16, "render HERE --size 32x32 --threads 2 -o {out}.png"),
 }
 

@@ -234,7 +234,7 @@ def test_ctrl_c_before_anything_was_gained_leaves_nothing(tmp_path: Path) -> Non
     code, err = interrupted(tmp_path, signal.SIGINT, kept=0)
     assert code == 130
     assert err.endswith("\ninterrupted\n")
-    assert "written" not in err
+    assert "Stopped before --refine improved anything; no file written." in err
     assert not list(tmp_path.iterdir())
 
 

@@ -41,7 +41,7 @@ def test_two_traversals_give_the_same_bytes(capsys: Capture) -> None:
 def test_an_output_is_a_file(tmp_path: Path, capsys: Capture) -> None:
     output = tmp_path / "frames.csv"
     assert traverse(TREE, *ORBIT, "-o", output, "--no-timing") == 0
-    assert capsys.readouterr() == ("", "")
+    assert capsys.readouterr() == ("", f"{output}  table of 3 frames\n")
     assert len(table(output.read_text())) == 3
     before = output.read_bytes()
     assert traverse(TREE, "--look-at", "0,0,9:0,0,0", "-o", output) == 1
@@ -91,9 +91,9 @@ def test_a_summary_is_said_when_it_is_asked_for(tmp_path: Path, capsys: Capture)
     assert out == ""
     assert "3 frames, 0.067 s" in err
     assert "100.0 % at the budget" in err
-    for silent in (("--no-summary",), (), ("--summary", "-q")):
+    for silent, said in ((("--no-summary",), True), ((), True), (("--summary", "-q"), False)):
         assert traverse(TOWN, *ORBIT, *silent, "-o", output, "--overwrite") == 0
-        assert capsys.readouterr() == ("", "")
+        assert capsys.readouterr() == ("", f"{output}  table of 3 frames\n" if said else "")
 
 
 def test_json_is_the_summary_and_the_table_goes_to_its_file(tmp_path: Path, capsys: Capture) -> None:
@@ -101,7 +101,8 @@ def test_json_is_the_summary_and_the_table_goes_to_its_file(tmp_path: Path, caps
     assert traverse(TOWN, *ORBIT, "--budget", "4k", "--json", "-o", output, "--assert", "selected<=4k") == 0
     out, err = capsys.readouterr()
     summary = json.loads(out)
-    assert (summary["frames"], summary["stop_reasons"], err) == (3, {"budget": 1.0}, "")
+    assert (summary["frames"], summary["stop_reasons"]) == (3, {"budget": 1.0})
+    assert err == f"{output}  table of 3 frames\n"
     assert summary["asserts"] == [{"assert": "selected<=4k", "held": True, "value": summary["asserts"][0]["value"]}]
     selected = [int(row["selected"]) for row in table(output.read_text())]
     assert summary["quantities"]["selected"]["max"] == max(selected) == summary["asserts"][0]["value"]
@@ -113,7 +114,7 @@ def test_an_assertion_that_does_not_hold_is_exit_code_3(tmp_path: Path, capsys: 
     output = tmp_path / "out.csv"
     settings = (TOWN, *ORBIT, "--budget", "4k", "-o", output, "--overwrite")
     assert traverse(*settings, "--assert", "selected<=4k", "--assert", "missing==0") == 0
-    assert capsys.readouterr() == ("", "")
+    assert capsys.readouterr() == ("", f"{output}  table of 3 frames\n")
     assert traverse(*settings, "--assert", "selected<=4k", "--assert", "churn_max<0.1", "-q") == 3
     out, err = capsys.readouterr()
     assert out == ""
