@@ -52,7 +52,9 @@ def main() -> None:
 
     STREAMS.redirect()
     caches = [Path(os.environ["XDG_CACHE_HOME"]) / "sparklod", Path(os.environ.get("NUMBA_CACHE_DIR") or temporary)]
-    watch = WriteWatch([temporary, given.scratch / "matplotlib", Path("/dev"), Path("/proc"), *caches])
+    watch = WriteWatch(
+        [temporary, given.scratch / "matplotlib", given.scratch / "home", Path("/dev"), Path("/proc"), *caches]
+    )
     limited = False
     with os.fdopen(given.requests) as requests, os.fdopen(given.results, "w") as results:
         results.write(f"{READY}\n")
