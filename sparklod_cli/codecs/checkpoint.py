@@ -28,6 +28,7 @@ from .content import Content, Source, Target
 from .left_out import HARMLESS, left_out
 from .stream import Positioned, size_of
 from .tensor_pickle import Tensor, unpickled
+from .zip_folder import ZIP
 
 #: Bytes of data.pkl at most. That of nerfstudio, with the state of its optimisers, has some 50,000. Chosen.
 MOST_PICKLE = 1 << 24
@@ -212,7 +213,7 @@ class _TensorArchive:
         """Return where the bytes of a member begin."""
         self._file.seek(max(member.header_offset, 0))  # a damaged directory gives negative ones
         header = self._file.read(LOCAL_HEADER)
-        if len(header) < LOCAL_HEADER or not header.startswith(b"PK\x03\x04"):
+        if len(header) < LOCAL_HEADER or not header.startswith(ZIP):
             raise TruncatedError("cut short, or corrupt: a member of its zip does not begin where it should")
         return member.header_offset + LOCAL_HEADER + int(np.frombuffer(header[LENGTHS], "<u2").sum(dtype=np.int64))
 

@@ -35,7 +35,7 @@ class Source:
         file: open for reading, at its beginning.
         open_companion: opens the files that it names; None if there are none to open.
         scratch: keeps what has to be unpacked before rows can be read in any order; None to read all rows once.
-        threads: to read the files on that it names.
+        threads: number that read the files which it names.
     """
 
     file: BinaryIO

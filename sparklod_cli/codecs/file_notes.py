@@ -34,7 +34,7 @@ class FileNote:
     is_ours: bool = False
 
     def axis_of(self, form: str) -> tuple[str | None, str]:
-        """Return `up` and `up_by` of a file: what it notes, or what a format of `SPECIFIED` says of those of others."""
+        """Return `up` and `up_by` of a file: its note, or what `SPECIFIED` says if another program wrote it."""
         if self.up is None and not self.is_ours:
             return SPECIFIED[form], form
         return self.up, ""

@@ -188,7 +188,8 @@ def head_of(file: BinaryIO) -> bytes:
 def sniff(head: bytes, suffix: str) -> Format | None:
     """Return the format of a file by its first bytes, see `head_of`, or else by its suffix; None if that is not known.
 
-    The suffix decides only for formats that may begin with any bytes, and not of files that are known to be other.
+    The suffix decides only for formats that may begin with any bytes, and not if the file is recognized as something
+    else.
     """
     keys = keys_of_object(head)
     by_content = next((form for form in FORMATS if form.begins(head, keys)), None)

@@ -11,7 +11,7 @@ from ..support.printable import printable
 #: What a clone that was made without Git LFS has in place of a file, of any kind.
 POINTER = "a Git LFS pointer; run git lfs pull to get the file"
 
-#: Bytes by which it is recognized, and more.
+#: Bytes at the beginning of a file that suffice to recognize a pointer.
 SHORT = 64
 
 #: Keys of an unknown object that a message names, and the characters that they may take.

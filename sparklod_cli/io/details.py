@@ -185,8 +185,8 @@ class LevelFiles:
     Attributes:
         manifest: as parsed.
         bytes: of the manifest.
-        requests: bytes of what a viewer asks for of each chunk file that it names, and then of the environment: of the
-            meta.json, and then of each of its images.
+        requests: for each chunk file, and then for the environment, bytes of the answers to a viewer: of the meta.json,
+            and then of each of its images.
     """
 
     manifest: Manifest

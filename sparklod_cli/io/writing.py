@@ -142,7 +142,8 @@ def write_stdout(pieces: Iterable[bytes], *, may_end: bool = False) -> int:
     """Write to standard output and return the number of bytes; raise `StdoutError` if they cannot be written.
 
     Args:
-        may_end: the first lines may be enough for a reader, such as head; otherwise its end is an error like others.
+        may_end: a reader may close after the first lines, as head does, which raises `ReaderGoneError`; otherwise that
+            is a `StdoutError`, too.
     """
     size = 0
     with guarded():

@@ -41,7 +41,7 @@ class Budget:
 
     @property
     def question(self) -> str:
-        """Return a question about a count that is probably meant otherwise; empty for other budgets."""
+        """Question about a count that is probably a mistake; empty for other budgets."""
         return "" if self.count is None else doubt(self.count)
 
     @classmethod
@@ -61,7 +61,7 @@ class Budget:
 
 
 def doubt(count: int, *, shares: bool = True) -> str:
-    """Return a question about a number of splats, as `Budget.question`; `shares` could be given instead."""
+    """Return a question about a number of splats, see `Budget.question`; `shares` if a share is allowed, too."""
     share = f" or {count}%" if shares else ""
     return f"{count} means {count_of(count, 'splat')}; did you mean {count}k{share}?" if count < FEW else ""
 

@@ -133,7 +133,7 @@ class DetailFiles:
     Attributes:
         of_run: (R, L) int64 number of the chunk file of each run; -1 where there is no run.
         sizes: (F,) int64 bytes of the chunk files, then of that of the environment where there is one.
-        requests: for each, bytes of what a viewer asks for: of its meta.json, then of each of its images; none where
+        requests: for each, bytes of the answers to a viewer: of its meta.json, then of each of its images; empty where
             there are no files.
         environment: number of the chunk file of the environment; None without.
         manifest: bytes of the manifest, which is read before any other file.

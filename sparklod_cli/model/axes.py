@@ -1,4 +1,4 @@
-"""The axis of a file that points up: what its format specifies, what is assumed where nobody says it, and what is told.
+"""The axis of a file that points up: the one that its format specifies, the assumed one, and messages about it.
 
 A note of sparklod, or the coordinate system of an SPZ 4, says it of one file. Without one, formats of `SPECIFIED` are
 taken at their word, and outputs note that axis. All other formats, and trees in SPZ, have the axes of whatever they
@@ -32,7 +32,7 @@ ASSUMED = "-y"
 
 
 def line(up: str | None, up_by: str) -> tuple[str, ...]:
-    """Return the sentence on an axis that a specification names, if one does, for the user who can tell better.
+    """Return the message on an axis that a specification names, which a file may contradict; empty for other axes.
 
     Args:
         up, up_by: of a `Scene`.
@@ -43,18 +43,18 @@ def line(up: str | None, up_by: str) -> tuple[str, ...]:
 
 
 def lines_of(files: Iterable[tuple[str, str | None, str]]) -> list[str]:
-    """Return what to tell of the axes of files that are shown together: the sentence of each, and if they differ.
+    """Return the messages on the axes of files that are shown together: that of each file, and one if they differ.
 
     Args:
         files: the name of each, and `up` and `up_by` of its scene.
     """
     each = list(dict.fromkeys(files))
-    told = [f"{name}: {text}" for name, up, up_by in each for text in line(up, up_by)]
-    return told + [f"{text}, so {ASSUMED} is taken; --up chooses" for text in differing(up for _, up, _ in each)]
+    messages = [f"{name}: {text}" for name, up, up_by in each for text in line(up, up_by)]
+    return messages + [f"{text}, so {ASSUMED} is taken; --up chooses" for text in differing(up for _, up, _ in each)]
 
 
 def differing(axes: Iterable[str | None]) -> tuple[str, ...]:
-    """Return the beginning of a sentence on files with different axes up, one of which may be unknown, if they are."""
+    """Return the beginning of a sentence that names the different axes of files; empty if all have the same."""
     names = list(dict.fromkeys(axis or "unknown" for axis in axes))
     return (f"the files differ in the axis that is up ({', '.join(names)})",) if len(names) > 1 else ()
 

@@ -136,7 +136,7 @@ class Required:
 
     @property
     def requirement(self) -> str:
-        """Return what pip installs to meet the requirement."""
+        """Argument of pip that meets the requirement."""
         return self.source or (f"{self.name}>={self.least}" if self.least else self.name)
 
     @property

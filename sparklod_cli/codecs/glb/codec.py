@@ -61,7 +61,7 @@ DRAFT_COLORS, LINEAR_COLORS = "BT.709-sRGB", "lin_rec709_display"
 #: Most primitives of splats that nodes place. Chosen.
 MAX_PARTS = 1 << 14
 
-#: Places of an accessor that are looked at, and values at each, to tell logarithms from scales. Chosen.
+#: Places of an accessor that are sampled, and values at each, to tell logarithms from scales. Chosen.
 PLACES, PLACE_ROWS = 64, 1 << 10
 
 #: Number of a mesh, and of a primitive of it.
@@ -155,7 +155,7 @@ def _check_required(file: GltfFile) -> None:
 
 
 def _parts(file: GltfFile, primitives: Mapping[Key, dict[str, Any]]) -> tuple[list[PlacedPrimitive], list[str]]:
-    """Return where the primitives are, and notes on what is left out beside them."""
+    """Return the placed primitives, and notes on the rest of the file, which is left out."""
     nodes, by_mesh, notes = GltfNodes(file), dict[int, list[Key]](), list[str]()
     for key in primitives:
         by_mesh.setdefault(key[0], []).append(key)
@@ -190,7 +190,7 @@ def _parts(file: GltfFile, primitives: Mapping[Key, dict[str, Any]]) -> tuple[li
 
 
 def _opened(file: GltfFile, primitive: dict[str, Any], source: Source, generator: object, *, alone: bool) -> Content:
-    """Open a primitive, where its mesh has it; `alone` if it is read once, as all of the scene."""
+    """Open a primitive in the axes of its mesh; `alone` if it is the whole scene, so that its rows are read once."""
     extensions = _extensions(primitive)
     extension = extensions.get(EXTENSION, {})
     packed = _extensions(extension).get(COMPRESSION, extensions.get(OLD_COMPRESSION))
@@ -270,7 +270,7 @@ def _sampled(file: GltfFile, accessor: Accessor) -> FloatArray:
 
 
 def _reopened(opened: Callable[[], Content]) -> Content:
-    """Return a content that is opened anew where rows of it are read; all are decoded, and kept until the last."""
+    """Return a content that decodes all splats at the first read, and keeps them until the last row was read."""
     content, held = opened(), list[Splats]()
 
     def fill(target: Target, threads: int, progress: Progress) -> None:

@@ -60,10 +60,10 @@ MAX_STRIDE = 252
 
 @dataclass(frozen=True)
 class Buffer:
-    """Bytes that buffer views are of.
+    """Place of the bytes that buffer views divide.
 
     Attributes:
-        start, length: of them in the file.
+        start, length: position in the file, and number of bytes.
         name: of the file, from the folder of the JSON on; None for the file with the JSON.
         data: the bytes themselves, where the JSON has them.
     """
@@ -206,7 +206,7 @@ class GltfFile:
 
     @property
     def size(self) -> int:
-        """Bytes of the file, and of those that its buffers are in, as far as they have been needed."""
+        """Bytes of the file, and of the buffer files that were opened so far."""
         named = {each.name: each.length for each in self._buffers.values() if each.name is not None}
         return self._size + sum(named.values())
 
@@ -230,7 +230,7 @@ class GltfFile:
         return found[index]
 
     def names(self) -> Iterator[str]:
-        """Yield the files that its buffers are in, from its folder on."""
+        """Yield the paths of the files with its buffers, relative to its folder."""
         for buffer in self.items("buffers"):
             uri = buffer.get("uri")
             if isinstance(uri, str) and not uri.startswith("data:"):
@@ -326,7 +326,9 @@ class GltfFile:
                 f" {' or '.join(map(str, components))}"
             )
         if "sparse" in accessor or "bufferView" not in accessor:
-            raise UnsupportedError(f"accessor {index} is sparse, or has no buffer view; such ones are not read")
+            raise UnsupportedError(
+                f"accessor {index} is sparse, or has no buffer view; only values in a buffer view are read"
+            )
         dtype = np.dtype(COMPONENTS[component])
         buffer, offset, length, stride = self.view(accessor["bufferView"])
         count, inside = whole(accessor, "count"), whole(accessor, "byteOffset", 0)
@@ -347,12 +349,12 @@ class GltfFile:
 
 
 def _name_of(uri: str) -> str:
-    """Return the path that a relative address means, from the folder of the JSON on; it may lead out of that."""
+    """Return the path of a relative address, from the folder of the JSON on; it may leave that folder."""
     return posixpath.normpath(urllib.parse.unquote(uri)) if uri else uri
 
 
 def _unpacked(uri: bytes, index: int) -> bytes:
-    """Return the data of an address that has them: data:TYPE;base64,DATA."""
+    """Decode an address that holds data: data:TYPE;base64,DATA."""
     kind, _, text = uri.partition(b",")
     data = urllib.parse.unquote_to_bytes(text) if b"%" in text else text
     try:

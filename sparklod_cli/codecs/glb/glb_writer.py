@@ -34,7 +34,7 @@ PROPERTIES = {
 
 
 def profile_of(options: WriteOptions) -> str:
-    """Return the profile that is written, which nobody has to choose."""
+    """Return the profile that is written, `KHRONOS` unless an option names another."""
     return options.glb_profile or KHRONOS
 
 

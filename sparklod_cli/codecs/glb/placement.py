@@ -52,7 +52,7 @@ class GltfNodes:
         self._matrices: dict[int, Matrix] = {}
 
     def having(self, meshes: Collection[int]) -> tuple[list[int], int]:
-        """Return the nodes with one of some meshes that a viewer shows, in order, and the number of those not shown.
+        """Return the nodes with these meshes that a viewer shows, in order, and the number of hidden nodes.
 
         All are shown where the file has no scene, or one without any of them.
         """
@@ -81,7 +81,7 @@ class GltfNodes:
         return self._matrices[number]
 
     def _down_to(self, number: int, known: Container[int]) -> Iterator[int]:
-        """Yield the unknown ones of a node and those above it, the uppermost first."""
+        """Yield a node and its ancestors as far as they are not in `known`, from the top down."""
         line, at = dict[int, None](), number
         while at not in known:
             if at in line:

@@ -47,7 +47,7 @@ class LayoutLoss:
     @classmethod
     @np.errstate(over="ignore", invalid="ignore")  # of numbers near the end of float32
     def of(cls, splats: Splats) -> LayoutLoss:
-        """Sums of all splats among these that are valid, and whose losses are numbers."""
+        """Return the sums over the valid splats whose losses are finite."""
         splats = splats.take(
             np.flatnonzero(
                 ~np.logical_or.reduce([splats.scale.max(axis=1, initial=0) <= 0, *splats.invalid().values()])
@@ -69,7 +69,7 @@ class LayoutLoss:
 
     @classmethod
     def total(cls, parts: Iterable[LayoutLoss]) -> LayoutLoss:
-        """Sums over several parts."""
+        """Return the sums over several parts."""
         every = list(parts)
         return cls(*(sum(getattr(part, name) for part in every) for name in ("weight", "ext", "packed")))
 

@@ -46,7 +46,7 @@ Read = Callable[[int], bytes]
 #: Bytes that are read of any file at first: the headers of the file and of its first chunk, and what tells its sides.
 START = 30
 
-#: Chunks that are looked at before that of the pixels: a colour profile, alpha, and some that are unknown.
+#: Most chunks that are read before that of the pixels: a colour profile, alpha, and some that are unknown.
 MOST_BEFORE = 16
 
 #: Flag of a WebP file's extended header.
@@ -258,7 +258,7 @@ class SogFiles:
         file.seek(0)
         self._archive = ZipFolder(file) if zipped else None
         if self._archive is not None and self._archive.first != META:
-            raise NotSplatsError(f"a zip archive with {self._archive.first}, which a SOG has not")
+            raise NotSplatsError(f"a zip archive with {self._archive.first}, not a SOG")
         self._companion = open_companion
         data = (self._archive.open(META) if self._archive else file).read(MAX_META + 1)
         if len(data) > MAX_META:

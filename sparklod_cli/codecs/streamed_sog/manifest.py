@@ -112,7 +112,7 @@ class Manifest:
         return [*self.filenames, *([] if self.environment is None else [self.environment])]
 
     def read_names(self) -> list[str]:
-        """Return the files that readers of the scene open: `names` without those of which no run has splats."""
+        """Return the files that readers of the scene open: `names` without chunk files that no run has splats of."""
         read = {run.file for _, node in self.regions() for run in (node.runs or {}).values() if run.count}
         return [name for number, name in enumerate(self.names()) if number in read or number >= len(self.filenames)]
 

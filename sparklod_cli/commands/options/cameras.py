@@ -133,7 +133,7 @@ class Cameras:
 
     @property
     def take_up_of_files(self) -> bool:
-        """Whether cameras are upright by the axis that the splat files have up."""
+        """Whether the up axis of the cameras is that of the splat files."""
         return self.up is None and self.camera_path is None
 
     @property

@@ -101,8 +101,8 @@ def up_option(about: str = "", besides: str = "") -> Any:
     """Return the field of `--up` of cameras.
 
     Args:
-        about: sentence of the help on cameras that it is for.
-        besides: another default, of some files.
+        about: sentence of the help on the cameras that it applies to.
+        besides: phrase on another default, such as that of a camera format.
     """
     return option(
         f"Axis that is up, such as -y, or a direction x,y,z.{about}  [default: what the files or their formats say, or"

@@ -263,7 +263,7 @@ def check_scenes(ctx: click.Context, scenes: Scenes) -> None:
 
 
 def notes_on_loading(scenes: Scenes, network: Network) -> list[str]:
-    """Return a note where trees would be streamed that viewers load whole."""
+    """Return a note on trees that viewers load whole, if a network is simulated."""
     whole = dict.fromkeys(printable(loaded.name) for loaded in scenes.trees if not loaded.has_chunks)
     if network.instant or not whole:
         return []
