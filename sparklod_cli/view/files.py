@@ -18,7 +18,7 @@ from ..codecs.file_names import META
 from ..codecs.formats import head_of
 from ..codecs.glb.codec import open_content as open_glb
 from ..codecs.glb.glb_container import MAGIC as GLB_MAGIC
-from ..codecs.rad.rad_header import MAGIC, RadHeader, read_header
+from ..codecs.rad.rad_header import CHUNK_MAGIC, MAGIC, RadHeader, read_header
 from ..codecs.streamed_sog.manifest import MAX_MANIFEST, parse
 from ..codecs.streamed_sog.manifest_rules import files_of_chunk
 from ..codecs.tiles_3d.codec import names_of
@@ -199,7 +199,11 @@ def _chunk_files(path: Path, header: RadHeader) -> Iterator[tuple[str, Path]]:
         companion = companion_path(path, name)
         if not companion.is_file():
             raise FormatError(f"its chunk file {quoted_value(name)} is missing")
-        yield name, _inside(path, companion)
+        real = _inside(path, companion)
+        with open_plain(real) as file:
+            if file.read(len(CHUNK_MAGIC)) != CHUNK_MAGIC:
+                raise FormatError(f"{quoted_value(name)}, which it names, is no RAD chunk; nothing is published")
+        yield name, real
 
 
 def _manifest_files(path: Path) -> list[str]:

@@ -231,6 +231,13 @@ def test_a_missing_chunk_file_is_named(tmp_path: Path) -> None:
         shown_files([tmp_path / "rad" / CHUNKED.name])
 
 
+def test_a_chunk_file_that_is_no_chunk_is_not_published(tmp_path: Path) -> None:
+    shutil.copytree(CHUNKED.parent, tmp_path / "rad")
+    (tmp_path / "rad" / "sh3-1.radc").write_text("a secret")
+    with pytest.raises(FormatError, match=r"'sh3-1.radc', which it names, is no RAD chunk"):
+        shown_files([tmp_path / "rad" / CHUNKED.name])
+
+
 def test_a_chunk_file_that_is_a_link_to_elsewhere_is_refused(tmp_path: Path) -> None:
     shutil.copytree(CHUNKED.parent, tmp_path / "rad")
     chunk = tmp_path / "rad" / "sh3-1.radc"
