@@ -22,14 +22,14 @@ _Column = TypeVar("_Column", bound=NDArray[Any])
 
 
 def _unchanging(column: _Column) -> _Column:
-    """Return a column that nobody can write to, a copy where somebody could."""
-    part: Any = column
-    while isinstance(part, np.ndarray) and not part.flags.writeable:
-        part = part.base
-    if isinstance(part, (np.ndarray, memoryview, bytearray)):
-        column = column.copy()
-        column.flags.writeable = False
-    return column
+    """Return a column in memory that nobody can write to: a copy unless it is such a one.
+
+    Flags do not suffice: whoever owns a read-only array can make it writable again.
+    """
+    if isinstance(column.base, bytes):
+        return column
+    copied: Any = np.frombuffer(column.tobytes(), column.dtype)
+    return copied
 
 
 @dataclass(frozen=True)
@@ -47,6 +47,8 @@ class LodTree:
     def __post_init__(self) -> None:
         for name, dtype in (("child_count", np.uint16), ("child_start", np.uint32)):
             column = getattr(self, name)
+            if not isinstance(column, np.ndarray):
+                raise TypeError(f"{name} is a {type(column).__name__}; give an array of {np.dtype(dtype)}")
             if column.dtype != dtype or column.ndim != 1:
                 raise ValueError(
                     f"{name} is {column.dtype}{list(column.shape)}, expected {np.dtype(dtype)} of one dimension"
@@ -56,7 +58,7 @@ class LodTree:
         return len(self.child_count)
 
     def frozen(self) -> LodTree:
-        """Return this tree, or one with copies of the columns that somebody can write to.
+        """Return this tree with columns that nobody can write to: copies unless they are such columns already.
 
         Kernels follow the links without looking where they lead: a tree must not change after `validate`.
         """

@@ -6,6 +6,7 @@ a file holds its scales: what it takes to know the numbers that another reader h
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -70,8 +71,8 @@ class Scene:
     """Splats, and what a file says of them all.
 
     The columns of splats become read-only views, so that a scene cannot change after it was drawn. Arrays that were
-    passed in keep their flags; what is drawn after a write to one of them is undefined. The columns of the tree are
-    copied if they can be written to, so that a tree which was valid stays valid.
+    passed in keep their flags; what is drawn after a write to one of them is undefined. The columns of the tree, a
+    tenth of its bytes at most, are copied, so that a tree which was valid stays valid.
 
     Attributes:
         splats: N splats, in the order and the axes of the file.
@@ -164,6 +165,10 @@ class Scene:
             raise InvalidSplatsError(describe_invalid(invalid))
         return cls(splats, antialiased=antialiased, up=up)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        columns = {each.name: getattr(self, each.name) for each in dataclasses.fields(self)}
+        return functools.partial(type(self), **columns), ()  # copies are read-only, too
+
     def __len__(self) -> int:
         return len(self.splats)
 
@@ -187,6 +192,7 @@ class Tree(Scene):
     def _facts(self) -> list[str]:
         nodes, leaves = len(self.splats), int(np.count_nonzero(self.tree.is_leaf))
         try:
+            self.check_tree()
             depth = f"depth {self.tree.depths().max()}"
         except TreeError as error:
             depth = f"broken: {error}"
