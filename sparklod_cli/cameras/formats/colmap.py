@@ -183,14 +183,16 @@ def _text_image(line: str, way: str) -> Image:
 def _is_points(line: str) -> bool:
     """Return whether a line has the points of an image: x, y and a whole number each. Its first four are judged.
 
-    A line of an image has a name; if that is a number, it has 10 words, which is no multiple of 3.
+    A line of an image with a name of one number has 10 words, which is no multiple of 3. One with a name such as
+    "2024 10 3" begins with a rotation.
     """
     words = line.split(maxsplit=4 * POINT_WORDS)[: 4 * POINT_WORDS]
     try:
         numbers = [float(word) for word in words]
     except ValueError:
         return False
-    return len(words) % POINT_WORDS == 0 and all(number.is_integer() for number in numbers[2::POINT_WORDS])
+    of_points = len(words) % POINT_WORDS == 0 and all(number.is_integer() for number in numbers[2::POINT_WORDS])
+    return of_points and not _begins_with_rotation(line)
 
 
 def _text_cameras(data: bytes) -> Cameras:

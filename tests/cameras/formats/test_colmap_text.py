@@ -62,7 +62,7 @@ def test_every_image_is_read_whatever_lines_of_points_follow(layout: str, head: 
 
 
 @pytest.mark.parametrize("between", ["\n", "\n\n", f"\n{POINTS}\n"])
-@pytest.mark.parametrize("name", ["7", "0012", "3.5", "a b.jpg", "1 2.jpg", "-1"])
+@pytest.mark.parametrize("name", ["7", "0012", "3.5", "a b.jpg", "1 2.jpg", "-1", "2024 10 3"])
 def test_a_name_may_be_a_number_or_have_blanks(name: str, between: str) -> None:
     assert names("".join(image(number, name) + between for number in range(4))) == [name] * 4
 
