@@ -159,7 +159,7 @@ class Meta:
             self.root = parse_json(data)
         except ValueError as error:
             raise FormatError(f"{META} is not JSON: {error}") from None
-        if not isinstance(self.root, dict):
+        if not isinstance(self.root, dict) or self.root.keys().isdisjoint(("means", "quats")):
             raise NotSplatsError(f"its {META} is not that of a SOG")
 
     def has(self, key: str) -> bool:

@@ -323,6 +323,7 @@ REFUSED: dict[str, tuple[Callable[[], Files], str]] = {
     ),
     "no JSON": (lambda: FILES | {"meta.json": b"{'version': 2}"}, "meta.json is not JSON"),
     "a list": (lambda: FILES | {"meta.json": b"[2]"}, "meta.json is not that of a SOG"),
+    "another object": (lambda: FILES | {"meta.json": b'{"version": 2}'}, "meta.json is not that of a SOG"),
     "bytes that are no text": (lambda: FILES | {"meta.json": b'{"version": "\xff"}'}, "meta.json is not JSON"),
 }
 

@@ -188,7 +188,10 @@ REFUSED: dict[str, tuple[Callable[[Any], object], str]] = {
     "too few": (lambda meta: meta["tree"]["children"][1]["children"][1]["lods"]["0"].update(count=14), "14"),
     "no such chunk": (lambda meta: meta["filenames"].__setitem__(0, "9_0/meta.json"), "there is no '9_0/meta.json'"),
     "twice": (lambda meta: meta["filenames"].__setitem__(1, "0_0/meta.json"), "names '0_0/meta.json' twice"),
-    "not a SOG": (lambda meta: meta["filenames"].__setitem__(0, "lod-meta.json"), "'lod-meta.json': meta.json has no"),
+    "not a SOG": (
+        lambda meta: meta["filenames"].__setitem__(0, "lod-meta.json"),
+        "'lod-meta.json': its meta.json is not that of a SOG",
+    ),
     "an image": (lambda meta: meta["filenames"].__setitem__(0, "0_0/sh0.webp"), r"'0_0/sh0.webp': meta\.json is not"),
     "no splats": (
         lambda meta: meta.update(tree={"bound": meta["tree"]["bound"], "lods": {}}),
