@@ -39,7 +39,7 @@ class Format:
             `encoder.Encoder`, and `stored(file)`, with `open_companion` where it has companions, the `encoder.Stored`
             of a file.
         suffixes: lower case, with the dot.
-        beginning: a regular expression that the first bytes of its files match; None if there is none.
+        beginning: a regular expression that the first bytes of its files match; None for formats without one.
         keys: that its files have at the top level, which are JSON objects; empty if they are not. Without `beginning`
             and `keys`, any bytes are possible, so that only the suffix decides.
         companions: its files refer to others beside them, which the `open_companion` of a source opens.

@@ -133,9 +133,8 @@ def _draw(ctx: click.Context, options: RenderOptions) -> None:
 
         def ready(path: CameraPath, scenes: Scenes) -> None:
             check_scenes(ctx, scenes)
-            axes = scenes.axis_notes if options.cameras.take_up_of_files else ()
             loading = notes_on_loading(scenes, options.streaming.streaming.network)
-            for note in (*path.notes, *scenes.notes, *axes, *loading):
+            for note in (*path.notes, *scenes.notes, *options.cameras.axis_notes(scenes), *loading):
                 console.say(note)
             console.detail(f"  read in {time.perf_counter() - start:.2f} s")
 

@@ -42,7 +42,7 @@ def compare(ctx: click.Context, options: RenderOptions) -> int:
         start = time.perf_counter()
 
         def ready(path: CameraPath, scenes: Scenes) -> None:
-            for note in (*path.notes, *(scenes.axis_notes if options.cameras.take_up_of_files else ())):
+            for note in (*path.notes, *options.cameras.axis_notes(scenes)):
                 console.say(note)
             check_scenes(ctx, scenes)
 

@@ -194,8 +194,8 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
 
         def ready(path: CameraPath, scenes: Scenes) -> None:
             check_scenes(ctx, scenes)
-            axes = scenes.axis_notes if options.cameras.take_up_of_files else ()
-            for note in (*path.notes, *axes, *notes_on_loading(scenes, options.streaming.network)):
+            loading = notes_on_loading(scenes, options.streaming.network)
+            for note in (*path.notes, *options.cameras.axis_notes(scenes), *loading):
                 console.say(note)
             keep_apart(ctx, {**besides, "indices_out": outputs.index_files(path.numbers, len(instances))})
 

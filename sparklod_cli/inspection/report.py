@@ -9,14 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from ..codecs.ply import FILTERED
-from ..codecs.sog.codec import LOSSY
+from ..codecs.sog.codec import code_of
 from ..codecs.spz_streams import KNOWN_FLAGS
 from ..codecs.tiles_3d.codec import NOT_PLACED
 from ..io import opened, read_arrays, read_scene, size_of_input
 from ..io.rad_file import FORMAT as RAD
 from ..io.rad_file import RadFile
 from ..model.scene import Scene
-from ..model.sh import COEFFICIENTS
+from ..model.sh import width_of
 from ..model.splats import COLUMNS
 from ..support.errors import FormatError, SparklodError
 from ..support.printable import printable
@@ -271,7 +271,7 @@ def _report(path: Path, head: Head | None, surveyed: HeaderScan | None) -> Repor
     """Return the report that headers alone give."""
     assert head is not None
     size, count = head.bytes, head.splats
-    decoded = 4 * count * (14 + 3 * COEFFICIENTS[head.sh_degree])
+    decoded = 4 * count * width_of(head.sh_degree)
     return Report(
         str(path),
         **dataclasses.asdict(head),
@@ -283,11 +283,7 @@ def _report(path: Path, head: Head | None, surveyed: HeaderScan | None) -> Repor
 
 def _container_findings(scene: Scene) -> list[Finding]:
     header = scene.header
-    findings = [
-        Finding("container.lossy" if note.startswith(LOSSY) else "container.left-out", note)
-        for note in scene.notes
-        if note not in (FILTERED, NOT_PLACED)
-    ]
+    findings = [Finding(code_of(note), note) for note in scene.notes if note not in (FILTERED, NOT_PLACED)]
     unknown = header.get("flags", 0) & ~KNOWN_FLAGS
     if unknown:
         findings.append(Finding("container.flags", f"the header sets flags {unknown:#04x}, which have no meaning"))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,21 +15,8 @@ from .splats import FloatArray, Splats
 #: The most children of a node: child counts are uint16 in Spark's nodes and in SPZ files.
 MAX_CHILDREN = 65535
 
-#: Attributes of a tree that cannot change, and of one of these that is valid.
-_FROZEN, _VALID = "_frozen", "_valid"
-
-_Column = TypeVar("_Column", bound=NDArray[Any])
-
-
-def _unchanging(column: _Column) -> _Column:
-    """Return a column in memory that nobody can write to: a copy unless it is such a one.
-
-    Flags do not suffice: whoever owns a read-only array can make it writable again.
-    """
-    if isinstance(column.base, bytes):
-        return column
-    copied: Any = np.frombuffer(column.tobytes(), column.dtype)
-    return copied
+#: Attribute of a tree that is valid and cannot change.
+_VALID = "_valid"
 
 
 @dataclass(frozen=True)
@@ -62,11 +49,15 @@ class LodTree:
 
         Kernels follow the links without looking where they lead: a tree must not change after `validate`.
         """
-        if _FROZEN in self.__dict__:
+        if self._is_frozen:
             return self
-        tree = LodTree(_unchanging(self.child_count), _unchanging(self.child_start))
-        tree.__dict__[_FROZEN] = True
-        return tree
+        count, start = self.child_count, self.child_start
+        return LodTree(np.frombuffer(count.tobytes(), np.uint16), np.frombuffer(start.tobytes(), np.uint32))
+
+    @property
+    def _is_frozen(self) -> bool:
+        """Whether both columns are in immutable memory: the owner of a read-only array can make it writable again."""
+        return all(isinstance(column.base, bytes) for column in (self.child_count, self.child_start))
 
     def __reduce__(self) -> tuple[type[LodTree], tuple[Any, ...]]:
         return LodTree, (self.child_count, self.child_start)  # a copy can be written to, and is validated again
@@ -131,7 +122,7 @@ class LodTree:
         )
         if expected[-1] != len(self):
             raise TreeError(f"node {expected[-1]} has no parent")
-        if _FROZEN in self.__dict__:
+        if self._is_frozen:
             self.__dict__[_VALID] = True
 
     @staticmethod

@@ -26,6 +26,11 @@ SH_C3 = (
 COEFFICIENTS = (0, 3, 8, 15, 24)
 
 
+def width_of(sh_degree: int) -> int:
+    """Return the numbers of a splat: 14 of its centre, scale, rotation, opacity and colour, and those of SH."""
+    return 14 + 3 * COEFFICIENTS[sh_degree]
+
+
 def degree_of(coefficients: int) -> int:
     """Return the degree with this many coefficients per channel above the constant term.
 

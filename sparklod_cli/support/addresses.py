@@ -56,7 +56,7 @@ class Address:
 
     @property
     def scheme(self) -> str:
-        """The one that names its service; of a chained address (simplecache::https://) the last."""
+        """Scheme that names the service; the last scheme of a chained address (simplecache::https://)."""
         return self.url.split("://", 1)[0].rpartition("::")[2].lower()
 
     @property

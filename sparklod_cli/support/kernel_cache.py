@@ -1,6 +1,6 @@
 """The cache of compiled kernels, which survives damage, full disks and races between processes.
 
-Its files are pickles: whoever writes one runs code as its reader. See `is_trusted` for those that are read.
+Its files are pickles: the writer of a file runs code as its reader. `is_trusted` decides which files are read.
 """
 
 from __future__ import annotations
@@ -217,7 +217,7 @@ class KernelCache:
         """Return the name of the file for a signature, which is a tuple of numba's types."""
         return f"{start_of(self._function)}-{_digest(str(signature))}{SUFFIX}"
 
-    def _content(self, signature: Any) -> tuple[Path, bytes] | None:
+    def _found(self, signature: Any) -> tuple[Path, bytes] | None:
         """Return the first file for a signature that can be read and trusted, and its content."""
         name = self.name(signature)
         for folder in (*([] if self._folder is None else [self._folder]), *self._read):
@@ -237,7 +237,7 @@ class KernelCache:
 
         from .errors import out_of_memory  # here, so that no kernel depends on its source
 
-        found = self._content(signature)
+        found = self._found(signature)
         if found is None:
             return None
         path, content = found
@@ -272,5 +272,5 @@ class KernelCache:
 
     def is_cached(self, signature: Any) -> bool:
         """Return True if there is a whole file for a signature."""
-        found = self._content(signature)
+        found = self._found(signature)
         return found is not None and is_whole(found[1])

@@ -26,7 +26,7 @@ def count_of(count: int, noun: str, plural: str | None = None) -> str:
 
 
 def percent_of(share: float, digits: int = 3) -> str:
-    """Return a share as "12.3 %" with so many significant digits, never with an exponent."""
+    """Return a share as a percentage, "12.3 %", without an exponent; `digits` are significant."""
     text = f"{float(f'{100 * share:.{digits}g}'):,.9f}"
     return f"{text.rstrip('0').rstrip('.')} %"
 

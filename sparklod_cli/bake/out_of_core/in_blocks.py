@@ -17,6 +17,7 @@ from ...codecs.statistics import Statistics
 from ...lod.builders import BUILDERS
 from ...lod.stage_records import NO_FAMILY, Pending
 from ...model.selection import SelectionTally
+from ...model.sh import width_of
 from ...model.splats import Splats
 from ...support.parallel import blocks_of
 from ...support.progress import Progress
@@ -25,7 +26,7 @@ from ..output import BakeOutput
 from ..records import BuiltTree, Clock
 from .blocks import BuildStage, cut_into_blocks
 from .job import ORDER, PUBLISHED, ROOT, Job, clean_of, encoded_of, families_of, pending_of, stage_of
-from .nodes import Rows, encode, encoded_chunk, node_stream, rows_of, splats_of, width_of
+from .nodes import Rows, encode, encoded_chunk, node_stream, rows_of, splats_of
 from .order import WINDOW_NODES, put_order
 from .reading import Findings, check_findings, first_look, parts_of, scatter
 from .tasks import Engine, Task

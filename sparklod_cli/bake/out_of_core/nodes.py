@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ...codecs.encoder import windows_of
 from ...codecs.validation import check_valid
 from ...model.lod_tree import LodTree
-from ...model.sh import COEFFICIENTS, degree_of
+from ...model.sh import degree_of, width_of
 from ...model.splats import COLUMNS, Splats
 from ...model.streams import NodeStream
 from ...support.parallel import for_blocks, ordered_map
@@ -22,11 +22,6 @@ from .store import Store
 
 #: (N, `width_of`) float32: centre, scale, rotation, opacity, rgb and SH of a splat, in the order of `COLUMNS`.
 Rows = NDArray[np.float32]
-
-
-def width_of(sh_degree: int) -> int:
-    """Return numbers of a row."""
-    return 14 + 3 * COEFFICIENTS[sh_degree]
 
 
 def rows_of(splats: Splats, threads: int = 1) -> Rows:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ...codecs.statistics import Statistics
 from ...lod.check import Bounds, check_visible
 from ...model.selection import REASONS, SelectionTally
+from ...model.sh import width_of
 from ...model.splats import FloatArray, Splats
 from ...model.streams import SceneStream
 from ...support.parallel import blocks_of
@@ -19,7 +20,7 @@ from ...support.threads import on_threads
 from ..selecting import check_transformed, select, transform
 from ..settings import BakeSettings
 from .job import Job
-from .nodes import Rows, fill_rows, rows_of, splats_of, width_of
+from .nodes import Rows, fill_rows, rows_of, splats_of
 from .store import Arrays
 
 #: Splats of a part, unless blocks are smaller, and the most parts: their splats of all blocks are pieces of files, of

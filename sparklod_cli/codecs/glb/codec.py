@@ -18,7 +18,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from ...model.sh import COEFFICIENTS
+from ...model.sh import width_of
 from ...model.splats import FloatArray, Splats
 from ...model.transforms import Transform
 from ...support.errors import FormatError, NotSplatsError, UnsupportedError
@@ -111,10 +111,10 @@ def open_content(source: Source) -> Content:
             alone = len(parts) == 1
             opened[part.key] = _opened(file, primitives[part.key], source, asset.get("generator"), alone=alone)
         contents.append(placed(opened[part.key], part.transform))
-        total += contents[-1].count * 4 * (14 + 3 * COEFFICIENTS[contents[-1].sh_degree])
+        total += contents[-1].count * 4 * width_of(contents[-1].sh_degree)
         check_promise(total, file.size)
     content = contents[0] if len(contents) == 1 else _joined(contents)
-    check_promise(content.count * 4 * (14 + 3 * COEFFICIENTS[content.sh_degree]), file.size)
+    check_promise(content.count * 4 * width_of(content.sh_degree), file.size)
     return dataclasses.replace(
         content,
         format=("GLB" if file.is_binary else "glTF") + f" {content.format}" * bool(content.format),
@@ -142,7 +142,7 @@ def _primitives(file: GltfFile) -> dict[Key, dict[str, Any]]:
 
 
 def _extensions(record: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Return the extensions of an object of the JSON; without those that are no objects."""
+    """Return the extensions of an object of the JSON whose values are objects, too."""
     found = record.get("extensions")
     return {name: each for name, each in found.items() if isinstance(each, dict)} if isinstance(found, dict) else {}
 

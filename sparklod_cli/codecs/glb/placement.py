@@ -81,7 +81,7 @@ class GltfNodes:
         return self._matrices[number]
 
     def _down_to(self, number: int, known: Container[int]) -> Iterator[int]:
-        """Yield a node and its ancestors as far as they are not in `known`, from the top down."""
+        """Yield a node and its ancestors that are not in `known`, from the top down."""
         line, at = dict[int, None](), number
         while at not in known:
             if at in line:

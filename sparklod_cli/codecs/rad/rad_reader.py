@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ...model.lod_tree import LodTree
 from ...model.scene import FileCoding, ScaleCoding
-from ...model.sh import COEFFICIENTS
+from ...model.sh import COEFFICIENTS, width_of
 from ...model.splats import COLUMNS, FloatArray, Splats
 from ...support.defaults import MAX_SH_DEGREE
 from ...support.errors import FormatError, TruncatedError
@@ -360,7 +360,7 @@ def scan_chunks(
 
 def decoded_bytes(header: RadHeader) -> int:
     """Return the bytes of all columns of splats in memory."""
-    return header.count * 4 * (14 + 3 * COEFFICIENTS[header.max_sh])
+    return header.count * 4 * width_of(header.max_sh)
 
 
 def _new_rows(count: int, header: RadHeader) -> tuple[Splats, LodTree | None]:

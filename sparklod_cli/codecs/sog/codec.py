@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...model.sh import COEFFICIENTS
+from ...model.sh import COEFFICIENTS, width_of
 from ...model.splats import FloatArray, Splats
 from ...support.errors import FormatError, VersionError
 from ...support.parallel import for_blocks, ordered_map
@@ -59,6 +59,11 @@ class Step:
     fill: Callable[[Splats, Pixels], str | None]
 
 
+def code_of(note: str) -> str:
+    """Return the kind of the finding that a note on a scene is."""
+    return "container.lossy" if note.startswith(LOSSY) else "container.left-out"
+
+
 def open_content(source: Source) -> Content:
     """Open a .sog archive, or the meta.json of an unpacked one. With `scratch`, the images are unpacked to that.
 
@@ -77,7 +82,7 @@ def open_content(source: Source) -> Content:
         raise FormatError(f"{count:,} splats, but a SOG holds 1 to {MAX_SPLATS:,}")
     palette = SogPalette(files, version) if meta.has("shN") else None
     degree = COEFFICIENTS.index(palette.coefficients) if palette is not None else 0
-    check_promise(count * 4 * (14 + 3 * COEFFICIENTS[degree]), files.size)
+    check_promise(count * 4 * width_of(degree), files.size)
     steps = _steps(meta, version, palette)
     lossy = ", ".join(map(quoted_value, files.lossy()))
     losses = (f"{LOSSY} ({lossy}), so that values are not those written; encode them without losses",) if lossy else ()

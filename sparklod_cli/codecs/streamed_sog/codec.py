@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...model.scene import Bounds, Counts, DetailScene, facts_of
-from ...model.sh import COEFFICIENTS
+from ...model.sh import width_of
 from ...support.errors import FormatError
 from ...support.progress import Progress, silent
 from ...support.units import count_of
@@ -151,7 +151,7 @@ def _open(source: Source, *, full_detail: bool) -> tuple[RegionLayout, Content]:
         chunks.append(beside.open(manifest.environment, row=sum(chunk.rows for chunk in chunks)))
     count, degree = sum(chunk.rows for chunk in chunks), max(chunk.sh_degree for chunk in chunks)
     size += sum(chunk.bytes for chunk in chunks)
-    check_promise(count * 4 * (14 + 3 * COEFFICIENTS[degree]), size)
+    check_promise(count * 4 * width_of(degree), size)
     regions, levels = layout.counts.shape
     header = {"version": VERSION, "levels": levels, "regions": regions, "bytes": size}
     antialiased, note = any(chunk.antialiased for chunk in chunks), manifest.noted

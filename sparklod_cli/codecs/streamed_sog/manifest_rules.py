@@ -115,8 +115,7 @@ def file_violations(manifest: Manifest, files: Mapping[str, Chunk | str]) -> Ite
 def _about(file: Chunk) -> Iterator[RuleViolation]:
     """Yield the notes on a chunk file as violations."""
     for note in file.notes:
-        code = "container.lossy" if note.startswith(sog.LOSSY) else "container.left-out"
-        yield RuleViolation(code, f"{quoted_value(file.name)}: {note}", fatal=False)
+        yield RuleViolation(sog.code_of(note), f"{quoted_value(file.name)}: {note}", fatal=False)
 
 
 def _kind_of(file: Chunk) -> str:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ...model.axes import common
 from ...model.scene import facts_of
-from ...model.sh import COEFFICIENTS
+from ...model.sh import width_of
 from ...model.tile_scene import TileScene
 from ...support.errors import FormatError
 from ...support.progress import Progress, silent
@@ -154,7 +154,7 @@ def _open(source: Source, tileset: Tileset, wanted: Sequence[int]) -> tuple[Cont
         chunks.append(beside.open(name, row=row))
         row += chunks[-1].rows
     degree, size = max(chunk.sh_degree for chunk in chunks), tileset.bytes + sum(chunk.bytes for chunk in chunks)
-    check_promise(row * 4 * (14 + 3 * COEFFICIENTS[degree]), size)
+    check_promise(row * 4 * width_of(degree), size)
     notes = tuple(dict.fromkeys(note for chunk in chunks for note in chunk.notes))
     if not np.array_equal(_root_transform(tileset), np.eye(4)):
         notes += (NOT_PLACED,)

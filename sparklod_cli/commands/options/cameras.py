@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from ...cameras.camera import Matrix
     from ...cameras.frame import Settings
     from ...cameras.sources import CameraSource
+    from ...scenes.loaded import Scenes
 
 #: The options that are each a source of cameras, of which one can be given.
 SOURCES = ("camera_path", "orbit", "dolly", "look_at", "keyframes", "views")
@@ -131,10 +132,9 @@ class Cameras:
         """The source of cameras: one of `SOURCES`, or `AROUND`."""
         return next((name for name in SOURCES if getattr(self, name, None)), AROUND)
 
-    @property
-    def take_up_of_files(self) -> bool:
-        """Whether the up axis of the cameras is that of the splat files."""
-        return self.up is None and self.camera_path is None
+    def axis_notes(self, scenes: Scenes) -> list[str]:
+        """Return the notes on the axes of splat files, if cameras are upright by these."""
+        return scenes.axis_notes if self.up is None and self.camera_path is None else []
 
     @property
     def all_views(self) -> tuple[Any, ...]:
