@@ -24,7 +24,7 @@ from sparklod_cli.render.backends import BACKENDS
 from sparklod_cli.render.rasterizer import Image
 from sparklod_cli.render.settings import RasterSettings
 from sparklod_cli.render.shading import ShadedSplats, shade
-from sparklod_cli.support.errors import SparklodError
+from sparklod_cli.system.errors import SparklodError
 
 HEADINGS = (
     "scene",

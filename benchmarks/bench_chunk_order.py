@@ -33,7 +33,7 @@ from sparklod_cli.scenes.reading import read_scenes
 from sparklod_cli.simulation.loading import chunks_of
 from sparklod_cli.simulation.streaming import ChunkStream
 from sparklod_cli.simulation.streaming_settings import Network
-from sparklod_cli.support.threads import processors
+from sparklod_cli.system.threads import processors
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from tests.references.chunk_orders import reordered, size_order, spark_order

@@ -17,7 +17,7 @@ from performance.rows import Row, Table, figure, label, ratio
 
 from sparklod_cli.render import gradients
 from sparklod_cli.render.settings import RasterSettings
-from sparklod_cli.support.threads import on_threads
+from sparklod_cli.system.threads import on_threads
 
 TABLE = Table(
     columns=(

@@ -26,7 +26,7 @@ from sparklod_cli.model.scene import DetailScene
 from sparklod_cli.render import rasterizer
 from sparklod_cli.render.settings import RasterSettings
 from sparklod_cli.render.shading import shade
-from sparklod_cli.support.progress import silent
+from sparklod_cli.system.progress import silent
 
 SHARES = (0.5, 0.25, 0.12, 0.06)
 BUDGETS = (0.1, 0.2, 0.4)

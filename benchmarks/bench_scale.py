@@ -25,7 +25,7 @@ from scenes import load
 
 from sparklod_cli import Splats
 from sparklod_cli.lod.builders import METHODS
-from sparklod_cli.support.units import parse_size
+from sparklod_cli.system.units import parse_size
 
 HERE = Path(__file__).resolve().parent
 

@@ -83,7 +83,7 @@ def bake(arguments: list[str]) -> None:
     meter = Meter()
     from sparklod_cli.bake.records import Clock
     from sparklod_cli.cli import main
-    from sparklod_cli.support.jit import Kernel
+    from sparklod_cli.system.jit import Kernel
 
     called, ended = Kernel.__call__, Clock.end
 

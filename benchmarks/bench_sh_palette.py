@@ -17,7 +17,7 @@ from performance.machine import machine
 
 import sparklod_cli as sparklod
 from sparklod_cli.codecs.sh_palette import cluster, visible_weight
-from sparklod_cli.support.threads import processors
+from sparklod_cli.system.threads import processors
 
 Rows = NDArray[np.float32]
 

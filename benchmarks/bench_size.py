@@ -22,7 +22,7 @@ from sparklod_cli.codecs.spz import WAYS
 from sparklod_cli.lod.builders import METHODS
 from sparklod_cli.lod.chunk_order import arrange
 from sparklod_cli.model.scene import Scene
-from sparklod_cli.support.progress import silent
+from sparklod_cli.system.progress import silent
 
 #: Streams of SPZ in file order; some scenes have no SH, and plain files no children.
 STREAMS = ("positions", "alphas", "colors", "scales", "rotations", "sh", "child_counts", "child_starts")

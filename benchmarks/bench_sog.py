@@ -20,7 +20,7 @@ from scenes import load, write_ply
 
 import sparklod_cli as sparklod
 from sparklod_cli.model import morton
-from sparklod_cli.support.threads import processors
+from sparklod_cli.system.threads import processors
 
 HEADINGS = ("scene", "splats", "SH", "writer", "seconds", "MB", "size", "SH RMSE", "PSNR", "lowest PSNR")
 

@@ -128,7 +128,7 @@ def _refined(source: Source) -> sparklod.Tree:
     """Return a tree of our quality builder whose merged splats are fitted to pictures of the scene."""
     from sparklod_cli.fitting.fit import fit
     from sparklod_cli.fitting.settings import FitSettings
-    from sparklod_cli.support.threads import processors
+    from sparklod_cli.system.threads import processors
 
     tree = sparklod.build_lod(source.drawn, method="quality", growth=source.growth)
     settings = FitSettings(source.steps)

@@ -18,7 +18,7 @@ from typing import BinaryIO
 
 from sparklod_cli.codecs.content import decode_file
 from sparklod_cli.codecs.formats import FORMATS, HEAD, sniff
-from sparklod_cli.support.errors import FormatError, SparklodError
+from sparklod_cli.system.errors import FormatError, SparklodError
 
 from .containers import seeds, split_file, valid_seeds
 

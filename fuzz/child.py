@@ -98,6 +98,8 @@ class Child:
         log = os.open(self._log, os.O_RDWR | os.O_CREAT | os.O_TRUNC)
         home = str(self.scratch / "home")
         environment = {**os.environ, "PYTHONPATH": str(ROOT), "HOME": home, "XDG_CACHE_HOME": _cache()}
+        for variable in ("ZDOTDIR", "XDG_CONFIG_HOME"):  # folders with the settings of a shell, outside of that home
+            environment.pop(variable, None)
         environment |= {
             "MPLBACKEND": "agg",
             "MPLCONFIGDIR": str(self.scratch / "matplotlib"),

@@ -11,7 +11,7 @@ from typing import Any
 import click
 
 from sparklod_cli import cli
-from sparklod_cli.support.errors import SparklodError
+from sparklod_cli.system.errors import SparklodError
 
 from .case import LawError
 from .oracle import innermost_frame, stderr_fault

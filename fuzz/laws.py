@@ -17,7 +17,7 @@ from sparklod_cli.model.scene import DetailScene, Scene
 from sparklod_cli.model.selection import Selection
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.model.streams import collected
-from sparklod_cli.support.errors import FormatError, HasTreeError, InvalidSplatsError
+from sparklod_cli.system.errors import FormatError, HasTreeError, InvalidSplatsError
 
 from .case import LawError
 from .oracle import stderr_fault

@@ -28,6 +28,9 @@ ADDRESS_SPACE = 4 << 30
 #: The line that the worker writes before it reads requests: Python, numpy and sparklod are loaded.
 READY = "ready"
 
+#: Files and folders of the home folder that `completion --install` may write.
+SETTINGS = (".bashrc", ".zshrc", ".config")
+
 #: Packages that cases cannot import: they take seconds to load and call into graphics drivers.
 BLOCKED = ("pyvista", "open3d")
 
@@ -52,9 +55,8 @@ def main() -> None:
 
     STREAMS.redirect()
     caches = [Path(os.environ["XDG_CACHE_HOME"]) / "sparklod", Path(os.environ.get("NUMBA_CACHE_DIR") or temporary)]
-    watch = WriteWatch(
-        [temporary, given.scratch / "matplotlib", given.scratch / "home", Path("/dev"), Path("/proc"), *caches]
-    )
+    settings = [given.scratch / "home" / name for name in SETTINGS]
+    watch = WriteWatch([temporary, given.scratch / "matplotlib", Path("/dev"), Path("/proc"), *settings, *caches])
     limited = False
     with os.fdopen(given.requests) as requests, os.fdopen(given.results, "w") as results:
         results.write(f"{READY}\n")

@@ -62,10 +62,10 @@ if TYPE_CHECKING:  # mypy then resolves the modules first, which import this one
     from .scenes.loaded import Cut as Cut
     from .simulation.streaming_settings import Network as Network
     from .simulation.streaming_settings import StreamingSettings as StreamingSettings
-    from .support.errors import CameraPathError as CameraPathError
-    from .support.errors import FormatError as FormatError
-    from .support.errors import InvalidSplatsError as InvalidSplatsError
-    from .support.errors import OutOfMemoryError as OutOfMemoryError
-    from .support.errors import OutputError as OutputError
-    from .support.errors import SparklodError as SparklodError
-    from .support.errors import TreeError as TreeError
+    from .system.errors import CameraPathError as CameraPathError
+    from .system.errors import FormatError as FormatError
+    from .system.errors import InvalidSplatsError as InvalidSplatsError
+    from .system.errors import OutOfMemoryError as OutOfMemoryError
+    from .system.errors import OutputError as OutputError
+    from .system.errors import SparklodError as SparklodError
+    from .system.errors import TreeError as TreeError

@@ -11,9 +11,9 @@ import click
 from . import __version__
 from .commands.command import Group
 from .commands.console import Verbosity, say, say_error, say_usage_error
-from .support import interrupts, stdout
-from .support.errors import SparklodError, out_of_memory
-from .support.printable import printable
+from .system import interrupts, stdout
+from .system.errors import SparklodError, out_of_memory
+from .system.printable import printable
 
 #: Characters that are quoted of an error that nobody foresaw.
 QUOTED = 200

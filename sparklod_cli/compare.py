@@ -25,10 +25,10 @@ from .render.renderer import Renderer
 from .render.settings import RenderSettings
 from .scenes.finder import CutFinder
 from .scenes.loaded import Scenes
-from .support.errors import SparklodError
-from .support.parallel import ordered_map
-from .support.progress import Progress, silent
-from .support.threads import on_threads
+from .system.errors import SparklodError
+from .system.parallel import ordered_map
+from .system.progress import Progress, silent
+from .system.threads import on_threads
 from .tables.columns import Row
 from .tables.comparison import COLUMNS
 from .tables.statistics import numbers

@@ -7,9 +7,9 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from .codecs.file_names import RAD_SUFFIX
-from .support import jit
-from .support.errors import SparklodError
-from .support.threads import processors
+from .system import jit
+from .system.errors import SparklodError
+from .system.threads import processors
 from .warmup import CompilingProcess, Unit
 
 if TYPE_CHECKING:

@@ -20,10 +20,10 @@ from pathlib import Path
 from typing import Literal
 
 from . import __version__
-from .support import machine
-from .support.optional import DISTRIBUTION, install_hint, pip_install, required_by
-from .support.python_process import program_command
-from .support.threads import processors
+from .system import machine
+from .system.optional import DISTRIBUTION, install_hint, pip_install, required_by
+from .system.python_process import program_command
+from .system.threads import processors
 
 #: ok: works. note: something optional is missing, or could be better. problem: baking does not work.
 State = Literal["ok", "note", "problem"]
@@ -144,7 +144,7 @@ def _print_kernels() -> None:
     """Load all that a bake takes, and print what there is of kernels, as JSON."""
     from . import warmup
     from .bake.flow import bake  # noqa: F401
-    from .support import jit
+    from .system import jit
 
     jit.load_numba()
     folder = jit.CACHE_FOLDER or next(iter(jit.READ_FOLDERS), None)

@@ -15,9 +15,9 @@ from .codecs.spz import like
 from .codecs.validation import check_scene
 from .io import read_scene, scene_sink
 from .model.scene import Scene
-from .support.addresses import Place
-from .support.errors import FormatError, memory_errors_translated
-from .support.progress import Progress, silent
+from .system.addresses import Place
+from .system.errors import FormatError, memory_errors_translated
+from .system.progress import Progress, silent
 
 
 @dataclass(frozen=True, kw_only=True)

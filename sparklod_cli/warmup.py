@@ -14,11 +14,11 @@ from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from .support import jit
-from .support.errors import SparklodError
-from .support.kernel_cache import PACKAGE, KernelCache, stem_of
-from .support.progress import Progress, silent
-from .support.python_process import program_command
+from .system import jit
+from .system.errors import SparklodError
+from .system.kernel_cache import PACKAGE, KernelCache, stem_of
+from .system.progress import Progress, silent
+from .system.python_process import program_command
 
 #: Seconds between two looks at how far the child processes are, for the progress bar.
 PATIENCE = 0.1

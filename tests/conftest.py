@@ -45,8 +45,8 @@ def pytest_sessionstart(session: pytest.Session) -> None:
     """Compiles all kernels that no cache has, so that no test meets a notice of it, or waits for one of its own."""
     from sparklod_cli import warmup
     from sparklod_cli.commands.console import count_of
-    from sparklod_cli.support import jit
-    from sparklod_cli.support.threads import processors
+    from sparklod_cli.system import jit
+    from sparklod_cli.system.threads import processors
 
     _refuse_undeclared_types()
     is_worker = hasattr(session.config, "workerinput")  # of xdist; the controlling process has compiled them
@@ -75,8 +75,8 @@ def _refuse_undeclared_types() -> None:
     """
     import numba
 
-    from sparklod_cli.support import jit
-    from sparklod_cli.support.jit_types import as_declared
+    from sparklod_cli.system import jit
+    from sparklod_cli.system.jit_types import as_declared
 
     call = jit.Kernel.__call__
     allowed = set()

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from fuzz.case import Case, LawError, Rng
 from sparklod_cli.commands import console
-from sparklod_cli.support.errors import FormatError
+from sparklod_cli.system.errors import FormatError
 
 
 def raises() -> None:

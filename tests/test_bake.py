@@ -35,8 +35,8 @@ from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.selection import Selection
 from sparklod_cli.model.sh import COEFFICIENTS
 from sparklod_cli.model.splats import Splats
-from sparklod_cli.support.defaults import MAX_FRACTIONAL_BITS, TREE_SPZ_VERSIONS
-from sparklod_cli.support.errors import InvalidSplatsError, SparklodError
+from sparklod_cli.system.defaults import MAX_FRACTIONAL_BITS, TREE_SPZ_VERSIONS
+from sparklod_cli.system.errors import InvalidSplatsError, SparklodError
 from sparklod_cli.tables import histograms
 from tests.conftest import FIXTURES, real_scene
 from tests.scenes import random_splats, splat_columns

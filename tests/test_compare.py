@@ -30,7 +30,7 @@ from sparklod_cli.model.instances import Instance
 from sparklod_cli.render.settings import RenderSettings
 from sparklod_cli.scenes.loaded import Scenes
 from sparklod_cli.scenes.reading import read_scenes
-from sparklod_cli.support.errors import SparklodError
+from sparklod_cli.system.errors import SparklodError
 from sparklod_cli.tables.columns import Row
 from sparklod_cli.tables.comparison import COLUMNS, rows_by_budget, summarize
 from tests.conftest import FIXTURES

@@ -10,8 +10,8 @@ import pytest
 from sparklod_cli import compile_ahead, warmup
 from sparklod_cli.cli import run
 from sparklod_cli.compile_ahead import JOBS, CompileAhead
-from sparklod_cli.support import jit
-from sparklod_cli.support.kernel_cache import stem_of
+from sparklod_cli.system import jit
+from sparklod_cli.system.kernel_cache import stem_of
 from sparklod_cli.warmup import Unit
 from tests.conftest import FIXTURES
 from tests.test_warmup import few as few

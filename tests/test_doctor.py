@@ -13,8 +13,8 @@ import pytest
 from sparklod_cli import doctor, warmup
 from sparklod_cli.doctor import Check, check_all
 from sparklod_cli.render.gl import context
-from sparklod_cli.support import jit, machine
-from sparklod_cli.support.optional import Required, install_hint, pip_install
+from sparklod_cli.system import jit, machine
+from sparklod_cli.system.optional import Required, install_hint, pip_install
 
 HEALTHY = {"folder": "/nowhere/kernels-1", "distrusted": [], "wanted": 35, "missing": 0}
 

@@ -11,7 +11,7 @@ import pytest
 from sparklod_cli.cli import run
 from sparklod_cli.codecs.formats import FORMATS
 from sparklod_cli.io import read_scene, reading
-from sparklod_cli.support.errors import FormatError, UnreadableError
+from sparklod_cli.system.errors import FormatError, UnreadableError
 from tests.conftest import FIXTURES, IS_ROOT
 
 SAMPLES = {"PLY": "sh1.ply", "PLY ascii": "sh1-ascii.ply", "SPZ": "golden/sh3-v3.spz", "SPZ 4": "golden/hand-v4.spz"}

@@ -16,11 +16,11 @@ from sparklod_cli.io import companions, read_parts, read_scene
 from sparklod_cli.io.details import detail_files, detail_sink
 from sparklod_cli.io.identity import files_of
 from sparklod_cli.io.local_files import leads_away
-from sparklod_cli.support import atomic
-from sparklod_cli.support.addresses import Address
-from sparklod_cli.support.errors import OutputError
+from sparklod_cli.system import atomic
+from sparklod_cli.system.addresses import Address
+from sparklod_cli.system.errors import OutputError
 from tests.conftest import FIXTURES
-from tests.support.test_atomic_set import held
+from tests.system.test_atomic_set import held
 
 posix = pytest.mark.skipif(os.name != "posix", reason="POSIX only")
 GOLDEN = FIXTURES / "golden" / "sh1-streamed-sog"

@@ -13,7 +13,7 @@ from sparklod_cli.codecs import file_names
 from sparklod_cli.codecs.rad import rad_header
 from sparklod_cli.codecs.rad.rad_header import RadChunkEntry, RadHeader
 from sparklod_cli.io import chunk_files, companions, sink_together, write_together
-from sparklod_cli.support.errors import OutputError
+from sparklod_cli.system.errors import OutputError
 from tests.conftest import IS_ROOT
 
 posix = pytest.mark.skipif(os.name != "posix", reason="POSIX only")

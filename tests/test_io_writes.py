@@ -14,10 +14,10 @@ import pytest
 
 from sparklod_cli.io import check_writable, sink_together, write_stdout, write_whole
 from sparklod_cli.io.details import detail_sink
-from sparklod_cli.support import atomic
-from sparklod_cli.support.errors import FormatError, OutputError
+from sparklod_cli.system import atomic
+from sparklod_cli.system.errors import FormatError, OutputError
 from tests.conftest import FIXTURES, IS_ROOT
-from tests.support.test_atomic import has_unnamed_files
+from tests.system.test_atomic import has_unnamed_files
 
 posix = pytest.mark.skipif(os.name != "posix", reason="POSIX only")
 
@@ -199,7 +199,7 @@ def test_a_file_that_may_not_grow_leaves_nothing(tmp_path: Path) -> None:
     """A limit of the file's size is the nearest to a full disk that can be had without one."""
     code = (
         "import resource, signal, sys, pathlib\n"
-        "from sparklod_cli.support.errors import OutputError\n"
+        "from sparklod_cli.system.errors import OutputError\n"
         "from sparklod_cli.io import write_whole\n"
         "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))\n"

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 import sparklod_cli
-from sparklod_cli.support import machine, threads
+from sparklod_cli.system import machine, threads
 from tests.conftest import FIXTURES, ROOT
 
 PACKAGE = Path(sparklod_cli.__file__).parent

@@ -24,7 +24,7 @@ from sparklod_cli.render.settings import RenderSettings
 from sparklod_cli.scenes.finder import CutFinder, view_of
 from sparklod_cli.scenes.loaded import Scenes
 from sparklod_cli.scenes.reading import read_scenes
-from sparklod_cli.support.errors import FormatError, InvalidSplatsError
+from sparklod_cli.system.errors import FormatError, InvalidSplatsError
 from tests.conftest import FIXTURES
 from tests.render.drawables import camera
 from tests.scenes import random_splats

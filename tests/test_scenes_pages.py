@@ -27,7 +27,7 @@ from sparklod_cli.scenes.loaded import Scenes
 from sparklod_cli.scenes.pages import PagedForest, PagedScene
 from sparklod_cli.scenes.reading import read_scenes
 from sparklod_cli.simulation.streaming_settings import Network, StreamingSettings
-from sparklod_cli.support.errors import FormatError, TreeError
+from sparklod_cli.system.errors import FormatError, TreeError
 from tests.conftest import FIXTURES
 from tests.lod.forests import transform
 from tests.scenes import random_splats

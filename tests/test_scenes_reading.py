@@ -24,7 +24,7 @@ from sparklod_cli.scenes import reading
 from sparklod_cli.scenes.loaded import Cut, Part
 from sparklod_cli.scenes.pages import TRAVERSED
 from sparklod_cli.scenes.reading import read_scenes
-from sparklod_cli.support.errors import FormatError, SparklodError, TreeError
+from sparklod_cli.system.errors import FormatError, SparklodError, TreeError
 from tests.conftest import FIXTURES
 from tests.lod.forests import transform
 from tests.references import gaussians

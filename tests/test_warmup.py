@@ -21,8 +21,8 @@ from sparklod_cli.cli import run
 from sparklod_cli.codecs.kernels import drawable, texels
 from sparklod_cli.commands.console import Console
 from sparklod_cli.lod.kernels import sort
-from sparklod_cli.support import jit
-from sparklod_cli.support.kernel_cache import start_of, stem_of
+from sparklod_cli.system import jit
+from sparklod_cli.system.kernel_cache import start_of, stem_of
 from sparklod_cli.warmup import Unit
 from tests.conftest import FIXTURES, ROOT
 
@@ -30,7 +30,7 @@ from tests.conftest import FIXTURES, ROOT
 RUN = """
 import json, sys
 from sparklod_cli.cli import run
-from sparklod_cli.support import jit
+from sparklod_cli.system import jit
 compiled = []
 jit.listen(compiled.append, lambda seconds: None, compiled.append)
 print(json.dumps([[run(command) for command in json.loads(sys.argv[1])], compiled]))
@@ -184,7 +184,7 @@ def test_the_tests_say_that_they_compile(tmp_path: Path) -> None:
     assert jit.CACHE_FOLDER is not None
     ignore = shutil.ignore_patterns(f"{start_of(texels.look_up_words.py_func)}*")
     shutil.copytree(jit.CACHE_FOLDER, tmp_path / jit.CACHE_FOLDER.name, ignore=ignore)
-    line = [sys.executable, "-m", "pytest", "tests/support/test_units.py", "-q", "-p", "no:cacheprovider"]
+    line = [sys.executable, "-m", "pytest", "tests/system/test_units.py", "-q", "-p", "no:cacheprovider"]
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
     how: dict[str, Any] = {"cwd": ROOT, "capture_output": True, "text": True, "check": True, "env": environment}
     said = subprocess.run([*line, "-n1"], **how).stdout

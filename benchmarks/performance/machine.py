@@ -7,7 +7,7 @@ import platform
 from importlib.metadata import version
 from pathlib import Path
 
-from sparklod_cli.support.threads import processors
+from sparklod_cli.system.threads import processors
 
 
 def machine() -> str:

@@ -16,8 +16,8 @@ from ..cameras.camera import Camera
 from ..cameras.path import CameraPath
 from ..lod.budget import LARGEST, Budget, parse_budget
 from ..model.scene import Scene
-from ..support.errors import OutputError
-from ..support.progress import Progress, silent
+from ..system.errors import OutputError
+from ..system.progress import Progress, silent
 
 
 def scene_like(value: Any) -> Scene:

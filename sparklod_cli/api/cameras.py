@@ -11,8 +11,8 @@ from ..cameras.formats.table import FORMATS, Axes
 from ..cameras.frame import MAX_FRAMES, Settings, direction_of
 from ..cameras.path import CameraPath
 from ..cameras.sources import Orbit, read_path, similarity
-from ..support.defaults import ELEVATION
-from ..support.errors import CameraPathError
+from ..system.defaults import ELEVATION
+from ..system.errors import CameraPathError
 from .views import Viewed, scenes_of
 
 Point = tuple[float, float, float]

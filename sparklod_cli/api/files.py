@@ -13,8 +13,8 @@ import numpy as np
 from ..io import rad_file, read_scene
 from ..model.scene import Scene, Tree
 from ..model.splats import COLUMNS, FloatArray
-from ..support.errors import FormatError, InvalidSplatsError, TreeError, memory_errors_translated
-from ..support.threads import thread_count
+from ..system.errors import FormatError, InvalidSplatsError, TreeError, memory_errors_translated
+from ..system.threads import thread_count
 from .arguments import ProgressLike, progress_callback, scene_like
 
 if TYPE_CHECKING:

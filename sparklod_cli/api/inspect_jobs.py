@@ -14,9 +14,9 @@ from ..inspection.findings import Finding
 from ..inspection.report import Report, ReportSettings, inspect
 from ..io import check_writable, read_scene, write_whole
 from ..model.scene import Scene
-from ..support.errors import FormatError, SparklodError, memory_errors_translated
-from ..support.progress import Progress
-from ..support.threads import on_threads
+from ..system.errors import FormatError, SparklodError, memory_errors_translated
+from ..system.progress import Progress
+from ..system.threads import on_threads
 from ..tables.output import TableOutput
 
 if TYPE_CHECKING:

@@ -22,8 +22,8 @@ from ..model.splats import COLUMNS
 from ..scenes.finder import CutFinder, CutSource
 from ..scenes.pages import TRAVERSED
 from ..scenes.reading import read_scenes
-from ..support.progress import Progress, silent
-from ..support.threads import on_threads
+from ..system.progress import Progress, silent
+from ..system.threads import on_threads
 
 if TYPE_CHECKING:
     from ..cameras.frame import Settings

@@ -16,7 +16,7 @@ from ..fitting.settings import STEPS, FitSettings
 from ..lod.builders import BUILDERS, METHODS
 from ..model.scene import Scene, Tree
 from ..model.selection import Selection
-from ..support.defaults import (
+from ..system.defaults import (
     DEFAULT_BASE,
     DEFAULT_GROWTH,
     DETAIL_GROWTH,
@@ -26,10 +26,10 @@ from ..support.defaults import (
     MIN_BASE,
     MIN_GROWTH,
 )
-from ..support.errors import FormatError, memory_errors_translated
-from ..support.progress import Progress
-from ..support.setting_fields import Range, whole
-from ..support.threads import on_threads, thread_count
+from ..system.errors import FormatError, memory_errors_translated
+from ..system.progress import Progress
+from ..system.setting_fields import Range, whole
+from ..system.threads import on_threads, thread_count
 from .arguments import BudgetLike, ProgressLike, budget_like, path_like, progress_callback, scene_like
 
 

@@ -9,8 +9,8 @@ from pathlib import Path
 from ..cameras.frame import Settings, direction_of
 from ..cameras.sources import read_path
 from ..model.axes import common
-from ..support.errors import NotSplatsError, SparklodError, memory_errors_translated
-from ..support.progress import Progress, silent
+from ..system.errors import NotSplatsError, SparklodError, memory_errors_translated
+from ..system.progress import Progress, silent
 from ..view.export import check_folder as check_folder
 from ..view.export import export as export
 from ..view.files import shown_files

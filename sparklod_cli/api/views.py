@@ -23,9 +23,9 @@ from ..scenes.finder import CutFinder, FixedCut
 from ..scenes.loaded import Cut, Scenes
 from ..scenes.loaded_scene import UNNAMED
 from ..scenes.reading import read_scenes
-from ..support.defaults import BLEND
-from ..support.errors import FormatError, memory_errors_translated
-from ..support.threads import on_threads, thread_count
+from ..system.defaults import BLEND
+from ..system.errors import FormatError, memory_errors_translated
+from ..system.threads import on_threads, thread_count
 from ..tables.comparison import COLUMNS as OF_COMPARISON
 from .arguments import BudgetLike, ProgressLike, budget_like, camera_like, path_like, progress_callback, viewed_like
 from .results import ComparisonTable, Frames

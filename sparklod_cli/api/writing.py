@@ -12,9 +12,9 @@ from ..codecs.file_names import MANIFEST
 from ..io import scene_sink, sink
 from ..io.details import detail_sink
 from ..model.scene import Scene
-from ..support.defaults import DEFAULT_COMPRESSION
-from ..support.errors import FormatError, InvalidSplatsError, memory_errors_translated
-from ..support.threads import thread_count
+from ..system.defaults import DEFAULT_COMPRESSION
+from ..system.errors import FormatError, InvalidSplatsError, memory_errors_translated
+from ..system.threads import thread_count
 from .arguments import ProgressLike, file_path, progress_callback, scene_like
 from .files import naming, pack
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from ..bake.parts_output import DetailOutput
     from ..codecs.options import RadOptions, SogOptions
     from ..lod.detail_rule import DetailSettings
-    from ..support.progress import Progress
+    from ..system.progress import Progress
 
 
 @dataclass(frozen=True)

@@ -14,9 +14,9 @@ import numpy as np
 from .. import __version__
 from ..cameras.formats.table import NAMES
 from ..io.identity import Identity, files_of, identity_of
-from ..support.addresses import Place
-from ..support.errors import UnreadableError
-from ..support.untrusted import quoted_value
+from ..system.addresses import Place
+from ..system.errors import UnreadableError
+from ..system.untrusted import quoted_value
 from .settings import BakeSettings
 from .sources import Source, placement_of, places_of
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from ..support.addresses import Place
-from ..support.errors import memory_errors_translated
-from ..support.progress import Progress, silent
+from ..system.addresses import Place
+from ..system.errors import memory_errors_translated
+from ..system.progress import Progress, silent
 from .in_memory import InMemory
 from .out_of_core.planning import blocks_for, has_published
 from .out_of_core.tasks import Engine

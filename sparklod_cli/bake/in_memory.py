@@ -13,8 +13,8 @@ from ..lod.builders import BUILDERS
 from ..model.lod_tree import LodTree
 from ..model.scene import Scene
 from ..model.splats import Splats
-from ..support.progress import Progress
-from ..support.threads import on_threads
+from ..system.progress import Progress
+from ..system.threads import on_threads
 from .output import BakeOutput, FileOutput, output_of_existing_tree
 from .records import BuiltTree, Clock
 from .selecting import read_environment, select, split_environment, transformed

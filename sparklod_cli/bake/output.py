@@ -19,9 +19,9 @@ from ..io.writing import SceneSink, Sink, scene_sink, sink
 from ..model.lod_tree import CHUNK_NODES
 from ..model.scene import Scene
 from ..model.splats import Splats, same_rows
-from ..support.addresses import Place
-from ..support.errors import FormatError
-from ..support.progress import Progress
+from ..system.addresses import Place
+from ..system.errors import FormatError
+from ..system.progress import Progress
 from .records import BuiltTree, Clock, WrittenTree
 from .settings import SPZ, BakeSettings
 from .sources import Merged, Source

@@ -15,8 +15,8 @@ from ..lod.tile_settings import TileSettings
 from ..model.scene import DetailScene, Scene
 from ..model.splats import Splats
 from ..model.tile_scene import TileScene
-from ..support.progress import Progress
-from ..support.threads import on_threads
+from ..system.progress import Progress
+from ..system.threads import on_threads
 from .output import BakeOutput, Encode
 from .records import BuiltTree, Clock, WrittenDetail, WrittenLevel, WrittenTiles, WrittenTree
 

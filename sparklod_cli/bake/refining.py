@@ -14,8 +14,8 @@ from ..codecs.validation import check_valid
 from ..fitting.settings import FitReport, FitSettings
 from ..model.scene import Scene
 from ..model.splats import Splats
-from ..support import interrupts
-from ..support.progress import Progress
+from ..system import interrupts
+from ..system.progress import Progress
 from .settings import BakeSettings
 
 

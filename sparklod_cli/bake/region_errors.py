@@ -23,8 +23,8 @@ from ..render.kernels.project import TILE, ShadedColumns
 from ..render.kernels.region_errors import compare_levels
 from ..render.kernels.shade import add_sh
 from ..render.settings import BLUR, CLIP
-from ..support.progress import Progress, silent
-from ..support.threads import on_threads
+from ..system.progress import Progress, silent
+from ..system.threads import on_threads
 
 Errors = NDArray[np.float64]
 

@@ -11,8 +11,8 @@ from ..io.reading import read_rgba, read_scene
 from ..model.selection import Selection, SelectionTally
 from ..model.splats import Splats
 from ..model.transforms import Transform
-from ..support.errors import FormatError, InvalidSplatsError
-from ..support.progress import Progress
+from ..system.errors import FormatError, InvalidSplatsError
+from ..system.progress import Progress
 from .settings import BakeSettings
 
 

@@ -17,8 +17,8 @@ from ..model.scene import Scene
 from ..model.selection import Selection
 from ..model.streams import SceneStream
 from ..model.transforms import Transform
-from ..support.addresses import Place
-from ..support.defaults import DEFAULT_BASE, DEFAULT_GROWTH, MAX_SH_DEGREE
+from ..system.addresses import Place
+from ..system.defaults import DEFAULT_BASE, DEFAULT_GROWTH, MAX_SH_DEGREE
 
 #: Suffix of the format that is written unless another one is chosen.
 SPZ = ".spz"

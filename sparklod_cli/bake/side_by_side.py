@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from ..support.addresses import Place, absolute
-from ..support.errors import SparklodError
-from ..support.progress import Progress, silent
+from ..system.addresses import Place, absolute
+from ..system.errors import SparklodError
+from ..system.progress import Progress, silent
 from .fingerprint import FILES
 from .flow import bake
 from .out_of_core.cluster_engine import ClusterEngine

@@ -22,10 +22,10 @@ from ..lod.detail_levels import RefinementOrder, with_plain_opacity
 from ..model.falloff import MIN_ALPHA
 from ..model.scene import Scene
 from ..model.splats import Splats
-from ..support.errors import FormatError, SparklodError
-from ..support.progress import Progress
-from ..support.threads import on_threads
-from ..support.units import count_of
+from ..system.errors import FormatError, SparklodError
+from ..system.progress import Progress
+from ..system.threads import on_threads
+from ..system.units import count_of
 from .output import BakeOutput, Encode
 from .records import BuiltTree, Clock, WrittenSet, WrittenTree
 from .refining import Refined, fit_settings, refined

@@ -14,9 +14,9 @@ from typing import Any
 
 from ..io.identity import Identity, content_of, files_of, identity_of, stamp_of
 from ..io.writing import check_writable, sink
-from ..support.addresses import Address, Place, size_of
-from ..support.errors import OutputError, UnreadableError
-from ..support.untrusted import parse_json
+from ..system.addresses import Address, Place, size_of
+from ..system.errors import OutputError, UnreadableError
+from ..system.untrusted import parse_json
 from .fingerprint import Fingerprint, files_named_in, settings_of
 from .flow import bake
 from .out_of_core.planning import has_published

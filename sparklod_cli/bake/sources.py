@@ -14,9 +14,9 @@ from ..model.instances import Instance
 from ..model.scene import Scene
 from ..model.streams import SceneStream, collected
 from ..model.transforms import Transform
-from ..support.addresses import Place, absolute
-from ..support.progress import Progress, silent
-from ..support.units import count_of
+from ..system.addresses import Place, absolute
+from ..system.progress import Progress, silent
+from ..system.units import count_of
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..support.errors import CameraPathError
+from ..system.errors import CameraPathError
 
 Matrix = NDArray[np.float64]
 

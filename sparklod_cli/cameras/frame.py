@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..model.axes import ASSUMED, AXES
-from ..support.errors import TooManyCamerasError
+from ..system.errors import TooManyCamerasError
 from .camera import Camera, Matrix
 from .formats.table import Axes
 

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..model.balls import Balls
-from ..support.defaults import FARTHEST
-from ..support.errors import InvalidSplatsError
+from ..system.defaults import FARTHEST
+from ..system.errors import InvalidSplatsError
 from .camera import Camera, Matrix
 
 #: The share of the splats in the ball around the middle whose radius is the size of a scene.

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..support.errors import CameraPathError
+from ..system.errors import CameraPathError
 from .camera import Matrix
 from .formats.table import Axes
 from .frame import DEFAULT_FOV_Y, DEFAULT_FPS, NO_LENS, NUMBERED, Frame, Intrinsics, Sampled, sampled

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..support.errors import CameraPathError, TooManyCamerasError
+from ..system.errors import CameraPathError, TooManyCamerasError
 from .camera import Camera
 from .formats import own_csv
 from .formats.source import Files, Parsed

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .. import io
-from ..support.defaults import ELEVATION
-from ..support.errors import CameraPathError, SparklodError
-from ..support.untrusted import parse_json
+from ..system.defaults import ELEVATION
+from ..system.errors import CameraPathError, SparklodError
+from ..system.untrusted import parse_json
 from . import framing, generators
 from .camera import Matrix
 from .formats.source import Files, Json, Parsed, finite

@@ -18,11 +18,11 @@ import numpy as np
 from ..model.gaussian import normalized_quat
 from ..model.sh import COEFFICIENTS, notes_on_degree
 from ..model.splats import FloatArray
-from ..support.defaults import MAX_SH_DEGREE
-from ..support.errors import FormatError, NotSplatsError, TruncatedError
-from ..support.parallel import blocks_of, ordered_map
-from ..support.progress import Progress
-from ..support.untrusted import ZIP_ERRORS, quoted, quoted_value
+from ..system.defaults import MAX_SH_DEGREE
+from ..system.errors import FormatError, NotSplatsError, TruncatedError
+from ..system.parallel import blocks_of, ordered_map
+from ..system.progress import Progress
+from ..system.untrusted import ZIP_ERRORS, quoted, quoted_value
 from . import quantize
 from .content import Content, Source, Target
 from .left_out import HARMLESS, left_out

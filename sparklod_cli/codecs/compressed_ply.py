@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from ..model.sh import degree_of, notes_on_degree
 from ..model.splats import FloatArray
-from ..support.defaults import MAX_SH_DEGREE
-from ..support.errors import FormatError
-from ..support.progress import Progress
-from ..support.units import count_of
+from ..system.defaults import MAX_SH_DEGREE
+from ..system.errors import FormatError
+from ..system.progress import Progress
+from ..system.units import count_of
 from . import quantize
 from .content import Content, Source, Target
 from .left_out import HARMLESS, left_out

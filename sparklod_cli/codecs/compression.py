@@ -12,10 +12,10 @@ from typing import Any, BinaryIO, NamedTuple
 import zstandard
 from zlib_ng import zlib_ng
 
-from ..support.defaults import DEFAULT_COMPRESSION
-from ..support.errors import ChecksumError, FormatError, PromiseError, TooLongError
-from ..support.parallel import ordered_map
-from ..support.progress import Progress
+from ..system.defaults import DEFAULT_COMPRESSION
+from ..system.errors import ChecksumError, FormatError, PromiseError, TooLongError
+from ..system.parallel import ordered_map
+from ..system.progress import Progress
 from .inflate import COMMENTED_HEAD, PLAIN_HEAD
 
 #: Bytes of a block that one thread deflates by itself, and bytes that are read at a time. That blocks of

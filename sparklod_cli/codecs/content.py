@@ -15,8 +15,8 @@ from ..model import streams
 from ..model.lod_tree import LodTree
 from ..model.scene import PLAIN, FileCoding, Scene, facts_of
 from ..model.splats import COLUMNS, Splats
-from ..support.errors import HasTreeError
-from ..support.progress import Progress, silent
+from ..system.errors import HasTreeError
+from ..system.progress import Progress, silent
 from .validation import with_valid_tree
 
 #: Opens a file of these bytes, which are made only if they have not been before; for formats whose splats do not lie

@@ -12,7 +12,7 @@ from typing import Any
 
 from .. import __version__
 from ..model.axes import AXES, SPECIFIED
-from ..support.untrusted import parse_json, quoted_value
+from ..system.untrusted import parse_json, quoted_value
 
 #: How the "generator" of a note of sparklod begins; its version follows.
 GENERATOR = "sparklod "

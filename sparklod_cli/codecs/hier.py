@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from ..model.gaussian import normalized_quat
 from ..model.sh import COEFFICIENTS
 from ..model.splats import FloatArray, Splats
-from ..support.errors import FormatError, TruncatedError
-from ..support.parallel import BLOCK_ROWS, blocks_of, ordered_map
-from ..support.progress import Progress
+from ..system.errors import FormatError, TruncatedError
+from ..system.parallel import BLOCK_ROWS, blocks_of, ordered_map
+from ..system.progress import Progress
 from . import quantize
 from .content import Content, Source, Target
 from .stream import Positioned, rows_between, size_of

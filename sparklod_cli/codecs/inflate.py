@@ -11,7 +11,7 @@ from typing import Any, BinaryIO
 
 from zlib_ng import zlib_ng
 
-from ..support.errors import ChecksumError, FormatError, TooLongError, TruncatedError
+from ..system.errors import ChecksumError, FormatError, TooLongError, TruncatedError
 
 try:
     from isal import isal_zlib as _library

@@ -6,8 +6,8 @@ import bisect
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
-from ..support.errors import FormatError
-from ..support.untrusted import parse_json, quoted_value
+from ..system.errors import FormatError
+from ..system.untrusted import parse_json, quoted_value
 
 #: Deepest nesting of a manifest; a node of a tree takes two.
 MAX_NESTING = 512

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from ..model.gaussian import normalized_quat
 from ..model.sh import COEFFICIENTS
 from ..model.splats import FloatArray, Splats
-from ..support.errors import FormatError, TruncatedError, VersionError
-from ..support.progress import Progress
-from ..support.units import count_of
+from ..system.errors import FormatError, TruncatedError, VersionError
+from ..system.progress import Progress
+from ..system.units import count_of
 from . import quantize
 from .content import Content, Source, Target
 from .stream import Positioned, Rows, decode_rows, rows_between, size_of

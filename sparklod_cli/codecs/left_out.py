@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator
 
-from ..support.printable import printable
+from ..system.printable import printable
 
 #: Names, or families of them, in a note, and characters of each at most: the file chooses both. Chosen.
 MOST_NAMED, MOST_NAME = 8, 40

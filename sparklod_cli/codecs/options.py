@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from ..support.defaults import (
+from ..system.defaults import (
     DEFAULT_COMPRESSION,
     DEFAULT_SPZ_VERSION,
     MAX_COMPRESSION,
@@ -15,7 +15,7 @@ from ..support.defaults import (
     MIN_SH_CODES,
     SPZ_VERSIONS,
 )
-from ..support.setting_fields import CheckedSettings, Quantity, setting, whole
+from ..system.setting_fields import CheckedSettings, Quantity, setting, whole
 from .rad.rad_layout import AUTO, choices
 
 if TYPE_CHECKING:

@@ -19,11 +19,11 @@ from ..model.gaussian import normalized_quat
 from ..model.scene import Scene
 from ..model.sh import degree_of, notes_on_degree
 from ..model.splats import FloatArray, Splats
-from ..support.defaults import MAX_SH_DEGREE
-from ..support.errors import FormatError, NotSplatsError, TruncatedError
-from ..support.parallel import blocks_of
-from ..support.progress import Progress, silent
-from ..support.untrusted import quoted
+from ..system.defaults import MAX_SH_DEGREE
+from ..system.errors import FormatError, NotSplatsError, TruncatedError
+from ..system.parallel import blocks_of
+from ..system.progress import Progress, silent
+from ..system.untrusted import quoted
 from . import quantize
 from .clamps import CodeRange
 from .content import Content, Scratch, Source, Target

@@ -9,8 +9,8 @@ from typing import Any, BinaryIO
 import numpy as np
 from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
 
-from ..support.errors import FormatError, PromiseError, TruncatedError
-from ..support.untrusted import quoted
+from ..system.errors import FormatError, PromiseError, TruncatedError
+from ..system.untrusted import quoted
 
 #: Largest header, bytes; that of a splat file has some 1,500.
 MAX_HEADER = 1 << 20

@@ -14,8 +14,8 @@ from numpy.lib import format as npy_format
 from numpy.typing import NDArray
 
 from ..model.splats import FloatArray
-from ..support.errors import FormatError, TruncatedError
-from ..support.units import count_of
+from ..system.errors import FormatError, TruncatedError
+from ..system.units import count_of
 
 #: Largest header of a .npy file, bytes; that of a two-dimensional array has 118.
 MAX_HEADER = 1 << 12

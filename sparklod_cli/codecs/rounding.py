@@ -10,7 +10,7 @@ import io
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from ..support.errors import FormatError
+from ..system.errors import FormatError
 from .formats import WRITABLE
 from .options import WriteOptions
 

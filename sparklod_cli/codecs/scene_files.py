@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from typing import BinaryIO
 
 from ..model.splats import COLUMNS, Splats
-from ..support.errors import FormatError, UnsupportedError
-from ..support.parallel import ordered_map
-from ..support.progress import Progress, silent
-from ..support.untrusted import quoted_value
+from ..system.errors import FormatError, UnsupportedError
+from ..system.parallel import ordered_map
+from ..system.progress import Progress, silent
+from ..system.untrusted import quoted_value
 from .content import Content, Fill, OpenCompanion, Source, Target
 from .stream import size_of
 from .validation import error_of

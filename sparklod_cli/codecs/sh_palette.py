@@ -21,9 +21,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..model.splats import FloatArray, Splats
-from ..support.parallel import blocks_of
-from ..support.progress import Progress, silent
-from ..support.threads import on_threads
+from ..system.parallel import blocks_of
+from ..system.progress import Progress, silent
+from ..system.threads import on_threads
 
 #: The most codes of a palette: labels have 16 bits in RAD and in SOG.
 MAX_CODES = 1 << 16

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ..model.gaussian import linear_opacity, lod_opacity
 from ..model.splats import FloatArray
-from ..support.errors import FormatError
+from ..system.errors import FormatError
 
 Words = NDArray[np.uint32]
 

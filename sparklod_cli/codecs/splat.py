@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from ..model.scene import Scene
 from ..model.splats import Splats
-from ..support.errors import FormatError, TruncatedError
-from ..support.progress import Progress, silent
+from ..system.errors import FormatError, TruncatedError
+from ..system.progress import Progress, silent
 from . import quantize
 from .clamps import CodeRange
 from .content import Content, Source, Target

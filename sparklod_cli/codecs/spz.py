@@ -18,10 +18,10 @@ from ..model.lod_tree import LodTree
 from ..model.scene import Scene
 from ..model.splats import COLUMNS, FloatArray, Splats
 from ..model.streams import NodeStream
-from ..support.defaults import DEFAULT_SPZ_VERSION, MAX_FRACTIONAL_BITS, TREE_SPZ_VERSIONS
-from ..support.errors import FormatError
-from ..support.parallel import blocks_of, ordered_map
-from ..support.progress import Progress, silent
+from ..system.defaults import DEFAULT_SPZ_VERSION, MAX_FRACTIONAL_BITS, TREE_SPZ_VERSIONS
+from ..system.errors import FormatError
+from ..system.parallel import blocks_of, ordered_map
+from ..system.progress import Progress, silent
 from . import clamps, compression, coverage, quantize
 from .clamps import CodeRange
 from .compression import DataRun

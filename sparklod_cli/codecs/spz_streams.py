@@ -19,10 +19,10 @@ from ..model.lod_tree import LodTree
 from ..model.scene import FileCoding, ScaleCoding
 from ..model.sh import COEFFICIENTS, notes_on_degree
 from ..model.splats import Splats
-from ..support.defaults import MAX_SH_DEGREE
-from ..support.errors import FormatError, MembersError, NotSplatsError, TruncatedError, VersionError
-from ..support.parallel import ordered_map
-from ..support.progress import Progress
+from ..system.defaults import MAX_SH_DEGREE
+from ..system.errors import FormatError, MembersError, NotSplatsError, TruncatedError, VersionError
+from ..system.parallel import ordered_map
+from ..system.progress import Progress
 from . import compression, quantize
 from .content import Content, Source, Target
 from .file_notes import FileNote, read_comment

@@ -11,9 +11,9 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from ..support.errors import TruncatedError
-from ..support.parallel import BLOCK_ROWS, blocks_of, ordered_map
-from ..support.progress import Progress
+from ..system.errors import TruncatedError
+from ..system.parallel import BLOCK_ROWS, blocks_of, ordered_map
+from ..system.progress import Progress
 
 #: Least bytes of a block: with narrow rows, such as SPZ's streams, handing a smaller one to a thread costs more than it
 #: saves.

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ..support.errors import FormatError
+from ..system.errors import FormatError
 
 #: Steps of a pickle at most. That of nerfstudio, with the states of optimisers and metrics, takes some 15,000. Chosen.
 MOST_STEPS = 1 << 18

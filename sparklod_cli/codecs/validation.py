@@ -12,8 +12,8 @@ from ..model.lod_tree import LodTree
 from ..model.scene import Scene
 from ..model.selection import EXAMINED
 from ..model.splats import COLUMNS, UNIT_TOLERANCE, Splats, describe_invalid
-from ..support.errors import FormatError, InvalidSplatsError, TreeError
-from ..support.parallel import blocks_of, ordered_map
+from ..system.errors import FormatError, InvalidSplatsError, TreeError
+from ..system.parallel import blocks_of, ordered_map
 from .kernels.drawable import count_doubtful
 
 

@@ -10,8 +10,8 @@ from collections.abc import Iterator
 from pathlib import PurePosixPath
 from typing import IO, BinaryIO
 
-from ..support.errors import ChecksumError, FormatError, NotSplatsError
-from ..support.untrusted import ZIP_ERRORS, quoted, quoted_value
+from ..system.errors import ChecksumError, FormatError, NotSplatsError
+from ..system.untrusted import ZIP_ERRORS, quoted, quoted_value
 from .compression import check_promise
 from .file_names import MANIFEST, META, TILESET
 from .stream import size_of

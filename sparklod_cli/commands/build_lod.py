@@ -13,11 +13,11 @@ import click
 
 from ..codecs.options import SogOptions, WriteOptions
 from ..lod.tile_settings import TileSettings
-from ..support import interrupts
-from ..support.addresses import Address, Place
-from ..support.errors import SparklodError
-from ..support.printable import MOST, shortened
-from ..support.stdin import DASH, name_of
+from ..system import interrupts
+from ..system.addresses import Address, Place
+from ..system.errors import SparklodError
+from ..system.printable import MOST, shortened
+from ..system.stdin import DASH, name_of
 from .build_lod_files import FORMS, VERIFY, BakedFiles, check_formats, check_inputs, record_of
 from .build_lod_text import report_baked, report_extracted
 from .console import Console, print_json, say

@@ -15,8 +15,8 @@ from ..codecs.formats import ENCODINGS, FORMATS, NPZ, RAW_SUFFIXES, WRITABLE, en
 from ..codecs.options import RadOptions
 from ..lod.detail_rule import DetailSettings
 from ..lod.tile_settings import TileSettings
-from ..support.addresses import Place
-from ..support.stdin import DASH
+from ..system.addresses import Place
+from ..system.stdin import DASH
 from .option_groups import COMMON, argument, exclude, flag, is_set, option, parameters_of, refuse
 from .options.baking import OF_TREES, STREAMED_SOG, TILES_3D, DetailOptions, RefineOptions
 from .options.common import output_option, overwrite_flag

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ..support.addresses import Place
-from ..support.stdin import DASH, name_of
-from ..support.units import format_size, percent_of
+from ..system.addresses import Place
+from ..system.stdin import DASH, name_of
+from ..system.units import format_size, percent_of
 from .console import Console, count_of, size_of
 
 if TYPE_CHECKING:

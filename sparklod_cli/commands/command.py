@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 if TYPE_CHECKING:
-    from ..support.setting_fields import Setting
+    from ..system.setting_fields import Setting
 
 
 #: Headings that several commands have: of what most people need, and of what every command has.

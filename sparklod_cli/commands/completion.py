@@ -12,7 +12,7 @@ from pathlib import Path
 import click
 from click.shell_completion import get_completion_class
 
-from ..support.errors import SparklodError
+from ..system.errors import SparklodError
 from .command import Command
 from .console import say
 

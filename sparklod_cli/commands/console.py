@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 import click
 
-from ..support import interrupts
-from ..support.printable import MOST, printable
-from ..support.progress import StagedProgress
-from ..support.stdout import silence
-from ..support.units import count_of as count_of
-from ..support.units import format_duration, format_size
+from ..system import interrupts
+from ..system.printable import MOST, printable
+from ..system.progress import StagedProgress
+from ..system.stdout import silence
+from ..system.units import count_of as count_of
+from ..system.units import format_duration, format_size
 
 if TYPE_CHECKING:
     from ..compile_ahead import CompileAhead
@@ -150,7 +150,7 @@ def _unheard() -> Iterator[None]:
 class Console:
     """Prints lines on standard error, and the progress of each stage of work: a bar on a terminal, lines in a log.
 
-    Used as a context manager, which clears the bar. Its `progress` is a `sparklod_cli.support.progress.Progress`.
+    Used as a context manager, which clears the bar. Its `progress` is a `sparklod_cli.system.progress.Progress`.
     """
 
     def __init__(self, *, quiet: bool, verbose: bool) -> None:
@@ -262,7 +262,7 @@ class Console:
         Args:
             jobs: of `compile_ahead.JOBS`, whose kernels another process compiles meanwhile.
         """
-        from ..support import jit
+        from ..system import jit
 
         ahead: list[CompileAhead] = []
         seconds: list[float] = []

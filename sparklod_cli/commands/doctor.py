@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..support.printable import printable
+from ..system.printable import printable
 from .console import count_of, print_json
 from .option_groups import command, values_of
 from .options.common import Messages, quiet_flag, verbose_flag

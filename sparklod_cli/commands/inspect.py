@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import click
 
-from ..support.defaults import MAX_SH_DEGREE, PLOT_BY
-from ..support.errors import OutOfMemoryError, SparklodError, StdoutError
-from ..support.printable import printable
-from ..support.setting_fields import Quantity, Range, whole
-from ..support.stdin import name_of
-from ..support.units import parse_size
+from ..system.defaults import MAX_SH_DEGREE, PLOT_BY
+from ..system.errors import OutOfMemoryError, SparklodError, StdoutError
+from ..system.printable import printable
+from ..system.setting_fields import Quantity, Range, whole
+from ..system.stdin import name_of
+from ..system.units import parse_size
 from .console import Console, count_of, size_of
 from .inspect_text import finding_line, lines, verdict
 from .option_groups import COMMON, argument, command, flag, option, refuse, values_of

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
-from ..support.printable import MOST, printable, shortened
+from ..system.printable import MOST, printable, shortened
 from .console import count_of, rows, size_of
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 import click
 
 from .. import __version__
-from ..support.setting_fields import setting, settings_in
+from ..system.setting_fields import setting, settings_in
 from .command import COMMON as COMMON
 from .command import GENERAL, Command, Option
 from .parameter_types import click_type

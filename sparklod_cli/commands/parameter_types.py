@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from ..support.setting_fields import MOST_WHOLE, Quantity, Range
+from ..system.setting_fields import MOST_WHOLE, Quantity, Range
 
 COLORS: dict[str, tuple[float, ...] | None] = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "transparent": None}
 

@@ -14,8 +14,8 @@ from typing import Any
 import click
 
 from ..codecs.file_names import MANIFEST, META, TILESET
-from ..support.addresses import Address, Place, place_of
-from ..support.stdin import DASH
+from ..system.addresses import Address, Place, place_of
+from ..system.stdin import DASH
 from ..tables.files import FORMS
 from .console import is_terminal
 from .option_groups import flag_of

@@ -13,12 +13,12 @@ from ..codecs.formats import WRITABLE, ending_of
 from ..codecs.options import SogOptions, WriteOptions
 from ..fitting.settings import STEPS, FitSettings
 from ..lod.budget import Budget, parse_budget
-from ..support import interrupts
-from ..support.addresses import Place
-from ..support.defaults import DETAIL_GROWTH
-from ..support.setting_fields import Quantity, Range, setting_of, whole
-from ..support.stdin import DASH
-from ..support.units import parse_size
+from ..system import interrupts
+from ..system.addresses import Place
+from ..system.defaults import DETAIL_GROWTH
+from ..system.setting_fields import Quantity, Range, setting_of, whole
+from ..system.stdin import DASH
+from ..system.units import parse_size
 from .build_lod_files import SPZ, record_of, refuse_others
 from .build_lod_text import report_simplified
 from .console import print_json, say

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import click
 
 from ..simulation.streaming_settings import StreamingSettings
-from ..support.printable import printable
-from ..support.stdin import DASH
-from ..support.units import percent_of
+from ..system.printable import printable
+from ..system.stdin import DASH
+from ..system.units import percent_of
 from ..tables.files import FORMS
 from .console import WIDTH, Console, count_of, for_screen, is_terminal, print_json, rows, size_of
 from .option_groups import COMMON, check_declared, command, exclude, flag, option, refuse, values_of

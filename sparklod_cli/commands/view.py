@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import click
 
 from ..lod.budget import doubt
-from ..support.printable import printable
-from ..support.setting_fields import Quantity, Range, whole
-from ..support.units import parse_count
+from ..system.printable import printable
+from ..system.setting_fields import Quantity, Range, whole
+from ..system.units import parse_count
 from .console import Console, count_of, print_json, size_of
 from .option_groups import COMMON, argument, check_declared, command, flag, option, values_of
 from .options.common import General, json_flag, overwrite_flag, quiet_flag, up_option, verbose_flag

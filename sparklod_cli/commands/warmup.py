@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from ..support.setting_fields import whole
+from ..system.setting_fields import whole
 from .console import count_of, print_json
 from .option_groups import command, option, values_of
 from .options.common import Messages, processors_to_use, verbose_flag
@@ -41,7 +41,7 @@ def warmup(ctx: click.Context, /, **_: Any) -> None:
     """
     options = values_of(ctx, _Options)
     with options.console() as console:
-        from ..support import jit
+        from ..system import jit
         from ..warmup import missing, warm_up
 
         for unit in missing():

@@ -13,8 +13,8 @@ from ..cameras.camera import Camera
 from ..images.pixels import BACKGROUND
 from ..model.splats import Splats
 from ..render.color_scales import range_of, whole_numbers
-from ..support.errors import SparklodError
-from ..support.units import count_of
+from ..system.errors import SparklodError
+from ..system.units import count_of
 from .geometry import Points, Viewpoint, bounds, box_lines, evenly, is_drawable, viewpoint
 from .pyvista_scene import PyvistaStage, write_png
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from ..images.pixels import BACKGROUND, FAINT, INK, LINE, write_title
-from ..support.optional import optional_import
+from ..system.optional import optional_import
 from ..tables.columns import Row
 from ..tables.statistics import numbers
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..images.pixels import FAINT
-from ..support.units import percent_of
+from ..system.units import percent_of
 from ..tables.columns import Row
 from ..tables.statistics import numbers
 from .charts import BLUE, GREEN, INDIGO, ORANGE, PINK, YELLOW, Axes, FrameColumns, draw, head, stacked

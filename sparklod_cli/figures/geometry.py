@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..model.gaussian import rotation_matrix
 from ..model.splats import FloatArray, Splats
-from ..support.defaults import DEFAULT_BASE
+from ..system.defaults import DEFAULT_BASE
 
 #: (N, 3) points, or pairs of ends of lines; (3,) for a single point.
 Points = NDArray[np.floating[Any]]

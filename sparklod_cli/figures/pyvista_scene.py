@@ -19,9 +19,9 @@ from PIL import Image, ImageDraw
 from ..images.pixels import FAINT, INK, LINE, font, write_scale, write_title
 from ..model.splats import FloatArray, Splats
 from ..render.color_scales import Coloring, ticks
-from ..support.errors import SparklodError
-from ..support.optional import optional_import
-from ..support.python_process import program_command
+from ..system.errors import SparklodError
+from ..system.optional import optional_import
+from ..system.python_process import program_command
 from .geometry import Points, Viewpoint, ellipsoids, rotation, sphere
 
 #: Smallest distance between the labels of an axis, in thousandths of the picture's height.

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from ..images.pixels import FAINT, INK
-from ..support.errors import SparklodError
-from ..support.units import percent_of
+from ..system.errors import SparklodError
+from ..system.units import percent_of
 from ..tables.columns import Row
 from ..tables.statistics import numbers, totals
 from .camera_path import PathScene as PathScene

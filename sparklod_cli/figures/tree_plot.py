@@ -30,8 +30,8 @@ from ..render.color_scales import (
     whole_numbers,
     with_ends,
 )
-from ..support.defaults import DEFAULT_BASE, PLOT_BY
-from ..support.errors import SparklodError
+from ..system.defaults import DEFAULT_BASE, PLOT_BY
+from ..system.errors import SparklodError
 from .geometry import Points, bounds, box_lines, cells, evenly, is_drawable, level_of_step, viewpoint, wall_lines
 from .pyvista_scene import PyvistaStage, write_png
 

@@ -14,9 +14,9 @@ from ..model.splats import Splats
 from ..render.backends import BackendError
 from ..render.devices import uses_card
 from ..render.settings import RasterSettings
-from ..support.progress import Progress, silent
-from ..support.threads import on_threads
-from ..support.units import percent_of
+from ..system.progress import Progress, silent
+from ..system.threads import on_threads
+from ..system.units import percent_of
 from .cameras import HELD_OUT, TRAINING, Place, placed, split_path
 from .nodes import FittedNodes, FittedSet, Index
 from .optimiser import Optimiser, Schedule, default_steps

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from ..render.devices import device_setting
-from ..support.setting_fields import CheckedSettings, setting, whole
+from ..system.setting_fields import CheckedSettings, setting, whole
 
 if TYPE_CHECKING:
     from ..cameras.path import CameraPath

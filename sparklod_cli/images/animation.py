@@ -10,8 +10,8 @@ from types import ModuleType
 import numpy as np
 from PIL import Image
 
-from ..support.errors import SparklodError
-from ..support.optional import optional_import
+from ..system.errors import SparklodError
+from ..system.optional import optional_import
 from .pixels import Pixels
 
 #: Durations of the frames of a GIF: steps in ms, and the fewest steps that players do not slow down.

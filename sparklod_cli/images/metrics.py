@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..support.errors import SparklodError
+from ..system.errors import SparklodError
 
 #: (H, W, C), 0..1.
 Image = NDArray[np.floating[Any]]

@@ -12,7 +12,7 @@ from PIL import Image as Pillow
 from PIL import ImageDraw, ImageFont
 
 from ..render.color_scales import Coloring, smooth
-from ..support.printable import printable
+from ..system.printable import printable
 from .defaults import JPEG_QUALITY
 
 if TYPE_CHECKING:

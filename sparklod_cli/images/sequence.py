@@ -14,9 +14,9 @@ from ..cameras.frame import DEFAULT_FPS
 from ..io import write_stdout, write_whole
 from ..render.renderer import Renderer
 from ..render.settings import OF_PIXELS
-from ..support.parallel import ordered_map
-from ..support.progress import Progress, silent
-from ..support.threads import on_threads
+from ..system.parallel import ordered_map
+from ..system.progress import Progress, silent
+from ..system.threads import on_threads
 from . import pixels as codes
 from .animation import animate
 from .contact_sheet import sheet

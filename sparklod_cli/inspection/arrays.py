@@ -12,7 +12,7 @@ from ..codecs.gpu.dump import Arrays
 from ..codecs.splat_encoding import SplatEncoding
 from ..model.scene import Scene
 from ..model.splats import Splats
-from ..support.errors import FormatError
+from ..system.errors import FormatError
 from . import tree, value_checks, values
 from .findings import Finding
 

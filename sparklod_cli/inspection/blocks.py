@@ -14,8 +14,8 @@ from ..io.rad_file import RadFile
 from ..model.lod_tree import CHUNK_NODES, LodTree
 from ..model.scene import Scene
 from ..model.splats import COLUMNS, FloatArray, Splats
-from ..support.parallel import ordered_map
-from ..support.progress import Progress, silent
+from ..system.parallel import ordered_map
+from ..system.progress import Progress, silent
 from .findings import Finding
 
 Mask = NDArray[np.bool_]

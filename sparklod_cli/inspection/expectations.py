@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from ..io import read_text
-from ..support.errors import SparklodError
-from ..support.printable import near, printable
-from ..support.untrusted import QUOTED, parse_json, parse_toml, quoted, quoted_value
+from ..system.errors import SparklodError
+from ..system.printable import near, printable
+from ..system.untrusted import QUOTED, parse_json, parse_toml, quoted, quoted_value
 from ..tables.assertions import BadAssertionError, Condition, is_number, number_text, parse_condition
 from .findings import Finding
 from .report import NoFieldError, Report, value_at

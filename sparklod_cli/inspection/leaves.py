@@ -22,8 +22,8 @@ from ..model.scene import Scene
 from ..model.selection import Selection
 from ..model.sh import COEFFICIENTS
 from ..model.splats import FloatArray, Splats
-from ..support.errors import InvalidSplatsError
-from ..support.units import count_of
+from ..system.errors import InvalidSplatsError
+from ..system.units import count_of
 from .findings import Finding
 from .rad import PropertyFacts, RadFacts
 

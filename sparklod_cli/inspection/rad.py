@@ -12,7 +12,7 @@ from ..codecs.rad.rad_header import ENCODING_KEYS, RadChunkHeader, RadHeader
 from ..codecs.rad.rad_layout import BY_NAME, PROPERTIES, SIZES
 from ..codecs.rad.rad_reader import scan_chunks, scan_header
 from ..codecs.splat_encoding import log_scale_table
-from ..support.printable import MOST, printable
+from ..system.printable import MOST, printable
 from .findings import ChunkBytes, Head, HeaderScan
 from .value_checks import Ends
 

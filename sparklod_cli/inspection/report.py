@@ -18,10 +18,10 @@ from ..io.rad_file import RadFile
 from ..model.scene import Scene
 from ..model.sh import width_of
 from ..model.splats import COLUMNS
-from ..support.errors import FormatError, SparklodError
-from ..support.printable import printable
-from ..support.progress import Progress, silent
-from ..support.untrusted import QUOTED
+from ..system.errors import FormatError, SparklodError
+from ..system.printable import printable
+from ..system.progress import Progress, silent
+from ..system.untrusted import QUOTED
 from ..tables.columns import Row
 from . import arrays, chunks, rad, streamed_sog, tiles, tree, value_checks, values
 from .blocks import Block, ReportBlocks, merged

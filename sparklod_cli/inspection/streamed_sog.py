@@ -11,9 +11,9 @@ from ..codecs.scene_files import Chunk
 from ..codecs.stream import size_of
 from ..codecs.streamed_sog.manifest import VERSION, Manifest, ManifestNode
 from ..codecs.streamed_sog.manifest_rules import level_counts, scan_files, scan_splats
-from ..support.printable import MOST, printable
-from ..support.progress import Progress, silent
-from ..support.untrusted import LARGEST
+from ..system.printable import MOST, printable
+from ..system.progress import Progress, silent
+from ..system.untrusted import LARGEST
 from .findings import ChunkBytes, Head, HeaderScan, quantiles_of
 from .values import Box
 

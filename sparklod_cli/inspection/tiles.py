@@ -23,8 +23,8 @@ from ..codecs.tiles_3d.tileset_rules import (
 )
 from ..model.axes import common
 from ..model.georeference import EarthPlace, place_of
-from ..support.printable import MOST, printable
-from ..support.progress import Progress, silent
+from ..system.printable import MOST, printable
+from ..system.progress import Progress, silent
 from .findings import ChunkBytes, Head, HeaderScan, quantiles_of
 
 #: Distance from the centre of the Earth, metres, from which on a transform places a tileset on it. Chosen.

@@ -30,8 +30,8 @@ from ..codecs.stream import size_of
 from ..codecs.streamed_sog.manifest import MAX_MANIFEST, Manifest, parse
 from ..codecs.streamed_sog.manifest_rules import files_of_chunk
 from ..codecs.tiles_3d import tileset
-from ..support.addresses import Address, Place
-from ..support.errors import FormatError, OutputError
+from ..system.addresses import Address, Place
+from ..system.errors import FormatError, OutputError
 from .local_files import reason_of
 from .reading import opened
 from .writing import Files, SinkTogether, check_header, real_target, write_set

@@ -7,8 +7,8 @@ import os
 from collections.abc import Collection
 from dataclasses import dataclass
 
-from ..support.addresses import Address, Place
-from ..support.stdin import DASH, name_of
+from ..system.addresses import Address, Place
+from ..system.stdin import DASH, name_of
 from .local_files import companions
 from .reading import file_of, readable
 

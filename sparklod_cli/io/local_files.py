@@ -15,11 +15,11 @@ from typing import BinaryIO
 from ..codecs.file_names import FIRST_FILES, MANIFEST, META, TILESET, rad_chunk_number, sog_image_number
 from ..codecs.formats import FORMATS, head_of, sniff
 from ..codecs.lookalikes import POINTER, SHORT, is_pointer
-from ..support.addresses import Place
-from ..support.errors import FormatError, UnreadableError
-from ..support.printable import near
-from ..support.stdin import DASH
-from ..support.untrusted import quoted_value
+from ..system.addresses import Place
+from ..system.errors import FormatError, UnreadableError
+from ..system.printable import near
+from ..system.stdin import DASH
+from ..system.untrusted import quoted_value
 
 #: Names in a folder that are compared with one that is missing: more take longer than a person expects of an error.
 MOST_NAMES = 10_000

@@ -17,8 +17,8 @@ from ..codecs.validation import check_rules
 from ..model.lod_tree import LodTree
 from ..model.scene import FileCoding, Scene
 from ..model.splats import FloatArray, Splats
-from ..support.errors import UnreadableError
-from ..support.machine import available_memory
+from ..system.errors import UnreadableError
+from ..system.machine import available_memory
 from .local_files import open_named, reason_of
 from .reading import opened
 

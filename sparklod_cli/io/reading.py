@@ -18,11 +18,11 @@ from ..codecs.zip_folder import ZIP, ZipFolder
 from ..model.scene import DetailScene, Scene
 from ..model.splats import COLUMNS, FloatArray
 from ..model.tile_scene import TileScene
-from ..support.addresses import Place, size_of
-from ..support.errors import FormatError, UnknownFormatError, UnreadableError
-from ..support.json_text import decoded_text
-from ..support.progress import Progress, silent
-from ..support.stdin import DASH, spooled
+from ..system.addresses import Place, size_of
+from ..system.errors import FormatError, UnknownFormatError, UnreadableError
+from ..system.json_text import decoded_text
+from ..system.progress import Progress, silent
+from ..system.stdin import DASH, spooled
 from .local_files import in_folder, open_named, reason_unreadable
 
 if TYPE_CHECKING:

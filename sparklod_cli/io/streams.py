@@ -19,10 +19,10 @@ from ..codecs.content import Content, Source
 from ..model.splats import Splats
 from ..model.streams import Placed, SceneStream, merged
 from ..model.transforms import Transform
-from ..support import atomic
-from ..support.addresses import Address, Place
-from ..support.errors import FormatError, OutputError, SparklodError
-from ..support.stdin import DASH, name_of
+from ..system import atomic
+from ..system.addresses import Address, Place
+from ..system.errors import FormatError, OutputError, SparklodError
+from ..system.stdin import DASH, name_of
 from .local_files import reason_of
 from .reading import opened, readable
 

@@ -17,13 +17,13 @@ from ..codecs.encoder import Get
 from ..codecs.formats import Format
 from ..codecs.options import WriteOptions
 from ..model.scene import Scene
-from ..support import atomic, atomic_set
-from ..support.addresses import Address, Place
-from ..support.errors import OutputError, StdoutError
-from ..support.progress import Progress, silent
-from ..support.stdin import DASH
-from ..support.stdout import ReaderGoneError, guarded
-from ..support.units import format_size
+from ..system import atomic, atomic_set
+from ..system.addresses import Address, Place
+from ..system.errors import OutputError, StdoutError
+from ..system.progress import Progress, silent
+from ..system.stdin import DASH
+from ..system.stdout import ReaderGoneError, guarded
+from ..system.units import format_size
 from .local_files import number_of, reason_of
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ import re
 from dataclasses import dataclass, replace
 from fractions import Fraction
 
-from ..support.units import check_grouping, count_of, parse_count
+from ..system.units import check_grouping, count_of, parse_count
 
 #: A share of the leaves, in percent, with at most nine digits after the point.
 SHARE = re.compile(r"([0-9]{1,3}(?:\.[0-9]{1,9})?|\.[0-9]{1,9})\s*%")

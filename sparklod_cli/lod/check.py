@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from ..codecs.validation import check_valid
 from ..model.splats import Splats
-from ..support.errors import InvalidSplatsError
-from ..support.parallel import BLOCK_ROWS
-from ..support.threads import threads_for
+from ..system.errors import InvalidSplatsError
+from ..system.parallel import BLOCK_ROWS
+from ..system.threads import threads_for
 from .kernels.geometry import find_bounds
 
 

@@ -19,9 +19,9 @@ from ..model.foveation import SPARK
 from ..model.gaussian import spark_size
 from ..model.lod_tree import CHUNK_NODES, LodTree
 from ..model.splats import FloatArray, Splats
-from ..support.parallel import blocks_of
-from ..support.progress import Progress, silent
-from ..support.threads import threads_for
+from ..system.parallel import blocks_of
+from ..system.progress import Progress, silent
+from ..system.threads import threads_for
 from .families import families_of, node_order, reordered
 from .kernels.chunk_sets import DEMAND_BYTES, LANES, Families, fill_demand, sort_within_chunks, split_sets
 from .kernels.pixel_scale import NODE, VIEW

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from ..model.gaussian import linear_opacity, lod_opacity
 from ..model.splats import FloatArray
-from ..support.defaults import BLEND
+from ..system.defaults import BLEND
 from .kernels.cut_arrays import BUCKET_BITS, BUCKETS
 from .kernels.pixel_scale import pixel_scales
 from .kernels.tree_links import find_depths, find_limits, find_parents

@@ -21,7 +21,7 @@ from ..model.gaussian import covariance, spark_size
 from ..model.lod_tree import LodTree
 from ..model.scene import DetailScene
 from ..model.splats import Splats
-from ..support.progress import Progress, silent
+from ..system.progress import Progress, silent
 from .detail_rule import DetailSettings
 from .kernels.tree_links import find_parents
 from .regions import divide, extents, united

@@ -6,8 +6,8 @@ import itertools
 from dataclasses import dataclass
 from typing import ClassVar
 
-from ..support.setting_fields import CheckedSettings, Quantity, Range, setting, whole
-from ..support.units import parse_count
+from ..system.setting_fields import CheckedSettings, Quantity, Range, setting, whole
+from ..system.units import parse_count
 
 #: What a viewer makes of a budget: it spends all of it, or only keeps within it what distances ask for.
 BUDGET_MODES = ("target", "limit")

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from ..model.lod_tree import LodTree
 from ..model.sh import degree_of
 from ..model.splats import COLUMNS, FloatArray, Splats
-from ..support.progress import Progress
-from ..support.threads import threads_for, threads_in_use
+from ..system.progress import Progress
+from ..system.threads import threads_for, threads_in_use
 from . import pruning
 from .kernels import node_rows, pair_cost, prune
 from .kernels.node_rows import fill_leaves, merge_colors

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..model.gaussian import rotation_matrices
 from ..model.splats import FloatArray, Splats
-from ..support.errors import InvalidSplatsError
+from ..system.errors import InvalidSplatsError
 from .detail_rule import DetailSettings
 
 #: Half a bound's side for one splat, in standard deviations. Tools bound a splat by the box of one standard deviation

@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass, field
 
 from ..model.foveation import SPARK, Foveation
-from ..support.defaults import PRESETS
-from ..support.setting_fields import CheckedSettings, Range, setting
+from ..system.defaults import PRESETS
+from ..system.setting_fields import CheckedSettings, Range, setting
 from .detail_rule import DetailRule
 
 #: Factors that the traversal multiplies in float32.

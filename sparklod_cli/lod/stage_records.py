@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..model.splats import COLUMNS, FloatArray, Splats
-from ..support.progress import Progress
+from ..system.progress import Progress
 
 if TYPE_CHECKING:
     from .check import Bounds

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from ..model.georeference import IDENTITY, Matrix16, placed
-from ..support.setting_fields import CheckedSettings, Quantity, Range, setting, whole
-from ..support.units import parse_count
+from ..system.setting_fields import CheckedSettings, Quantity, Range, setting, whole
+from ..system.units import parse_count
 
 #: Least determinant of the axes of a transform, as a share of the product of their lengths: less is flat. Chosen.
 LEAST_VOLUME = 1e-6

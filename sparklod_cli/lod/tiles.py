@@ -15,7 +15,7 @@ from ..model.gaussian import spark_size
 from ..model.lod_tree import LodTree
 from ..model.splats import FloatArray, Splats
 from ..model.tile_scene import TileScene
-from ..support.progress import Progress, silent
+from ..system.progress import Progress, silent
 from .detail_levels import STEP, Nodes, RefinementOrder, owners_of, with_plain_opacity
 from .regions import extents, united
 from .tile_settings import TileSettings

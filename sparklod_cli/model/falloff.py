@@ -16,8 +16,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ..support.fast_math import exp2, log2
-from ..support.jit import kernel
+from ..system.fast_math import exp2, log2
+from ..system.jit import kernel
 
 f32 = np.float32
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ..support.defaults import BEHIND_FOVEATE, CONE_FOV, CONE_FOV0, CONE_FOVEATE
+from ..system.defaults import BEHIND_FOVEATE, CONE_FOV, CONE_FOV0, CONE_FOVEATE
 
 
 @dataclass(frozen=True)

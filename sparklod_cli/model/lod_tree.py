@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..support.errors import TreeError
+from ..system.errors import TreeError
 from .gaussian import spark_size
 from .splats import FloatArray, Splats
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..support.errors import InvalidSplatsError, TreeError
+from ..system.errors import InvalidSplatsError, TreeError
 from .axes import AXES
 from .lod_tree import LodTree
 from .sh import COEFFICIENTS

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from ..support.errors import InvalidSplatsError
-from ..support.parallel import blocks_of, ordered_map
+from ..system.errors import InvalidSplatsError
+from ..system.parallel import blocks_of, ordered_map
 from .splats import INVALID, Splats, describe_counts
 
 Vector = tuple[float, float, float]

@@ -10,9 +10,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..support.errors import SparklodError
-from ..support.progress import Progress, silent
-from ..support.units import count_of
+from ..system.errors import SparklodError
+from ..system.progress import Progress, silent
+from ..system.units import count_of
 from .axes import common, differing, rotated
 from .lod_tree import LodTree
 from .scene import Scene, facts_of

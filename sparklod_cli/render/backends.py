@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, cast
 
-from ..support.errors import SparklodError
+from ..system.errors import SparklodError
 
 if TYPE_CHECKING:
     from ..cameras.camera import Camera

@@ -16,8 +16,8 @@ from ..render.color_scales import ticks
 from ..scenes.finder import CutSource
 from ..scenes.loaded import Part
 from ..scenes.loaded_scene import Index, LoadedScene
-from ..support.errors import SparklodError
-from ..support.progress import Progress, silent
+from ..system.errors import SparklodError
+from ..system.progress import Progress, silent
 from .color_scales import (
     CLIPPED,
     MAGMA,

@@ -6,7 +6,7 @@ import importlib.util
 from collections.abc import Callable
 from typing import Any
 
-from ..support.setting_fields import setting
+from ..system.setting_fields import setting
 from .backends import BackendError
 
 #: What is asked for: a card if there is one; the processor; a card.

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..cameras.camera import Camera
 from ..cameras.pose import FARTHEST, FLIP
 from ..model.falloff import MAX_STD_DEV, MIN_ALPHA, STD_DEV_PER_D
-from ..support.threads import threads_in_use
+from ..system.threads import threads_in_use
 from .kernels import ellipse, project, raster
 from .settings import BLUR, CLIP, RasterSettings
 from .shading import ShadedSplats

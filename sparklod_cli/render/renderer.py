@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..cameras.camera import Camera
 from ..scenes.finder import CutSource
 from ..scenes.loaded import Cut
-from ..support.progress import Progress, silent
+from ..system.progress import Progress, silent
 from . import color_by, styles
 from .backends import ON_CARD
 from .color_by import Scale

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from ..support.defaults import FARTHEST, MAX_SH_DEGREE, MAX_SUPERSAMPLE
-from ..support.setting_fields import CheckedSettings, Range, setting, whole
+from ..system.defaults import FARTHEST, MAX_SH_DEGREE, MAX_SUPERSAMPLE
+from ..system.setting_fields import CheckedSettings, Range, setting, whole
 from .backends import BACKENDS, ON_CARD
 from .devices import device_setting
 

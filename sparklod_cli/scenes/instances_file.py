@@ -16,8 +16,8 @@ from ..io import is_file_name, read_text
 from ..model.foveation import Cones, Foveation, Frustum
 from ..model.instances import TOTAL, Instance, Matrix, names_of
 from ..model.transforms import LARGEST, scale_of
-from ..support.errors import SparklodError
-from ..support.untrusted import parse_json, quoted_value, well_formed
+from ..system.errors import SparklodError
+from ..system.untrusted import parse_json, quoted_value, well_formed
 
 #: What an instance may say, and how many numbers that is; 0 for something else.
 KEYS = {"file": 0, "name": 0, "matrix": 16, "translation": 3, "rotation": 4, "scale": 1, "lod_scale": 1, "foveation": 0}

@@ -25,7 +25,7 @@ from ..model.instances import Instance, Matrix
 from ..model.lod_tree import Nodes
 from ..model.scene import Scene
 from ..model.splats import Splats
-from ..support.units import count_of
+from ..system.units import count_of
 from .loaded_scene import Index, LoadedDetail, LoadedRuns, LoadedScene, LoadedTiles, nodes_of
 from .pages import PagedForest, PagedScene, sampled_balls
 

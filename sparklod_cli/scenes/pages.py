@@ -21,9 +21,9 @@ from ..model.instances import Instance
 from ..model.lod_tree import CHUNK_BITS, CHUNK_NODES, LodTree, Nodes
 from ..model.scene import FileCoding
 from ..model.splats import COLUMNS, Splats
-from ..support.errors import SparklodError, TreeError
-from ..support.machine import available_memory
-from ..support.parallel import ordered_map
+from ..system.errors import SparklodError, TreeError
+from ..system.machine import available_memory
+from ..system.parallel import ordered_map
 from .loaded_scene import Index, LoadedScene, bytes_of
 
 #: Makes nodes of the splats, the tree and the coding of a chunk.

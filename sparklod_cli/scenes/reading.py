@@ -20,9 +20,9 @@ from ..model.scene import DetailScene, Scene
 from ..model.selection import Selection, describe
 from ..model.splats import COLUMNS
 from ..model.tile_scene import TileScene
-from ..support.errors import FormatError, InvalidSplatsError, SparklodError, TreeError, memory_errors_translated
-from ..support.progress import Progress, silent
-from ..support.stdin import DASH
+from ..system.errors import FormatError, InvalidSplatsError, SparklodError, TreeError, memory_errors_translated
+from ..system.progress import Progress, silent
+from ..system.stdin import DASH
 from .loaded import Scenes
 from .loaded_scene import (
     UNNAMED,

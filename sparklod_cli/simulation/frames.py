@@ -16,8 +16,8 @@ from ..lod.traversal import TreeCut
 from ..model.instances import TOTAL
 from ..scenes.finder import view_of
 from ..scenes.loaded import Scenes
-from ..support.parallel import ordered_map
-from ..support.progress import Progress, silent
+from ..system.parallel import ordered_map
+from ..system.progress import Progress, silent
 from ..tables.columns import Row
 from .columns import COLUMNS, OF_BUDGETS, OF_TREES
 from .loading import Viewer

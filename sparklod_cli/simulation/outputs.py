@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..io import check_free, check_writable, write_whole
-from ..support.progress import Progress, silent
+from ..system.progress import Progress, silent
 from ..tables.output import Filter, TableOutput
 from .summary import Lookout
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 from ..lod import detail_rule
-from ..support.defaults import FETCHERS
-from ..support.setting_fields import CheckedSettings, Quantity, Range, setting, whole
-from ..support.units import parse_bandwidth, parse_time
+from ..system.defaults import FETCHERS
+from ..system.setting_fields import CheckedSettings, Quantity, Range, setting, whole
+from ..system.units import parse_bandwidth, parse_time
 
 
 @dataclass(frozen=True)

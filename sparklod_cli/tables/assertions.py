@@ -12,9 +12,9 @@ from decimal import Decimal
 from types import MappingProxyType
 from typing import Any
 
-from ..support.errors import SparklodError
-from ..support.printable import near
-from ..support.units import PREFIXES
+from ..system.errors import SparklodError
+from ..system.printable import near
+from ..system.units import PREFIXES
 from .columns import Column, Row
 from .statistics import STATISTICS, Number, is_statistic, numbers, statistic, totals
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from html import escape
 from typing import Any, overload
 
-from ..support.optional import optional_import
+from ..system.optional import optional_import
 
 #: The value of a cell; None for an empty one, such as the churn of the first frame.
 Cell = int | float | str | None

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from types import ModuleType
 from typing import Any
 
-from ..support.optional import optional_import
+from ..system.optional import optional_import
 from .columns import Cell, Column, Row
 
 #: Version of the schema: counts up when a column changes its meaning or is removed, not when one is added.

@@ -10,9 +10,9 @@ from pathlib import Path
 
 from ..io import read_text, try_place, write_whole
 from ..io.local_files import open_plain, reason_of
-from ..support.errors import OutputError, SparklodError
-from ..support.progress import Progress, silent
-from ..support.untrusted import parse_json
+from ..system.errors import OutputError, SparklodError
+from ..system.progress import Progress, silent
+from ..system.untrusted import parse_json
 from .site import GENERATOR, SETTINGS, Site
 
 #: Names of folders that are incomplete, or about to be removed.

@@ -27,9 +27,9 @@ from ..codecs.zip_folder import ZIP, ZipFolder
 from ..io.local_files import companion_path, in_folder, open_named, open_plain, reason_unreadable
 from ..io.reading import recognised
 from ..model.lod_tree import CHUNK_NODES
-from ..support.errors import FormatError, NotSplatsError, UnreadableError
-from ..support.printable import printable
-from ..support.untrusted import quoted_value
+from ..system.errors import FormatError, NotSplatsError, UnreadableError
+from ..system.printable import printable
+from ..system.untrusted import quoted_value
 
 #: What Spark calls the formats that sparklod reads.
 SPARK_TYPES = {

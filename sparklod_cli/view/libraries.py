@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..io import read_text
-from ..support.errors import SparklodError
-from ..support.printable import printable
-from ..support.untrusted import parse_json
+from ..system.errors import SparklodError
+from ..system.printable import printable
+from ..system.untrusted import parse_json
 from .files import ENGINES
 
 SPARK, PLAYCANVAS, CESIUM, THREE = "@sparkjsdev/spark", "playcanvas", "cesium", "three"

@@ -21,7 +21,7 @@ from urllib.parse import unquote_to_bytes
 
 from .. import __version__
 from ..io.local_files import open_plain
-from ..support.errors import SparklodError
+from ..system.errors import SparklodError
 from .files import media_type
 from .site import CAMERAS, INDEX, MAX_BYTES, Site, parse_drop
 

@@ -25,8 +25,8 @@ from ..cameras.frame import Settings as CameraSettings
 from ..cameras.path import CameraPath, read
 from ..io.local_files import leads_away
 from ..model.axes import lines_of
-from ..support.errors import CameraPathError
-from ..support.untrusted import parse_json, quoted_value
+from ..system.errors import CameraPathError
+from ..system.untrusted import parse_json, quoted_value
 from .files import Resources, ShownFile
 from .libraries import LENIENT, Libraries
 from .start import Extent, Start

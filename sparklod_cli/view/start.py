@@ -24,9 +24,9 @@ from ..model.balls import Balls, balls_of
 from ..model.scene import DetailScene
 from ..model.splats import Splats
 from ..model.tile_scene import TileScene
-from ..support.defaults import ELEVATION
-from ..support.errors import InvalidSplatsError, SparklodError, UnreadableError
-from ..support.progress import Progress, silent
+from ..system.defaults import ELEVATION
+from ..system.errors import InvalidSplatsError, SparklodError, UnreadableError
+from ..system.progress import Progress, silent
 from .files import ShownFile
 
 #: x, y and z in world units.

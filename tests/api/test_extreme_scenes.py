@@ -22,7 +22,7 @@ from sparklod_cli.lod.detail_rule import DetailSettings
 from sparklod_cli.model.gaussian import normalized_quat
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.sh import COEFFICIENTS
-from sparklod_cli.support.errors import SparklodError
+from sparklod_cli.system.errors import SparklodError
 
 LARGEST = float(np.finfo(np.float32).max)
 TINIEST = float(np.finfo(np.float32).smallest_subnormal)

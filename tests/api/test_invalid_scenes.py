@@ -21,7 +21,7 @@ from sparklod_cli.io import write_whole
 from sparklod_cli.lod.detail_rule import DetailSettings
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene, Tree
-from sparklod_cli.support.errors import InvalidSplatsError, TreeError
+from sparklod_cli.system.errors import InvalidSplatsError, TreeError
 from tests.scenes import random_splats
 
 #: Encodings of RAD that hold any float.

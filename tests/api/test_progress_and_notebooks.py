@@ -38,7 +38,7 @@ def test_work_is_done_on_the_threads_that_are_asked_for(
     scene: sparklod.Scene, held: sparklod.Tree, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from sparklod_cli.render import rasterizer
-    from sparklod_cli.support.threads import threads_in_use
+    from sparklod_cli.system.threads import threads_in_use
 
     before, used = threads_in_use(), set()
     draw = rasterizer.draw

@@ -14,7 +14,7 @@ from sparklod_cli.bake.settings import BakeSettings
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
 from sparklod_cli.model.selection import Selection
 from sparklod_cli.model.transforms import Transform
-from sparklod_cli.support.errors import UnreadableError
+from sparklod_cli.system.errors import UnreadableError
 from tests.conftest import FIXTURES
 
 SETTINGS = BakeSettings()

@@ -16,8 +16,8 @@ from sparklod_cli.codecs.statistics import Statistics
 from sparklod_cli.lod import quick
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.streams import NodeStream
-from sparklod_cli.support.errors import OutputError
-from sparklod_cli.support.progress import silent
+from sparklod_cli.system.errors import OutputError
+from sparklod_cli.system.progress import silent
 from tests.node_streams import node_stream
 from tests.scenes import random_splats
 

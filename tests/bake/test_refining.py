@@ -18,7 +18,7 @@ from sparklod_cli.fitting.settings import FitSettings
 from sparklod_cli.io import read_scene, scene_sink
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import same_rows
-from sparklod_cli.support.errors import CameraPathError, FormatError, InvalidSplatsError, OutOfMemoryError, OutputError
+from sparklod_cli.system.errors import CameraPathError, FormatError, InvalidSplatsError, OutOfMemoryError, OutputError
 from tests.conftest import FIXTURES
 from tests.fittings import StandIn
 from tests.fittings import stand_in as stand_in

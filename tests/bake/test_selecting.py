@@ -8,7 +8,7 @@ import pytest
 from sparklod_cli.bake.selecting import select
 from sparklod_cli.bake.settings import BakeSettings
 from sparklod_cli.model.selection import Selection, SelectionTally
-from sparklod_cli.support.errors import InvalidSplatsError
+from sparklod_cli.system.errors import InvalidSplatsError
 from tests.lod.trees import hard_cases
 from tests.scenes import random_splats
 

@@ -13,7 +13,7 @@ from sparklod_cli.bake import side_by_side
 from sparklod_cli.bake.out_of_core.estimate import in_memory_bytes
 from sparklod_cli.bake.settings import BakeSettings, Resources
 from sparklod_cli.bake.side_by_side import bake_side_by_side
-from sparklod_cli.support.errors import OutputError, SparklodError
+from sparklod_cli.system.errors import OutputError, SparklodError
 from tests.conftest import FIXTURES
 
 #: Splats and SH degree of the largest scene that a worker of these tests holds.

@@ -14,7 +14,7 @@ from sparklod_cli.fitting.nodes import FittedNodes
 from sparklod_cli.lod.budget import parse_budget
 from sparklod_cli.lod.detail_levels import RefinementOrder
 from sparklod_cli.model.lod_tree import LodTree
-from sparklod_cli.support.progress import silent
+from sparklod_cli.system.progress import silent
 from tests.scenes import random_splats
 
 SCENE = sparklod.Scene(random_splats(2000, sh_degree=1), up="-y")

@@ -14,7 +14,7 @@ from sparklod_cli.bake.skipping import SUFFIX, bake_unless_there
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
 from sparklod_cli.io import identity
 from sparklod_cli.lod.detail_rule import DetailSettings
-from sparklod_cli.support.errors import OutputError
+from sparklod_cli.system.errors import OutputError
 from tests.conftest import FIXTURES
 
 SETTINGS = BakeSettings()

@@ -25,7 +25,7 @@ from sparklod_cli.cameras.generators import orbit
 from sparklod_cli.model.balls import Balls, balls_of
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.render.settings import RasterSettings
-from sparklod_cli.support.errors import InvalidSplatsError
+from sparklod_cli.system.errors import InvalidSplatsError
 
 SIZES = st.sampled_from([(1280, 720), (720, 1280), (500, 500), (2000, 100)])
 

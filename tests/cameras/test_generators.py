@@ -23,7 +23,7 @@ from sparklod_cli.cameras.generators import (
 )
 from sparklod_cli.cameras.path import cameras_of
 from sparklod_cli.cameras.pose import look_at
-from sparklod_cli.support.errors import CameraPathError
+from sparklod_cli.system.errors import CameraPathError
 
 DOWN_Y = (0.0, -1.0, 0.0)
 

@@ -22,7 +22,7 @@ from sparklod_cli.codecs.tensor_pickle import Tensor, unpickled
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.sh import SH_C0
 from sparklod_cli.model.splats import COLUMNS
-from sparklod_cli.support.errors import FormatError, NotSplatsError, TruncatedError
+from sparklod_cli.system.errors import FormatError, NotSplatsError, TruncatedError
 from tests.codecs.cases import linear
 from tests.scenes import random_splats
 

@@ -18,7 +18,7 @@ from sparklod_cli.codecs.content import decode_file
 from sparklod_cli.io import read_scene
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS
-from sparklod_cli.support.errors import FormatError
+from sparklod_cli.system.errors import FormatError
 from tests.codecs.cases import linear
 from tests.conftest import FIXTURES
 from tests.scenes import random_splats

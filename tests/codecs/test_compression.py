@@ -15,8 +15,8 @@ import zstandard
 
 from sparklod_cli.codecs import compression
 from sparklod_cli.codecs.compression import DataRun, Way
-from sparklod_cli.support.errors import FormatError
-from sparklod_cli.support.progress import silent
+from sparklod_cli.system.errors import FormatError
+from sparklod_cli.system.progress import silent
 
 BLOCK = compression.BLOCK
 SIZES = (0, 1, 2, BLOCK - 1, BLOCK, BLOCK + 1, 2 * BLOCK, 3 * BLOCK, 3 * BLOCK + 7)

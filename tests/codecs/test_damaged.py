@@ -20,7 +20,7 @@ from fixtures import by_hand, by_hand_sog
 from sparklod_cli.codecs.content import decode_file
 from sparklod_cli.codecs.formats import FORMATS, HEAD, Format, sniff
 from sparklod_cli.model.scene import Scene
-from sparklod_cli.support.errors import FormatError
+from sparklod_cli.system.errors import FormatError
 from tests.conftest import FIXTURES
 
 #: Files to damage: small ones of every kind that is read.

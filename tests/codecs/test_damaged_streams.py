@@ -16,7 +16,7 @@ from fixtures import by_hand_sog
 from sparklod_cli.codecs.content import Source, decode_file
 from sparklod_cli.model import streams
 from sparklod_cli.model.splats import COLUMNS, Splats
-from sparklod_cli.support.errors import FormatError, HasTreeError
+from sparklod_cli.system.errors import FormatError, HasTreeError
 from tests.codecs.test_damaged import FILES, WORDS, content, files_of, format_of, header, insides, members
 
 TRIES = 40

@@ -16,7 +16,7 @@ from sparklod_cli.codecs.rad import rad_encoder, rad_options
 from sparklod_cli.codecs.sh_palette import cluster
 from sparklod_cli.lod import quality, quick
 from sparklod_cli.model.scene import Scene
-from sparklod_cli.support.progress import silent
+from sparklod_cli.system.progress import silent
 from tests.node_streams import node_stream
 from tests.scenes import random_splats
 

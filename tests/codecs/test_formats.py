@@ -14,7 +14,7 @@ from sparklod_cli.codecs.formats import ENCODINGS, FORMATS, WRITABLE, Format, en
 from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
-from sparklod_cli.support.errors import FormatError
+from sparklod_cli.system.errors import FormatError
 from tests.scenes import random_splats
 
 

@@ -24,7 +24,7 @@ from sparklod_cli.model.axes import AXES
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.model.transforms import Transform
-from sparklod_cli.support.errors import FormatError
+from sparklod_cli.system.errors import FormatError
 from tests.conftest import FIXTURES
 from tests.scenes import random_splats
 

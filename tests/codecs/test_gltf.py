@@ -21,7 +21,7 @@ from sparklod_cli.io import companions, open_stream, read_scene
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.model.transforms import Transform
-from sparklod_cli.support.errors import FormatError, NotSplatsError, PromiseError, UnsupportedError, VersionError
+from sparklod_cli.system.errors import FormatError, NotSplatsError, PromiseError, UnsupportedError, VersionError
 from tests.codecs.cases import linear
 from tests.codecs.streamed_sog.scenes import open_companion
 from tests.codecs.test_glb import with_root

@@ -14,7 +14,7 @@ from sparklod_cli.codecs import hier
 from sparklod_cli.codecs.content import decode_file
 from sparklod_cli.codecs.formats import sniff
 from sparklod_cli.model.scene import Scene
-from sparklod_cli.support.errors import FormatError, TruncatedError
+from sparklod_cli.system.errors import FormatError, TruncatedError
 from tests.codecs.cases import linear
 from tests.scenes import random_splats
 

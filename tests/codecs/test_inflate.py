@@ -21,8 +21,8 @@ from sparklod_cli.codecs.inflate import Inflate
 from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS
-from sparklod_cli.support.errors import ChecksumError, FormatError, TruncatedError
-from sparklod_cli.support.progress import silent
+from sparklod_cli.system.errors import ChecksumError, FormatError, TruncatedError
+from sparklod_cli.system.progress import silent
 from tests.scenes import random_splats
 
 LIBRARIES = (inflate._library, zlib_ng)

@@ -12,7 +12,7 @@ import pytest
 from sparklod_cli.codecs import ksplat
 from sparklod_cli.codecs.content import decode_file
 from sparklod_cli.model.scene import Scene
-from sparklod_cli.support.errors import FormatError
+from sparklod_cli.system.errors import FormatError
 from tests.conftest import FIXTURES
 
 GOLDEN = [FIXTURES / "golden" / f"sh2-level{level}.ksplat" for level in range(3)]

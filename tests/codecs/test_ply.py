@@ -20,7 +20,7 @@ from sparklod_cli.codecs.content import decode_file
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
-from sparklod_cli.support.errors import FormatError, NotSplatsError
+from sparklod_cli.system.errors import FormatError, NotSplatsError
 from tests.conftest import FIXTURES
 from tests.scenes import random_splats, splat_columns
 

@@ -21,7 +21,7 @@ from sparklod_cli.model.gaussian import linear_opacity, lod_opacity
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
-from sparklod_cli.support.errors import FormatError
+from sparklod_cli.system.errors import FormatError
 from tests.codecs.cases import Precision, put
 from tests.codecs.test_quantize import rotation_degrees
 from tests.codecs.writers import WRITERS

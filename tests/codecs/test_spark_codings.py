@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from sparklod_cli.codecs import spark_codings
 from sparklod_cli.codecs.spark_codings import STEPS_8_8_8, STEPS_10_10_12
 from sparklod_cli.model.gaussian import normalized_quat
-from sparklod_cli.support.errors import FormatError
+from sparklod_cli.system.errors import FormatError
 
 Steps = tuple[int, int]
 BOTH = pytest.mark.parametrize("steps", [STEPS_8_8_8, STEPS_10_10_12])

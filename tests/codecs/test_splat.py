@@ -15,7 +15,7 @@ from sparklod_cli.io import read_scene
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
-from sparklod_cli.support.errors import FormatError
+from sparklod_cli.system.errors import FormatError
 from tests.conftest import FIXTURES
 from tests.scenes import random_splats
 

@@ -38,7 +38,7 @@ from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.sh import COEFFICIENTS
 from sparklod_cli.model.transforms import sh_basis
-from sparklod_cli.support.errors import FormatError
+from sparklod_cli.system.errors import FormatError
 from tests.scenes import random_splats
 
 

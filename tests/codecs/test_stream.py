@@ -18,8 +18,8 @@ from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.codecs.stream import rows_of
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
-from sparklod_cli.support.errors import FormatError
-from sparklod_cli.support.parallel import BLOCK_ROWS, ordered_map
+from sparklod_cli.system.errors import FormatError
+from sparklod_cli.system.parallel import BLOCK_ROWS, ordered_map
 from tests.scenes import random_splats
 
 COUNT = 12 * BLOCK_ROWS

@@ -17,7 +17,7 @@ from sparklod_cli.io.details import read_level_files
 from sparklod_cli.io.streams import open_stream
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS
-from sparklod_cli.support.errors import FormatError, NotSplatsError
+from sparklod_cli.system.errors import FormatError, NotSplatsError
 from tests.conftest import FIXTURES, Capture
 
 GOLDEN = FIXTURES / "golden"

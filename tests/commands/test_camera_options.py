@@ -18,7 +18,7 @@ from sparklod_cli.cameras.path import CameraPath
 from sparklod_cli.commands.option_groups import argument, command, values_of
 from sparklod_cli.commands.options.cameras import Cameras
 from sparklod_cli.model.balls import Balls
-from sparklod_cli.support.errors import CameraPathError
+from sparklod_cli.system.errors import CameraPathError
 from tests.cameras.known import FOLDER, KNOWN, SIZE, check_pose
 
 #: A ball around (1, 2, 3), of which nine in ten are nearer than 2.

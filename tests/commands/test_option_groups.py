@@ -17,7 +17,7 @@ from sparklod_cli.lod.detail_rule import DetailRule, DetailSettings
 from sparklod_cli.lod.settings import LodSettings
 from sparklod_cli.render.settings import RasterSettings, RenderSettings
 from sparklod_cli.simulation.streaming_settings import Network, StreamingSettings
-from sparklod_cli.support.setting_fields import CheckedSettings, Range, Setting, setting, settings_in
+from sparklod_cli.system.setting_fields import CheckedSettings, Range, Setting, setting, settings_in
 from tests.conftest import Capture
 
 SETTINGS = (

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from sparklod_cli.cli import run
 from sparklod_cli.io import read_rgba, read_scene
-from sparklod_cli.support.errors import FormatError
+from sparklod_cli.system.errors import FormatError
 from tests.conftest import FIXTURES, Capture
 
 SCENE = FIXTURES / "sh2.ply"

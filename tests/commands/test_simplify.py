@@ -14,7 +14,7 @@ from sparklod_cli.codecs import ply
 from sparklod_cli.codecs.formats import WRITABLE
 from sparklod_cli.io import read_scene
 from sparklod_cli.model.scene import Scene
-from sparklod_cli.support.errors import SparklodError
+from sparklod_cli.system.errors import SparklodError
 from tests.conftest import FIXTURES, Capture
 from tests.scenes import random_splats
 

@@ -6,7 +6,7 @@ from sparklod_cli import io
 from sparklod_cli.cameras import frame
 from sparklod_cli.codecs import compression
 from sparklod_cli.inspection import tree
-from sparklod_cli.support import printable, untrusted
+from sparklod_cli.system import printable, untrusted
 from tests.conftest import ROOT
 
 

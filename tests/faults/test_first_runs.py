@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from sparklod_cli.support.kernel_cache import SUFFIX
+from sparklod_cli.system.kernel_cache import SUFFIX
 from tests.conftest import ROOT
 from tests.faults.runs import ENVIRONMENT
 
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.slow
 #: Calls a few kernels that call each other; prints the cache folder, the number of compilations, and the results.
 SCRIPT = """
 import numpy as np
-from sparklod_cli.support import jit
+from sparklod_cli.system import jit
 from sparklod_cli.lod.kernels.geometry import find_bounds
 from sparklod_cli.render.kernels.shade import add_sh
 

@@ -21,7 +21,7 @@ from sparklod_cli.bake.out_of_core.scratch_folder import SUFFIX
 from sparklod_cli.bake.out_of_core.store import Store
 from sparklod_cli.bake.settings import BakeSettings, Resources
 from sparklod_cli.bake.skipping import bake_unless_there
-from sparklod_cli.support.errors import InvalidSplatsError, OutputError, ScratchError
+from sparklod_cli.system.errors import InvalidSplatsError, OutputError, ScratchError
 from tests.faults.runs import DEMO, ENVIRONMENT, mounted
 from tests.signals import heed_signals
 
@@ -37,7 +37,7 @@ from pathlib import Path
 from sparklod_cli.bake.flow import bake
 from sparklod_cli.bake.settings import BakeSettings, Resources
 from sparklod_cli.bake.out_of_core.store import Store
-from sparklod_cli.support import interrupts
+from sparklod_cli.system import interrupts
 
 source, target, scratch, method, suffix, moment, how = sys.argv[1:]
 left, write = int(moment), Store._write

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 
 from sparklod_cli.figures import pyvista_scene
-from sparklod_cli.support.errors import SparklodError
+from sparklod_cli.system.errors import SparklodError
 
 
 @pytest.fixture

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from sparklod_cli.figures import charts, traversal_chart
-from sparklod_cli.support.errors import SparklodError
-from sparklod_cli.support.optional import install_hint
+from sparklod_cli.system.errors import SparklodError
+from sparklod_cli.system.optional import install_hint
 from sparklod_cli.tables.columns import Row
 from tests.figures.flights import count_of, marked, path_scene, pixels, plotted
 from tests.tables.rows import flight, row

@@ -13,7 +13,7 @@ from sparklod_cli.figures import charts, geometry
 from sparklod_cli.figures.camera_path import FRAME, PathScene, _above, frustum_lines, picture_of_path
 from sparklod_cli.figures.geometry import viewpoint
 from sparklod_cli.model.gaussian import covariance
-from sparklod_cli.support.errors import SparklodError
+from sparklod_cli.system.errors import SparklodError
 from tests.figures.flights import SIZE, circle, count_of, looking, path_scene, pixels, plotted
 from tests.scenes import random_splats
 from tests.tables.rows import flight

@@ -13,8 +13,8 @@ import pytest
 from PIL import Image, ImageSequence
 
 from sparklod_cli.images import animation
-from sparklod_cli.support.errors import SparklodError
-from sparklod_cli.support.optional import install_hint
+from sparklod_cli.system.errors import SparklodError
+from sparklod_cli.system.optional import install_hint
 
 pytestmark = pytest.mark.slow
 

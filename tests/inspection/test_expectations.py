@@ -12,7 +12,7 @@ import pytest
 from sparklod_cli.cli import run
 from sparklod_cli.inspection.expectations import ExpectationError, Expectations, check, read
 from sparklod_cli.inspection.report import NoFieldError, Report, ReportSettings, inspect
-from sparklod_cli.support.errors import SparklodError
+from sparklod_cli.system.errors import SparklodError
 from tests.conftest import FIXTURES, Capture
 from tests.inspection.expected import DEPTH, LEAVES, NODES, PLAIN, TREE, written
 

@@ -24,7 +24,7 @@ from sparklod_cli.io import read_parts
 from sparklod_cli.io.details import detail_sink
 from sparklod_cli.lod import detail_levels, quick
 from sparklod_cli.lod.detail_rule import DetailSettings
-from sparklod_cli.support.errors import FormatError
+from sparklod_cli.system.errors import FormatError
 from tests.inspection.streamed_sog_files import COUNTS, Folder, Node, folder, regions, splats
 from tests.inspection.test_schema import faults as schema_faults
 from tests.inspection.test_schema import places

@@ -13,7 +13,7 @@ from sparklod_cli.lod.check import check
 from sparklod_cli.lod.stage_records import NO_FAMILY, STAGE_BITS, Pending, Region, StagedBuilder, StageFamilies
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.splats import Splats
-from sparklod_cli.support.progress import silent
+from sparklod_cli.system.progress import silent
 
 #: Parts of a region along x, y and z, from the whole scene down to the regions of blocks.
 Splits = Sequence[tuple[int, int, int]]

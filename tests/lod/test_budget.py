@@ -7,7 +7,7 @@ from fractions import Fraction
 import pytest
 
 from sparklod_cli.lod.budget import LARGEST, Budget, parse_budget, parse_budgets
-from sparklod_cli.support.units import parse_count, parse_size
+from sparklod_cli.system.units import parse_count, parse_size
 
 
 def test_budgets_are_shares_or_counts() -> None:

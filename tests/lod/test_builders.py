@@ -8,7 +8,7 @@ import pytest
 
 from sparklod_cli.lod.builders import BUILDERS, METHODS
 from sparklod_cli.lod.check import check as check_input
-from sparklod_cli.support.errors import InvalidSplatsError
+from sparklod_cli.system.errors import InvalidSplatsError
 from tests.lod.assembled import run_stages
 from tests.lod.trees import check_colours, check_threads, check_tree, hard_cases
 from tests.scenes import random_splats

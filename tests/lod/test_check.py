@@ -8,7 +8,7 @@ import pytest
 from sparklod_cli.codecs import validation
 from sparklod_cli.codecs.validation import check_valid, is_valid_and_visible
 from sparklod_cli.model.splats import COLUMNS
-from sparklod_cli.support.errors import InvalidSplatsError
+from sparklod_cli.system.errors import InvalidSplatsError
 from tests.lod.trees import hard_cases
 from tests.scenes import random_splats
 

@@ -23,7 +23,7 @@ from sparklod_cli.lod.traversal import CutView, Forest, Traversal, TreeCut, Tree
 from sparklod_cli.model.gaussian import spark_size
 from sparklod_cli.model.lod_tree import CHUNK_NODES, LodTree, Nodes
 from sparklod_cli.model.splats import Splats
-from sparklod_cli.support.threads import on_threads
+from sparklod_cli.system.threads import on_threads
 from tests.lod.forests import links
 from tests.lod.trees import check_threads
 from tests.references import chunk_splits

@@ -15,7 +15,7 @@ from sparklod_cli.lod.kernels.prune import MOST_CHILDREN
 from sparklod_cli.lod.stage_records import Pending, Region
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.splats import COLUMNS, Splats
-from sparklod_cli.support.progress import silent
+from sparklod_cli.system.progress import silent
 from tests.lod.assembled import Splits, build_in_stages, check_families, run_stages
 from tests.lod.trees import check_colours, check_tree, coincident, hard_cases
 from tests.scenes import random_splats

@@ -13,7 +13,7 @@ from sparklod_cli.lod.detail_rule import DetailSettings
 from sparklod_cli.lod.regions import EXTENT, beyond, divide, extents, middle_of, united
 from sparklod_cli.model.gaussian import covariance, rotation_matrices
 from sparklod_cli.model.splats import Splats
-from sparklod_cli.support.errors import InvalidSplatsError
+from sparklod_cli.system.errors import InvalidSplatsError
 from tests.scenes import random_splats
 
 

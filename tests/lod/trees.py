@@ -10,7 +10,7 @@ import numpy as np
 from sparklod_cli.model.gaussian import MAX_OPACITY, MIN_OPACITY
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.splats import COLUMNS, Splats
-from sparklod_cli.support.threads import on_threads
+from sparklod_cli.system.threads import on_threads
 from tests.references import gaussians
 from tests.scenes import random_splats
 

@@ -17,7 +17,7 @@ from sparklod_cli.lod import quality, quick
 from sparklod_cli.lod.builders import METHODS
 from sparklod_cli.model.selection import REASONS, Selection
 from sparklod_cli.model.splats import INVALID, Splats
-from sparklod_cli.support.errors import InvalidSplatsError
+from sparklod_cli.system.errors import InvalidSplatsError
 from tests.scenes import random_splats
 
 pytestmark = pytest.mark.filterwarnings("error")

@@ -8,7 +8,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from sparklod_cli.model.lod_tree import LodTree
-from sparklod_cli.support.errors import TreeError
+from sparklod_cli.system.errors import TreeError
 
 
 def tree_of(counts: list[int], starts: list[int]) -> LodTree:

@@ -10,7 +10,7 @@ import pytest
 from sparklod_cli.model import selection
 from sparklod_cli.model.selection import Selection, describe
 from sparklod_cli.model.splats import COLUMNS, Splats
-from sparklod_cli.support.errors import InvalidSplatsError
+from sparklod_cli.system.errors import InvalidSplatsError
 from tests.scenes import random_splats
 
 

@@ -14,7 +14,7 @@ from sparklod_cli.lod.kernels.geometry import ellipsoid_area
 from sparklod_cli.model.gaussian import linear_opacity, lod_opacity, normalized_quat
 from sparklod_cli.model.sh import COEFFICIENTS, degree_of
 from sparklod_cli.model.splats import COLUMNS, Splats
-from sparklod_cli.support.errors import FormatError
+from sparklod_cli.system.errors import FormatError
 from tests.references import gaussians
 from tests.scenes import random_splats
 

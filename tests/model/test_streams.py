@@ -14,7 +14,7 @@ from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.model.streams import Placed, SceneStream, collected, merged
 from sparklod_cli.model.transforms import Transform
-from sparklod_cli.support.errors import FormatError
+from sparklod_cli.system.errors import FormatError
 from tests.bake.out_of_core.plain import stream_of
 from tests.scenes import random_splats
 

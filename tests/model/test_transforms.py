@@ -19,7 +19,7 @@ from sparklod_cli.model.transforms import LARGEST, ROWS, Transform, sh_basis, sh
 from sparklod_cli.render.rasterizer import Image, draw
 from sparklod_cli.render.settings import RasterSettings
 from sparklod_cli.render.shading import shade
-from sparklod_cli.support.defaults import UP_AXES
+from sparklod_cli.system.defaults import UP_AXES
 from tests.references.gaussians import covariance as reference_covariance
 from tests.references.gaussians import rotation_matrix
 from tests.references.spark_pictures import spherical_harmonics

@@ -17,7 +17,7 @@ from sparklod_cli.model.splats import Splats
 from sparklod_cli.render.rasterizer import Image, draw
 from sparklod_cli.render.settings import PROFILES, SORTS, RasterSettings
 from sparklod_cli.render.shading import ShadedSplats, shade
-from sparklod_cli.support.threads import on_threads
+from sparklod_cli.system.threads import on_threads
 from tests.references import spark_pictures
 from tests.scenes import random_splats
 

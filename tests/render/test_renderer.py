@@ -14,7 +14,7 @@ from sparklod_cli.render.settings import COLOR_BY, STYLES, RasterSettings, Rende
 from sparklod_cli.render.shading import shade
 from sparklod_cli.render.styles import BILLBOARD_ALPHA
 from sparklod_cli.scenes.finder import CutFinder
-from sparklod_cli.support.errors import SparklodError
+from sparklod_cli.system.errors import SparklodError
 from tests.render.drawables import balls, camera, plain
 from tests.scenes import random_splats
 

@@ -16,8 +16,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sparklod_cli.simulation.columns import COLUMNS
-from sparklod_cli.support.errors import SparklodError
-from sparklod_cli.support.optional import install_hint
+from sparklod_cli.system.errors import SparklodError
+from sparklod_cli.system.optional import install_hint
 from sparklod_cli.tables.columns import Cell, Column, Row
 from sparklod_cli.tables.files import FORMS, TYPES, encode
 from tests.tables.rows import flight, row

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from sparklod_cli.cli import run
-from sparklod_cli.support.errors import OutputError
+from sparklod_cli.system.errors import OutputError
 from sparklod_cli.view import export as exporting
 from sparklod_cli.view.export import check_folder, export
 from sparklod_cli.view.site import Site

@@ -20,7 +20,7 @@ from sparklod_cli.codecs.rad.rad_header import RadChunkEntry, RadHeader, pack_he
 from sparklod_cli.io import read_parts
 from sparklod_cli.lod import quick
 from sparklod_cli.model.scene import Scene
-from sparklod_cli.support.errors import CameraPathError, FormatError, SparklodError
+from sparklod_cli.system.errors import CameraPathError, FormatError, SparklodError
 from sparklod_cli.view.files import shown_files
 from tests.conftest import FIXTURES
 from tests.scenes import random_splats

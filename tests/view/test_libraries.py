@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from sparklod_cli.support.errors import SparklodError
+from sparklod_cli.system.errors import SparklodError
 from sparklod_cli.view.libraries import LICENSES, MODULES, PACKAGES, VERSIONS, from_cdn, from_folder
 from sparklod_cli.view.site import Site
 from tests.conftest import FIXTURES

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sparklod_cli.support.errors import SparklodError
+from sparklod_cli.system.errors import SparklodError
 from sparklod_cli.view.server import Server, span_of
 from sparklod_cli.view.site import MAX_BYTES, Site
 from tests.conftest import FIXTURES

@@ -10,11 +10,11 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from ...support import machine
-from ...support.errors import SparklodError
-from ...support.optional import optional_import
-from ...support.python_process import check_current_folder, safe_path
-from ...support.threads import thread_count
+from ...system import machine
+from ...system.errors import SparklodError
+from ...system.optional import optional_import
+from ...system.python_process import check_current_folder, safe_path
+from ...system.threads import thread_count
 from .cluster_engine import ClusterEngine
 from .cluster_pool import Connection
 from .estimate import default_memory

@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 
 from ... import __version__
-from ...support import machine
-from ...support.addresses import Place
-from ...support.errors import SparklodError, memory_errors_translated
-from ...support.progress import Progress, silent
+from ...system import machine
+from ...system.addresses import Place
+from ...system.errors import SparklodError, memory_errors_translated
+from ...system.progress import Progress, silent
 from .cluster_pool import Connection, Pool
 from .store import Store
 from .tasks import Task

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError
 from typing import Any
 
-from ...support.errors import OutOfMemoryError, SparklodError
+from ...system.errors import OutOfMemoryError, SparklodError
 
 #: Seconds to wait before a call that failed is tried again: networks recover, and shared folders show files late.
 PAUSES = (1.0, 5.0)
@@ -25,7 +25,10 @@ PATIENCE = 10.0
 #: Errors of the system that another try does not mend: no room, no right.
 LASTING = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EFBIG, errno.ENAMETOOLONG}
 
-#: What the scheduler tells of workers, and nannies of memory.
+#: Seconds to wait for the message of a nanny that ended a worker for its memory: it may come after the loss.
+NANNY_DELAY = 3.0
+
+#: Topics of the scheduler's messages about workers, and of the nannies' about memory.
 TOPICS = ("all", "worker-restart-memory")
 
 #: States of a future that has ended. Others are "pending", and "lost" with the worker that held its result.
@@ -118,7 +121,7 @@ class Connection:
             error: Exception = future.exception()
         if type(error).__name__ == "KilledWorker":
             worker = str(error.last_worker.address)  # type: ignore[attr-defined]
-            if worker in self._starved:
+            if self._was_starved(worker):
                 return OutOfMemoryError(f"{name} does not fit into the memory of a worker; {LESS_MEMORY}")
             return SparklodError(
                 f"each worker that did {name} was lost, the last one {worker}. Its log may tell why; if the system"
@@ -127,6 +130,13 @@ class Connection:
         if isinstance(error, OutOfMemoryError):
             return OutOfMemoryError(f"{name}: {error}; {LESS_MEMORY}")
         return error
+
+    def _was_starved(self, worker: str) -> bool:
+        """Return whether a nanny ended this lost worker for its memory."""
+        deadline = time.monotonic() + NANNY_DELAY
+        while worker not in self._starved and time.monotonic() < deadline:
+            time.sleep(TICK / 20)
+        return worker in self._starved
 
     def _keep(self, event: tuple[float, Any]) -> None:
         """Keep what the scheduler tells; called on the client's own thread."""

@@ -8,9 +8,9 @@ from __future__ import annotations
 import functools
 
 from ...lod.builders import BUILDERS, SplatBytes
-from ...support import machine
-from ...support.errors import OutOfMemoryError
-from ...support.units import format_size
+from ...system import machine
+from ...system.errors import OutOfMemoryError
+from ...system.units import format_size
 
 #: Part of the memory available that a bake may take unless told otherwise: other programs need some, and figures for it
 #: are estimates. Chosen.

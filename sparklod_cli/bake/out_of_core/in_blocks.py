@@ -19,9 +19,9 @@ from ...lod.stage_records import NO_FAMILY, Pending
 from ...model.selection import SelectionTally
 from ...model.sh import width_of
 from ...model.splats import Splats
-from ...support.parallel import blocks_of
-from ...support.progress import Progress
-from ...support.threads import on_threads
+from ...system.parallel import blocks_of
+from ...system.progress import Progress
+from ...system.threads import on_threads
 from ..output import BakeOutput
 from ..records import BuiltTree, Clock
 from .blocks import BuildStage, cut_into_blocks

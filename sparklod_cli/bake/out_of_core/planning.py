@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ...model.streams import SceneStream
-from ...support.addresses import Place, absolute
-from ...support.errors import FormatError, HasTreeError, OutOfMemoryError, ScratchError
-from ...support.progress import Progress
-from ...support.stdin import name_of
-from ...support.units import count_of, format_size
+from ...system.addresses import Place, absolute
+from ...system.errors import FormatError, HasTreeError, OutOfMemoryError, ScratchError
+from ...system.progress import Progress
+from ...system.stdin import name_of
+from ...system.units import count_of, format_size
 from ..fingerprint import files_named_in, source_fingerprint
 from ..output import BakeOutput
 from ..records import Clock

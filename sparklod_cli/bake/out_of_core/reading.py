@@ -14,9 +14,9 @@ from ...model.selection import REASONS, SelectionTally
 from ...model.sh import width_of
 from ...model.splats import FloatArray, Splats
 from ...model.streams import SceneStream
-from ...support.parallel import blocks_of
-from ...support.progress import Progress
-from ...support.threads import on_threads
+from ...system.parallel import blocks_of
+from ...system.progress import Progress
+from ...system.threads import on_threads
 from ..selecting import check_transformed, select, transform
 from ..settings import BakeSettings
 from .job import Job

@@ -13,13 +13,13 @@ from pathlib import Path
 
 import numpy as np
 
-from ...support import atomic
-from ...support.addresses import Place
-from ...support.errors import FormatError, InvalidSplatsError, ScratchError, UnreadableError
-from ...support.parallel import ordered_map
-from ...support.stdin import DASH
-from ...support.units import count_of
-from ...support.untrusted import parse_json
+from ...system import atomic
+from ...system.addresses import Place
+from ...system.errors import FormatError, InvalidSplatsError, ScratchError, UnreadableError
+from ...system.parallel import ordered_map
+from ...system.stdin import DASH
+from ...system.units import count_of
+from ...system.untrusted import parse_json
 from ..fingerprint import Fingerprint
 from .job import forget
 from .store import Store

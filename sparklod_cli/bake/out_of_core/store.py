@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...support import atomic
-from ...support.addresses import Address, Place
-from ...support.errors import ScratchError
+from ...system import atomic
+from ...system.addresses import Address, Place
+from ...system.errors import ScratchError
 
 #: Arrays of a result by name, empty or of any shape.
 Arrays = Mapping[str, NDArray[Any]]

@@ -6,9 +6,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from ...support import machine
-from ...support.parallel import ordered_map
-from ...support.progress import Progress, silent
+from ...system import machine
+from ...system.parallel import ordered_map
+from ...system.progress import Progress, silent
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from ...support.errors import CameraPathError
+from ...system.errors import CameraPathError
 from ..frame import Frame, Intrinsics, Settings
 from ..generators import frame_looking
 from .source import Files, Json, Parsed

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from ...support.errors import CameraPathError
+from ...system.errors import CameraPathError
 from ..frame import NO_LENS, Frame, Intrinsics, Settings
 from .source import Files, Parsed, decoded, finite, posed, side, whole
 from .table import FORMATS

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from ...support.errors import CameraPathError
+from ...system.errors import CameraPathError
 from ..frame import Frame, Intrinsics, Settings
 from .source import Files, Json, Parsed
 

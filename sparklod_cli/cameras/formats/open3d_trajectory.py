@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...support.errors import CameraPathError
+from ...system.errors import CameraPathError
 from ..frame import NO_LENS, Frame, Intrinsics, Settings
 from .source import Files, Json, Parsed, finite
 

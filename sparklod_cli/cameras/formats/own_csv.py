@@ -6,7 +6,7 @@ import csv
 import math
 from collections.abc import Collection
 
-from ...support.errors import CameraPathError
+from ...system.errors import CameraPathError
 from ..frame import Frame, Intrinsics, Settings
 from ..generators import frame_looking
 from .source import Files, Parsed, finite, posed, side

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from ...support.errors import CameraPathError
+from ...system.errors import CameraPathError
 from ..camera import Matrix
 from ..frame import NO_LENS, Frame, Intrinsics, Settings
 from ..generators import Key, between, frame_looking

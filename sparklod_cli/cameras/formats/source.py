@@ -9,9 +9,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from ...support.errors import CameraPathError
-from ...support.json_text import decoded_text
-from ...support.untrusted import LARGEST, parse_json, quoted_value
+from ...system.errors import CameraPathError
+from ...system.json_text import decoded_text
+from ...system.untrusted import LARGEST, parse_json, quoted_value
 from ..camera import Matrix
 from ..frame import Frame
 from ..pose import pose, rotation_of

@@ -13,7 +13,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from ...support.errors import CameraPathError
+from ...system.errors import CameraPathError
 from ..camera import Matrix
 from ..frame import Frame, Intrinsics, Settings, sampled
 from ..generators import along, cardinal_tangents, frame_looking, hermite

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from ...support.errors import CameraPathError
+from ...system.errors import CameraPathError
 from ..frame import Frame, Settings
 from .source import Files, Parsed, finite, posed
 

@@ -12,8 +12,8 @@ import numpy as np
 from ...model.gaussian import normalized_quat
 from ...model.sh import COEFFICIENTS, notes_on_degree
 from ...model.splats import FloatArray, Splats
-from ...support.defaults import MAX_SH_DEGREE
-from ...support.errors import FormatError
+from ...system.defaults import MAX_SH_DEGREE
+from ...system.errors import FormatError
 from .. import quantize
 from ..left_out import left_out
 

@@ -21,11 +21,11 @@ import numpy as np
 from ...model.sh import width_of
 from ...model.splats import FloatArray, Splats
 from ...model.transforms import Transform
-from ...support.errors import FormatError, NotSplatsError, UnsupportedError
-from ...support.parallel import blocks_of, ordered_map
-from ...support.progress import Progress, silent
-from ...support.units import count_of
-from ...support.untrusted import quoted_value
+from ...system.errors import FormatError, NotSplatsError, UnsupportedError
+from ...system.parallel import blocks_of, ordered_map
+from ...system.progress import Progress, silent
+from ...system.units import count_of
+from ...system.untrusted import quoted_value
 from .. import spz
 from ..compression import check_promise
 from ..content import Content, Source, Target

@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...model.splats import FloatArray
-from ...support.errors import FormatError, TruncatedError, UnsupportedError, VersionError
-from ...support.untrusted import parse_json, quoted, quoted_value
+from ...system.errors import FormatError, TruncatedError, UnsupportedError, VersionError
+from ...system.untrusted import parse_json, quoted, quoted_value
 from ..content import Source
 from ..json_trees import leads_away
 from ..stream import Positioned, size_of

@@ -10,8 +10,8 @@ import numpy as np
 
 from ...model.scene import Scene
 from ...model.splats import FloatArray, Splats
-from ...support.errors import FormatError
-from ...support.progress import Progress, silent
+from ...system.errors import FormatError
+from ...system.progress import Progress, silent
 from .. import spz
 from ..clamps import SPZ, CodeRange
 from ..file_notes import note_of

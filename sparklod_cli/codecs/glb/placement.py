@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from ...model.gaussian import rotation_matrices
 from ...model.transforms import LARGEST, Transform, scale_of
-from ...support.errors import FormatError, UnsupportedError
-from ...support.untrusted import quoted_value
+from ...system.errors import FormatError, UnsupportedError
+from ...system.untrusted import quoted_value
 from .glb_container import GltfFile
 
 Matrix = NDArray[np.float64]

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from ...model.gaussian import covariance
 from ...model.scene import Scene
 from ...model.splats import Splats
-from ...support.errors import FormatError
-from ...support.parallel import for_blocks
+from ...system.errors import FormatError
+from ...system.parallel import for_blocks
 from .. import quantize
 from ..spark_codings import Words
 

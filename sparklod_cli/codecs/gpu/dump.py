@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...model.scene import Scene
-from ...support.errors import FormatError
-from ...support.untrusted import ZIP_ERRORS, quoted, quoted_value
+from ...system.errors import FormatError
+from ...system.untrusted import ZIP_ERRORS, quoted, quoted_value
 from .. import rgba
 from ..formats import ENCODINGS
 

@@ -12,8 +12,8 @@ from ...model.gaussian import spark_size
 from ...model.lod_tree import MAX_CHILDREN, LodTree, Nodes
 from ...model.scene import Scene
 from ...model.splats import Splats
-from ...support.errors import FormatError
-from ...support.parallel import for_blocks
+from ...system.errors import FormatError
+from ...system.parallel import for_blocks
 from ..spark_codings import Words, checked_words
 
 NODE = np.dtype(

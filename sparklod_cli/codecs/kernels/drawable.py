@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...support.jit import kernel
-from ...support.jit_types import f4
+from ...system.jit import kernel
+from ...system.jit_types import f4
 
 #: The largest finite float32.
 LARGEST = np.finfo(np.float32).max

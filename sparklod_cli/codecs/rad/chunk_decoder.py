@@ -14,7 +14,7 @@ from ...model.lod_tree import LodTree
 from ...model.scene import ScaleCoding
 from ...model.sh import COEFFICIENTS
 from ...model.splats import FloatArray, Splats
-from ...support.errors import FormatError, TooLongError, TruncatedError
+from ...system.errors import FormatError, TooLongError, TruncatedError
 from .. import spark_codings
 from ..inflate import ERRORS, raw_unpacker
 from ..quantize import Bytes, quat_of_xyz

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ...model.lod_tree import LodTree
 from ...model.scene import Scene
 from ...model.splats import COLUMNS, Splats
-from ...support.progress import Progress, silent
+from ...system.progress import Progress, silent
 from ..content import OpenCompanion
 from ..encoder import results
 from ..options import DEFAULTS, WriteOptions

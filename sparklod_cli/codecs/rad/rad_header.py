@@ -16,8 +16,8 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, BinaryIO
 
-from ...support.errors import FormatError, NotSplatsError, PromiseError, TruncatedError, VersionError
-from ...support.untrusted import parse_json, quoted_value
+from ...system.errors import FormatError, NotSplatsError, PromiseError, TruncatedError, VersionError
+from ...system.untrusted import parse_json, quoted_value
 from ..file_names import RAD_SUFFIX, rad_chunk_name
 from ..file_notes import FileNote, read_comment
 from ..splat_encoding import SplatEncoding

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ...model.scene import Scene
 from ...model.sh import COEFFICIENTS
-from ...support.errors import FormatError
+from ...system.errors import FormatError
 from ..clamps import CodeRange
 from ..options import RadOptions, WriteOptions
 from ..splat_encoding import LARGEST_END, SCALE_ZERO, SplatEncoding

@@ -15,10 +15,10 @@ from ...model.lod_tree import LodTree
 from ...model.scene import FileCoding, ScaleCoding
 from ...model.sh import COEFFICIENTS, width_of
 from ...model.splats import COLUMNS, FloatArray, Splats
-from ...support.defaults import MAX_SH_DEGREE
-from ...support.errors import FormatError, TruncatedError
-from ...support.parallel import ordered_map
-from ...support.progress import Progress
+from ...system.defaults import MAX_SH_DEGREE
+from ...system.errors import FormatError, TruncatedError
+from ...system.parallel import ordered_map
+from ...system.progress import Progress
 from .. import compression
 from ..content import Content, OpenCompanion, Source, Target
 from ..stream import size_of

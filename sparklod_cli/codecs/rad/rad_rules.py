@@ -6,8 +6,8 @@ from collections import defaultdict
 from collections.abc import Iterator, Mapping
 
 from ...model.lod_tree import CHUNK_NODES
-from ...support.defaults import MAX_SH_DEGREE
-from ...support.untrusted import quoted_value
+from ...system.defaults import MAX_SH_DEGREE
+from ...system.untrusted import quoted_value
 from ..quantize import LARGEST
 from ..validation import RuleViolation
 from .rad_header import ALIGNMENT, GZ, Property, RadChunkEntry, RadChunkHeader, RadHeader, padding

@@ -15,10 +15,10 @@ import numpy as np
 
 from ...model.sh import COEFFICIENTS, width_of
 from ...model.splats import FloatArray, Splats
-from ...support.errors import FormatError, VersionError
-from ...support.parallel import for_blocks, ordered_map
-from ...support.progress import Progress
-from ...support.untrusted import quoted_value
+from ...system.errors import FormatError, VersionError
+from ...system.parallel import for_blocks, ordered_map
+from ...system.progress import Progress
+from ...system.untrusted import quoted_value
 from .. import quantize
 from ..compression import check_promise
 from ..content import Content, Source, Target

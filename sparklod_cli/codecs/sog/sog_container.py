@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from PIL import Image
 from PIL.WebPImagePlugin import WebPImageFile
 
-from ...support.errors import FormatError, NotSplatsError
-from ...support.units import count_of
-from ...support.untrusted import parse_json, quoted_value
+from ...system.errors import FormatError, NotSplatsError
+from ...system.units import count_of
+from ...system.untrusted import parse_json, quoted_value
 from ..compression import check_promise
 from ..content import OpenCompanion
 from ..file_names import META, SOG_IMAGES

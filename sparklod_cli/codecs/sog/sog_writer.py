@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from ...model import morton
 from ...model.scene import Scene
 from ...model.splats import FloatArray, Splats
-from ...support.defaults import MAX_SH_CODES
-from ...support.errors import FormatError
-from ...support.parallel import blocks_of, ordered_map
-from ...support.progress import Progress, silent
-from ...support.units import count_of
+from ...system.defaults import MAX_SH_CODES
+from ...system.errors import FormatError
+from ...system.parallel import blocks_of, ordered_map
+from ...system.progress import Progress, silent
+from ...system.units import count_of
 from .. import quantize, sh_palette
 from ..clamps import CodeRange
 from ..file_names import META, SOG_IMAGES

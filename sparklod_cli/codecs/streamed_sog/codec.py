@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from ...model.scene import Bounds, Counts, DetailScene, facts_of
 from ...model.sh import width_of
-from ...support.errors import FormatError
-from ...support.progress import Progress, silent
-from ...support.units import count_of
-from ...support.untrusted import quoted_value
+from ...system.errors import FormatError
+from ...system.progress import Progress, silent
+from ...system.units import count_of
+from ...system.untrusted import quoted_value
 from ..compression import check_promise
 from ..content import Content, OpenCompanion, Source
 from ..file_names import MANIFEST

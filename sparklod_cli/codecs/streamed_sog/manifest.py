@@ -13,8 +13,8 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from ...support.errors import VersionError
-from ...support.untrusted import quoted_value
+from ...system.errors import VersionError
+from ...system.untrusted import quoted_value
 from .. import quantize
 from ..file_names import MANIFEST
 from ..file_notes import FileNote, read_note

@@ -13,10 +13,10 @@ import numpy as np
 
 from ...model.morton import order_of_cells
 from ...model.splats import FloatArray, Splats
-from ...support.errors import FormatError
-from ...support.progress import Progress, silent
-from ...support.units import count_of
-from ...support.untrusted import quoted_value
+from ...system.errors import FormatError
+from ...system.progress import Progress, silent
+from ...system.units import count_of
+from ...system.untrusted import quoted_value
 from ..content import OpenCompanion
 from ..file_names import MANIFEST
 from ..json_trees import leads_away

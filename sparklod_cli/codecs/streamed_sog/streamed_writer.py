@@ -11,9 +11,9 @@ import numpy as np
 from ...model import morton
 from ...model.scene import Bounds, DetailScene, Scene
 from ...model.splats import Splats
-from ...support.errors import FormatError
-from ...support.parallel import ordered_map
-from ...support.progress import Progress, silent
+from ...system.errors import FormatError
+from ...system.parallel import ordered_map
+from ...system.progress import Progress, silent
 from .. import quantize
 from ..file_names import ENVIRONMENT_FILE, MANIFEST, META, chunk_folder
 from ..file_notes import note_of

@@ -17,9 +17,9 @@ from ...model.axes import common
 from ...model.scene import facts_of
 from ...model.sh import width_of
 from ...model.tile_scene import TileScene
-from ...support.errors import FormatError
-from ...support.progress import Progress, silent
-from ...support.untrusted import quoted_value
+from ...system.errors import FormatError
+from ...system.progress import Progress, silent
+from ...system.untrusted import quoted_value
 from ..compression import check_promise
 from ..content import Content, OpenCompanion, Source
 from ..file_names import TILESET

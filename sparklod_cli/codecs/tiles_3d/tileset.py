@@ -12,8 +12,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from ...support.errors import FormatError, VersionError
-from ...support.untrusted import quoted_value
+from ...system.errors import FormatError, VersionError
+from ...system.untrusted import quoted_value
 from ..content import OpenCompanion
 from ..file_names import TILESET
 from ..file_notes import FileNote, read_note

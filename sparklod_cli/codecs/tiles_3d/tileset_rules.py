@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...model.splats import Splats
-from ...support.errors import FormatError, UnsupportedError
-from ...support.progress import Progress, silent
-from ...support.units import count_of
-from ...support.untrusted import quoted_value
+from ...system.errors import FormatError, UnsupportedError
+from ...system.progress import Progress, silent
+from ...system.units import count_of
+from ...system.untrusted import quoted_value
 from ..glb.attributes import COMPRESSION, EXTENSION
 from ..glb.placement import product
 from ..json_trees import leads_away

@@ -14,10 +14,10 @@ from ...codecs.options import SH_CODES
 from ...fitting.settings import STEPS, FitSettings
 from ...lod.builders import BUILDERS, METHODS
 from ...lod.detail_rule import DetailSettings
-from ...support import defaults
-from ...support.addresses import Place
-from ...support.setting_fields import Quantity, Range, setting_of, whole
-from ...support.units import parse_size
+from ...system import defaults
+from ...system.addresses import Place
+from ...system.setting_fields import Quantity, Range, setting_of, whole
+from ...system.units import parse_size
 from ..option_groups import COMMON, flag, is_set, option, parameters_of, refuse
 from ..parameter_types import BALL, POINT, OptionalNumber
 from ..paths import InputPath, OutputPath

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import click
 
 from ...cameras.formats.table import FORMATS, Axes
-from ...support.defaults import ELEVATION, ORBIT
-from ...support.errors import CameraPathError, TooManyCamerasError
-from ...support.setting_fields import Range, whole
+from ...system.defaults import ELEVATION, ORBIT
+from ...system.errors import CameraPathError, TooManyCamerasError
+from ...system.setting_fields import Range, whole
 from ..option_groups import COMMON, flag, flag_of, is_set, option, refuse
 from ..parameter_types import POINT, SIZE, VIEW, VIEWS
 from ..paths import InputPath, file_of

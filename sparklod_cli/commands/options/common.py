@@ -13,8 +13,8 @@ import click
 
 from ...codecs.formats import FORMATS
 from ...images.defaults import MOVING, STILL, SUFFIXES
-from ...support.defaults import MAX_THREADS
-from ...support.setting_fields import whole
+from ...system.defaults import MAX_THREADS
+from ...system.setting_fields import whole
 from ...tables.files import FORMS
 from ..console import Console, Verbosity
 from ..option_groups import COMMON, flag, option
@@ -39,7 +39,7 @@ def _note_verbosity(ctx: click.Context, param: click.Parameter, value: bool) -> 
 
 def processors_to_use() -> int:
     """Return the default of --threads."""
-    from ...support.threads import processors
+    from ...system.threads import processors
 
     return min(processors(), MAX_THREADS)
 

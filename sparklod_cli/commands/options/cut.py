@@ -14,10 +14,10 @@ from ...lod import detail_rule
 from ...lod.settings import FACTOR, LodSettings
 from ...model.foveation import Cones, Foveation, Frustum
 from ...simulation.streaming_settings import Network, StreamingSettings
-from ...support import defaults
-from ...support.printable import printable
-from ...support.setting_fields import Quantity, Range
-from ...support.units import check_grouping, parse_time
+from ...system import defaults
+from ...system.printable import printable
+from ...system.setting_fields import Quantity, Range
+from ...system.units import check_grouping, parse_time
 from ..option_groups import COMMON, argument, flag, option, parameters_of, refuse, require
 from ..paths import InputPath
 

@@ -14,8 +14,8 @@ from ...codecs.rounding import ROUND_TRIPS
 from ...images.defaults import JPEG_QUALITY, MOVING, STILL, THUMBNAIL_SIZE, THUMBNAIL_SUPERSAMPLE
 from ...render.devices import uses_card
 from ...render.settings import OF_PIXELS, SORTINGS, RenderSettings
-from ...support import defaults
-from ...support.setting_fields import Range, whole
+from ...system import defaults
+from ...system.setting_fields import Range, whole
 from ..option_groups import COMMON, exclude, flag, is_set, option, require
 from ..parameter_types import COLOR
 from ..paths import Folder, InputPath, require_suffix, stem_of

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...support.jit import kernel
-from ...support.jit_types import f4, out
+from ...system.jit import kernel
+from ...system.jit_types import f4, out
 from .cut_arrays import (
     BASE,
     BUCKET_BITS,

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from ...support.jit import kernel
-from ...support.jit_types import b1, f4, f8, i8, out, u4, u8
+from ...system.jit import kernel
+from ...system.jit_types import b1, f4, f8, i8, out, u4, u8
 
 #: Bits of a digit.
 DIGIT_BITS = 16

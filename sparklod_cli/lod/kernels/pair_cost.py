@@ -10,9 +10,9 @@ import math
 
 import numpy as np
 
-from ...support.fast_math import log2
-from ...support.jit import kernel
-from ...support.jit_types import f4, i4, i8, out, u4
+from ...system.fast_math import log2
+from ...system.jit import kernel
+from ...system.jit_types import f4, i4, i8, out, u4
 
 f32 = np.float32
 

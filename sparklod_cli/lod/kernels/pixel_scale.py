@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...support.jit import kernel
-from ...support.jit_types import Type, f4, i8, out
+from ...system.jit import kernel
+from ...system.jit_types import Type, f4, i8, out
 
 #: A node as the traversal reads it; child indices are relative to its own tree. Siblings are adjacent, so that
 #: a node's children share a few cache lines.

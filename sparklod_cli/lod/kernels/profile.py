@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ...model import gaussian
 from ...model.falloff import harmonic
 from ...model.gaussian import MIN_OPACITY, SIZE_PER_D, linear_opacity
-from ...support.jit import kernel
+from ...system.jit import kernel
 
 #: The largest D of a merged splat; a sharper profile gains nothing (benchmarks/notes/quality-builder.md). A splat
 #: whose density is higher than that of this profile is drawn larger instead.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...support.jit import kernel, prefetch
+from ...system.jit import kernel, prefetch
 from .cut_arrays import (
     BASE,
     BUCKET_BITS,

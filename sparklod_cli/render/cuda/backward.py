@@ -10,9 +10,9 @@ import numpy as np
 from numba import cuda
 
 from ...model.falloff import merged_slopes, plain_slopes
-from ...support.jit import kernel
-from ...support.jit_cuda import SIMULATED, cuda_kernel
-from ...support.jit_types import f4, f8, i2, i4, i8, out, u8
+from ...system.jit import kernel
+from ...system.jit_cuda import SIMULATED, cuda_kernel
+from ...system.jit_types import f4, f8, i2, i4, i8, out, u8
 from ..kernels.backward import (
     BY_BLUE,
     BY_GREEN,

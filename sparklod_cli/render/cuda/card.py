@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...support.jit import check_numba_settings
-from ...support.optional import optional_import
+from ...system.jit import check_numba_settings
+from ...system.optional import optional_import
 from ..backends import BackendError
 
 #: An array on the card, as numba has it.
@@ -55,7 +55,7 @@ def find_card() -> Card:
     check_numba_settings()
     with optional_import("--device cuda needs numba-cuda", "cuda", BackendError):
         from numba import cuda
-    from ...support.jit_cuda import SIMULATED
+    from ...system.jit_cuda import SIMULATED
 
     if SIMULATED:
         return Card("numba's simulator", 0, 0, LEAST_DRIVER, "numpy")
@@ -199,6 +199,6 @@ def add_up(array: CardArray) -> int:
 
 
 def _use_cupy() -> bool:
-    from ...support.jit_cuda import SIMULATED
+    from ...system.jit_cuda import SIMULATED
 
     return not SIMULATED and _sorter() == "cupy"

@@ -14,7 +14,7 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
-from ...support.python_process import module_command
+from ...system.python_process import module_command
 
 #: OpenGL version that the shaders need: 4.2 introduced unpackHalf2x16.
 VERSION = 420

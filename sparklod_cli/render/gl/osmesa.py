@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from ...cameras.camera import Camera
-from ...support.optional import optional_import
+from ...system.optional import optional_import
 from ..backends import BackendError
 from ..rasterizer import Image, world_to_camera
 from ..settings import RasterSettings

@@ -7,8 +7,8 @@ import math
 import numpy as np
 
 from ...model.falloff import alpha_at
-from ...support.jit import kernel
-from ...support.jit_types import b1, f4, i4, i8, out, u8
+from ...system.jit import kernel
+from ...system.jit_types import b1, f4, i4, i8, out, u8
 from .project import HALF_HEIGHT, HALF_WIDTH, LEAST, OPACITY, POWER, X, Y, exponent, index_of
 
 f32 = np.float32

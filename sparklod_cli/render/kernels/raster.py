@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from ...model.falloff import merged, plain, shifted
-from ...support.jit import kernel, prefetch
-from ...support.jit_types import b1, f4, i2, i4, i8, out, u8
+from ...system.jit import kernel, prefetch
+from ...system.jit_types import b1, f4, i2, i4, i8, out, u8
 from .project import (
     ACROSS,
     ALONG,

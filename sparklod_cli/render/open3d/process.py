@@ -11,7 +11,7 @@ import threading
 from pathlib import Path
 from typing import Any
 
-from ...support.python_process import module_command
+from ...system.python_process import module_command
 from ..backends import BackendError
 from .child import PACKAGES, Array, receive, send
 

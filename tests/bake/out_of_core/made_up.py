@@ -12,7 +12,7 @@ import numpy as np
 
 from sparklod_cli.bake.out_of_core.store import Store
 from sparklod_cli.bake.out_of_core.tasks import Task
-from sparklod_cli.support.errors import ScratchError
+from sparklod_cli.system.errors import ScratchError
 
 
 @dataclass(frozen=True)

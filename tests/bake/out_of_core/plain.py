@@ -12,7 +12,7 @@ from sparklod_cli.bake.out_of_core.tasks import Task
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.model.streams import SceneStream
-from sparklod_cli.support.progress import Progress, silent
+from sparklod_cli.system.progress import Progress, silent
 
 
 @dataclass

@@ -12,8 +12,8 @@ import pytest
 pytest.importorskip("fsspec")
 
 from sparklod_cli.bake.out_of_core.store import Store
-from sparklod_cli.support.addresses import Address
-from sparklod_cli.support.errors import ScratchError
+from sparklod_cli.system.addresses import Address
+from sparklod_cli.system.errors import ScratchError
 
 pytestmark = pytest.mark.slow
 

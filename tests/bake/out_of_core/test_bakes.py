@@ -18,7 +18,7 @@ from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.selection import Selection
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.model.transforms import Transform
-from sparklod_cli.support.errors import InvalidSplatsError
+from sparklod_cli.system.errors import InvalidSplatsError
 from tests.bake.out_of_core.plain import Loop
 from tests.conftest import FIXTURES, real_scene
 from tests.scenes import random_splats

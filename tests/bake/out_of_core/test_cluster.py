@@ -21,8 +21,8 @@ from sparklod_cli.bake.out_of_core.cluster import ClusterSettings, cluster
 from sparklod_cli.bake.out_of_core.cluster_engine import ClusterEngine
 from sparklod_cli.bake.out_of_core.store import Store
 from sparklod_cli.bake.out_of_core.tasks import Task
-from sparklod_cli.support.errors import OutOfMemoryError, ScratchError, SparklodError
-from sparklod_cli.support.progress import silent
+from sparklod_cli.system.errors import OutOfMemoryError, ScratchError, SparklodError
+from sparklod_cli.system.progress import silent
 
 from . import made_up
 from .made_up import Job, tree_of

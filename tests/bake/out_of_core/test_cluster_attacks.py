@@ -22,7 +22,7 @@ from sparklod_cli.bake.out_of_core import cluster as module
 from sparklod_cli.bake.out_of_core.cluster import ClusterSettings, cluster
 from sparklod_cli.bake.out_of_core.cluster_engine import ClusterEngine
 from sparklod_cli.bake.out_of_core.store import Store
-from sparklod_cli.support.progress import silent
+from sparklod_cli.system.progress import silent
 
 from .made_up import Job, tree_of
 

@@ -27,9 +27,9 @@ from sparklod_cli.bake.out_of_core.tasks import Engine
 from sparklod_cli.bake.records import Baked
 from sparklod_cli.bake.settings import BakeSettings, Resources
 from sparklod_cli.codecs.file_names import RAD_SUFFIX as RAD
-from sparklod_cli.support.addresses import Address, Place
-from sparklod_cli.support.errors import SparklodError
-from sparklod_cli.support.progress import Progress, silent
+from sparklod_cli.system.addresses import Address, Place
+from sparklod_cli.system.errors import SparklodError
+from sparklod_cli.system.progress import Progress, silent
 from tests.conftest import FIXTURES
 
 pytestmark = pytest.mark.slow

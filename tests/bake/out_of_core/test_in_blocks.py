@@ -24,7 +24,7 @@ from sparklod_cli.lod.chunk_order import arrange
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
-from sparklod_cli.support.progress import silent
+from sparklod_cli.system.progress import silent
 from tests.bake.out_of_core.plain import Loop, stream_of
 from tests.scenes import random_splats
 

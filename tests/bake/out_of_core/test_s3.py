@@ -12,7 +12,7 @@ from sparklod_cli.bake.flow import bake
 from sparklod_cli.bake.out_of_core.cluster import ClusterSettings, cluster
 from sparklod_cli.bake.settings import BakeSettings, Resources
 from sparklod_cli.cli import run
-from sparklod_cli.support.addresses import Address, Place
+from sparklod_cli.system.addresses import Address, Place
 from tests.conftest import FIXTURES
 
 pytest.importorskip("s3fs", reason="s3:// needs the extra cloud")

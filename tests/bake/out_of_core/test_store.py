@@ -17,7 +17,7 @@ from hypothesis.extra import numpy as arrays_of
 
 from sparklod_cli.bake.out_of_core import store as store_module
 from sparklod_cli.bake.out_of_core.store import Store
-from sparklod_cli.support.errors import ScratchError
+from sparklod_cli.system.errors import ScratchError
 from tests.conftest import IS_ROOT
 from tests.faults.runs import mounted
 

@@ -11,7 +11,7 @@ import pytest
 
 from sparklod_cli.bake.out_of_core.store import Store
 from sparklod_cli.bake.out_of_core.tasks import LocalEngine, Task
-from sparklod_cli.support.progress import Progress, silent
+from sparklod_cli.system.progress import Progress, silent
 
 COUNT = 6
 

@@ -18,7 +18,7 @@ from sparklod_cli.cameras.formats.source import Files
 from sparklod_cli.cameras.formats.table import FORMATS
 from sparklod_cli.cameras.frame import Settings
 from sparklod_cli.cameras.path import read
-from sparklod_cli.support.errors import CameraPathError
+from sparklod_cli.system.errors import CameraPathError
 from tests.cameras.formats.test_same_cameras import CASES
 from tests.cameras.known import FOLDER, files_at, text_file
 

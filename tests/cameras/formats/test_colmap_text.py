@@ -9,7 +9,7 @@ import pytest
 from sparklod_cli.cameras.formats.source import Files
 from sparklod_cli.cameras.path import read
 from sparklod_cli.cameras.sources import read_path
-from sparklod_cli.support.errors import CameraPathError
+from sparklod_cli.system.errors import CameraPathError
 from tests.cameras.known import FOLDER, KNOWN, check_pose, files_at, text_file
 
 HEAD = "# Image list with two lines of data per image:\n#   IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n"

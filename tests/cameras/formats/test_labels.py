@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli.cameras.path import CameraPath, read
-from sparklod_cli.support.errors import CameraPathError
+from sparklod_cli.system.errors import CameraPathError
 from tests.cameras.known import FOLDER, text_file
 
 EYE = np.eye(4).tolist()

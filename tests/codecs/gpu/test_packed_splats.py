@@ -18,8 +18,8 @@ from sparklod_cli.codecs.splat_encoding import DEFAULT, SplatEncoding
 from sparklod_cli.model.gaussian import linear_opacity, lod_opacity
 from sparklod_cli.model.sh import COEFFICIENTS
 from sparklod_cli.model.splats import Splats
-from sparklod_cli.support.errors import FormatError
-from sparklod_cli.support.parallel import BLOCK_ROWS
+from sparklod_cli.system.errors import FormatError
+from sparklod_cli.system.parallel import BLOCK_ROWS
 from tests.codecs.test_spark_codings import degrees_between, random_quats
 from tests.scenes import random_splats
 

@@ -27,7 +27,7 @@ from sparklod_cli.model.gaussian import linear_opacity, lod_opacity
 from sparklod_cli.model.lod_tree import CHUNK_NODES, LodTree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
-from sparklod_cli.support.errors import FormatError
+from sparklod_cli.system.errors import FormatError
 from tests.codecs.cases import linear
 from tests.conftest import FIXTURES, real_scene
 from tests.scenes import random_splats

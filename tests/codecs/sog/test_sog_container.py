@@ -13,7 +13,7 @@ from PIL import Image
 
 from fixtures import by_hand_sog
 from sparklod_cli.codecs.sog import sog_container
-from sparklod_cli.support.errors import FormatError
+from sparklod_cli.system.errors import FormatError
 
 Texels = NDArray[np.uint8]
 

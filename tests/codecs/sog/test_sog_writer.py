@@ -23,7 +23,7 @@ from sparklod_cli.model.gaussian import normalized_quat
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.sh import COEFFICIENTS
 from sparklod_cli.model.splats import COLUMNS, Splats
-from sparklod_cli.support.errors import FormatError, InvalidSplatsError
+from sparklod_cli.system.errors import FormatError, InvalidSplatsError
 from tests.conftest import FIXTURES
 from tests.scenes import random_splats
 

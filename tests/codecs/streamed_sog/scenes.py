@@ -12,7 +12,7 @@ from sparklod_cli.codecs.options import DEFAULTS
 from sparklod_cli.codecs.streamed_sog import codec
 from sparklod_cli.lod.detail_rule import DetailSettings
 from sparklod_cli.model.scene import DetailScene
-from sparklod_cli.support.errors import FormatError
+from sparklod_cli.system.errors import FormatError
 from tests.scenes import random_splats
 
 #: Splats of each region at each level: there are empty runs, and a region that has only the last level.

@@ -20,7 +20,7 @@ from sparklod_cli.io import open_stream, read_parts, read_scene
 from sparklod_cli.model import streams
 from sparklod_cli.model.scene import DetailScene, Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
-from sparklod_cli.support.errors import FormatError
+from sparklod_cli.system.errors import FormatError
 from tests.codecs.cases import linear
 from tests.codecs.test_round_trip import assert_close
 from tests.codecs.writers import sog_precision

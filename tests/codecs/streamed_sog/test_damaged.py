@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli.codecs.streamed_sog import codec
-from sparklod_cli.support.errors import FormatError
+from sparklod_cli.system.errors import FormatError
 from tests.codecs.sog.test_damaged import VALUES, places_of, replaced
 from tests.codecs.test_damaged import attempt, content, files_of
 

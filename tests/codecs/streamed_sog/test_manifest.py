@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from sparklod_cli.codecs.file_names import is_of_streamed_sog
 from sparklod_cli.codecs.streamed_sog import manifest as manifests
 from sparklod_cli.codecs.streamed_sog.manifest import LARGEST, Manifest, ManifestNode, Run, parse, serialise
-from sparklod_cli.support.errors import FormatError, VersionError
+from sparklod_cli.system.errors import FormatError, VersionError
 
 BOUND = {"min": [-1, 0, 0.5], "max": [1, 2, 3e5]}
 LEAF = {"bound": BOUND, "lods": {"0": {"file": 0, "offset": 0, "count": 3}, "1": {"file": 1, "offset": 4, "count": 2}}}

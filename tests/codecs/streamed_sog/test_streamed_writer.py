@@ -19,7 +19,7 @@ from sparklod_cli.io.details import detail_sink
 from sparklod_cli.model import morton
 from sparklod_cli.model.scene import DetailScene, Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
-from sparklod_cli.support.errors import FormatError
+from sparklod_cli.system.errors import FormatError
 
 from .scenes import CHILDREN, COUNTS, SETTINGS, detail_scene, files_of, levels_of
 

@@ -27,7 +27,7 @@ from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.model.tile_scene import TileScene
 from sparklod_cli.model.transforms import Transform
-from sparklod_cli.support.errors import FormatError, VersionError
+from sparklod_cli.system.errors import FormatError, VersionError
 from tests.codecs.cases import linear
 from tests.codecs.streamed_sog.scenes import open_companion
 from tests.conftest import FIXTURES

@@ -10,7 +10,7 @@ import pytest
 
 pytest.importorskip("fsspec")
 
-from sparklod_cli.support.addresses import Address
+from sparklod_cli.system.addresses import Address
 from tests.commands.build_lod.runs import SMALL, build
 from tests.conftest import FIXTURES, Capture
 

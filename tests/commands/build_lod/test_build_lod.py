@@ -24,8 +24,8 @@ from sparklod_cli.lod import quality, quick
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
-from sparklod_cli.support.progress import Progress
-from sparklod_cli.support.stdin import spooled
+from sparklod_cli.system.progress import Progress
+from sparklod_cli.system.stdin import spooled
 from tests.commands.build_lod.runs import ONE, SMALL, build, sparklod
 from tests.conftest import FIXTURES, ROOT, Capture
 from tests.signals import heed_signals

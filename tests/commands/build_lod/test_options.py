@@ -93,7 +93,7 @@ def test_options_reach_the_tree(scene: Path, tmp_path: Path, capsys: Capture) ->
 
 
 def test_more_processors_than_the_most_threads_are_no_error(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sparklod_cli.support.threads.processors", lambda: 5000)
+    monkeypatch.setattr("sparklod_cli.system.threads.processors", lambda: 5000)
     assert build(scene) == 0
 
 

@@ -60,10 +60,10 @@ def test_what_does_not_fit_goes_out_of_core_and_gives_the_same_bytes(
 def test_the_default_memory_is_a_share_of_what_is_available(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
 ) -> None:
-    monkeypatch.setattr("sparklod_cli.support.machine.available_memory", lambda: 4_000_000)
+    monkeypatch.setattr("sparklod_cli.system.machine.available_memory", lambda: 4_000_000)
     assert build(DEMO, "-o", tmp_path / "a.spz") == 0
     assert "of memory and may take 3.0 MB" in capsys.readouterr().err
-    monkeypatch.setattr("sparklod_cli.support.machine.available_memory", lambda: None)
+    monkeypatch.setattr("sparklod_cli.system.machine.available_memory", lambda: None)
     assert build(DEMO, "-o", tmp_path / "b.spz") == 0
     assert "out of core" not in capsys.readouterr().err
 

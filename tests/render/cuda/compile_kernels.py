@@ -19,7 +19,7 @@ def main() -> int:
     from numba import cuda
     from numba.cuda import dispatcher
 
-    from sparklod_cli.support.jit_cuda import CudaKernel
+    from sparklod_cli.system.jit_cuda import CudaKernel
 
     try:
         cuda.compile(lambda: None, (), cc=CAPABILITY, output="ptx")

@@ -15,8 +15,8 @@ from sparklod_cli.figures.pyvista_scene import load_pyvista
 from sparklod_cli.render.backends import BackendError
 from sparklod_cli.render.gl import context, osmesa
 from sparklod_cli.render.settings import RasterSettings
-from sparklod_cli.support.errors import SparklodError
-from sparklod_cli.support.optional import install_hint
+from sparklod_cli.system.errors import SparklodError
+from sparklod_cli.system.optional import install_hint
 from tests.render.gl.test_osmesa import CAMERAS, SPLATS, needs_opengl, opengl
 
 pytestmark = pytest.mark.slow
@@ -37,7 +37,7 @@ def child(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
 
 DRAW_ONE = """
 import numpy as np
-from sparklod_cli.support.errors import SparklodError
+from sparklod_cli.system.errors import SparklodError
 from sparklod_cli.render.gl import osmesa
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.render.settings import RasterSettings

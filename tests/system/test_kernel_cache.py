@@ -14,9 +14,9 @@ from typing import Any
 
 import pytest
 
-from sparklod_cli.support import atomic, jit, kernel_cache
-from sparklod_cli.support.jit_types import f8
-from sparklod_cli.support.kernel_cache import SUFFIX, cache_folders, is_trusted, is_whole, start_of
+from sparklod_cli.system import atomic, jit, kernel_cache
+from sparklod_cli.system.jit_types import f8
+from sparklod_cli.system.kernel_cache import SUFFIX, cache_folders, is_trusted, is_whole, start_of
 from sparklod_cli.warmup import units
 from tests.conftest import ROOT
 
@@ -67,7 +67,7 @@ def test_code_compiled_for_another_processor_is_not_used(cache: Cache) -> None:
     cache.compiles()
     start = start_of(twice)
     assert list(cache.folder.glob(f"{start}-*"))
-    code = "from sparklod_cli.support.kernel_cache import start_of; from tests.support.test_kernel_cache import twice"
+    code = "from sparklod_cli.system.kernel_cache import start_of; from tests.system.test_kernel_cache import twice"
     for changed, same in (({}, True), ({"NUMBA_NUM_THREADS": "1"}, True), ({"NUMBA_CPU_NAME": "generic"}, False)):
         command, environment = [sys.executable, "-c", f"{code}; print(start_of(twice))"], {**os.environ, **changed}
         other = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
@@ -82,7 +82,7 @@ from llvmlite import binding
 if len(sys.argv) > 1:
     binding.get_host_cpu_name = lambda: sys.argv[1]
     binding.get_host_cpu_features = lambda: binding.FeatureMap({sys.argv[1]: True})
-from sparklod_cli.support import fast_math, kernel_cache
+from sparklod_cli.system import fast_math, kernel_cache
 print(kernel_cache.start_of(fast_math.exp2.py_func))
 """
 
@@ -181,7 +181,7 @@ def test_memory_that_runs_out_is_no_damage(cache: Cache, monkeypatch: pytest.Mon
     def starved(*arguments: object) -> None:
         raise MemoryError
 
-    monkeypatch.setattr("sparklod_cli.support.kernel_cache.is_whole", starved)
+    monkeypatch.setattr("sparklod_cli.system.kernel_cache.is_whole", starved)
     with pytest.raises(MemoryError):
         cache.compiles()
     assert cache.told == []

@@ -13,11 +13,11 @@ from typing import Any
 
 import pytest
 
-from sparklod_cli.support import addresses
-from sparklod_cli.support.addresses import Address, place_of
-from sparklod_cli.support.errors import SparklodError
-from sparklod_cli.support.optional import install_hint
-from sparklod_cli.support.printable import printable
+from sparklod_cli.system import addresses
+from sparklod_cli.system.addresses import Address, place_of
+from sparklod_cli.system.errors import SparklodError
+from sparklod_cli.system.optional import install_hint
+from sparklod_cli.system.printable import printable
 
 pytestmark = pytest.mark.slow
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from sparklod_cli.support import machine
+from sparklod_cli.system import machine
 
 GB = 10**9
 MEMINFO = f"MemTotal: {16 * GB // 1024} kB\nMemFree: 1 kB\nMemAvailable: {8 * GB // 1024} kB\n"

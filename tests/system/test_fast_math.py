@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sparklod_cli.support import fast_math
+from sparklod_cli.system import fast_math
 
 
 def test_exp2_is_that_of_numpy_to_six_digits() -> None:

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from sparklod_cli.support.kernel_cache import SUFFIX
+from sparklod_cli.system.kernel_cache import SUFFIX
 from tests.conftest import ROOT
 from tests.signals import heed_signals
 
@@ -20,10 +20,10 @@ pytestmark = pytest.mark.slow
 KERNELS = """
 import os, signal, sys, threading, time, warnings
 import numpy as np
-from sparklod_cli.support import jit
-from sparklod_cli.support.jit import kernel
-from sparklod_cli.support.jit_types import f8, i8, out
-from sparklod_cli.support.threads import on_threads, threads_in_use
+from sparklod_cli.system import jit
+from sparklod_cli.system.jit import kernel
+from sparklod_cli.system.jit_types import f8, i8, out
+from sparklod_cli.system.threads import on_threads, threads_in_use
 
 @kernel(i8, f8[:], out(f8[:]), ranges=True)
 def fill_squares(start, stop, values, found):
@@ -94,7 +94,7 @@ import builtins
 builtins.kept = squares(values)[::2]
 """,
     "a kernel is loaded once": """
-from sparklod_cli.support.kernel_cache import KernelCache
+from sparklod_cli.system.kernel_cache import KernelCache
 load, loaded = KernelCache.load_overload, []
 KernelCache.load_overload = lambda cache, *more: loaded.append(cache) or load(cache, *more)
 for _ in range(3):

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from sparklod_cli.support import optional
-from sparklod_cli.support.errors import CameraPathError, SparklodError
-from sparklod_cli.support.optional import Required, install_hint, optional_import, pip_install, required_by
+from sparklod_cli.system import optional
+from sparklod_cli.system.errors import CameraPathError, SparklodError
+from sparklod_cli.system.optional import Required, install_hint, optional_import, pip_install, required_by
 from tests.conftest import ROOT
 
 

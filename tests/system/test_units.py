@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sparklod_cli.support.units import (
+from sparklod_cli.system.units import (
     format_duration,
     parse_bandwidth,
     parse_count,

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sparklod_cli.support.untrusted import MAX_DEPTH, parse_json, parse_toml, quoted_value, well_formed
+from sparklod_cli.system.untrusted import MAX_DEPTH, parse_json, parse_toml, quoted_value, well_formed
 
 VALUES = st.recursive(
     st.none() | st.booleans() | st.integers(-(10**18), 10**18) | st.floats(allow_nan=False) | st.text(),

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sparklod_cli.support.progress import StagedProgress
+from sparklod_cli.system.progress import StagedProgress
 
 SHARES = {"reading": 1.0, "building": 3.0, "writing": 4.0}
 

@@ -11,8 +11,8 @@ import pytest
 
 import sparklod_cli
 from sparklod_cli import doctor
-from sparklod_cli.support.errors import SparklodError
-from sparklod_cli.support.python_process import check_current_folder, module_command, program_command
+from sparklod_cli.system.errors import SparklodError
+from sparklod_cli.system.python_process import check_current_folder, module_command, program_command
 from tests.conftest import ROOT
 
 pytestmark = pytest.mark.slow
@@ -72,7 +72,7 @@ def start_workers() -> None:
 
 def import_numba_without_forks() -> None:
     code = "import multiprocessing; multiprocessing.set_start_method('forkserver')\n"
-    code += "from sparklod_cli.support import jit; jit.load_numba()"
+    code += "from sparklod_cli.system import jit; jit.load_numba()"
     subprocess.run(program_command(code), check=True)
 
 
@@ -127,10 +127,10 @@ def test_every_process_of_python_is_started_in_this_way() -> None:
         path.relative_to(package).with_suffix("").as_posix(): path.read_text(encoding="utf-8")
         for path in package.rglob("*.py")
     }
-    helper = "support/python_process"
-    users = {name for name, text in texts.items() if "support.python_process import" in text}
+    helper = "system/python_process"
+    users = {name for name, text in texts.items() if "system.python_process import" in text}
     assert users == set(STARTED)
-    shown = {"commands/completion", "doctor", "support/optional"}  # which show the interpreter, and start nothing by it
+    shown = {"commands/completion", "doctor", "system/optional"}  # which show the interpreter, and start nothing by it
     assert {name for name, text in texts.items() if "sys.executable" in text} == {helper, *shown}
 
 

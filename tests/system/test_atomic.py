@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from sparklod_cli.support import atomic
+from sparklod_cli.system import atomic
 from tests.conftest import ROOT
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="POSIX only")
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.skipif(os.name != "posix", reason="POSIX only")
 #: Writes for ever: new files, or one file again and again.
 WRITER = """
 import itertools, pathlib, sys
-from sparklod_cli.support import atomic
+from sparklod_cli.system import atomic
 folder, unnamed, overwrite = pathlib.Path(sys.argv[1]), sys.argv[2] == "True", sys.argv[3] == "True"
 if not unnamed:
     atomic.UNNAMED = None
@@ -200,7 +200,7 @@ def test_a_part_swept_before_it_is_locked_is_made_again(tmp_path: Path, monkeypa
 #: Modules that write files, and what: outputs (whole, or to a device or an address), the cache of kernels, what the
 #: process of Open3D says, a line in the settings of a shell.
 WRITERS = {
-    *("io/writing.py", "support/addresses.py", "support/atomic.py", "support/atomic_set.py"),
+    *("io/writing.py", "system/addresses.py", "system/atomic.py", "system/atomic_set.py"),
     *("render/open3d/process.py", "commands/completion.py"),
 }
 

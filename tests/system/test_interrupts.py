@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from sparklod_cli.support.kernel_cache import SUFFIX, is_whole
+from sparklod_cli.system.kernel_cache import SUFFIX, is_whole
 from tests.conftest import FIXTURES, ROOT
 from tests.signals import heed_signals
 
@@ -58,7 +58,7 @@ SCRIPT = """
 import os, signal, sys, time
 from sparklod_cli import cli
 from sparklod_cli.io import reading
-from sparklod_cli.support import interrupts, jit
+from sparklod_cli.system import interrupts, jit
 {work}
 reading.opened = work
 interrupts.handle()

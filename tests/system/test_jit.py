@@ -17,10 +17,10 @@ import numba
 import numpy as np
 import pytest
 
-from sparklod_cli.support import jit
-from sparklod_cli.support.jit import prefetch as jit_prefetch
-from sparklod_cli.support.jit_types import Type, as_declared, b1, example, f4, fields, i8, out, u2, u4
-from sparklod_cli.support.kernel_cache import cache_folders, sources_of
+from sparklod_cli.system import jit
+from sparklod_cli.system.jit import prefetch as jit_prefetch
+from sparklod_cli.system.jit_types import Type, as_declared, b1, example, f4, fields, i8, out, u2, u4
+from sparklod_cli.system.kernel_cache import cache_folders, sources_of
 from sparklod_cli.warmup import Unit, units
 from tests.conftest import ROOT
 
@@ -64,18 +64,18 @@ def test_a_kernel_depends_on_all_that_its_module_imports(kernels: Path) -> None:
         made_of |= new
         new = set().union(*map(imported, new)) - made_of
     assert sources_of(kernels) == made_of
-    assert kernels.stem == "__init__" or PACKAGE / "support/jit.py" in made_of
+    assert kernels.stem == "__init__" or PACKAGE / "system/jit.py" in made_of
 
 
 def test_a_change_of_a_kernel_or_constant_changes_the_names_of_those_that_depend_on_it(tmp_path: Path) -> None:
     copy = tmp_path / "sparklod_cli"
     shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
     names = ("geometry", "sort", "node_rows", "cut_statistics")
-    code = "from sparklod_cli.support.kernel_cache import *; " + "".join(
+    code = "from sparklod_cli.system.kernel_cache import *; " + "".join(
         f"print(digest_of(sources_of(PACKAGE / 'lod/kernels/{name}.py'))); " for name in names
     )
     digests = []
-    for changed in ("model/falloff.py", "lod/kernels/geometry.py", "support/jit.py", "README.md"):
+    for changed in ("model/falloff.py", "lod/kernels/geometry.py", "system/jit.py", "README.md"):
         command = [sys.executable, "-c", code]
         found = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True).stdout.split()
         digests.append(dict(zip(names, found, strict=True)))
@@ -169,7 +169,7 @@ def test_kernels_run_without_compilation() -> None:
 LOADS = """
 import sys
 sys.path.insert(0, sys.argv[1])
-from sparklod_cli.support import errors, jit
+from sparklod_cli.system import errors, jit
 try:
     jit.load_numba()
 except errors.SparklodError as error:

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from sparklod_cli.support import atomic, atomic_set
+from sparklod_cli.system import atomic, atomic_set
 from tests.conftest import ROOT
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="POSIX only")
@@ -311,7 +311,7 @@ def test_a_folder_swept_before_it_is_locked_is_made_again(tmp_path: Path, monkey
 #: Replaces a set by another one for ever; all of its files say which they belong to.
 WRITER = """
 import itertools, pathlib, sys
-from sparklod_cli.support import atomic_set
+from sparklod_cli.system import atomic_set
 folder = pathlib.Path(sys.argv[1])
 print("ready", flush=True)
 for number in itertools.count():

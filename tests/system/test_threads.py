@@ -11,8 +11,8 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from sparklod_cli.support import threads as threads_module
-from sparklod_cli.support.threads import (
+from sparklod_cli.system import threads as threads_module
+from sparklod_cli.system.threads import (
     PARALLEL_ROWS,
     most_threads,
     on_threads,
