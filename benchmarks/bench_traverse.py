@@ -31,8 +31,7 @@ from sparklod_cli.model.lod_tree import Nodes
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.scenes.finder import view_of
-from sparklod_cli.system.parallel import ordered_map
-from sparklod_cli.system.threads import on_threads, processors
+from sparklod_cli.system.threads import on_threads, ordered_map, processors
 
 #: Nodes of the trees of tiled scenes in millions, budgets in nodes, and frames of their path.
 MILLIONS, BUDGETS, FRAMES = (0.5, 1, 2, 5, 10, 20), (50_000, 200_000, 500_000, 1_500_000), 24

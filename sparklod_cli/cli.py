@@ -11,7 +11,7 @@ import click
 from . import __version__
 from .commands.command import Group
 from .commands.console import Verbosity, say, say_error, say_usage_error
-from .system import interrupts, stdout
+from .system import interrupts, stdio
 from .system.errors import SparklodError, out_of_memory
 from .system.printable import printable
 
@@ -87,7 +87,7 @@ def cli(ctx: click.Context) -> None:
 
 def run(arguments: list[str] | None = None) -> int:
     """Run the command line and return its exit code; arguments are those of the process unless given."""
-    with stdout.guarded():
+    with stdio.guarded():
         code = _run(arguments)
     return interrupts.INTERRUPTED if code and interrupts.came() else code
 
@@ -99,7 +99,7 @@ def _run(arguments: list[str] | None) -> int:
     except click.ClickException as error:
         say_usage_error(error)
         return error.exit_code
-    except stdout.ReaderGoneError:
+    except stdio.ReaderGoneError:
         return 1
     except SparklodError as error:
         say_error(str(error))
@@ -155,7 +155,7 @@ def main() -> NoReturn:
     """Entry point of the script; cleans up on a polite kill as on Ctrl-C."""
     one_thread_of_blas()
     try:
-        stdout.reserve()
+        stdio.reserve()
         interrupts.handle()
         code = run()
         interrupts.ignore()

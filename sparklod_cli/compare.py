@@ -26,9 +26,8 @@ from .render.settings import RenderSettings
 from .scenes.finder import CutFinder
 from .scenes.loaded import Scenes
 from .system.errors import SparklodError
-from .system.parallel import ordered_map
 from .system.progress import Progress, silent
-from .system.threads import on_threads
+from .system.threads import on_threads, ordered_map
 from .tables.columns import Row
 from .tables.comparison import COLUMNS
 from .tables.statistics import numbers

@@ -20,8 +20,8 @@ from ..model.sh import COEFFICIENTS, notes_on_degree
 from ..model.splats import FloatArray
 from ..system.defaults import MAX_SH_DEGREE
 from ..system.errors import FormatError, NotSplatsError, TruncatedError
-from ..system.parallel import blocks_of, ordered_map
 from ..system.progress import Progress
+from ..system.threads import blocks_of, ordered_map
 from ..system.untrusted import ZIP_ERRORS, quoted, quoted_value
 from . import quantize
 from .content import Content, Source, Target

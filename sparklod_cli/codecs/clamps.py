@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..model.lod_tree import LodTree
 from ..model.splats import FloatArray, Splats
-from ..system.parallel import blocks_of, ordered_map
+from ..system.threads import blocks_of, ordered_map
 from . import quantize
 
 

@@ -14,8 +14,8 @@ from zlib_ng import zlib_ng
 
 from ..system.defaults import DEFAULT_COMPRESSION
 from ..system.errors import ChecksumError, FormatError, PromiseError, TooLongError
-from ..system.parallel import ordered_map
 from ..system.progress import Progress
+from ..system.threads import ordered_map
 from .inflate import COMMENTED_HEAD, PLAIN_HEAD
 
 #: Bytes of a block that one thread deflates by itself, and bytes that are read at a time. That blocks of

@@ -18,8 +18,8 @@ from ..model.lod_tree import CHUNK_NODES, LodTree
 from ..model.scene import Scene
 from ..model.splats import Splats
 from ..model.streams import NodeStream
-from ..system.parallel import blocks_of, ordered_map
 from ..system.progress import Progress
+from ..system.threads import blocks_of, ordered_map
 from . import clamps
 from .options import WriteOptions
 

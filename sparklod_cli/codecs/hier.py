@@ -18,8 +18,8 @@ from ..model.gaussian import normalized_quat
 from ..model.sh import COEFFICIENTS
 from ..model.splats import FloatArray, Splats
 from ..system.errors import FormatError, TruncatedError
-from ..system.parallel import BLOCK_ROWS, blocks_of, ordered_map
 from ..system.progress import Progress
+from ..system.threads import BLOCK_ROWS, blocks_of, ordered_map
 from . import quantize
 from .content import Content, Source, Target
 from .stream import Positioned, rows_between, size_of

@@ -21,8 +21,8 @@ from ..model.sh import degree_of, notes_on_degree
 from ..model.splats import FloatArray, Splats
 from ..system.defaults import MAX_SH_DEGREE
 from ..system.errors import FormatError, NotSplatsError, TruncatedError
-from ..system.parallel import blocks_of
 from ..system.progress import Progress, silent
+from ..system.threads import blocks_of
 from ..system.untrusted import quoted
 from . import quantize
 from .clamps import CodeRange

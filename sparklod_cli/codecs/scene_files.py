@@ -13,8 +13,8 @@ from typing import BinaryIO
 
 from ..model.splats import COLUMNS, Splats
 from ..system.errors import FormatError, UnsupportedError
-from ..system.parallel import ordered_map
 from ..system.progress import Progress, silent
+from ..system.threads import ordered_map
 from ..system.untrusted import quoted_value
 from .content import Content, Fill, OpenCompanion, Source, Target
 from .stream import size_of

@@ -21,9 +21,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..model.splats import FloatArray, Splats
-from ..system.parallel import blocks_of
 from ..system.progress import Progress, silent
-from ..system.threads import on_threads
+from ..system.threads import blocks_of, on_threads
 
 #: The most codes of a palette: labels have 16 bits in RAD and in SOG.
 MAX_CODES = 1 << 16

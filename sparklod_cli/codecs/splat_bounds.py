@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from ..model.gaussian import covariance
 from ..model.splats import Splats
-from ..system.parallel import blocks_of
+from ..system.threads import blocks_of
 
 #: By how much a splat may lie outside of its bound: a share of its own extent, by which codes of 8 bits change it; of
 #: its largest scale, since they turn it by up to 1.1 degrees; of the bound; and, for codes of logarithms of 16 bits, of

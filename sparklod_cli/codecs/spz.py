@@ -20,8 +20,8 @@ from ..model.splats import COLUMNS, FloatArray, Splats
 from ..model.streams import NodeStream
 from ..system.defaults import DEFAULT_SPZ_VERSION, MAX_FRACTIONAL_BITS, TREE_SPZ_VERSIONS
 from ..system.errors import FormatError
-from ..system.parallel import blocks_of, ordered_map
 from ..system.progress import Progress, silent
+from ..system.threads import blocks_of, ordered_map
 from . import clamps, compression, coverage, quantize
 from .clamps import CodeRange
 from .compression import DataRun

@@ -21,8 +21,8 @@ from ..model.sh import COEFFICIENTS, notes_on_degree
 from ..model.splats import Splats
 from ..system.defaults import MAX_SH_DEGREE
 from ..system.errors import FormatError, MembersError, NotSplatsError, TruncatedError, VersionError
-from ..system.parallel import ordered_map
 from ..system.progress import Progress
+from ..system.threads import ordered_map
 from . import compression, quantize
 from .content import Content, Source, Target
 from .file_notes import FileNote, read_comment

@@ -19,7 +19,7 @@ from ..model.scene import Scene
 from ..model.sh import COEFFICIENTS
 from ..model.splats import FloatArray, Splats
 from ..system.defaults import MAX_SH_DEGREE
-from ..system.parallel import blocks_of, ordered_map
+from ..system.threads import blocks_of, ordered_map
 from . import quantize
 
 #: A bin has the float32 of the same upper bits: sign, exponent and 7 bits of the mantissa, so its ends are at most

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..system.errors import TruncatedError
-from ..system.parallel import BLOCK_ROWS, blocks_of, ordered_map
 from ..system.progress import Progress
+from ..system.threads import BLOCK_ROWS, blocks_of, ordered_map
 
 #: Least bytes of a block: with narrow rows, such as SPZ's streams, handing a smaller one to a thread costs more than it
 #: saves.

@@ -13,7 +13,7 @@ from ..model.scene import Scene
 from ..model.selection import EXAMINED
 from ..model.splats import COLUMNS, UNIT_TOLERANCE, Splats, describe_invalid
 from ..system.errors import FormatError, InvalidSplatsError, TreeError
-from ..system.parallel import blocks_of, ordered_map
+from ..system.threads import blocks_of, ordered_map
 from .kernels.drawable import count_doubtful
 
 

@@ -17,7 +17,7 @@ from ..system import interrupts
 from ..system.addresses import Address, Place
 from ..system.errors import SparklodError
 from ..system.printable import MOST, shortened
-from ..system.stdin import DASH, name_of
+from ..system.stdio import DASH, name_of
 from .build_lod_files import FORMS, VERIFY, BakedFiles, check_formats, check_inputs, record_of
 from .build_lod_text import report_baked, report_extracted
 from .console import Console, print_json, say

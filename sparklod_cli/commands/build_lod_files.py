@@ -16,7 +16,7 @@ from ..codecs.options import RadOptions
 from ..lod.detail_rule import DetailSettings
 from ..lod.tile_settings import TileSettings
 from ..system.addresses import Place
-from ..system.stdin import DASH
+from ..system.stdio import DASH
 from .option_groups import COMMON, argument, exclude, flag, is_set, option, parameters_of, refuse
 from .options.baking import OF_TREES, STREAMED_SOG, TILES_3D, DetailOptions, RefineOptions
 from .options.common import output_option, overwrite_flag

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from ..system.addresses import Place
-from ..system.stdin import DASH, name_of
+from ..system.stdio import DASH, name_of
 from ..system.units import format_size, percent_of
 from .console import Console, count_of, size_of
 

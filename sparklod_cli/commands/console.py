@@ -18,7 +18,7 @@ import click
 from ..system import interrupts
 from ..system.printable import MOST, printable
 from ..system.progress import StagedProgress
-from ..system.stdout import silence
+from ..system.stdio import silence
 from ..system.units import count_of as count_of
 from ..system.units import format_duration, format_size
 

@@ -16,7 +16,7 @@ from ..system.defaults import MAX_SH_DEGREE, PLOT_BY
 from ..system.errors import OutOfMemoryError, SparklodError, StdoutError
 from ..system.printable import printable
 from ..system.setting_fields import Quantity, Range, whole
-from ..system.stdin import name_of
+from ..system.stdio import name_of
 from ..system.units import parse_size
 from .console import Console, count_of, size_of
 from .inspect_text import finding_line, lines, verdict

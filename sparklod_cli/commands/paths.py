@@ -15,7 +15,7 @@ import click
 
 from ..codecs.file_names import MANIFEST, META, TILESET
 from ..system.addresses import Address, Place, place_of
-from ..system.stdin import DASH
+from ..system.stdio import DASH
 from ..tables.files import FORMS
 from .console import is_terminal
 from .option_groups import flag_of

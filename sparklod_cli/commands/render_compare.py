@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ..system.stdin import DASH
+from ..system.stdio import DASH
 from .console import Console, count_of, for_screen, is_terminal, print_json
 from .options.common import question_budgets, report_outcomes, table_form
 from .options.cut import check_scenes, viewed_files

@@ -17,7 +17,7 @@ from ..system import interrupts
 from ..system.addresses import Place
 from ..system.defaults import DETAIL_GROWTH
 from ..system.setting_fields import Quantity, Range, setting_of, whole
-from ..system.stdin import DASH
+from ..system.stdio import DASH
 from ..system.units import parse_size
 from .build_lod_files import SPZ, record_of, refuse_others
 from .build_lod_text import report_simplified

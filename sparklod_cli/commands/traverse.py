@@ -13,7 +13,7 @@ import click
 
 from ..simulation.streaming_settings import StreamingSettings
 from ..system.printable import printable
-from ..system.stdin import DASH
+from ..system.stdio import DASH
 from ..system.units import percent_of
 from ..tables.files import FORMS
 from .console import WIDTH, Console, count_of, for_screen, is_terminal, print_json, rows, size_of

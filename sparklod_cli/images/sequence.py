@@ -14,9 +14,8 @@ from ..cameras.frame import DEFAULT_FPS
 from ..io import write_stdout, write_whole
 from ..render.renderer import Renderer
 from ..render.settings import OF_PIXELS
-from ..system.parallel import ordered_map
 from ..system.progress import Progress, silent
-from ..system.threads import on_threads
+from ..system.threads import on_threads, ordered_map
 from . import pixels as codes
 from .animation import animate
 from .contact_sheet import sheet

@@ -14,8 +14,8 @@ from ..io.rad_file import RadFile
 from ..model.lod_tree import CHUNK_NODES, LodTree
 from ..model.scene import Scene
 from ..model.splats import COLUMNS, FloatArray, Splats
-from ..system.parallel import ordered_map
 from ..system.progress import Progress, silent
+from ..system.threads import ordered_map
 from .findings import Finding
 
 Mask = NDArray[np.bool_]

@@ -27,7 +27,7 @@ from ..model.gaussian import spark_size
 from ..model.lod_tree import CHUNK_BITS, CHUNK_NODES, LodTree
 from ..model.scene import Scene
 from ..model.splats import FloatArray, Splats
-from ..system.parallel import blocks_of, ordered_map
+from ..system.threads import blocks_of, ordered_map
 from .blocks import Block, Mask, MaskTally, ReportBlocks, largest, merged, tallies
 from .findings import Finding
 

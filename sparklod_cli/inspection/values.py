@@ -14,7 +14,7 @@ from ..model.gaussian import spark_size
 from ..model.scene import Scene
 from ..model.sh import COEFFICIENTS
 from ..model.splats import COLUMNS, FloatArray, Splats
-from ..system.parallel import ordered_map
+from ..system.threads import ordered_map
 from ..tables.histograms import Histogram, histogram
 from .blocks import Block, ReportBlocks, largest, smallest
 from .percentiles import Percentiles

@@ -8,7 +8,7 @@ from collections.abc import Collection
 from dataclasses import dataclass
 
 from ..system.addresses import Address, Place
-from ..system.stdin import DASH, name_of
+from ..system.stdio import DASH, name_of
 from .local_files import companions
 from .reading import file_of, readable
 

@@ -18,7 +18,7 @@ from ..codecs.lookalikes import POINTER, SHORT, is_pointer
 from ..system.addresses import Place
 from ..system.errors import FormatError, UnreadableError
 from ..system.printable import near
-from ..system.stdin import DASH
+from ..system.stdio import DASH
 from ..system.untrusted import quoted_value
 
 #: Names in a folder that are compared with one that is missing: more take longer than a person expects of an error.

@@ -22,7 +22,7 @@ from ..system.addresses import Place, size_of
 from ..system.errors import FormatError, UnknownFormatError, UnreadableError
 from ..system.json_text import decoded_text
 from ..system.progress import Progress, silent
-from ..system.stdin import DASH, spooled
+from ..system.stdio import DASH, spooled
 from .local_files import in_folder, open_named, reason_unreadable
 
 if TYPE_CHECKING:

@@ -22,7 +22,7 @@ from ..model.transforms import Transform
 from ..system import atomic
 from ..system.addresses import Address, Place
 from ..system.errors import FormatError, OutputError, SparklodError
-from ..system.stdin import DASH, name_of
+from ..system.stdio import DASH, name_of
 from .local_files import reason_of
 from .reading import opened, readable
 

@@ -21,8 +21,7 @@ from ..system import atomic, atomic_set
 from ..system.addresses import Address, Place
 from ..system.errors import OutputError, StdoutError
 from ..system.progress import Progress, silent
-from ..system.stdin import DASH
-from ..system.stdout import ReaderGoneError, guarded
+from ..system.stdio import DASH, ReaderGoneError, guarded
 from ..system.units import format_size
 from .local_files import number_of, reason_of
 

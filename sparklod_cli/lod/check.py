@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from ..codecs.validation import check_valid
 from ..model.splats import Splats
 from ..system.errors import InvalidSplatsError
-from ..system.parallel import BLOCK_ROWS
-from ..system.threads import threads_for
+from ..system.threads import BLOCK_ROWS, threads_for
 from .kernels.geometry import find_bounds
 
 

@@ -19,9 +19,8 @@ from ..model.foveation import SPARK
 from ..model.gaussian import spark_size
 from ..model.lod_tree import CHUNK_NODES, LodTree
 from ..model.splats import FloatArray, Splats
-from ..system.parallel import blocks_of
 from ..system.progress import Progress, silent
-from ..system.threads import threads_for
+from ..system.threads import blocks_of, threads_for
 from .families import families_of, node_order, reordered
 from .kernels.chunk_sets import DEMAND_BYTES, LANES, Families, fill_demand, sort_within_chunks, split_sets
 from .kernels.pixel_scale import NODE, VIEW

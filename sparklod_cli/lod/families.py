@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from ..model.gaussian import spark_size
 from ..model.lod_tree import LodTree
 from ..model.splats import FloatArray, Splats
-from ..system.parallel import for_blocks
-from ..system.threads import threads_in_use
+from ..system.threads import for_blocks, threads_in_use
 from .kernels.tree_links import find_limits, find_parents
 
 #: Nodes of the first band, and how many times more there are at the end of each band than at that of the one before.

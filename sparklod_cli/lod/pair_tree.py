@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..model.splats import FloatArray, Splats
-from ..system.parallel import blocks_of, for_blocks
 from ..system.progress import Progress
-from ..system.threads import threads_for
+from ..system.threads import blocks_of, for_blocks, threads_for
 from .check import Bounds
 from .kernels import node_rows, pair_cost, pair_merge
 from .kernels.geometry import SplatColumns

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from ..model.lod_tree import LodTree
 from ..model.splats import COLUMNS, FloatArray, Splats
-from ..system.parallel import blocks_of
-from ..system.threads import threads_for
+from ..system.threads import blocks_of, threads_for
 from .kernels.cell_pairs import SPAN, merge_in_cells, split_families
 from .kernels.geometry import SplatColumns
 from .kernels.node_rows import Space, fill_leaf_rows, fill_leaves, fill_merged_splats, merge_colors

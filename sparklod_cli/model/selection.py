@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..system.errors import InvalidSplatsError
-from ..system.parallel import blocks_of, ordered_map
+from ..system.threads import blocks_of, ordered_map
 from .splats import INVALID, Splats, describe_counts
 
 Vector = tuple[float, float, float]

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..system.defaults import UP_AXES
-from ..system.parallel import blocks_of
+from ..system.threads import blocks_of
 from .gaussian import quat_of_rotation, rotation_matrices
 from .sh import COEFFICIENTS, SH_C1, SH_C2, SH_C3
 from .splats import FloatArray, Splats

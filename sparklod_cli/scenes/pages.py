@@ -23,7 +23,7 @@ from ..model.scene import FileCoding
 from ..model.splats import COLUMNS, Splats
 from ..system.errors import SparklodError, TreeError
 from ..system.machine import available_memory
-from ..system.parallel import ordered_map
+from ..system.threads import ordered_map
 from .loaded_scene import Index, LoadedScene, bytes_of
 
 #: Makes nodes of the splats, the tree and the coding of a chunk.

@@ -22,7 +22,7 @@ from ..model.splats import COLUMNS
 from ..model.tile_scene import TileScene
 from ..system.errors import FormatError, InvalidSplatsError, SparklodError, TreeError, memory_errors_translated
 from ..system.progress import Progress, silent
-from ..system.stdin import DASH
+from ..system.stdio import DASH
 from .loaded import Scenes
 from .loaded_scene import (
     UNNAMED,

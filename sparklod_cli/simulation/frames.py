@@ -16,8 +16,8 @@ from ..lod.traversal import TreeCut
 from ..model.instances import TOTAL
 from ..scenes.finder import view_of
 from ..scenes.loaded import Scenes
-from ..system.parallel import ordered_map
 from ..system.progress import Progress, silent
+from ..system.threads import ordered_map
 from ..tables.columns import Row
 from .columns import COLUMNS, OF_BUDGETS, OF_TREES
 from .loading import Viewer

@@ -1,7 +1,7 @@
-"""The number of threads that work is divided among, and ranges of rows that compiled kernels process on them.
+"""Threads: their number, ranges of rows for compiled kernels, and blocks of rows and other items, in order.
 
 A function of the API takes `threads`, None for all processors. It passes the number to functions with their own pools
-(`parallel.ordered_map`), and calls kernels inside `on_threads`.
+(`ordered_map`), and calls kernels inside `on_threads`.
 """
 
 from __future__ import annotations
@@ -10,9 +10,9 @@ import contextlib
 import os
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor, wait
-from typing import Any
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from typing import Any, TypeVar
 
 #: Least number of rows for which several threads are used: with fewer, one thread finishes before another wakes up.
 #: Chosen; no difference was measured up to 65,536 (benchmarks/notes/kernels.md).
@@ -132,3 +132,42 @@ def _after_fork() -> None:
 
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_after_fork)
+
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+#: Rows of a block: few enough for temporaries to stay in the processor's cache, enough for the
+#: overhead of the interpreter to stay small.
+BLOCK_ROWS = 1 << 14
+
+
+def ordered_map(work: Callable[[Item], Result], items: Iterable[Item], threads: int) -> Generator[Result, None, None]:
+    """Yield the results of `work` in the order of `items`, computed up to `threads` at a time.
+
+    Items are taken when they are needed, a few ahead of the workers, so that all of them need not fit into memory.
+    """
+    if threads == 1:
+        yield from map(work, items)
+        return
+    pool = ThreadPoolExecutor(threads)
+    pending: deque[Future[Result]] = deque()
+    try:
+        for item in items:
+            pending.append(pool.submit(work, item))
+            if len(pending) > 2 * threads:
+                yield pending.popleft().result()
+        while pending:
+            yield pending.popleft().result()
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def blocks_of(rows: int, size: int = BLOCK_ROWS) -> list[slice]:
+    """Return slices of `size` rows that cover `rows`; the last may be shorter."""
+    return [slice(start, min(start + size, rows)) for start in range(0, rows, size)]
+
+
+def for_blocks(work: Callable[[slice], None], rows: int, threads: int) -> None:
+    """Call `work` with slices that cover `rows`."""
+    deque(ordered_map(work, blocks_of(rows), threads), maxlen=0)

@@ -19,7 +19,7 @@ from sparklod_cli.codecs.stream import rows_of
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.system.errors import FormatError
-from sparklod_cli.system.parallel import BLOCK_ROWS, ordered_map
+from sparklod_cli.system.threads import BLOCK_ROWS, ordered_map
 from tests.scenes import random_splats
 
 COUNT = 12 * BLOCK_ROWS

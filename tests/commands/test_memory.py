@@ -18,7 +18,7 @@ from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.system.errors import OutOfMemoryError, memory_errors_translated, out_of_memory
-from sparklod_cli.system.parallel import ordered_map
+from sparklod_cli.system.threads import ordered_map
 from tests.conftest import FIXTURES, ROOT, Capture
 
 #: Runs a command twice: with something small HERE, so that all code is loaded and compiled, then with something large

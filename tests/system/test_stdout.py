@@ -109,7 +109,7 @@ def test_an_error_while_making_the_output_is_not_one_of_standard_output() -> Non
 
 @pytest.mark.skipif(os.name != "posix", reason="a shell of POSIX")
 def test_no_file_gets_the_number_of_a_closed_stream() -> None:
-    code = "import os; from sparklod_cli.system import stdout; stdout.reserve(); "
+    code = "import os; from sparklod_cli.system import stdio; stdio.reserve(); "
     code += "os._exit(os.open(os.devnull, os.O_RDONLY))"
     for closed in ("<&-", ">&-", "2>&-", "<&- >&- 2>&-"):
         done = subprocess.run(["sh", "-c", f"{sys.executable} -c '{code}' {closed}"], cwd=ROOT, check=False)

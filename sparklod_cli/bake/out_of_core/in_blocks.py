@@ -19,9 +19,8 @@ from ...lod.stage_records import NO_FAMILY, Pending
 from ...model.selection import SelectionTally
 from ...model.sh import width_of
 from ...model.splats import Splats
-from ...system.parallel import blocks_of
 from ...system.progress import Progress
-from ...system.threads import on_threads
+from ...system.threads import blocks_of, on_threads
 from ..output import BakeOutput
 from ..records import BuiltTree, Clock
 from .blocks import BuildStage, cut_into_blocks

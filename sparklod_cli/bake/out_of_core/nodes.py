@@ -14,8 +14,8 @@ from ...model.lod_tree import LodTree
 from ...model.sh import degree_of, width_of
 from ...model.splats import COLUMNS, Splats
 from ...model.streams import NodeStream
-from ...system.parallel import for_blocks, ordered_map
 from ...system.progress import Progress
+from ...system.threads import for_blocks, ordered_map
 from .job import ROOT, Job, encoded_of, families_of, window_of
 from .order import WINDOW_NODES
 from .store import Store

@@ -16,9 +16,8 @@ from ...lod.kernels.tree_links import find_limits
 from ...lod.stage_records import NO_FAMILY, STAGE_BITS
 from ...model.lod_tree import CHUNK_NODES
 from ...model.splats import FloatArray
-from ...system.parallel import blocks_of
 from ...system.progress import Progress
-from ...system.threads import on_threads
+from ...system.threads import blocks_of, on_threads
 from .job import ORDER, Job, families_of, window_of
 from .store import Store
 

@@ -16,7 +16,7 @@ from ...model.streams import SceneStream
 from ...system.addresses import Place, absolute
 from ...system.errors import FormatError, HasTreeError, OutOfMemoryError, ScratchError
 from ...system.progress import Progress
-from ...system.stdin import name_of
+from ...system.stdio import name_of
 from ...system.units import count_of, format_size
 from ..fingerprint import files_named_in, source_fingerprint
 from ..output import BakeOutput

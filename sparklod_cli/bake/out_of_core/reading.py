@@ -14,9 +14,8 @@ from ...model.selection import REASONS, SelectionTally
 from ...model.sh import width_of
 from ...model.splats import FloatArray, Splats
 from ...model.streams import SceneStream
-from ...system.parallel import blocks_of
 from ...system.progress import Progress
-from ...system.threads import on_threads
+from ...system.threads import blocks_of, on_threads
 from ..selecting import check_transformed, select, transform
 from ..settings import BakeSettings
 from .job import Job

@@ -16,8 +16,8 @@ import numpy as np
 from ...system import atomic
 from ...system.addresses import Place
 from ...system.errors import FormatError, InvalidSplatsError, ScratchError, UnreadableError
-from ...system.parallel import ordered_map
-from ...system.stdin import DASH
+from ...system.stdio import DASH
+from ...system.threads import ordered_map
 from ...system.units import count_of
 from ...system.untrusted import parse_json
 from ..fingerprint import Fingerprint

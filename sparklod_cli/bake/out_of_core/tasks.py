@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from ...system import machine
-from ...system.parallel import ordered_map
 from ...system.progress import Progress, silent
+from ...system.threads import ordered_map
 
 
 @dataclass(frozen=True)

@@ -22,8 +22,8 @@ from ...model.sh import width_of
 from ...model.splats import FloatArray, Splats
 from ...model.transforms import Transform
 from ...system.errors import FormatError, NotSplatsError, UnsupportedError
-from ...system.parallel import blocks_of, ordered_map
 from ...system.progress import Progress, silent
+from ...system.threads import blocks_of, ordered_map
 from ...system.units import count_of
 from ...system.untrusted import quoted_value
 from .. import spz

@@ -12,7 +12,7 @@ from ...model.gaussian import covariance
 from ...model.scene import Scene
 from ...model.splats import Splats
 from ...system.errors import FormatError
-from ...system.parallel import for_blocks
+from ...system.threads import for_blocks
 from .. import quantize
 from ..spark_codings import Words
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ...model.scene import Scene
 from ...model.splats import FloatArray, Splats
-from ...system.parallel import for_blocks
+from ...system.threads import for_blocks
 from .. import spark_codings
 from ..spark_codings import STEPS_10_10_12, Words
 

@@ -17,7 +17,7 @@ from ...model.gaussian import size_factor
 from ...model.lod_tree import LodTree, Nodes
 from ...model.scene import PLAIN, FileCoding, ScaleCoding
 from ...model.splats import FloatArray, Splats
-from ...system.parallel import for_blocks
+from ...system.threads import for_blocks
 from .. import quantize, spark_codings, splat_encoding
 from ..splat_encoding import SplatEncoding
 

@@ -13,7 +13,7 @@ from ...model.lod_tree import MAX_CHILDREN, LodTree, Nodes
 from ...model.scene import Scene
 from ...model.splats import Splats
 from ...system.errors import FormatError
-from ...system.parallel import for_blocks
+from ...system.threads import for_blocks
 from ..spark_codings import Words, checked_words
 
 NODE = np.dtype(

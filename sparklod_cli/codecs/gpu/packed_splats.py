@@ -16,7 +16,7 @@ from ...model.scene import Scene
 from ...model.sh import COEFFICIENTS
 from ...model.splats import FloatArray, Splats
 from ...system.errors import FormatError
-from ...system.parallel import for_blocks
+from ...system.threads import for_blocks
 from .. import spark_codings
 from ..spark_codings import STEPS_8_8_8, Words
 from ..splat_encoding import DEFAULT, SplatEncoding, decode_linear, encode_linear, encode_log_scale, log_scale_table

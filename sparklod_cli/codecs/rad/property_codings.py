@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...model.splats import FloatArray
-from ...system.parallel import blocks_of
+from ...system.threads import blocks_of
 from .. import spark_codings, splat_encoding
 from ..quantize import Bytes
 from ..spark_codings import STEPS_8_8_8

@@ -17,8 +17,8 @@ from ...model.scene import Scene
 from ...model.sh import COEFFICIENTS
 from ...model.splats import COLUMNS, FloatArray, Splats
 from ...model.streams import NodeStream
-from ...system.parallel import blocks_of
 from ...system.progress import Progress, silent
+from ...system.threads import blocks_of
 from .. import coverage, sh_palette, spark_codings
 from ..clamps import CodeRange
 from ..encoder import Encoded, Encoder, Get, windows_of

@@ -17,8 +17,8 @@ from ...model.sh import COEFFICIENTS, width_of
 from ...model.splats import COLUMNS, FloatArray, Splats
 from ...system.defaults import MAX_SH_DEGREE
 from ...system.errors import FormatError, TruncatedError
-from ...system.parallel import ordered_map
 from ...system.progress import Progress
+from ...system.threads import ordered_map
 from .. import compression
 from ..content import Content, OpenCompanion, Source, Target
 from ..stream import size_of

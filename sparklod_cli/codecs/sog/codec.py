@@ -16,8 +16,8 @@ import numpy as np
 from ...model.sh import COEFFICIENTS, width_of
 from ...model.splats import FloatArray, Splats
 from ...system.errors import FormatError, VersionError
-from ...system.parallel import for_blocks, ordered_map
 from ...system.progress import Progress
+from ...system.threads import for_blocks, ordered_map
 from ...system.untrusted import quoted_value
 from .. import quantize
 from ..compression import check_promise

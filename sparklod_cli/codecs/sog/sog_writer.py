@@ -18,8 +18,8 @@ from ...model.scene import Scene
 from ...model.splats import FloatArray, Splats
 from ...system.defaults import MAX_SH_CODES
 from ...system.errors import FormatError
-from ...system.parallel import blocks_of, ordered_map
 from ...system.progress import Progress, silent
+from ...system.threads import blocks_of, ordered_map
 from ...system.units import count_of
 from .. import quantize, sh_palette
 from ..clamps import CodeRange

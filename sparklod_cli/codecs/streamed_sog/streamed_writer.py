@@ -12,8 +12,8 @@ from ...model import morton
 from ...model.scene import Bounds, DetailScene, Scene
 from ...model.splats import Splats
 from ...system.errors import FormatError
-from ...system.parallel import ordered_map
 from ...system.progress import Progress, silent
+from ...system.threads import ordered_map
 from .. import quantize
 from ..file_names import ENVIRONMENT_FILE, MANIFEST, META, chunk_folder
 from ..file_notes import note_of

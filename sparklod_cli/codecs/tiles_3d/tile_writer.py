@@ -14,8 +14,8 @@ import numpy as np
 from ...model.scene import Scene
 from ...model.tile_scene import TileScene
 from ...system.errors import FormatError
-from ...system.parallel import ordered_map
 from ...system.progress import Progress, silent
+from ...system.threads import ordered_map
 from ..file_names import TILES, TILESET
 from ..file_notes import note_of
 from ..glb import codec as glb

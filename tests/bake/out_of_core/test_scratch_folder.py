@@ -15,7 +15,7 @@ from sparklod_cli.bake.fingerprint import Fingerprint
 from sparklod_cli.bake.out_of_core.scratch_folder import LOCK, RECIPE, SUFFIX, at_work, scratch_folder
 from sparklod_cli.bake.out_of_core.store import Store
 from sparklod_cli.system.errors import FormatError, ScratchError, UnreadableError
-from sparklod_cli.system.stdin import DASH
+from sparklod_cli.system.stdio import DASH
 from tests.conftest import ROOT
 
 A = Fingerprint(("content a",), ("a.ply",), {"method": "quick", "base": 1.5})

@@ -16,7 +16,7 @@ from sparklod_cli.codecs.gpu import data_texture
 from sparklod_cli.model.gaussian import normalized_quat
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.system.errors import FormatError
-from sparklod_cli.system.parallel import BLOCK_ROWS
+from sparklod_cli.system.threads import BLOCK_ROWS
 from tests.references import gaussians
 from tests.scenes import random_splats
 

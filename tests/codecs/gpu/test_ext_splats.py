@@ -16,7 +16,7 @@ from sparklod_cli.codecs.gpu import ext_splats
 from sparklod_cli.model.gaussian import linear_opacity, lod_opacity
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.system.errors import FormatError
-from sparklod_cli.system.parallel import BLOCK_ROWS
+from sparklod_cli.system.threads import BLOCK_ROWS
 from tests.codecs.test_spark_codings import degrees_between, random_quats
 from tests.scenes import random_splats
 

@@ -18,7 +18,7 @@ from sparklod_cli.model.gaussian import linear_opacity
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.system.errors import FormatError
-from sparklod_cli.system.parallel import BLOCK_ROWS
+from sparklod_cli.system.threads import BLOCK_ROWS
 from tests.scenes import random_splats
 
 

@@ -25,7 +25,7 @@ from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.system.progress import Progress
-from sparklod_cli.system.stdin import spooled
+from sparklod_cli.system.stdio import spooled
 from tests.commands.build_lod.runs import ONE, SMALL, build, sparklod
 from tests.conftest import FIXTURES, ROOT, Capture
 from tests.signals import heed_signals

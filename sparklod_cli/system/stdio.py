@@ -1,14 +1,16 @@
-"""Standard output with its own exceptions, so that a failed write is not mistaken for another error."""
+"""Standard input as a seekable file, and standard output whose failed writes have errors of their own."""
 
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import sys
 from collections.abc import Iterator
-from typing import Any
+from pathlib import Path
+from typing import Any, BinaryIO
 
-from .errors import StdoutError
+from .errors import StdoutError, UnreadableError
 
 
 class ReaderGoneError(StdoutError):
@@ -90,3 +92,33 @@ def reserve() -> None:
         if descriptor > 2:
             os.close(descriptor)
             return
+
+
+#: The path that means standard input or output.
+DASH = Path("-")
+
+
+def name_of(path: object) -> str:
+    """Return the name of an input, a path or what has one as its text, in messages."""
+    return "standard input" if path == DASH else str(path)
+
+
+def spooled() -> BinaryIO:
+    """Return standard input as a temporary file, not to be closed; `UnreadableError` if it is closed or a terminal."""
+    if sys.stdin is None:
+        raise UnreadableError("standard input is closed")
+    if sys.stdin.isatty():
+        raise UnreadableError("standard input is a terminal; pipe a file into it, or give a path")
+    file = _copy_of(sys.stdin)
+    file.seek(0)
+    return file
+
+
+@functools.lru_cache(maxsize=1)
+def _copy_of(stream: Any) -> BinaryIO:
+    import shutil  # which take milliseconds, and every command loads this module
+    import tempfile
+
+    file: BinaryIO = tempfile.TemporaryFile(prefix="sparklod-")  # noqa: SIM115
+    shutil.copyfileobj(stream.buffer, file, 1 << 20)
+    return file
