@@ -54,7 +54,6 @@ if TYPE_CHECKING:  # mypy then resolves the modules first, which import this one
     from .model.selection import Selection as Selection
     from .model.splats import Splats as Splats
     from .model.transforms import Transform as Transform
-    from .render.backends import BackendError as BackendError
     from .render.settings import RasterSettings as RasterSettings
     from .render.settings import RenderSettings as RenderSettings
     from .scenes.instances_file import InstancesFileError as InstancesFileError
@@ -62,6 +61,7 @@ if TYPE_CHECKING:  # mypy then resolves the modules first, which import this one
     from .scenes.loaded import Cut as Cut
     from .simulation.streaming_settings import Network as Network
     from .simulation.streaming_settings import StreamingSettings as StreamingSettings
+    from .system.errors import BackendError as BackendError
     from .system.errors import CameraPathError as CameraPathError
     from .system.errors import FormatError as FormatError
     from .system.errors import InvalidSplatsError as InvalidSplatsError

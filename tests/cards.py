@@ -7,7 +7,7 @@ import shutil
 
 import pytest
 
-from sparklod_cli.render.backends import BackendError
+from sparklod_cli.system.errors import BackendError
 
 #: The variable that has numba simulate a card, which it reads when it is loaded.
 SIMULATE = "NUMBA_ENABLE_CUDASIM"

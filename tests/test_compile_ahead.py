@@ -7,12 +7,11 @@ from typing import Any
 
 import pytest
 
-from sparklod_cli import compile_ahead, warmup
+from sparklod_cli import warmup
 from sparklod_cli.cli import run
-from sparklod_cli.compile_ahead import JOBS, CompileAhead
 from sparklod_cli.system import jit
 from sparklod_cli.system.kernel_cache import stem_of
-from sparklod_cli.warmup import Unit
+from sparklod_cli.warmup import JOBS, CompileAhead, Unit
 from tests.conftest import FIXTURES
 from tests.test_warmup import few as few
 
@@ -47,7 +46,7 @@ def test_a_command_calls_all_kernels_of_its_job(job: str, tmp_path: Path, monkey
 def several_processors(few: list[Unit], monkeypatch: pytest.MonkeyPatch) -> list[Unit]:
     """Three kernels that are missing are a job, on a machine of two processors."""
     monkeypatch.setitem(JOBS, "few", tuple(dict.fromkeys(unit.name for unit in few)))
-    monkeypatch.setattr(compile_ahead, "processors", lambda: 2)
+    monkeypatch.setattr(warmup, "processors", lambda: 2)
     return few
 
 
@@ -83,7 +82,7 @@ def test_a_kernel_that_is_being_compiled_is_waited_for(several_processors: list[
 def test_one_processor_or_no_job_needs_no_process(
     job: list[str], several_processors: list[Unit], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(compile_ahead, "processors", lambda: 1 if job else 2)
+    monkeypatch.setattr(warmup, "processors", lambda: 1 if job else 2)
     ahead = CompileAhead(several_processors, job, "")
     ahead.close()
     assert ahead.compiled == 0

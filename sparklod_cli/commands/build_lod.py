@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 from collections.abc import Callable, Iterator, Sequence
@@ -11,29 +12,58 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..codecs.options import SogOptions, WriteOptions
+from ..codecs.file_names import MANIFEST, TILESET
+from ..codecs.file_names import RAD_SUFFIX as RAD
+from ..codecs.formats import ENCODINGS, FORMATS, NPZ, RAW_SUFFIXES, WRITABLE, ending_of
+from ..codecs.options import RadOptions, SogOptions, WriteOptions
+from ..lod.detail_rule import DetailSettings
 from ..lod.tile_settings import TileSettings
 from ..system import interrupts
 from ..system.addresses import Address, Place
 from ..system.errors import SparklodError
 from ..system.printable import MOST, shortened
 from ..system.stdio import DASH, name_of
-from .build_lod_files import FORMS, VERIFY, BakedFiles, check_formats, check_inputs, record_of
 from .build_lod_text import report_baked, report_extracted
 from .console import Console, print_json, say
-from .option_groups import COMMON, check_declared, command, exclude, flags_set, is_set, parameters_of, values_of
+from .option_groups import (
+    COMMON,
+    argument,
+    check_declared,
+    command,
+    flag,
+    flags_set,
+    is_set,
+    option,
+    parameters_of,
+    refuse,
+    values_of,
+)
 from .options.baking import (
     OF_TREES,
+    STREAMED_SOG,
+    TILES_3D,
     ClusterOptions,
     DetailOptions,
     PaletteOptions,
+    RefineOptions,
     ResourceOptions,
     SelectionOptions,
     TransformOptions,
     TreeOptions,
 )
-from .options.common import General
-from .paths import NAMELESS, Folder, claim_stdout, is_same_place, keep_apart, with_chunks
+from .options.common import General, output_option, overwrite_flag
+from .paths import (
+    NAMELESS,
+    Folder,
+    InputPath,
+    OutputPath,
+    claim_stdout,
+    is_same_place,
+    keep_apart,
+    require_suffix,
+    stem_of,
+    with_chunks,
+)
 
 if TYPE_CHECKING:
     from ..bake.out_of_core.cluster_engine import ClusterEngine
@@ -41,12 +71,10 @@ if TYPE_CHECKING:
     from ..bake.settings import BakeSettings
     from ..bake.sources import Source
     from ..extract_leaves import Extracted
+    from ..model.instances import Instance
 
-    #: Result of a job; None where the output was there already.
-    Outcome = Baked | Extracted | None
-
-    #: Makes the outputs of inputs, and yields what came of each, in order.
-    Make = Callable[[Sequence[tuple[Source, Place]]], Iterator[Outcome | SparklodError]]
+    #: Result for an input; None where the output exists already.
+    Outcome = Baked | Extracted | SparklodError | None
 
 EXAMPLES = """\
   sparklod build-lod scene.ply                     # writes scene-lod.spz
@@ -74,6 +102,290 @@ EXAMPLES = """\
     --scheduler tcp://host:8786 --scratch-dir s3://bucket/scratch
   cat scene.ply | sparklod build-lod - -o - | aws s3 cp - s3://bucket/lod.spz
 """
+
+
+#: Suffixes of the formats in which a tree can be written, and what they are called; the first one is the default.
+TREES = {suffix: form.name for suffix, form in WRITABLE.items() if form.trees}
+SPZ = next(iter(TREES))
+
+#: Suffixes of formats that hold no tree, and how else their names end.
+PLAIN = {ending for form in FORMATS for ending in (*form.suffixes, *form.endings) if not form.trees}
+
+#: Values of --skip-existing: read only files whose size or date changed, or all.
+BY_DATE, VERIFY = "date", "verify"
+
+#: Values of --format: the suffix of the file, and whether each chunk of a RAD gets a file of its own.
+FORMS = {
+    "spz": (".spz", False),
+    "rad": (".rad", False),
+    "rad-chunked": (".rad", True),
+    STREAMED_SOG: (".json", False),
+    TILES_3D: (".json", False),
+}
+
+#: What the formats of cuts are called.
+DETAIL, TILED = DetailOptions.HEADING, TileSettings.HEADING
+
+#: By the value of --format, for those that are cuts of a tree: the names of the manifest and of the format, and what is
+#: beside the manifest.
+MANIFESTS = {STREAMED_SOG: (MANIFEST, DETAIL, "folders"), TILES_3D: (TILESET, TILED, "a folder")}
+
+#: Parameters of formats, the names of these, and how to get one of them.
+OF_FORMATS = (
+    (("spz_version", "fractional_bits"), ("SPZ",), ""),
+    (parameters_of(RadOptions), ("RAD",), "; name the output .rad, or add --format rad"),
+    (("compression_level",), ("SPZ", "RAD"), ""),
+    (("glb_profile",), ("GLB", TILED), "; GLB is written by --unlod and simplify"),
+    (("cluster_sh",), ("RAD", "SOG"), "; name the output .rad, or add --format rad"),
+    (
+        parameters_of(DetailSettings, DetailOptions),
+        (DETAIL,),
+        f"; name the output {MANIFEST}, or add --format {STREAMED_SOG}",
+    ),
+    (parameters_of(TileSettings), (TILED,), f"; name the output {TILESET}, or add --format {TILES_3D}"),
+)
+
+
+@dataclass(frozen=True)
+class BakedFiles:
+    """Options of inputs and outputs, and of refining, which may replace its input."""
+
+    inputs: tuple[Place, ...] = argument(InputPath(stdin=True, addresses=True), metavar="INPUT...")
+    merge: bool = flag(
+        "Bake all INPUTs as one scene, into the file that --output names: tiles of a city, each where its own"
+        " coordinates put it.",
+        heading=COMMON,
+    )
+    scene: Path | None = option(
+        "Merge the files of an instances file, each where it stands there, in place of INPUTs (see docs/build-lod.md).",
+        InputPath(),
+        heading=COMMON,
+    )
+    output: Place | None = output_option(
+        "Output of a single input, or a folder for all outputs; - is standard output.  [default: NAME-lod.spz beside"
+        f" the input; NAME-lod.rad with --format rad, NAME-lod/{MANIFEST} with --format {STREAMED_SOG},"
+        f" NAME-lod/{TILESET} with --format {TILES_3D}, NAME-lod.npz with --encoding, NAME-unlod.spz with --unlod,"
+        " NAME-lod-refined.spz of a NAME-lod.spz with --refine]",
+        addresses=True,
+    )
+    output_dir: Place | None = option(
+        "Folder for the outputs; created if it does not exist.",
+        OutputPath(folder=True, addresses=True),
+        heading=COMMON,
+    )
+    overwrite: bool = overwrite_flag()
+    skip_existing: str | None = option(
+        "Bake nothing whose output is there already, of the same inputs and settings; a small file beside each output,"
+        " NAME.sparklod.json, tells of what it is. Files whose size and date are unchanged are not read;"
+        " --skip-existing=verify reads all, and so finds damage that left both as they were.",
+        (BY_DATE, VERIFY),
+        heading="Large scenes",
+        metavar="[=verify]",
+        bare=BY_DATE,
+    )
+    unlod: bool = flag(
+        "Write the leaves of Level-of-Detail files instead: the original splats as the file holds them, rounded, with"
+        " opacities that make up for it. As SPZ or, by the name of FILE, .rad, .ply, .sog, DIR/meta.json (an unpacked"
+        " SOG), .glb or .splat, which has no SH.",
+        heading=COMMON,
+    )
+    form: str | None = option(
+        "Format of the output. rad is what Spark streams; rad-chunked writes each chunk to a file of its own,"
+        " NAME-lod-0.radc and so on, beside NAME-lod.rad; streamed-sog is what PlayCanvas, SuperSplat and Babylon.js"
+        f" stream, {MANIFEST} and folders beside it; 3d-tiles is what CesiumJS streams, {TILESET} and a folder beside"
+        " it. A Level-of-Detail file of another format keeps its tree. "
+        " [default: by the name of FILE, or spz]",
+        tuple(FORMS),
+        flags=("--format",),
+        heading=COMMON,
+    )
+    refining: RefineOptions = field(default_factory=RefineOptions)
+    encoding: str | None = option(
+        f"Write arrays in a viewer's memory layout instead: a {NPZ} file, or the words alone if FILE ends in"
+        f" {' or '.join(RAW_SUFFIXES)}.",
+        tuple(ENCODINGS),
+        heading="File format",
+    )
+
+    @property
+    def is_merged(self) -> bool:
+        """Whether all inputs are one scene."""
+        return self.merge or self.scene is not None
+
+    def instances(self) -> list[Instance]:
+        """Return the instances of the instances file; none without one.
+
+        Raises:
+            InstancesFileError: it cannot be read.
+        """
+        if self.scene is None:
+            return []
+        from ..scenes.instances_file import read_instances
+
+        return read_instances(self.scene)
+
+    def jobs(self, instances: Sequence[Instance], say: Callable[[str], None]) -> list[tuple[Source, Place]]:
+        """Return pairs of an input and its output; `say` gets a line on attributes of instances that are ignored."""
+        from ..bake.sources import Merged
+
+        if not self.is_merged:
+            return [(place, self.target(place)) for place in self.inputs]
+        assert self.output is not None  # see `check_inputs`
+        if any(each.lod_scale != 1 or each.foveation is not None for each in instances):
+            say(f"{self.scene}: lod_scale and foveation of instances are for viewers, and no part of a tree")
+        merged = Merged.of(self.inputs) if self.scene is None else Merged.of_instances(instances)
+        return [(merged, self.output)]
+
+    @property
+    def named_suffix(self) -> str:
+        """Suffix of the named output, or its name where that tells the format, see `ending_of`; empty without one."""
+        return ending_of(self.output.name) if self.output is not None and self.output != DASH else ""
+
+    @property
+    def suffix(self) -> str:
+        """Suffix of the format that is written, which the name of the output need not have."""
+        if self.encoding:
+            return NPZ
+        if self.form is not None:
+            return FORMS[self.form][0]
+        refines_rad = self.refining.refine is not None and {each.suffix.lower() for each in self.inputs} == {RAD}
+        return self.named_suffix or (RAD if refines_rad else SPZ)
+
+    @property
+    def manifest(self) -> str | None:
+        """The value of --format of an output of cuts of a tree, with files beside a manifest; None for others."""
+        if self.form in MANIFESTS:
+            return self.form
+        return None if self.form or self.encoding or self.unlod else self.named_manifest
+
+    @property
+    def named_manifest(self) -> str | None:
+        """The format whose manifest has the name of the named output; None where that has another name."""
+        name = self.output.name if self.output is not None and self.output != DASH else ""
+        return next((form for form, (manifest, *_) in MANIFESTS.items() if manifest == name), None)
+
+    @property
+    def is_chunked(self) -> bool:
+        """Whether the chunks of a RAD are files of their own."""
+        return self.form is not None and FORMS[self.form][1]
+
+    @property
+    def format_is_chosen(self) -> bool:
+        """Whether somebody chose the format, by --format or by a name."""
+        return self.form is not None or self.named_suffix in TREES or self.manifest is not None
+
+    def target(self, source: Place) -> Place:
+        """Return the output path for an input."""
+        return self.output or (self.output_dir or source.parent) / self._name(source)
+
+    def _name(self, source: Place) -> str:
+        stem = stem_of(source)
+        if self.manifest is not None:
+            return f"{stem.removesuffix('-lod')}-lod/{MANIFESTS[self.manifest][0]}"
+        if self.unlod:
+            return f"{stem.removesuffix('-lod')}-unlod{self.suffix}"
+        known = self.form is not None or self.refining.refine is not None
+        if known and source.suffix.lower() in TREES:  # a tree in another format has its name
+            stem = stem.removesuffix("-lod")
+        name = f"{stem}-lod{self.suffix}"
+        return f"{stem}-lod-refined{self.suffix}" if self.refining.refine is not None and name == source.name else name
+
+
+def check_inputs(ctx: click.Context, files: BakedFiles) -> None:
+    """Raise a `click.UsageError` where there are no inputs, or merging them contradicts other options."""
+    if not files.inputs and files.scene is None:
+        raise click.MissingParameter(ctx=ctx, param=next(each for each in ctx.command.params if each.name == "inputs"))
+    if files.inputs and files.scene is not None:
+        raise click.UsageError("INPUT cannot be used with --scene, which names the files")
+    if not files.is_merged:
+        return
+    flag = "--merge" if files.merge else "--scene"
+    refuse(ctx, ("output_dir", "unlod", "rgba"), f"cannot be used with {flag}")
+    if files.output is None:
+        raise click.UsageError(f"{flag} makes one file of all inputs; name it with --output")
+
+
+def record_of(source: Source) -> dict[str, Any]:
+    """Return the input as a line of JSON has it: "input", or "inputs" where several are one scene."""
+    from ..bake.sources import Merged
+
+    if isinstance(source, Merged):
+        return {"inputs": [str(each.file) for each in source.files]}
+    return {"input": str(source)}
+
+
+def check_formats(ctx: click.Context, outputs: BakedFiles) -> None:
+    """Raise a `click.UsageError` where the options of formats, and the name of the output, contradict each other."""
+    suffix = outputs.named_suffix
+    chosen = outputs.form is not None or outputs.encoding is not None or outputs.output is not None
+    suffixes = {source.suffix.lower() for source in outputs.inputs}
+    if outputs.refining.refine is not None and not chosen and RAD in suffixes and len(suffixes) > 1:
+        raise click.UsageError(
+            "--refine keeps the format of a Level-of-Detail file, and the inputs are of several; give --format, or"
+            " refine the .rad files on their own"
+        )
+    if outputs.manifest is not None:
+        _check_manifest(ctx, outputs, outputs.manifest)
+        return
+    if outputs.is_chunked and outputs.output == DASH:
+        raise click.UsageError("--format rad-chunked writes several files; name the output, or use --format rad")
+    if outputs.encoding:
+        refuse(ctx, ("form",), "cannot be used with --encoding")
+        refuse_others(ctx, "--encoding", hints=False)
+    if outputs.form is not None and suffix not in ("", outputs.suffix):
+        raise click.UsageError(f"--format {outputs.form} writes {outputs.suffix}, not {suffix}")
+    if outputs.output is not None and outputs.form is None:
+        arrays, trees = (NPZ, *RAW_SUFFIXES), (*TREES, MANIFEST, TILESET)
+        require_suffix("--output", outputs.output, arrays if outputs.encoding else WRITABLE if outputs.unlod else trees)
+    if outputs.unlod:
+        _check_unlod(ctx, outputs)
+    elif outputs.encoding:
+        if suffix not in ("", NPZ, *RAW_SUFFIXES):
+            raise click.UsageError(f"--encoding writes {', '.join((NPZ, *RAW_SUFFIXES))}, not {suffix}")
+        return
+    else:
+        known = f"{', '.join((*TREES, MANIFEST))} or {TILESET}"
+        if suffix in (NPZ, *RAW_SUFFIXES):
+            raise click.UsageError(f"{suffix} is a file of arrays; choose their layout with --encoding")
+        if suffix in PLAIN:
+            raise click.UsageError(f"{suffix} cannot hold a tree; name the output {known}")
+        if suffix not in ("", *TREES):
+            names = f"{', '.join((*TREES.values(), DETAIL))} or {TILED}"
+            raise click.UsageError(f"trees are written as {names}, not as {suffix}; name the output {known}")
+    refuse_others(ctx, WRITABLE[outputs.suffix].name, hints=not outputs.unlod)
+
+
+def refuse_others(ctx: click.Context, written: str, *, hints: bool = True) -> None:
+    """Raise a `click.UsageError` where an option of another format than the one that is written was given."""
+    for names, formats, hint in OF_FORMATS:
+        if written not in formats and not (written == DETAIL and "SOG" in formats):
+            refuse(ctx, names, f"is an option of {' and '.join(formats)}, not of {written}{hint if hints else ''}")
+
+
+def _check_manifest(ctx: click.Context, outputs: BakedFiles, form: str) -> None:
+    manifest, written, beside = MANIFESTS[form]
+    flag = f"--format {form}"
+    refuse(ctx, ("unlod", "encoding"), f"cannot be used with {flag}")
+    if outputs.output == DASH:
+        raise click.UsageError(f"{flag} writes several files; name the output, such as web/{manifest}")
+    if outputs.output is not None and outputs.named_manifest != form:
+        raise click.UsageError(
+            f"{flag} writes {manifest} and {beside} beside it, not {outputs.output.name}; name the output"
+            f" {outputs.output.parent / outputs.output.stem / manifest}"
+        )
+    refuse_others(ctx, written, hints=False)
+    if is_set(ctx, "environment"):
+        refuse(ctx, ("environment_beyond",), "cannot be used with --environment")
+
+
+def _check_unlod(ctx: click.Context, outputs: BakedFiles) -> None:
+    suffix = outputs.named_suffix
+    if outputs.named_manifest is not None:
+        manifest = MANIFESTS[outputs.named_manifest][0]
+        raise click.UsageError(f"--unlod writes splats without detail levels, not {manifest}")
+    refuse(ctx, (*OF_TREES, "encoding"), "cannot be used with --unlod")
+    if suffix not in ("", *WRITABLE):
+        raise click.UsageError(f"--unlod writes {', '.join(WRITABLE)}, not {suffix}")
 
 
 BOTH = "--output cannot be used with --output-dir"
@@ -109,9 +421,9 @@ class BuildLodOptions:
             suffix=files.suffix,
             options=self.write_options(),
             encoding=files.encoding,
-            raw=files.is_raw,
-            detail=self.detail.settings if files.is_streamed_sog else None,
-            tiles=self.tiles if files.is_tiles else None,
+            raw=files.output is not None and files.named_suffix != NPZ,
+            detail=self.detail.settings if files.manifest == STREAMED_SOG else None,
+            tiles=self.tiles if files.manifest == TILES_3D else None,
             environment=self.detail.environment,
             environment_beyond=self.detail.environment_beyond,
             refine=files.refining.settings(),
@@ -164,9 +476,9 @@ def build_lod(ctx: click.Context, /, **_: Any) -> None:
     failed = False
     memory = options.resources.memory
     with general.console() as console, options.cluster.engine(ctx, general, memory, console) as engine:
-        make, report = _job_of(ctx, options, console, engine)
-        pairs = list(files.jobs(instances, console.say))
-        for (source, target), outcome in zip(pairs, make(pairs), strict=True):
+        report: Callable[..., None] = report_extracted if files.unlod else report_baked
+        pairs = files.jobs(instances, console.say)
+        for (source, target), outcome in zip(pairs, _outcomes(ctx, options, pairs, console, engine), strict=True):
             if isinstance(outcome, SparklodError):
                 failed = True
                 console.error(f"{name_of(source)}: {outcome}")
@@ -179,7 +491,7 @@ def build_lod(ctx: click.Context, /, **_: Any) -> None:
                 record = {**record_of(source), "output": str(target), **dataclasses.asdict(outcome)}
             if general.as_json:
                 print_json(record)
-            if interrupts.came():  # while merged splats were fitted, which ended early then
+            if interrupts.came():  # during fitting, which then ends early
                 console.clear()
                 say("interrupted")
                 ctx.exit(interrupts.INTERRUPTED)
@@ -201,11 +513,17 @@ def _check(ctx: click.Context, options: BuildLodOptions, named: list[Path]) -> N
     elif DASH in inputs:
         raise click.UsageError(NAMELESS)
     elif files.output_dir is None:
-        _require_places(inputs)
+        for source in inputs:
+            if isinstance(source, Address) and source.is_read_only:
+                raise click.UsageError(
+                    f"nothing can be written beside {source}; name the output with -o or --output-dir"
+                )
     targets = [output] if output is not None else [files.target(source) for source in inputs]
-    if files.may_replace_inputs and not files.is_merged:
+    refines = files.refining.refine is not None and not files.skip_existing and not files.is_merged
+    if refines and files.overwrite:  # a tree may replace itself, for its leaves and links stay
         targets = [target for source, target in zip(inputs, targets, strict=True) if not is_same_place(source, target)]
-    if files.is_chunked or files.is_folder or files.manifest is not None:
+    unbundled = files.suffix in WRITABLE and files.suffix == WRITABLE[files.suffix].unbundled
+    if files.is_chunked or unbundled or files.manifest is not None:
         targets = with_chunks(targets)
     keep_apart(ctx, {"output" if files.output_dir is None else "output_dir": targets, "scene": named})
     claim_stdout(ctx, "output", as_json=options.general.as_json, binary=True)
@@ -216,82 +534,73 @@ def _check(ctx: click.Context, options: BuildLodOptions, named: list[Path]) -> N
     check_formats(ctx, files)
     check_declared(ctx)
     if is_set(ctx, "scheduler"):
-        exclude(ctx, ["workers"], "--scheduler, whose workers run already")
+        refuse(ctx, ["workers"], "cannot be used with --scheduler, whose workers run already")
     if is_set(ctx, "refine"):
-        exclude(ctx, ["scratch_dir", "resume"], "--refine, which needs the whole tree in memory")
+        refuse(ctx, ["scratch_dir", "resume"], "cannot be used with --refine, which needs the whole tree in memory")
     of_clusters = parameters_of(ClusterOptions)
     if files.unlod:
-        exclude(ctx, (*parameters_of(ResourceOptions), *of_clusters, "refine", "skip_existing"), "--unlod")
+        refuse(
+            ctx,
+            (*parameters_of(ResourceOptions), *of_clusters, "refine", "skip_existing"),
+            "cannot be used with --unlod",
+        )
     else:
         options.tree.check(ctx, only_cuts=files.manifest is not None)
     if DASH in inputs:
-        exclude(ctx, of_clusters, "standard input, which workers cannot read; save it to a file first")
+        refuse(
+            ctx, of_clusters, "cannot be used with standard input, which workers cannot read; save it to a file first"
+        )
 
 
-def _require_places(inputs: Sequence[Place]) -> None:
-    """Raise a `click.UsageError` where an output would be named after an address that is only read."""
-    for source in inputs:
-        if isinstance(source, Address) and source.is_read_only:
-            raise click.UsageError(f"nothing can be written beside {source}; name the output with -o or --output-dir")
+def _outcomes(
+    ctx: click.Context,
+    options: BuildLodOptions,
+    pairs: Sequence[tuple[Source, Place]],
+    console: Console,
+    engine: ClusterEngine | None,
+) -> Iterator[Outcome]:
+    """Make the output of each input, and return the results in order; loads numpy.
 
-
-def _job_of(
-    ctx: click.Context, options: BuildLodOptions, console: Console, engine: ClusterEngine | None
-) -> tuple[Make, Callable[..., None]]:
-    """Return a function that makes the outputs of inputs, and one that reports an output; loads numpy."""
+    An error is the result of its input, so that it does not stop the others.
+    """
     files, threads = options.files, options.general.threads
     shared: dict[str, Any] = {"overwrite": files.overwrite, "progress": console.progress}
+    job: Callable[[], contextlib.AbstractContextManager[None]] = contextlib.nullcontext
+    make: Callable[..., Any]
+
+    def outcome(source: Source, target: Place) -> Outcome:
+        try:
+            with job():
+                result: Baked | Extracted | None = make(source, target)
+                return result
+        except SparklodError as error:
+            return error
+
     if files.unlod:
         console.announce_compiling()
         from ..extract_leaves import extract_leaves
 
-        how: dict[str, Any] = {"suffix": files.suffix, "options": options.write_options(), "threads": threads}
-        return _one_by_one(functools.partial(extract_leaves, **how, **shared)), report_extracted
+        written: dict[str, Any] = {"suffix": files.suffix, "options": options.write_options()}
+        make = functools.partial(extract_leaves, **written, threads=threads, **shared)
+        return (outcome(*pair) for pair in pairs)
     from ..bake.flow import bake
+    from ..bake.settings import Resources
     from ..bake.stage_shares import stage_shares
-    from ..compile_ahead import jobs_of
 
     settings = options.bake_settings(ctx)
-    console.announce_compiling(*jobs_of(settings))
-    make: Callable[..., Baked | None] = bake
+    console.announce_compiling(settings)
+    bake_one: Callable[..., Baked | None] = bake
     if files.skip_existing is not None:
         from ..bake.skipping import bake_unless_there
 
-        make = functools.partial(bake_unless_there, verify=files.skip_existing == VERIFY)
-    resources = options.resources.resources()
-    if engine is not None:
-        resources = dataclasses.replace(resources, memory=engine.memory)
-    how = {"settings": settings, "resources": resources, "engine": engine, "threads": threads, "say": console.say}
-
-    def here(source: Source, target: Place) -> Baked | None:
-        with console.job(stage_shares(settings)):
-            return make(source, target, **how, **shared)
-
-    alone = _one_by_one(here)
-    if engine is None:
-        return alone, report_baked
+        bake_one = functools.partial(bake_unless_there, verify=files.skip_existing == VERIFY)
+    limits, memory = options.resources, options.resources.memory if engine is None else engine.memory
+    how: dict[str, Any] = {"settings": settings, "resources": Resources(memory, limits.scratch_dir, limits.resume)}
+    how["engine"] = engine
+    job = functools.partial(console.job, stage_shares(settings))
+    make = functools.partial(bake_one, **how, threads=threads, say=console.say, **shared)
+    if engine is None or len(pairs) < 2:
+        return (outcome(*pair) for pair in pairs)
     from ..bake.side_by_side import bake_side_by_side
 
-    side_by_side: Make = functools.partial(
-        bake_side_by_side,
-        make=make,
-        settings=settings,
-        engine=engine,
-        resources=resources,
-        bake_large=functools.partial(_outcome, here),
-        **shared,
-    )
-    return lambda pairs: (side_by_side if len(pairs) > 1 else alone)(pairs), report_baked
-
-
-def _one_by_one(make: Callable[..., Outcome]) -> Make:
-    """Return a function that makes outputs of inputs one after the other."""
-    return lambda pairs: (_outcome(make, *pair) for pair in pairs)
-
-
-def _outcome(make: Callable[..., Outcome], source: Source, target: Place) -> Outcome | SparklodError:
-    """Return the result for an input, or its error, so that one which fails does not stop the others."""
-    try:
-        return make(source, target)
-    except SparklodError as error:
-        return error
+    return bake_side_by_side(pairs, make=bake_one, bake_large=outcome, **how, **shared)

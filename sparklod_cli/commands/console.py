@@ -23,7 +23,8 @@ from ..system.units import count_of as count_of
 from ..system.units import format_duration, format_size
 
 if TYPE_CHECKING:
-    from ..compile_ahead import CompileAhead
+    from ..bake.settings import BakeSettings
+    from ..warmup import CompileAhead
 
 #: Columns of reports for people, of the names that their rows begin with, and by which messages go on indented.
 WIDTH, NAMES, INDENT = 80, 13, 4
@@ -254,13 +255,13 @@ class Console:
             amount = f"{format_size(done)} of {format_size(total)}" if unit == "B" else f"{done:,} of {total:,} {unit}s"
             self.say(f"{stage}: {amount} ({100 * done / total:.0f} %), {format_duration(now - self._start)}")
 
-    def announce_compiling(self, *jobs: str) -> None:
+    def announce_compiling(self, work: str | BakeSettings | None = None) -> None:
         """Announce the first kernel that is compiled, show which one it is, and print at the end how long all took.
 
-        What is wrong with the cache is wrong for every kernel, and printed once.
+        A problem with the cache concerns every kernel, and is printed once.
 
         Args:
-            jobs: of `compile_ahead.JOBS`, whose kernels another process compiles meanwhile.
+            work: a bake, or one of `warmup.JOBS`, whose kernels a second process compiles meanwhile.
         """
         from ..system import jit
 
@@ -271,11 +272,10 @@ class Console:
         def begin(name: str) -> None:
             interrupts.leave_if_lost()
             if not ahead:
-                from ..compile_ahead import CompileAhead
-                from ..warmup import missing
+                from ..warmup import CompileAhead, jobs_of, missing
 
                 absent = missing()
-                ahead.append(CompileAhead(absent, jobs, name))
+                ahead.append(CompileAhead(absent, [] if work is None else jobs_of(work), name))
                 self._ended.callback(ahead[0].close)
                 advance = f"kept for later runs; sparklod warmup compiles all {len(absent)} in advance"
                 often = advance if jit.CACHE_FOLDER else "in every run: no cache can be written"
@@ -287,7 +287,7 @@ class Console:
 
         def end(duration: float) -> None:
             seconds.append(duration)
-            self._start += duration  # which tells nothing of the time that a job takes
+            self._start += duration  # compiling does not count as time of the job
             self._logged += duration
             self.clear()
 

@@ -16,7 +16,6 @@ import click
 from ..codecs.file_names import MANIFEST, META, TILESET
 from ..system.addresses import Address, Place, place_of
 from ..system.stdio import DASH
-from ..tables.files import FORMS
 from .console import is_terminal
 from .option_groups import flag_of
 
@@ -104,6 +103,8 @@ def name_outputs(ctx: click.Context, source: Place | None) -> None:
     Raises:
         click.UsageError: the input is standard input, which has no name.
     """
+    from ..tables.files import FORMS
+
     for parameter in ctx.command.params:
         value = ctx.params.get(parameter.name or "")
         if source is None or not isinstance(value, Folder):

@@ -12,7 +12,7 @@ import click
 
 from ..images.defaults import THUMBNAIL_SIZE, THUMBNAIL_SUPERSAMPLE
 from .console import Console, count_of, print_json, size_of
-from .option_groups import COMMON, check_declared, command, exclude, flags_set, values_of
+from .option_groups import COMMON, check_declared, command, flags_set, refuse, values_of
 from .options.cameras import PictureCameras
 from .options.common import General, json_flag, question_budgets
 from .options.cut import Inputs, PictureCut, PictureStreaming, check_scenes, notes_on_loading, viewed_files
@@ -183,7 +183,7 @@ def _place(
 
     look, output = options.appearance, _output(ctx, options, len(path.cameras))
     if output.form == "npy":
-        exclude(ctx, look.of_pictures(), "a .npy, which holds numbers")
+        refuse(ctx, look.of_pictures(), "cannot be used with a .npy, which holds numbers")
     settings = PictureSettings(
         background=look.background_for(ctx, output.form),
         bar=not look.no_bar,

@@ -19,7 +19,7 @@ from ..system.defaults import DETAIL_GROWTH
 from ..system.setting_fields import Quantity, Range, setting_of, whole
 from ..system.stdio import DASH
 from ..system.units import parse_size
-from .build_lod_files import SPZ, record_of, refuse_others
+from .build_lod import SPZ, record_of, refuse_others
 from .build_lod_text import report_simplified
 from .console import print_json, say
 from .option_groups import (
@@ -211,11 +211,10 @@ def simplify(ctx: click.Context, /, **_: Any) -> None:
         from ..bake.flow import bake
         from ..bake.settings import Resources
         from ..bake.stage_shares import stage_shares
-        from ..compile_ahead import jobs_of
 
         settings = options.settings(ctx)
         question_budgets(console, files.to)
-        console.announce_compiling(*jobs_of(settings))
+        console.announce_compiling(settings)
         with console.job(stage_shares(settings)):
             baked = bake(
                 files.source,
@@ -231,7 +230,7 @@ def simplify(ctx: click.Context, /, **_: Any) -> None:
         if general.as_json:
             record = {**record_of(files.source), "output": str(files.output), **dataclasses.asdict(baked)}
             print_json(record)
-        if interrupts.came():  # while the set was fitted, which ended early then
+        if interrupts.came():  # during fitting, which then ends early
             console.clear()
             say("interrupted")
             ctx.exit(interrupts.INTERRUPTED)

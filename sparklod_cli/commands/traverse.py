@@ -17,7 +17,7 @@ from ..system.stdio import DASH
 from ..system.units import percent_of
 from ..tables.files import FORMS
 from .console import WIDTH, Console, count_of, for_screen, is_terminal, print_json, rows, size_of
-from .option_groups import COMMON, check_declared, command, exclude, flag, option, refuse, values_of
+from .option_groups import COMMON, check_declared, command, flag, option, refuse, values_of
 from .options.cameras import Cameras
 from .options.common import (
     General,
@@ -101,7 +101,7 @@ class FrameTable:
     def check(self, ctx: click.Context, *, as_json: bool) -> None:
         """Raise a `click.UsageError` where options contradict each other, or have no effect."""
         if as_json and self.output is None:
-            exclude(ctx, OF_TABLES, "--json without --output, which writes no table")
+            refuse(ctx, OF_TABLES, "cannot be used with --json without --output, which writes no table")
         elif self.summary_on_stdout(as_json=as_json):
             refuse(ctx, OF_TABLES, "is of the table, and a terminal gets the summary; redirect it, or add --output")
 

@@ -11,9 +11,9 @@ import numpy as np
 
 from ..model.lod_tree import LodTree
 from ..model.splats import Splats
-from ..render.backends import BackendError
 from ..render.devices import uses_card
 from ..render.settings import RasterSettings
+from ..system.errors import BackendError
 from ..system.progress import Progress, silent
 from ..system.threads import on_threads
 from ..system.units import percent_of

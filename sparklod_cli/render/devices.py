@@ -6,8 +6,8 @@ import importlib.util
 from collections.abc import Callable
 from typing import Any
 
+from ..system.errors import BackendError
 from ..system.setting_fields import setting
-from .backends import BackendError
 
 #: What is asked for: a card if there is one; the processor; a card.
 DEVICES = ("auto", "cpu", "cuda")

@@ -15,11 +15,10 @@ from ..scenes.finder import CutSource
 from ..scenes.loaded import Cut
 from ..system.progress import Progress, silent
 from . import color_by, styles
-from .backends import ON_CARD
 from .color_by import Scale
 from .devices import uses_card
 from .rasterizer import Image
-from .settings import RasterSettings, RenderSettings
+from .settings import ON_CARD, RasterSettings, RenderSettings
 from .shading import ShadedSplats, shade
 
 #: Held while kernels run on all threads: they do not share them, and not every layer of threads survives their trying.

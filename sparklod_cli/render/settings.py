@@ -1,15 +1,56 @@
-"""Settings of rasterization and rendering; the defaults are Spark 2's. Imports nothing heavy."""
+"""Backends, and settings of rasterization and rendering, whose defaults are those of Spark 2. Imports nothing heavy."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, cast
 
 from ..system.defaults import FARTHEST, MAX_SH_DEGREE, MAX_SUPERSAMPLE
 from ..system.setting_fields import CheckedSettings, Range, setting, whole
-from .backends import BACKENDS, ON_CARD
 from .devices import device_setting
+
+if TYPE_CHECKING:
+    from ..cameras.camera import Camera
+    from .rasterizer import Image
+    from .shading import ShadedSplats
+
+
+@dataclass(frozen=True)
+class Backend:
+    """One way to draw; its module has a function `draw`."""
+
+    name: str
+    module: str
+
+    def draw(self, splats: ShadedSplats, camera: Camera, settings: RasterSettings, **options: Any) -> Image:
+        """Draw splats; options are those of the module's function.
+
+        Returns:
+            (height, width, 4) float32: red, green and blue, multiplied by alpha, and alpha, all 0..1.
+
+        Raises:
+            BackendError: it cannot draw here.
+        """
+        module = import_module(self.module, __package__)
+        return cast("Image", module.draw(splats, camera, settings, **options))
+
+
+#: The backend that draws instead of numba where that is to use an NVIDIA card.
+ON_CARD = "cuda"
+
+#: Backends by name; adding one is a module and a row. The first is the default.
+BACKENDS = {
+    backend.name: backend
+    for backend in (
+        Backend("numba", ".rasterizer"),
+        Backend(ON_CARD, ".cuda.rasterizer"),
+        Backend("osmesa", ".gl.osmesa"),
+        Backend("open3d", ".open3d.backend"),
+    )
+}
+
 
 #: Pixels squared that are added to the covariance on the screen, for which opacity makes up: Spark's `blurAmount`.
 BLUR = 0.3

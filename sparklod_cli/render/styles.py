@@ -12,10 +12,9 @@ from ..cameras.camera import Camera
 from ..model.falloff import MIN_ALPHA
 from ..model.gaussian import size_factor
 from . import rasterizer
-from .backends import BACKENDS
 from .kernels import bands
 from .rasterizer import Image
-from .settings import CLIP, RasterSettings
+from .settings import BACKENDS, CLIP, RasterSettings
 from .shading import ShadedSplats
 
 #: How opaque a billboard is.

@@ -91,6 +91,10 @@ class TreeError(SparklodError):
     """A Level-of-Detail tree violates one of its invariants."""
 
 
+class BackendError(SparklodError):
+    """A backend cannot draw here; the text says what is missing and which package brings it."""
+
+
 class OutputError(SparklodError):
     """An output file already exists, or the file system refused to write it."""
 

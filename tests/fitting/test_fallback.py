@@ -17,7 +17,7 @@ from sparklod_cli.fitting.pictures import FullDetailPicture
 from sparklod_cli.fitting.settings import FitReport, FitSettings
 from sparklod_cli.lod import quality
 from sparklod_cli.model.splats import COLUMNS, Splats
-from sparklod_cli.render.backends import BackendError
+from sparklod_cli.system.errors import BackendError
 from tests.scenes import random_splats
 
 STEPS, LAST = 40, 7

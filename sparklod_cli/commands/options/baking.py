@@ -18,14 +18,12 @@ from ...system import defaults
 from ...system.addresses import Place
 from ...system.setting_fields import Quantity, Range, setting_of, whole
 from ...system.units import parse_size
-from ..option_groups import COMMON, flag, is_set, option, parameters_of, refuse
-from ..parameter_types import BALL, POINT, OptionalNumber
+from ..option_groups import BALL, COMMON, POINT, OptionalNumber, flag, is_set, option, parameters_of, refuse
 from ..paths import InputPath, OutputPath
 from .common import General
 
 if TYPE_CHECKING:
     from ...bake.out_of_core.cluster_engine import ClusterEngine
-    from ...bake.settings import Resources
     from ...model.selection import Selection
     from ...model.transforms import Transform
     from ..console import Console
@@ -271,12 +269,6 @@ class ResourceOptions:
     resume: bool = flag(
         "Go on with a bake out of core that was interrupted; it must be the same bake. Without one, begin."
     )
-
-    def resources(self) -> Resources:
-        """Return what the bakes may use."""
-        from ...bake.settings import Resources
-
-        return Resources(memory=self.memory, scratch_dir=self.scratch_dir, resume=self.resume)
 
 
 @dataclass(frozen=True)

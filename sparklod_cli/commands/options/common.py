@@ -11,23 +11,15 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ...codecs.formats import FORMATS
-from ...images.defaults import MOVING, STILL, SUFFIXES
 from ...system.defaults import MAX_THREADS
 from ...system.setting_fields import whole
-from ...tables.files import FORMS
 from ..console import Console, Verbosity
-from ..option_groups import COMMON, flag, option
-from ..parameter_types import DIRECTION
+from ..option_groups import COMMON, DIRECTION, flag, option
 from ..paths import OutputPath, require_suffix
 
 if TYPE_CHECKING:
     from ...lod.budget import Budget
     from ...tables.assertions import Outcome
-
-#: Suffixes, without a point, of what is no table, whatever format is asked for: splats, pictures, pages and arrays.
-NO_TABLES = {suffix[1:] for form in FORMATS for suffix in form.suffixes} - {*FORMS}
-NO_TABLES |= {*STILL, *MOVING, *SUFFIXES, "html", "npz"}
 
 
 def _note_verbosity(ctx: click.Context, param: click.Parameter, value: bool) -> bool:
@@ -124,13 +116,19 @@ def table_form(flag: str, output: Path | None, form: str | None = None) -> str:
         click.UsageError: nothing is written by that suffix, or it promises something else than `form`, or there is
             neither.
     """
+    from ...codecs.formats import FORMATS
+    from ...images.defaults import MOVING, STILL, SUFFIXES
+    from ...tables.files import FORMS
+
     suffix = output.suffix.lower() if output is not None else ""
     if output is not None and form is None:
         require_suffix(flag, output, (f".{each}" for each in FORMS))
     if not suffix:
         return form or next(iter(FORMS))
     if form is not None:
-        if suffix[1:] != form and suffix[1:] in (*FORMS, *NO_TABLES):
+        of_splats = (suffix for each in FORMATS for suffix in each.suffixes)
+        others = {*FORMS, *STILL, *MOVING, *SUFFIXES, "html", "npz"}
+        if suffix[1:] != form and (suffix[1:] in others or suffix in of_splats):
             raise click.UsageError(f"{flag} {output} does not end in .{form}, which --format asks for")
         return form
     if suffix[1:] not in FORMS:

@@ -18,7 +18,7 @@ from ...system import defaults
 from ...system.printable import printable
 from ...system.setting_fields import Quantity, Range
 from ...system.units import check_grouping, parse_time
-from ..option_groups import COMMON, argument, flag, option, parameters_of, refuse, require
+from ..option_groups import COMMON, argument, flag, option, parameters_of, refuse
 from ..paths import InputPath
 
 if TYPE_CHECKING:
@@ -228,7 +228,7 @@ class PictureStreaming:
     def check(self, ctx: click.Context) -> None:
         """Raise a `click.UsageError` where an option has no effect."""
         if self.after is None:
-            require(ctx, LOADING, "--after")
+            refuse(ctx, LOADING, "can only be used with --after")
 
     def loading(self) -> tuple[StreamingSettings, float] | None:
         """Return how chunks get to a viewer, and the seconds that it has had for them; None where all are resident."""

@@ -16,8 +16,7 @@ from ...render.devices import uses_card
 from ...render.settings import OF_PIXELS, SORTINGS, RenderSettings
 from ...system import defaults
 from ...system.setting_fields import Range, whole
-from ..option_groups import COMMON, exclude, flag, is_set, option, require
-from ..parameter_types import COLOR
+from ..option_groups import COLOR, COMMON, flag, is_set, option, refuse
 from ..paths import Folder, InputPath, require_suffix, stem_of
 from .common import assert_errors, assert_option, output_option, overwrite_flag, plot_option
 
@@ -92,15 +91,23 @@ class Appearance:
         if not raster.near < raster.far:
             raise click.UsageError(f"--near {raster.near:g} must be less than --far {raster.far:g}")
         if render.style != "splats":
-            exclude(ctx, ["backend", "device"], f"--style {render.style}, which every picture gets from one renderer")
-        exclude(ctx, UNSTYLED.get(render.style, ()), f"--style {render.style}")
-        exclude(ctx, UNKNOWN_TO.get(render.backend, ()), f"--backend {render.backend}")
+            refuse(
+                ctx,
+                ["backend", "device"],
+                f"cannot be used with --style {render.style}, which every picture gets from one renderer",
+            )
+        refuse(ctx, UNSTYLED.get(render.style, ()), f"cannot be used with --style {render.style}")
+        refuse(ctx, UNKNOWN_TO.get(render.backend, ()), f"cannot be used with --backend {render.backend}")
         if render.backend != "numba":
-            exclude(ctx, ["device"], f"--backend {render.backend}")
+            refuse(ctx, ["device"], f"cannot be used with --backend {render.backend}")
         if render.color_by == "overdraw":
-            exclude(ctx, ["sort", "style", "backend", "device"], "--color-by overdraw, which counts splats")
+            refuse(
+                ctx,
+                ["sort", "style", "backend", "device"],
+                "cannot be used with --color-by overdraw, which counts splats",
+            )
         if is_set(ctx, "background") and self.background is not None:
-            exclude(ctx, ["alpha"], "--background, which fills what is transparent")
+            refuse(ctx, ["alpha"], "cannot be used with --background, which fills what is transparent")
 
     @property
     def keeps_alpha(self) -> bool:
@@ -170,9 +177,9 @@ class ComparisonOptions:
             return
         if self.diff is None:
             if appearance.render.color_by is None:
-                require(ctx, ["no_bar"], "--color-by or --diff")
+                refuse(ctx, ["no_bar"], "can only be used with --color-by or --diff")
             return
-        exclude(ctx, ["color_by"], "--diff, which compares the splats' own colours")
+        refuse(ctx, ["color_by"], "cannot be used with --diff, which compares the splats' own colours")
         if appearance.keeps_alpha:
             raise click.UsageError("--diff compares pictures without alpha; name a --background such as black")
 
@@ -252,7 +259,7 @@ class PictureFiles:
         except ValueError as error:
             raise click.UsageError(str(error)) from None
         if output.form != "jpg":
-            require(ctx, ["jpeg_quality"], "a .jpg")
+            refuse(ctx, ["jpeg_quality"], "can only be used with a .jpg")
         return output
 
 

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...system.errors import BackendError
 from ...system.jit import check_numba_settings
 from ...system.optional import optional_import
-from ..backends import BackendError
 
 #: An array on the card, as numba has it.
 CardArray = Any

@@ -15,8 +15,8 @@ from typing import Any, TypeVar
 import numpy as np
 
 from ...cameras.camera import Camera
+from ...system.errors import BackendError
 from ...system.optional import optional_import
-from ..backends import BackendError
 from ..rasterizer import Image, world_to_camera
 from ..settings import RasterSettings
 from ..shading import ShadedSplats

@@ -11,8 +11,8 @@ import threading
 from pathlib import Path
 from typing import Any
 
+from ...system.errors import BackendError
 from ...system.python_process import module_command
-from ..backends import BackendError
 from .child import PACKAGES, Array, receive, send
 
 #: Time limits in seconds for starting the process, and for drawing a piece.

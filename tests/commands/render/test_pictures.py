@@ -12,8 +12,8 @@ import pytest
 
 from sparklod_cli.images.metrics import psnr
 from sparklod_cli.render import settings
-from sparklod_cli.render.backends import BACKENDS, ON_CARD
 from sparklod_cli.render.devices import DEVICES
+from sparklod_cli.render.settings import BACKENDS, ON_CARD
 from tests.commands.render.runs import AT, DEMO, PLAIN, SIZE, TOWN, TREE, floats, pixels, render
 from tests.conftest import FIXTURES, Capture
 

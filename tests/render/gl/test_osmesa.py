@@ -16,11 +16,11 @@ from sparklod_cli.model.falloff import MIN_ALPHA
 from sparklod_cli.model.gaussian import normalized_quat
 from sparklod_cli.model.splats import FloatArray
 from sparklod_cli.render import rasterizer, settings
-from sparklod_cli.render.backends import BACKENDS, BackendError
 from sparklod_cli.render.gl import order, osmesa, texture
 from sparklod_cli.render.rasterizer import Image
-from sparklod_cli.render.settings import PROFILES, SORTS, RasterSettings
+from sparklod_cli.render.settings import BACKENDS, PROFILES, SORTS, RasterSettings
 from sparklod_cli.render.shading import ShadedSplats, shade
+from sparklod_cli.system.errors import BackendError
 from tests.conftest import FIXTURES
 from tests.scenes import random_splats
 

@@ -14,10 +14,10 @@ import pytest
 from numpy.typing import NDArray
 
 from sparklod_cli.cameras.camera import Camera
-from sparklod_cli.render.backends import BackendError
 from sparklod_cli.render.open3d import backend, process
 from sparklod_cli.render.settings import RasterSettings
 from sparklod_cli.render.shading import ShadedSplats
+from sparklod_cli.system.errors import BackendError
 from tests.conftest import ROOT
 
 pytestmark = pytest.mark.slow
