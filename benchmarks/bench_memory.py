@@ -1,4 +1,4 @@
-"""Measures what `bake.out_of_core.estimate` estimates: peaks of memory and of scratch, in bytes a splat.
+"""Measures what `bake.estimate` estimates: peaks of memory and of scratch, in bytes a splat.
 
 python benchmarks/bench_memory.py scene.ply --splats 1000000
 """
@@ -14,7 +14,7 @@ from pathlib import Path
 
 from scenes import load, ply_header, ply_rows, tiled
 
-from sparklod_cli.bake.out_of_core import estimate
+from sparklod_cli.bake import estimate
 from sparklod_cli.lod.builders import METHODS
 from sparklod_cli.model.sh import COEFFICIENTS
 

@@ -56,7 +56,7 @@ def main() -> None:
         resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
     tasks: list[dict[str, Any]] = []
     if limit:
-        from sparklod_cli.bake.out_of_core import estimate
+        from sparklod_cli.bake import estimate
 
         estimate.in_memory_bytes = lambda *_, **__: 1 << 62  # out of core, also where that is not needed
         record_tasks(tasks)

@@ -38,7 +38,7 @@ print([run(command) for command in json.loads(sys.argv[1])], file=sys.stderr)
 
 #: Lets a scene of 27,800 splats be too large for 3.2 MB of memory.
 SMALL_BLOCKS = """
-from sparklod_cli.bake.out_of_core import estimate
+from sparklod_cli.bake import estimate
 estimate.PROCESS = estimate.WINDOW = estimate.FAMILIES = 0
 estimate.LEAST_BLOCK_SPLATS = 1 << 12
 """

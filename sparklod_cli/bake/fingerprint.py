@@ -95,9 +95,8 @@ def source_fingerprint(source: Source, settings: BakeSettings) -> Fingerprint:
 
 def files_named_in(settings: BakeSettings) -> list[Place]:
     """Return the files that settings name, and those that belong to these."""
-    named = {name: path for name in FILES if (path := getattr(settings, name)) is not None}
     sets = {"camera_path": NAMES}
-    return [file for name, path in named.items() for file in files_of(path, sets.get(name, ()))]
+    return [file for name, path in settings.files.items() for file in files_of(path, sets.get(name, ()))]
 
 
 def _identity_of_named(file: Place) -> Identity:

@@ -2,19 +2,34 @@
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
+import os
+import tempfile
 from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
 
+from ..model.streams import SceneStream
 from ..system.addresses import Place
-from ..system.errors import memory_errors_translated
+from ..system.errors import FormatError, HasTreeError, memory_errors_translated
 from ..system.progress import Progress, silent
+from ..system.stdio import DASH
+from . import estimate
 from .in_memory import InMemory
-from .out_of_core.planning import blocks_for, has_published
-from .out_of_core.tasks import Engine
 from .output import output_of
 from .records import Baked, Clock
-from .refining import fit_settings, refined
 from .settings import BakeSettings, Resources
-from .sources import Source
+from .sources import Merged, Source, opened_source
+
+if TYPE_CHECKING:
+    from .out_of_core.tasks import Engine
+
+#: Suffix of scratch folders.
+SCRATCH = ".sparklod-scratch"
+
+#: Longest output name, bytes, that the name of its scratch folder contains: file systems allow 255 in all.
+NAME_BYTES = 200
 
 
 def bake(
@@ -29,50 +44,61 @@ def bake(
     engine: Engine | None = None,
     say: Callable[[str], None] = lambda text: None,
 ) -> Baked:
-    """Read splat files, build a tree of them and write a Level-of-Detail file. The tree of a single one may be kept.
+    """Read splat files, build a tree of them and write a Level-of-Detail file. The tree of a single input may be kept.
 
-    What does not fit into the memory that it may take is baked out of core: block by block, with a scratch folder.
+    A scene too large for the memory allowed is baked out of core: block by block, with a scratch folder.
 
     Args:
         source: a file of any format that is read, - for standard input, or several files as one scene.
-        target: a file of the format that is set, or one of arrays, whatever its name; - is standard output.
-        resources: that it may use; None for those of a machine that is otherwise idle.
-        engine: runs the tasks of a bake that goes out of core because of it; None for this process.
-        say: called with a line when it goes out of core, what is left after an interruption, and what fitting brought.
+        target: a file of the chosen format, or of arrays, whatever its name; - is standard output.
+        resources: memory and scratch folder; None for those of an otherwise idle machine.
+        engine: runs the tasks of the bake, which then goes out of core; None for this process.
+        say: receives one-line messages for the user.
 
     Raises:
         FormatError, InvalidSplatsError, OutputError: see `read_source`, `Selection.check`, `validation.check_scene` and
             `io.writing.scene_sink`; or the input has a tree, and the settings do not keep it.
-        ScratchError: the scratch folder is full, in use, or has the results of another bake.
-        OutOfMemoryError: it does not fit into memory.
+        ScratchError: the scratch folder is full, in use, or belongs to another bake.
+        OutOfMemoryError: the scene does not fit into memory.
         CameraPathError: the training cameras cannot be read.
         KeyboardInterrupt: see `refined`.
     """
-    with memory_errors_translated():
-        fitting, resources = fit_settings(settings), resources or Resources()
+    with memory_errors_translated(), contextlib.ExitStack() as stack:
+        resources, fitting = resources or Resources(), None
+        if settings.refine is not None:
+            from .refining import fit_settings, refined
+
+            fitting = fit_settings(settings)
         overwrite = overwrite or has_published(source, target, settings, resources)  # its own output
         output, clock = output_of(target, settings, overwrite=overwrite, say=say), Clock()
-        with blocks_for(
-            source,
-            target,
-            settings,
-            output,
-            clock,
-            overwrite=overwrite,
-            threads=threads,
-            progress=progress,
-            resources=resources,
-            engine=engine,
-            say=say,
-        ) as blocks:
-            work = blocks or InMemory(source, settings, output, clock, threads, progress)
-            tree, fit = work.build(), None
-            if fitting is not None and settings.simplify is None:  # which fits its one cut
-                tree.nodes, fit = refined(tree.scene, fitting, threads=threads, progress=progress, say=say)
-                clock.end("refine")
-            work.order(tree)
-            written = tree.output.write(tree, work.encode, clock, threads, progress)
-            traffic = None if blocks is None else blocks.job.store.traffic
+        header, blocks = _header_of(source), None
+        if header is not None and _may_need_blocks(header, source, target, settings, resources, engine):
+            from .out_of_core.planning import blocks_for
+
+            blocks = stack.enter_context(
+                blocks_for(
+                    source,
+                    settings,
+                    output,
+                    clock,
+                    header=header,
+                    folder=scratch_folder(source, target, settings, resources.scratch_dir),
+                    overwrite=overwrite,
+                    threads=threads,
+                    progress=progress,
+                    resources=resources,
+                    engine=engine,
+                    say=say,
+                )
+            )
+        work = blocks or InMemory(source, settings, output, clock, threads, progress)
+        tree, fit = work.build(), None
+        if fitting is not None and settings.simplify is None:  # which fits its one cut
+            tree.nodes, fit = refined(tree.scene, fitting, threads=threads, progress=progress, say=say)
+            clock.end("refine")
+        work.order(tree)
+        written = tree.output.write(tree, work.encode, clock, threads, progress)
+        traffic = None if blocks is None else blocks.job.store.traffic
     return Baked(
         **vars(written),
         format=tree.format,
@@ -90,3 +116,81 @@ def bake(
         scratch_bytes_written=None if traffic is None else traffic.written,
         scratch_bytes_read=None if traffic is None else traffic.read,
     )
+
+
+def has_published(source: Source, target: Place, settings: BakeSettings, resources: Resources) -> bool:
+    """Return whether a bake resumes one that was interrupted when its output, or a part of it, may have been there."""
+    if not resources.resume:
+        return False
+    from .out_of_core.job import PUBLISHED
+    from .out_of_core.store import Store
+
+    return Store(scratch_folder(source, target, settings, resources.scratch_dir)).has(PUBLISHED)
+
+
+def fits_in_memory(source: Source, settings: BakeSettings, memory: int | None) -> bool:
+    """Return whether an input can be baked in this much memory; trees and unreadable inputs do.
+
+    Args:
+        memory: bytes; None for any number.
+    """
+    try:
+        header = _header_of(source)
+    except FormatError:  # reported when it is baked
+        return True
+    return header is None or memory is None or estimate.in_memory_bytes_of(header, settings) <= memory
+
+
+def scratch_folder(source: Source, target: Place, settings: BakeSettings, parent: Place | None) -> Place:
+    """Return the scratch folder of a bake.
+
+    Args:
+        target: - for standard output, whose folder is among the system's temporary files and named after the input.
+        parent: folder for the scratch folders of several bakes; None for the folder of the output.
+    """
+    if target == DASH:
+        from .fingerprint import source_fingerprint
+
+        parent = parent or Path(tempfile.gettempdir())
+        return parent / f"standard-output-{source_fingerprint(source, settings).digest[:8]}{SCRATCH}"
+    short = target.name if len(os.fsencode(target.name)) <= NAME_BYTES else f"output-{_digest(target.name)}"
+    if parent is None:
+        return target.parent / f"{short}{SCRATCH}"
+    whole = os.path.realpath(target) if isinstance(target, Path) else target.url
+    return parent / f"{short}-{_digest(whole)}{SCRATCH}"
+
+
+def _digest(text: str) -> str:
+    return hashlib.blake2b(os.fsencode(text), digest_size=4).hexdigest()
+
+
+def _header_of(source: Source) -> SceneStream | None:
+    """Read the header of an input; None for a tree."""
+    try:
+        with opened_source(source) as stream:
+            return stream
+    except HasTreeError:
+        if isinstance(source, Merged):
+            raise
+        return None
+
+
+def _may_need_blocks(
+    header: SceneStream,
+    source: Source,
+    target: Place,
+    settings: BakeSettings,
+    resources: Resources,
+    engine: Engine | None,
+) -> bool:
+    """Return whether a bake goes out of core, or an interrupted one may have left a scratch folder."""
+    if engine is not None or resources != Resources(memory=resources.memory):
+        return True
+    memory = estimate.default_memory() if resources.memory is None else resources.memory
+    if settings.files or (memory is not None and estimate.in_memory_bytes_of(header, settings) > memory):
+        return True
+    if not isinstance(target, Path):
+        return True
+    if target == DASH:
+        return any(Path(tempfile.gettempdir()).glob(f"standard-output-*{SCRATCH}"))
+    return scratch_folder(source, target, settings, None).exists()

@@ -48,7 +48,7 @@ class InMemory:
             format=scene.format,
             notes=settings.notes_on(scene),
             read=len(scene),
-            environment=read_environment(settings, threads=threads, progress=progress),
+            environment=None if settings.environment is None else read_environment(settings, threads, progress),
         )
         antialiased, up = scene.antialiased, settings.up_of(scene.up)
         if scene.tree is not None:
@@ -59,7 +59,9 @@ class InMemory:
             return tree
         splats, tally = select(scene.splats, settings, threads=threads)
         settings.selection.check(tally)
-        splats, far = split_environment(splats, settings)
+        far = None
+        if settings.environment_beyond is not None:
+            splats, far = split_environment(splats, settings.environment_beyond)
         splats = transformed(splats, settings.transform, threads)
         if far is not None and tree.environment is None:
             tree.environment = transformed(far, settings.transform, threads)

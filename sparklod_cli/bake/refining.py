@@ -33,7 +33,7 @@ class Refined(FitReport):
 
 
 def fit_settings(settings: BakeSettings) -> FitSettings | None:
-    """Return how merged splats are fitted, with the cameras of the file that the settings name; None for not at all.
+    """Return the settings of fitting, with the cameras of the file they name; None without `--refine`.
 
     Raises:
         CameraPathError: that file cannot be read, or has no cameras; names it.

@@ -59,29 +59,29 @@ def transformed(splats: Splats, settings: Transform, threads: int = 1) -> Splats
     return turned
 
 
-def split_environment(splats: Splats, settings: BakeSettings) -> tuple[Splats, Splats | None]:
-    """Return the splats of a scene, and those far outside, which become its environment; None where there are none.
+def split_environment(splats: Splats, distance: float) -> tuple[Splats, Splats | None]:
+    """Return the splats of a scene, and those far outside, which become its environment; None without any.
+
+    Args:
+        distance: see `lod.regions.beyond`.
 
     Raises:
         InvalidSplatsError: all of them would.
     """
-    if settings.environment_beyond is None:
-        return splats, None
     from ..lod.regions import beyond
 
-    far = beyond(splats, settings.environment_beyond)
+    far = beyond(splats, distance)
     return (splats.take(~far), splats.take(far)) if far.any() else (splats, None)
 
 
-def read_environment(settings: BakeSettings, *, threads: int, progress: Progress) -> Splats | None:
-    """Read the file of an environment, turned and moved as the scene; None where the settings name none.
+def read_environment(settings: BakeSettings, threads: int, progress: Progress) -> Splats:
+    """Read the file of an environment, turned and moved as the scene.
 
     Raises:
         FormatError, InvalidSplatsError: it cannot be read, is a tree, or has invalid splats; names it.
     """
     path = settings.environment
-    if path is None:
-        return None
+    assert path is not None
     try:
         scene = read_scene(path, threads=threads, progress=progress)
         if scene.tree is not None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from ..codecs.options import WriteOptions
 from ..fitting.settings import FitSettings
@@ -102,6 +103,12 @@ class BakeSettings:
     camera_path: Path | None = None
     converts: bool = False
     unused: tuple[str, ...] = ()
+
+    @property
+    def files(self) -> dict[str, Any]:
+        """Files whose contents are inputs of the bake, by the setting that names them."""
+        named = {"rgba": self.rgba, "environment": self.environment, "camera_path": self.camera_path}
+        return {name: path for name, path in named.items() if path is not None}
 
     def up_of(self, found: str | None) -> str | None:
         """Return the axis of the output that points up, for that of the input."""

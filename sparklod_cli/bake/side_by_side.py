@@ -10,10 +10,8 @@ from typing import Any
 from ..system.addresses import Place, absolute
 from ..system.errors import SparklodError
 from ..system.progress import Progress, silent
-from .fingerprint import FILES
-from .flow import bake
+from .flow import bake, fits_in_memory
 from .out_of_core.cluster_engine import ClusterEngine
-from .out_of_core.planning import fits_in_memory
 from .records import Baked
 from .settings import BakeSettings, Resources
 from .sources import Source, absolute_source, places_of
@@ -39,8 +37,7 @@ def bake_side_by_side(
         make: bakes one; a function of a module.
     """
     small = [fits_in_memory(source, settings, resources.memory) for source, _ in pairs]
-    named = {name: getattr(settings, name) for name in FILES}
-    settings = dataclasses.replace(settings, **{name: path and path.absolute() for name, path in named.items()})
+    settings = dataclasses.replace(settings, **{name: path.absolute() for name, path in settings.files.items()})
     whole = [
         (absolute_source(source), absolute(target)) for source, target in pairs
     ]  # workers have folders of their own

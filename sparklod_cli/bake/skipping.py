@@ -18,8 +18,7 @@ from ..system.addresses import Address, Place, size_of
 from ..system.errors import OutputError, UnreadableError
 from ..system.untrusted import parse_json
 from .fingerprint import Fingerprint, files_named_in, settings_of
-from .flow import bake
-from .out_of_core.planning import has_published
+from .flow import bake, has_published
 from .records import Baked
 from .settings import BakeSettings, Resources
 from .sources import Source, placement_of, places_of

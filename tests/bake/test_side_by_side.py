@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from sparklod_cli.bake import side_by_side
-from sparklod_cli.bake.out_of_core.estimate import in_memory_bytes
+from sparklod_cli.bake.estimate import in_memory_bytes
 from sparklod_cli.bake.settings import BakeSettings, Resources
 from sparklod_cli.bake.side_by_side import bake_side_by_side
 from sparklod_cli.system.errors import OutputError, SparklodError

@@ -14,10 +14,10 @@ from pathlib import Path
 
 import pytest
 
+from sparklod_cli.bake.flow import SCRATCH as SUFFIX
 from sparklod_cli.bake.flow import bake
 from sparklod_cli.bake.out_of_core import scratch_folder
 from sparklod_cli.bake.out_of_core.job import PUBLISHED
-from sparklod_cli.bake.out_of_core.scratch_folder import SUFFIX
 from sparklod_cli.bake.out_of_core.store import Store
 from sparklod_cli.bake.settings import BakeSettings, Resources
 from sparklod_cli.bake.skipping import bake_unless_there
@@ -215,7 +215,7 @@ def test_leftover_results_are_refused_or_removed_by_a_bake_in_memory_too(tmp_pat
 def test_a_full_scratch_disk_is_one_error_and_room_lets_it_go_on(
     tmp_path: Path, whole: dict[tuple[str, str], bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from sparklod_cli.bake.out_of_core import estimate
+    from sparklod_cli.bake import estimate
 
     target = tmp_path / "out.rad"
     with mounted(tmp_path / "disk", "size=4m") as disk:

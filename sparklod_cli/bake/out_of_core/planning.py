@@ -14,18 +14,18 @@ from typing import TYPE_CHECKING
 
 from ...model.streams import SceneStream
 from ...system.addresses import Place, absolute
-from ...system.errors import FormatError, HasTreeError, OutOfMemoryError, ScratchError
+from ...system.errors import OutOfMemoryError, ScratchError
 from ...system.progress import Progress
 from ...system.stdio import name_of
 from ...system.units import count_of, format_size
-from ..fingerprint import files_named_in, source_fingerprint
+from .. import estimate
+from ..fingerprint import source_fingerprint
 from ..output import BakeOutput
 from ..records import Clock
 from ..settings import BakeSettings, Resources
-from ..sources import Merged, Source, absolute_source, opened_source
-from . import estimate
-from .job import PUBLISHED, Job
-from .scratch_folder import at_work, scratch_folder
+from ..sources import Source, absolute_source, opened_source
+from .job import Job
+from .scratch_folder import at_work
 from .store import Store
 from .tasks import Engine, LocalEngine
 
@@ -39,11 +39,12 @@ UNPACKED = "input"
 @contextlib.contextmanager
 def blocks_for(
     source: Source,
-    target: Place,
     settings: BakeSettings,
     output: BakeOutput,
     clock: Clock,
     *,
+    header: SceneStream,
+    folder: Place,
     overwrite: bool,
     threads: int,
     progress: Progress,
@@ -57,21 +58,14 @@ def blocks_for(
         ScratchError: the scratch folder cannot be used, or has too little room.
         FormatError, OutOfMemoryError: as `flow.bake`.
     """
-    header = _header_of(source)
-    if header is None:
-        yield None
-        return
     memory = estimate.default_memory() if resources.memory is None else resources.memory
-    # It reads samples of all inputs, and most bakes in memory need none.
-    fingerprint = functools.lru_cache(1)(lambda: source_fingerprint(source, settings))
-    if files_named_in(settings):
-        fingerprint()  # so that one that is missing is named at once
-    folder = scratch_folder(target, fingerprint, resources.scratch_dir)
+    if settings.files:
+        source_fingerprint(source, settings)  # reports a missing one at once
     if engine is not None:
         folder = absolute(folder)  # other processes work in folders of their own
     store = Store(folder)
     is_left = bool(store.names())
-    needed = _in_memory_bytes(header, settings)
+    needed = estimate.in_memory_bytes_of(header, settings)
     whole, why = _as_a_whole(settings), None
     if memory is not None and needed > memory:
         if whole is not None:
@@ -90,7 +84,7 @@ def blocks_for(
     work = functools.partial(at_work, store, resume=resources.resume, overwrite=overwrite, say=say)
     if why is None:
         if is_left:  # refused, or removed
-            with work(fingerprint(), 0):
+            with work(source_fingerprint(source, settings), 0):
                 pass
         yield None
         return
@@ -108,53 +102,13 @@ def blocks_for(
         f" {block_splats:,}, scratch of about {format_size(scratch)} in {folder}"
     )
     with (
-        work(fingerprint(), block_splats) as block_splats,
+        work(source_fingerprint(source, settings), block_splats) as block_splats,
         _opened(source, folder, threads, engine) as stream,
     ):
         settings = dataclasses.replace(settings, rgba=settings.rgba and settings.rgba.absolute())
         job = Job(store, stream, settings, output.needed, output.in_chunks)
         windows = estimate.windows_within(memory, splats, degree, threads)
         yield InBlocks(job, output, clock, engine or LocalEngine(threads), block_splats, windows, progress)
-
-
-def has_published(source: Source, target: Place, settings: BakeSettings, resources: Resources) -> bool:
-    """Return whether a bake resumes one that was interrupted when its output, or a part of it, may have been there."""
-    if not resources.resume:
-        return False
-    fingerprint = functools.partial(source_fingerprint, source, settings)
-    return Store(scratch_folder(target, fingerprint, resources.scratch_dir)).has(PUBLISHED)
-
-
-def fits_in_memory(source: Source, settings: BakeSettings, memory: int | None) -> bool:
-    """Return whether an input can be baked in so much memory; an unreadable one fits: whoever bakes it will say why.
-
-    Args:
-        memory: bytes; None for any number.
-    """
-    try:
-        header = _header_of(source)
-    except FormatError:
-        return True
-    if header is None or memory is None:
-        return True
-    return _in_memory_bytes(header, settings) <= memory
-
-
-def _header_of(source: Source) -> SceneStream | None:
-    """Return what the headers of an input say; None for a tree."""
-    try:
-        with opened_source(source) as stream:
-            return stream
-    except HasTreeError:
-        if isinstance(source, Merged):
-            raise
-        return None
-
-
-def _in_memory_bytes(header: SceneStream, settings: BakeSettings) -> int:
-    """Return bytes that a bake in memory takes."""
-    refines = settings.refine is not None
-    return estimate.in_memory_bytes(settings.method, header.count, header.sh_degree, refines=refines)
 
 
 def _as_a_whole(settings: BakeSettings) -> str | None:

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import os
 import shutil
-import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,9 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from ...system import atomic
-from ...system.addresses import Place
 from ...system.errors import FormatError, InvalidSplatsError, ScratchError, UnreadableError
-from ...system.stdio import DASH
 from ...system.threads import ordered_map
 from ...system.units import count_of
 from ...system.untrusted import parse_json
@@ -41,31 +37,6 @@ LAYOUT = 1
 
 #: Errors that another run of the same fingerprint would meet again.
 HOPELESS = (FormatError, InvalidSplatsError)
-
-
-def scratch_folder(target: Place, fingerprint: Callable[[], Fingerprint], parent: Place | None) -> Place:
-    """Return the scratch folder of a bake: beside its output, or in a folder for those of several bakes.
-
-    Args:
-        target: the output. That of standard output (-) is among the system's temporary files.
-        fingerprint: makes that of the output, where it is needed.
-        parent: the folder for several; None for that of the output.
-    """
-    if target == DASH:
-        return (parent or Path(tempfile.gettempdir())) / f"standard-output-{fingerprint().digest[:8]}{SUFFIX}"
-    if parent is None:
-        return target.parent / f"{_shortened(target.name)}{SUFFIX}"
-    name = os.path.realpath(target) if isinstance(target, Path) else target.url
-    return parent / f"{_shortened(target.name)}-{_digest(name)}{SUFFIX}"
-
-
-def _shortened(name: str) -> str:
-    """Return a name to which more can be added: file systems allow 255 bytes."""
-    return name if len(os.fsencode(name)) <= NAME_BYTES else f"output-{_digest(name)}"
-
-
-def _digest(text: str) -> str:
-    return hashlib.blake2b(os.fsencode(text), digest_size=4).hexdigest()
 
 
 @dataclass(frozen=True)

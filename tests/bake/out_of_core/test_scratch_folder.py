@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 
 from sparklod_cli.bake.fingerprint import Fingerprint
-from sparklod_cli.bake.out_of_core.scratch_folder import LOCK, RECIPE, SUFFIX, at_work, scratch_folder
+from sparklod_cli.bake.flow import SCRATCH, scratch_folder
+from sparklod_cli.bake.out_of_core.scratch_folder import LOCK, RECIPE, at_work
 from sparklod_cli.bake.out_of_core.store import Store
+from sparklod_cli.bake.settings import BakeSettings
 from sparklod_cli.system.errors import FormatError, ScratchError, UnreadableError
 from sparklod_cli.system.stdio import DASH
 from tests.conftest import ROOT
@@ -24,7 +26,7 @@ VALUE = {"value": np.arange(5)}
 
 @pytest.fixture
 def store(tmp_path: Path) -> Store:
-    return Store(tmp_path / f"a.spz{SUFFIX}")
+    return Store(tmp_path / f"a.spz{SCRATCH}")
 
 
 class Run:
@@ -207,11 +209,13 @@ def test_a_folder_that_cannot_be_made_is_an_error(tmp_path: Path) -> None:
 
 
 def test_scratch_folders_have_names_of_their_own(tmp_path: Path) -> None:
-    target = tmp_path / "web" / "a.spz"
-    assert scratch_folder(target, lambda: A, None) == tmp_path / "web" / f"a.spz{SUFFIX}"
+    def folder_of(target: Path, parent: Path | None) -> Path:
+        return Path(str(scratch_folder(ROOT / "fixtures" / "one.ply", target, BakeSettings(), parent)))
+
+    assert folder_of(tmp_path / "web" / "a.spz", None) == tmp_path / "web" / f"a.spz{SCRATCH}"
     parent = tmp_path / "fast"
-    names = {scratch_folder(tmp_path / folder / "a.spz", lambda: A, parent) for folder in ("web", "www")}
+    names = {folder_of(tmp_path / folder / "a.spz", parent) for folder in ("web", "www")}
     assert len(names) == 2
     assert {name.parent for name in names} == {parent}
-    assert scratch_folder(DASH, lambda: A, parent).parent == parent
-    assert scratch_folder(DASH, lambda: A, None) == scratch_folder(DASH, lambda: A, None)
+    assert folder_of(DASH, parent).parent == parent
+    assert folder_of(DASH, None) == folder_of(DASH, None)

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from sparklod_cli.bake.out_of_core import estimate
-from sparklod_cli.bake.out_of_core.scratch_folder import SUFFIX
+from sparklod_cli.bake import estimate
+from sparklod_cli.bake.flow import SCRATCH as SUFFIX
 from sparklod_cli.io import read_scene
 from tests.commands.build_lod.runs import SMALL, build
 from tests.conftest import FIXTURES, Capture

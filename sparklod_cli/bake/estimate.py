@@ -1,4 +1,4 @@
-"""Estimates of the memory and disk space that a bake takes.
+"""Memory and disk space that a bake takes: estimates.
 
 Coefficients are measured as those of `lod.builders.SplatBytes`.
 """
@@ -6,11 +6,16 @@ Coefficients are measured as those of `lod.builders.SplatBytes`.
 from __future__ import annotations
 
 import functools
+from typing import TYPE_CHECKING
 
-from ...lod.builders import BUILDERS, SplatBytes
-from ...system import machine
-from ...system.errors import OutOfMemoryError
-from ...system.units import format_size
+from ..lod.builders import BUILDERS, SplatBytes
+from ..system import machine
+from ..system.errors import OutOfMemoryError
+from ..system.units import format_size
+
+if TYPE_CHECKING:
+    from ..model.streams import SceneStream
+    from .settings import BakeSettings
 
 #: Part of the memory available that a bake may take unless told otherwise: other programs need some, and figures for it
 #: are estimates. Chosen.
@@ -53,8 +58,14 @@ def in_memory_bytes(method: str, splats: int, sh_degree: int, *, refines: bool =
     return PROCESS + BUILDERS[method].in_memory.of(splats, sh_degree) + refining
 
 
+def in_memory_bytes_of(header: SceneStream, settings: BakeSettings) -> int:
+    """Return bytes that the bake of an input in memory takes at its peak."""
+    refines = settings.refine is not None
+    return in_memory_bytes(settings.method, header.count, header.sh_degree, refines=refines)
+
+
 def most_in_memory(memory: int, method: str, sh_degree: int, *, refines: bool = False) -> int:
-    """Return the most splats whose bake in memory takes at most so many bytes."""
+    """Return the size of the largest scene, splats, that can be baked in memory of this many bytes."""
     fixed, one = (in_memory_bytes(method, splats, sh_degree, refines=refines) for splats in (0, 1))
     return max(memory - fixed, 0) // (one - fixed)
 
@@ -68,7 +79,7 @@ def out_of_core_bytes(
         splats, sh_degree: of the input; `sh_degree` as far as it is kept.
         in_chunks: families are put in an order for streaming at the end.
     """
-    from ...lod.chunk_order import MOST_FAMILIES, family_bytes  # takes long to load, and this is asked out of core only
+    from ..lod.chunk_order import MOST_FAMILIES, family_bytes  # takes long to load, and this is asked out of core only
 
     window = OF_WINDOW.of(min(2 * splats, WINDOW), sh_degree)
     block = BUILDERS[method].in_block.of(min(splats, block_splats), sh_degree)

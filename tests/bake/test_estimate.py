@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sparklod_cli.bake.out_of_core import estimate
+from sparklod_cli.bake import estimate
 from sparklod_cli.lod.builders import METHODS
 from sparklod_cli.system import machine
 from sparklod_cli.system.defaults import MAX_SH_DEGREE
