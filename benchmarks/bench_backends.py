@@ -20,9 +20,8 @@ from sparklod_cli.cameras.framing import framing
 from sparklod_cli.cameras.pose import look_at
 from sparklod_cli.images.metrics import psnr
 from sparklod_cli.model.splats import Splats
-from sparklod_cli.render.rasterizer import Image
+from sparklod_cli.render.rasterizer import Image, ShadedSplats, shade
 from sparklod_cli.render.settings import BACKENDS, RasterSettings
-from sparklod_cli.render.shading import ShadedSplats, shade
 from sparklod_cli.system.errors import SparklodError
 
 HEADINGS = (

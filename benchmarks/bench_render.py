@@ -19,9 +19,8 @@ from scenes import load
 import sparklod_cli as sparklod
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.model.scene import Scene
-from sparklod_cli.render.rasterizer import draw
+from sparklod_cli.render.rasterizer import ShadedSplats, draw, shade
 from sparklod_cli.render.settings import RasterSettings
-from sparklod_cli.render.shading import ShadedSplats, shade
 
 #: Width and height in pixels, and numbers of splats.
 SIZE, SPLATS = (1280, 720), (100_000, 500_000, 1_500_000)

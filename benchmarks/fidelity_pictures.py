@@ -17,9 +17,8 @@ from PIL import Image
 
 import sparklod_cli as sparklod
 from sparklod_cli.compare import PicturePair, measured
-from sparklod_cli.images.contact_sheet import sheet
 from sparklod_cli.images.metrics import edges
-from sparklod_cli.images.pixels import eight_bits, over
+from sparklod_cli.images.pixels import eight_bits, over, sheet
 
 #: In front of the made scene, as (eye, target): tree, wires, fence and chart are in the picture.
 FRONT = ((1.0, -1.9, -7.0), (0.5, -1.9, 0.0))

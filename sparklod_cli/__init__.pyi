@@ -13,19 +13,19 @@ if TYPE_CHECKING:  # mypy then resolves the modules first, which import this one
     from .api.files import read_rad_chunk as read_rad_chunk
     from .api.files import read_rad_header as read_rad_header
     from .api.files import unpack as unpack
-    from .api.results import ComparisonTable as ComparisonTable
-    from .api.results import Frames as Frames
-    from .api.results import Picture as Picture
-    from .api.results import show as show
     from .api.trees import arrange_chunks as arrange_chunks
     from .api.trees import build_lod as build_lod
     from .api.trees import extract_leaves as extract_leaves
     from .api.trees import refine as refine
     from .api.trees import simplify as simplify
+    from .api.views import ComparisonTable as ComparisonTable
+    from .api.views import Frames as Frames
+    from .api.views import Picture as Picture
     from .api.views import compare as compare
     from .api.views import cut as cut
     from .api.views import psnr as psnr
     from .api.views import render as render
+    from .api.views import show as show
     from .api.views import ssim as ssim
     from .api.views import traverse as traverse
     from .api.writing import Written as Written

@@ -28,9 +28,9 @@ from .scenes.loaded import Scenes
 from .system.errors import SparklodError
 from .system.progress import Progress, silent
 from .system.threads import on_threads, ordered_map
+from .tables.assertions import numbers
 from .tables.columns import Row
 from .tables.comparison import COLUMNS
-from .tables.statistics import numbers
 
 #: Threads that measure pictures; each has a few that wait, which take memory.
 MEASURERS = 4

@@ -230,8 +230,8 @@ def _open3d() -> Iterator[Check]:
         yield Check("Open3D", "note", "not tried, since it is not installed", install_hint("render", package="open3d"))
         return
     try:
+        from .render.open3d.backend import command
         from .render.open3d.child import PACKAGES
-        from .render.open3d.process import command
     except ImportError as error:  # numpy
         yield Check("Open3D", "note", f"not tried ({error})", install_hint())
         return

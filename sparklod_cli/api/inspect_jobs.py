@@ -167,8 +167,7 @@ def _thumbnail(report: Report, scene: Scene, threads: int) -> DescribedPicture |
     from ..inspection.arrays import NO_CHILDREN
     from .cameras import orbit
     from .files import as_tree
-    from .results import show
-    from .views import cut, render
+    from .views import cut, render, show
 
     count = len(scene.splats)
     if not count or scene.splats.invalid() or NO_CHILDREN in report.notes:

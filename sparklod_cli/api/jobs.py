@@ -257,7 +257,7 @@ def compare_files(
     table.write(rows, passed=passed)
     groups = rows_by_budget(rows, len(budgets))
     if plot is not None:
-        from ..figures.comparison_chart import plot as chart
+        from ..figures.charts import plot_comparison as chart
 
         series = list(zip((budget.text for budget in budgets), groups, strict=True))
         write_whole(plot, [chart(series, scenes.title)], overwrite=overwrite)

@@ -24,8 +24,7 @@ from ..system.errors import SparklodError
 from ..system.printable import MOST, shortened
 from ..system.stdio import DASH, name_of
 from .build_lod_text import report_baked, report_extracted
-from .console import Console, print_json, say
-from .option_groups import (
+from .command import (
     COMMON,
     argument,
     check_declared,
@@ -38,6 +37,7 @@ from .option_groups import (
     refuse,
     values_of,
 )
+from .console import Console, print_json, say
 from .options.baking import (
     OF_TREES,
     STREAMED_SOG,

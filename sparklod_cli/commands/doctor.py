@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ..system.printable import printable
+from .command import command, values_of
 from .console import count_of, print_json
-from .option_groups import command, values_of
 from .options.common import Messages, quiet_flag, verbose_flag
 
 if TYPE_CHECKING:

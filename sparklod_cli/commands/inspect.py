@@ -18,9 +18,9 @@ from ..system.printable import printable
 from ..system.setting_fields import Quantity, Range, whole
 from ..system.stdio import name_of
 from ..system.units import parse_size
+from .command import COMMON, argument, command, flag, option, refuse, values_of
 from .console import Console, count_of, size_of
 from .inspect_text import finding_line, lines, verdict
-from .option_groups import COMMON, argument, command, flag, option, refuse, values_of
 from .options.common import General, assert_errors, assert_option, overwrite_flag, plot_option, quiet_flag, table_form
 from .paths import InputPath, OutputPath, keep_apart, name_outputs
 

@@ -16,8 +16,8 @@ import click
 from ..codecs.file_names import MANIFEST, META, TILESET
 from ..system.addresses import Address, Place, place_of
 from ..system.stdio import DASH
+from .command import flag_of
 from .console import is_terminal
-from .option_groups import flag_of
 
 #: What a place is taken by.
 INPUT, OUTPUT = "an input", "an output"
@@ -103,7 +103,7 @@ def name_outputs(ctx: click.Context, source: Place | None) -> None:
     Raises:
         click.UsageError: the input is standard input, which has no name.
     """
-    from ..tables.files import FORMS
+    from ..tables.columns import FORMS
 
     for parameter in ctx.command.params:
         value = ctx.params.get(parameter.name or "")

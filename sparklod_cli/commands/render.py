@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ..images.defaults import THUMBNAIL_SIZE, THUMBNAIL_SUPERSAMPLE
+from .command import COMMON, check_declared, command, flags_set, refuse, values_of
 from .console import Console, count_of, print_json, size_of
-from .option_groups import COMMON, check_declared, command, flags_set, refuse, values_of
 from .options.cameras import PictureCameras
 from .options.common import General, json_flag, question_budgets
 from .options.cut import Inputs, PictureCut, PictureStreaming, check_scenes, notes_on_loading, viewed_files

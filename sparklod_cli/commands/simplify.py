@@ -21,8 +21,7 @@ from ..system.stdio import DASH
 from ..system.units import parse_size
 from .build_lod import SPZ, record_of, refuse_others
 from .build_lod_text import report_simplified
-from .console import print_json, say
-from .option_groups import (
+from .command import (
     COMMON,
     argument,
     check_declared,
@@ -33,6 +32,7 @@ from .option_groups import (
     parameters_of,
     values_of,
 )
+from .console import print_json, say
 from .options.baking import (
     BY_SIZE,
     EXAMPLE_STEPS,

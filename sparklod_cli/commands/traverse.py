@@ -15,9 +15,9 @@ from ..simulation.streaming_settings import StreamingSettings
 from ..system.printable import printable
 from ..system.stdio import DASH
 from ..system.units import percent_of
-from ..tables.files import FORMS
+from ..tables.columns import FORMS
+from .command import COMMON, check_declared, command, flag, option, refuse, values_of
 from .console import WIDTH, Console, count_of, for_screen, is_terminal, print_json, rows, size_of
-from .option_groups import COMMON, check_declared, command, flag, option, refuse, values_of
 from .options.cameras import Cameras
 from .options.common import (
     General,

@@ -16,8 +16,8 @@ from ..lod.budget import doubt
 from ..system.printable import printable
 from ..system.setting_fields import Quantity, Range, whole
 from ..system.units import parse_count
+from .command import COMMON, VIEW, argument, check_declared, command, flag, option, values_of
 from .console import Console, count_of, print_json, size_of
-from .option_groups import COMMON, VIEW, argument, check_declared, command, flag, option, values_of
 from .options.common import General, json_flag, overwrite_flag, quiet_flag, up_option, verbose_flag
 from .paths import InputPath, OutputPath, keep_apart
 

@@ -9,8 +9,8 @@ from typing import Any
 import click
 
 from ..system.setting_fields import whole
+from .command import command, option, values_of
 from .console import count_of, print_json
-from .option_groups import command, option, values_of
 from .options.common import Messages, processors_to_use, verbose_flag
 
 EXAMPLES = """\

@@ -15,8 +15,7 @@ from ..model.splats import Splats
 from ..render.color_scales import range_of, whole_numbers
 from ..system.errors import SparklodError
 from ..system.units import count_of
-from .geometry import Points, Viewpoint, bounds, box_lines, evenly, is_drawable, viewpoint
-from .pyvista_scene import PyvistaStage, write_png
+from .pyvista_scene import Points, PyvistaStage, Viewpoint, bounds, box_lines, evenly, is_drawable, viewpoint, write_png
 
 #: Most splats that are drawn; of more, an even sample.
 MOST_POINTS = 600_000

@@ -15,8 +15,8 @@ from PIL import Image
 from ..images.pixels import FAINT, INK
 from ..system.errors import SparklodError
 from ..system.units import percent_of
+from ..tables.assertions import numbers, totals
 from ..tables.columns import Row
-from ..tables.statistics import numbers, totals
 from .camera_path import PathScene as PathScene
 from .camera_path import picture_of_path
 from .charts import BLUE, GREEN, INDIGO, ORANGE, PINK, YELLOW, Axes, FrameColumns, Series, draw, head, stacked

@@ -32,8 +32,19 @@ from ..render.color_scales import (
 )
 from ..system.defaults import DEFAULT_BASE, PLOT_BY
 from ..system.errors import SparklodError
-from .geometry import Points, bounds, box_lines, cells, evenly, is_drawable, level_of_step, viewpoint, wall_lines
-from .pyvista_scene import PyvistaStage, write_png
+from .pyvista_scene import (
+    Points,
+    PyvistaStage,
+    bounds,
+    box_lines,
+    cells,
+    evenly,
+    is_drawable,
+    level_of_step,
+    viewpoint,
+    wall_lines,
+    write_png,
+)
 
 #: Marks closer to an end of a scale than this share of it are left out: they would touch the mark of the end.
 APART = 0.04

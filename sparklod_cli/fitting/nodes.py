@@ -17,8 +17,8 @@ from ..model.sh import COEFFICIENTS
 from ..model.splats import FloatArray, Splats
 from ..render import rasterizer
 from ..render.kernels.shade import add_sh
+from ..render.rasterizer import ShadedSplats
 from ..render.settings import RasterSettings
-from ..render.shading import ShadedSplats
 from ..scenes.loaded_scene import nodes_of
 from .kernels.adam import MOST_D, Columns, FitBounds
 from .kernels.view import mark_seen

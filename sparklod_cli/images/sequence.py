@@ -18,9 +18,9 @@ from ..system.progress import Progress, silent
 from ..system.threads import on_threads, ordered_map
 from . import pixels as codes
 from .animation import animate
-from .contact_sheet import sheet
 from .defaults import JPEG_QUALITY
 from .metrics import check_covered, psnr
+from .pixels import sheet
 
 if TYPE_CHECKING:
     from ..cameras.camera import Camera

@@ -14,9 +14,8 @@ from . import rasterizer
 from .kernels import backward
 from .kernels.backward import CENTER, LOD_OPACITY, LOG_SCALE, RGB, TURN
 from .kernels.shade import sh_gradients
-from .rasterizer import Image, Projected, Tiles
+from .rasterizer import Image, Projected, ShadedSplats, Tiles
 from .settings import RasterSettings
-from .shading import ShadedSplats
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,8 @@ from ..system.progress import Progress, silent
 from . import color_by, styles
 from .color_by import Scale
 from .devices import uses_card
-from .rasterizer import Image
+from .rasterizer import Image, ShadedSplats, shade
 from .settings import ON_CARD, RasterSettings, RenderSettings
-from .shading import ShadedSplats, shade
 
 #: Held while kernels run on all threads: they do not share them, and not every layer of threads survives their trying.
 _KERNELS = threading.Lock()

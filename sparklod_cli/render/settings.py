@@ -13,8 +13,7 @@ from .devices import device_setting
 
 if TYPE_CHECKING:
     from ..cameras.camera import Camera
-    from .rasterizer import Image
-    from .shading import ShadedSplats
+    from .rasterizer import Image, ShadedSplats
 
 
 @dataclass(frozen=True)

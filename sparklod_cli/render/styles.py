@@ -13,9 +13,8 @@ from ..model.falloff import MIN_ALPHA
 from ..model.gaussian import size_factor
 from . import rasterizer
 from .kernels import bands
-from .rasterizer import Image
+from .rasterizer import Image, ShadedSplats
 from .settings import BACKENDS, CLIP, RasterSettings
-from .shading import ShadedSplats
 
 #: How opaque a billboard is.
 BILLBOARD_ALPHA = 0.5

@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, cast
 
+from ..tables.assertions import Number, numbers, statistic, totals
 from ..tables.columns import Row
-from ..tables.statistics import Number, numbers, statistic, totals
 from .columns import COLUMNS
 
 UNITS = {column.name: column.unit for column in COLUMNS}

@@ -7,8 +7,8 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from ..cameras.path import MOST_TURN
+from .assertions import numbers, statistic
 from .columns import FRAME, Column, Row
-from .statistics import numbers, statistic
 
 COLUMNS = (
     *FRAME,

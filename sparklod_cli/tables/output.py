@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..io import check_writable, write_stdout, write_whole
-from .columns import Column, Row
-from .files import encode, load_pyarrow
+from .columns import Column, Row, encode, load_pyarrow
 
 #: What the bytes of a table are passed through on their way to standard output.
 Filter = Callable[[Iterable[bytes]], Iterable[bytes]]

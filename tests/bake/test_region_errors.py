@@ -16,8 +16,8 @@ from sparklod_cli.model.gaussian import covariance
 from sparklod_cli.model.scene import DetailScene
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.render import rasterizer
+from sparklod_cli.render.rasterizer import shade
 from sparklod_cli.render.settings import RasterSettings
-from sparklod_cli.render.shading import shade
 
 
 def cloud(count: int, seed: int, sh_degree: int = 1) -> Splats:

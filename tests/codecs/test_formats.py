@@ -81,7 +81,7 @@ def test_tables_load_nothing_heavy() -> None:
     """`--help` names what stands in them."""
     program = (
         "import sys; from sparklod_cli.codecs import file_names, formats, rounding;"
-        "from sparklod_cli.tables import files; from sparklod_cli.cameras.formats import table;"
+        "from sparklod_cli.tables import columns; from sparklod_cli.cameras.formats import table;"
         "assert not {'numpy', 'numba'} & set(sys.modules), 'heavy'"
     )
     subprocess.run([sys.executable, "-c", program], check=True)

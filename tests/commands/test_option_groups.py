@@ -11,7 +11,7 @@ import pytest
 
 from sparklod_cli.cli import COMMANDS, cli, run
 from sparklod_cli.codecs.options import RadOptions, SogOptions, WriteOptions
-from sparklod_cli.commands.option_groups import Option
+from sparklod_cli.commands.command import Option
 from sparklod_cli.fitting.settings import FitSettings
 from sparklod_cli.lod.detail_rule import DetailRule, DetailSettings
 from sparklod_cli.lod.settings import LodSettings

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sparklod_cli.figures import charts, geometry
+from sparklod_cli.figures import charts, pyvista_scene
 from sparklod_cli.figures.camera_path import FRAME, PathScene, _above, frustum_lines, picture_of_path
-from sparklod_cli.figures.geometry import viewpoint
+from sparklod_cli.figures.pyvista_scene import viewpoint
 from sparklod_cli.model.gaussian import covariance
 from sparklod_cli.system.errors import SparklodError
 from tests.figures.flights import SIZE, circle, count_of, looking, path_scene, pixels, plotted
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.mark.parametrize(("rounds", "points", "triangles"), [(0, 12, 20), (1, 42, 80), (2, 162, 320)])
 def test_a_sphere_is_closed_and_faces_outwards(rounds: int, points: int, triangles: int) -> None:
-    sphere = geometry.sphere(rounds)
+    sphere = pyvista_scene.sphere(rounds)
     assert (len(sphere.points), len(sphere.triangles)) == (points, triangles)
     assert np.allclose(np.linalg.norm(sphere.points, axis=1), 1)
     p, q, r = sphere.points[sphere.triangles].transpose(1, 0, 2)
@@ -34,8 +34,8 @@ def test_a_sphere_is_closed_and_faces_outwards(rounds: int, points: int, triangl
 
 def test_ellipsoids_are_where_the_gaussian_says() -> None:
     splats = random_splats(30)
-    of = geometry.sphere(1)
-    mesh = geometry.ellipsoids(splats, 2, of, thinnest=0)
+    of = pyvista_scene.sphere(1)
+    mesh = pyvista_scene.ellipsoids(splats, 2, of, thinnest=0)
     points = (mesh.points.reshape(30, len(of.points), 3) - splats.center[:, None]).astype(np.float64)
     matrices = covariance(splats.scale, splats.quat_xyzw)[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(30, 3, 3)
     gradient = np.linalg.solve(matrices[:, None], points[..., None])[..., 0]
@@ -47,8 +47,8 @@ def test_ellipsoids_are_where_the_gaussian_says() -> None:
 
 def test_ellipsoids_are_not_thinner_than_a_pixel() -> None:
     splats = random_splats(10)
-    of = geometry.sphere(0)
-    mesh = geometry.ellipsoids(splats, 1, of, thinnest=10)
+    of = pyvista_scene.sphere(0)
+    mesh = pyvista_scene.ellipsoids(splats, 1, of, thinnest=10)
     away = np.linalg.norm(mesh.points.reshape(10, -1, 3) - splats.center[:, None], axis=2)
     assert np.allclose(away, 10, rtol=1e-5)
 
@@ -56,7 +56,7 @@ def test_ellipsoids_are_not_thinner_than_a_pixel() -> None:
 @given(st.integers(0, 10**9), st.integers(1, 1000))
 def test_a_sample_is_even_and_has_the_size_asked_for(count: int, most: int) -> None:
     if count > most:
-        index = geometry.evenly(count, most)
+        index = pyvista_scene.evenly(count, most)
         assert len(index) == most
         assert index[0] == 0
         assert set(np.diff(index)) <= {count // most, count // most + 1}
@@ -64,28 +64,28 @@ def test_a_sample_is_even_and_has_the_size_asked_for(count: int, most: int) -> N
 
 
 def test_an_even_sample_of_few_has_all() -> None:
-    assert geometry.evenly(5, 5).tolist() == [0, 1, 2, 3, 4]
+    assert pyvista_scene.evenly(5, 5).tolist() == [0, 1, 2, 3, 4]
 
 
 @given(st.floats(1e-30, 1e30))
 def test_the_level_of_a_step_is_the_smallest_not_below_it(size: float) -> None:
-    level = geometry.level_of_step(size)
+    level = pyvista_scene.level_of_step(size)
     assert 1.5 ** (level - 1) * (1 - 1e-6) <= size <= 1.5**level * (1 + 1e-6)
 
 
 def test_cells_are_the_corners_of_occupied_cubes_once_each() -> None:
     center = np.array([[0.1, 0.1, -0.1], [0.4, 0.3, -0.4], [0.6, 0.1, -0.1]], np.float32)
-    assert geometry.cells(center, 0.5).tolist() == [[0, 0, -0.5], [0.5, 0, -0.5]]
+    assert pyvista_scene.cells(center, 0.5).tolist() == [[0, 0, -0.5], [0.5, 0, -0.5]]
 
 
 def test_a_box_has_twelve_edges_of_its_size() -> None:
-    lines = geometry.box_lines(np.array([[1.0, 2, 3]]), np.array([[2.0, 4, 6]])).reshape(12, 2, 3)
+    lines = pyvista_scene.box_lines(np.array([[1.0, 2, 3]]), np.array([[2.0, 4, 6]])).reshape(12, 2, 3)
     assert sorted(np.abs(np.diff(lines, axis=1)).sum(axis=(1, 2)).tolist()) == [1] * 4 + [2] * 4 + [3] * 4
 
 
 def test_wall_lines_are_at_multiples_of_the_step() -> None:
     low, high = np.array([-1.1, 0.2, 5.0]), np.array([1.1, 0.9, 6.0])
-    lines = geometry.wall_lines(low, high, np.array([-1.1, 0.9, 5.0]), 0.5).reshape(-1, 2, 3)
+    lines = pyvista_scene.wall_lines(low, high, np.array([-1.1, 0.9, 5.0]), 0.5).reshape(-1, 2, 3)
     assert len(lines) == 2 * (5 + 1 + 3)
     assert (lines >= low).all()
     assert (lines <= high).all()
@@ -99,7 +99,7 @@ def test_wall_lines_are_at_multiples_of_the_step() -> None:
 @pytest.mark.parametrize("aspect", [0.5, 1.6, 3])
 @pytest.mark.parametrize("extent", [(1.0, 1, 1), (100, 1, 1), (1, 50, 0.1), (1e-6, 1e-6, 1e-6)])
 def test_a_viewpoint_sees_all_within_its_frame(aspect: float, extent: tuple[float, float, float]) -> None:
-    corners = geometry.CORNERS * extent + 7
+    corners = pyvista_scene.CORNERS * extent + 7
     frame = (0.1, 0.2, 0.8, 0.9)
     eye = viewpoint(corners, np.array([-0.6, 0.5, -1]), np.array([0, -1.0, 0]), aspect=aspect, frame=frame)
     seen = eye.project(corners)
@@ -113,7 +113,7 @@ def test_a_viewpoint_sees_all_within_its_frame(aspect: float, extent: tuple[floa
 
 def test_a_viewpoint_sees_y_downwards() -> None:
     eye = viewpoint(
-        geometry.CORNERS, np.array([0, 0, -1.0]), np.array([0, -1.0, 0]), aspect=1, frame=(0.1, 0.1, 0.9, 0.9)
+        pyvista_scene.CORNERS, np.array([0, 0, -1.0]), np.array([0, -1.0, 0]), aspect=1, frame=(0.1, 0.1, 0.9, 0.9)
     )
     above, below = eye.project(np.array([[0.5, 0, 0.5], [0.5, 1, 0.5]]))
     assert above[1] < below[1]

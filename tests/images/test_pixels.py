@@ -13,7 +13,7 @@ from hypothesis.extra import numpy as hnp
 from PIL import Image, ImageDraw, ImageFont
 
 from sparklod_cli.images import pixels
-from sparklod_cli.images.contact_sheet import _fitting, cells, grid, sheet
+from sparklod_cli.images.pixels import _fitting, cells, grid, sheet
 from sparklod_cli.render.color_scales import VIRIDIS, smooth
 from sparklod_cli.render.renderer import averaged, finer
 from tests.render.drawables import camera

@@ -19,9 +19,8 @@ from sparklod_cli.lod.settings import pixel_limit
 from sparklod_cli.lod.traversal import CutView, Forest, Traversal, TreeInstance
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
-from sparklod_cli.render.rasterizer import draw
+from sparklod_cli.render.rasterizer import draw, shade
 from sparklod_cli.render.settings import RasterSettings
-from sparklod_cli.render.shading import shade
 from tests.interop.page import Page
 
 FOV_Y = math.radians(50)

@@ -32,7 +32,7 @@ from sparklod_cli.lod import quick
 from sparklod_cli.lod.tile_settings import TileSettings
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
-from sparklod_cli.view.libraries import CDN, CESIUM, MODULES, PACKAGES, PLAYCANVAS, THREE, VERSIONS
+from sparklod_cli.view.site import CDN, CESIUM, MODULES, PACKAGES, PLAYCANVAS, THREE, VERSIONS
 from tests.conftest import FIXTURES
 from tests.interop import npm
 from tests.interop.conftest import PAGE

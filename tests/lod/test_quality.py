@@ -29,9 +29,8 @@ from sparklod_cli.model.gaussian import spark_size
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.selection import Selection
 from sparklod_cli.model.splats import Splats
-from sparklod_cli.render.rasterizer import Image, draw
+from sparklod_cli.render.rasterizer import Image, draw, shade
 from sparklod_cli.render.settings import RasterSettings
-from sparklod_cli.render.shading import shade
 from sparklod_cli.scenes.finder import view_of
 from tests.conftest import real_scene
 from tests.lod.trees import check_tree, children, coincident, parents

@@ -16,9 +16,8 @@ from sparklod_cli.images.metrics import psnr
 from sparklod_cli.model.gaussian import covariance
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.model.transforms import LARGEST, ROWS, Transform, sh_basis, sh_rotations
-from sparklod_cli.render.rasterizer import Image, draw
+from sparklod_cli.render.rasterizer import Image, draw, shade
 from sparklod_cli.render.settings import RasterSettings
-from sparklod_cli.render.shading import shade
 from sparklod_cli.system.defaults import UP_AXES
 from tests.references.gaussians import covariance as reference_covariance
 from tests.references.gaussians import rotation_matrix

@@ -9,8 +9,8 @@ import numpy as np
 
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.model.splats import Splats
+from sparklod_cli.render.rasterizer import ShadedSplats
 from sparklod_cli.render.settings import RasterSettings
-from sparklod_cli.render.shading import ShadedSplats
 from tests.references.gaussians import covariance
 
 

@@ -14,9 +14,8 @@ from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.cameras.pose import look_at
 from sparklod_cli.model.gaussian import normalized_quat
 from sparklod_cli.model.splats import Splats
-from sparklod_cli.render.rasterizer import Image, draw
+from sparklod_cli.render.rasterizer import Image, ShadedSplats, draw, shade
 from sparklod_cli.render.settings import PROFILES, SORTS, RasterSettings
-from sparklod_cli.render.shading import ShadedSplats, shade
 from sparklod_cli.system.threads import on_threads
 from tests.references import spark_pictures
 from tests.scenes import random_splats

@@ -8,9 +8,9 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
+from sparklod_cli.render.rasterizer import shade
 from sparklod_cli.render.renderer import DrawnPicture, Renderer
 from sparklod_cli.render.settings import BACKENDS, COLOR_BY, STYLES, RasterSettings, RenderSettings
-from sparklod_cli.render.shading import shade
 from sparklod_cli.render.styles import BILLBOARD_ALPHA
 from sparklod_cli.scenes.finder import CutFinder
 from sparklod_cli.system.errors import SparklodError

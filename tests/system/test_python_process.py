@@ -40,9 +40,9 @@ def probe_pyvista() -> None:
 
 def start_open3d() -> None:
     pytest.importorskip("open3d")
-    from sparklod_cli.render.open3d import process
+    from sparklod_cli.render.open3d import backend
 
-    process.Child().close()
+    backend.Child().close()
 
 
 def find_ffmpeg() -> None:
@@ -82,7 +82,7 @@ STARTED: dict[str, list[Callable[[], object]]] = {
     "doctor": [check_kernels, find_ffmpeg],
     "figures/pyvista_scene": [probe_pyvista],
     "render/gl/context": [probe_opengl],
-    "render/open3d/process": [start_open3d],
+    "render/open3d/backend": [start_open3d],
     "warmup": [start_warmup, import_numba_without_forks],
 }
 

@@ -18,8 +18,7 @@ from hypothesis import strategies as st
 from sparklod_cli.simulation.columns import COLUMNS
 from sparklod_cli.system.errors import SparklodError
 from sparklod_cli.system.optional import install_hint
-from sparklod_cli.tables.columns import Cell, Column, Row
-from sparklod_cli.tables.files import FORMS, TYPES, encode
+from sparklod_cli.tables.columns import FORMS, TYPES, Cell, Column, Row, encode
 from tests.tables.rows import flight, row
 
 pytestmark = pytest.mark.slow

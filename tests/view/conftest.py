@@ -14,9 +14,8 @@ import pytest
 
 from sparklod_cli.api import viewing
 from sparklod_cli.lod.tile_settings import TileSettings
-from sparklod_cli.view.libraries import FILES, LICENSES, MODULES, VERSIONS
 from sparklod_cli.view.server import Server
-from sparklod_cli.view.site import Site
+from sparklod_cli.view.site import FILES, LICENSES, MODULES, VERSIONS, Site
 from tests.conftest import FIXTURES
 from tests.scenes import random_splats
 from tests.tiled import tiled

@@ -12,8 +12,7 @@ from pathlib import Path
 import pytest
 
 from sparklod_cli.system.errors import SparklodError
-from sparklod_cli.view.libraries import LICENSES, MODULES, PACKAGES, VERSIONS, from_cdn, from_folder
-from sparklod_cli.view.site import Site
+from sparklod_cli.view.site import LICENSES, MODULES, PACKAGES, VERSIONS, Site, from_cdn, from_folder
 from tests.conftest import FIXTURES
 from tests.view.conftest import TREE, prepared
 

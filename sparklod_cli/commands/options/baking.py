@@ -18,7 +18,7 @@ from ...system import defaults
 from ...system.addresses import Place
 from ...system.setting_fields import Quantity, Range, setting_of, whole
 from ...system.units import parse_size
-from ..option_groups import BALL, COMMON, POINT, OptionalNumber, flag, is_set, option, parameters_of, refuse
+from ..command import BALL, COMMON, POINT, OptionalNumber, flag, is_set, option, parameters_of, refuse
 from ..paths import InputPath, OutputPath
 from .common import General
 

@@ -15,7 +15,7 @@ from ...cameras.formats.table import FORMATS, Axes
 from ...system.defaults import ELEVATION, ORBIT
 from ...system.errors import CameraPathError, TooManyCamerasError
 from ...system.setting_fields import Range, whole
-from ..option_groups import COMMON, POINT, SIZE, VIEW, VIEWS, flag, flag_of, is_set, option, refuse
+from ..command import COMMON, POINT, SIZE, VIEW, VIEWS, flag, flag_of, is_set, option, refuse
 from ..paths import InputPath, file_of
 from .common import up_option
 

@@ -13,8 +13,8 @@ import click
 
 from ...system.defaults import MAX_THREADS
 from ...system.setting_fields import whole
+from ..command import COMMON, DIRECTION, flag, option
 from ..console import Console, Verbosity
-from ..option_groups import COMMON, DIRECTION, flag, option
 from ..paths import OutputPath, require_suffix
 
 if TYPE_CHECKING:
@@ -118,7 +118,7 @@ def table_form(flag: str, output: Path | None, form: str | None = None) -> str:
     """
     from ...codecs.formats import FORMATS
     from ...images.defaults import MOVING, STILL, SUFFIXES
-    from ...tables.files import FORMS
+    from ...tables.columns import FORMS
 
     suffix = output.suffix.lower() if output is not None else ""
     if output is not None and form is None:

@@ -18,7 +18,7 @@ from ...system import defaults
 from ...system.printable import printable
 from ...system.setting_fields import Quantity, Range
 from ...system.units import check_grouping, parse_time
-from ..option_groups import COMMON, argument, flag, option, parameters_of, refuse
+from ..command import COMMON, argument, flag, option, parameters_of, refuse
 from ..paths import InputPath
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ from ...render.devices import uses_card
 from ...render.settings import OF_PIXELS, SORTINGS, RenderSettings
 from ...system import defaults
 from ...system.setting_fields import Range, whole
-from ..option_groups import COLOR, COMMON, flag, is_set, option, refuse
+from ..command import COLOR, COMMON, flag, is_set, option, refuse
 from ..paths import Folder, InputPath, require_suffix, stem_of
 from .common import assert_errors, assert_option, output_option, overwrite_flag, plot_option
 

@@ -12,9 +12,8 @@ from ...model.falloff import MIN_ALPHA
 from ...model.sh import COEFFICIENTS
 from .. import rasterizer
 from ..kernels.project import COLUMNS
-from ..rasterizer import Image
+from ..rasterizer import Image, ShadedSplats
 from ..settings import RasterSettings
-from ..shading import ShadedSplats
 from . import forward
 from .card import CardArray, CardMemory, add_up, card_errors, find_card, on_card, sort, to_card
 

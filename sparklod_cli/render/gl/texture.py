@@ -12,7 +12,7 @@ from ...codecs.gpu import data_texture
 from ...model.sh import COEFFICIENTS
 from ...model.splats import FloatArray, Splats
 from ..kernels.project import MAX_COLOR
-from ..shading import ShadedSplats
+from ..rasterizer import ShadedSplats
 
 #: Precision of the stored splats: float32, or that of antimatter15's viewer.
 PRECISIONS = ("float", "half")

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sparklod_cli.images.contact_sheet import cells
+from sparklod_cli.images.pixels import cells
 from sparklod_cli.render.renderer import Renderer
 from sparklod_cli.system.optional import install_hint
 from tests.commands.render.runs import CAMERAS, DEMO, SIZE, TOWN, TREE, pixels, render

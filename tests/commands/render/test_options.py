@@ -19,9 +19,8 @@ from sparklod_cli.codecs import ply
 from sparklod_cli.commands.render import render as command
 from sparklod_cli.lod.tile_settings import TileSettings
 from sparklod_cli.model.scene import Scene
-from sparklod_cli.render.rasterizer import Image
+from sparklod_cli.render.rasterizer import Image, ShadedSplats
 from sparklod_cli.render.settings import Backend, RasterSettings
-from sparklod_cli.render.shading import ShadedSplats
 from tests.conftest import FIXTURES, Capture
 from tests.lod.details import row_of_regions
 from tests.scenes import random_splats

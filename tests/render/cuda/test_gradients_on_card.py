@@ -7,8 +7,8 @@ import numpy as np
 from sparklod_cli.model.gaussian import lod_opacity
 from sparklod_cli.render import gradients as on_processor
 from sparklod_cli.render.kernels.backward import CENTER, LOD_OPACITY, LOG_SCALE, RGB, TURN
+from sparklod_cli.render.rasterizer import shade
 from sparklod_cli.render.settings import RasterSettings
-from sparklod_cli.render.shading import shade
 from tests.cards import MARKS
 from tests.render.cuda.test_pictures import camera_at, splats_of
 

@@ -10,8 +10,8 @@ from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.model.gaussian import lod_opacity
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.render import rasterizer
+from sparklod_cli.render.rasterizer import ShadedSplats, shade
 from sparklod_cli.render.settings import BACKENDS, PROFILES, SORTS, RasterSettings
-from sparklod_cli.render.shading import ShadedSplats, shade
 from tests.cards import MARKS
 
 pytestmark = MARKS

@@ -40,7 +40,7 @@ from sparklod_cli.system.errors import SparklodError
 from sparklod_cli.render.gl import osmesa
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.render.settings import RasterSettings
-from sparklod_cli.render.shading import ShadedSplats
+from sparklod_cli.render.rasterizer import ShadedSplats
 rows = [[0, 0, -5]], [[0.1] * 3], [[0, 0, 0, 1]], [0.5], [[1, 1, 1]]
 shown = ShadedSplats(*(np.array(row, np.float32) for row in rows))
 try:

@@ -16,10 +16,9 @@ from sparklod_cli.model.falloff import MIN_ALPHA
 from sparklod_cli.model.gaussian import normalized_quat
 from sparklod_cli.model.splats import FloatArray
 from sparklod_cli.render import rasterizer, settings
-from sparklod_cli.render.gl import order, osmesa, texture
-from sparklod_cli.render.rasterizer import Image
+from sparklod_cli.render.gl import osmesa, texture
+from sparklod_cli.render.rasterizer import Image, ShadedSplats, shade
 from sparklod_cli.render.settings import BACKENDS, PROFILES, SORTS, RasterSettings
-from sparklod_cli.render.shading import ShadedSplats, shade
 from sparklod_cli.system.errors import BackendError
 from tests.conftest import FIXTURES
 from tests.scenes import random_splats
@@ -288,14 +287,14 @@ def test_keys_are_sorted_upwards_and_equal_ones_backwards() -> None:
     rng = np.random.default_rng(0)
     key = np.concatenate([rng.normal(0, 100, 5000), np.repeat(rng.normal(0, 100, 50), 20)]).astype(np.float32)
     rng.shuffle(key)
-    assert np.array_equal(order.sort_exact(key), len(key) - 1 - np.argsort(key[::-1], kind="stable"))
-    by_steps = order.sort_counting16(key)
+    assert np.array_equal(osmesa.sort_exact(key), len(key) - 1 - np.argsort(key[::-1], kind="stable"))
+    by_steps = osmesa.sort_counting16(key)
     assert np.array_equal(np.sort(by_steps), np.arange(len(key)))
     step = (float(key.max()) - float(key.min())) / 65535
     assert (np.diff(key[by_steps]) > -1.001 * step).all()
     assert (np.diff(key[by_steps]) < 0).any(), "16 bits cannot tell all of these apart"
     for few in ([], [3.0], [2.0, 2.0], [-0.0, 0.0]):
-        for sort in order.SORT.values():
+        for sort in osmesa.SORT.values():
             assert sort(np.array(few, np.float32)).tolist() == list(range(len(few)))[::-1]
 
 

@@ -13,8 +13,8 @@ from sparklod_cli.model.gaussian import lod_opacity
 from sparklod_cli.render import rasterizer
 from sparklod_cli.render.open3d import backend
 from sparklod_cli.render.open3d.child import PIECE
+from sparklod_cli.render.rasterizer import ShadedSplats
 from sparklod_cli.render.settings import BACKENDS, RasterSettings
-from sparklod_cli.render.shading import ShadedSplats
 from sparklod_cli.system.errors import BackendError
 from tests.render.open3d.test_process import forget
 

@@ -14,9 +14,9 @@ import pytest
 from numpy.typing import NDArray
 
 from sparklod_cli.cameras.camera import Camera
-from sparklod_cli.render.open3d import backend, process
+from sparklod_cli.render.open3d import backend
+from sparklod_cli.render.rasterizer import ShadedSplats
 from sparklod_cli.render.settings import RasterSettings
-from sparklod_cli.render.shading import ShadedSplats
 from sparklod_cli.system.errors import BackendError
 from tests.conftest import ROOT
 
@@ -42,7 +42,7 @@ def play(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str], None]]:
     """Puts another program in the place of Open3D's."""
 
     def put(text: str) -> None:
-        monkeypatch.setattr(process, "command", lambda: [sys.executable, "-c", PREAMBLE + textwrap.dedent(text)])
+        monkeypatch.setattr(backend, "command", lambda: [sys.executable, "-c", PREAMBLE + textwrap.dedent(text)])
 
     forget()
     yield put
@@ -73,7 +73,7 @@ def test_a_failing_process_is_an_error(
 ) -> None:
     play(text)
     if "not answered" in message:
-        monkeypatch.setattr(process, "DRAW_LIMIT", 1.5)
+        monkeypatch.setattr(backend, "DRAW_LIMIT", 1.5)
     with pytest.raises(BackendError, match=message):
         draw_one()
     with pytest.raises(BackendError, match=message):  # and again, by a new one
@@ -131,7 +131,7 @@ def test_one_process_draws_all_pictures(play: Callable[[str], None]) -> None:
     play(NUMBER)
     first, second = draw_one(), draw_one(300)
     child = backend._child
-    assert child is not None and child.most_entries == process.MOST_ENTRIES
+    assert child is not None and child.most_entries == backend.MOST_ENTRIES
     grey = (child._process.pid % 251 + 1) / 255
     assert first.shape == (40, 60, 4) and second.shape == (40, 300, 4)
     np.testing.assert_allclose(first[..., :3], grey, rtol=1e-6)
@@ -145,15 +145,15 @@ def test_an_old_mesa_gets_small_pieces(play: Callable[[str], None]) -> None:
     play("print('Vulkan device driver: llvmpipe Mesa 22.3.6', file=sys.stderr, flush=True)" + NUMBER)
     draw_one()
     child = backend._child
-    assert child is not None and child.most_entries == process.MOST_ENTRIES_OF_OLD_MESA
+    assert child is not None and child.most_entries == backend.MOST_ENTRIES_OF_OLD_MESA
 
 
 def test_the_process_ends_with_its_parent() -> None:
     program = f"""
     import sys
-    from sparklod_cli.render.open3d import process
-    process.command = lambda: [sys.executable, "-c", {PREAMBLE + NUMBER!r}]
-    print(process.Child()._process.pid, "open3d" in sys.modules)
+    from sparklod_cli.render.open3d import backend
+    backend.command = lambda: [sys.executable, "-c", {PREAMBLE + NUMBER!r}]
+    print(backend.Child()._process.pid, "open3d" in sys.modules)
     """
     command = [sys.executable, "-c", textwrap.dedent(program)]
     said = subprocess.run(command, check=True, capture_output=True, text=True, cwd=ROOT, timeout=120).stdout.split()
