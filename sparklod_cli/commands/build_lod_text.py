@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from ..system.addresses import Place
 from ..system.stdio import DASH, name_of
 from ..system.units import format_size, percent_of
-from .console import Console, count_of, size_of
+from .console import Console, count_of
 
 if TYPE_CHECKING:
     from ..bake.records import Baked, WrittenDetail, WrittenSet
@@ -57,7 +57,7 @@ def report_baked(console: Console, source: Place, target: Place, baked: Baked) -
     """Print a line about the file, and one for each thing that a person should know."""
     console.say(
         f"{name_of(source)}  {count_of(baked.splats, 'splat')}, SH {baked.sh_degree}  ->  {_name(target)} "
-        f" {_contents(baked)}, {size_of(baked.bytes)}, {_total(baked.seconds)}"
+        f" {_contents(baked)}, {format_size(baked.bytes)}, {_total(baked.seconds)}"
     )
     if baked.detail is not None and len(baked.detail.levels) > 1:
         console.say(f"  {_levels(baked.detail)}")
@@ -183,7 +183,7 @@ def report_extracted(console: Console, source: Place, target: Place, extracted: 
     """Print a line about the file."""
     console.say(
         f"{name_of(source)}  {count_of(extracted.nodes, 'node')}  ->  {_name(target)} "
-        f" {count_of(extracted.splats, 'splat')}, SH {extracted.sh_degree}, {size_of(extracted.bytes)},"
+        f" {count_of(extracted.splats, 'splat')}, SH {extracted.sh_degree}, {format_size(extracted.bytes)},"
         f" {_total(extracted.seconds)}"
     )
     _report_losses(console, extracted, extracted.splats, extracted.output_format)
@@ -197,7 +197,7 @@ def report_simplified(console: Console, source: Source, target: Place, baked: Ba
     measured = "" if made.psnr is None else f", PSNR {made.psnr:.2f} dB"
     console.say(
         f"{name_of(source)}  {count_of(baked.splats, 'splat')}, SH {baked.sh_degree}  ->  {_name(target)} "
-        f" {count_of(made.splats, 'splat')} ({percent_of(made.share)}){measured}, {size_of(baked.bytes)},"
+        f" {count_of(made.splats, 'splat')} ({percent_of(made.share)}){measured}, {format_size(baked.bytes)},"
         f" {_total(baked.seconds)}"
     )
     _report_tree(console, baked, made.refine)

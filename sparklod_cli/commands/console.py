@@ -46,11 +46,6 @@ class Verbosity:
     verbose: bool = False
 
 
-def size_of(size: int) -> str:
-    """Return an amount of bytes for display, such as "2.9 MB"."""
-    return f"{size / 1e6:.1f} MB" if size >= 1e5 else f"{size / 1e3:.1f} kB"
-
-
 def rows(name: str, text: str) -> list[str]:
     """Return the lines of a row of a report: a name and a text, which goes on below where it is longer than a line."""
     return _wrapped(f"  {name:<{NAMES - 3}} {printable(text, MOST)}".rstrip(), WIDTH, NAMES)

@@ -17,9 +17,9 @@ from ..system.errors import OutOfMemoryError, SparklodError, StdoutError
 from ..system.printable import printable
 from ..system.setting_fields import Quantity, Range, whole
 from ..system.stdio import name_of
-from ..system.units import parse_size
+from ..system.units import format_size, parse_size
 from .command import COMMON, argument, command, flag, option, refuse, values_of
-from .console import Console, count_of, size_of
+from .console import Console, count_of
 from .inspect_text import finding_line, lines, verdict
 from .options.common import General, assert_errors, assert_option, overwrite_flag, plot_option, quiet_flag, table_form
 from .paths import InputPath, OutputPath, keep_apart, name_outputs
@@ -332,7 +332,7 @@ class _Job:
             click.echo(f"\n  {quantity}\n{text}")
         if inspected.picture is not None:
             description, size = inspected.picture
-            self.console.say(f"{self.settings.plot}  {description.partition(';')[0]}, {size_of(size)}")
+            self.console.say(f"{self.settings.plot}  {description.partition(';')[0]}, {format_size(size)}")
         elif inspected.problem is not None and self.settings.plot is not None:
             self.console.error(f"{name}: {inspected.problem}")
             status = max(status, 1)
@@ -385,4 +385,4 @@ class _Job:
         from ..api.inspect_jobs import write_page
 
         size = write_page(self.settings.html, self.sections, overwrite=self.settings.overwrite)
-        self.console.say(f"{self.settings.html}  page of {count_of(len(self.sections), 'file')}, {size_of(size)}")
+        self.console.say(f"{self.settings.html}  page of {count_of(len(self.sections), 'file')}, {format_size(size)}")

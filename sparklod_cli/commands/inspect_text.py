@@ -7,7 +7,8 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 from ..system.printable import MOST, printable, shortened
-from .console import count_of, rows, size_of
+from ..system.units import format_size
+from .console import count_of, rows
 
 if TYPE_CHECKING:
     from ..inspection.findings import Finding
@@ -29,7 +30,7 @@ def lines(name: str, report: dict[str, Any]) -> Iterator[str]:
 
     tree, values = report["tree"], report["values"]
     noun = "node" if tree else "splat"
-    size = "" if report["bytes"] is None else f", {size_of(report['bytes'])}"
+    size = "" if report["bytes"] is None else f", {format_size(report['bytes'])}"
     yield f"{printable(name)}  {report['format']}{size}"
     about = [count_of(report["splats"], noun), f"SH {report['sh_degree']}"]
     about += ["antialiased"] * bool(report["antialiased"])
@@ -59,10 +60,10 @@ def lines(name: str, report: dict[str, Any]) -> Iterator[str]:
 
 def _rad(rad: dict[str, Any]) -> Iterator[str]:
     where = "files of their own" if rad["chunked"] else "one file"
-    header, first = size_of(rad["header_bytes"]), size_of(rad["first_bytes"])
+    header, first = format_size(rad["header_bytes"]), format_size(rad["first_bytes"])
     yield from rows("stored", f"{where}, header {header}, with the first chunk {first}")
     if rad["chunk_bytes"]:
-        least, median, most = (size_of(rad["chunk_bytes"][name]) for name in ("min", "median", "max"))
+        least, median, most = (format_size(rad["chunk_bytes"][name]) for name in ("min", "median", "max"))
         yield from rows("chunks", f"{least} to {most}, median {median}, of {rad['chunk_size']:,} splats")
     if rad["palette"]:
         yield from rows("palette", count_of(rad["palette"], "entry", "entries") + " of SH")
@@ -80,11 +81,11 @@ def _rad(rad: dict[str, Any]) -> Iterator[str]:
 
 
 def _streamed_sog(streamed: dict[str, Any]) -> Iterator[str]:
-    first, manifest = size_of(streamed["first_bytes"]), size_of(streamed["manifest_bytes"])
+    first, manifest = format_size(streamed["first_bytes"]), format_size(streamed["manifest_bytes"])
     around = " and the environment" if streamed["environment"] else ""
     yield from rows("stored", f"manifest {manifest}, with the coarsest level{around} {first}")
     if streamed["file_bytes"]:
-        least, median, most = (size_of(streamed["file_bytes"][name]) for name in ("min", "median", "max"))
+        least, median, most = (format_size(streamed["file_bytes"][name]) for name in ("min", "median", "max"))
         count = count_of(streamed["files"], "chunk file")
         yield from rows("files", f"{count} of {least} to {most}, median {median}")
     splats, edge = streamed["region_splats"], streamed["region_edge"]
@@ -101,22 +102,22 @@ def _streamed_sog(streamed: dict[str, Any]) -> Iterator[str]:
     for number, level in enumerate(streamed["levels"]):
         share = "" if level["share"] is None else f"{100 * level['share']:.1f} %"
         errors = (f"{level['errors'][name]:>8.2g}" for name in ("p25", "p50", "p75") if level["errors"])
-        size = size_of(level["bytes"])
+        size = format_size(level["bytes"])
         counts = f"{level['splats']:>11,} {share:>7} {level['regions']:>7,} {level['files']:>5,} {size:>8}"
         yield f"    {number:<8} {counts} {''.join(errors)}".rstrip()
     if streamed["environment"]:
         around = streamed["environment"]
-        yield from rows("environment", f"{count_of(around['splats'], 'splat')}, {size_of(around['bytes'])}")
+        yield from rows("environment", f"{count_of(around['splats'], 'splat')}, {format_size(around['bytes'])}")
     if streamed["generator"]:
         yield from rows("written by", streamed["generator"])
 
 
 def _tiles(tiles: dict[str, Any]) -> Iterator[str]:
-    first, tileset = size_of(tiles["first_bytes"]), size_of(tiles["tileset_bytes"])
+    first, tileset = format_size(tiles["first_bytes"]), format_size(tiles["tileset_bytes"])
     nested = f" and {tiles['tilesets'] - 1:,} nested" if tiles["tilesets"] > 1 else ""
     yield from rows("stored", f"tileset.json{nested} {tileset}, with the root tile {first}")
     if tiles["file_bytes"]:
-        least, median, most = (size_of(tiles["file_bytes"][name]) for name in ("min", "median", "max"))
+        least, median, most = (format_size(tiles["file_bytes"][name]) for name in ("min", "median", "max"))
         yield from rows("files", f"{count_of(tiles['tiles'], 'tile')} of {least} to {most}, median {median}")
     splats = tiles["tile_splats"]
     yield from rows("", f"{splats['min']:,.0f} to {splats['max']:,.0f} splats each, median {splats['p50']:,.0f}")
@@ -127,7 +128,7 @@ def _tiles(tiles: dict[str, Any]) -> Iterator[str]:
     )
     for number, level in enumerate(tiles["levels"]):
         errors = [f"{level['errors'][name]:>8.3g}" for name in ("min", "p50", "max")] if level["errors"] else []
-        counts = f"{level['splats']:>11,} {level['tiles']:>6,} {level['leaves']:>6,} {size_of(level['bytes']):>9}"
+        counts = f"{level['splats']:>11,} {level['tiles']:>6,} {level['leaves']:>6,} {format_size(level['bytes']):>9}"
         yield f"    {number:<8} {' '.join([counts, *errors])}"
     if tiles["georeference"]:
         place = tiles["georeference"]

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ..images.defaults import THUMBNAIL_SIZE, THUMBNAIL_SUPERSAMPLE
+from ..system.units import format_size
 from .command import COMMON, check_declared, command, flags_set, refuse, values_of
-from .console import Console, count_of, print_json, size_of
+from .console import Console, count_of, print_json
 from .options.cameras import PictureCameras
 from .options.common import General, json_flag, question_budgets
 from .options.cut import Inputs, PictureCut, PictureStreaming, check_scenes, notes_on_loading, viewed_files
@@ -229,7 +230,7 @@ def _report(console: Console, drawn: DrawnPath, seconds: float, *, as_json: bool
     name = "standard output" if output.name is None else output.name
     console.say(f"{name}  {_describe(written)}, {seconds:.2f} s")
     console.detail(
-        f"  {drawn.path.format}, {size_of(written.bytes)} of {output.form}; {settings.style} by {settings.backend},"
+        f"  {drawn.path.format}, {format_size(written.bytes)} of {output.form}; {settings.style} by {settings.backend},"
         f" from {settings.raster.near:g} to {settings.raster.far:g} units away"
     )
 

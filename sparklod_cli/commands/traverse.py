@@ -14,10 +14,10 @@ import click
 from ..simulation.streaming_settings import StreamingSettings
 from ..system.printable import printable
 from ..system.stdio import DASH
-from ..system.units import percent_of
+from ..system.units import format_size, percent_of
 from ..tables.columns import FORMS
 from .command import COMMON, check_declared, command, flag, option, refuse, values_of
-from .console import WIDTH, Console, count_of, for_screen, is_terminal, print_json, rows, size_of
+from .console import WIDTH, Console, count_of, for_screen, is_terminal, print_json, rows
 from .options.cameras import Cameras
 from .options.common import (
     General,
@@ -293,8 +293,8 @@ def lines(summary: Summary) -> Iterator[str]:
         stops = (f"{_share(share)} {STOPS.get(reason, reason)}" for reason, share in summary.stop_reasons.items())
         yield from rows("stops", ", ".join(stops))
     if summary.chunks:
-        first = f"{size_of(summary.bytes_first)} in {count_of(summary.chunks_first, 'chunk')} for the first frame"
-        yield from rows("fetches", f"{size_of(summary.bytes)} in {count_of(summary.chunks, 'chunk')}, {first}")
+        first = f"{format_size(summary.bytes_first)} in {count_of(summary.chunks_first, 'chunk')} for the first frame"
+        yield from rows("fetches", f"{format_size(summary.bytes)} in {count_of(summary.chunks, 'chunk')}, {first}")
     if summary.loading:
         yield from rows("opens", _loading(summary.loading))
     if summary.quantities:
@@ -313,7 +313,7 @@ def _loading(figures: Row) -> str:
     for label, name in (("first picture", "first_picture"), ("90 %", "resident_90"), ("all", "resident_all")):
         seconds, size = figures[f"{name}_s"], figures.get(f"{name}_bytes")
         text = "never" if seconds is None else f"after {seconds:.2f} s"
-        parts.append(f"{label} {text}" + (f" and {size_of(size)}" if isinstance(size, int) else ""))
+        parts.append(f"{label} {text}" + (f" and {format_size(size)}" if isinstance(size, int) else ""))
     return ", ".join(parts)
 
 
@@ -337,7 +337,7 @@ def _said(value: float, style: str) -> str:
     if style == "share":
         return _share(value)
     if style == "bytes":
-        return size_of(round(value)) if value else "0"
+        return format_size(round(value)) if value else "0"
     if style == "seconds":
         return f"{value:.2f} s"
     if style == "ms":

@@ -15,9 +15,9 @@ import click
 from ..lod.budget import doubt
 from ..system.printable import printable
 from ..system.setting_fields import Quantity, Range, whole
-from ..system.units import parse_count
+from ..system.units import format_size, parse_count
 from .command import COMMON, VIEW, argument, check_declared, command, flag, option, values_of
-from .console import Console, count_of, print_json, size_of
+from .console import Console, count_of, print_json
 from .options.common import General, json_flag, overwrite_flag, quiet_flag, up_option, verbose_flag
 from .paths import InputPath, OutputPath, keep_apart
 
@@ -180,7 +180,7 @@ def _open(console: Console, url: str) -> None:
 
 
 def _report_export(console: Console, folder: Path, site: Site, size: int, *, as_json: bool) -> None:
-    console.say(f"wrote {printable(str(folder))}: {count_of(len(site.resources), 'file')}, {size_of(size)}")
+    console.say(f"wrote {printable(str(folder))}: {count_of(len(site.resources), 'file')}, {format_size(size)}")
     if as_json:
         print_json({"folder": str(folder), "bytes": size, "files": _files(site)})
 

@@ -1,120 +1,81 @@
-"""Reports as one self-contained page of HTML, without scripts and without access to a network."""
+"""Reports as one self-contained page of HTML, made from their own keys, without scripts and without a network."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import base64
+from bisect import bisect_left
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
 from importlib.resources import files
 from typing import Any
 
+import numpy as np
+
 from .. import __version__
 from ..figures.tree_plot import DescribedPicture
 from ..model.scene import Scene
-from ..tables.histograms import Histogram
+from ..system.units import count_of, format_size, percent_of
+from ..tables.histograms import Histogram, edge_names
 from . import values
 from .findings import CODES, ERROR, NOTE, WARNING
-from .html_parts import (
-    NONE,
-    bar,
-    children_groups,
-    figure_of,
-    histogram_chart,
-    number_text,
-    panel,
-    size_text,
-    table_of,
-    text_of,
-)
 from .report import Report
-
-
-def streamed_sog_panels(streamed: Mapping[str, Any]) -> str:
-    """Return the panels, from `streamed_sog` of a report as JSON."""
-    levels = panel("Detail levels", _levels(streamed["levels"]))
-    return f'{levels}\n<div class="two">{panel("Container", _container(streamed))}{_regions(streamed)}</div>'
-
-
-def _levels(levels: list[Mapping[str, Any]]) -> str:
-    most = max(level["splats"] for level in levels) or 1
-    rows = []
-    for number, level in enumerate(levels):
-        share = NONE if level["share"] is None else f"{100 * level['share']:.1f} %"
-        errors = level["errors"] or {}
-        cells = [number_text(level["splats"]), share, number_text(level["regions"]), number_text(level["files"])]
-        cells += [size_text(level["bytes"]), *(number_text(errors.get(name)) for name in ("p25", "p50", "p75"))]
-        rows.append([f"{number}", *cells, bar(level["splats"] / most)])
-    head = ("Level", "Splats", "Share", "Regions", "Files", "Size", "Error, 25 %", "Median", "75 %", "")
-    caption = "Level 0 is full detail. Errors of regions, each weighted by its splats at level 0."
-    return table_of(head, rows, caption)
-
-
-def _container(streamed: Mapping[str, Any]) -> str:
-    facts = [
-        ["Manifest", size_text(streamed["manifest_bytes"])],
-        ["Manifest, coarsest level and environment", size_text(streamed["first_bytes"])],
-        ["Chunk files", number_text(streamed["files"])],
-    ]
-    if streamed["file_bytes"]:
-        sizes = [size_text(streamed["file_bytes"][name]) for name in ("min", "median", "max")]
-        facts.append(["Smallest, median and largest chunk file", ", ".join(sizes)])
-    if streamed["environment"]:
-        around = streamed["environment"]
-        facts.append(["Environment", f"{number_text(around['splats'])} splats, {size_text(around['bytes'])}"])
-    if streamed["generator"]:
-        facts.append(["Written by", text_of(streamed["generator"])])
-    return table_of(("Streamed SOG", ""), facts, "As its manifest says.")
-
-
-def _regions(streamed: Mapping[str, Any]) -> str:
-    names = ("min", "p25", "p50", "p75", "max", "mean")
-    rows = [
-        [what, *(number_text(streamed[field][name]) for name in names)]
-        for what, field in (("Splats at level 0", "region_splats"), ("Longest edge, world units", "region_edge"))
-    ]
-    caption = f"{number_text(streamed['regions'])} regions; depth of their tree: {number_text(streamed['depth'])}."
-    return panel("Regions", table_of(("", *names), rows, caption))
-
-
-def tile_panels(tiles: Mapping[str, Any]) -> str:
-    """Return the panels, from `tiles` of a report as JSON."""
-    most = max(level["splats"] for level in tiles["levels"]) or 1
-    rows = []
-    for number, level in enumerate(tiles["levels"]):
-        errors = level["errors"] or {}
-        cells = [number_text(level[name]) for name in ("splats", "tiles", "leaves")]
-        cells += [size_text(level["bytes"]), *(number_text(errors.get(name)) for name in ("min", "p50", "max"))]
-        rows.append([f"{number}", *cells, bar(level["splats"] / most)])
-    head = ("Depth", "Splats", "Tiles", "Without children", "Size", "Geometric error, least", "Median", "Largest", "")
-    levels = table_of(head, rows, "Depth 0 is the root tile. Tiles without children have full detail.")
-    facts = [
-        ["Tileset files", f"{number_text(tiles['tilesets'])}, {size_text(tiles['tileset_bytes'])}"],
-        ["Tileset files and the root tile", size_text(tiles["first_bytes"])],
-    ]
-    if tiles["file_bytes"]:
-        sizes = [size_text(tiles["file_bytes"][name]) for name in ("min", "median", "max")]
-        facts.append(["Smallest, median and largest tile", ", ".join(sizes)])
-    if tiles["georeference"]:
-        place = tiles["georeference"]
-        where = ", ".join(number_text(place[name]) for name in ("latitude", "longitude", "height", "heading"))
-        facts.append(["Latitude, longitude, height and heading", where])
-    if tiles["generator"]:
-        facts.append(["Written by", text_of(tiles["generator"])])
-    about = table_of(("3D Tiles", ""), facts, "As the tileset says.")
-    return f"{panel('Tiles', levels)}\n{panel('Container', about)}"
-
 
 #: Content security policy: only the style and the pictures inside the page, whatever the name of a file contains.
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
-
-#: Fields of a header that the page shows, by name, and their titles.
-HEADER = {"version": "Version", "fractional_bits": "Fractional bits"}
 
 #: Severities, the worst first.
 SEVERITIES = (ERROR, WARNING, NOTE)
 
 #: Most findings of a file that are listed; checks have some forty kinds, but a file of expectations has no limit.
 MAX_FINDINGS = 200
+
+#: Fields of a header that the page shows, by name, and their titles.
+HEADER = {"version": "Version", "fractional_bits": "Fractional bits"}
+
+#: Titles of keys that say too little with blanks for their underscores.
+LABELS = {
+    "first_bytes": "Size needed for a first picture",
+    "bytes": "Size",
+    "file_bytes": "Sizes of the files",
+    "palette": "Entries of the palette of SH",
+    "box": "Box of all centres",
+    "box_98": "Box of the centres, 1 % to 99 %",
+    "region_edge": "Longest edge of the regions, world units",
+    "non_finite": "Splats with a number that is not finite",
+    "negative_scale": "Splats with a negative scale",
+    "zero_opacity": "Splats of opacity 0",
+    "zero_scale": "Splats of scale 0",
+    "more_than_opaque": "Splats of opacity above 1",
+}
+
+#: Titles of the parts of a report, and titles and captions of the tables in them.
+PARTS = {"rad": "RAD", "streamed_sog": "Streamed SOG", "tiles": "3D Tiles", "tree": "Tree", "values": "Unusual values"}
+TABLES = {
+    ("rad", "properties"): ("Properties", "As stored, in all chunks."),
+    ("streamed_sog", "levels"): (
+        "Detail levels",
+        "Level 0 is full detail. Errors of regions, each weighted by its splats at level 0.",
+    ),
+    ("tiles", "levels"): ("Tiles", "Depth 0 is the root tile. Leaves are tiles without children, with full detail."),
+    ("tree", "levels"): (
+        "Nodes by depth",
+        "Depth: edges from the root. Size: geometric mean of the feature sizes, world units.",
+    ),
+    ("values", "quantities"): ("Values", "Without numbers that are not finite."),
+}
+
+#: Width and height of a chart, and what the labels below and the figure above take of it, in units of its view box.
+WIDTH, HEIGHT, BELOW, ABOVE = 360, 150, 20, 16
+
+#: Number of labels below a histogram.
+LABELLED = 5
+
+#: Up to this number of children, every number has its own row; beyond it, ranges double.
+SINGLE_CHILDREN = 8
+
+#: Stands for a missing value.
+NONE = "\u2013"
 
 
 @dataclass(frozen=True)
@@ -147,9 +108,13 @@ def section_of(
 def page(sections: Sequence[FileSection]) -> str:
     """Return the page about one or more files, as HTML to be written in UTF-8."""
     one = len(sections) == 1
-    title = f"{text_of(sections[0].report.get('file', ''))} \u2013 sparklod inspect" if one else "sparklod inspect"
+    title = f"{_text(sections[0].report.get('file', ''))} \u2013 sparklod inspect" if one else "sparklod inspect"
     style = files(__package__).joinpath("page.css").read_text("utf-8")
-    contents = "" if one else _contents(sections)
+    contents = ""
+    if not one:
+        head = ("File", "Format", "Splats", "Size", "Findings")
+        rows = [_overview(section.report, number) for number, section in enumerate(sections, 1)]
+        contents = f'<nav class="panel" aria-label="Files">{_table(head, rows, "The files")}</nav>\n'
     body = "\n".join(_section(section, f"file-{number}") for number, section in enumerate(sections, 1))
     return f"""<!DOCTYPE html>
 <html lang="en">
@@ -173,193 +138,270 @@ def page(sections: Sequence[FileSection]) -> str:
 """
 
 
+def _overview(report: Mapping[str, Any], number: int) -> list[str]:
+    name = f'<a href="#file-{number}">{_text(report.get("file", number))}</a>'
+    cells = [_shown(key, report.get(key)) for key in ("format", "splats", "bytes")]
+    return [name, *cells, _verdict(report)]
+
+
+def _section(section: FileSection, anchor: str) -> str:
+    report = section.report
+    form = f'<span class="badge plain">{_text(report["format"])}</span>' if report.get("format") else ""
+    name = _text(report.get("file", ""))
+    parts = [
+        f'<article id="{anchor}" aria-labelledby="{anchor}-name">',
+        f'<div class="head"><h2 id="{anchor}-name">{name}</h2>{form}{_verdict(report)}</div>',
+        _figures(report),
+        _findings(report),
+        _picture(section.thumbnail, small=True),
+        _picture(section.picture),
+        *(_part(key, report[key]) for key in PARTS if report.get(key)),
+        _histograms(section.histograms),
+        "</article>",
+    ]
+    return "\n".join(filter(None, parts))
+
+
 def _verdict(report: Mapping[str, Any]) -> str:
-    """Return the worst severity of the findings, as a badge."""
+    """Return a badge with the number of findings of the worst severity."""
     findings = report.get("findings")
     if findings is None:
         return '<span class="badge plain">not checked</span>'
     for severity in SEVERITIES:
         count = sum(found.get("severity") == severity for found in findings)
         if count:
-            return f'<span class="badge {severity}">{count} {severity}{"s" if count > 1 else ""}</span>'
+            return f'<span class="badge {severity}">{count_of(count, severity)}</span>'
     return '<span class="badge good">no faults found</span>'
-
-
-def _contents(sections: Sequence[FileSection]) -> str:
-    rows = []
-    for number, report in enumerate((section.report for section in sections), 1):
-        name = f'<a href="#file-{number}">{text_of(report.get("file", number))}</a>'
-        size = report.get("bytes")
-        rows.append(
-            [
-                name,
-                text_of(report.get("format") or NONE),
-                number_text(report.get("splats")),
-                NONE if size is None else size_text(size),
-                _verdict(report),
-            ]
-        )
-    head = ("File", "Format", "Splats", "Size", "Findings")
-    return f'<nav class="panel" aria-label="Files">{table_of(head, rows, "The files")}</nav>\n'
-
-
-def _section(section: FileSection, anchor: str) -> str:
-    report = section.report
-    form = f'<span class="badge plain">{text_of(report["format"])}</span>' if report.get("format") else ""
-    name = text_of(report.get("file", ""))
-    parts = [
-        f'<article id="{anchor}" aria-labelledby="{anchor}-name">',
-        f'<div class="head"><h2 id="{anchor}-name">{name}</h2>{form}{_verdict(report)}</div>',
-        _figures(report),
-        _findings(report),
-        figure_of(section.thumbnail, small=True),
-        figure_of(section.picture),
-    ]
-    if report.get("rad"):
-        parts.append(_rad(report["rad"]))
-    if report.get("streamed_sog"):
-        parts.append(streamed_sog_panels(report["streamed_sog"]))
-    if report.get("tiles"):
-        parts.append(tile_panels(report["tiles"]))
-    if report.get("tree"):
-        parts.append(_tree(report["tree"]))
-    if report.get("values"):
-        parts.append(_values(report["values"]))
-    parts.append(_histograms(section.histograms))
-    return "\n".join(part for part in [*parts, "</article>"] if part)
 
 
 def _figures(report: Mapping[str, Any]) -> str:
     """Return the key figures, as cards."""
     tree, header = report.get("tree") or {}, report.get("header") or {}
     noun = "node" if tree else "splat"
-    cards: list[tuple[str, str, str]] = []
-    if report.get("splats") is not None:
-        cards.append((f"{noun.title()}s", number_text(report["splats"]), ""))
-    if report.get("bytes") is not None:
-        each, ratio = report.get("bytes_per_splat"), report.get("compression_ratio")
-        of_each = f"{each:.1f} bytes a {noun}" if each else ""
-        of_ratio = f"{ratio:.1f} times smaller than as floats" if ratio else ""
-        cards.append(("Size", size_text(report["bytes"]), ", ".join(filter(None, (of_each, of_ratio)))))
-    if tree:
-        share, needed = tree.get("more_than_opaque"), number_text(tree.get("chunks_of_coarse_cut"))
-        opaque = "" if share is None else f"{100 * share:.1f} % of all nodes have D &gt; 1"
-        cards += [
-            ("Leaves", number_text(tree.get("leaves")), "splats of the scene"),
-            ("Inner nodes", number_text(tree.get("inner")), opaque),
-            ("Growth", number_text(tree.get("growth")), "nodes per leaf"),
-            ("Depth", number_text(tree.get("depth")), "edges to the deepest node"),
-            ("Chunks", number_text(tree.get("chunks")), f"{needed} for a coarse cut"),
-        ]
-    if report.get("sh_degree") is not None:
-        cards.append(("SH degree", number_text(report["sh_degree"]), ""))
-    if report.get("antialiased") is not None:
-        cards.append(("Antialiased", "yes" if report["antialiased"] else "no", ""))
-    if report.get("up") is not None:
-        cards.append(("Up", text_of(report["up"]), "axis that points up"))
-    cards += [(title, number_text(header[name]), "") for name, title in HEADER.items() if name in header]
+    each, ratio = report.get("bytes_per_splat"), report.get("compression_ratio")
+    size = [f"{each:.1f} bytes a {noun}"] if each else []
+    size += [f"{ratio:.1f} times smaller than as floats"] if ratio else []
+    share = tree.get("more_than_opaque")
+    small = {
+        "bytes": ", ".join(size),
+        "leaves": "splats of the scene",
+        "inner": "" if share is None else f"{percent_of(share)} of all nodes have D &gt; 1",
+        "growth": "nodes per leaf",
+        "depth": "edges to the deepest node",
+        "chunks": f"{_shown('', tree.get('chunks_of_coarse_cut'))} for a coarse cut",
+        "up": "axis that points up",
+    }
+    titles = {"splats": f"{noun.title()}s", "bytes": "Size"}
+    titles |= {key: key.title() for key in ("leaves", "inner", "growth", "depth", "chunks") if tree}
+    titles |= {"inner": "Inner nodes"} if tree else {}
+    titles |= {"sh_degree": "SH degree", "antialiased": "Antialiased", "up": "Up"} | HEADER
     items = []
-    for title, value, small in cards:
-        more = f"<small>{small}</small>" if small else ""
-        items.append(f"<div><dt>{title}</dt><dd>{value}{more}</dd></div>")
-    return f'<dl class="figures">{"".join(items)}</dl>' if cards else ""
+    for key, value in ((key, {**report, **tree, **header}.get(key)) for key in titles):
+        if value is not None or (tree and key in tree):
+            more = f"<small>{small[key]}</small>" if small.get(key) else ""
+            items.append(f"<div><dt>{titles[key]}</dt><dd>{_shown(key, value)}{more}</dd></div>")
+    return f'<dl class="figures">{"".join(items)}</dl>' if items else ""
 
 
 def _findings(report: Mapping[str, Any]) -> str:
     findings = report.get("findings")
-    notes = "".join(f"<p>{text_of(note)}</p>" for note in (*(report.get("notes") or ()), *(report.get("hints") or ())))
+    notes = "".join(f"<p>{_text(note)}</p>" for note in (*(report.get("notes") or ()), *(report.get("hints") or ())))
     if not findings:
-        return panel("Notes", notes)
+        return _panel("Notes", notes)
     items = []
     worst_first = sorted(findings, key=lambda found: SEVERITIES.index(found["severity"]))
     for found in worst_first[:MAX_FINDINGS]:
-        severity, code, message = (text_of(found[name]) for name in ("severity", "code", "message"))
-        meaning = text_of(CODES[found["code"]][1]) if found["code"] in CODES else ""
+        severity, code, message = (_text(found[name]) for name in ("severity", "code", "message"))
+        meaning = _text(CODES[found["code"]][1]) if found["code"] in CODES else ""
         head = f'<b>{severity}</b><code>{code}</code> <span class="faint">{meaning}</span>'
         items.append(f'<li class="{severity}">{head}<p>{message}</p></li>')
     if len(findings) > MAX_FINDINGS:
-        items.append(f"<li>{number_text(len(findings) - MAX_FINDINGS)} more findings are not listed.</li>")
-    return panel("Findings", f'<ul class="findings">{"".join(items)}</ul>{notes}')
+        items.append(f"<li>{len(findings) - MAX_FINDINGS:,} more findings are not listed.</li>")
+    return _panel("Findings", f'<ul class="findings">{"".join(items)}</ul>{notes}')
 
 
-def _rad(rad: Mapping[str, Any]) -> str:
-    rows = []
-    for name, found in (rad.get("properties") or {}).items():
-        ends = [number_text(found[end]) for end in ("min", "max") if found.get(end) is not None]
-        share = f"{100 * found['share']:.1f} %"
-        cells = [text_of(found["encoding"]), size_text(found["bytes"]), share, " to ".join(ends)]
-        rows.append([text_of(name), *cells, bar(found["share"])])
-    head = ("Property", "Encoding", "Size", "Share", "Range", "")
-    properties = table_of(head, rows, "As stored, in all chunks.") if rows else ""
-    facts = [
-        ["Chunks", "files of their own" if rad.get("chunked") else "in one file"],
-        ["Header", size_text(rad["header_bytes"])],
-        ["Header and first chunk", size_text(rad["first_bytes"])],
+def _part(name: str, part: Mapping[str, Any]) -> str:
+    """Return the panels of a part of a report: a table for each list or group in it, and one of the other values."""
+    wide: list[str] = []
+    panels: list[str] = []
+    facts = []
+    beside = panels if name in ("rad", "tree") else wide
+    for key, value in part.items():
+        title, caption = TABLES.get((name, key), (_label(key), ""))
+        if (name, key) == ("tree", "levels") and part.get("levels_left_out"):
+            caption += f" {part['levels_left_out']:,} greater depths are not listed."
+        if not value and not isinstance(value, int):
+            continue
+        if isinstance(value, list):
+            beside.append(_panel(title, _rows(((str(at), row) for at, row in enumerate(value)), caption)))
+        elif key == "children":
+            groups = children_groups(value)
+            most = max(count for _, count in groups)
+            rows = [[group, f"{count:,}", _bar(count / most)] for group, count in groups]
+            head = ("Children", "Inner nodes", "")
+            panels.append(_panel(title, _table(head, rows, "Inner nodes by number of children.")))
+        elif key in ("box", "box_98", "bound"):
+            edges = [high - low for low, high in zip(value["min"], value["max"], strict=True)]
+            ends = {"from": value["min"], "to": value["max"], "extent": edges}.items()
+            rows = [[end, *(_shown("", float(number)) for number in numbers)] for end, numbers in ends]
+            panels.append(_panel(title, _table(("", "x", "y", "z"), rows, "World units.")))
+        elif isinstance(value, Mapping) and all(isinstance(each, Mapping) for each in value.values()):
+            beside.append(_panel(title, _rows(value.items(), caption)))
+        elif name != "tree":  # whose values are among the key figures
+            facts.append([_label(key), _shown(key, value)])
+    if facts:
+        panels.append(_panel(PARTS[name], _table(("", ""), facts, "")))
+    return "\n".join([*wide, f'<div class="two">{"".join(panels)}</div>' if panels else ""])
+
+
+def _rows(rows: Iterable[tuple[str, Mapping[str, Any]]], caption: str) -> str:
+    """Return a table with a column for each key, and bars of shares or counts."""
+    rows = list(rows)
+    counted = "nodes" if "nodes" in rows[0][1] else "splats"
+    most = max(row.get(counted, 0) for _, row in rows) or 1
+    cells: list[dict[str, str]] = []
+    bars: list[str] = []
+    for _, row in rows:
+        flat: dict[str, str] = {}
+        for key, value in row.items():
+            inner = value if isinstance(value, Mapping) else {"": value}
+            flat |= {f"{key} {end}".strip(): _shown(key, each) for end, each in inner.items() if each is not None}
+        shares = [row["share"]] if row.get("share") is not None else []
+        if counted in row:
+            leaves = row["leaves"] if counted == "nodes" else 0
+            shares = [(row[counted] - leaves) / most, leaves / most]
+        cells.append(flat)
+        bars.append(_bar(*shares) if shares else "")
+    columns = list(dict.fromkeys(name for flat in cells for name in flat))
+    key = '<span class="key">inner</span> <span class="key soft">leaves</span>' if counted == "nodes" else ""
+    ends = [[each] if any(bars) else [] for each in bars]
+    body = [
+        [_text(name), *(flat.get(column, NONE) for column in columns), *end]
+        for (name, _), flat, end in zip(rows, cells, ends, strict=True)
     ]
-    if rad.get("chunk_bytes"):
-        sizes = [size_text(rad["chunk_bytes"][name]) for name in ("min", "median", "max")]
-        facts.append(["Smallest, median and largest chunk", ", ".join(sizes)])
-    if rad.get("palette"):
-        facts.append(["Palette of SH", f"{number_text(rad['palette'])} entries"])
-    facts += [[text_of(name), text_of(value)] for name, value in (rad.get("ranges") or {}).items()]
-    comment = f"<p>{text_of(rad['comment'])}</p>" if rad.get("comment") else ""
-    stored = table_of(("RAD", ""), facts, "As its header says.")
-    return f'<div class="two">{panel("Properties", properties)}{panel("Container", stored + comment)}</div>'
+    return _table(("", *map(_label, columns), *([key] if any(bars) else [])), body, caption)
 
 
-def _tree(tree: Mapping[str, Any]) -> str:
-    levels = tree.get("levels") or ()
-    most = max((level["nodes"] for level in levels), default=0) or 1
-    rows = []
-    for number, level in enumerate(levels):
-        bars = bar((level["nodes"] - level["leaves"]) / most, level["leaves"] / most)
-        rows.append([f"{number}", *(number_text(level[name]) for name in ("nodes", "leaves", "size")), bars])
-    key = '<span class="key">inner</span> <span class="key soft">leaves</span>'
-    caption = "Depth: edges from the root. Size: geometric mean of the feature sizes, world units."
-    if tree.get("levels_left_out"):
-        caption += f" {number_text(tree['levels_left_out'])} greater depths are not listed."
-    table = table_of(("Depth", "Nodes", "Leaves", "Size", key), rows, caption) if rows else ""
-    groups = children_groups(tree.get("children") or {})
-    most = max((count for _, count in groups), default=0) or 1
-    rows = [[name, number_text(count), bar(count / most)] for name, count in groups]
-    children = table_of(("Children", "Inner nodes", ""), rows, "Inner nodes by number of children.") if rows else ""
-    return f'<div class="two">{panel("Nodes by depth", table)}{panel("Children", children)}</div>'
+def _label(key: str) -> str:
+    return LABELS.get(key) or _text(key[:1].upper() + key[1:].replace("_", " "))
 
 
-def _values(values: Mapping[str, Any]) -> str:
-    quantities = values.get("quantities") or {}
-    columns = list(dict.fromkeys(name for summary in quantities.values() for name in summary))
-    rows = [[text_of(name), *(number_text(row.get(column)) for column in columns)] for name, row in quantities.items()]
-    table = table_of(["", *map(text_of, columns)], rows, "Without numbers that are not finite.") if rows else ""
-    boxes = []
-    for name, what in (("box", "all centres"), ("box_98", "1 % to 99 %")):
-        box = values.get(name)
-        if box:
-            edges = [high - low for low, high in zip(box["min"], box["max"], strict=True)]
-            for end, numbers in (("from", box["min"]), ("to", box["max"]), ("extent", edges)):
-                boxes.append([f"{what}, {end}", *(number_text(float(number)) for number in numbers)])
-    extent = table_of(("", "x", "y", "z"), boxes, "World units.") if boxes else ""
-    counts = (
-        ("with a number that is not finite", "non_finite"),
-        ("with a negative scale", "negative_scale"),
-        ("of opacity 0", "zero_opacity"),
-        ("of scale 0", "zero_scale"),
-        ("of opacity above 1", "more_than_opaque"),
+def _shown(key: str, value: Any) -> str:
+    """Return a value of a report as HTML; its key tells sizes and shares from other numbers."""
+    if value is None:
+        return NONE
+    if isinstance(value, Mapping):
+        parts = {end: _shown(end if end.endswith("bytes") else key, each) for end, each in value.items()}
+        return ", ".join(f"{_text(end)} {part}" for end, part in parts.items())
+    if isinstance(value, str):
+        return _text(value)
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if key.endswith("bytes"):
+        return format_size(value)
+    if key == "share":
+        return percent_of(value)
+    if isinstance(value, int):
+        return f"{value:,}"
+    return f"{value:,.4g}" if abs(value) < 1e6 else f"{value:.4g}"
+
+
+def _text(value: object) -> str:
+    """Escape a text for a page; characters that HTML or UTF-8 cannot hold are replaced."""
+    plain = str(value).encode("utf-8", "replace").decode("utf-8")
+    return escape("".join(mark if mark.isprintable() or mark in "\n\t" else "\ufffd" for mark in plain))
+
+
+def _panel(title: str, content: str) -> str:
+    return f'<section class="panel"><h3>{title}</h3>\n{content}\n</section>' if content else ""
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]], caption: str) -> str:
+    """Return a table of cells of HTML; the first cell of each row is its heading."""
+    columns = "".join(f'<th scope="col">{cell}</th>' for cell in head)
+    lines = (f'<tr><th scope="row">{row[0]}</th>{"".join(map(_cell, row[1:]))}</tr>' for row in rows)
+    body = "\n".join(lines)
+    return (
+        f'<div class="scroll" tabindex="0"><table><caption>{caption}</caption>\n<thead><tr>{columns}</tr></thead>\n'
+        f"<tbody>\n{body}\n</tbody></table></div>"
     )
-    degenerate = [[what, number_text(values[name])] for what, name in counts if name in values]
-    out_of_range = table_of(("Splats", "Count"), degenerate, "Among all splats or nodes.") if degenerate else ""
-    side = f"{panel('Box', extent)}{panel('Unusual values', out_of_range)}"
-    return f'{panel("Values", table)}\n<div class="two">{side}</div>'
+
+
+def _cell(content: str) -> str:
+    return f'<td class="wide">{content}</td>' if content.startswith('<div class="track"') else f"<td>{content}</td>"
+
+
+def _bar(*shares: float) -> str:
+    """Return bars of shares, 0..1, side by side, for a cell of a table whose other cells have the numbers."""
+    parts = "".join(
+        f'<i class="of{n}" style="width:{100 * share:.2f}%"></i>' for n, share in enumerate(shares) if share
+    )
+    return f'<div class="track" aria-hidden="true">{parts}</div>'
+
+
+def _picture(picture: DescribedPicture | None, *, small: bool = False) -> str:
+    if picture is None:
+        return ""
+    data, words = base64.b64encode(picture.png).decode("ascii"), picture.description
+    image = f'<img alt="Drawing of {_text(words.partition(";")[0])}" src="data:image/png;base64,{data}">'
+    kind = ' class="small"' if small else ""
+    return f"<figure{kind}>{image}<figcaption>{_text(words)}</figcaption></figure>"
 
 
 def _histograms(histograms: Mapping[str, Histogram]) -> str:
     parts = []
     for name, counted in histograms.items():
-        chart = histogram_chart(counted, name)
         beyond = ((counted.below, "below"), (counted.above, "above"), (counted.not_finite, "not finite"))
         remarks = ["bins of equal ratios"] * counted.log + [f"{count:,} {where}" for count, where in beyond if count]
         meaning = values.QUANTITIES[name].meaning if name in values.QUANTITIES else ""
         said = "; ".join(filter(None, [meaning, *remarks]))
-        head = f'<h4>{text_of(name)}</h4><p class="faint">{text_of(said)}</p>'
-        parts.append(f"<div>{head}{chart or '<p>no numbers</p>'}</div>")
-    return panel("Histograms", f'<div class="charts">{"".join(parts)}</div>' if parts else "")
+        head = f'<h4>{_text(name)}</h4><p class="faint">{_text(said)}</p>'
+        parts.append(f"<div>{head}{_chart(counted, name) or '<p>no numbers</p>'}</div>")
+    return _panel("Histograms", f'<div class="charts">{"".join(parts)}</div>' if parts else "")
+
+
+def _chart(histogram: Histogram, name: str) -> str:
+    """Return a histogram as a bar chart; an empty text if it has no numbers."""
+    counts = [int(count) for count in histogram.counts]
+    if not counts:
+        return ""
+    names = edge_names(histogram.edges)
+    tooltips = [f"{low} to {high}: {count:,}" for low, high, count in zip(names, names[1:], counts, strict=False)]
+    at = np.unique(np.linspace(0, len(counts), LABELLED).round().astype(int))
+    labels = [(float(place), f"{histogram.edges[place]:.3g}") for place in at] if len(counts) > 1 else [(0.5, names[0])]
+    most, base, room, step = max(counts), HEIGHT - BELOW, HEIGHT - ABOVE - BELOW, WIDTH / len(counts)
+    gap, peak = min(2.0, step / 5), tooltips[int(np.argmax(counts))]
+    summary = f"Histogram of {name}: {sum(counts):,} numbers from {names[0]} to {names[-1]}, most at {peak}"
+    parts = [
+        f'<svg class="chart" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{_text(summary)}">',
+        f'<text class="faint" x="0" y="{ABOVE - 5}">{most:,}</text>',
+        f'<line class="line" x1="0" y1="{ABOVE}" x2="{WIDTH}" y2="{ABOVE}"/>',
+    ]
+    for number, (count, tooltip) in enumerate(zip(counts, tooltips, strict=True)):
+        height = max(1.0, room * count / most) if count else 0.0  # a count above 0 has a visible bar
+        x, y = number * step + gap / 2, base - height
+        parts.append(f'<g class="bar"><title>{_text(tooltip)}</title>')
+        parts.append(f'<rect class="hit" x="{number * step:.2f}" y="{ABOVE}" width="{step:.2f}" height="{room}"/>')
+        parts.append(f'<rect x="{x:.2f}" y="{y:.2f}" width="{step - gap:.2f}" height="{height:.2f}"/></g>')
+    parts.append(f'<line class="base" x1="0" y1="{base}" x2="{WIDTH}" y2="{base}"/>')
+    for place, text in labels:
+        x = place * step
+        anchor = "start" if x < 0.06 * WIDTH else "end" if x > 0.94 * WIDTH else "middle"
+        parts.append(f'<text class="faint" x="{x:.1f}" y="{HEIGHT - 4}" text-anchor="{anchor}">{_text(text)}</text>')
+    return "".join([*parts, "</svg>"])
+
+
+def children_groups(children: Mapping[str, int]) -> list[tuple[str, int]]:
+    """Return numbers of nodes by their number of children: first single numbers, then ranges that double."""
+    if not children:
+        return []
+    most = max(int(number) for number in children)
+    ranges = [(number, number) for number in range(1, min(SINGLE_CHILDREN, most) + 1)]
+    while ranges[-1][1] < most:
+        ranges.append((ranges[-1][1] + 1, 2 * ranges[-1][1]))
+    ends = [high for _, high in ranges]
+    counts = [0] * len(ranges)
+    for number, count in children.items():
+        counts[bisect_left(ends, int(number))] += count
+    names = [f"{low}" if low == high else f"{low:,} to {high:,}" for low, high in ranges]
+    return list(zip(names, counts, strict=True))

@@ -32,11 +32,11 @@ def percent_of(share: float, digits: int = 3) -> str:
 
 
 def format_size(size: float) -> str:
-    """Return a number of bytes as "12.3 GB", "350 MB" or "2 kB", of powers of 1000."""
-    for name, power in (("GB", 10**9), ("MB", 10**6)):
-        if size >= power:
-            return f"{size / power:,.1f} {name}" if size < 10 * power or name == "GB" else f"{size / power:,.0f} {name}"
-    return f"{size / 1000:.0f} kB"
+    """Return a number of bytes as "12.3 GB", "2.9 MB", "0.1 MB" or "2.0 kB", of powers of 1000."""
+    for name, power, least in (("GB", 1e9, 1e9), ("MB", 1e6, 1e5)):
+        if size >= least:
+            return f"{size / power:,.1f} {name}"
+    return f"{size / 1e3:.1f} kB"
 
 
 def format_duration(seconds: float) -> str:

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli.figures.tree_plot import DescribedPicture
-from sparklod_cli.inspection.html import FileSection, page
-from sparklod_cli.inspection.html_parts import children_groups
+from sparklod_cli.inspection.html import FileSection, children_groups, page
 from sparklod_cli.inspection.report import ReportSettings, inspect
 from sparklod_cli.inspection.values import histogram_of, names_of
 from sparklod_cli.tables.histograms import histogram
@@ -126,7 +125,7 @@ def test_a_page_has_the_figures_of_its_report() -> None:
         "scene-lod.spz",
         "SPZ 3 LoD",
         "5,004",
-        "123.5 kB",
+        "0.1 MB",
         "24.7 bytes a node",
         "12.5 %",
         "Growth 1 nodes per leaf",

@@ -92,7 +92,14 @@ def test_a_person_reads_what_is_stored_how(tmp_path: Path, capsys: Capture) -> N
 def test_the_page_has_the_properties(tmp_path: Path) -> None:
     report, _ = inspect(PALETTE.write(tmp_path / "a.rad"), ReportSettings())
     text = page([FileSection(report.as_dict())])
-    for part in ("Properties", "ln_0r8", "sh2_code", "Palette of SH", "24 entries", "Header and first chunk"):
+    for part in (
+        "Properties",
+        "ln_0r8",
+        "sh2_code",
+        "Entries of the palette of SH",
+        "<td>24</td>",
+        "Size needed for a first picture",
+    ):
         assert part in text
 
 

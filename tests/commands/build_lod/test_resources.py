@@ -70,7 +70,7 @@ def test_the_default_memory_is_a_share_of_what_is_available(
 
 def test_too_little_memory_is_an_error_that_says_how_much_is_enough(tmp_path: Path, capsys: Capture) -> None:
     assert build(DEMO, "-o", tmp_path / "a.spz", "--memory", "20M") == 1
-    words = r"20 MB of memory is too little even out of core; give --memory (.*) or more"
+    words = r"20.0 MB of memory is too little even out of core; give --memory (.*) or more"
     found = re.search(words, capsys.readouterr().err)
     assert found is not None
     assert build(DEMO, "-o", tmp_path / "a.spz", "--memory", found[1]) == 0
