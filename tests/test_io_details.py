@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sparklod_cli.bake.identity import files_of
 from sparklod_cli.io import companions, read_parts, read_scene
 from sparklod_cli.io.details import detail_files, detail_sink
-from sparklod_cli.io.identity import files_of
 from sparklod_cli.io.local_files import leads_away
 from sparklod_cli.system import atomic
 from sparklod_cli.system.addresses import Address

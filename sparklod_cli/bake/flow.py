@@ -149,10 +149,10 @@ def scratch_folder(source: Source, target: Place, settings: BakeSettings, parent
         parent: folder for the scratch folders of several bakes; None for the folder of the output.
     """
     if target == DASH:
-        from .fingerprint import source_fingerprint
+        from .identity import BakeIdentity
 
         parent = parent or Path(tempfile.gettempdir())
-        return parent / f"standard-output-{source_fingerprint(source, settings).digest[:8]}{SCRATCH}"
+        return parent / f"standard-output-{BakeIdentity.of(source, settings).digest[:8]}{SCRATCH}"
     short = target.name if len(os.fsencode(target.name)) <= NAME_BYTES else f"output-{_digest(target.name)}"
     if parent is None:
         return target.parent / f"{short}{SCRATCH}"

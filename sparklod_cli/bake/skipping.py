@@ -1,8 +1,7 @@
-"""Bakes that need not be done again, as their output is there: `--skip-existing`.
+"""Bakes that are skipped because their output exists: `--skip-existing`.
 
-A file beside the output, NAME.sparklod.json, has the fingerprint of the output, with a digest of all that each input
-held, and a digest of each file of the output. Dates only save reading files that nobody has touched since; with
-`verify`, all are read.
+A file beside the output, NAME.sparklod.json, has the identity of the bake, with a digest of each input, and a digest of
+each file of the output. Dates only save reading files that nobody has touched since; with `verify`, all are read.
 """
 
 from __future__ import annotations
@@ -12,132 +11,109 @@ import json
 from pathlib import Path
 from typing import Any
 
-from ..io.identity import Identity, content_of, files_of, identity_of, stamp_of
+from ..io.reading import readable
 from ..io.writing import check_writable, sink
 from ..system.addresses import Address, Place, size_of
 from ..system.errors import OutputError, UnreadableError
 from ..system.untrusted import parse_json
-from .fingerprint import Fingerprint, files_named_in, settings_of
 from .flow import bake, has_published
+from .identity import BakeIdentity, content_of, files_of
 from .records import Baked
 from .settings import BakeSettings, Resources
-from .sources import Source, placement_of, places_of
+from .sources import Source
 
-#: Suffix of the file beside an output, and the most bytes of it that are read.
+#: Suffix of the file beside an output, and the largest size that is read.
 SUFFIX, MAX_BYTES = ".sparklod.json", 1 << 24
 
 
 def bake_unless_there(
     source: Source, target: Place, settings: BakeSettings, *, verify: bool = False, overwrite: bool = False, **how: Any
 ) -> Baked | None:
-    """Bake as `bake` does, and notes of what; None where the output of the same fingerprint is there.
+    """Bake as `bake` does, and record the identity of the bake; None if the output of the same identity exists.
 
     Args:
-        verify: read all of the inputs and of the output, also where size and date are those of the last bake.
+        verify: read all of the inputs and of the output, also if their sizes and dates are those of the last bake.
 
     Raises:
-        OutputError: the output is there and of another recipe, and `overwrite` is not set.
+        OutputError: the output exists, is not that of this bake, and `overwrite` is not set.
         SparklodError: as `bake`.
     """
     note_path = target.parent / f"{target.name}{SUFFIX}"
-    former = _former(note_path)
+    former, output = _read_note(note_path)
     if not target.exists():
         check_writable(target, overwrite=overwrite)  # before all inputs are read
-    files = [*(file for place in places_of(source) for file in files_of(place)), *files_named_in(settings)]
-    seen = [identity_of(file) for file in files]
-    fingerprint = _fingerprint(source, settings, files, seen, {} if verify else former)
-    if (
-        target.exists()
-        and not target.is_dir()
-        and not has_published(source, target, settings, how.get("resources") or Resources())
-    ):
-        differences = _differences(fingerprint, target, former, verify=verify)
+    identity = BakeIdentity.of(source, settings, whole=True, former=None if verify else former)
+    resources = how.get("resources") or Resources()
+    if target.exists() and not target.is_dir() and not has_published(source, target, settings, resources):
+        if former is None:
+            differences = ["there is no record of its inputs and settings"]
+        else:
+            differences = identity.differences(former) or _changed_files(target, output, verify=verify)
         if not differences:
             return None
         if not overwrite:
-            raise OutputError(f"{target} is there, but {'; '.join(differences)}; add --overwrite to bake it anew")
+            raise OutputError(f"{target} exists, but {'; '.join(differences)}; add --overwrite to bake it again")
     write_note = sink(note_path, overwrite=True)
-    _remove(note_path)  # so that it never stands beside an output that it does not tell of
+    try:
+        note_path.unlink(missing_ok=True)  # so that it never lies beside an output of another bake
+    except OSError as error:
+        raise OutputError(f"cannot replace {note_path}: {(error.strerror or str(error)).lower()}") from None
     baked = bake(source, target, settings, overwrite=overwrite, **how)
-    if baked.refine is not None and not baked.refine.is_complete:
-        return baked  # another run would get farther
-    inputs = [dataclasses.asdict(each) for each in seen]
-    note = {
-        "recipe": dataclasses.asdict(fingerprint),
-        "inputs": inputs,
-        "output": {_within(target, file): _record_of(file) for file in files_of(target)},
-    }
-    write_note([json.dumps(note, indent=1).encode() + b"\n"])
+    if baked.refine is None or baked.refine.is_complete:  # otherwise another run improves it further
+        files = {_within(target, file): _record_of(file) for file in files_of(target)}
+        note = {"bake": dataclasses.asdict(identity), "output": files}
+        write_note([json.dumps(note, indent=1).encode() + b"\n"])
     return baked
 
 
-def _former(note_path: Place) -> dict[str, Any]:
-    """Return what the file beside an output says; empty where there is none that can be understood."""
+def _read_note(path: Place) -> tuple[BakeIdentity | None, dict[str, Any]]:
+    """Read the identity of a bake and the records of its output files; None if missing or invalid."""
     try:
-        if size_of(note_path) > MAX_BYTES:
-            return {}
-        with note_path.open("rb") as file:
-            found = parse_json(file.read())
-        return {
-            "recipe": Fingerprint.from_record(found["recipe"]),
-            "inputs": [Identity(**each) for each in found["inputs"]],
-            "output": dict(found["output"]),
-        }
+        if size_of(path) <= MAX_BYTES:
+            with path.open("rb") as file:
+                note = parse_json(file.read())
+            return BakeIdentity.from_record(note["bake"]), dict(note["output"])
     except (OSError, ValueError, KeyError, TypeError):
-        return {}
+        pass
+    return None, {}
 
 
-def _fingerprint(
-    source: Source, settings: BakeSettings, files: list[Place], seen: list[Identity], former: dict[str, Any]
-) -> Fingerprint:
-    """Return the fingerprint of an output; inputs that are as they were last time are not read again."""
-    known = {}
-    if former and len(former["recipe"].inputs) == len(former["inputs"]):
-        known = dict(zip(former["inputs"], former["recipe"].inputs, strict=True))
-    inputs = tuple(known.get(each) or content_of(file) for file, each in zip(files, seen, strict=True))
-    return Fingerprint(inputs, tuple(each.name for each in seen), settings_of(settings) | placement_of(source))
-
-
-def _differences(fingerprint: Fingerprint, target: Place, former: dict[str, Any], *, verify: bool) -> list[str]:
-    """Return why an output that is there is not that of a recipe; empty where it is."""
-    if not former:
-        return ["nothing tells of what it was made"]
-    found = fingerprint.differences(former["recipe"])
-    if found:
-        return found
-    files, records = {_within(target, file): file for file in files_of(target)}, former["output"]
+def _changed_files(target: Place, records: dict[str, Any], *, verify: bool) -> list[str]:
+    """Return the files of an output that differ from their records, in words."""
+    files = {_within(target, file): file for file in files_of(target)}
     names = sorted({*files, *records})
     changed = (name for name in names if not _is_same(files.get(name), records.get(name), verify=verify))
     return [f"{name} was changed since it was baked" for name in changed]
 
 
-def _record_of(file: Place) -> dict[str, str]:
-    """Return size and date of a file of an output, and a digest of all of it; at an address, its version."""
-    stamp = stamp_of(file)
-    return {"stamp": stamp, "content": stamp if isinstance(file, Address) else content_of(file)}
-
-
 def _is_same(file: Place | None, record: Any, *, verify: bool) -> bool:
-    """Return True if a file of an output is the one of a record; it is read where size or date differ, or to verify."""
     if file is None or not isinstance(record, dict):
         return False
     try:
-        if not verify and record.get("stamp") == stamp_of(file):
+        if not verify and record.get("stamp") == _stamp_of(file):
             return True
         return bool(record.get("content") == _record_of(file)["content"])
     except UnreadableError:
         return False
 
 
+def _record_of(file: Place) -> dict[str, str]:
+    """Return the stamp and the digest of an output file; at an address, its version for both."""
+    stamp = _stamp_of(file)
+    return {"stamp": stamp, "content": stamp if isinstance(file, Address) else content_of(file)}
+
+
+def _stamp_of(file: Place) -> str:
+    """Return size and date of a file, or its version at an address, which change when it is written."""
+    with readable():
+        if isinstance(file, Address):
+            return file.version()
+        status = file.stat()
+        return f"{status.st_size} {status.st_mtime_ns}"
+
+
 def _within(target: Place, file: Place) -> str:
-    """Return the name of a file of an output, with the folder that it has beside it."""
+    """Return the path of an output file within the folder of the output."""
     if isinstance(target, Path) and isinstance(file, Path) and file.is_relative_to(target.parent):
         return file.relative_to(target.parent).as_posix()
     return file.name
-
-
-def _remove(place: Place) -> None:
-    try:
-        place.unlink(missing_ok=True)
-    except OSError as error:
-        raise OutputError(f"cannot replace {place}: {(error.strerror or str(error)).lower()}") from None

@@ -8,11 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from sparklod_cli.bake import skipping
+from sparklod_cli.bake import identity, skipping
 from sparklod_cli.bake.settings import BakeSettings
 from sparklod_cli.bake.skipping import SUFFIX, bake_unless_there
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
-from sparklod_cli.io import identity
 from sparklod_cli.lod.detail_rule import DetailSettings
 from sparklod_cli.system.errors import OutputError
 from tests.conftest import FIXTURES
@@ -48,7 +47,7 @@ def test_another_setting_is_refused_or_baked(scene: Path, tmp_path: Path) -> Non
     target = tmp_path / "a.spz"
     bake_unless_there(scene, target, SETTINGS)
     other = BakeSettings(base=1.3)
-    with pytest.raises(OutputError, match=r"a\.spz is there, but base was 1\.5 and is 1\.3; add --overwrite"):
+    with pytest.raises(OutputError, match=r"a\.spz exists, but base was 1\.5 and is 1\.3; add --overwrite"):
         bake_unless_there(scene, target, other)
     assert bake_unless_there(scene, target, other, overwrite=True) is not None
     assert bake_unless_there(scene, target, other, overwrite=True) is None
@@ -125,8 +124,9 @@ def test_nothing_is_read_whose_size_and_date_are_unchanged(
     target = tmp_path / "a.rad"
     bake_unless_there(scene, target, CHUNKED)
     read: list[str] = []
-    content_of = skipping.content_of
-    monkeypatch.setattr(skipping, "content_of", lambda file: read.append(file.name) or content_of(file))
+    content_of = identity.content_of
+    for module in (identity, skipping):
+        monkeypatch.setattr(module, "content_of", lambda file: read.append(file.name) or content_of(file))
     assert bake_unless_there(scene, target, CHUNKED) is None
     assert read == []
     assert bake_unless_there(scene, target, CHUNKED, verify=True) is None
@@ -136,7 +136,7 @@ def test_nothing_is_read_whose_size_and_date_are_unchanged(
 def test_an_input_whose_date_was_set_back_is_found_by_verify(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(identity, "PLACE_BYTES", 1)  # so that the sample misses the damage, as in a large file
+    monkeypatch.setattr(identity, "SAMPLE_BYTES", 1)  # so that the sample misses the damage, as in a large file
     target = tmp_path / "a.spz"
     bake_unless_there(scene, target, SETTINGS)
     damage(scene, keep_date=True)
@@ -145,14 +145,14 @@ def test_an_input_whose_date_was_set_back_is_found_by_verify(
         bake_unless_there(scene, target, SETTINGS, verify=True)
 
 
-@pytest.mark.parametrize("note", [None, "", "[]", "{}", '{"recipe": {"inputs": 3}}', "\x00"])
+@pytest.mark.parametrize("note", [None, "", "[]", "{}", '{"bake": {"inputs": 3}}', "\x00"])
 def test_an_output_without_a_note_is_not_trusted(scene: Path, tmp_path: Path, note: str | None) -> None:
     target = tmp_path / "a.spz"
     bake_unless_there(scene, target, SETTINGS)
     note_of(target).unlink()
     if note is not None:
         note_of(target).write_text(note)
-    with pytest.raises(OutputError, match="nothing tells of what it was made"):
+    with pytest.raises(OutputError, match="there is no record of its inputs and settings"):
         bake_unless_there(scene, target, SETTINGS)
     assert bake_unless_there(scene, target, SETTINGS, overwrite=True) is not None
     assert bake_unless_there(scene, target, SETTINGS) is None

@@ -117,7 +117,7 @@ def test_a_killed_bake_goes_on_and_ends_with_the_same_bytes(
     (folder,) = scratch.iterdir()
     assert folder.name.endswith(SUFFIX)
     said = baked(target, scratch, method, resume=True)
-    assert any("goes on with" in line for line in said)
+    assert any("continues with" in line for line in said)
     assert target.read_bytes() == whole[method, suffix]
     assert list(scratch.iterdir()) == []
 
@@ -136,12 +136,12 @@ def test_an_interrupted_bake_says_what_is_left_and_is_refused_or_begun_anew(
     out, _ = process.communicate()
     assert process.returncode == 130
     (folder,) = scratch.iterdir()
-    assert f"what is done stays in {folder}; run it again with --resume" in out
+    assert f"finished work stays in {folder}; run the command again with --resume" in out
     with pytest.raises(ScratchError, match="an interrupted bake left"):
         baked(target, scratch)
     with pytest.raises(ScratchError, match=r"results of another bake: .*method was 'quick' and is 'quality'"):
         baked(target, scratch, "quality", resume=True)
-    for path in (folder / "families").glob("*.result"):  # as if power had failed
+    for path in (folder / "families").glob("*.npy"):  # as if power had failed
         os.truncate(path, path.stat().st_size - 7)
     assert "that a failure damaged" in "".join(baked(target, scratch, resume=True))
     assert target.read_bytes() == whole["quick", ".rad"]

@@ -19,7 +19,7 @@ from ...system.progress import Progress
 from ...system.stdio import name_of
 from ...system.units import count_of, format_size
 from .. import estimate
-from ..fingerprint import source_fingerprint
+from ..identity import BakeIdentity
 from ..output import BakeOutput
 from ..records import Clock
 from ..settings import BakeSettings, Resources
@@ -60,7 +60,7 @@ def blocks_for(
     """
     memory = estimate.default_memory() if resources.memory is None else resources.memory
     if settings.files:
-        source_fingerprint(source, settings)  # reports a missing one at once
+        BakeIdentity.of(source, settings)  # reports a missing one at once
     if engine is not None:
         folder = absolute(folder)  # other processes work in folders of their own
     store = Store(folder)
@@ -84,7 +84,7 @@ def blocks_for(
     work = functools.partial(at_work, store, resume=resources.resume, overwrite=overwrite, say=say)
     if why is None:
         if is_left:  # refused, or removed
-            with work(source_fingerprint(source, settings), 0):
+            with work(BakeIdentity.of(source, settings), 0):
                 pass
         yield None
         return
@@ -102,7 +102,7 @@ def blocks_for(
         f" {block_splats:,}, scratch of about {format_size(scratch)} in {folder}"
     )
     with (
-        work(source_fingerprint(source, settings), block_splats) as block_splats,
+        work(BakeIdentity.of(source, settings), block_splats) as block_splats,
         _opened(source, folder, threads, engine) as stream,
     ):
         settings = dataclasses.replace(settings, rgba=settings.rgba and settings.rgba.absolute())

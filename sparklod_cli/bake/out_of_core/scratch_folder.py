@@ -1,12 +1,13 @@
-"""The scratch folder of a bake: whose it is, whether a run is at work in it, and what becomes of it at the end."""
+"""Scratch folder of a bake: ownership, locking and clean-up."""
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
+import json
 import os
 import shutil
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -16,110 +17,91 @@ from ...system.errors import FormatError, InvalidSplatsError, ScratchError, Unre
 from ...system.threads import ordered_map
 from ...system.units import count_of
 from ...system.untrusted import parse_json
-from ..fingerprint import Fingerprint
+from ..identity import BakeIdentity
 from .job import forget
 from .store import Store
 
-#: How the names of scratch folders end.
-SUFFIX = ".sparklod-scratch"
-
-#: The file that the run at work has locked.
+#: File that the running bake has locked.
 LOCK = "lock"
 
-#: Bytes of an output's name up to which that of its scratch folder has it.
-NAME_BYTES = 200
+#: Result with the identity of the bake, and its key.
+MANIFEST = "manifest"
 
-#: The name of the result that has the fingerprint.
-RECIPE = "recipe"
+#: Version of the names and contents of results; a bake of another version cannot be resumed.
+LAYOUT = 2
 
-#: Version of what results have and are called; one that differs cannot be gone on with.
-LAYOUT = 1
-
-#: Errors that another run of the same fingerprint would meet again.
+#: Errors that another run of the same bake would meet again.
 HOPELESS = (FormatError, InvalidSplatsError)
-
-
-@dataclass(frozen=True)
-class _Manifest:
-    """Manifest that identifies the bake a store belongs to."""
-
-    fingerprint: Fingerprint
-    block_splats: int
-
-    def put(self, store: Store) -> None:
-        """Write it as a result."""
-        text = np.frombuffer(self.fingerprint.to_json(), np.uint8)
-        store.put(RECIPE, {"recipe": text, "numbers": np.array([LAYOUT, self.block_splats], np.int64)})
-
-    @classmethod
-    def get(cls, store: Store) -> _Manifest | None:
-        """Return the one of a store; None where it has none that this version understands."""
-        try:
-            if not store.is_sound(RECIPE):
-                return None
-            found = store.get(RECIPE)
-            layout, block_splats = found["numbers"].tolist()
-            fingerprint = Fingerprint.from_record(parse_json(found["recipe"].tobytes()))
-            return cls(fingerprint, block_splats) if layout == LAYOUT else None
-        except (KeyError, ValueError):
-            return None
 
 
 @contextlib.contextmanager
 def at_work(
     store: Store,
-    fingerprint: Fingerprint,
+    identity: BakeIdentity,
     block_splats: int,
     *,
     resume: bool,
     overwrite: bool,
     say: Callable[[str], None],
 ) -> Iterator[int]:
-    """Yield a context in which a bake puts its results into a store, which is empty at the end if all went well.
+    """Lock a scratch folder for the tasks of a bake, and remove the folder at the end.
 
-    After an error that another run need not meet, or an interrupt, the results stay.
+    The results stay after an interrupt, and after an error that another run need not meet.
 
     Args:
-        block_splats: of the blocks that the scene is cut into, unless that was done before.
-        overwrite: remove them, unless `resume` is set.
-        say: told what was found, and what is left.
+        block_splats: size of a block, unless a resumed bake has another.
+        overwrite: remove results of an earlier bake, unless `resume` is set.
+        say: receives one-line messages for the user.
 
     Yields:
-        the splats of a block: those of the run that began.
+        size of a block; that of the bake that is resumed.
 
     Raises:
-        ScratchError: a run is at work there; there are results and neither `resume` nor `overwrite` is set, or they are
-            of another fingerprint; or the store cannot be written.
+        ScratchError: another run is at work there; there are results and neither `resume` nor `overwrite` is set, or
+            they belong to another bake; or the store cannot be written.
     """
-    folder = _folder_of(store)
-    with contextlib.nullcontext() if folder is None else locked(folder):  # an address cannot be locked
-        former = _Manifest.get(store)
-        names = [name for name in store.names() if name != RECIPE]
+    folder = store.folder
+    with locked(folder) if isinstance(folder, Path) else contextlib.nullcontext():  # an address cannot be locked
+        former = _read_manifest(store)
+        names = [name for name in store.names() if name != MANIFEST]
         if names and not resume and not overwrite:
             raise ScratchError(
-                f"an interrupted bake left {store}; go on with it by --resume, or begin anew with --overwrite"
+                f"an interrupted bake left {store}; continue it with --resume, or begin anew with --overwrite"
             )
         if names and resume:
-            block_splats = _resumed(store, fingerprint, former, names, say)
+            block_splats = _resume(store, identity, former, names, say)
         else:
             _clear(store)
-            _Manifest(fingerprint, block_splats).put(store)
+            manifest = {"layout": LAYOUT, "block_splats": block_splats, "bake": dataclasses.asdict(identity)}
+            store.put(MANIFEST, {MANIFEST: np.frombuffer(json.dumps(manifest).encode(), np.uint8)})
         try:
             yield block_splats
         except BaseException as error:
             hopeless = isinstance(error, HOPELESS) and not isinstance(error, UnreadableError)
-            if hopeless or store.names() in ([], [RECIPE]):
+            if hopeless or store.names() in ([], [MANIFEST]):
                 _clear(store)
             elif not isinstance(error, ScratchError):
-                say(f"what is done stays in {store}; run it again with --resume to go on")
+                say(f"finished work stays in {store}; run the command again with --resume to continue")
             raise
         _clear(store)
 
 
+def _read_manifest(store: Store) -> tuple[BakeIdentity, int] | None:
+    """Read the identity of the bake and the size of its blocks; None if missing or from another version."""
+    try:
+        if store.is_sound(MANIFEST):
+            manifest = parse_json(store.get(MANIFEST)[MANIFEST].tobytes())
+            if manifest["layout"] == LAYOUT:
+                return BakeIdentity.from_record(manifest["bake"]), int(manifest["block_splats"])
+    except (KeyError, TypeError, ValueError):
+        pass
+    return None
+
+
 def _clear(store: Store) -> None:
-    """Remove all that is there but the lock; last the files that tell what it is, for a run that is killed here."""
-    folder = _folder_of(store)
-    if folder is not None:
+    """Remove everything but the lock; the manifest last, for a run that is killed here."""
+    folder = store.folder
+    if isinstance(folder, Path):
         for path in sorted(folder.iterdir(), key=lambda path: (path.is_file(), path.name)):
             if path.is_dir():
                 shutil.rmtree(path, ignore_errors=True)
@@ -129,46 +111,37 @@ def _clear(store: Store) -> None:
         store.remove(name)
 
 
-def _resumed(
+def _resume(
     store: Store,
-    fingerprint: Fingerprint,
-    former: _Manifest | None,
+    identity: BakeIdentity,
+    former: tuple[BakeIdentity, int] | None,
     names: list[str],
     say: Callable[[str], None],
 ) -> int:
-    """Check that the results are those of the fingerprint, and remove damaged ones; return the splats of a block."""
+    """Check that the results belong to the bake, and remove damaged ones; return the size of a block."""
     if former is None:
         raise ScratchError(
-            f"nothing tells what the results in {store} are of; begin anew with --overwrite, without --resume"
+            f"{store} has no record of its bake's inputs and settings; begin anew with --overwrite, without --resume"
         )
-    differences = fingerprint.differences(former.fingerprint)
-    if differences:
+    if differences := identity.differences(former[0]):
         raise ScratchError(
             f"{store} has the results of another bake: {'; '.join(differences)}. Begin anew with --overwrite, without"
             " --resume"
         )
     sound = ordered_map(store.is_sound, names, 2)
     damaged = [name for name, is_sound in zip(names, sound, strict=True) if not is_sound]
-    if damaged:
-        for name in damaged:
-            store.remove(name)
-        forget(store, damaged)
+    forget(store, damaged)
     lost = f"; {count_of(len(damaged), 'other')} that a failure damaged will be made again" if damaged else ""
-    say(f"goes on with {count_of(len(names) - len(damaged), 'result')} in {store}{lost}")
-    return former.block_splats
-
-
-def _folder_of(store: Store) -> Path | None:
-    """Return the folder of a store on this machine."""
-    return store.folder if isinstance(store.folder, Path) else None
+    say(f"continues with {count_of(len(names) - len(damaged), 'result')} in {store}{lost}")
+    return former[1]
 
 
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Lock a folder for one run; it is made if need be, and removed if empty, as are its parents that were made.
+    """Lock a folder for one run; it and its parents are created if missing, and removed at the end if empty.
 
     Raises:
-        ScratchError: another run is at work there, it is nobody's scratch folder, or it cannot be made.
+        ScratchError: another run is at work there, it is not a scratch folder, or it cannot be created.
     """
     path = folder / LOCK
     with contextlib.ExitStack() as stack:
@@ -191,11 +164,11 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 def _opened_lock(path: Path) -> int:
-    """Open and lock the file for that, in a folder that is ours; raises `ScratchError` where it is taken."""
+    """Create and lock the file; raise `ScratchError` if another run has locked it, or the folder is not ours."""
     folder = path.parent
     with contextlib.suppress(FileNotFoundError):
         if not path.exists() and any(folder.iterdir()):
-            raise ScratchError(f"{folder} is no scratch folder of sparklod; move it, or choose another --scratch-dir")
+            raise ScratchError(f"{folder} is not a scratch folder ; move it, or choose another --scratch-dir")
     while True:
         folder.mkdir(parents=True, exist_ok=True)
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_CLOEXEC", 0), 0o666)
@@ -212,7 +185,7 @@ def _opened_lock(path: Path) -> int:
 
 
 def _remove_empty(path: Path) -> None:
-    """Remove a folder that has nothing but the file that is locked."""
+    """Remove a folder that holds only its lock."""
     with contextlib.suppress(OSError):
         if [*path.parent.iterdir()] == [path]:
             path.unlink()

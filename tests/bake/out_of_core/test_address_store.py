@@ -30,8 +30,8 @@ def test_it_has_the_bytes_of_a_folder(store: Store, tmp_path: Path) -> None:
     for each in (store, folder):
         each.put("stage/1", ARRAYS)
         assert each.names() == ["stage/1"]
-    (path,) = tmp_path.rglob("*.result")
-    with (store.folder / "stage/1.result").open() as file:
+    (path,) = tmp_path.rglob("*.npy")
+    with (store.folder / "stage/1.npy").open() as file:
         assert file.read() == path.read_bytes()
     assert store.traffic.written == folder.traffic.written > 1_200_000
 
@@ -54,14 +54,14 @@ def test_what_is_put_is_got(store: Store) -> None:
 
 def test_damage_is_found(store: Store) -> None:
     store.put("stage/1", ARRAYS)
-    object_of = store.folder / "stage/1.result"
+    object_of = store.folder / "stage/1.npy"
     with object_of.open() as file:
         data = bytearray(file.read())
     data[5_000] ^= 1
     object_of.write([data])
     again = Store(store.folder)
     assert again.has("stage/1") and not again.is_sound("stage/1")
-    with pytest.raises(ScratchError, match="damaged: its checksum does not match; run it again with --resume"):
+    with pytest.raises(ScratchError, match="damaged: its checksum does not match; run the command again with --resume"):
         again.get("stage/1")
 
 

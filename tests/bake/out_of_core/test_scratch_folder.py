@@ -11,16 +11,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sparklod_cli.bake.fingerprint import Fingerprint
 from sparklod_cli.bake.flow import SCRATCH, scratch_folder
-from sparklod_cli.bake.out_of_core.scratch_folder import LOCK, RECIPE, at_work
+from sparklod_cli.bake.identity import BakeIdentity, FileState
+from sparklod_cli.bake.out_of_core.scratch_folder import LOCK, MANIFEST, at_work
 from sparklod_cli.bake.out_of_core.store import Store
 from sparklod_cli.bake.settings import BakeSettings
 from sparklod_cli.system.errors import FormatError, ScratchError, UnreadableError
 from sparklod_cli.system.stdio import DASH
 from tests.conftest import ROOT
 
-A = Fingerprint(("content a",), ("a.ply",), {"method": "quick", "base": 1.5})
+A = BakeIdentity((FileState("a.ply", 3, 5, "sample a"),), {"method": "quick", "base": 1.5})
 VALUE = {"value": np.arange(5)}
 
 
@@ -38,11 +38,11 @@ class Run:
 
     @contextlib.contextmanager
     def begun(
-        self, *, resume: bool = False, overwrite: bool = False, fingerprint: Fingerprint = A, block_splats: int = 100
+        self, *, resume: bool = False, overwrite: bool = False, identity: BakeIdentity = A, block_splats: int = 100
     ) -> Iterator[int]:
         with at_work(
             self.store,
-            fingerprint,
+            identity,
             block_splats,
             resume=resume,
             overwrite=overwrite,
@@ -73,11 +73,11 @@ def test_nothing_is_left_of_a_run_that_ended_well(store: Store, tmp_path: Path) 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), MemoryError(), UnreadableError("x"), SystemExit()])
 def test_results_stay_after_an_interruption_and_are_gone_on_with(store: Store, error: BaseException) -> None:
     run = Run(store).interrupted(error)
-    assert run.said == [f"what is done stays in {store}; run it again with --resume to go on"]
+    assert run.said == [f"finished work stays in {store}; run the command again with --resume to continue"]
     run = Run(store)
     with run.begun(resume=True, block_splats=50) as block_splats:
         assert block_splats == 100  # that of the run that began
-        assert run.said == [f"goes on with 2 results in {store}"]
+        assert run.said == [f"continues with 2 results in {store}"]
         assert run.store.has("first")
         assert run.store.has("second")
     assert not store.folder.exists()
@@ -103,14 +103,14 @@ def test_leftover_results_are_named_and_refused(store: Store) -> None:
         Run(store).begun(),
     ):
         pass
-    assert store.names() == ["first", RECIPE, "second"]
+    assert store.names() == ["first", MANIFEST, "second"]
 
 
 def test_overwrite_begins_anew(store: Store) -> None:
     Run(store).interrupted()
     with Run(store).begun(overwrite=True, block_splats=50) as block_splats:
         assert block_splats == 50
-        assert store.names() == [RECIPE]
+        assert store.names() == [MANIFEST]
 
 
 def test_resume_without_results_begins(store: Store) -> None:
@@ -121,23 +121,23 @@ def test_resume_without_results_begins(store: Store) -> None:
 @pytest.mark.parametrize(
     ("other", "words"),
     [
-        (Fingerprint(("content b",), ("b.ply",), A.settings), r"b\.ply changed since"),
-        (Fingerprint(A.inputs, A.names, {"method": "quality", "base": 1.5}), "method was 'quick' and is 'quality'"),
-        (Fingerprint((*A.inputs, "more"), ("a.ply", "c.ply"), A.settings), "it had 1 input files and has 2"),
-        (Fingerprint(A.inputs, A.names, {"method": "quick"}), "base was 1.5 and is None"),
+        (BakeIdentity((FileState("b.ply", 3, 5, "sample b"),), A.settings), r"b\.ply changed since"),
+        (BakeIdentity(A.inputs, {"method": "quality", "base": 1.5}), "method was 'quick' and is 'quality'"),
+        (BakeIdentity((*A.inputs, FileState("c.ply", 3, 5, "more")), A.settings), "it had 1 input files and has 2"),
+        (BakeIdentity(A.inputs, {"method": "quick"}), "base was 1.5 and is None"),
     ],
 )
 @pytest.mark.parametrize("overwrite", [False, True])
-def test_another_fingerprint_is_refused_with_what_differs(
-    store: Store, other: Fingerprint, words: str, overwrite: bool
+def test_another_identity_is_refused_with_what_differs(
+    store: Store, other: BakeIdentity, words: str, overwrite: bool
 ) -> None:
     Run(store).interrupted()
     with (
         pytest.raises(ScratchError, match=f"results of another bake: {words}"),
-        Run(store).begun(resume=True, overwrite=overwrite, fingerprint=other),
+        Run(store).begun(resume=True, overwrite=overwrite, identity=other),
     ):
         pass
-    assert store.names() == ["first", RECIPE, "second"]
+    assert store.names() == ["first", MANIFEST, "second"]
 
 
 def flip(path: Path) -> None:
@@ -149,18 +149,18 @@ def flip(path: Path) -> None:
 @pytest.mark.parametrize("damage", [flip, lambda path: path.write_bytes(path.read_bytes()[:-1])])
 def test_damaged_results_are_removed_and_told(store: Store, damage: Callable[[Path], None]) -> None:
     Run(store).interrupted()
-    damage(store.folder / "second.result")
+    damage(store.folder / "second.npy")
     run = Run(store)
     with run.begun(resume=True):
         assert not run.store.has("second")
         assert run.store.has("first")
-    assert run.said == [f"goes on with 1 result in {store}; 1 other that a failure damaged will be made again"]
+    assert run.said == [f"continues with 1 result in {store}; 1 other that a failure damaged will be made again"]
 
 
-def test_a_damaged_fingerprint_is_refused(store: Store) -> None:
+def test_a_damaged_manifest_is_refused(store: Store) -> None:
     Run(store).interrupted()
-    flip(store.folder / f"{RECIPE}.result")
-    with pytest.raises(ScratchError, match="nothing tells what the results"), Run(store).begun(resume=True):
+    flip(store.folder / f"{MANIFEST}.npy")
+    with pytest.raises(ScratchError, match="has no record of its bake"), Run(store).begun(resume=True):
         pass
 
 
@@ -168,7 +168,7 @@ def test_a_folder_of_somebody_else_is_refused(store: Store) -> None:
     store.folder.mkdir()
     (store.folder / "thesis.txt").write_text("mine")
     for how in ({}, {"overwrite": True}, {"resume": True}):
-        with pytest.raises(ScratchError, match="is no scratch folder"), Run(store).begun(**how):
+        with pytest.raises(ScratchError, match="is not a scratch folder"), Run(store).begun(**how):
             pass
     assert (store.folder / "thesis.txt").read_text() == "mine"
 

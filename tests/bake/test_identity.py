@@ -1,4 +1,4 @@
-"""The fingerprint of an output changes with whatever changes its bytes, and with nothing else."""
+"""The identity of a bake changes with whatever changes the bytes of its output, and with nothing else."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from sparklod_cli.bake.fingerprint import NO_PART, Fingerprint, source_fingerprint
+from sparklod_cli.bake.identity import NO_PART, BakeIdentity
 from sparklod_cli.bake.settings import BakeSettings
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
 from sparklod_cli.model.selection import Selection
@@ -37,8 +37,8 @@ def scene(tmp_path: Path) -> Path:
     return path
 
 
-def test_the_same_fingerprint_has_the_same_digest(scene: Path) -> None:
-    first, second = source_fingerprint(scene, SETTINGS), source_fingerprint(scene, BakeSettings(unused=("--up",)))
+def test_the_same_identity_has_the_same_digest(scene: Path) -> None:
+    first, second = BakeIdentity.of(scene, SETTINGS), BakeIdentity.of(scene, BakeSettings(unused=("--up",)))
     assert first == second
     assert first.digest == second.digest
     assert first.differences(second) == []
@@ -46,7 +46,7 @@ def test_the_same_fingerprint_has_the_same_digest(scene: Path) -> None:
 
 @pytest.mark.parametrize("name", OTHERS)
 def test_every_setting_is_part_of_it(scene: Path, name: str) -> None:
-    first, second = source_fingerprint(scene, SETTINGS), source_fingerprint(scene, OTHERS[name])
+    first, second = BakeIdentity.of(scene, SETTINGS), BakeIdentity.of(scene, OTHERS[name])
     assert first.digest != second.digest
     (difference,) = second.differences(first)
     assert difference.startswith(f"{name} was ")
@@ -54,37 +54,37 @@ def test_every_setting_is_part_of_it(scene: Path, name: str) -> None:
 
 def test_all_settings_are_named_once(scene: Path) -> None:
     names = {field.name for field in dataclasses.fields(BakeSettings)} - {*NO_PART}
-    assert {name.split(".")[0] for name in source_fingerprint(scene, SETTINGS).settings} == {*names, "sparklod"}
+    assert {name.split(".")[0] for name in BakeIdentity.of(scene, SETTINGS).settings} == {*names, "sparklod"}
 
 
 @pytest.mark.parametrize("at", [0, 100, -1])
-def test_another_content_is_another_fingerprint(scene: Path, at: int) -> None:
-    before, times = source_fingerprint(scene, SETTINGS), scene.stat()
+def test_another_content_is_another_identity(scene: Path, at: int) -> None:
+    before, times = BakeIdentity.of(scene, SETTINGS), scene.stat()
     data = bytearray(scene.read_bytes())
     data[at] ^= 1
     scene.write_bytes(data)
     os.utime(scene, ns=(times.st_atime_ns, times.st_mtime_ns))
-    assert source_fingerprint(scene, SETTINGS).differences(before) == [f"{scene} changed since"]
+    assert BakeIdentity.of(scene, SETTINGS).differences(before) == [f"{scene} changed since"]
 
 
 def test_a_file_of_another_time_is_another_input(scene: Path) -> None:
-    before = source_fingerprint(scene, SETTINGS)
+    before = BakeIdentity.of(scene, SETTINGS)
     os.utime(scene, ns=(0, 0))
-    assert source_fingerprint(scene, SETTINGS).digest != before.digest
+    assert BakeIdentity.of(scene, SETTINGS).digest != before.digest
 
 
 def test_the_name_of_a_file_does_not_matter(scene: Path) -> None:
-    before = source_fingerprint(scene, SETTINGS)
-    assert source_fingerprint(scene.rename(scene.with_name("moved.ply")), SETTINGS).digest == before.digest
+    before = BakeIdentity.of(scene, SETTINGS)
+    assert BakeIdentity.of(scene.rename(scene.with_name("moved.ply")), SETTINGS).digest == before.digest
 
 
 def test_colours_are_an_input(scene: Path, tmp_path: Path) -> None:
     colors = tmp_path / "colors.npy"
     colors.write_bytes(b"one")
     settings = BakeSettings(rgba=colors)
-    before = source_fingerprint(scene, settings)
+    before = BakeIdentity.of(scene, settings)
     colors.write_bytes(b"two")
-    assert source_fingerprint(scene, settings).differences(before) == [f"{colors} changed since"]
+    assert BakeIdentity.of(scene, settings).differences(before) == [f"{colors} changed since"]
 
 
 def test_files_that_an_input_names_are_inputs(tmp_path: Path) -> None:
@@ -92,20 +92,21 @@ def test_files_that_an_input_names_are_inputs(tmp_path: Path) -> None:
     folder.mkdir()
     (folder / "meta.json").write_text('{"version": 2, "means": {"files": ["means.webp"]}}')
     (folder / "means.webp").write_bytes(b"one")
-    before = source_fingerprint(folder, SETTINGS)
+    before = BakeIdentity.of(folder, SETTINGS)
     (folder / "means.webp").write_bytes(b"two")
-    assert source_fingerprint(folder, SETTINGS).differences(before) == [f"{folder / 'means.webp'} changed since"]
+    assert BakeIdentity.of(folder, SETTINGS).differences(before) == [f"{folder / 'means.webp'} changed since"]
 
 
 def test_it_can_be_written_and_read(scene: Path) -> None:
-    fingerprint = source_fingerprint(scene, OTHERS["transform.rotation"])
-    assert Fingerprint.from_record(json.loads(fingerprint.to_json())) == fingerprint
-    assert Fingerprint.from_record(json.loads(fingerprint.to_json())).digest == fingerprint.digest
-    for record in ({}, [], {"inputs": 3}, None):
+    identity = BakeIdentity.of(scene, OTHERS["transform.rotation"])
+    read = BakeIdentity.from_record(json.loads(json.dumps(dataclasses.asdict(identity))))
+    assert read == identity
+    assert read.digest == identity.digest
+    for record in ({}, [], {"inputs": 3}, {"inputs": [{}], "settings": {}}, None):
         with pytest.raises(ValueError, match=r"."):
-            Fingerprint.from_record(record)
+            BakeIdentity.from_record(record)
 
 
 def test_a_missing_input_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(UnreadableError, match="cannot be read: no such file"):
-        source_fingerprint(tmp_path / "none.ply", SETTINGS)
+        BakeIdentity.of(tmp_path / "none.ply", SETTINGS)
