@@ -23,7 +23,7 @@ from .settings import BakeSettings, Resources
 from .sources import Merged, Source, opened_source
 
 if TYPE_CHECKING:
-    from .out_of_core.tasks import Engine
+    from .out_of_core.job import Engine
 
 #: Suffix of scratch folders.
 SCRATCH = ".sparklod-scratch"

@@ -16,8 +16,7 @@ from ...system.optional import optional_import
 from ...system.python_process import check_current_folder, safe_path
 from ...system.threads import thread_count
 from ..estimate import default_memory
-from .cluster_engine import ClusterEngine
-from .cluster_pool import Connection
+from .cluster_engine import ClusterEngine, Connection
 
 #: Seconds that a scheduler, or the workers of a cluster, are waited for.
 PATIENCE = 30

@@ -1,49 +1,55 @@
-"""The order of the nodes of a tree, and where each of its windows finds them."""
+"""Order of the nodes of a tree out of core, and the windows of nodes that are gathered from the stages' results."""
 
 from __future__ import annotations
 
 import bisect
+import functools
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ...codecs.encoder import windows_of
+from ...codecs.validation import check_valid
 from ...lod.builders import BUILDERS
 from ...lod.chunk_order import MOST_FAMILIES, family_order
 from ...lod.families import band_order
 from ...lod.kernels.tree_links import find_limits
 from ...lod.stage_records import NO_FAMILY, STAGE_BITS
-from ...model.lod_tree import CHUNK_NODES
-from ...model.splats import FloatArray
+from ...model.lod_tree import CHUNK_NODES, LodTree
+from ...model.sh import degree_of, width_of
+from ...model.splats import COLUMNS, FloatArray, Splats
+from ...model.streams import NodeStream
 from ...system.progress import Progress
-from ...system.threads import blocks_of, on_threads
-from .job import ORDER, Job, families_of, window_of
+from ...system.threads import blocks_of, for_blocks, on_threads, ordered_map
+from .job import ORDER, ROOT, Job, encoded_of, families_of, window_of
 from .store import Store
 
-#: Nodes of a window that is gathered in one go, whole chunks: 30 MB without SH, 120 MB with SH of degree 3. Chosen.
+#: Nodes of a window, whole chunks: 30 MB without SH, 120 MB with SH of degree 3. Chosen.
 WINDOW_NODES = 8 * CHUNK_NODES
 
 #: Families whose keys are in memory at once: some 100 MB. Chosen.
 MERGED = 1 << 22
 
-#: Keys of so many families that are looked at to cut them in ranges of about as many. Chosen.
+#: Sampled keys for each `MERGED` families, by which ranges of families are balanced. Chosen.
 PROBES = 256
 
-#: A range of families of a stage: the stage, the first one and the end.
+#: Range of the families of a stage: stage, first family, end.
 Run = tuple[int, int, int]
 
 
 @dataclass(frozen=True, eq=False)
 class _Links:
-    """Links between F families, which are numbered stage by stage.
+    """Links between F families, numbered stage by stage.
 
     Attributes:
-        begin: (stages + 1,) number of the first family of each stage, and F.
-        count: (F,) children.
+        begin: (stages + 1,) first family of each stage, and F.
+        count: (F,) number of children.
         row: (F,) place of the first child among the nodes of its stage.
-        parent: (F,) family of the node whose children they are; -1 for the children of the root.
-        offset: (F,) place of that node in its family.
+        parent: (F,) family of the parent node; -1 for the children of the root.
+        offset: (F,) place of the parent node in its family.
         runs: of each stage, by batch.
     """
 
@@ -56,18 +62,18 @@ class _Links:
 
     @property
     def nodes(self) -> int:
-        """The root, and all children."""
+        """Number of nodes: the root, and all children."""
         return 1 + int(self.count.sum(dtype=np.int64))
 
     def starts(self, sequence: NDArray[np.uint32]) -> NDArray[np.uint32]:
-        """Return (F,) where the children of each family are, if families are in this order."""
+        """Return (F,) the place of the first child of each family, if families are in this sequence."""
         start = np.empty(len(sequence), np.uint32)
         ordered = self.count[sequence].astype(np.uint32)
         start[sequence] = np.cumsum(ordered, dtype=np.uint32) - ordered + np.uint32(1)
         return start
 
     def families_at(self, start: NDArray[np.uint32]) -> NDArray[np.int32]:
-        """Return (nodes,) the family of the children of each node, if families begin there; -1 for a leaf."""
+        """Return (nodes,) the family of the children of each node, for the places of `starts`; -1 for a leaf."""
         at = np.full(self.nodes, -1, np.int32)
         place = start[self.parent]
         place += self.offset
@@ -77,7 +83,7 @@ class _Links:
 
 
 def put_order(job: Job, *, threads: int, progress: Progress) -> None:
-    """Order the nodes; a task. Results: what each window is read by; at last the number of nodes and of levels."""
+    """Order the nodes; a task. Results: the plan of each window; then the number of nodes and of levels."""
     links = _links(job)
     levels = 1
     sequence = _by_key(job, links, progress)
@@ -99,37 +105,36 @@ def put_order(job: Job, *, threads: int, progress: Progress) -> None:
 
 
 def _by_key(job: Job, links: _Links, progress: Progress) -> NDArray[np.uint32]:
-    """Return (F,) the families by batch, and then by key."""
+    """Return (F,) the families sorted by batch, then by key."""
     sequence, done = np.empty(len(links.count), np.uint32), 0
-    for some in _merged(job.store, links.runs, links.begin):
-        sequence[done : done + len(some)] = some
-        done += len(some)
+    for families in _merged(job.store, links.runs, links.begin):
+        sequence[done : done + len(families)] = families
+        done += len(families)
         progress("ordering", done, 2 * len(sequence), "family")
     return sequence
 
 
 def _by_place(links: _Links, sequence: NDArray[np.uint32]) -> NDArray[np.int32]:
-    """Return (F,) the families in the order of their parents, in a tree whose families are in this sequence."""
+    """Return (F,) the families in the order of their parent nodes, if families are in this sequence."""
     at = links.families_at(links.starts(sequence))
     return at[at >= 0]
 
 
 def _links(job: Job) -> _Links:
-    """Read the families of all stages."""
     begin = np.cumsum([0, *job.families])
     total = int(begin[-1])
     count, row, offset = np.empty(total, np.uint16), np.empty(total, np.uint32), np.zeros(total, np.uint16)
     parent, runs = np.full(total, -1, np.int32), []
     for stage, length in enumerate(job.families):
-        found = job.store.get(families_of(stage), ["batch", "count", "family"])
+        families = job.store.get(families_of(stage), ["batch", "count", "family"])
         here = slice(begin[stage], begin[stage + 1])
-        count[here] = found["count"]
-        row[here] = np.cumsum(found["count"], dtype=np.int64) - found["count"]
-        runs.append(_runs_of(stage, found["batch"]))
-        inner = np.flatnonzero(found["family"] != NO_FAMILY)
-        family = found["family"][inner]
+        count[here] = families["count"]
+        row[here] = np.cumsum(families["count"], dtype=np.int64) - families["count"]
+        runs.append(_runs_of(stage, families["batch"]))
+        inner = np.flatnonzero(families["family"] != NO_FAMILY)
+        family = families["family"][inner]
         child = begin[family >> STAGE_BITS] + (family & ((1 << STAGE_BITS) - 1))
-        mine = np.repeat(np.arange(length, dtype=np.int32), found["count"])[inner]
+        mine = np.repeat(np.arange(length, dtype=np.int32), families["count"])[inner]
         parent[child] = begin[stage] + mine
         offset[child] = inner - row[here][mine]
     return _Links(begin, count, row, parent, offset, runs)
@@ -138,10 +143,10 @@ def _links(job: Job) -> _Links:
 def _arranged(
     job: Job, links: _Links, by_place: NDArray[np.int32], progress: Progress
 ) -> tuple[int, NDArray[np.uint32] | None]:
-    """Return the levels of the tree, and the order of its families in the output, if that is not the builder's.
+    """Return the number of levels, and the sequence of families in the output; None for the builder's.
 
     Args:
-        by_place: (F,) the families in the order of the nodes whose children they are.
+        by_place: (F,) the families in the order of their parent nodes.
     """
     place = np.empty(len(by_place), np.int32)
     place[by_place] = np.arange(len(by_place), dtype=np.int32)
@@ -164,7 +169,7 @@ def _arranged(
 
 
 def _of_all(job: Job, key: str, place: NDArray[np.int32]) -> FloatArray:
-    """Return a column of the families of all stages, each at its place."""
+    """Read a column of the families of all stages, each family at its place."""
     column, begin = np.empty((len(place), *job.store.shape(families_of(0), key)[1:]), np.float32), 0
     for stage, length in enumerate(job.families):
         column[place[begin : begin + length]] = job.store.get(families_of(stage), [key])[key]
@@ -181,11 +186,11 @@ def _put_window(
     start: NDArray[np.uint32],
     at: NDArray[np.int32],
 ) -> None:
-    """Put what a window is read by.
+    """Put the plan of a window.
 
-    Families whose children are in it, as far as they are, stage by stage: `stages`, where those of each stage begin,
-    `row`, `count` and `target`, the first one's place in the window. Its nodes with children: `owner`, places in the
-    window, `child_start`, `child_count`.
+    Families overlapping the window, grouped by stage: `stages`, the first one of each stage; for each family, `row`,
+    the place of its children among the nodes of their stage, `count`, how many are in the window, and `target`, their
+    place there. Nodes with children: `owner`, places in the window; `child_start`; `child_count`.
     """
     begin, end = (
         bisect.bisect_right(sequence, place, key=lambda number: int(start[number]))
@@ -214,30 +219,30 @@ def _put_window(
 
 
 def _runs_of(stage: int, batch: NDArray[np.int32]) -> dict[int, Run]:
-    """Return the families of each batch of a stage."""
+    """Return the families of a stage by batch."""
     ends = [*(np.flatnonzero(np.diff(batch)) + 1).tolist(), len(batch)]
     return {int(batch[a]): (stage, a, b) for a, b in zip([0, *ends], ends, strict=False) if a < b}
 
 
 def _merged(store: Store, batches: list[dict[int, Run]], begin: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
-    """Yield the numbers of all families in the order of the tree, some at a time."""
+    """Yield the numbers of all families by batch and key, in pieces that fit into memory."""
     for batch in sorted({batch for runs in batches for batch in runs}):
         runs = [runs[batch] for runs in batches if batch in runs]
         words = max(store.shape(families_of(stage), "key")[1] for stage, _, _ in runs)
-        for some in _ranges(store, runs, words):
-            key = np.concatenate([_keys(store, run, words) for run in some])
-            number = np.concatenate([np.arange(start, stop) + begin[stage] for stage, start, stop in some])
+        for parts in _ranges(store, runs, words):
+            key = np.concatenate([_keys(store, run, words) for run in parts])
+            number = np.concatenate([np.arange(start, stop) + begin[stage] for stage, start, stop in parts])
             yield number[np.lexsort(key.T[::-1])]
 
 
 def _ranges(store: Store, runs: list[Run], words: int) -> Iterator[list[Run]]:
-    """Yield runs cut at the same keys, so that each range is small enough to be sorted at once."""
+    """Yield runs cut at common keys, each range small enough to be sorted at once."""
     pieces = -(-sum(stop - start for _, start, stop in runs) // MERGED)
     if pieces == 1:
         yield runs
         return
     ends = np.concatenate([_keys(store, (stage, k, k + 1), words) for stage, a, b in runs for k in (a, b - 1)])
-    # The first word in which they differ decides: families that are the same there stay together.
+    # Cut by the first word that differs: families with the same word stay together.
     word = int(np.argmax((ends != ends[0]).any(axis=0)))
     columns = [_keys(store, run, words)[:, word].copy() for run in runs]
     probes = np.sort(np.concatenate([column[:: max(1, MERGED // PROBES)] for column in columns]))
@@ -245,12 +250,130 @@ def _ranges(store: Store, runs: list[Run], words: int) -> Iterator[list[Run]]:
     cuts = [[0, *np.searchsorted(column, pivots).tolist(), len(column)] for column in columns]
     for piece in range(len(pivots) + 1):
         parts = [(run[0], run[1] + cut[piece], run[1] + cut[piece + 1]) for run, cut in zip(runs, cuts, strict=True)]
-        if some := [part for part in parts if part[1] < part[2]]:
-            yield some
+        if parts := [part for part in parts if part[1] < part[2]]:
+            yield parts
 
 
 def _keys(store: Store, run: Run, words: int) -> NDArray[np.uint64]:
-    """Return the keys of a run, of so many words."""
+    """Read the keys of a run, padded to this many words."""
     stage, start, stop = run
     key = store.rows(families_of(stage), "key", start, stop)
     return np.pad(key, ((0, 0), (words - key.shape[1], 0)))
+
+
+def node_stream(job: Job, count: int) -> NodeStream:
+    """Return the nodes of an ordered tree."""
+    read = functools.partial(_read, job.store, width_of(job.sh_degree))
+    up = job.settings.up_of(job.stream.up)
+    return NodeStream(count, job.sh_degree, job.stream.antialiased, read, up)
+
+
+def encode(job: Job, window: int, *, threads: int, progress: Progress) -> None:
+    """Encode a window; a task. Result: the encoded arrays of its chunks, as NUMBER.NAME."""
+    assert job.encoder is not None
+    encoder = job.encoder
+    start = window * WINDOW_NODES
+    stop = min(start + WINDOW_NODES, encoder.count)
+    splats, tree = _read(job.store, width_of(job.sh_degree), start, stop, threads)
+    check_valid(splats, threads)
+
+    def encoded(part: slice) -> dict[str, NDArray[np.generic]]:
+        return encoder.encode(splats.rows(part), tree.rows(part), start + part.start)
+
+    arrays: dict[str, NDArray[np.generic]] = {}
+    for number, chunk in enumerate(ordered_map(encoded, windows_of(stop - start), threads)):
+        arrays |= {f"{number}.{name}": array for name, array in chunk.items()}
+    job.store.put(encoded_of(window), arrays)
+
+
+def encoded_chunk(store: Store, number: int, name: str) -> NDArray[np.generic]:
+    """Read an encoded array of a chunk."""
+    window, place = divmod(number, len(windows_of(WINDOW_NODES)))
+    key = f"{place}.{name}"
+    return store.get(encoded_of(window), [key])[key]
+
+
+def _read(store: Store, width: int, start: int, stop: int, threads: int = 1) -> tuple[Splats, LodTree]:
+    """Read nodes as `NodeStream.read`, from rows of this width."""
+    parts = []
+    for window in range(start // WINDOW_NODES, -(-stop // WINDOW_NODES)):
+        first = window * WINDOW_NODES
+        rows, tree = _read_window(store, width, window)
+        here = slice(max(start - first, 0), stop - first)
+        parts.append((rows[here], tree.child_count[here], tree.child_start[here]))
+    rows, count, child_start = parts[0] if len(parts) == 1 else map(np.concatenate, zip(*parts, strict=True))
+    return splats_of(rows, threads), LodTree(count.copy(), child_start.copy())
+
+
+def _read_window(store: Store, width: int, window: int) -> tuple[Rows, LodTree]:
+    """Gather the nodes of a window by the plan of `_put_window`."""
+    plan = store.get(window_of(window))
+    count = plan["count"].astype(np.int64)
+    total = int(count.sum()) + (window == 0)
+    rows: Rows = np.empty((total, width), np.float32)
+    if window == 0:
+        rows[0] = store.get(ROOT, ["rows"])["rows"][0]
+    row, target = (plan[name].astype(np.int64) for name in ("row", "target"))
+    ends = plan["stages"]
+    for stage in np.flatnonzero(np.diff(ends)).tolist():
+        here = slice(ends[stage], ends[stage + 1])
+        _fill(store, families_of(stage), row[here], count[here], target[here], rows)
+    tree = LodTree(np.zeros(total, np.uint16), np.zeros(total, np.uint32))
+    tree.child_count[plan["owner"]] = plan["child_count"]
+    tree.child_start[plan["owner"]] = plan["child_start"]
+    return rows, tree
+
+
+def _fill(
+    store: Store, name: str, row: NDArray[np.int64], count: NDArray[np.int64], target: NDArray[np.int64], rows: Rows
+) -> None:
+    """Copy children of families of a stage into the rows of a window; see `_put_window`."""
+    total = int(count.sum())
+    step = np.arange(total) - np.repeat(np.cumsum(count) - count, count)
+    rows[np.repeat(target, count) + step] = store.rows_at(name, "rows", np.repeat(row, count) + step)
+
+
+#: (N, `width_of`) float32: the columns of splats side by side, in the order of `COLUMNS`.
+Rows = NDArray[np.float32]
+
+
+def rows_of(splats: Splats, threads: int = 1) -> Rows:
+    """Pack splats into new rows."""
+    rows = np.empty((len(splats), width_of(splats.sh_degree)), np.float32)
+    fill_rows(splats, rows, threads)
+    return rows
+
+
+def fill_rows(splats: Splats, rows: Rows, threads: int = 1) -> None:
+    """Pack splats into rows."""
+    places = _places(splats)
+
+    def fill(block: slice) -> None:
+        for part, column in places:
+            rows[block, part] = column[block]
+
+    for_blocks(fill, len(rows), threads)
+
+
+def splats_of(rows: Rows, threads: int = 1) -> Splats:
+    """Unpack rows."""
+    splats = Splats.empty(len(rows), degree_of((rows.shape[1] - width_of(0)) // 3))
+    places = _places(splats)
+
+    def fill(block: slice) -> None:
+        for part, column in places:
+            column[block] = rows[block, part]
+
+    for_blocks(fill, len(rows), threads)
+    return splats
+
+
+def _places(splats: Splats) -> list[tuple[slice, Rows]]:
+    """Return each column as a matrix, a view of it, and its place in a row."""
+    places, at = [], 0
+    for name in COLUMNS:
+        column = getattr(splats, name)
+        numbers = math.prod(column.shape[1:])
+        places.append((slice(at, at + numbers), column.reshape(len(splats), numbers)))
+        at += numbers
+    return places

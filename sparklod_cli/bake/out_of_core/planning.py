@@ -24,10 +24,9 @@ from ..output import BakeOutput
 from ..records import Clock
 from ..settings import BakeSettings, Resources
 from ..sources import Source, absolute_source, opened_source
-from .job import Job
+from .job import Engine, Job, LocalEngine
 from .scratch_folder import at_work
 from .store import Store
-from .tasks import Engine, LocalEngine
 
 if TYPE_CHECKING:
     from .in_blocks import InBlocks

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from sparklod_cli.bake.out_of_core.job import Task
 from sparklod_cli.bake.out_of_core.store import Store
-from sparklod_cli.bake.out_of_core.tasks import Task
 from sparklod_cli.system.errors import ScratchError
 
 

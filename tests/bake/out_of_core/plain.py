@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from sparklod_cli.bake.out_of_core.tasks import Task
+from sparklod_cli.bake.out_of_core.job import Task
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.model.streams import SceneStream

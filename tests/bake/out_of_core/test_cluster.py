@@ -16,11 +16,11 @@ import pytest
 pytest.importorskip("cryptography")
 pytest.importorskip("distributed")
 
-from sparklod_cli.bake.out_of_core import cluster_engine, cluster_pool
+from sparklod_cli.bake.out_of_core import cluster_engine
 from sparklod_cli.bake.out_of_core.cluster import ClusterSettings, cluster
 from sparklod_cli.bake.out_of_core.cluster_engine import ClusterEngine
+from sparklod_cli.bake.out_of_core.job import Task
 from sparklod_cli.bake.out_of_core.store import Store
-from sparklod_cli.bake.out_of_core.tasks import Task
 from sparklod_cli.system.errors import OutOfMemoryError, ScratchError, SparklodError
 from sparklod_cli.system.progress import silent
 
@@ -51,8 +51,8 @@ def job(tmp_path: Path) -> Job:
 
 @pytest.fixture(autouse=True)
 def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cluster_pool, "PAUSES", (0.0, 0.0))
-    monkeypatch.setattr(cluster_pool, "TICK", 0.05)
+    monkeypatch.setattr(cluster_engine, "PAUSES", (0.0, 0.0))
+    monkeypatch.setattr(cluster_engine, "TICK", 0.05)
 
 
 def test_tasks_run_after_what_they_need_on_all_workers(engine: ClusterEngine, job: Job) -> None:
@@ -116,7 +116,7 @@ def test_calls_side_by_side_give_results_and_failures_in_order(engine: ClusterEn
 
 
 def test_a_result_that_is_lost_with_its_worker_is_waited_for(engine: ClusterEngine) -> None:
-    with cluster_pool.Pool(engine._connection, "baking") as pool:
+    with cluster_engine.Pool(engine._connection, "baking") as pool:
         pool.submit("twice", 0, functools.partial(made_up.twice, threads=1), 21)
         future = pool._futures["twice"]
         future.result(timeout=60)

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
-from sparklod_cli.bake.out_of_core import nodes, order, store
+from sparklod_cli.bake.out_of_core import order, store
 from sparklod_cli.bake.out_of_core.in_blocks import InBlocks
 from sparklod_cli.bake.out_of_core.job import Job
 from sparklod_cli.bake.out_of_core.store import Store
@@ -39,7 +39,6 @@ def _small_windows() -> Iterator[None]:
     """Windows, and ranges of keys, of which a small scene has several."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(order, "WINDOW_NODES", 64)
-        patch.setattr(nodes, "WINDOW_NODES", 64)
         patch.setattr(store, "GAP", 5)
         patch.setattr(families, "FIRST_BAND", 16)
         patch.setattr(order, "MERGED", 20)

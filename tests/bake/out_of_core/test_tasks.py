@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sparklod_cli.bake.out_of_core.job import LocalEngine, Task
 from sparklod_cli.bake.out_of_core.store import Store
-from sparklod_cli.bake.out_of_core.tasks import LocalEngine, Task
 from sparklod_cli.system.progress import Progress, silent
 
 COUNT = 6
