@@ -16,8 +16,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import BinaryIO
 
-from sparklod_cli.codecs.content import decode_file
 from sparklod_cli.codecs.formats import FORMATS, HEAD, sniff
+from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.system.errors import FormatError, SparklodError
 
 from .containers import seeds, split_file, valid_seeds

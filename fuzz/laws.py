@@ -12,11 +12,10 @@ from PIL import Image
 
 from sparklod_cli.commands.inspect_text import finding_line
 from sparklod_cli.inspection import report
-from sparklod_cli.io import open_stream, read_parts, read_scene
+from sparklod_cli.io import open_reader, read_parts, read_scene
 from sparklod_cli.model.scene import DetailScene, Scene
 from sparklod_cli.model.selection import Selection
 from sparklod_cli.model.splats import COLUMNS, Splats
-from sparklod_cli.model.streams import collected
 from sparklod_cli.system.errors import FormatError, HasTreeError, InvalidSplatsError
 
 from .case import LawError
@@ -73,8 +72,8 @@ def check_levels(path: Path, threads: int) -> None:
 
 
 def _streamed(path: Path, threads: int) -> Splats:
-    with open_stream(path, threads=threads) as stream:
-        return collected(stream).splats
+    with open_reader(path, threads=threads) as reader:
+        return Splats.concat([Splats.empty(0, reader.sh_degree), *reader.blocks()])
 
 
 def _outcome(make: Callable[[], Splats]) -> Splats | str | None:

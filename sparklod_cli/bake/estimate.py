@@ -14,7 +14,7 @@ from ..system.errors import OutOfMemoryError
 from ..system.units import format_size
 
 if TYPE_CHECKING:
-    from ..model.streams import SceneStream
+    from ..codecs.reader import Reader
     from .settings import BakeSettings
 
 #: Part of the memory available that a bake may take unless told otherwise: other programs need some, and figures for it
@@ -58,7 +58,7 @@ def in_memory_bytes(method: str, splats: int, sh_degree: int, *, refines: bool =
     return PROCESS + BUILDERS[method].in_memory.of(splats, sh_degree) + refining
 
 
-def in_memory_bytes_of(header: SceneStream, settings: BakeSettings) -> int:
+def in_memory_bytes_of(header: Reader, settings: BakeSettings) -> int:
     """Return bytes that the bake of an input in memory takes at its peak."""
     refines = settings.refine is not None
     return in_memory_bytes(settings.method, header.count, header.sh_degree, refines=refines)

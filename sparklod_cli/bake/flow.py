@@ -10,9 +10,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..model.streams import SceneStream
+from ..codecs.reader import Reader
 from ..system.addresses import Place
-from ..system.errors import FormatError, HasTreeError, memory_errors_translated
+from ..system.errors import FormatError, memory_errors_translated
 from ..system.progress import Progress, silent
 from ..system.stdio import DASH
 from . import estimate
@@ -20,7 +20,7 @@ from .in_memory import InMemory
 from .output import output_of
 from .records import Baked, Clock
 from .settings import BakeSettings, Resources
-from .sources import Merged, Source, opened_source
+from .sources import Source, open_source
 
 if TYPE_CHECKING:
     from .out_of_core.job import Engine
@@ -56,7 +56,7 @@ def bake(
         say: receives one-line messages for the user.
 
     Raises:
-        FormatError, InvalidSplatsError, OutputError: see `read_source`, `Selection.check`, `validation.check_scene` and
+        FormatError, InvalidSplatsError, OutputError: see `open_source`, `Selection.check`, `validation.check_scene` and
             `io.writing.scene_sink`; or the input has a tree, and the settings do not keep it.
         ScratchError: the scratch folder is full, in use, or belongs to another bake.
         OutOfMemoryError: the scene does not fit into memory.
@@ -71,8 +71,10 @@ def bake(
             fitting = fit_settings(settings)
         overwrite = overwrite or has_published(source, target, settings, resources)  # its own output
         output, clock = output_of(target, settings, overwrite=overwrite, say=say), Clock()
-        header, blocks = _header_of(source), None
-        if header is not None and _may_need_blocks(header, source, target, settings, resources, engine):
+        opened, blocks = contextlib.ExitStack(), None
+        stack.enter_context(opened)
+        reader = opened.enter_context(open_source(source, threads=threads))
+        if not reader.has_tree and _may_need_blocks(reader, source, target, settings, resources, engine):
             from .out_of_core.planning import blocks_for
 
             blocks = stack.enter_context(
@@ -81,7 +83,7 @@ def bake(
                     settings,
                     output,
                     clock,
-                    header=header,
+                    header=reader,
                     folder=scratch_folder(source, target, settings, resources.scratch_dir),
                     overwrite=overwrite,
                     threads=threads,
@@ -91,7 +93,10 @@ def bake(
                     say=say,
                 )
             )
-        work = blocks or InMemory(source, settings, output, clock, threads, progress)
+        if blocks is not None:
+            opened.close()
+        work = blocks or InMemory(source, reader, opened, settings, output, clock, threads, progress)
+        del reader  # which may hold much memory until the last splat was read
         tree, fit = work.build(), None
         if fitting is not None and settings.simplify is None:  # which fits its one cut
             tree.nodes, fit = refined(tree.scene, fitting, threads=threads, progress=progress, say=say)
@@ -135,10 +140,10 @@ def fits_in_memory(source: Source, settings: BakeSettings, memory: int | None) -
         memory: bytes; None for any number.
     """
     try:
-        header = _header_of(source)
+        with open_source(source) as header:
+            return header.has_tree or memory is None or estimate.in_memory_bytes_of(header, settings) <= memory
     except FormatError:  # reported when it is baked
         return True
-    return header is None or memory is None or estimate.in_memory_bytes_of(header, settings) <= memory
 
 
 def scratch_folder(source: Source, target: Place, settings: BakeSettings, parent: Place | None) -> Place:
@@ -164,19 +169,8 @@ def _digest(text: str) -> str:
     return hashlib.blake2b(os.fsencode(text), digest_size=4).hexdigest()
 
 
-def _header_of(source: Source) -> SceneStream | None:
-    """Read the header of an input; None for a tree."""
-    try:
-        with opened_source(source) as stream:
-            return stream
-    except HasTreeError:
-        if isinstance(source, Merged):
-            raise
-        return None
-
-
 def _may_need_blocks(
-    header: SceneStream,
+    header: Reader,
     source: Source,
     target: Place,
     settings: BakeSettings,

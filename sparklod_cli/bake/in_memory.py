@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass
 
 import numpy as np
 
 from ..codecs.encoder import Encoder, Get, results
+from ..codecs.reader import Reader
 from ..codecs.statistics import Statistics
 from ..codecs.validation import check_scene
 from ..lod.builders import BUILDERS
@@ -19,7 +21,7 @@ from .output import BakeOutput, FileOutput, output_of_existing_tree
 from .records import BuiltTree, Clock
 from .selecting import read_environment, select, split_environment, transformed
 from .settings import BakeSettings
-from .sources import Source, read_source
+from .sources import Source
 
 
 @dataclass
@@ -28,9 +30,13 @@ class InMemory:
 
     Attributes:
         source, settings, threads, progress: as for `flow.bake`.
+        reader: of the source; None once it was read.
+        opened: closes it.
     """
 
     source: Source
+    reader: Reader | None
+    opened: contextlib.ExitStack
     settings: BakeSettings
     output: BakeOutput
     clock: Clock
@@ -41,7 +47,9 @@ class InMemory:
     def build(self) -> BuiltTree:
         """Read the input, select and transform its splats, and build their tree, or keep the one that it has."""
         settings, threads, progress = self.settings, self.threads, self.progress
-        scene = read_source(self.source, threads=threads, progress=progress)
+        assert self.reader is not None
+        with self.opened:
+            scene, self.reader = self.reader.scene(progress=progress), None
         tree = BuiltTree(
             nodes=None,
             output=self.output,

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING
 from ..codecs.clamps import Clamp
 from ..codecs.losses import Losses
 from ..codecs.statistics import Statistics
-from ..model.scene import Scene
+from ..model.scene import NodeStream, Scene
 from ..model.splats import Splats
-from ..model.streams import NodeStream
 
 if TYPE_CHECKING:
     from .output import BakeOutput

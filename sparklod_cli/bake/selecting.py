@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 
 from ..codecs.validation import is_valid_and_visible
-from ..io.reading import read_rgba, read_scene
+from ..io import read_rgba, read_scene
 from ..model.selection import Selection, SelectionTally
 from ..model.splats import Splats
 from ..model.transforms import Transform

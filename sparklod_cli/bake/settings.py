@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ..codecs.options import WriteOptions
+from ..codecs.reader import Reader
 from ..fitting.settings import FitSettings
 from ..images.metrics import MOST_PSNR
 from ..lod.budget import Budget
@@ -16,7 +17,6 @@ from ..lod.tile_settings import TileSettings
 from ..model.axes import line, rotated
 from ..model.scene import Scene
 from ..model.selection import Selection
-from ..model.streams import SceneStream
 from ..model.transforms import Transform
 from ..system.addresses import Place
 from ..system.defaults import DEFAULT_BASE, DEFAULT_GROWTH, MAX_SH_DEGREE
@@ -114,7 +114,7 @@ class BakeSettings:
         """Return the axis of the output that points up, for that of the input."""
         return rotated(self.up or found, self.transform.rotation)
 
-    def notes_on(self, source: Scene | SceneStream) -> tuple[str, ...]:
+    def notes_on(self, source: Scene | Reader) -> tuple[str, ...]:
         """Return what a user should know of an input: its notes, and its axis if a specification names it."""
         return source.notes + (line(source.up, source.up_by) if self.up is None else ())
 

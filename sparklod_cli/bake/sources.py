@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..io import PlacedFile, open_stream, open_streams, read_scene
+from ..codecs.reader import Reader
+from ..io import PlacedFile, open_reader, open_readers
 from ..model.instances import Instance
-from ..model.scene import Scene
-from ..model.streams import SceneStream, collected
 from ..model.transforms import Transform
 from ..system.addresses import Place, absolute
-from ..system.progress import Progress, silent
 from ..system.units import count_of
 
 
@@ -67,34 +65,10 @@ def _numbers(transform: Transform) -> list[float]:
     return [float(each) for each in (*transform.rotation.flat, transform.scale, *transform.translation)]
 
 
-def read_source(source: Source, *, threads: int = 1, progress: Progress = silent) -> Scene:
-    """Return all of a source in memory; several files take no more of it than their splats and a block.
-
-    Raises:
-        HasTreeError: one of several files is a tree; names it.
-        FormatError: see `io.read_scene`; names the file where there are several.
-    """
-    if not isinstance(source, Merged):
-        return read_scene(source, threads=threads, progress=progress)
-    with open_streams(source.files, threads=threads) as stream:
-        return collected(stream, progress)
-
-
-@contextlib.contextmanager
-def opened_source(source: Source, *, scratch: Path | None = None, threads: int = 1) -> Iterator[SceneStream]:
-    """Yield a source as a stream.
-
-    Args:
-        source: without a tree.
-        scratch: folder in which what is unpacked stays, so that other processes find it; None for one that is removed.
-
-    Raises:
-        HasTreeError, FormatError: as `read_source`.
-    """
-    keep = scratch is not None
+def open_source(
+    source: Source, *, scratch: Path | None = None, threads: int = 1
+) -> contextlib.AbstractContextManager[Reader]:
+    """Return the context in which a source is open; see `io.open_reader`, or `io.open_readers` of several files."""
     if isinstance(source, Merged):
-        opened = open_streams(source.files, scratch=scratch, keep=keep, threads=threads)
-    else:
-        opened = open_stream(source, scratch=scratch, keep=keep, threads=threads)
-    with opened as stream:
-        yield stream
+        return open_readers(source.files, scratch=scratch, threads=threads)
+    return open_reader(source, scratch=scratch, threads=threads)

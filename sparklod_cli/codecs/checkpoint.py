@@ -24,9 +24,8 @@ from ..system.progress import Progress
 from ..system.threads import blocks_of, ordered_map
 from ..system.untrusted import ZIP_ERRORS, quoted, quoted_value
 from . import quantize
-from .content import Content, Source, Target
 from .left_out import HARMLESS, left_out
-from .stream import Positioned, size_of
+from .reader import Positioned, Reader, Source, Target, size_of
 from .tensor_pickle import Tensor, unpickled
 from .zip_folder import ZIP
 
@@ -99,7 +98,7 @@ class _StoredColumn:
         return rows.astype(np.float32)
 
 
-def open_content(source: Source) -> Content:
+def open_content(source: Source) -> Reader:
     """Open a checkpoint of gsplat or of nerfstudio's splatfacto.
 
     Raises:
@@ -142,7 +141,7 @@ def open_content(source: Source) -> Content:
         for part in ordered_map(read, blocks_of(len(target.splats)), threads):
             progress("reading", part.stop, len(target.splats), "splat")
 
-    return Content(count[0], min(degree, MAX_SH_DEGREE), "checkpoint", fill, notes=notes)
+    return Reader(count[0], min(degree, MAX_SH_DEGREE), "checkpoint", fill, notes=notes, concurrent=True)
 
 
 def _tensors_of(root: Any) -> tuple[Mapping[str, Tensor], int]:

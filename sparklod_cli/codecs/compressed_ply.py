@@ -15,10 +15,9 @@ from ..system.errors import FormatError
 from ..system.progress import Progress
 from ..system.units import count_of
 from . import quantize
-from .content import Content, Source, Target
 from .left_out import HARMLESS, left_out
 from .ply_header import PlyHeader, offset_of, read_header
-from .stream import Positioned, Rows, decode_rows, rows_between, size_of
+from .reader import Positioned, Reader, Rows, Source, Target, decode_rows, rows_between, size_of
 
 #: Splats of a chunk, which share bounds.
 CHUNK_SPLATS = 256
@@ -34,7 +33,7 @@ BOUNDS = {
 }
 
 
-def open_content(source: Source) -> Content:
+def open_content(source: Source) -> Reader:
     """Open a compressed PLY file, with or without bounds of colours and SH.
 
     Raises:
@@ -44,8 +43,13 @@ def open_content(source: Source) -> Content:
     header = read_header(source.file)
     count, coefficients = _checked(header)
     trailing = header.check_size(size)
-    degree, file = degree_of(coefficients), source.file
-    bounds = _read_bounds(file, header, -(-count // CHUNK_SPLATS))
+    degree, file, elements = degree_of(coefficients), Positioned(source.file), _elements(source.file, header)
+
+    def read(name: str, start: int, stop: int) -> Iterator[Rows]:
+        offset, row_type, rows = elements[name]
+        return rows_between(file, offset, row_type, start, stop, rows)
+
+    bounds = _bounds(read("chunk", 0, -(-count // CHUNK_SPLATS)))
 
     def fill(target: Target, threads: int, progress: Progress) -> None:
         @np.errstate(invalid="ignore", over="ignore")  # absurd bounds overflow
@@ -65,14 +69,14 @@ def open_content(source: Source) -> Content:
             sh = target.rows(part).sh
             sh[:] = quantize.decode_centred_8(codes[:, :, : sh.shape[1]].transpose(0, 2, 1))
 
-        decode_rows(_rows(file, header, "vertex", target.start, target.stop), unpack, count, threads, progress)
+        decode_rows(read("vertex", target.start, target.stop), unpack, count, threads, progress)
         if coefficients:
-            decode_rows(_rows(file, header, "sh", target.start, target.stop), unpack_sh, count, threads, progress)
+            decode_rows(read("sh", target.start, target.stop), unpack_sh, count, threads, progress)
 
     facts = {"chunks": header.count("chunk"), "color_bounds": int(bounds["color"] is not None)}
     facts["trailing_bytes"] = trailing
     kept, notes = min(degree, MAX_SH_DEGREE), notes_on_degree(degree) + _left_out(header)
-    return Content(count, kept, "compressed PLY", fill, header.mode == "mip", notes, facts)
+    return Reader(count, kept, "compressed PLY", fill, header.mode == "mip", notes, facts, concurrent=True)
 
 
 def _left_out(header: PlyHeader) -> tuple[str, ...]:
@@ -98,15 +102,21 @@ def _within(bounds: FloatArray | None, part: slice, unit: FloatArray) -> FloatAr
     return quantize.between(unit, low, high)
 
 
-def _rows(file: BinaryIO, header: PlyHeader, name: str, start: int, stop: int) -> Iterator[Rows]:
-    row_type = header.row_type(name)
-    if row_type is None:
-        raise FormatError("compressed PLY cannot have list properties")
-    return rows_between(Positioned(file), offset_of(file, header, name), row_type, start, stop, header.count(name))
+#: Of an element: where its rows begin in the file, their type and number.
+Element = tuple[int, np.dtype[Any], int]
 
 
-def _read_bounds(file: BinaryIO, header: PlyHeader, chunks: int) -> dict[str, FloatArray | None]:
-    rows = np.concatenate([rows for _, rows in _rows(file, header, "chunk", 0, chunks)] or [np.empty(0)])
+def _elements(file: BinaryIO, header: PlyHeader) -> dict[str, Element]:
+    """Return the elements that are read; their types have been checked."""
+    return {
+        name: (offset_of(file, header, name), row_type, header.count(name))
+        for name in ("chunk", "vertex", "sh")
+        if name in header.elements and (row_type := header.row_type(name)) is not None
+    }
+
+
+def _bounds(runs: Iterator[Rows]) -> dict[str, FloatArray | None]:
+    rows = np.concatenate([rows for _, rows in runs] or [np.empty(0)])
     have = rows.dtype.names or ()
     return {
         what: np.stack([rows[name] for name in names], axis=1).astype(np.float32) if names[0] in have else None

@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..model.lod_tree import CHUNK_NODES, LodTree
-from ..model.scene import Scene
+from ..model.scene import NodeStream, Scene
 from ..model.splats import Splats
-from ..model.streams import NodeStream
 from ..system.progress import Progress
 from ..system.threads import blocks_of, ordered_map
 from . import clamps

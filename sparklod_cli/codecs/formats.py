@@ -27,7 +27,7 @@ class Format:
 
     Attributes:
         name: for display.
-        module: in this package; has `open_content(source) -> Content`, see `content`.
+        module: in this package; has `open_content(source) -> Reader`, see `content`.
         writable: its module also has `encode(scene, options, *, threads, progress) -> Iterator[bytes]`;
             `settled(scene, options) -> WriteOptions`, the options with nothing left open, which raises `FormatError`
             if the scene cannot be written; and `held(options, sh_degree)`, the `clamps.CodeRange`s that it can hold.

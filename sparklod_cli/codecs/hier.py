@@ -21,8 +21,7 @@ from ..system.errors import FormatError, TruncatedError
 from ..system.progress import Progress
 from ..system.threads import BLOCK_ROWS, blocks_of, ordered_map
 from . import quantize
-from .content import Content, Source, Target
-from .stream import Positioned, rows_between, size_of
+from .reader import Positioned, Reader, Source, Target, rows_between, size_of
 
 #: Before the columns, the number of splats, negative where numbers are halves; before the nodes, their number.
 COUNT = np.dtype("<i4")
@@ -89,7 +88,7 @@ COLUMNS = (
 )
 
 
-def open_content(source: Source) -> Content:
+def open_content(source: Source) -> Reader:
     """Open a hierarchy.
 
     Raises:
@@ -128,7 +127,7 @@ def open_content(source: Source) -> Content:
                 progress("reading", done, len(leaves), "splat")
 
     trailing = {"trailing_bytes": size - end}
-    return Content(len(leaves), DEGREE, "HIER", fill, header=trailing, block=BLOCK_ROWS)
+    return Reader(len(leaves), DEGREE, "HIER", fill, header=trailing, block=BLOCK_ROWS, concurrent=True)
 
 
 def _count(file: Positioned, at: int, size: int) -> int:

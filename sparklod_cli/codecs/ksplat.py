@@ -20,8 +20,7 @@ from ..system.errors import FormatError, TruncatedError, VersionError
 from ..system.progress import Progress
 from ..system.units import count_of
 from . import quantize
-from .content import Content, Source, Target
-from .stream import Positioned, Rows, decode_rows, rows_between, size_of
+from .reader import Positioned, Reader, Rows, Source, Target, decode_rows, rows_between, size_of
 
 HEADER = np.dtype(
     {
@@ -105,7 +104,7 @@ class KsplatSection:
     steps: int
 
 
-def open_content(source: Source) -> Content:
+def open_content(source: Source) -> Reader:
     """Open a .ksplat file of any compression level.
 
     Raises:
@@ -157,7 +156,7 @@ def open_content(source: Source) -> Content:
         decode_rows(some, lambda part, rows: unpack(part, rows, target.rows(part)), count, threads, progress)
 
     facts = {"level": level, "sections": len(sections), "trailing_bytes": size - end}
-    return Content(count, max(degrees, default=0), "KSPLAT", fill, header=facts)
+    return Reader(count, max(degrees, default=0), "KSPLAT", fill, header=facts, concurrent=True)
 
 
 def _centers(section: KsplatSection, part: slice, codes: NDArray[np.uint16]) -> FloatArray:

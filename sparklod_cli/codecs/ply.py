@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import functools
 import re
+import threading
 from collections import deque
 from collections.abc import Callable, Collection, Iterator, Sequence
 from itertools import islice
@@ -26,12 +27,11 @@ from ..system.threads import blocks_of
 from ..system.untrusted import quoted
 from . import quantize
 from .clamps import CodeRange
-from .content import Content, Scratch, Source, Target
 from .file_notes import comment_of, read_comment
 from .left_out import HARMLESS, left_out
 from .options import DEFAULTS, WriteOptions
 from .ply_header import PlyHeader, first_value, offset_of, read_header
-from .stream import Positioned, Rows, decode_rows, encode_rows, rows_between, size_of
+from .reader import Positioned, Reader, Rows, Scratch, Source, Target, decode_rows, encode_rows, rows_between, size_of
 
 Coding = Callable[[FloatArray], FloatArray]
 
@@ -80,7 +80,7 @@ class _Column(NamedTuple):
     decode: Coding
 
 
-def open_content(source: Source) -> Content:
+def open_content(source: Source) -> Reader:
     """Open a PLY file. An ascii file is unpacked to `scratch`, as binary rows.
 
     Raises:
@@ -102,12 +102,13 @@ def open_content(source: Source) -> Content:
     rows = _rows(file, header, needed, source.scratch)
 
     def fill(target: Target, threads: int, progress: Progress) -> None:
-        some = rows(target.start, target.stop)
+        some = rows(target)
         decode_rows(some, lambda part, rows: unpack(rows, target.rows(part)), count, threads, progress)
 
     noted = read_comment(header.note)
     notes = notes_on_degree(degree) + noted.problems + _notes(file, header, names, needed)
-    return Content(count, min(degree, MAX_SH_DEGREE), "PLY", fill, header.mode == "mip", notes, facts, noted.up)
+    kept, antialiased = min(degree, MAX_SH_DEGREE), header.mode == "mip"
+    return Reader(count, kept, "PLY", fill, antialiased, notes, facts, noted.up, concurrent=True)
 
 
 def _notes(file: BinaryIO, header: PlyHeader, names: Collection[str], needed: Collection[str]) -> tuple[str, ...]:
@@ -239,10 +240,11 @@ def _row_type(header: PlyHeader) -> np.dtype[Any]:
 
 def _rows(
     file: BinaryIO, header: PlyHeader, needed: Collection[str], scratch: Scratch | None
-) -> Callable[[int, int], Iterator[Rows]]:
-    """Return the function that reads the vertices from a number to another."""
-    row_type, count = _row_type(header), header.count("vertex")
+) -> Callable[[Target], Iterator[Rows]]:
+    """Return the function that reads the vertices of a target."""
+    row_type, count, lock = _row_type(header), header.count("vertex"), threading.Lock()
 
+    @functools.lru_cache(1)
     def opened() -> tuple[Positioned, int]:
         """Return a file of binary rows, and where they begin."""
         if not header.text:
@@ -250,14 +252,14 @@ def _rows(
         assert scratch is not None
         return Positioned(scratch(lambda: (rows.tobytes() for _, rows in _text_rows(file, header, needed)))), 0
 
-    def between(start: int, stop: int) -> Iterator[Rows]:
-        if header.text and scratch is None:
+    def read(target: Target) -> Iterator[Rows]:
+        if header.text and (scratch is None or target.once):
             return _text_rows(file, header, needed)
-        source, offset = once()
-        return rows_between(source, offset, row_type, start, stop, count, "vertices")
+        with lock:  # it seeks
+            source, offset = opened()
+        return rows_between(source, offset, row_type, target.start, target.stop, count, "vertices")
 
-    once = functools.lru_cache(1)(opened)
-    return between
+    return read
 
 
 def _text_rows(file: BinaryIO, header: PlyHeader, needed: Collection[str]) -> Iterator[Rows]:

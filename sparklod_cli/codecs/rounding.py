@@ -36,7 +36,7 @@ def _ext(scene: Scene, threads: int) -> Splats:
 
 
 def _file(form: str, scene: Scene, threads: int) -> Splats:
-    from .content import decode_file
+    from .reader import decode_file
 
     codec = WRITABLE[form].codec()
     options = WriteOptions(compression_level=1)  # the bytes live for a moment only, so they need not be small

@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import posixpath
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import BinaryIO
 
 from ..model.splats import COLUMNS, Splats
@@ -16,8 +16,7 @@ from ..system.errors import FormatError, UnsupportedError
 from ..system.progress import Progress, silent
 from ..system.threads import ordered_map
 from ..system.untrusted import quoted_value
-from .content import Content, Fill, OpenCompanion, Source, Target
-from .stream import size_of
+from .reader import Fill, OpenCompanion, Reader, Source, Target, size_of
 from .validation import error_of
 
 
@@ -73,7 +72,7 @@ class SceneFiles:
     open_companion: OpenCompanion | None
     manifest: str
     code: str
-    open_content: Callable[[str, Source], Content]
+    open_content: Callable[[str, Source], Reader]
 
     def open(self, name: str, pieces: Sequence[Piece] | None = None, row: int = 0) -> Chunk:
         """Read the header of a file.
@@ -122,8 +121,9 @@ class SceneFiles:
 
         def work(chunk: Chunk) -> int:
             with self._opened(chunk.name) as source:
-                splats = self.open_content(chunk.name, source).scene(threads=max(1, threads // together)).splats
-            if (len(splats), splats.sh_degree) != (chunk.count, chunk.sh_degree):
+                reader = replace(self.open_content(chunk.name, source), threads=max(1, threads // together))
+                splats, _ = reader.read(0, reader.count, once=True)
+            if (reader.count, reader.sh_degree) != (chunk.count, chunk.sh_degree):
                 raise FormatError(f"{quoted_value(chunk.name)} was changed while it was read; start again")
             for piece in chunk.pieces:
                 _copy(out, piece, piece.row - first_row, splats)

@@ -14,9 +14,8 @@ from ..system.errors import FormatError, TruncatedError
 from ..system.progress import Progress, silent
 from . import quantize
 from .clamps import CodeRange
-from .content import Content, Source, Target
 from .options import DEFAULTS, WriteOptions
-from .stream import Positioned, decode_rows, encode_rows, rows_between, size_of
+from .reader import Positioned, Reader, Source, Target, decode_rows, encode_rows, rows_between, size_of
 
 ROW = np.dtype(
     [
@@ -33,7 +32,7 @@ assert ROW.itemsize == 32
 HELD = (CodeRange("rgb", -0.5 / 255, 255.5 / 255), CodeRange("sh", 0, 0))
 
 
-def open_content(source: Source) -> Content:
+def open_content(source: Source) -> Reader:
     """Open a .splat file. The format has no header: any file whose size is a multiple of 32 is accepted.
 
     Raises:
@@ -56,7 +55,7 @@ def open_content(source: Source) -> Content:
         rows = rows_between(file, 0, ROW, target.start, target.stop, count)
         decode_rows(rows, decode_part, count, threads, progress)
 
-    return Content(count, 0, "SPLAT", fill)
+    return Reader(count, 0, "SPLAT", fill, concurrent=True)
 
 
 def importance_order(splats: Splats) -> NDArray[np.intp]:

@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..model.lod_tree import LodTree
-from ..model.scene import Scene
+from ..model.scene import NodeStream, Scene
 from ..model.splats import COLUMNS, FloatArray, Splats
-from ..model.streams import NodeStream
 from ..system.defaults import DEFAULT_SPZ_VERSION, MAX_FRACTIONAL_BITS, TREE_SPZ_VERSIONS
 from ..system.errors import FormatError
 from ..system.progress import Progress, silent
@@ -25,11 +24,11 @@ from ..system.threads import blocks_of, ordered_map
 from . import clamps, compression, coverage, quantize
 from .clamps import CodeRange
 from .compression import DataRun
-from .content import Source
 from .encoder import Encoded, Encoder, Get, results, windows_of
 from .file_notes import comment_of
 from .options import DEFAULTS, WriteOptions
 from .quantize import Bytes
+from .reader import Source
 from .spz_extensions import SYSTEM_OF_UP, extensions_of
 from .spz_streams import (
     ANTIALIASED,

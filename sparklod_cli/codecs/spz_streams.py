@@ -24,13 +24,12 @@ from ..system.errors import FormatError, MembersError, NotSplatsError, Truncated
 from ..system.progress import Progress
 from ..system.threads import ordered_map
 from . import compression, quantize
-from .content import Content, Source, Target
 from .file_notes import FileNote, read_comment
 from .inflate import GZIP_MAGIC, Inflate
 from .quantize import Bytes
+from .reader import Positioned, Read, Reader, Source, Target, rows_between, rows_of, size_of
 from .spz_extensions import MOST_BYTES, Extensions, read_extensions
 from .statistics import ALL_BITS
-from .stream import Positioned, Read, rows_between, rows_of, size_of
 
 MAGIC = 0x5053474E  # "NGSP"
 HEADER = struct.Struct("<IIIBBBB")  # magic, version, splats, SH degree, fractional bits, flags, reserved
@@ -152,7 +151,7 @@ READABLE = (1, 2, 3, 4)
 CODING = FileCoding((ScaleCoding("spz"),), 1)
 
 
-def open_content(source: Source) -> Content:
+def open_content(source: Source) -> Reader:
     """Open any SPZ file, plain or LoD. With `scratch`, its streams are unpacked to that.
 
     The header of its scene has the flags, the reserved byte and, once all is read, the number of bytes after the data.
@@ -173,7 +172,7 @@ def read_codes(source: Source) -> tuple[Layout, dict[str, Bytes]]:
     return layout, codes
 
 
-def _open(source: Source) -> tuple[Content, Layout, Iterator[StreamRows]]:
+def _open(source: Source) -> tuple[Reader, Layout, Iterator[StreamRows]]:
     """Open a file: its content, its layout, and the rows of its streams, which can be read once."""
     file, note, extensions, header = source.file, FileNote(), Extensions(), dict[str, int]()
     size = size_of(file)
@@ -195,7 +194,7 @@ def _open(source: Source) -> tuple[Content, Layout, Iterator[StreamRows]]:
             yield codes.tobytes()
 
     def read(target: Target) -> Iterator[StreamRows]:
-        if source.scratch is None:
+        if source.scratch is None or target.once:
             yield from rows
             return
         positioned, offset = Positioned(source.scratch(unpacked)), 0
@@ -226,7 +225,7 @@ def _open(source: Source) -> tuple[Content, Layout, Iterator[StreamRows]]:
         notes += (f"{header['unknown_streams']} streams of an unknown kind are left out",)
     note = dataclasses.replace(note, up=note.up or extensions.up)
     up, up_by = (note.up, "") if layout.has_tree or extensions.has_system else note.axis_of("SPZ")
-    content = Content(
+    content = Reader(
         layout.count,
         min(layout.sh_degree, MAX_SH_DEGREE),
         f"SPZ {layout.version}" + " LoD" * layout.has_tree,
@@ -238,6 +237,7 @@ def _open(source: Source) -> tuple[Content, Layout, Iterator[StreamRows]]:
         layout.has_tree,
         coding=lambda: CODING,
         up_by=up_by,
+        concurrent=True,
     )
     return content, layout, rows
 

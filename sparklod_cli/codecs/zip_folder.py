@@ -14,7 +14,7 @@ from ..system.errors import ChecksumError, FormatError, NotSplatsError
 from ..system.untrusted import ZIP_ERRORS, quoted, quoted_value
 from .compression import check_promise
 from .file_names import MANIFEST, META, TILESET
-from .stream import size_of
+from .reader import size_of
 
 #: Beginning of a zip that is not empty.
 ZIP = b"PK\x03\x04"

@@ -6,11 +6,11 @@ from collections import Counter
 from dataclasses import dataclass, field, replace
 from typing import BinaryIO
 
-from ..codecs.content import OpenCompanion
 from ..codecs.rad.property_codings import LARGEST_F16
 from ..codecs.rad.rad_header import ENCODING_KEYS, RadChunkHeader, RadHeader
 from ..codecs.rad.rad_layout import BY_NAME, PROPERTIES, SIZES
 from ..codecs.rad.rad_reader import scan_chunks, scan_header
+from ..codecs.reader import OpenCompanion
 from ..codecs.splat_encoding import log_scale_table
 from ..system.printable import MOST, printable
 from .findings import ChunkBytes, Head, HeaderScan

@@ -8,7 +8,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from ..codecs.content import OpenCompanion
+from ..codecs.reader import OpenCompanion
 from ..codecs.scene_files import Chunk
 from ..codecs.tiles_3d.codec import tile_files
 from ..codecs.tiles_3d.tileset import MAX_TILESET, Tileset, read_whole

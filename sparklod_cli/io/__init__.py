@@ -10,13 +10,12 @@ from .reading import (
     read_arrays,
     read_parts,
     read_rgba,
-    read_scene,
     read_stored,
     read_text,
     read_together,
     size_of_input,
 )
-from .streams import PlacedFile, open_stream, open_streams
+from .streams import PlacedFile, open_reader, open_readers, read_scene
 from .writing import (
     SceneSink,
     Sink,

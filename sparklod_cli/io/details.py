@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..codecs.content import OpenCompanion
 from ..codecs.file_names import (
     MANIFEST,
     META,
@@ -25,8 +24,8 @@ from ..codecs.file_names import (
     is_of_streamed_sog,
     is_of_tileset,
 )
+from ..codecs.reader import OpenCompanion, size_of
 from ..codecs.sog.sog_container import MAX_META, companion_names
-from ..codecs.stream import size_of
 from ..codecs.streamed_sog.manifest import MAX_MANIFEST, Manifest, parse
 from ..codecs.streamed_sog.manifest_rules import files_of_chunk
 from ..codecs.tiles_3d import tileset

@@ -131,9 +131,9 @@ def _named_in(path: Path) -> list[Path]:
         form = sniff(head, "")
         if form is not None and not form.companions:
             return []
-        from ..codecs.content import Source  # what most jobs do without, as what follows
         from ..codecs.glb.glb_container import GltfFile
         from ..codecs.rad import rad_header
+        from ..codecs.reader import Source  # what most jobs do without, as what follows
         from ..codecs.streamed_sog.manifest import MAX_MANIFEST, parse
         from ..codecs.tiles_3d.tileset import MAX_TILESET
 

@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 from ..codecs import rgba
-from ..codecs.content import Content, OpenCompanion, Source
 from ..codecs.encoder import Stored
 from ..codecs.formats import FORMATS, NPZ, RAW_SUFFIXES, Format, head_of, sniff
 from ..codecs.lookalikes import POINTER, SHORT, is_pointer, lookalike_of
+from ..codecs.reader import OpenCompanion
 from ..codecs.zip_folder import ZIP, ZipFolder
-from ..model.scene import DetailScene, Scene
-from ..model.splats import COLUMNS, FloatArray
+from ..model.scene import DetailScene
+from ..model.splats import FloatArray
 from ..model.tile_scene import TileScene
 from ..system.addresses import Place, size_of
 from ..system.errors import FormatError, UnknownFormatError, UnreadableError
@@ -27,29 +27,6 @@ from .local_files import in_folder, open_named, reason_unreadable
 
 if TYPE_CHECKING:
     from ..codecs.gpu import dump
-
-
-def read_scene(
-    path: Place,
-    *,
-    columns: Collection[str] = COLUMNS,
-    threads: int = 1,
-    progress: Progress = silent,
-    validate: bool = True,
-) -> Scene:
-    """Read a splat file of any known format, told by its content, or else by its suffix.
-
-    Args:
-        path: of a file, or of a folder that holds an unpacked SOG or a Streamed SOG; - is standard input.
-        columns: of the splats that are needed; the others may be 0.
-        validate: refuse a broken tree.
-
-    Raises:
-        FormatError: it is not a file, empty, of no known format, or broken.
-    """
-    with opened(path) as (file, form, more):
-        content: Content = form.codec().open_content(Source(file, threads=threads, **more))
-        return content.scene(columns=columns, threads=threads, progress=progress, validate=validate)
 
 
 def read_stored(path: Place) -> Stored:
@@ -89,25 +66,30 @@ def opened(path: Place) -> Iterator[tuple[BinaryIO, Format, dict[str, Any]]]:
     Raises:
         FormatError: it is not a file, empty, or of no known format; an `OSError` of the body becomes one.
     """
-    with readable():
-        if path.is_dir():
-            path = in_folder(path)
-        if path != DASH and path.exists() and not path.is_file():
-            raise UnreadableError(
-                "it is a pipe or a device; save it to a file, or give - to build-lod, simplify or inspect: - reads"
-                " standard input"
-            )
-        with file_of(path) as file:
-            head = head_of(file)
-            form = recognised(head, path)
-            open_companion: OpenCompanion = functools.partial(open_named, path, folders=form.folders)
-            if head.startswith(ZIP) and form.companions:
-                folder = ZipFolder(file)
-                file.seek(0)
-                if folder.first != form.unbundled:  # a folder of another format in a zip
-                    file, open_companion = folder.open(folder.first), folder.open
-                    form = recognised(head_of(file), Path(folder.first))
-            yield file, form, {"open_companion": open_companion} if form.companions else {}
+    with readable(), contextlib.ExitStack() as closing:
+        yield open_splats(path, closing)
+
+
+def open_splats(path: Place, closing: contextlib.ExitStack) -> tuple[BinaryIO, Format, dict[str, Any]]:
+    """As `opened`, until `closing` closes the file; an `OSError` is raised as it is."""
+    if path.is_dir():
+        path = in_folder(path)
+    if path != DASH and path.exists() and not path.is_file():
+        raise UnreadableError(
+            "it is a pipe or a device; save it to a file, or give - to build-lod, simplify or inspect: - reads"
+            " standard input"
+        )
+    file = closing.enter_context(file_of(path))
+    head = head_of(file)
+    form = recognised(head, path)
+    open_companion: OpenCompanion = functools.partial(open_named, path, folders=form.folders)
+    if head.startswith(ZIP) and form.companions:
+        folder = ZipFolder(file)
+        file.seek(0)
+        if folder.first != form.unbundled:  # a folder of another format in a zip
+            file, open_companion = folder.open(folder.first), folder.open
+            form = recognised(head_of(file), Path(folder.first))
+    return file, form, {"open_companion": open_companion} if form.companions else {}
 
 
 def recognised(head: bytes, path: Place) -> Format:

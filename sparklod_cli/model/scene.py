@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -295,3 +295,22 @@ class DetailScene:
 def facts_of(source: Any) -> dict[str, Any]:
     """Return what a scene of any kind says of its file, by the names of the attributes that all of them have."""
     return {name: getattr(source, name) for name in ("antialiased", "format", "notes", "header", "up", "up_by")}
+
+
+@dataclass(frozen=True, eq=False)
+class NodeStream:
+    """The nodes of a tree in their final order, made whenever they are asked for.
+
+    Attributes:
+        count: M nodes.
+        sh_degree: of all windows.
+        antialiased, up: as in `Scene`.
+        read: called with a range of nodes, returns them and their tree columns, whose `child_start` counts from the
+            first node of the whole tree; may be called again, from several threads at once.
+    """
+
+    count: int
+    sh_degree: int
+    antialiased: bool
+    read: Callable[[int, int], tuple[Splats, LodTree]]
+    up: str | None = None

@@ -17,7 +17,7 @@ import pytest
 
 from fixtures import by_hand_checkpoint
 from sparklod_cli.codecs import checkpoint, tensor_pickle
-from sparklod_cli.codecs.content import decode_file
+from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.codecs.tensor_pickle import Tensor, unpickled
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.sh import SH_C0

@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 
 from fixtures import by_hand, by_hand_sog
-from sparklod_cli.codecs.content import decode_file
 from sparklod_cli.codecs.formats import FORMATS, HEAD, Format, sniff
+from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.system.errors import FormatError
 from tests.conftest import FIXTURES

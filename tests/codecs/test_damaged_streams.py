@@ -13,8 +13,7 @@ import pytest
 from PIL import Image
 
 from fixtures import by_hand_sog
-from sparklod_cli.codecs.content import Source, decode_file
-from sparklod_cli.model import streams
+from sparklod_cli.codecs.reader import Source, decode_file
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.system.errors import FormatError, HasTreeError
 from tests.codecs.test_damaged import FILES, WORDS, content, files_of, format_of, header, insides, members
@@ -53,8 +52,8 @@ def compare(name: str, data: bytes) -> str:
     more = {"open_companion": open_companion} if form.folders else {}
 
     def streamed() -> Splats:
-        stream = codec.open_content(Source(io.BytesIO(data), scratch=in_memory, **more)).stream(1)
-        return Splats.concat([Splats.empty(0, stream.sh_degree), *stream.blocks()])
+        reader = codec.open_content(Source(io.BytesIO(data), scratch=in_memory, **more))
+        return Splats.concat([Splats.empty(0, reader.sh_degree), *reader.blocks()])
 
     whole, found = outcome(lambda: decode_file(codec, io.BytesIO(data), **more).splats), outcome(streamed)
     if found is None:
@@ -88,7 +87,7 @@ def damaged(name: str, rng: np.random.Generator) -> Iterable[bytes]:
 
 @pytest.mark.parametrize("name", FILES)
 def test_a_stream_of_damaged_bytes_fails_as_the_decoder_does(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(streams, "BLOCK_SPLATS", 20)
+    monkeypatch.setattr("sparklod_cli.codecs.reader.BLOCK_SPLATS", 20)
     rng = np.random.default_rng([17, len(name)])
     found = [compare(name, data) for data in damaged(name, rng)]
     assert found[0] == ("tree" if "tree" in name else "splats")

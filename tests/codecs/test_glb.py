@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 
 from fixtures import by_hand_glb
-from sparklod_cli.codecs.content import decode_file
 from sparklod_cli.codecs.glb import codec as glb
 from sparklod_cli.codecs.glb.placement import TURNS
 from sparklod_cli.codecs.options import PROFILES, WriteOptions
+from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.io import read_scene
 from sparklod_cli.model.axes import AXES
 from sparklod_cli.model.scene import Scene

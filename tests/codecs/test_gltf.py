@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 from fixtures import by_hand_glb
-from sparklod_cli.codecs.content import Source, decode_file
 from sparklod_cli.codecs.glb import codec as glb
 from sparklod_cli.codecs.glb import glb_container, log_scales
 from sparklod_cli.codecs.options import WriteOptions
+from sparklod_cli.codecs.reader import Source, decode_file
 from sparklod_cli.inspection.report import ReportSettings, inspect
-from sparklod_cli.io import companions, open_stream, read_scene
+from sparklod_cli.io import companions, open_reader, read_scene
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.model.transforms import Transform
@@ -115,8 +115,8 @@ def test_parts_are_read_in_blocks_as_they_are_read_whole(make: Callable[..., Any
         assert_same(whole.rows(slice(40)), held[0].splats)
     path = tmp_path / "scene.glb"
     path.write_bytes(data)
-    with open_stream(path, scratch=tmp_path) as stream:
-        blocks = [block for start in range(0, 110, 17) for block in stream.read(start, min(start + 17, 110))]
+    with open_reader(path, scratch=tmp_path) as stream:
+        blocks = [block for start in range(0, 110, 17) for block in stream.blocks(start, min(start + 17, 110))]
     assert_same(Splats.concat(blocks), whole, 0)
 
 

@@ -11,8 +11,8 @@ import pytest
 
 from fixtures import by_hand_hier
 from sparklod_cli.codecs import hier
-from sparklod_cli.codecs.content import decode_file
 from sparklod_cli.codecs.formats import sniff
+from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.system.errors import FormatError, TruncatedError
 from tests.codecs.cases import linear

@@ -16,9 +16,9 @@ from zlib_ng import zlib_ng
 
 from sparklod_cli.codecs import compression, inflate, spz
 from sparklod_cli.codecs.compression import BLOCK, DataRun
-from sparklod_cli.codecs.content import decode_file
 from sparklod_cli.codecs.inflate import Inflate
 from sparklod_cli.codecs.options import WriteOptions
+from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS
 from sparklod_cli.system.errors import ChecksumError, FormatError, TruncatedError

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli.codecs import ksplat
-from sparklod_cli.codecs.content import decode_file
+from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.system.errors import FormatError
 from tests.conftest import FIXTURES

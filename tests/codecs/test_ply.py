@@ -16,7 +16,7 @@ from plyfile import PlyData, PlyElement
 
 from fixtures import by_hand
 from sparklod_cli.codecs import ply
-from sparklod_cli.codecs.content import decode_file
+from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from sparklod_cli.codecs import coverage, spz
-from sparklod_cli.codecs.content import decode_file
 from sparklod_cli.codecs.formats import FORMATS
 from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.codecs.rad import codec as rad
+from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.io import read_scene
 from sparklod_cli.model.gaussian import linear_opacity, lod_opacity
 from sparklod_cli.model.lod_tree import LodTree

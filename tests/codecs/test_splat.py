@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli.codecs import splat
-from sparklod_cli.codecs.content import decode_file
+from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.io import read_scene
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene

@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 
 from fixtures import by_hand
 from sparklod_cli.codecs import clamps, quantize, spz
-from sparklod_cli.codecs.content import decode_file
 from sparklod_cli.codecs.options import WriteOptions
+from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.codecs.spz_extensions import MOST_BYTES
 from sparklod_cli.codecs.statistics import Statistics
 from sparklod_cli.model.lod_tree import LodTree

@@ -13,9 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sparklod_cli.codecs import quantize, spz, statistics
-from sparklod_cli.codecs.content import decode_file
 from sparklod_cli.codecs.options import DEFAULTS, RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import codec as rad
+from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.codecs.statistics import (
     ALL,
     ALL_BITS,

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from sparklod_cli.codecs import spz
-from sparklod_cli.codecs.content import decode_file
 from sparklod_cli.codecs.encoder import results
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import codec as rad
 from sparklod_cli.codecs.rad.rad_layout import OPTIONS, choices
+from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.codecs.spz import like
 from sparklod_cli.lod import quick
 from sparklod_cli.model.scene import Scene

@@ -12,10 +12,9 @@ import pytest
 
 from fixtures import by_hand
 from sparklod_cli.codecs import ply, splat, spz
-from sparklod_cli.codecs.content import decode_file
 from sparklod_cli.codecs.formats import HEAD, sniff
 from sparklod_cli.codecs.options import WriteOptions
-from sparklod_cli.codecs.stream import rows_of
+from sparklod_cli.codecs.reader import decode_file, rows_of
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.system.errors import FormatError

@@ -14,7 +14,7 @@ from sparklod_cli.cli import run
 from sparklod_cli.codecs.zip_folder import ZipFolder
 from sparklod_cli.io import read_parts, read_scene
 from sparklod_cli.io.details import read_level_files
-from sparklod_cli.io.streams import open_stream
+from sparklod_cli.io.streams import open_reader
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS
 from sparklod_cli.system.errors import FormatError, NotSplatsError
@@ -101,8 +101,8 @@ def test_commands_read_a_zipped_streamed_sog(tmp_path: Path, monkeypatch: pytest
     tree = read_scene(Path("tree.spz")).tree
     assert tree is not None
     assert int(tree.is_leaf.sum()) == count
-    with open_stream(Path("scene.ssog")) as stream:
-        assert sum(map(len, stream.read(0, stream.count))) == count
+    with open_reader(Path("scene.ssog")) as stream:
+        assert sum(map(len, stream.blocks(0, stream.count))) == count
     assert run(["view", "scene.ssog", "--export", "site"]) == 1
     assert "viewers do not read lod-meta.json in a zip; unzip it" in capsys.readouterr().err
     assert not Path("site").exists()

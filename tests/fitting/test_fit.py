@@ -12,7 +12,7 @@ import pytest
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.cameras.path import CameraPath
 from sparklod_cli.codecs import ply
-from sparklod_cli.codecs.content import decode_file
+from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.fitting import cameras, optimiser
 from sparklod_cli.fitting import fit as fit_module
 from sparklod_cli.fitting.fit import fit

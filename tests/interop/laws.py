@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sparklod_cli.codecs import coverage, spz
-from sparklod_cli.codecs.content import decode_file
 from sparklod_cli.codecs.options import DEFAULTS, WriteOptions
+from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.model.gaussian import lod_opacity
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene

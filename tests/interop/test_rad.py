@@ -17,12 +17,12 @@ import pytest
 
 from sparklod_cli.cli import run
 from sparklod_cli.codecs import coverage
-from sparklod_cli.codecs.content import decode_file
 from sparklod_cli.codecs.gpu import packed_splats
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import codec as rad
 from sparklod_cli.codecs.rad.rad_header import RadHeader, read_chunk_header, read_header
 from sparklod_cli.codecs.rad.rad_layout import choices
+from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.codecs.spark_codings import encode_lod_alpha
 from sparklod_cli.codecs.splat_encoding import SplatEncoding
 from sparklod_cli.io import read_scene

@@ -8,14 +8,16 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
+from sparklod_cli.codecs.merging import Placed, merged
+from sparklod_cli.codecs.reader import Reader, Target
 from sparklod_cli.model.gaussian import placed
 from sparklod_cli.model.instances import Instance
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
-from sparklod_cli.model.streams import Placed, SceneStream, collected, merged
 from sparklod_cli.model.transforms import Transform
 from sparklod_cli.system.errors import FormatError
-from tests.bake.out_of_core.plain import stream_of
+from sparklod_cli.system.progress import Progress
+from tests.bake.out_of_core.plain import reader_of
 from tests.scenes import random_splats
 
 TRANSFORMS = (
@@ -30,9 +32,9 @@ def scenes() -> list[Scene]:
     return [Scene(random_splats(count, sh_degree=degree)) for count, degree in ((90, 1), (1, 3), (0, 0), (300, 0))]
 
 
-def merge(scenes: Sequence[Scene], transforms: Sequence[Transform] = ()) -> SceneStream:
+def merge(scenes: Sequence[Scene], transforms: Sequence[Transform] = ()) -> Reader:
     places = [*transforms, *[Transform()] * len(scenes)]
-    return merged([Placed(stream_of(each), f"no. {k}", places[k]) for k, each in enumerate(scenes)])
+    return merged([Placed(reader_of(each), f"no. {k}", places[k]) for k, each in enumerate(scenes)])
 
 
 def assert_same(found: Splats, expected: Splats) -> None:
@@ -52,9 +54,9 @@ def test_any_range_is_that_of_the_placed_scenes_one_after_the_other() -> None:
     parts = [padded(each.splats, 15) for each in given]
     expected = Splats.concat([place.apply(part) for place, part in zip((*TRANSFORMS, Transform()), parts, strict=True)])
     assert (found.count, found.sh_degree) == (391, 3)
-    assert_same(collected(found).splats, expected)
+    assert_same(found.scene().splats, expected)
     for start, stop in ((0, 391), (5, 5), (89, 92), (90, 91), (91, 391), (390, 391)):
-        pieces = list(found.read(start, stop))
+        pieces = list(found.blocks(start, stop))
         if start < stop:
             assert_same(Splats.concat(pieces), expected.take(slice(start, stop)))
         else:
@@ -127,9 +129,9 @@ def test_formats_notes_and_errors_tell_where_they_come_from() -> None:
     found = merge([one, other, other])
     assert (found.format, found.notes) == ("PLY and SPZ 3", ("no. 0: cut to 3",))
 
-    def broken(start: int, stop: int) -> None:
+    def broken(target: Target, threads: int, progress: Progress) -> None:
         raise FormatError("cut short")
 
-    stream = dataclasses.replace(stream_of(one), read=broken)
+    reader = dataclasses.replace(reader_of(one), fill=broken)
     with pytest.raises(FormatError, match=r"^tile\.ply: cut short$"):
-        list(merged([Placed(stream_of(one), "whole.ply"), Placed(stream, "tile.ply")]).blocks())
+        list(merged([Placed(reader_of(one), "whole.ply"), Placed(reader, "tile.ply")]).blocks())

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...codecs.encoder import Encoder, Get
+from ...codecs.reader import Reader
 from ...codecs.statistics import Statistics
 from ...lod.builders import BUILDERS
 from ...lod.check import Bounds, check_visible
@@ -20,7 +21,6 @@ from ...lod.stage_records import NO_FAMILY, Pending
 from ...model.selection import REASONS, SelectionTally
 from ...model.sh import width_of
 from ...model.splats import FloatArray, Splats
-from ...model.streams import SceneStream
 from ...system.progress import Progress
 from ...system.threads import blocks_of, on_threads
 from ..output import BakeOutput
@@ -241,7 +241,7 @@ def parts_of(count: int, block_splats: int) -> tuple[int, ...]:
 
 
 def leaves_of(
-    stream: SceneStream, start: int, stop: int, settings: BakeSettings
+    stream: Reader, start: int, stop: int, settings: BakeSettings
 ) -> Iterator[tuple[Splats, SelectionTally, int]]:
     """Yield the leaves that a range of the input becomes, block by block.
 
@@ -249,14 +249,14 @@ def leaves_of(
         those that are kept, transformed; the tally of all; and how many of those that are kept left the range of
         float32.
     """
-    for splats in stream.read(start, stop):
+    for splats in stream.blocks(start, stop):
         selected, tally = select(splats, settings, start=start, total=stream.count)
         start += len(splats)
         leaves, beyond = transform(selected, settings.transform)
         yield leaves, tally, beyond
 
 
-def first_look(stream: SceneStream, settings: BakeSettings, blocks: int) -> tuple[FloatArray, float]:
+def first_look(stream: Reader, settings: BakeSettings, blocks: int) -> tuple[FloatArray, float]:
     """Return (n, 3) centres of selected splats, from ranges all over the input, and the share of selected splats.
 
     Args:

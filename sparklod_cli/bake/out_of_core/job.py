@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from ...codecs.encoder import Encoder
+from ...codecs.reader import Reader
 from ...lod.builders import BUILDERS
 from ...lod.stage_records import StagedBuilder
-from ...model.streams import SceneStream
 from ...system import machine
 from ...system.progress import Progress, silent
 from ...system.threads import ordered_map
@@ -39,7 +39,7 @@ class Job:
     """
 
     store: Store
-    stream: SceneStream
+    stream: Reader
     settings: BakeSettings
     needed: frozenset[str]
     in_chunks: bool

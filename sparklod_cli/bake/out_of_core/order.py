@@ -19,9 +19,9 @@ from ...lod.families import band_order
 from ...lod.kernels.tree_links import find_limits
 from ...lod.stage_records import NO_FAMILY, STAGE_BITS
 from ...model.lod_tree import CHUNK_NODES, LodTree
+from ...model.scene import NodeStream
 from ...model.sh import degree_of, width_of
 from ...model.splats import COLUMNS, FloatArray, Splats
-from ...model.streams import NodeStream
 from ...system.progress import Progress
 from ...system.threads import blocks_of, for_blocks, on_threads, ordered_map
 from .job import ORDER, ROOT, Job, encoded_of, families_of, window_of

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ...model.streams import SceneStream
+from ...codecs.reader import Reader
 from ...system.addresses import Place, absolute
 from ...system.errors import OutOfMemoryError, ScratchError
 from ...system.progress import Progress
@@ -23,7 +23,7 @@ from ..identity import BakeIdentity
 from ..output import BakeOutput
 from ..records import Clock
 from ..settings import BakeSettings, Resources
-from ..sources import Source, absolute_source, opened_source
+from ..sources import Source, absolute_source, open_source
 from .job import Engine, Job, LocalEngine
 from .scratch_folder import at_work
 from .store import Store
@@ -42,7 +42,7 @@ def blocks_for(
     output: BakeOutput,
     clock: Clock,
     *,
-    header: SceneStream,
+    header: Reader,
     folder: Place,
     overwrite: bool,
     threads: int,
@@ -123,7 +123,7 @@ def _as_a_whole(settings: BakeSettings) -> str | None:
     return None if settings.detail is None else "detail levels are made of a whole tree"
 
 
-def _too_large(header: SceneStream, settings: BakeSettings, needed: int, memory: int, whole: str) -> OutOfMemoryError:
+def _too_large(header: Reader, settings: BakeSettings, needed: int, memory: int, whole: str) -> OutOfMemoryError:
     """Return the error for a bake that cannot go out of core and needs more memory than it may take.
 
     Args:
@@ -151,20 +151,20 @@ def _check_room(folder: Path, needed: int) -> None:
 
 
 @contextlib.contextmanager
-def _opened(source: Source, folder: Place, threads: int, engine: Engine | None) -> Iterator[SceneStream]:
+def _opened(source: Source, folder: Place, threads: int, engine: Engine | None) -> Iterator[Reader]:
     """Open the input so that the processes of an engine can open it, too, whatever folders they work in."""
     from .cluster_engine import ClusterEngine
 
     if isinstance(folder, Path):
-        with opened_source(absolute_source(source), scratch=folder.absolute() / UNPACKED, threads=threads) as stream:
+        with open_source(absolute_source(source), scratch=folder.absolute() / UNPACKED, threads=threads) as stream:
             yield stream
     elif isinstance(engine, ClusterEngine):
         own = Path(tempfile.gettempdir()) / f"sparklod-{uuid.uuid4().hex}"  # each machine unpacks what it needs
         try:
-            with opened_source(absolute_source(source), scratch=own, threads=threads) as stream:
+            with open_source(absolute_source(source), scratch=own, threads=threads) as stream:
                 yield stream
         finally:
             engine.remove(own)
     else:
-        with opened_source(source, threads=threads) as stream:
+        with open_source(source, threads=threads) as stream:
             yield stream

@@ -28,9 +28,9 @@ from ...system.units import count_of
 from ...system.untrusted import quoted_value
 from .. import spz
 from ..compression import check_promise
-from ..content import Content, Source, Target
 from ..file_notes import FileNote, read_note
 from ..left_out import left_out
+from ..reader import Reader, Source, Target
 from ..scene_files import copy_rows
 from . import log_scales
 from .attributes import (
@@ -81,7 +81,7 @@ class PlacedPrimitive:
     transform: Transform
 
 
-def open_content(source: Source) -> Content:
+def open_content(source: Source) -> Reader:
     """Open a glTF with primitives of splats, each placed by its nodes; y is up, as glTF demands.
 
     A file of sparklod that notes the axis which points up is read in the axes of its splats, without the turn of the
@@ -105,7 +105,7 @@ def open_content(source: Source) -> Content:
         else:
             noted = FileNote(noted.antialiased, problems=noted.problems)  # another program has turned it
     up, up_by = noted.axis_of("glTF")
-    opened, contents, total = dict[Key, Content](), list[Content](), 0
+    opened, contents, total = dict[Key, Reader](), list[Reader](), 0
     for part in parts:
         if part.key not in opened:
             alone = len(parts) == 1
@@ -189,7 +189,7 @@ def _parts(file: GltfFile, primitives: Mapping[Key, dict[str, Any]]) -> tuple[li
     return parts or [PlacedPrimitive(key, Transform()) for key in primitives], notes
 
 
-def _opened(file: GltfFile, primitive: dict[str, Any], source: Source, generator: object, *, alone: bool) -> Content:
+def _opened(file: GltfFile, primitive: dict[str, Any], source: Source, generator: object, *, alone: bool) -> Reader:
     """Open a primitive in the axes of its mesh; `alone` if it is the whole scene, so that its rows are read once."""
     extensions = _extensions(primitive)
     extension = extensions.get(EXTENSION, {})
@@ -199,7 +199,7 @@ def _opened(file: GltfFile, primitive: dict[str, Any], source: Source, generator
     else:
         view = packed.get("bufferView")
 
-        def unpacked(*, whole: bool = False) -> Content:
+        def unpacked(*, whole: bool = False) -> Reader:
             data = io.BytesIO(file.bytes_of(view))
             scratch = None if whole else source.scratch
             found = spz.open_content(dataclasses.replace(source, file=data, open_companion=None, scratch=scratch))
@@ -217,7 +217,7 @@ def _opened(file: GltfFile, primitive: dict[str, Any], source: Source, generator
     return dataclasses.replace(content, notes=content.notes + notes)
 
 
-def _plain_content(file: GltfFile, primitive: dict[str, Any], generator: object) -> Content:
+def _plain_content(file: GltfFile, primitive: dict[str, Any], generator: object) -> Reader:
     names = primitive.get("attributes")
     if not isinstance(names, dict):
         raise FormatError("its splats have no attributes")
@@ -257,7 +257,7 @@ def _plain_content(file: GltfFile, primitive: dict[str, Any], generator: object)
             for part in ordered_map(read, items, threads):
                 progress("reading", part.stop, len(target.splats), "splat")
 
-    return Content(count, degree, "", fill, notes=tuple(notes))
+    return Reader(count, degree, "", fill, notes=tuple(notes))
 
 
 def _sampled(file: GltfFile, accessor: Accessor) -> FloatArray:
@@ -269,7 +269,7 @@ def _sampled(file: GltfFile, accessor: Accessor) -> FloatArray:
     return np.concatenate([np.empty((0, accessor.width), np.float32), *values])
 
 
-def _reopened(opened: Callable[[], Content]) -> Content:
+def _reopened(opened: Callable[[], Reader]) -> Reader:
     """Return a content that decodes all splats at the first read, and keeps them until the last row was read."""
     content, held = opened(), list[Splats]()
 
@@ -285,7 +285,7 @@ def _reopened(opened: Callable[[], Content]) -> Content:
     return dataclasses.replace(content, fill=fill)
 
 
-def _joined(contents: Sequence[Content]) -> Content:
+def _joined(contents: Sequence[Reader]) -> Reader:
     """Return the splats of several contents as one; SH coefficients that one does not have become 0."""
     degree = max(content.sh_degree for content in contents)
 
@@ -305,10 +305,10 @@ def _joined(contents: Sequence[Content]) -> Content:
 
     first, notes = contents[0], [note for content in contents for note in content.notes]
     antialiased = any(content.antialiased for content in contents)
-    return Content(sum(content.count for content in contents), degree, first.format, fill, antialiased, tuple(notes))
+    return Reader(sum(content.count for content in contents), degree, first.format, fill, antialiased, tuple(notes))
 
 
-def placed(content: Content, transform: Transform) -> Content:
+def placed(content: Reader, transform: Transform) -> Reader:
     """Return the content with its splats transformed as they are read; its `up` is that of the transformed ones."""
     if transform.is_identity:
         return content

@@ -25,9 +25,8 @@ from numpy.typing import NDArray
 from ...model.splats import FloatArray
 from ...system.errors import FormatError, TruncatedError, UnsupportedError, VersionError
 from ...system.untrusted import parse_json, quoted, quoted_value
-from ..content import Source
 from ..json_trees import leads_away
-from ..stream import Positioned, size_of
+from ..reader import Positioned, Source, size_of
 
 #: The header of a binary file, magic, version and length, and of a chunk, length and type.
 HEADER, CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")

@@ -16,7 +16,7 @@ from .. import spz
 from ..clamps import SPZ, CodeRange
 from ..file_notes import note_of
 from ..options import CESIUM, DEFAULTS, KHRONOS, WriteOptions
-from ..stream import encode_rows
+from ..reader import encode_rows
 from .attributes import ATTRIBUTES, COMPRESSION, EXTENSION, POINT_COLOR, UNSIGNED, Attribute, sh_attributes
 from .glb_container import FLOAT, TYPES, check_length, head_of
 from .placement import TURNS, rotation_of_up

@@ -18,10 +18,10 @@ from ...model.lod_tree import LodTree
 from ...model.scene import Scene
 from ...model.splats import COLUMNS, Splats
 from ...system.progress import Progress, silent
-from ..content import OpenCompanion
 from ..encoder import results
 from ..options import DEFAULTS, WriteOptions
 from ..quantize import Bytes
+from ..reader import OpenCompanion
 from ..splat_encoding import SplatEncoding
 from .property_codings import CODINGS
 from .rad_encoder import CHUNK, CodedProperty, RadEncoder

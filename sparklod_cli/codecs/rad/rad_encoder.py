@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 from zlib_ng import zlib_ng
 
 from ...model.lod_tree import CHUNK_NODES, LodTree
-from ...model.scene import Scene
+from ...model.scene import NodeStream, Scene
 from ...model.sh import COEFFICIENTS
 from ...model.splats import COLUMNS, FloatArray, Splats
-from ...model.streams import NodeStream
 from ...system.progress import Progress, silent
 from ...system.threads import blocks_of
 from .. import coverage, sh_palette, spark_codings

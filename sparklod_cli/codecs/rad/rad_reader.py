@@ -20,8 +20,7 @@ from ...system.errors import FormatError, TruncatedError
 from ...system.progress import Progress
 from ...system.threads import ordered_map
 from .. import compression
-from ..content import Content, OpenCompanion, Source, Target
-from ..stream import size_of
+from ..reader import OpenCompanion, Reader, Source, Target, size_of
 from ..validation import RuleViolation, check_rules, error_of
 from . import rad_rules
 from .chunk_decoder import PackedChunk, fill
@@ -191,7 +190,7 @@ class RadReader:
         packed_range = None if ranges is None else (ranges.ln_scale_min, ranges.ln_scale_max)
         return FileCoding(tuple(scales), self.header.chunk_size, packed_range)
 
-    def content(self) -> Content:
+    def content(self) -> Reader:
         """Return the content of the file."""
         header, size = self.header, self.header.chunk_size
         codings = [ScaleCoding()] * max(len(header.chunks), 1)
@@ -215,7 +214,7 @@ class RadReader:
                 for done in ordered_map(work, self.packed(numbers), threads):
                     progress("reading", done, header.count, "splat")
 
-        return Content(
+        return Reader(
             header.count,
             header.max_sh,
             header.format,
@@ -231,7 +230,7 @@ class RadReader:
         )
 
 
-def open_content(source: Source) -> Content:
+def open_content(source: Source) -> Reader:
     """Open a RAD file, whole or with chunks in files of their own; raises `FormatError` as `RadReader.open`."""
     return RadReader.open(source.file, source.open_companion).content()
 

@@ -21,10 +21,9 @@ from ...system.threads import for_blocks, ordered_map
 from ...system.untrusted import quoted_value
 from .. import quantize
 from ..compression import check_promise
-from ..content import Content, Source, Target
 from ..file_notes import read_note
 from ..kernels import texels
-from ..stream import Positioned
+from ..reader import Positioned, Reader, Source, Target
 from . import texel_codings as codings
 from .sog_container import Meta, Pixels, SogFiles
 from .sog_writer import encode as encode
@@ -64,7 +63,7 @@ def code_of(note: str) -> str:
     return "container.lossy" if note.startswith(LOSSY) else "container.left-out"
 
 
-def open_content(source: Source) -> Content:
+def open_content(source: Source) -> Reader:
     """Open a .sog archive, or the meta.json of an unpacked one. With `scratch`, the images are unpacked to that.
 
     Raises:
@@ -99,7 +98,7 @@ def open_content(source: Source) -> Content:
     def fill(target: Target, threads: int, progress: Progress) -> None:
         if palette is not None:
             palette.values()
-        positioned = None if source.scratch is None else Positioned(source.scratch(unpacked))
+        positioned = None if source.scratch is None or target.once else Positioned(source.scratch(unpacked))
 
         def work(item: tuple[int, Step]) -> None:
             number, step = item
@@ -120,7 +119,8 @@ def open_content(source: Source) -> Content:
     antialiased = version == 2 and (meta.root.get("antialias") is True or meta.root.get("model") == "antialiased")
     header = {"version": version, "palette": palette.entries if palette is not None else 0, "bytes": files.size}
     note = read_note(meta.root.get("asset"))
-    return Content(count, degree, f"SOG {version}", fill, antialiased, note.problems + losses, header, note.up)
+    form, notes = f"SOG {version}", note.problems + losses
+    return Reader(count, degree, form, fill, antialiased, notes, header, note.up, concurrent=True)
 
 
 def _steps(meta: Meta, version: int, palette: SogPalette | None) -> list[Step]:

@@ -20,9 +20,8 @@ from ...system.errors import FormatError, NotSplatsError
 from ...system.units import count_of
 from ...system.untrusted import parse_json, quoted_value
 from ..compression import check_promise
-from ..content import OpenCompanion
 from ..file_names import META, SOG_IMAGES
-from ..stream import size_of
+from ..reader import OpenCompanion, size_of
 from ..zip_folder import PIECE, ZipFolder
 
 Texels = NDArray[np.uint8]

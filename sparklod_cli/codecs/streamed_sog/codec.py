@@ -5,7 +5,7 @@ As a scene it is full detail, level 0, and the environment; `decode_parts` reads
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import BinaryIO
 
 import numpy as np
@@ -18,10 +18,9 @@ from ...system.progress import Progress, silent
 from ...system.units import count_of
 from ...system.untrusted import quoted_value
 from ..compression import check_promise
-from ..content import Content, OpenCompanion, Source
 from ..file_names import MANIFEST
+from ..reader import OpenCompanion, Reader, Source, size_of
 from ..scene_files import Chunk, Piece
-from ..stream import size_of
 from ..validation import check_rules, error_of
 from .manifest import MAX_MANIFEST, VERSION, Manifest, parse
 from .manifest_rules import chunk_files, run_violations, violations
@@ -30,7 +29,7 @@ from .streamed_writer import encode_files as encode_files
 Index = NDArray[np.int64]
 
 
-def open_content(source: Source) -> Content:
+def open_content(source: Source) -> Reader:
     """Open level 0, chunk after chunk, and then the environment.
 
     Nothing is unpacked to `scratch`: where blocks are read, one chunk at a time stays in memory.
@@ -53,7 +52,7 @@ def decode_parts(
     """
     layout, content = _open(Source(file, open_companion, threads=threads), full_detail=False)
     bounds, children, errors = layout.bounds(), layout.children(), layout.errors()
-    scene, environment = content.scene(threads=threads, progress=progress), None
+    scene, environment = replace(content, threads=threads).scene(progress=progress), None
     splats = scene.splats
     if layout.manifest.environment is not None:
         total = int(layout.counts.sum())
@@ -120,7 +119,7 @@ def layout_of(manifest: Manifest) -> RegionLayout:
     return RegionLayout(manifest, file, offset, count, level, region, counts)
 
 
-def _open(source: Source, *, full_detail: bool) -> tuple[RegionLayout, Content]:
+def _open(source: Source, *, full_detail: bool) -> tuple[RegionLayout, Reader]:
     """Read a manifest, and open its chunks: those of level 0, or all."""
     size, beside = size_of(source.file), chunk_files(source.open_companion)
     manifest = parse(source.file.read(MAX_MANIFEST + 1))
@@ -158,4 +157,4 @@ def _open(source: Source, *, full_detail: bool) -> tuple[RegionLayout, Content]:
     notes = dict.fromkeys((*note.problems, *(text for chunk in chunks for text in chunk.notes)))
     form = f"Streamed SOG {VERSION}"
     fill = beside.fill(chunks, degree, source.threads)
-    return layout, Content(count, degree, form, fill, antialiased, tuple(notes), header, note.up)
+    return layout, Reader(count, degree, form, fill, antialiased, tuple(notes), header, note.up)

@@ -17,9 +17,9 @@ from ...system.errors import FormatError
 from ...system.progress import Progress, silent
 from ...system.units import count_of
 from ...system.untrusted import quoted_value
-from ..content import OpenCompanion
 from ..file_names import MANIFEST
 from ..json_trees import leads_away
+from ..reader import OpenCompanion
 from ..scene_files import Chunk, SceneFiles
 from ..sog import codec as sog
 from ..sog import texel_codings

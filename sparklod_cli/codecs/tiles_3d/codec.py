@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import posixpath
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import BinaryIO
 
 import numpy as np
@@ -21,10 +22,10 @@ from ...system.errors import FormatError
 from ...system.progress import Progress, silent
 from ...system.untrusted import quoted_value
 from ..compression import check_promise
-from ..content import Content, OpenCompanion, Source
 from ..file_names import TILESET
 from ..glb import codec as glb
 from ..glb.placement import transform_of
+from ..reader import OpenCompanion, Reader, Source
 from ..scene_files import Chunk, SceneFiles
 from ..validation import check_rules, error_of
 from .tile_writer import encode_files as encode_files
@@ -38,7 +39,7 @@ NOT_PLACED = "the transform of the tileset, its place on the Earth, is not appli
 Matrix = NDArray[np.float64]
 
 
-def open_content(source: Source) -> Content:
+def open_content(source: Source) -> Reader:
     """Open the tiles without children, one after the other.
 
     The transform of the root is not applied: splats are where they are in the axes of the scene, not on the Earth.
@@ -67,7 +68,7 @@ def decode_parts(
     order, parent, level = _hierarchy(tileset)
     held = [number for number in order if tileset.tiles[number].uri is not None]
     content, chunks = _open(source, tileset, held)
-    scene = content.scene(threads=threads, progress=progress)
+    scene = replace(content, threads=threads).scene(progress=progress)
     counts = dict(zip(held, (chunk.rows for chunk in chunks), strict=True))
     sizes = dict(zip(held, (chunk.bytes for chunk in chunks), strict=True))
     check_rules(violations(tileset))
@@ -135,7 +136,7 @@ def _hierarchy(tileset: Tileset) -> tuple[list[int], NDArray[np.int32], NDArray[
     return order, np.array(parent, np.int32), np.array(level, np.int32)
 
 
-def _open(source: Source, tileset: Tileset, wanted: Sequence[int]) -> tuple[Content, list[Chunk]]:
+def _open(source: Source, tileset: Tileset, wanted: Sequence[int]) -> tuple[Reader, list[Chunk]]:
     """Return the content of some tiles, one after the other, and the files of these."""
     if not wanted:
         raise FormatError("no tile of it has splats")
@@ -165,13 +166,13 @@ def _open(source: Source, tileset: Tileset, wanted: Sequence[int]) -> tuple[Cont
     header = {"tiles": len(chunks), "bytes": size}
     fill = beside.fill(chunks, degree, source.threads)
     by = common(chunk.up_by for chunk in chunks) or ""
-    return Content(row, degree, form, fill, antialiased, notes, header, up, up_by=by), chunks
+    return Reader(row, degree, form, fill, antialiased, notes, header, up, up_by=by), chunks
 
 
 def tile_files(open_companion: OpenCompanion | None, matrices: dict[str, Matrix]) -> SceneFiles:
     """Return the glTF files of tiles, each read where its (4, 4) transform puts it."""
 
-    def open_tile(name: str, source: Source) -> Content:
+    def open_tile(name: str, source: Source) -> Reader:
         content = glb.open_content(source)
         matrix = matrices.get(name)
         if matrix is None or np.array_equal(matrix, np.eye(4)):

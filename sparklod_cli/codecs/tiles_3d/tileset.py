@@ -14,10 +14,10 @@ from typing import Any
 
 from ...system.errors import FormatError, VersionError
 from ...system.untrusted import quoted_value
-from ..content import OpenCompanion
 from ..file_names import TILESET
 from ..file_notes import FileNote, read_note
 from ..json_trees import nodes_of, parse_manifest, place_of, wrong
+from ..reader import OpenCompanion
 from ..validation import error_of
 
 #: The version that is written, and the one before it, which is read, too.

@@ -1,17 +1,17 @@
-"""The plainest engine and stream: a loop, and a scene in memory."""
+"""The plainest engine and reader: a loop, and a scene in memory."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from sparklod_cli.bake.out_of_core.job import Task
+from sparklod_cli.codecs.reader import Reader, Target
+from sparklod_cli.codecs.scene_files import copy_rows
 from sparklod_cli.model.scene import Scene
-from sparklod_cli.model.splats import Splats
-from sparklod_cli.model.streams import SceneStream
 from sparklod_cli.system.progress import Progress, silent
 
 
@@ -33,13 +33,10 @@ class Loop:
             del left[task.name]
 
 
-def stream_of(scene: Scene, block: int = 1000) -> SceneStream:
-    """A scene as a stream whose blocks are that long."""
+def reader_of(scene: Scene) -> Reader:
+    """A reader of a scene in memory."""
 
-    def read(start: int, stop: int) -> Iterator[Splats]:
-        for at in range(start, stop, block):
-            yield scene.splats.take(slice(at, min(at + block, stop)))
+    def fill(target: Target, threads: int, progress: Progress) -> None:
+        copy_rows(scene.splats.rows(slice(target.start, target.stop)), target.splats)
 
-    return SceneStream(
-        len(scene), scene.splats.sh_degree, read, scene.antialiased, scene.format, scene.notes, scene.header
-    )
+    return Reader(len(scene), scene.splats.sh_degree, scene.format, fill, scene.antialiased, scene.notes, scene.header)

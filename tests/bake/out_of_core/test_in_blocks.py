@@ -25,7 +25,7 @@ from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.system.progress import silent
-from tests.bake.out_of_core.plain import Loop, stream_of
+from tests.bake.out_of_core.plain import Loop, reader_of
 from tests.scenes import random_splats
 
 #: Without shrinking, which takes minutes, as any scene will do.
@@ -48,7 +48,7 @@ def _small_windows() -> Iterator[None]:
 
 def built(folder: str, splats: Splats, how: BakeSettings, block: int, engine: Loop, *, in_chunks: bool) -> BuiltTree:
     """A tree in a store, of blocks of about so many splats."""
-    job = Job(Store(Path(folder)), stream_of(Scene(splats)), how, ALL, in_chunks)
+    job = Job(Store(Path(folder)), reader_of(Scene(splats)), how, ALL, in_chunks)
     blocks = InBlocks(job, BakeOutput(), Clock(), engine, block, 1, silent)
     tree = blocks.build()
     blocks.order(tree)

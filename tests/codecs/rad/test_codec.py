@@ -15,11 +15,11 @@ import pytest
 from fixtures import by_hand_rad
 from sparklod_cli import __version__
 from sparklod_cli.codecs import clamps
-from sparklod_cli.codecs.content import decode_file
 from sparklod_cli.codecs.options import DEFAULTS, RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import codec as rad
 from sparklod_cli.codecs.rad import rad_options
 from sparklod_cli.codecs.rad.rad_header import RadHeader, read_header
+from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.codecs.splat_encoding import SplatEncoding
 from sparklod_cli.codecs.statistics import SMALL_QUANTILE, STEPS_A_SPLAT, Statistics
 from sparklod_cli.io import read_scene

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 from fixtures import by_hand_rad
-from sparklod_cli.codecs.content import decode_file
 from sparklod_cli.codecs.rad import codec as rad
 from sparklod_cli.codecs.rad.rad_header import read_header
 from sparklod_cli.codecs.rad.rad_layout import RANGES
+from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.system.errors import FormatError, PromiseError
 from tests.codecs.sog.test_damaged import VALUES, places_of, replaced
 from tests.codecs.test_damaged import attempt, content

@@ -17,7 +17,7 @@ import pytest
 from PIL import Image
 
 from fixtures import by_hand_sog
-from sparklod_cli.codecs.content import decode_file
+from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.codecs.sog import codec as sog
 from sparklod_cli.io import read_scene
 from sparklod_cli.model.scene import Scene

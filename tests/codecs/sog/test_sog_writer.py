@@ -14,8 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import sparklod_cli
-from sparklod_cli.codecs.content import decode_file
 from sparklod_cli.codecs.options import SogOptions, WriteOptions
+from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.codecs.sog import codec as sog
 from sparklod_cli.codecs.sog import sog_container, sog_writer
 from sparklod_cli.io import read_scene

@@ -13,11 +13,10 @@ import numpy as np
 import pytest
 
 from fixtures import by_hand_sog, by_hand_streamed_sog
-from sparklod_cli.codecs.content import decode_file
+from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.codecs.scene_files import SceneFiles
 from sparklod_cli.codecs.streamed_sog import codec
-from sparklod_cli.io import open_stream, read_parts, read_scene
-from sparklod_cli.model import streams
+from sparklod_cli.io import open_reader, read_parts, read_scene
 from sparklod_cli.model.scene import DetailScene, Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.system.errors import FormatError
@@ -107,12 +106,12 @@ def test_full_detail_needs_no_chunk_of_other_levels() -> None:
 
 @pytest.mark.parametrize("block", [7, 60, 1 << 17])
 def test_a_stream_has_the_same_splats_from_any_on(block: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(streams, "BLOCK_SPLATS", block)
+    monkeypatch.setattr("sparklod_cli.codecs.reader.BLOCK_SPLATS", block)
     expected = read_scene(GOLDEN).splats
-    with open_stream(GOLDEN / "lod-meta.json", threads=2) as stream:
+    with open_reader(GOLDEN / "lod-meta.json", threads=2) as stream:
         assert (stream.count, stream.sh_degree) == (66, 1)
         for start, stop in ((0, 66), (20, 30), (44, 66), (59, 61), (5, 6), (3, 3), (0, 45), (45, 60), (60, 66)):
-            blocks = list(stream.read(start, stop))
+            blocks = list(stream.blocks(start, stop))
             assert all(len(each) <= block for each in blocks)
             if start < stop:
                 assert_same(Splats.concat(blocks), expected.take(slice(start, stop)))
@@ -127,9 +126,9 @@ def test_a_stream_decodes_each_chunk_once(monkeypatch: pytest.MonkeyPatch) -> No
         read(self, chunks, *rest, **more)
 
     monkeypatch.setattr(SceneFiles, "read", counted)
-    with open_stream(GOLDEN) as stream:
+    with open_reader(GOLDEN) as stream:
         for start in range(0, 66, 5):
-            list(stream.read(start, min(start + 5, 66)))
+            list(stream.blocks(start, min(start + 5, 66)))
     assert decoded == ["0_0/meta.json", "0_1/meta.json", "env/meta.json"]
 
 

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 from fixtures import by_hand_glb, by_hand_tiles
-from sparklod_cli.codecs.content import decode_file
 from sparklod_cli.codecs.options import PROFILES, WriteOptions
+from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.codecs.tiles_3d import codec, tile_writer
 from sparklod_cli.codecs.tiles_3d.volumes import LARGEST
-from sparklod_cli.io import open_stream, read_parts, read_scene
+from sparklod_cli.io import open_reader, read_parts, read_scene
 from sparklod_cli.lod import quality
 from sparklod_cli.lod.tile_settings import TileSettings
 from sparklod_cli.lod.tiles import make
@@ -186,8 +186,8 @@ def test_the_golden_file_is_read() -> None:
     made = read_parts(GOLDEN)
     assert made.parent.tolist() == [-1, 0, 0, 2] and made.counts.tolist() == [10, 25, 12, 35]
     assert made.errors.tolist() == [1, 0, 0.5, 0]
-    with open_stream(GOLDEN / "tileset.json", threads=2) as stream:
-        blocks = [block for start in range(0, 60, 7) for block in stream.read(start, min(start + 7, 60))]
+    with open_reader(GOLDEN / "tileset.json", threads=2) as stream:
+        blocks = [block for start in range(0, 60, 7) for block in stream.blocks(start, min(start + 7, 60))]
     assert_close(Splats.concat(blocks), expected.take(order), 2e-6, 1e-6)
     assert read_parts(FIXTURES / "sh1.ply") is None
 

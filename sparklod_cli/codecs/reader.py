@@ -1,0 +1,319 @@
+"""Files as streams of rows, decoded and encoded in blocks, so that a file is never in memory as a whole."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import os
+import threading
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, BinaryIO, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..model.lod_tree import LodTree
+from ..model.scene import PLAIN, FileCoding, Scene, facts_of
+from ..model.splats import COLUMNS, Splats
+from ..system.errors import HasTreeError, TruncatedError
+from ..system.progress import Progress, silent
+from ..system.threads import BLOCK_ROWS, blocks_of, ordered_map
+from .validation import with_valid_tree
+
+#: Least bytes of a block: with narrow rows, such as SPZ's streams, handing a smaller one to a thread costs more than it
+#: saves.
+BLOCK_BYTES = 1 << 18
+
+#: A block of rows: which rows, and their content.
+Rows = tuple[slice, NDArray[Any]]
+
+#: Reads the next `size` bytes, or fewer at the end of the data.
+Read = Callable[[int], bytes | memoryview]
+
+
+def size_of(file: BinaryIO) -> int:
+    """Return the bytes of a file, which is left at its beginning."""
+    size = file.seek(0, io.SEEK_END)
+    file.seek(0)
+    return size
+
+
+class Positioned:
+    """A file that is read by position, by several threads at once, whatever else reads it.
+
+    Args:
+        file: open for reading, until the last read.
+    """
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self._lock = threading.Lock()
+        plain = isinstance(getattr(file, "raw", None), io.FileIO) and hasattr(os, "pread")
+        self._descriptor = file.fileno() if plain else None
+
+    def read(self, at: int, size: int) -> bytes:
+        """Return the `size` bytes from `at` on, or fewer at the end of the file."""
+        if self._descriptor is None:
+            with self._lock:
+                self._file.seek(at)
+                return self._file.read(size)
+        data = os.pread(self._descriptor, size, at)
+        while 0 < len(data) < size:  # a read may give less, at most 2 GiB
+            more = os.pread(self._descriptor, size - len(data), at + len(data))
+            if not more:
+                break
+            data += more
+        return data
+
+    def reader(self, at: int) -> Read:
+        """Return a reader that resumes at an offset (not thread-safe)."""
+
+        def read(size: int) -> bytes:
+            nonlocal at
+            data = self.read(at, size)
+            at += len(data)
+            return data
+
+        return read
+
+
+def rows_between(
+    file: Positioned,
+    offset: int,
+    row_type: np.dtype[Any],
+    start: int,
+    stop: int,
+    count: int,
+    subject: str = "splats",
+) -> Iterator[Rows]:
+    """Read rows from `start` to `stop`, of `count` that begin at `offset` in a file; blocks and errors as `rows_of`."""
+    read = file.reader(offset + start * row_type.itemsize)
+    return rows_of(read, row_type, start, stop, count, subject)
+
+
+def rows_of(
+    read: Read, row_type: np.dtype[Any], start: int, stop: int, count: int, subject: str = "splats"
+) -> Iterator[Rows]:
+    """Read rows from `start` to `stop`, of `count`, in blocks of at least `BLOCK_ROWS` rows and `BLOCK_BYTES` bytes.
+
+    Raises:
+        TruncatedError: the data ends early.
+    """
+    step = max(BLOCK_ROWS, BLOCK_BYTES // row_type.itemsize)
+    for first in range(start, stop, step):
+        part = slice(first, min(first + step, stop))
+        data = read((part.stop - part.start) * row_type.itemsize)
+        whole = len(data) // row_type.itemsize
+        if part.start + whole < part.stop:
+            raise TruncatedError(f"cut short after {part.start + whole:,} of {count:,} {subject}")
+        yield part, np.frombuffer(data, row_type)
+
+
+def decode_rows(
+    rows: Iterator[Rows], decode: Callable[[slice, NDArray[Any]], None], count: int, threads: int, progress: Progress
+) -> None:
+    """Call `decode` with every block of rows, on several threads, while this thread reads on."""
+
+    def run(item: Rows) -> int:
+        part, content = item
+        decode(part, content)
+        return part.stop
+
+    for done in ordered_map(run, rows, threads):
+        progress("reading", done, count, "splat")
+
+
+def encode_rows(encode: Callable[[slice], bytes], count: int, threads: int, progress: Progress) -> Iterator[bytes]:
+    """Return the bytes of `count` rows in order: `encode` is called with blocks of rows, on several threads."""
+    parts = blocks_of(count)
+    for part, piece in zip(parts, ordered_map(encode, parts, threads), strict=True):
+        yield piece
+        progress("writing", part.stop, count, "splat")
+
+
+#: Splats of a block that a scene is read in, unless its format has other ones: some 30 MB with SH of degree 3.
+BLOCK_SPLATS = 1 << 17
+
+#: Opens a file of these bytes, which are made only if they have not been before; for formats whose splats do not lie
+#: one after the other. Whoever passes it closes the file.
+Scratch = Callable[[Callable[[], Iterable[bytes]]], BinaryIO]
+
+#: Opens a file that another one names; raises `FormatError` where it cannot.
+OpenCompanion = Callable[[str], BinaryIO]
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """Open file for a codec.
+
+    Attributes:
+        file: open for reading, at its beginning.
+        open_companion: opens the files that it names; None if there are none to open.
+        scratch: keeps what has to be unpacked before rows can be read in any order; None to read all rows once.
+        threads: number that read the files which it names.
+    """
+
+    file: BinaryIO
+    open_companion: OpenCompanion | None = None
+    scratch: Scratch | None = None
+    threads: int = 1
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """Rows of a file to fill.
+
+    Attributes:
+        splats: n rows.
+        start: number in the file of the first.
+        tree: (n,) nodes to fill; None in a file without a tree.
+        columns: of `Splats` to fill; a codec may fill the others, too.
+        once: these are all rows of the file and are read once, so that they need not be unpacked to `Source.scratch`.
+    """
+
+    splats: Splats
+    start: int = 0
+    tree: LodTree | None = None
+    columns: Collection[str] = COLUMNS
+    once: bool = False
+
+    @property
+    def stop(self) -> int:
+        """Number in the file of the row after the last."""
+        return self.start + len(self.splats)
+
+    def rows(self, part: slice) -> Splats:
+        """Return views of rows, which are counted as those of the file."""
+        return self.splats.rows(slice(part.start - self.start, part.stop - self.start))
+
+    def nodes(self, part: slice) -> LodTree | None:
+        """Return views of nodes, counted as `rows`."""
+        return None if self.tree is None else self.tree.rows(slice(part.start - self.start, part.stop - self.start))
+
+
+class Fill(Protocol):
+    """Reads and decodes rows; raises `FormatError` if the file is cut short or corrupt."""
+
+    def __call__(self, target: Target, threads: int, progress: Progress) -> None: ...
+
+
+def plain_coding() -> FileCoding:
+    """Return the coding of files that hold numbers as they are."""
+    return PLAIN
+
+
+@dataclass(frozen=True, eq=False)
+class Reader:
+    """Splats of a file, or of several as one scene, whose headers have been read.
+
+    Attributes:
+        count: N splats, as the header promises.
+        sh_degree: of the decoded splats.
+        format, antialiased, notes, up, up_by, chunk_bytes: as in `Scene`.
+        fill: reads and decodes rows.
+        header: as in `Scene`; reading all splats may add to it.
+        has_tree: whether the splats are the nodes of a tree.
+        coding: called when all splats have been read, returns `Scene.coding`.
+        block: splats that are read together at least; blocks are whole ones.
+        up_by: as in `Scene`.
+        concurrent: several threads may call `fill` at a time.
+        threads: that decode rows.
+    """
+
+    count: int
+    sh_degree: int
+    format: str
+    fill: Fill
+    antialiased: bool = False
+    notes: tuple[str, ...] = ()
+    header: Mapping[str, int] = field(default_factory=dict)
+    up: str | None = None
+    has_tree: bool = False
+    chunk_bytes: tuple[int, ...] | None = None
+    coding: Callable[[], FileCoding] = plain_coding
+    block: int = 1
+    up_by: str = ""
+    concurrent: bool = False
+    threads: int = 1
+
+    def __getstate__(self) -> dict[str, Any]:
+        # The coding belongs to an open file, and blocks do without it.
+        return {**vars(self), "header": dict(self.header), "coding": plain_coding}
+
+    def read(
+        self,
+        start: int,
+        stop: int,
+        columns: Collection[str] = COLUMNS,
+        progress: Progress = silent,
+        *,
+        once: bool = False,
+    ) -> tuple[Splats, LodTree | None]:
+        """Read a range of splats, and their nodes in a file with a tree, of which whole blocks are read.
+
+        Args:
+            columns: of `Splats` to read; the others may be 0.
+            once: as in `Target`.
+
+        Raises:
+            FormatError: the file is cut short or corrupt.
+        """
+        make = Splats.empty if set(COLUMNS) <= set(columns) else Splats.zeros
+        splats, tree = make(stop - start, self.sh_degree), None
+        if self.has_tree:
+            tree = LodTree(np.empty(stop - start, np.uint16), np.empty(stop - start, np.uint32))
+        self.fill(Target(splats, start, tree, columns, once), self.threads, progress)
+        return splats, tree
+
+    def scene(self, *, columns: Collection[str] = COLUMNS, progress: Progress = silent, validate: bool = True) -> Scene:
+        """Read all splats, once.
+
+        Args:
+            columns: as for `read`.
+            validate: refuse a broken tree.
+
+        Raises:
+            FormatError: the file is cut short or corrupt, or its tree is broken.
+        """
+        splats, tree = self.read(0, self.count, columns, progress, once=True)
+        scene = Scene(splats, tree, chunk_bytes=self.chunk_bytes, coding=self.coding(), **facts_of(self))
+        return with_valid_tree(scene) if validate else scene
+
+    def blocks(self, start: int = 0, stop: int | None = None) -> Iterator[Splats]:
+        """Read a range of splats, all by default, in blocks.
+
+        Raises:
+            HasTreeError: the file has a tree.
+            FormatError: as `read`.
+        """
+        self.check_plain()
+        stop = self.count if stop is None else stop
+        step = self.block * max(1, BLOCK_SPLATS // self.block)
+        for first in range(start - start % self.block, stop, step):
+            yield self.read(max(first, start), min(first + step, stop))[0]
+
+    def check_plain(self) -> None:
+        """Check that the file has no tree, and if it has no splats either, that it is sound.
+
+        Raises:
+            HasTreeError, FormatError: it has one, or is corrupt.
+        """
+        if self.has_tree:
+            raise HasTreeError("it is a Level-of-Detail file already; give the splats that it was built from")
+        if not self.count:
+            self.read(0, 0)
+
+
+def decode_file(
+    codec: Any,
+    file: BinaryIO,
+    *,
+    open_companion: OpenCompanion | None = None,
+    threads: int = 1,
+    progress: Progress = silent,
+    **more: Any,
+) -> Scene:
+    """Read a whole scene from an open file by the module of its format; `more` is passed on to `Reader.scene`."""
+    reader: Reader = codec.open_content(Source(file, open_companion, threads=threads))
+    return dataclasses.replace(reader, threads=threads).scene(progress=progress, **more)
