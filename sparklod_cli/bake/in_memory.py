@@ -75,7 +75,7 @@ class InMemory:
             tree.environment = transformed(far, settings.transform, threads)
         self.clock.end("read")
         if isinstance(self.output, FileOutput):
-            self._leaves = Statistics.of_leaves(splats, self.output.needed, threads=threads)
+            self._leaves = Statistics.of_blocks(splats, np.ones(len(splats), np.bool_), self.output.needed, threads)
             self.output.check(self._leaves)  # before building, so that what does not fit is said at once
         tree.splats, tree.dropped, tree.method = len(splats), tally.dropped, settings.method
         leaves = [splats]
@@ -104,7 +104,10 @@ class InMemory:
                 tree.nodes = scene = Scene(*reordered(built, order, child_start), antialiased=antialiased, up=up)
             self.clock.end("arrange")
         if isinstance(output, FileOutput) and self._leaves is not None:
-            tree.statistics = Statistics.of_tree(scene, self._leaves, output.needed, threads=self.threads)
+            assert scene.tree is not None
+            inner = scene.splats.take(~scene.tree.is_leaf)
+            merged = Statistics.of_blocks(inner, np.zeros(len(inner), np.bool_), output.needed, self.threads)
+            tree.statistics = Statistics.merged([self._leaves, merged])
         elif isinstance(output, FileOutput):
             tree.statistics = Statistics.of_scene(scene, output.needed, threads=self.threads)
 

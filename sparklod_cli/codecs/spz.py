@@ -94,8 +94,7 @@ def settled(scene: Scene | Statistics, options: WriteOptions) -> WriteOptions:
     assert found.reach is not None
     bits, most = options.fractional_bits, largest_fractional_bits(found.reach)
     if bits is None:
-        assert found.leaf_scale is not None
-        bits = max(0, min(most, fine_bits(found.leaf_scale)))
+        bits = max(0, min(most, fine_bits(found.values["leaf_scale"])))
     if bits > most:
         raise FormatError(f"a coordinate does not fit {bits} fractional bits; use at most {most}")
     sh_bits = options.sh_bits

@@ -17,7 +17,7 @@ from ..codecs.rad.rad_layout import PROPERTIES, Row
 from ..codecs.spark_codings import STEPS_8_8_8, encode_axis_angle, encode_lod_alpha
 from ..codecs.spz import to_code
 from ..codecs.spz_streams import LOD, Layout
-from ..codecs.statistics import ALL_BITS, ShBytes, Statistics, enough, fine_bits
+from ..codecs.statistics import ALL_BITS, Distribution, ShBytes, enough, fine_bits
 from ..model.scene import Scene
 from ..model.selection import Selection
 from ..model.sh import COEFFICIENTS
@@ -87,8 +87,7 @@ def codings_of(scene: Scene, leaves: Splats, original: Splats, facts: RadFacts |
         yield from (of_spz(scene, leaves, covering=covering) for covering in (True, False))
         return
     # RAD does not store to how many bits centres were rounded. By default the scales decide; else the leaves tell.
-    scales, bits = Statistics.of_leaves(original, {"leaf_scale"}).leaf_scale, _fractional_bits(leaves.center)
-    assert scales is not None
+    scales, bits = Distribution.of(np.maximum.reduce(original.scale.T)), _fractional_bits(leaves.center)
     for guess, covering in ((fine_bits(scales), True), (bits, True), (bits, False)):
         yield of_rad(facts, leaves, guess, covering=covering)
 

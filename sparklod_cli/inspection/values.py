@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -9,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..lod.kernels.digits import sh_lengths
+from ..codecs.statistics import Distribution, interpolated
 from ..model.gaussian import spark_size
 from ..model.scene import Scene
 from ..model.sh import COEFFICIENTS
@@ -17,7 +18,6 @@ from ..model.splats import COLUMNS, FloatArray, Splats
 from ..system.threads import ordered_map
 from ..tables.histograms import Histogram, histogram
 from .blocks import Block, ReportBlocks, largest, smallest
-from .percentiles import Percentiles
 from .value_checks import Ends, ValueTally
 
 #: Coordinates, whose percentiles are those of the box.
@@ -52,9 +52,8 @@ def _anisotropy(splats: Splats) -> FloatArray:
 
 def _sh(degree: int) -> SplatQuantity:
     def of(splats: Splats) -> FloatArray:
-        lengths = np.empty(len(splats), np.float64)
-        sh_lengths(splats.sh, COEFFICIENTS[degree - 1], COEFFICIENTS[degree], lengths)
-        return lengths
+        own = splats.sh[:, COEFFICIENTS[degree - 1] : COEFFICIENTS[degree]]
+        return np.sqrt(np.einsum("nkc,nkc->n", own, own, dtype=np.float64) / (3 * own.shape[1]))
 
     return SplatQuantity(f"root mean square of the coefficients of degree {degree}", ("sh",), of, sh_degree=degree)
 
@@ -82,8 +81,62 @@ QUANTITIES = {
 MAIN = ("scale", "opacity", "anisotropy")
 #: Percentiles of a quantity, by name.
 PERCENTILES = {"p1": 1, "p25": 25, "p50": 50, "p75": 75, "p99": 99}
-#: The same, the least and the largest number.
-LEVELS = (0, *PERCENTILES.values(), 100)
+#: The same, with the smallest and the largest number.
+LEVELS = {"min": 0, **PERCENTILES, "max": 100}
+
+#: Numbers of a quantity that are kept and sorted where a scene is read by chunk. Chosen.
+KEPT = 1 << 18
+
+
+class Numbers:
+    """Percentiles and mean of numbers that are added block by block.
+
+    Percentiles are exact for numbers up to a limit. More than that are counted in a `Distribution` of their distances
+    from an origin, in memory that does not depend on their number: a percentile is then off by at most 0.8 % of its
+    distance from there, and stands for one within float32.
+
+    Args:
+        limit: how many numbers are kept.
+        centred: the origin is the median of the first numbers, instead of 0.
+    """
+
+    def __init__(self, limit: float, *, centred: bool) -> None:
+        self._limit, self._centred = limit, centred
+        self._kept: list[FloatArray] = []
+        self._distribution: Distribution | None = None
+        self._sum = self._origin = 0.0
+        self.count = 0
+
+    def add(self, values: FloatArray) -> None:
+        """Add (n,) numbers; those that are not finite are left out."""
+        values = values[np.isfinite(values)]
+        self.count += len(values)
+        self._sum += float(values.sum(dtype=np.float64))
+        self._kept.append(values)
+        if self._distribution is not None or self.count > self._limit:
+            self._merge()
+
+    def _merge(self) -> None:
+        """Count the numbers that were kept instead of keeping them."""
+        values = np.concatenate(self._kept).astype(np.float64)
+        self._kept = []
+        if self._distribution is None and self._centred:
+            self._origin = float(np.median(values))
+        most = float(np.finfo(np.float32).max)
+        added = Distribution.of(np.clip(values - self._origin, -most, most).astype(np.float32))
+        known = [] if self._distribution is None else [self._distribution]
+        self._distribution = Distribution.merged([*known, added])
+
+    def summary(self) -> dict[str, float]:
+        """Return the percentiles and the mean by name; nothing without numbers."""
+        if not self.count:
+            return {}
+        if self._distribution is not None:
+            found = {name: self._origin + self._distribution.quantile(level / 100) for name, level in LEVELS.items()}
+        else:
+            at = np.sort(np.concatenate(self._kept)).item
+            found = {name: interpolated(at, self.count, level / 100) for name, level in LEVELS.items()}
+        return {name: _number(value) for name, value in found.items()} | {"mean": _number(self._sum / self.count)}
 
 
 @dataclass(frozen=True)
@@ -132,37 +185,37 @@ def examine(splats: Splats, *, all_quantities: bool = False) -> ValueFacts:
 
 
 def statistics_of(blocks: ReportBlocks, tally: ValueTally, *, all_quantities: bool, threads: int) -> ValueFacts:
-    """Statistics of splats, which pass as often as percentiles need.
+    """Statistics of splats, which are read once more.
 
     Args:
         threads: to work on, each on quantities of some columns, where blocks are in memory.
     """
     none = blocks.about.splats.take(slice(0))
     shown = names_of(none) if all_quantities else MAIN
-    numbers = {name: Percentiles(LEVELS, quantity(none, name).dtype) for name in dict.fromkeys((*AXES, *shown))}
     groups: dict[tuple[str, ...], list[str]] = {}
-    for name in numbers:
+    for name in dict.fromkeys((*AXES, *shown)):
         groups.setdefault(QUANTITIES[name].columns if blocks.in_memory else (), []).append(name)
 
     def valid_splats(block: Block) -> Splats:
         valid = tally.valid.get(block.start)
         return block.splats if valid is None else block.splats.take(valid)
 
-    def count(names: list[str]) -> None:
-        while left := [name for name in names if numbers[name].passes]:
-            for splats in blocks.map(valid_splats, {column for name in left for column in QUANTITIES[name].columns}, 1):
-                for name in left:
-                    numbers[name].add(quantity(splats, name))
-            for name in left:
-                numbers[name].end_pass()
+    def summaries(names: list[str]) -> dict[str, dict[str, float]]:
+        limit = math.inf if blocks.in_memory else KEPT
+        numbers = {name: Numbers(limit, centred=name in AXES) for name in names}
+        columns = {column for name in names for column in QUANTITIES[name].columns}
+        for splats in blocks.map(valid_splats, columns, 1):
+            for name in names:
+                numbers[name].add(quantity(splats, name))
+        return {name: numbers.pop(name).summary() for name in names}
 
-    for _ in ordered_map(count, groups.values(), threads):
-        pass
+    found: dict[str, dict[str, float]] = {}
+    for some in ordered_map(summaries, groups.values(), threads):
+        found |= some
     box = box_98 = None
-    if numbers["x"].count:
+    if found["x"]:
         box = Box(_numbers(tally.low), _numbers(tally.high))
-        ends = np.array([numbers[axis].values() for axis in AXES])
-        box_98 = Box(*(_numbers(ends[:, LEVELS.index(level)]) for level in (1, 99)))
+        box_98 = Box(*([found[axis][level] for axis in AXES] for level in ("p1", "p99")))
     return ValueFacts(
         box,
         box_98,
@@ -171,15 +224,8 @@ def statistics_of(blocks: ReportBlocks, tally: ValueTally, *, all_quantities: bo
         tally.number("transparent"),
         tally.number("without scale"),
         tally.number("opaque"),
-        {name: _summary(numbers[name]) for name in shown},
+        {name: {key: found[name].get(key) for key in (*LEVELS, "mean")} for name in shown},
     )
-
-
-def _summary(numbers: Percentiles) -> dict[str, float | None]:
-    if not numbers.count:
-        return dict.fromkeys(("min", *PERCENTILES, "max", "mean"))
-    levels: dict[str, float | None] = dict(zip(("min", *PERCENTILES, "max"), _numbers(numbers.values()), strict=True))
-    return levels | {"mean": _number(numbers.mean)}
 
 
 def _number(value: Any) -> float:

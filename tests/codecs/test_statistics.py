@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
 
 from sparklod_cli.codecs import quantize, spz, statistics
 from sparklod_cli.codecs.options import DEFAULTS, RadOptions, WriteOptions
@@ -25,8 +26,7 @@ from sparklod_cli.codecs.statistics import (
     SMALL_QUANTILE,
     STEPS_A_SPLAT,
     UPPER,
-    Binades,
-    Magnitudes,
+    Distribution,
     ShBytes,
     Statistics,
     enough,
@@ -87,8 +87,11 @@ def test_a_tree_whose_leaves_were_counted_settles_as_the_whole(
     center[0], scale[0] = 3_000, 80  # the root
     scene = dataclasses.replace(scene, splats=dataclasses.replace(splats, center=center, scale=scale))
     assert scene.tree is not None
-    leaves = Statistics.of_leaves(scene.splats.take(scene.tree.is_leaf), needed, threads=2)
-    found = Statistics.of_tree(scene, leaves, needed, threads=2)
+    leaf = scene.tree.is_leaf
+    leaves, inner = (
+        Statistics.of_blocks(scene.splats.take(rows), leaf[rows], needed, threads=2) for rows in (leaf, ~leaf)
+    )
+    found = Statistics.merged([leaves, inner])
     assert (found.count, found.tree) == (len(scene), True)
     settled = codec.settled(found, DEFAULTS)
     assert settled == codec.settled(Statistics.of(scene.splats, scene.tree.is_leaf, needed), DEFAULTS)
@@ -98,24 +101,19 @@ def test_a_tree_whose_leaves_were_counted_settles_as_the_whole(
 def test_an_array_holds_all_of_them() -> None:
     scene = tree_of(900, 2)
     found = Statistics.of_scene(scene)
-    assert set(found.magnitudes) == {"rgb", "scale", "sh1", "sh2"}
+    assert set(found.values) == {"leaf_scale", "leaf_length", "rgb", "scale", "sh1", "sh2"}
     array = found.array()
-    assert array.dtype == np.uint8 and array.ndim == 1 and len(array) < 20_000
+    assert array.dtype == np.uint8 and array.ndim == 1 and len(array) < 100_000
     back = Statistics.from_array(array)
     for name, value in vars(found).items():
-        if name not in ("leaf_scale", "leaf_length", "leaf_sh", "magnitudes"):
+        if name not in ("values", "leaf_sh"):
             assert getattr(back, name) == value
-    for one, other in [
-        (found.leaf_scale, back.leaf_scale),
-        (found.leaf_sh, back.leaf_sh),
-        (found.leaf_length, back.leaf_length),
-        *((found.magnitudes[name], back.magnitudes[name]) for name in found.magnitudes),
-    ]:
+    pairs = [(values, back.values[name]) for name, values in found.values.items()]
+    for one, other in [(found.leaf_sh, back.leaf_sh), *pairs]:
         for key, value in vars(one).items():
             np.testing.assert_array_equal(getattr(other, key), value)
     few = Statistics.from_array(Statistics.of_scene(scene, {"reach"}).array())
-    assert few.leaf_scale is None and few.leaf_sh is None
-    assert few.reach == float(np.abs(scene.splats.center).max()) and not few.magnitudes
+    assert few.reach == float(np.abs(scene.splats.center).max()) and not few.values and few.leaf_sh is None
 
 
 def test_only_what_is_needed_is_counted() -> None:
@@ -148,29 +146,32 @@ def test_pieces_of_different_scenes_are_refused() -> None:
 def test_tops_are_above_quantiles_by_less_than_a_hundredth(seed: int) -> None:
     rng = np.random.default_rng(seed)
     values = (rng.normal(size=(20_001, 3)) * np.exp(rng.normal(0, 3, size=(20_001, 1)))).astype(np.float32)
-    found = Magnitudes.of(values)
+    found = Distribution.of(values)
     assert (found.count, found.lowest, found.highest) == (values.size, values.min(), values.max())
+    counts = found.magnitudes(1) + found.magnitudes(-1)
     size = np.abs(values).reshape(-1)
     for share in (0.0, 1e-3, 1e-2, 0.5):
-        (top,) = tops(found.positive + found.negative, size.size, float(size.max()), np.array([share]))
+        (top,) = tops(counts, size.size, float(size.max()), np.array([share]))
         assert np.count_nonzero(size > top) <= share * size.size
         exact = np.sort(size)[::-1][int(share * size.size)]
         assert exact * (1 - 1e-6) <= top <= exact * 1.009
 
 
 def test_signs_and_ends_are_kept_apart() -> None:
-    found = Magnitudes.of(np.array([[-2.5, 0.0, 0.75], [1e-30, 4e30, -1e-42]], np.float32))
-    assert (found.positive.sum(), found.negative.sum()) == (4, 2)
-    for counts, values in ((found.positive, [0, 1e-30, 0.75, 4e30]), (found.negative, [1e-42, 2.5])):
+    found = Distribution.of(np.array([[-2.5, 0.0, 0.75], [1e-30, 4e30, -1e-42], [1, -0.0, 0.75]], np.float32))
+    positive, negative = found.magnitudes(1), found.magnitudes(-1)
+    assert (positive.sum(), negative.sum()) == (7, 2)
+    for counts, values in ((positive, [0, 1e-30, 0.75, 1, 4e30]), (negative, [1e-42, 2.5])):
         bins = np.flatnonzero(counts)
         assert (LOWER[bins] <= values).all() and (values < UPPER[bins]).all()
-    assert tops(found.negative, 6, 2.5, np.array([0.0])) == [2.5]
+    assert tops(negative, 9, 2.5, np.array([0.0])) == [2.5]
 
 
 def test_no_values_have_no_ends() -> None:
-    found = Magnitudes.of(np.empty((0, 3), np.float32))
+    found = Distribution.of(np.empty((0, 3), np.float32))
     assert (found.count, found.lowest, found.highest) == (0, 0, 0)
-    assert tops(found.positive, 1, 0, np.array([0.0, 0.5])).tolist() == [0, 0]
+    assert found.quantile(0.5) == 0
+    assert tops(found.magnitudes(1), 1, 0, np.array([0.0, 0.5])).tolist() == [0, 0]
 
 
 def bits_of(values: np.ndarray) -> int:
@@ -186,26 +187,46 @@ def test_bits_are_those_of_the_quantile(seed: int) -> None:
     spread = rng.uniform(0, 4)
     values = np.exp(rng.normal(rng.uniform(-40, 40), spread, size=rng.integers(1, 400))).astype(np.float32)
     values[rng.random(len(values)) < rng.choice([0, 0.01, 0.02])] = 0
-    assert fine_bits(Binades.of(values)) == bits_of(values)
+    assert fine_bits(Distribution.of(values)) == bits_of(values)
 
 
-def test_a_quantile_between_two_binades_is_exact() -> None:
+def test_a_quantile_between_two_bins_is_exact() -> None:
     values = np.array([1.5, 1.75, 200, 300], np.float32)
-    found = Binades.of(values)
-    assert found.quantile(0.5) == np.quantile(values, 0.5) == 100.875
-    assert found.quantile(0) == found.quantile(0.2) == 1.5
-    assert found.quantile(1) == 300
+    found = Distribution.of(values)
+    for share in (0, 0.2, 0.5, 1):
+        assert found.quantile(share) == np.quantile(values, share)
+    assert Distribution.of(np.array([1, -np.nan], np.float32)).quantile(0) == math.inf
+
+
+@given(
+    arrays.arrays("<f4", st.integers(1, 60), elements=st.floats(width=32, allow_nan=False, allow_infinity=False)),
+    st.lists(st.integers(0, 60), max_size=4),
+    st.floats(0, 1),
+)
+def test_quantiles_of_merged_parts_are_off_by_less_than_a_hundredth(
+    values: np.ndarray, cuts: list[int], share: float
+) -> None:
+    parts = [Distribution.of(part) for part in np.split(values, sorted(cuts))]
+    found = Distribution.merged([*parts[1:], parts[0]])
+    whole = Distribution.of(values)
+    for name, column in vars(whole).items():
+        np.testing.assert_array_equal(getattr(found, name), column)
+    ordered, place = np.sort(values).astype(np.float64), share * (len(values) - 1)
+    ends = ordered[[math.floor(place), math.ceil(place)]]
+    off = 0.008 * np.abs(ends) + 1e-38
+    assert ends[0] - off[0] <= found.quantile(share) <= ends[1] + off[1]
+    assert (found.quantile(0), found.quantile(1)) == (values.min(), values.max())
 
 
 @pytest.mark.parametrize("small", [1.0, 2.0**-149, 2.0**-126, 2.0**127, np.nextafter(np.float32(2), np.float32(0))])
 def test_powers_of_two_and_the_ends_of_float32_have_their_own_binade(small: float) -> None:
     values = np.full(7, small, np.float32)
-    assert fine_bits(Binades.of(values)) == bits_of(values)
+    assert fine_bits(Distribution.of(values)) == bits_of(values)
 
 
 @pytest.mark.parametrize("values", [[], [0, 0, 5], [1, math.nan], [math.inf, math.inf]])
 def test_without_a_size_nothing_is_rounded(values: list[float]) -> None:
-    assert fine_bits(Binades.of(np.array(values, np.float32))) == EXACT_BITS
+    assert fine_bits(Distribution.of(np.array(values, np.float32))) == EXACT_BITS
 
 
 def sh_of(degree: int, spread: float, count: int = 400, seed: int = 0) -> np.ndarray:

@@ -15,10 +15,11 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from sparklod_cli.cli import run
-from sparklod_cli.inspection import chunks, percentiles
+from sparklod_cli.inspection import chunks
 from sparklod_cli.inspection.blocks import ReportBlocks, merged
 from sparklod_cli.inspection.report import Report, ReportSettings, inspect
 from sparklod_cli.inspection.tree import TreeColumns
+from sparklod_cli.inspection.values import LEVELS, Numbers
 from sparklod_cli.io import read_scene
 from sparklod_cli.io.rad_file import RadFile
 from sparklod_cli.model.gaussian import spark_size
@@ -173,8 +174,7 @@ def test_of_files_with_faults(name: str, tmp_path: Path) -> None:
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # any bits are numbers
 @pytest.mark.parametrize("links", [False, True])
 @pytest.mark.parametrize("seed", range(6))
-def test_of_files_with_any_numbers(seed: int, links: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(percentiles, "KEPT", 100)  # so that more numbers pass several times
+def test_of_files_with_any_numbers(seed: int, links: bool, tmp_path: Path) -> None:
     path = random_tree(seed, links=links).write(tmp_path / "a.rad")
     for settings in (EVERYTHING, PLAIN):
         one, other = both(path, settings)
@@ -228,35 +228,39 @@ def numbers_of(kind: str) -> st.SearchStrategy[np.ndarray]:
     return arrays.arrays(kind, st.integers(1, 60), elements=elements | st.sampled_from([0.0, -0.0, 1.0, 1.5]))
 
 
+def summary_of(values: np.ndarray, limit: float, step: int, *, centred: bool = False) -> dict[str, float]:
+    numbers = Numbers(limit, centred=centred)
+    for start in range(0, len(values), step):
+        numbers.add(values[start : start + step])
+    assert numbers.count == np.isfinite(values).sum()
+    return numbers.summary()
+
+
 @pytest.mark.filterwarnings("ignore:overflow")
-@given(st.one_of(numbers_of("<f4"), numbers_of("<f8")), st.integers(1, 20), st.integers(0, 50))
-@example(np.array([-0.0, 0.0, 0.0], np.float32), 2, 0)
-def test_percentiles_are_those_of_numpy(values: np.ndarray, step: int, kept: int) -> None:
-    levels, passes = (0, 1, 25, 50, 75, 99, 100), 0
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(percentiles, "KEPT", kept)
-        found = percentiles.Percentiles(levels, values.dtype)
-        while found.passes:
-            for start in range(0, len(values), step):
-                found.add(values[start : start + step])
-            found.end_pass()
-            passes += 1
-    most = 1 if len(values) <= kept or len(np.unique(values)) == 1 else values.dtype.itemsize // 2
-    assert 1 <= passes <= most
-    assert np.array_equal(found.values(), np.percentile(values.astype(np.float64), levels), equal_nan=True)
-    assert found.mean == pytest.approx(values.mean(dtype=np.float64), rel=1e-9, abs=1e-9 * float(np.abs(values).max()))
+@given(st.one_of(numbers_of("<f4"), numbers_of("<f8")), st.integers(1, 20))
+@example(np.array([-0.0, 0.0, 0.0], np.float32), 2)
+def test_percentiles_of_numbers_that_are_kept_are_those_of_numpy(values: np.ndarray, step: int) -> None:
+    found, wide = summary_of(values, len(values), step), values.astype(np.float64)
+    assert list(found) == [*LEVELS, "mean"]
+    for name, level in LEVELS.items():
+        assert found[name] == pytest.approx(np.percentile(wide, level), rel=6e-6, abs=1e-320)
+    assert found["mean"] == pytest.approx(wide.mean(), rel=6e-6, abs=1e-9 * float(np.abs(wide).max()))
 
 
-@pytest.mark.parametrize(("kind", "step", "passes"), [("<f4", 2.0**-7, 1), ("<f4", 2.0**-23, 2), ("<f8", 2.0**-52, 4)])
-def test_numbers_pass_until_their_digits_tell_them_apart(
-    kind: str, step: float, passes: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(percentiles, "KEPT", 0)
-    values = (1 + step * np.arange(20)).astype(kind)
-    found, count = percentiles.Percentiles((0, 50, 99), values.dtype), 0
-    while found.passes:
-        found.add(np.concatenate([values, [np.nan, np.inf]]).astype(kind))
-        found.end_pass()
-        count += 1
-    assert (count, found.count) == (passes, len(values))
-    assert np.array_equal(found.values(), np.percentile(values.astype(np.float64), (0, 50, 99)))
+@pytest.mark.parametrize("origin", [0, 500_000])
+@pytest.mark.parametrize("kind", ["<f4", "<f8"])
+def test_percentiles_of_more_numbers_are_off_by_less_than_a_hundredth(kind: str, origin: int) -> None:
+    rng = np.random.default_rng(0)
+    away = (rng.normal(size=5_000) * np.exp(rng.normal(size=5_000))).astype(np.float32)
+    away[:3] = np.nan, np.inf, -np.inf
+    values = (origin + away).astype(kind)
+    found, finite = summary_of(values, 100, 64, centred=True), values[np.isfinite(values)].astype(np.float64)
+    for name, level in LEVELS.items():
+        expected = np.percentile(finite, level)
+        assert found[name] == pytest.approx(expected, abs=0.009 * abs(expected - origin) + 5e-6 * abs(expected) + 2e-3)
+    assert found["mean"] == pytest.approx(finite.mean(), rel=1e-5)
+
+
+def test_numbers_beyond_float32_are_counted() -> None:
+    found = summary_of(np.array([1e-60, 1.0, 1e60, np.inf]), 1, 2)
+    assert [found[name] for name in ("min", "p50", "max")] == pytest.approx([0, 1, 3.40282e38], rel=1e-5)

@@ -15,7 +15,7 @@ from ...system.errors import FormatError
 from ..clamps import CodeRange
 from ..options import RadOptions, WriteOptions
 from ..splat_encoding import LARGEST_END, SCALE_ZERO, SplatEncoding
-from ..statistics import EXACT_BITS, LOWER, SMALL_QUANTILE, UPPER, Magnitudes, Statistics, fine_bits, tops
+from ..statistics import EXACT_BITS, LOWER, SMALL_QUANTILE, UPPER, Distribution, Statistics, fine_bits, tops
 from .property_codings import LARGEST_F16
 from .rad_layout import AUTO, OPTIONS, PROPERTIES, RANGES, Row
 
@@ -96,13 +96,12 @@ def settled(scene: Scene | Statistics, options: WriteOptions) -> WriteOptions:
         chosen["scales"] = "ln_f16"
     if rad.rgb == AUTO and ranges.rgb_max - ranges.rgb_min > WIDE_RGB_RANGE:
         chosen["rgb"] = "f16"
-    if rad.orientation == AUTO and statistics.leaf_length is not None and statistics.leaf_length.quantile(0.5) >= LONG:
+    if rad.orientation == AUTO and statistics.values["leaf_length"].quantile(0.5) >= LONG:
         chosen["orientation"] = "f16"
     bits = rad.center_bits
     if _rounds(rad):
         # The lowest bytes of rounded float32 are mostly zeros, which take no room.
-        assert statistics.leaf_scale is not None
-        bits = min(fine_bits(statistics.leaf_scale), EXACT_BITS)
+        bits = min(fine_bits(statistics.values["leaf_scale"]), EXACT_BITS)
     return dataclasses.replace(options, rad=dataclasses.replace(rad, **chosen, center_bits=bits, ranges=ranges))
 
 
@@ -142,11 +141,11 @@ def held(options: WriteOptions, sh_degree: int) -> list[CodeRange]:
 
 def fitted(statistics: Statistics) -> SplatEncoding:
     """Return the ranges that suit splats in any order: what clamping and rounding cost together is least."""
-    rgb_min, rgb_max = _linear_range(statistics.magnitudes["rgb"])
-    low, high = _log_range(statistics.magnitudes["scale"])
+    rgb_min, rgb_max = _linear_range(statistics.values["rgb"])
+    low, high = _log_range(statistics.values["scale"])
     sh_max = dict.fromkeys(("sh1_max", "sh2_max", "sh3_max"), 1.0)
     for degree in range(1, statistics.sh_degree + 1):
-        sh_max[f"sh{degree}_max"] = _largest(statistics.magnitudes[f"sh{degree}"])
+        sh_max[f"sh{degree}_max"] = _largest(statistics.values[f"sh{degree}"])
     return SplatEncoding(rgb_min, rgb_max, low, high, **sh_max, lod_opacity=statistics.tree)
 
 
@@ -161,13 +160,13 @@ def _clamping(counts: NDArray[np.int64], top: float) -> float:
     return float(np.sum(counts[bins] * beyond**2))
 
 
-def _linear_range(magnitudes: Magnitudes) -> tuple[float, float]:
+def _linear_range(values: Distribution) -> tuple[float, float]:
     """Return the range of 255 steps with the least squared error, of rounding and of clamping together."""
-    total = max(magnitudes.count, 1)
-    below = tops(magnitudes.negative, total, -magnitudes.lowest, BEYOND)
-    above = np.maximum(tops(magnitudes.positive, total, magnitudes.highest, BEYOND), 1)
-    lows = {-low: _clamping(magnitudes.negative, low) for low in below}
-    highs = {high: _clamping(magnitudes.positive, high) for high in above}
+    total, negative, positive = max(values.count, 1), values.magnitudes(-1), values.magnitudes(1)
+    below = tops(negative, total, -values.lowest, BEYOND)
+    above = np.maximum(tops(positive, total, values.highest, BEYOND), 1)
+    lows = {-low: _clamping(negative, low) for low in below}
+    highs = {high: _clamping(positive, high) for high in above}
 
     def error(ends: tuple[float, float]) -> float:
         low, high = ends
@@ -177,10 +176,10 @@ def _linear_range(magnitudes: Magnitudes) -> tuple[float, float]:
     return _outward(max(low, -LARGEST_END), False), _outward(min(high, LARGEST_END), True)
 
 
-def _largest(magnitudes: Magnitudes) -> float:
+def _largest(values: Distribution) -> float:
     """Return the largest coefficient for 254 steps with the least squared error of rounding and clamping."""
-    total, counts = magnitudes.count, magnitudes.positive + magnitudes.negative
-    most = max(magnitudes.highest, -magnitudes.lowest)
+    total, counts = values.count, values.magnitudes(1) + values.magnitudes(-1)
+    most = max(values.highest, -values.lowest)
     if not total:
         return 1.0
 
@@ -190,9 +189,9 @@ def _largest(magnitudes: Magnitudes) -> float:
     return max(GRID, _outward(min(*tops(counts, total, most, BEYOND), LARGEST_END, key=error), True))
 
 
-def _log_range(scale: Magnitudes) -> tuple[float, float]:
+def _log_range(scale: Distribution) -> tuple[float, float]:
     """Return the logarithms of a small and of the largest scale: sizes of coarse splats must not be clamped."""
-    counts = scale.positive.copy()
+    counts = scale.magnitudes(1)
     counts[(UPPER <= SCALE_ZERO) | ~np.isfinite(LOWER)] = 0
     bins = np.flatnonzero(counts)
     if not bins.size:
