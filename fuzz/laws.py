@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from sparklod_cli.commands.inspect_text import finding_line
+from sparklod_cli.commands.inspect import finding_line
 from sparklod_cli.inspection import report
 from sparklod_cli.io import open_reader, read_parts, read_scene
 from sparklod_cli.model.scene import DetailScene, Scene

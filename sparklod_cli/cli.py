@@ -15,13 +15,13 @@ from .system import interrupts, stdio
 from .system.errors import SparklodError, out_of_memory
 from .system.printable import printable
 
-#: Characters that are quoted of an error that nobody foresaw.
+#: Most characters of an unexpected error in its message.
 QUOTED = 200
 
 #: Variables by which a person chooses the threads of numpy's OpenBLAS; the first one is for nothing else.
 BLAS_THREADS = ("OPENBLAS_NUM_THREADS", "GOTO_NUM_THREADS", "OMP_NUM_THREADS")
 
-#: The commands, and what `sparklod --help` says of them.
+#: Commands and their lines in `sparklod --help`.
 COMMANDS = {
     "build-lod": "Bake splat files into Level-of-Detail files.",
     "simplify": "Write a scene with fewer splats, for all cameras.",
@@ -35,7 +35,7 @@ COMMANDS = {
     "help": "Print the help of a command.",
 }
 
-#: What people come to do, and the command for it; the commands can be run one after the other.
+#: Tasks and their commands, which can be run one after the other.
 TASKS = {
     "Bake a scene for the web": "sparklod build-lod scene.ply",
     "Look at it in a browser": "sparklod view scene-lod.spz",
@@ -86,7 +86,7 @@ def cli(ctx: click.Context) -> None:
 
 
 def run(arguments: list[str] | None = None) -> int:
-    """Run the command line and return its exit code; arguments are those of the process unless given."""
+    """Run a command line, by default that of the process, and return its exit code."""
     with stdio.guarded():
         code = _run(arguments)
     return interrupts.INTERRUPTED if code and interrupts.came() else code
@@ -107,7 +107,7 @@ def _run(arguments: list[str] | None) -> int:
     except (click.Abort, KeyboardInterrupt):
         say("interrupted")
         return interrupts.INTERRUPTED
-    except OSError as error:  # of neither a file that was named nor standard output: those are told where they occur
+    except OSError as error:  # not about a named file or standard output; those are reported at the source
         if out_of_memory(error):
             return _failed(error, verbosity)
         where = f"{os.fsdecode(error.filename)}: " if isinstance(error.filename, (str, bytes, os.PathLike)) else ""
@@ -119,9 +119,9 @@ def _run(arguments: list[str] | None) -> int:
 
 
 def _failed(error: BaseException, verbosity: Verbosity) -> int:
-    """Say in one line what nobody foresaw, or that memory ran out, and return the exit code.
+    """Report an unexpected error, or that memory ran out, in one line; return the exit code.
 
-    This is the last guard: whatever gets here is ours to mend, but a person has no use for a traceback.
+    Last resort: reaching this line is a bug, but a user has no use for a traceback.
     """
     if interrupts.came():
         say("interrupted")
@@ -143,9 +143,9 @@ def _failed(error: BaseException, verbosity: Verbosity) -> int:
 
 
 def one_thread_of_blas() -> None:
-    """Have numpy's library of linear algebra start no threads: each spins for some 60 ms when numpy is loaded.
+    """Keep numpy's OpenBLAS from starting threads: each spins for some 60 ms when numpy is loaded.
 
-    What it gets are small matrices, and blocks of large ones on threads of our own.
+    Matrices are small, or are blocks of large ones on threads of our own.
     """
     if not any(map(os.environ.get, BLAS_THREADS)):
         os.environ[BLAS_THREADS[0]] = "1"

@@ -41,7 +41,7 @@ class PicturePair:
     """A cut's picture and that of full detail, of one camera.
 
     Attributes:
-        row: what is known of them so far.
+        row: the cells known so far.
         image, full: (H, W, 4) of the cut and of full detail.
         edges: (H, W) where full detail has edges.
         before: the pictures, of the same budget, that they follow in a movement; None for the first. Those have no
@@ -61,11 +61,7 @@ class Comparison:
     Args:
         scenes: trees alone, read with all columns of their splats.
         lod: settings of the cuts but for the budget.
-        full: what full detail is; the leaves of the trees unless given.
-
-    Attributes:
-        leaves: splats of full detail, all instances together.
-        counts: of `budgets`, in splats.
+        full: full detail; None for the leaves of the trees.
 
     Raises:
         SparklodError: a budget is less than one splat for each instance.
@@ -131,7 +127,7 @@ class Comparison:
 
 
 def measured(pictures: PicturePair) -> Row:
-    """Return the row of a comparison: what was known of the pictures, and how far they are apart."""
+    """Return the complete row of a comparison, with the errors of the picture."""
     row, before = pictures.row, pictures.before
     tiles = []
     for name, gray in BACKGROUNDS.items():

@@ -28,10 +28,10 @@ from .system.threads import processors
 #: ok: works. note: something optional is missing, or could be better. problem: baking does not work.
 State = Literal["ok", "note", "problem"]
 
-#: Extras for display who work on sparklod, which nobody else need install.
+#: Extras for developers of sparklod.
 INTERNAL_EXTRAS = ("dev", "docs", "test")
 
-#: What the other extras bring, for display.
+#: Purposes of the other extras, for display.
 PURPOSES = {
     "cloud": "files at addresses such as s3://bucket/scan.ply",
     "cluster": "build-lod on several processes or machines",
@@ -41,16 +41,16 @@ PURPOSES = {
     "video": ".mp4 animations",
 }
 
-#: Seconds that a process which tries something is given; Open3D alone may load for a minute.
+#: Time limit of a child process, seconds; Open3D alone may load for a minute.
 PATIENCE = 120
 
 #: Below so many bytes of available memory, little can be baked.
 LITTLE_MEMORY = 1 << 30
 
-#: What `_print_kernels` is called by, in a process of its own.
+#: Program of the child process that calls `_print_kernels`.
 KERNELS = f"import {__name__} as doctor; doctor._print_kernels()"
 
-#: Prints the card, its driver and the versions of what compiles for it, or exits with the reason why there is none.
+#: Prints the card, its driver and the versions of its compilers, or exits with the reason why there is none.
 CARD = "from sparklod_cli.render.cuda.card import print_card; print_card()"
 
 #: Prints the encoder of videos.
@@ -59,12 +59,9 @@ FFMPEG = "import imageio_ffmpeg; print(imageio_ffmpeg.get_ffmpeg_exe())"
 
 @dataclass(frozen=True)
 class Check:
-    """One thing that was looked at.
+    """Result of one check.
 
     Attributes:
-        name: what it is.
-        state: see `State`.
-        value: what was found.
         advice: what to do about it; empty where nothing need be done.
     """
 
@@ -75,7 +72,7 @@ class Check:
 
 
 def check_all(begun: Callable[[str], None] = lambda name: None) -> list[Check]:
-    """Look at everything, in the order in which a person would; takes some seconds."""
+    """Run all checks, the most important first; takes some seconds."""
     found: list[Check] = []
     parts: list[tuple[str, Callable[[], Iterator[Check]]]] = [
         ("versions", _versions),
@@ -94,8 +91,8 @@ def check_all(begun: Callable[[str], None] = lambda name: None) -> list[Check]:
         begun(name)
         try:
             found.extend(look())
-        except Exception as error:  # this is where people turn when things are broken in ways that nobody foresaw
-            value = f"cannot be looked at ({type(error).__name__}: {error})"
+        except Exception as error:  # doctor must work where things are broken in unexpected ways
+            value = f"cannot be checked ({type(error).__name__}: {error})"
             found.append(Check(name, "note", value, "please report this, with what sparklod doctor --json prints"))
     return found
 
@@ -115,7 +112,7 @@ def _packages() -> Iterator[Check]:
             advice = pip_install(one.requirement, options=["--upgrade"]) if one.missing else ""
             yield Check(one.name, "problem" if one.missing else "ok", one.state, advice)
     except metadata.PackageNotFoundError:
-        value = "sparklod itself is not installed, so nothing tells what it requires"
+        value = "sparklod itself is not installed, so its requirements are unknown"
         yield Check("packages", "note", value, install_hint())
 
 
@@ -141,7 +138,7 @@ def _extras() -> Iterator[Check]:
 
 
 def _print_kernels() -> None:
-    """Load all that a bake takes, and print what there is of kernels, as JSON."""
+    """Import everything that a bake needs, and print the state of the kernels as JSON."""
     from . import warmup
     from .bake.flow import bake  # noqa: F401
     from .system import jit
@@ -165,7 +162,7 @@ def _kernels() -> Iterator[Check]:
         advice = (
             f"{install_hint(options=['--force-reinstall'])}   # in a new virtual environment, if that does not help"
         )
-        yield Check("kernels", "problem", f"what bakes does not load: {_last_line(err, code)}", advice)
+        yield Check("kernels", "problem", f"the modules of bakes cannot be imported: {_last_line(err, code)}", advice)
         return
     for text in about["distrusted"]:
         yield Check("kernel cache", "problem", *text.split("; ", 1))
@@ -292,7 +289,6 @@ def _is_installed(package: str) -> bool:
 
 
 def _run(command: list[str]) -> tuple[int, str, str]:
-    """Return the exit code, output and errors of a program that has nothing to read."""
     try:
         done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, check=False, timeout=PATIENCE)
     except subprocess.TimeoutExpired:

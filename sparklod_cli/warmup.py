@@ -22,7 +22,7 @@ from .system.progress import Progress, silent
 from .system.python_process import program_command
 from .system.threads import processors
 
-#: Seconds between two looks at how far the child processes are, for the progress bar.
+#: Seconds between updates of the progress bar.
 PATIENCE = 0.1
 
 #: Program of a child process.
@@ -45,13 +45,12 @@ class Unit(NamedTuple):
 
     @property
     def is_cached(self) -> bool:
-        """Whether the cache has its machine code."""
         cache = KernelCache(self.kernel.py_func, jit.CACHE_FOLDER, jit.READ_FOLDERS, jit.report_trouble)
         return cache.is_cached(self.kernel.signatures[self.number])
 
 
 def units() -> list[Unit]:
-    """Return all that can be compiled in advance, by module."""
+    """Return all kernels and signatures that can be compiled in advance, by module."""
     found = []
     for path in sorted(PACKAGE.glob("*/kernels/*.py")):
         name = ".".join([PACKAGE.name, *path.relative_to(PACKAGE).with_suffix("").parts])
@@ -62,7 +61,7 @@ def units() -> list[Unit]:
 
 
 def missing() -> list[Unit]:
-    """Return those of `units` that are not in the cache."""
+    """Return the `units` that are not in the cache."""
     return [unit for unit in units() if not unit.is_cached]
 
 
@@ -111,10 +110,7 @@ class CompilingProcess:
     """Child process that compiles the kernels of one module after the other.
 
     Args:
-        modules: what is left to compile, by module; children share it.
-
-    Attributes:
-        compiled: number of kernels that it has compiled.
+        modules: units left to compile, by module; children share the iterator.
     """
 
     def __init__(self, modules: Iterator[list[Unit]], cache: Path) -> None:
@@ -123,11 +119,6 @@ class CompilingProcess:
         self.compiled = 0
 
     def run(self) -> None:
-        """Compile until nothing is left.
-
-        Raises:
-            SparklodError: a kernel cannot be compiled.
-        """
         piped: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
         environment = {**os.environ, "NUMBA_CACHE_DIR": str(self._cache)}
         with subprocess.Popen(program_command(_PROGRAM), env=environment, text=True, **piped) as process:
@@ -239,8 +230,6 @@ class CompileAhead:
     """Compiles missing kernels of jobs from the last to the first; no kernel is compiled by both processes.
 
     Args:
-        missing: kernels that are not in the cache.
-        jobs: of `JOBS`, in order.
         compiling: name of the kernel that this process is compiling.
     """
 
@@ -259,7 +248,6 @@ class CompileAhead:
 
     @property
     def compiled(self) -> int:
-        """Number of kernels that the process has compiled."""
         return 0 if self._process is None else self._process.compiled
 
     def claim(self, kernel: jit.Kernel) -> None:
@@ -269,14 +257,13 @@ class CompileAhead:
             self._changed.wait_for(lambda: self._current is None or self._current.kernel is not kernel)
 
     def close(self) -> None:
-        """End the process."""
         if self._process is not None:
             jit.claim_by(None)
             self._process.stop()
             self._thread.join()
 
     def _taken(self) -> Iterator[list[Unit]]:
-        """Yield the next kernel, which the one before is finished then."""
+        """Yield the next kernel, after the previous one is compiled."""
         while True:
             with self._changed:
                 self._current = self._left.pop() if self._left else None
@@ -288,7 +275,7 @@ class CompileAhead:
     def _run(self, process: CompilingProcess) -> None:
         try:
             process.run()
-        except (OSError, SparklodError):  # it was stopped, or the command will compile the kernel and say what is wrong
+        except (OSError, SparklodError):  # it was stopped, or the command will compile the kernel and report the error
             pass
         finally:
             with self._changed:

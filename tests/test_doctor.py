@@ -64,7 +64,7 @@ def test_a_package_that_ends_its_process_is_a_problem(tmp_path: Path, monkeypatc
     monkeypatch.syspath_prepend(str(tmp_path))
     (check,) = doctor._kernels()
     assert check.state == "problem"
-    assert "what bakes does not load" in check.value
+    assert "the modules of bakes cannot be imported" in check.value
     assert check.advice.startswith(install_hint(options=["--force-reinstall"]))
 
 
@@ -74,7 +74,10 @@ def test_a_package_that_does_not_import_is_a_problem_with_its_reason(
     (tmp_path / "numpy.py").write_text("raise ImportError('no such processor')")
     monkeypatch.syspath_prepend(str(tmp_path))
     (check,) = doctor._kernels()
-    assert (check.state, check.value) == ("problem", "what bakes does not load: ImportError: no such processor")
+    assert (check.state, check.value) == (
+        "problem",
+        "the modules of bakes cannot be imported: ImportError: no such processor",
+    )
 
 
 def test_missing_and_old_packages_are_problems(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -222,7 +225,7 @@ def test_an_unexpected_error_in_a_check_is_a_note(monkeypatch: pytest.MonkeyPatc
 
     monkeypatch.setattr(machine, "total_memory", fail)
     checks = {check.name: check for check in check_all()}
-    assert checks["memory"].value == "cannot be looked at (ZeroDivisionError: by zero)"
+    assert checks["memory"].value == "cannot be checked (ZeroDivisionError: by zero)"
     assert checks["kernels"].state == "problem"
     assert "Chromium" in checks
 

@@ -78,7 +78,7 @@ def budget_like(budget: BudgetLike) -> Budget:
     """Return a budget of splats.
 
     Raises:
-        TypeError, ValueError: it is none, or is out of its range.
+        TypeError, ValueError: it is no budget, or out of range.
     """
     if isinstance(budget, str):
         return parse_budget(budget)
@@ -104,12 +104,12 @@ def file_path(path: Path | str) -> Path:
 
 
 def viewed_like(value: Any) -> None:
-    """Raise TypeError for what cannot be looked at, though Python could iterate over it or fail within it."""
+    """Raise TypeError for a value that is no scene, though Python could iterate over it."""
     if isinstance(value, (str, bytes)) or not hasattr(value, "__iter__"):
         raise TypeError(f"it takes scenes, trees or instances, not {_kind(value)}; {_SCENES}")
 
 
-#: How scenes come about.
+#: Ways to get a scene, for messages.
 _SCENES = "read reads a file, Scene.from_arrays takes arrays"
 
 
@@ -135,7 +135,6 @@ class _Bars:
         self._bar.update(done - self._bar.n)
 
     def close(self) -> None:
-        """End the bar of the last stage."""
         if self._bar is not None:
             self._bar.close()
 

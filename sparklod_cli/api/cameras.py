@@ -34,7 +34,7 @@ def read_cameras(
 
     Args:
         path: of the file or folder.
-        format: its name, as `--camera-format` has it; "auto" tells it by the content.
+        format: its name, as `--camera-format` has it; "auto" recognises it by the content.
         axes: of its matrices, as `--camera-axes` has them, where the format does not say.
         world_transform: (4, 4) or 16 numbers row by row, from the file's world to that of the splats: a rotation, a
             uniform scale and a translation.
@@ -42,7 +42,7 @@ def read_cameras(
         fov_y: vertical field of view, degrees; that of the file unless given.
         fps: frames a second; times are then counted anew.
         every: keep only every so many frames.
-        up: x, y, z of what is up, for cameras of which the file has only eye and target.
+        up: x, y, z that points up, for cameras of which the file has only eye and target.
 
     Raises:
         CameraPathError: it cannot be read, is of no known format, or has a camera that makes no sense.
@@ -96,7 +96,7 @@ def orbit(
         center: x, y, z that they look at; the middle of the scenes unless given.
         distance: from there, world units; as near as all scenes are in every picture unless given.
         elevation: above the center, degrees.
-        up: x, y, z of what is up; what the scenes note unless given, or -y, as training leaves scenes.
+        up: x, y, z that points up; noted in the scenes unless given, or -y, as training leaves scenes.
         fov_y: vertical field of view, degrees.
         size: width and height of the images, pixels.
 

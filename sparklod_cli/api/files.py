@@ -33,7 +33,7 @@ def read(
     threads: int | None = None,
     progress: ProgressLike = None,
 ) -> Scene:
-    """Read a splat file; its content tells the format. The scene is a `Tree` if the file has a Level-of-Detail tree.
+    """Read a splat file, whose content determines the format. The scene is a `Tree` if the file has one.
 
     Args:
         path: of a file, or of a folder that holds an unpacked SOG or a Streamed SOG, of which level 0 is read.
@@ -63,7 +63,7 @@ def read(
 
 @contextlib.contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Put the file before what is wrong with it: Python, unlike a command, says nothing before it."""
+    """Prefix errors with the file, as commands do."""
     try:
         yield
     except (FormatError, InvalidSplatsError, TreeError) as error:
@@ -141,13 +141,13 @@ def inspect(
     threads: int | None = None,
     progress: ProgressLike = None,
 ) -> Report:
-    """Report what is in a file, and what is wrong with it; `Report.as_dict` is what `inspect --json` prints.
+    """Report the contents and faults of a file; `inspect --json` prints `Report.as_dict`.
 
     Args:
         path: of a splat file, or of a folder that holds an unpacked SOG.
         values: look at the numbers of the splats.
         all_quantities: every quantity of them.
-        check: look for what is wrong. A file that cannot be read is a finding, not an error.
+        check: look for faults. An unreadable file is a finding, not an error.
         threads: to decode on; None for all processors.
         progress: called with how much is done.
     """

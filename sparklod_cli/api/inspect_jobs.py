@@ -31,7 +31,7 @@ THUMBNAIL, THUMBNAIL_BUDGET, MOST_SPLATS = (512, 384), 200_000, 3_000_000
 
 @dataclass(frozen=True)
 class InspectSettings:
-    """Settings of reports and checks, and of what is drawn: histograms, a picture, a page, a table of chunks.
+    """Settings of reports and checks, and of their outputs: histograms, a picture, a page, a table of chunks.
 
     Attributes:
         expected: expectations that a file must meet.
@@ -90,7 +90,7 @@ class Inspected:
     """Result of an inspection.
 
     Attributes:
-        histograms: as text, by quantity; those that the file does not have are left out.
+        histograms: as text, by quantity; only quantities that the file has.
         picture: in words, and the bytes of its file; None where none was written.
         section: of the page; None where none is wanted.
         problem: why there is no picture, where one is wanted.
@@ -148,7 +148,7 @@ def _checked(report: Report, scene: Scene | None, settings: InspectSettings) -> 
 def _picture(
     report: Report, scene: Scene | None, settings: InspectSettings
 ) -> tuple[DescribedPicture | None, str | None]:
-    """Return the picture that is wanted, or why there is none."""
+    """Return the requested picture, or the reason why there is none."""
     if (settings.plot is None and settings.html is None) or report.format is None:
         return None, None
     if scene is None:

@@ -1,6 +1,6 @@
 """Whole-file jobs of the commands: pictures, comparisons and traversals of files, from reading to writing.
 
-Each reads files and cameras, asks its caller where the results go as soon as that can be told, and does the work.
+Each reads files and cameras, asks its caller for the outputs as early as possible, and does the work.
 """
 
 from __future__ import annotations
@@ -84,7 +84,6 @@ class ViewedFiles:
         return self.cameras.cameras(settings, lambda: scenes().balls())
 
     def _up_of(self, scenes: Scenes) -> Point:
-        """Return up axis of the scenes, in the world of the cameras."""
         up = direction_of(scenes.up)
         if scenes.up is None or self.settings.world is None:
             return up
@@ -99,7 +98,7 @@ class ViewedFiles:
         return dataclasses.replace(render, raster=dataclasses.replace(render.raster, near=near, far=far))
 
 
-#: Colours of pictures whose scale is that of what cameras see, rather than of all that they may see.
+#: Colours whose scale spans the numbers that cameras see, rather than all numbers of the scenes.
 COLORS_OF_CUTS = ("level", "chunk", "overdraw")
 
 
@@ -135,12 +134,12 @@ def draw_files(
 
     Args:
         budget: of the cuts; None draws full detail.
-        place: tells where the pictures of some cameras go and how they become files; is asked before a file is read,
-            if the cameras do not depend on one.
+        place: returns the output of the pictures of some cameras; called before a file is read if the cameras do not
+            depend on one.
         through: one of `rounding.ROUND_TRIPS`, after which splats are drawn.
-        loading: how chunks get to the viewer, and how many seconds after a page was opened pictures are of, each of a
-            visitor who opened it in front of that camera; None where every chunk is there.
-        reference: the file whose pictures are compared with these: the difference is written.
+        loading: how chunks get to the viewer, and and the seconds since a visitor opened the page in front of
+            each camera; None where every chunk is resident.
+        reference: the file whose pictures are subtracted from these.
         ready: called with the cameras and the scenes before the first picture is drawn.
 
     Raises:
@@ -279,11 +278,11 @@ def traverse_files(
     passed: Filter | None = None,
     bar: bool = True,
 ) -> Traversed:
-    """Simulate what a viewer draws of files along a path, and write what is made of the frames.
+    """Simulate what a viewer draws of files along a path, and write tables and charts of the frames.
 
     Args:
         by_instance: make rows of single instances, too.
-        bar: tell how many frames are done.
+        bar: report the number of frames done.
 
     Raises:
         UnfitError: the budget, or the chunk cache, is too small for the roots.

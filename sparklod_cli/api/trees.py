@@ -55,7 +55,7 @@ def build_lod(
         max_sh: SH degrees above this are left out.
         selection: which splats to keep; all that can be drawn, unless given.
         refine: fit merged splats to pictures of full detail: True, or in how many steps, or how. The function `refine`
-            does the same and tells what it brought.
+            does the same and reports the gain.
         threads: to work on; None for all processors.
         progress: called with how much is done.
 
@@ -164,7 +164,7 @@ def refine(
         say: called with a line of text after each stage.
 
     Returns:
-        the tree, and what the fitting brought on held-out cameras.
+        the tree, and its gain on held-out cameras.
 
     Raises:
         FormatError: the scene has no tree.
@@ -182,10 +182,10 @@ def refine(
 
 
 def fit_settings_of(refine: bool | int | FitSettings) -> FitSettings | None:
-    """Return the settings that an argument `refine` stands for; None for not at all.
+    """Return the settings for an argument `refine`; None for no fitting.
 
     Raises:
-        TypeError, ValueError: it stands for none.
+        TypeError, ValueError: the argument is invalid.
     """
     if isinstance(refine, bool):
         return FitSettings() if refine else None
@@ -198,7 +198,7 @@ def fit_settings_of(refine: bool | int | FitSettings) -> FitSettings | None:
 def refined_tree(
     tree: Scene, settings: FitSettings, threads: int, progress: Progress, say: Callable[[str], None] | None
 ) -> tuple[Tree, Refined]:
-    """Return a tree whose merged splats are fitted, and what that brought."""
+    """Return a tree whose merged splats are fitted, and the gain."""
     found, report = refined(tree, settings, threads=threads, progress=progress, say=say or (lambda text: None))
     assert found.tree is not None
     return Tree(found.splats, found.tree, found.antialiased, up=found.up), report

@@ -41,12 +41,17 @@ from .arguments import (
 )
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from ..simulation.streaming_settings import StreamingSettings
+    from ..simulation.summary import Summary
+    from ..tables.comparison import BudgetSummary
+
 
 #: A scene, a tree or a scene at several detail levels, or several of them, each with where it stands.
 Viewed = Scene | DetailScene | Instance | Iterable["Scene | DetailScene | Instance"]
 
-#: Where a scene keeps what was prepared of it for looking at it once more.
+#: Attribute in which a scene caches its prepared form.
 _PREPARED = "_prepared_scenes"
 
 
@@ -97,7 +102,7 @@ def render(
     Splats of scenes without trees that cannot be drawn are left out.
 
     Args:
-        viewed: what is drawn.
+        viewed: a cut, or scenes and trees.
         camera: that sees it.
         settings: how it is drawn; as Spark 2 does unless given.
         backend: "numba" (the reference), "osmesa" or "open3d"; that of `settings` unless given.
@@ -187,7 +192,7 @@ def compare(
         progress: called with how much is done.
 
     Raises:
-        FormatError: what is cut has no tree.
+        FormatError: a scene to be cut has no tree.
         SparklodError: a budget is less than one splat for each instance, or full detail covers no pixel.
     """
     from ..compare import Comparison
@@ -255,14 +260,12 @@ def scenes_of(viewed: Viewed, threads: int | None, precision: str = PRECISIONS[0
     every: list[Any] = [viewed] if isinstance(viewed, Instance) else list(viewed)
     instances = [each if isinstance(each, Instance) else Instance(each) for each in every]
     if not instances:
-        raise ValueError("there is nothing to look at; give at least one scene or instance")
+        raise ValueError("there are no scenes; give at least one scene or instance")
     return read_scenes(_named(instances), precision=precision, threads=count)
 
 
 def _named(instances: Sequence[Instance]) -> list[Instance]:
     """Return the instances, those without a name with one of their own."""
-    from pathlib import Path
-
     unnamed = [each.file or Path(UNNAMED) for each in instances if not each.name]
     names = iter(names_of(unnamed, [each.name for each in instances if each.name]))
     return [each if each.name else replace(each, name=next(names)) for each in instances]
@@ -292,19 +295,11 @@ def _lod(
     return settings
 
 
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from ..simulation.summary import Summary
-    from ..tables.comparison import BudgetSummary
-
-
 class Frames(Table):
-    """The rows of a traversal: one for each frame and, if asked for, one for each of its instances."""
+    """The rows of a traversal: one for each frame and, if requested, one for each of its instances."""
 
     def summary(self) -> Summary:
-        """Return statistics of the frames, totals, and the frames that are worth a look."""
+        """Return statistics of the frames, totals, and notable frames."""
         from ..simulation.summary import summarize
 
         return summarize(self.rows)

@@ -1,1 +1,1 @@
-"""One module a sub-command: parse, one library call, report."""
+"""One module a sub-command: parse, one library call, report. Contradicting options raise `click.UsageError`."""

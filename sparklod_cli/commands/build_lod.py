@@ -123,11 +123,11 @@ FORMS = {
     TILES_3D: (".json", False),
 }
 
-#: What the formats of cuts are called.
+#: Names of the formats of cuts.
 DETAIL, TILED = DetailOptions.HEADING, TileSettings.HEADING
 
-#: By the value of --format, for those that are cuts of a tree: the names of the manifest and of the format, and what is
-#: beside the manifest.
+#: Formats of cuts of a tree, by the value of --format: name of the manifest, name of the format, and the files beside
+#: the manifest.
 MANIFESTS = {STREAMED_SOG: (MANIFEST, DETAIL, "folders"), TILES_3D: (TILESET, TILED, "a folder")}
 
 #: Parameters of formats, the names of these, and how to get one of them.
@@ -175,8 +175,8 @@ class BakedFiles:
     )
     overwrite: bool = overwrite_flag()
     skip_existing: str | None = option(
-        "Bake nothing whose output is there already, of the same inputs and settings; a small file beside each output,"
-        " NAME.sparklod.json, tells of what it is. Files whose size and date are unchanged are not read;"
+        "Skip inputs whose output exists already, made from the same inputs and settings, as a small file beside it,"
+        " NAME.sparklod.json, records. Files whose size and date are unchanged are not read;"
         " --skip-existing=verify reads all, and so finds damage that left both as they were.",
         (BY_DATE, VERIFY),
         heading="Large scenes",
@@ -209,7 +209,6 @@ class BakedFiles:
 
     @property
     def is_merged(self) -> bool:
-        """Whether all inputs are one scene."""
         return self.merge or self.scene is not None
 
     def instances(self) -> list[Instance]:
@@ -238,12 +237,12 @@ class BakedFiles:
 
     @property
     def named_suffix(self) -> str:
-        """Suffix of the named output, or its name where that tells the format, see `ending_of`; empty without one."""
+        """Suffix of the named output, or its name where that is the format's (`ending_of`); empty without one."""
         return ending_of(self.output.name) if self.output is not None and self.output != DASH else ""
 
     @property
     def suffix(self) -> str:
-        """Suffix of the format that is written, which the name of the output need not have."""
+        """Suffix of the output format; the name of the output may have another one."""
         if self.encoding:
             return NPZ
         if self.form is not None:
@@ -253,14 +252,14 @@ class BakedFiles:
 
     @property
     def manifest(self) -> str | None:
-        """The value of --format of an output of cuts of a tree, with files beside a manifest; None for others."""
+        """The value of --format where cuts of a tree are written, with files beside a manifest; otherwise None."""
         if self.form in MANIFESTS:
             return self.form
         return None if self.form or self.encoding or self.unlod else self.named_manifest
 
     @property
     def named_manifest(self) -> str | None:
-        """The format whose manifest has the name of the named output; None where that has another name."""
+        """The format whose manifest is called as the named output; None if there is none."""
         name = self.output.name if self.output is not None and self.output != DASH else ""
         return next((form for form, (manifest, *_) in MANIFESTS.items() if manifest == name), None)
 
@@ -271,11 +270,10 @@ class BakedFiles:
 
     @property
     def format_is_chosen(self) -> bool:
-        """Whether somebody chose the format, by --format or by a name."""
+        """Whether --format or a name chose the format."""
         return self.form is not None or self.named_suffix in TREES or self.manifest is not None
 
     def target(self, source: Place) -> Place:
-        """Return the output path for an input."""
         return self.output or (self.output_dir or source.parent) / self._name(source)
 
     def _name(self, source: Place) -> str:
@@ -433,7 +431,7 @@ class BuildLodOptions:
         )
 
     def write_options(self) -> WriteOptions:
-        """Return the write options; what nobody chose is left to the library, which may take it from the input."""
+        """Return the write options; defaults are left to the library, which may take them from the input."""
         form, codes = self.files.form, self.palette.cluster_sh
         rad = dataclasses.replace(self.written.rad, chunked=form is not None and FORMS[form][1], sh_codes=codes)
         return dataclasses.replace(self.written, rad=rad, sog=SogOptions(codes))
@@ -475,7 +473,10 @@ def build_lod(ctx: click.Context, /, **_: Any) -> None:
     _check(ctx, options, [instance.file for instance in instances if instance.file is not None])
     failed = False
     memory = options.resources.memory
-    with general.console() as console, options.cluster.engine(ctx, general, memory, console) as engine:
+    with (
+        Console(quiet=general.quiet, verbose=general.verbose) as console,
+        options.cluster.engine(ctx, general, memory, console) as engine,
+    ):
         report: Callable[..., None] = report_extracted if files.unlod else report_baked
         pairs = files.jobs(instances, console.say)
         for (source, target), outcome in zip(pairs, _outcomes(ctx, options, pairs, console, engine), strict=True):
@@ -484,7 +485,7 @@ def build_lod(ctx: click.Context, /, **_: Any) -> None:
                 console.error(f"{name_of(source)}: {outcome}")
                 record = {**record_of(source), "error": shortened(str(outcome), MOST)}
             elif outcome is None:
-                console.say(f"{name_of(source)}  ->  {target}  is there already")
+                console.say(f"{name_of(source)}  ->  {target}  exists already")
                 record = {**record_of(source), "output": str(target), "skipped": True}
             else:
                 report(console, source, target, outcome)

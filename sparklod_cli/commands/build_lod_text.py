@@ -90,7 +90,6 @@ def _report_tree(console: Console, baked: Baked, refine: Refined | None) -> None
 
 
 def _contents(baked: Baked) -> str:
-    """Return a phrase on the contents of the output."""
     detail, tiles = baked.detail, baked.tiles
     if tiles is not None:
         place = ", on the Earth" if tiles.georeferenced else ""
@@ -120,7 +119,6 @@ def _refined(refined: Refined) -> str:
 
 
 def _levels(detail: WrittenDetail) -> str:
-    """Return the detail levels after full detail, and how far they are from it."""
     levels = (
         f"{level.splats:,} splats ({percent_of(level.share)}, error at most {level.worst_error:.2g})"
         for level in detail.levels[1:]
@@ -129,7 +127,6 @@ def _levels(detail: WrittenDetail) -> str:
 
 
 def _written(baked: Baked) -> str:
-    """Return the format of the output and the choices that were made for it."""
     if baked.detail is not None:
         return "Streamed SOG"
     if baked.tiles is not None:

@@ -18,28 +18,31 @@ import click
 from .. import __version__
 from ..system.setting_fields import MOST_WHOLE, Quantity, Range, Setting, setting, settings_in
 
-#: Headings that several commands have: of what most people need, and of what every command has.
+#: Headings of several commands: options that most users need, and options of every command.
 COMMON, GENERAL = "Common options", "General"
 
-#: Most options of a command whose `--help` lists them all, and what that of other commands has of its help.
+#: Most options of a command whose `--help` lists all; paragraphs and examples in the `--help` of others.
 MOST_LISTED, FEW_PARAGRAPHS, FEW_EXAMPLES = 12, 2, 5
 
 #: Options that print help.
 HELP = {"--help", "--help-all"}
 
-#: Columns of the longest option that has its help beside it, not below.
+#: Columns of the longest option with its help beside it instead of below.
 TERM_WIDTH = 24
 
-#: Units that people put after a blank. They are no names of files.
+#: Units that may follow a number after a blank by mistake.
 UNIT = re.compile(r"%|[kmgt]i?b?|ms|s|[kmg]bit(?:/s)?", re.IGNORECASE)
 
-#: The parameter of the output, and those with which a missing output is no mistake.
+#: The parameter of the output, and parameters that replace it.
 OUTPUT, NO_OUTPUT = "output", ("output_dir", "scene")
+
+#: Other parameters of outputs, and the suffixes of these.
+OTHER_OUTPUTS = {"html": (".html", ".htm"), "export": ("",)}
 
 #: Suffixes that inputs and outputs of build-lod and simplify may share.
 TREES = (".spz", ".rad")
 
-#: What else people type, and what they mean by it.
+#: Names of commands in other tools, and the commands here.
 ALIASES = {
     "bake": "build-lod",
     "build": "build-lod",
@@ -102,8 +105,7 @@ class Command(click.Command):
 
     Args:
         examples: lines with a command each, the most useful ones first. A command may take several lines.
-        headings: the order of the headings; those that are not named follow in the order of their first options, and
-            `GENERAL` is the last one.
+        headings: the order of the headings; others follow in the order of their first options, `GENERAL` last.
     """
 
     def __init__(
@@ -137,7 +139,7 @@ class Command(click.Command):
         """Return the options that the help lists, by heading, in the order of both.
 
         Args:
-            whole: all; else the common ones and those that print help.
+            whole: all options; otherwise the common ones and the ones that print help.
         """
         params = [param for param in self.get_params(ctx) if isinstance(param, click.Option) and not param.hidden]
         if not whole:
@@ -150,7 +152,6 @@ class Command(click.Command):
         return {heading: params for heading, params in (*listed.items(), (GENERAL, last)) if params}
 
     def get_help(self, ctx: click.Context, *, whole: bool = False) -> str:
-        """Return the help; with `whole`, that of all options."""
         whole = whole or not self.abridged
         formatter = _Formatter(width=ctx.terminal_width, max_width=ctx.max_content_width)
         self.format_usage(ctx, formatter)
@@ -169,7 +170,7 @@ class Command(click.Command):
 
 
 def _brief(text: str) -> str:
-    """Return the first sentence of the help of an option, and its default as far as a semicolon."""
+    """Return the first sentence of the help of an option, and its default up to a semicolon."""
     about, _, default = text.partition("  [")
     sentence = about.split(". ")[0].rstrip(".") + "."
     return f"{sentence}  [{re.split('[];]', default)[0]}]" if default else sentence
@@ -195,29 +196,35 @@ def refuse_lone_units(args: Sequence[str], ctx: click.Context) -> None:
 
 
 def refuse_output_among_inputs(ctx: click.Context, *, missing: bool = False) -> None:
-    """Raise a `click.UsageError` if the last input seems to be the output, as of cp: nothing has its name yet.
+    """Raise a `click.UsageError` if the last input seems to be the output, as with cp: it does not exist.
 
     Args:
         missing: the command must have an output, and has none.
     """
+    *others, last = ctx.params.get("inputs") or ctx.params.get("files") or (None,)
+    if not others or not isinstance(last, Path) or last.exists():
+        return
+    import shlex  # needed after a mistake only
+
+    error = "{} does not exist; did you mean {} {}?"
+    for name, suffixes in OTHER_OUTPUTS.items():
+        if name in ctx.params and not ctx.params[name] and last.suffix.lower() in suffixes:
+            raise click.UsageError(error.format(last, f"--{name}", shlex.quote(str(last))), ctx)
     if (not missing and OUTPUT not in ctx.params) or any(ctx.params.get(name) for name in (OUTPUT, *NO_OUTPUT)):
         return
-    *others, last = ctx.params.get("inputs") or ctx.params.get("files") or (None,)
-    if not others or not isinstance(last, Path) or not last.suffix or last.exists():
+    if not last.suffix:
         return
     alike = {other.suffix.lower() for other in others if other.suffix} - set(TREES if "inputs" in ctx.params else ())
     if last.suffix.lower() in alike and not missing:
         return  # a second input whose name is wrong
-    import shlex  # needed after a mistake only
-
-    raise click.UsageError(f"{last} does not exist; did you mean -o {shlex.quote(str(last))}?", ctx)
+    raise click.UsageError(error.format(last, "-o", shlex.quote(str(last))), ctx)
 
 
 class Group(click.Group):
-    """A group of commands that are each imported when they are called for.
+    """A group of commands, each imported when it is needed.
 
     Args:
-        rows: by the name of a command what `--help` says of it. Its module in `commands`, and the function there, have
+        rows: lines of `--help` by the name of the command. Its module in `commands`, and the function there, have
             the same name, with _ for -.
     """
 
@@ -262,7 +269,7 @@ class Group(click.Group):
 
 
 def near_command(name: str, names: Sequence[str]) -> str | None:
-    """Return the command that was probably meant by another name, or None."""
+    """Return the command that a wrong name probably means, or None."""
     import difflib  # which takes a millisecond, and is needed after a mistake only
 
     plain = name.lower().replace("_", "-")
@@ -352,11 +359,7 @@ def _options(kind: type[Any], heading: str) -> Iterator[Callable[[Any], Any]]:
 
 
 def values_of(ctx: click.Context, kind: type[Options]) -> Options:
-    """Return a group of options with the values of a command line.
-
-    Raises:
-        click.UsageError: the values do not go together.
-    """
+    """Return a group of options with the values of a command line."""
     values: dict[str, Any] = {}
     for field, declared in settings_in(kind):
         if declared is None:
@@ -389,12 +392,12 @@ def check_declared(ctx: click.Context) -> None:
 
 
 def is_set(ctx: click.Context, name: str) -> bool:
-    """Return whether somebody set a parameter, be it to its default."""
+    """Return whether a parameter was given, even with its default value."""
     return ctx.get_parameter_source(name) not in (None, click.core.ParameterSource.DEFAULT)
 
 
 def flag_of(ctx: click.Context, name: str) -> str:
-    """Return what people type for a parameter, such as --lod-splat-scale for lod_splat_scale."""
+    """Return the flag of a parameter, such as --lod-splat-scale for lod_splat_scale."""
     return next(max(param.opts, key=len) for param in ctx.command.params if param.name == name)
 
 
@@ -483,7 +486,7 @@ class Text(click.ParamType):
 
 
 class OptionalNumber(click.IntRange):
-    """A number that may be left out, so that an input after its option is taken for it; says what to do then."""
+    """A number that may be left out; the error for an input taken for it says what to do."""
 
     def __init__(self, range: Range, *, placeholder: str = "N", example: int) -> None:
         super().__init__(range.least, range.most)  # type: ignore[arg-type]  # whole numbers
@@ -521,7 +524,6 @@ def _direction(text: str) -> tuple[float, ...]:
 
 
 def _ball(text: str) -> tuple[tuple[float, ...], float]:
-    """Parse x, y, z and a positive radius."""
     *center, radius = _numbers(text, "x,y,z,radius")
     if radius <= 0:
         raise ValueError(f"radius {radius:g} is not positive")
@@ -541,7 +543,6 @@ def _color(text: str) -> tuple[float, ...] | None:
 
 
 def _view(text: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Parse camera position and target."""
     eye, colon, target = text.partition(":")
     if not colon:
         raise ValueError(f"{text!r} is not EYE:TARGET, x,y,z:x,y,z, such as 0,1,5:0,0,0")
@@ -552,7 +553,6 @@ def _view(text: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
 
 
 def _views(text: str) -> tuple[Any, ...]:
-    """Parse two or more views, with spaces or semicolons between."""
     views = tuple(map(_view, text.replace(";", " ").split()))
     if len(views) < 2:
         raise ValueError(f"{text!r} has fewer than two keyframes, EYE:TARGET EYE:TARGET")
@@ -560,7 +560,6 @@ def _views(text: str) -> tuple[Any, ...]:
 
 
 def _size(text: str) -> tuple[int, int]:
-    """Parse width and height in pixels."""
     sides = [side.lstrip("0") for side in text.lower().split("x")]
     if len(sides) != 2 or not all(side.isascii() and side.isdigit() for side in sides):
         raise ValueError(f"{text!r} is not a width and a height in pixels, such as 1280x720")

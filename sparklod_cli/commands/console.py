@@ -52,7 +52,7 @@ def rows(name: str, text: str) -> list[str]:
 
 
 def _wrapped(line: str, width: int, indent: int) -> list[str]:
-    """Return a line, or those that it is broken into between words, though not after a number or a colon."""
+    """Break a line between words, but not after a number or a colon."""
     if len(line) <= width:
         return [line]
     import re
@@ -64,7 +64,7 @@ def _wrapped(line: str, width: int, indent: int) -> list[str]:
 
 
 def _columns() -> int | None:
-    """Return the columns of the terminal that standard error is; None where it is none."""
+    """Return the columns of the terminal; None if standard error is not a terminal."""
     try:
         return os.get_terminal_size(sys.stderr.fileno()).columns or None
     except (AttributeError, OSError, ValueError):  # it is closed, redirected, or no file
@@ -94,7 +94,7 @@ def say_error(text: str) -> None:
 
 
 def say_usage_error(error: click.ClickException) -> None:
-    """Print the usage of the command, how to get its help, and in the last line what is wrong."""
+    """Print the usage of the command, how to get its help, and the error in the last line."""
     ctx = error.ctx if isinstance(error, click.UsageError) else None
     if ctx is not None:
         _echo(f"{ctx.get_usage()}\nTry '{ctx.command_path} --help'.\n")
@@ -105,7 +105,7 @@ def say_usage_error(error: click.ClickException) -> None:
 
 
 def _meant(error: click.NoSuchOption) -> str:
-    """Return a hint at a value of that name (--quality), at the commands that have the option, or at a similar one."""
+    """Return a hint: a value of that name (--quality), the commands that have the option, or a similar option."""
     ctx, flag = error.ctx, error.option_name
     if ctx is None:
         return ""
@@ -164,13 +164,7 @@ class Console:
         self.clear()
         self._ended.close()
 
-    @property
-    def quiet(self) -> bool:
-        """Whether only errors are printed."""
-        return self._quiet
-
     def clear(self) -> None:
-        """Remove the progress bar."""
         if self._bar is not None:
             self._bar.close()
             self._bar = None
@@ -194,7 +188,7 @@ class Console:
 
     @contextlib.contextmanager
     def job(self, shares: Mapping[str, float]) -> Iterator[None]:
-        """Show the stages of what is done inside as one bar, with the time left; `shares` of `StagedProgress`."""
+        """Show the stages of the work inside as one bar, with the time left; `shares` as for `StagedProgress`."""
         self.clear()
         self._job, self._start = StagedProgress(shares), monotonic()
         self._logged = self._start
@@ -225,7 +219,7 @@ class Console:
         return self._bar
 
     def _show_job(self, stage: str, reached: float) -> None:
-        """Show the stage of a job, how much of the job is done, and the time that the rest takes at that rate."""
+        """Show the stage of a job, its progress, and the time left at the rate so far."""
         now = monotonic()
         if self._bars:
             bar = self._bar

@@ -10,7 +10,7 @@ import click
 
 from ..system.printable import printable
 from .command import command, values_of
-from .console import count_of, print_json
+from .console import Console, count_of, print_json
 from .options.common import Messages, quiet_flag, verbose_flag
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ def doctor(ctx: click.Context, /, **_: Any) -> None:
     comes with a line on what to do. The exit status is 1 if there is a problem, else 0.
     """
     messages = values_of(ctx, _Messages)
-    with messages.console() as console:
+    with Console(quiet=messages.quiet, verbose=messages.verbose) as console:
         from ..doctor import check_all
 
         checks = check_all(lambda name: console.detail(f"checking {name}"))

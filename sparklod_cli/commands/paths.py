@@ -34,7 +34,7 @@ class Folder:
 
 
 class _NamedPath(click.Path):
-    """A path as it was given. Whether it can be opened turns out when it is opened, so that one file fails alone."""
+    """A path as given. Whether it can be opened is checked later, so that a bad file does not stop the others."""
 
     _to_do = ""
 
@@ -98,10 +98,7 @@ def name_outputs(ctx: click.Context, source: Place | None) -> None:
     """Replace each parameter that is a `Folder` by the path of the file in it, which is named after an input.
 
     Args:
-        source: the input; None where there is none, which other checks report.
-
-    Raises:
-        click.UsageError: the input is standard input, which has no name.
+        source: the input; None if missing, which other checks report.
     """
     from ..tables.columns import FORMS
 
@@ -122,16 +119,18 @@ def require_suffix(flag: str, output: Place, endings: Iterable[str]) -> None:
         output: a file; standard output, pipes and devices need no suffix.
         endings: suffixes, and names of files, that are possible.
     """
-    if output == DASH or output.suffix or _is_stream(output):
+    if output == DASH or output.suffix or _is_stream(_status(output)):
         return
     names = ", ".join(ending if ending.startswith(".") else f"/{ending}" for ending in endings)
-    raise click.UsageError(f"{flag} {output} has no suffix to tell the format; end it in {names}, or in / for a folder")
+    raise click.UsageError(
+        f"{flag} {output} has no suffix, which chooses the format; end it in {names}, or in / for a folder"
+    )
 
 
 def keep_apart(ctx: click.Context, stands_for: Mapping[str, Iterable[Place]] | None = None) -> None:
     """Raise a `click.UsageError` if an output of a command is also an input or another output of it.
 
-    Also raises one if the suffix of an output is that of another format than what is written.
+    Also raises one if an output has the suffix of another format than the one written.
 
     Compares the files themselves, so that links and other spellings of a name do not matter. Pipes and devices are
     never replaced.
@@ -139,7 +138,7 @@ def keep_apart(ctx: click.Context, stands_for: Mapping[str, Iterable[Place]] | N
     Args:
         ctx: of the command; its parameters of type `InputPath` and `OutputPath` are checked.
         stands_for: by the name of a parameter, other files that it means: those which an input names besides itself,
-            and those that are written into an output folder.
+            and files that are written into an output folder.
     """
     stands_for = stands_for or {}
     inputs: list[Place] = []
@@ -153,7 +152,24 @@ def keep_apart(ctx: click.Context, stands_for: Mapping[str, Iterable[Place]] | N
             promised += [(parameter, kind, path) for path in values if kind.suffixes or kind.folder]
         else:
             inputs += [*(values if isinstance(kind, InputPath) else []), *(more or ())]
-    _keep_apart(outputs, inputs)
+    files, places = set[tuple[int, int]](), dict[str, str]()
+    for path in _all_read(inputs):
+        places[_place(path)] = INPUT
+        status = _status(path)
+        if status is not None:
+            files.add((status.st_dev, status.st_ino))
+    for path in outputs:
+        status = _status(path)
+        if path == DASH or _is_stream(status):
+            continue
+        place = _place(path)
+        is_input = status is not None and (status.st_dev, status.st_ino) in files
+        taken = INPUT if is_input else places.get(place)
+        if taken == OUTPUT:
+            raise click.UsageError(f"two outputs would be written to {path}; give each a name of its own")
+        if taken is not None:
+            raise click.UsageError(f"{path} is {taken}; name another output")
+        places[place] = OUTPUT
     for parameter, kind, path in promised:
         if path == DASH:
             raise click.BadParameter("it cannot go to standard output; name a file or folder", ctx, parameter)
@@ -178,10 +194,10 @@ def with_chunks(headers: Iterable[Place]) -> list[Place]:
 
 
 def claim_stdout(ctx: click.Context, name: str, *, as_json: bool, binary: bool = False) -> None:
-    """Raise a `click.UsageError` where an output is - and standard output is taken, or no place for it.
+    """Raise a `click.UsageError` where an output is - and standard output is taken or unsuitable.
 
     Args:
-        binary: the output is nothing that a terminal could show.
+        binary: a terminal cannot show the output.
     """
     if ctx.params[name] != DASH:
         return
@@ -196,27 +212,8 @@ def is_same_place(one: Place, other: Place) -> bool:
     """Return whether two paths are of the same file, whatever links and spellings lead there."""
     if DASH in (one, other):
         return False
-    return _place(one) == _place(other) or (_identity(one) is not None and _identity(one) == _identity(other))
-
-
-def _keep_apart(outputs: Iterable[Place], inputs: Iterable[Place]) -> None:
-    files = set[tuple[int, int]]()
-    places = dict[str, str]()
-    for path in _all_read(inputs):
-        places[_place(path)] = INPUT
-        identity = _identity(path)
-        if identity is not None:
-            files.add(identity)
-    for path in outputs:
-        if path == DASH or _is_stream(path):
-            continue
-        place = _place(path)
-        taken = INPUT if _identity(path) in files else places.get(place)
-        if taken == OUTPUT:
-            raise click.UsageError(f"two outputs would be written to {path}; give each a name of its own")
-        if taken is not None:
-            raise click.UsageError(f"{path} is {taken}; name another output")
-        places[place] = OUTPUT
+    statuses = _status(one), _status(other)
+    return _place(one) == _place(other) or (all(statuses) and os.path.samestat(*statuses))  # type: ignore[arg-type]
 
 
 def _all_read(paths: Iterable[Place]) -> Iterator[Place]:
@@ -232,25 +229,18 @@ def _all_read(paths: Iterable[Place]) -> Iterator[Place]:
             yield from companions(path, NAMES)
 
 
-def _identity(path: Place) -> tuple[int, int] | None:
-    """Device and inode of a file; None if it does not exist, or is at an address."""
+def _status(path: Place) -> os.stat_result | None:
+    """Return the status of a file; None if it does not exist, or is at an address."""
     if isinstance(path, Address):
         return None
     try:
-        status = path.stat()
+        return path.stat()
     except (OSError, ValueError):
         return None
-    return status.st_dev, status.st_ino
 
 
-def _is_stream(path: Place) -> bool:
-    if isinstance(path, Address):
-        return False
-    try:
-        mode = path.stat().st_mode
-    except (OSError, ValueError):
-        return False
-    return not (stat.S_ISREG(mode) or stat.S_ISDIR(mode))
+def _is_stream(status: os.stat_result | None) -> bool:
+    return status is not None and not (stat.S_ISREG(status.st_mode) or stat.S_ISDIR(status.st_mode))
 
 
 def _place(path: Place) -> str:
@@ -279,7 +269,7 @@ def stem_of(source: Place) -> str:
 
 
 def file_of(text: str) -> Path | None:
-    """Return the file that the text of an option names; None if there is none, as the text means something else."""
+    """Return the file that the text of an option names; None if no such file exists."""
     try:
         return Path(text) if Path(text).is_file() else None
     except (OSError, ValueError):

@@ -32,7 +32,7 @@ from .command import (
     parameters_of,
     values_of,
 )
-from .console import print_json, say
+from .console import Console, print_json, say
 from .options.baking import (
     BY_SIZE,
     EXAMPLE_STEPS,
@@ -116,8 +116,8 @@ class SimplifiedFiles:
     seed: int = setting_of(FitSettings, "seed")
     device: str = setting_of(FitSettings, "device")
     output: Place = option(
-        "Output, whose name tells the format: .ply, .spz, .sog, DIR/meta.json (an unpacked SOG), .glb, .rad or .splat,"
-        " which has no SH; DIR/ means DIR/NAME-small.spz, - standard output, as SPZ.",
+        "Output, whose name chooses the format: .ply, .spz, .sog, DIR/meta.json (an unpacked SOG), .glb, .rad or"
+        " .splat, which has no SH; DIR/ means DIR/NAME-small.spz, - standard output, as SPZ.",
         OutputPath(addresses=True),
         flags=("-o", "--output"),
         heading=COMMON,
@@ -138,7 +138,6 @@ class SimplifiedFiles:
 
     @property
     def source(self) -> Source:
-        """The input, or all of them as one scene."""
         from ..bake.sources import Merged
 
         return self.inputs[0] if len(self.inputs) == 1 else Merged.of(self.inputs)
@@ -207,7 +206,7 @@ def simplify(ctx: click.Context, /, **_: Any) -> None:
     options = values_of(ctx, SimplifyOptions)
     files, general = options.files, options.general
     _check(ctx, files, as_json=general.as_json)
-    with general.console() as console:
+    with Console(quiet=general.quiet, verbose=general.verbose) as console:
         from ..bake.flow import bake
         from ..bake.settings import Resources
         from ..bake.stage_shares import stage_shares
@@ -240,7 +239,7 @@ def _check(ctx: click.Context, files: SimplifiedFiles, *, as_json: bool) -> None
     """Raise a `click.UsageError` where options contradict each other, or the names of files."""
     given = flags_set(ctx, GOALS)
     if len(given) != 1:
-        what = f"{' and '.join(given)} cannot be used together; give" if given else "say how many splats are left: give"
+        what = f"{' and '.join(given)} cannot be used together; give" if given else "say how many splats to keep: give"
         raise click.UsageError(f"{what} one of --to, --max-bytes and --psnr")
     require_suffix("--output", files.output, WRITABLE)
     if files.suffix not in WRITABLE:

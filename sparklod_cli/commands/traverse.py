@@ -31,7 +31,7 @@ from .options.common import (
     report_outcomes,
     table_form,
 )
-from .options.cut import CutOptions, Inputs, check_scenes, notes_on_loading, viewed_files
+from .options.cut import CutOptions, Inputs, check_scenes, files_read, notes_on_loading, viewed_files
 from .paths import OutputPath, claim_stdout, keep_apart, name_outputs
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ EXAMPLES = """\
     --look-at 0,-1,4:0,0,0 --indices-out cuts --padded
 """
 
-#: Options that say what is in the table.
+#: Options of the content of the table.
 OF_TABLES = ("form", "per_instance", "no_timing")
 
 
@@ -75,7 +75,7 @@ class FrameTable:
     )
     overwrite: bool = overwrite_flag()
     summary: bool | None = option(
-        "Print what the frames come to, on standard error.  [default: if that is a terminal]",
+        "Print a summary of the frames on standard error.  [default: if that is a terminal]",
         flags=("--summary/--no-summary",),
         heading=COMMON,
     )
@@ -99,7 +99,6 @@ class FrameTable:
     )
 
     def check(self, ctx: click.Context, *, as_json: bool) -> None:
-        """Raise a `click.UsageError` where options contradict each other, or have no effect."""
         if as_json and self.output is None:
             refuse(ctx, OF_TABLES, "cannot be used with --json without --output, which writes no table")
         elif self.summary_on_stdout(as_json=as_json):
@@ -110,11 +109,6 @@ class FrameTable:
         return self.output is None and not as_json and is_terminal(sys.stdout)
 
     def outputs(self, *, as_json: bool) -> FrameOutputs:
-        """Return the table and the other outputs.
-
-        Raises:
-            click.UsageError: the suffix of --output promises something else.
-        """
         from ..simulation import columns
         from ..simulation.outputs import FrameOutputs
         from ..tables.output import TableOutput
@@ -129,11 +123,6 @@ class FrameTable:
         return FrameOutputs(table, self.indices_out, self.padded, self.plot, self.overwrite)
 
     def assertions(self) -> list[Assertion]:
-        """Return the assertions.
-
-        Raises:
-            click.UsageError: an assertion cannot be understood.
-        """
         from ..simulation.columns import COLUMNS, LOADING
         from ..tables import assertions
 
@@ -184,12 +173,12 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
     claim_stdout(ctx, "output", as_json=general.as_json)
     budget = options.cut.one_budget()
     instances = options.inputs.instances()
-    besides = {"scene": options.inputs.read(instances), "world_transform": options.cameras.files()}
+    besides = files_read(options, instances)
     keep_apart(ctx, besides)
     outputs = table.outputs(as_json=general.as_json)
     asserts = table.assertions()
     start = time.perf_counter()
-    with general.console() as console:
+    with Console(quiet=general.quiet, verbose=general.verbose) as console:
         from ..api.jobs import traverse_files
 
         def ready(path: CameraPath, scenes: Scenes) -> None:
@@ -267,7 +256,7 @@ QUANTITIES = {
     "traverse_ms": ("traversal", "ms"),
 }
 
-#: What a frame is worth a look for, with its value.
+#: Reasons to look at a frame, and its value.
 MOMENTS = {
     "churn": ("{} of the splats pop", "share"),
     "bytes": ("{} are fetched", "bytes"),
@@ -331,7 +320,6 @@ def _moment(moment: Moment) -> str:
 
 
 def _said(value: float, style: str) -> str:
-    """Return a number with its unit."""
     if style == "count":
         return f"{round(value):,}"
     if style == "share":

@@ -128,7 +128,7 @@ def view(ctx: click.Context, /, **_: Any) -> None:
     files, page, place, general = options.files, options.page, options.place, options.general
     keep_apart(ctx)
     check_declared(ctx)
-    with general.console() as console:
+    with Console(quiet=general.quiet, verbose=general.verbose) as console:
         from ..api import viewing
 
         if place.export is not None:
@@ -168,7 +168,6 @@ def _serve(console: Console, server: Server, *, opens: bool, as_json: bool) -> N
 
 
 def _open(console: Console, url: str) -> None:
-    """Open a browser, or says that there is none."""
     import webbrowser
 
     # Without a display, Python would start a browser for terminals, in ours.

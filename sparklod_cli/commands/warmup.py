@@ -10,7 +10,7 @@ import click
 
 from ..system.setting_fields import whole
 from .command import command, option, values_of
-from .console import count_of, print_json
+from .console import Console, count_of, print_json
 from .options.common import Messages, processors_to_use, verbose_flag
 
 EXAMPLES = """\
@@ -40,7 +40,7 @@ def warmup(ctx: click.Context, /, **_: Any) -> None:
     is read-only, in your cache folder; NUMBA_CACHE_DIR names another one. Kernels that are in the cache stay there.
     """
     options = values_of(ctx, _Options)
-    with options.console() as console:
+    with Console(quiet=options.quiet, verbose=options.verbose) as console:
         from ..system import jit
         from ..warmup import missing, warm_up
 

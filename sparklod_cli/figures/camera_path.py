@@ -117,7 +117,6 @@ def frustum_lines(camera: Camera, length: float) -> Points:
     """(20, 3) ends of the lines of a frustum, world units: four edges, the far rectangle and a roof on its upper side.
 
     Args:
-        camera: of the frustum; its principal point need not be in the middle.
         length: distance of the far rectangle along the optical axis, world units.
     """
     (fx, fy), (cx, cy) = camera.focal, camera.principal

@@ -40,7 +40,6 @@ class FrameColumns:
             self.rows, self.x = [rows[0], rows[0]], self.x + np.array([-0.5, 0.5])
 
     def tick(self, value: float, place: int) -> str:
-        """Return the label of a tick of the axis."""
         if self._timed:
             return f"{value:g} s"
         return f"frame {value:,.0f}" if value == round(value) else ""
@@ -193,7 +192,6 @@ def _by_budget(
 
 
 def _by_frame(axes: Axes, series: Sequence[BudgetRows], name: str, title: str, unit: str) -> None:
-    """One line for each budget."""
     if not any(numbers(rows, name) for _, rows in series):
         axes.set_visible(False)
         return

@@ -79,7 +79,6 @@ def ellipsoids(splats: Splats, deviations: float, of: Mesh, thinnest: float) -> 
     Points of the sphere are multiplied by the radii, its normals divided by them.
 
     Args:
-        deviations: the radii, in standard deviations.
         thinnest: smallest radius that is drawn, world units, so that no splat falls between pixels.
     """
     axes = rotation(splats.quat_xyzw)
@@ -161,7 +160,6 @@ def viewpoint(
     """Return the viewpoint that looks along a direction and just fits all points into a frame.
 
     Args:
-        points: (N, 3) points to show.
         direction, up: (3,) world axes.
         frame: left, top, right and bottom of the frame in the picture, 0..1 from the left and from the top.
     """
@@ -400,7 +398,6 @@ class PyvistaStage:
         actor.prop.interpolation = "gouraud"
 
     def dots(self, points: Points, color: str) -> None:
-        """Add small points of one colour."""
         mesh = self._pyvista.PolyData(self._local(points))
         self._plotter.add_mesh(mesh, color=color, point_size=1.5 * OVERSAMPLING, lighting=False)
 

@@ -33,10 +33,9 @@ class Panel:
     """One chart of the figure.
 
     Attributes:
-        title: of the chart.
         columns: that the chart needs; without a number in each of them it is left out.
         draw: draws into matplotlib's axes and returns (N,) heights at which frames are marked.
-        marks: reasons for marking a frame, of those that this chart shows.
+        marks: reasons for marking a frame in this chart.
     """
 
     title: str
@@ -73,7 +72,6 @@ def _stack(axes: Axes, frames: FrameColumns, parts: Sequence[tuple[str, str, str
 
 
 def _from_zero(axes: Axes, values: Series) -> None:
-    """Lets the vertical axis run from 0 to `HEADROOM` times the largest value; NaN is ignored."""
     axes.set_ylim(0, HEADROOM * float(np.nanmax(values)) or 1)
 
 
@@ -84,7 +82,6 @@ def _counted(axes: Axes, matplotlib: ModuleType, unit: str = "") -> None:
 
 
 def _beside(axes: Axes) -> Axes:
-    """Return a second vertical axis, on the right."""
     other = axes.twinx()
     other.grid(False)
     return other
@@ -202,7 +199,7 @@ CALLED = {
 
 @dataclass(frozen=True)
 class Plot:
-    """The bytes of a PNG, and why it has no picture of the path; None if it has one or none was asked for."""
+    """The bytes of a PNG, and the reason why it has no picture of the path, if one was requested."""
 
     png: bytes
     note: str | None
@@ -213,7 +210,7 @@ def plot(rows: Iterable[Row], marked: Mapping[str, int], title: str, scene: Path
 
     Args:
         rows: of all frames; those of single instances are left out.
-        marked: numbers of frames worth a look, by the reason, a key of `CALLED`.
+        marked: numbers of notable frames, by the reason, a key of `CALLED`.
 
     Raises:
         SparklodError: matplotlib is not installed, or there is no frame.
@@ -262,7 +259,7 @@ def draw_charts(rows: Sequence[Row], marked: Mapping[str, int]) -> NDArray[np.ui
 
     Args:
         rows: one for each frame, at least one.
-        marked: numbers of frames worth a look, by the reason (`Panel.marks`).
+        marked: numbers of notable frames, by the reason (`Panel.marks`).
 
     Raises:
         SparklodError: matplotlib is not installed.

@@ -23,7 +23,7 @@ LONGEST = {"gif": GIF_STEP * 0xFFFF, "webp": 0xFFFFFF, "mp4": 1_000_000, "webm":
 #: Quality of WebP (0 to 100), rate factors of H.264 (51 to 0) and VP9 (63 to 0): losses are hardly visible.
 WEBP_QUALITY, H264_QUALITY, VP9_QUALITY = 90, 16, 24
 
-#: Flag of a WebP that it has alpha. libwebp leaves it out where only what is cut off at the edges is transparent.
+#: Flag of a WebP that it has alpha. libwebp omits it where only cropped edges are transparent.
 WEBP_ALPHA = 0x10
 
 #: Codec and options of ffmpeg for each kind of video. VP9 obeys its rate factor only with a bit rate of 0, and uses

@@ -8,7 +8,7 @@ SHEETS = ("png", "jpg", "webp")
 #: Formats by suffix, where the two differ.
 SUFFIXES = {"jpeg": "jpg"}
 
-#: Quality of JPEG, 1 to 100: what is lost is hardly seen.
+#: Quality of JPEG, 1 to 100: losses are hardly visible.
 JPEG_QUALITY = 92
 
 #: Width and height of a thumbnail, pixels, and the pixels along each side that each of them is the mean of.

@@ -39,7 +39,6 @@ class PictureOutput:
         return self.name.with_name(NUMBER.sub(lambda match: match[0] % number, self.name.name))
 
     def paths(self, numbers: Sequence[int]) -> list[Path]:
-        """Return the paths of all files that will be written."""
         if self.name is None:
             return []
         return [self.path(number) for number in (numbers if self.kind == "frames" else [0])]

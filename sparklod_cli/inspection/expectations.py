@@ -69,9 +69,7 @@ class Expectations:
     """Expectations of a file; None means anything. Each is a condition, see `assertions.Condition`.
 
     Attributes:
-        max_bytes: of the file.
         min_splats, max_splats: of a plain file, or leaves of a tree.
-        sh: the SH degree.
         lod: whether it should be a tree.
         max_growth: nodes over leaves.
         values: by the field of the report ("tree.depth"), what it should be: a value, or a table of `min` and `max`.
@@ -88,7 +86,6 @@ class Expectations:
     asserts: tuple[str, ...] = ()
 
     def conditions(self) -> list[Condition]:
-        """All of them, in the order of the attributes."""
         found = [
             Condition.of(name, sign, getattr(self, key))
             for key, (name, sign) in KEYS.items()
@@ -206,5 +203,4 @@ def check(report: Report, expected: Expectations) -> list[Finding]:
 
 
 def _text(value: Any) -> str:
-    """Return a value as text, no longer than a line of a log."""
     return number_text(value) if is_number(value) else printable(json.dumps(value), QUOTED)

@@ -98,7 +98,7 @@ class FileSection:
 def section_of(
     report: Report, scene: Scene | None, picture: DescribedPicture | None, thumbnail: DescribedPicture | None = None
 ) -> FileSection:
-    """Return the section about a file: its report, its pictures, and histograms of what was read of it."""
+    """Return the section about a file: its report, its pictures, and histograms of the splats that were read."""
     drawn = {}
     if scene is not None and len(scene.splats):
         drawn = {name: values.histogram_of(scene.splats, name) for name in values.names_of(scene.splats)}
@@ -163,7 +163,6 @@ def _section(section: FileSection, anchor: str) -> str:
 
 
 def _verdict(report: Mapping[str, Any]) -> str:
-    """Return a badge with the number of findings of the worst severity."""
     findings = report.get("findings")
     if findings is None:
         return '<span class="badge plain">not checked</span>'
@@ -175,7 +174,6 @@ def _verdict(report: Mapping[str, Any]) -> str:
 
 
 def _figures(report: Mapping[str, Any]) -> str:
-    """Return the key figures, as cards."""
     tree, header = report.get("tree") or {}, report.get("header") or {}
     noun = "node" if tree else "splat"
     each, ratio = report.get("bytes_per_splat"), report.get("compression_ratio")
@@ -287,7 +285,7 @@ def _label(key: str) -> str:
 
 
 def _shown(key: str, value: Any) -> str:
-    """Return a value of a report as HTML; its key tells sizes and shares from other numbers."""
+    """Return a value of a report as HTML; sizes and shares are recognised by their keys."""
     if value is None:
         return NONE
     if isinstance(value, Mapping):

@@ -51,10 +51,7 @@ class ReportSettings:
     """Contents of a report besides the header and the tree.
 
     Attributes:
-        values: statistics of the splats.
         all_quantities: all of their quantities, instead of the main ones.
-        check: findings.
-        chunks: a row for each chunk.
         headers_only: read no more than headers where a format has those; tree and values are left out.
         at_once: have the whole scene in memory, with all columns, for callers that draw it; False reads RAD files chunk
             by chunk; None does so with large ones, see `RadFile.fits`.
@@ -79,19 +76,19 @@ class Report:
         splats: number of splats, or nodes of a tree.
         sh_degree, antialiased: of the splats.
         up: the axis that points up: "y", "-z"; None where it is unknown.
-        up_by: the format whose specification says so; empty where the file itself does, or nobody.
+        up_by: the format whose specification says so; empty if the file itself does, or if unknown.
         header: fields of the header, which depend on the format.
         bytes_per_splat: size over splats.
         compression_ratio: size of the decoded splats, as 4-byte floats, over that of the file.
         notes: data that the reader left out.
         hints: settings of viewers that suit the file; none unless it was checked.
-        rad: what the headers of a RAD file tell; None for other formats.
-        streamed_sog: what the manifest of a Streamed SOG tells; None for other formats.
-        tiles: what the tilesets and headers of 3D Tiles tell; None for other formats.
+        rad: facts from the headers of a RAD file; None for other formats.
+        streamed_sog: facts from the manifest of a Streamed SOG; None for other formats.
+        tiles: facts from the tilesets and headers of 3D Tiles; None for other formats.
         tree: facts of the Level-of-Detail tree; None without one.
-        values: statistics of the splats; None if not asked for.
-        chunks: a row for each chunk, see `chunks.COLUMNS`; None if not asked for.
-        findings: None if not asked for, unless the file could not be read.
+        values: statistics of the splats; None if not requested.
+        chunks: a row for each chunk, see `chunks.COLUMNS`; None if not requested.
+        findings: None if not requested, unless the file could not be read.
     """
 
     file: str
@@ -124,7 +121,6 @@ class Report:
         return value_at(self.as_dict(), name)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the report as plain values, for JSON."""
         plain = {"schema_version": SCHEMA_VERSION} | dataclasses.asdict(self)
         if self.findings is not None:
             plain["findings"] = [{"severity": found.severity} | dataclasses.asdict(found) for found in self.findings]
@@ -149,7 +145,7 @@ def value_at(plain: dict[str, Any], name: str) -> Any:
 def inspect(
     path: Path, settings: ReportSettings, *, threads: int = 1, progress: Progress = silent
 ) -> tuple[Report, Scene | None]:
-    """Return the report on a file, and its scene as far as it was read.
+    """Return the report on a file, and its scene if it was read.
 
     A file that cannot be read gives a finding, not an error, and None for the scene. Unless the scene is wanted as a
     whole (`ReportSettings.at_once`), it is None of RAD files that are read chunk by chunk and of SPZ files.
@@ -190,7 +186,7 @@ def inspect(
 
 
 def _surveyed(path: Path, check: bool, threads: int, progress: Progress) -> HeaderScan | None:
-    """Return what the headers of a file tell; None for formats of which they tell little."""
+    """Return facts and findings from the headers of a file; None for formats with few."""
     with opened(path) as (file, form, more):
         if form.name == RAD:
             return rad.survey(file, more["open_companion"], check=check)

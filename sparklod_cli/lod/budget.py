@@ -11,6 +11,9 @@ from ..system.units import check_grouping, count_of, parse_count
 #: A share of the leaves, in percent, with at most nine digits after the point.
 SHARE = re.compile(r"([0-9]{1,3}(?:\.[0-9]{1,9})?|\.[0-9]{1,9})\s*%")
 
+#: A share that is not in percent.
+FRACTION = re.compile(r"0?\.[0-9]{1,9}")
+
 #: A comma in digits that no list of budgets has: none begins with a zero.
 GROUPED_LIST = re.compile(r"[0-9],0")
 
@@ -78,7 +81,8 @@ def parse_budget(text: str) -> Budget:
     try:
         budget = Budget(text, Fraction(found[1]) / 100, None) if found else Budget(text, None, parse_count(text))
     except ValueError:
-        raise ValueError(f"{text!r} is neither a share such as 5% nor a count such as 500k") from None
+        meant = f"; did you mean {100 * float(text):g}%?" if FRACTION.fullmatch(text) and float(text) else ""
+        raise ValueError(f"{text!r} is neither a share such as 5% nor a count such as 500k{meant}") from None
     if budget.share == 0:
         raise ValueError(f"a budget of {text} leaves nothing to draw; give more than 0%")
     if budget.count is not None and not 1 <= budget.count <= LARGEST:

@@ -1,4 +1,4 @@
-"""Colours for numbers: perceptually even ramps, and the scale that tells what a colour means."""
+"""Colours for numbers: perceptually even ramps, and scales that explain them."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def log_marks(low: float, high: float) -> list[Mark]:
 
 
 def with_ends(marks: list[Mark], low: str | None, high: str | None, apart: float) -> list[Mark]:
-    """Return the marks of a scale with those of its ends, and without those that are nearer to them than `apart`."""
+    """Return the marks of a scale and its ends, without marks nearer to the ends than `apart`."""
     ends = [(place, text) for place, text in ((0.0, low), (1.0, high)) if text is not None]
     return [mark for mark in marks if all(abs(mark[0] - place) > apart for place, _ in ends)] + ends
 

@@ -9,7 +9,7 @@ from typing import Any
 from ..system.errors import BackendError
 from ..system.setting_fields import setting
 
-#: What is asked for: a card if there is one; the processor; a card.
+#: Devices that can be requested: a card if there is one; the processor; a card.
 DEVICES = ("auto", "cpu", "cuda")
 
 
@@ -30,7 +30,7 @@ def uses_card(device: str, say: Callable[[str], None] = lambda text: None) -> bo
     "auto" does without a word where the extra is not installed.
 
     Raises:
-        BackendError: a card is asked for, and there is none that can be used.
+        BackendError: a card is requested, and none is usable.
     """
     if device == "cpu" or (device == "auto" and importlib.util.find_spec("numba_cuda") is None):
         return False

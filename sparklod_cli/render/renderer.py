@@ -49,8 +49,8 @@ class Renderer:
         scale: the color scale; None where splats have their own colours.
 
     Raises:
-        SparklodError: there is nothing to colour by.
-        BackendError: the device is a card, and there is none that can be used.
+        SparklodError: the scenes lack the quantity to colour by.
+        BackendError: the device is a card, and none is usable.
         ValueError: the device is a card, and the backend does not draw on one.
     """
 
@@ -95,7 +95,6 @@ class Renderer:
         return DrawnPicture(averaged(image, self.settings.supersample), None, len(cut))
 
     def _shaded(self, cut: Cut, camera: Camera) -> ShadedSplats:
-        """Shade splats, without SH where colours are not their own."""
         degree = self.settings.max_sh if self.settings.color_by is None else 0
         return shade([(part.splats.with_max_sh(degree), part.object_to_world) for part in cut.parts], camera)
 

@@ -90,8 +90,6 @@ class Condition:
     """Condition on a named value.
 
     Attributes:
-        text: as it was given, without spaces at its ends.
-        name: of what is compared.
         sign: one of `SIGNS`.
         bound: what it is compared with: a number, or for == and != anything that JSON has.
     """
@@ -103,7 +101,7 @@ class Condition:
 
     @classmethod
     def of(cls, name: str, sign: str, bound: Any) -> Condition:
-        """Return a condition that nobody typed."""
+        """Return a condition made by the program, with its text."""
         return cls(f"{name}{sign}{json.dumps(bound)}", name, sign, bound)
 
     def holds(self, value: Any) -> bool:
@@ -125,9 +123,6 @@ def parse_condition(text: str, *, example: str) -> Condition:
 
     VALUE is a number, which may end in k, M, G, % or a unit of bytes (3MB, 3MiB); or true, false, null or a text in
     double quotes.
-
-    Raises:
-        BadAssertionError: it cannot be understood.
     """
     match = TEXT.fullmatch(text)
     left, sign, right = (part.strip() for part in match.groups()) if match else ("", "", "")
@@ -169,24 +164,16 @@ def number_text(value: Number) -> str:
 
 
 @dataclass(frozen=True)
-class Assertion:
-    """A comparison of a column, or of a statistic of it, with a bound.
+class Assertion(Condition):
+    """Comparison of a column, or of a statistic of it, with a number.
 
     Attributes:
         column: a numeric column.
         statistic: of its cells, see `statistics`; empty if every frame must hold by itself.
-        bound: right side of the comparison.
     """
 
-    text: str
     column: Column
     statistic: str
-    sign: str
-    bound: Number
-
-    def holds(self, value: Number) -> bool:
-        """Whether a value compares with the bound as it must."""
-        return SIGNS[self.sign](value, self.bound)
 
 
 @dataclass(frozen=True)
@@ -194,7 +181,6 @@ class Outcome:
     """Whether an assertion holds.
 
     Attributes:
-        assertion: the assertion.
         value: the statistic; without one, the value of the worst frame.
         failed, frames: frames that fail by themselves, and frames that have a value; `failed` is 0 for a statistic.
         worst: row of the frame that fails by most, or that comes closest to failing; None for a count.
@@ -208,22 +194,20 @@ class Outcome:
     worst: Row | None
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
         return {"assert": self.assertion.text, "held": self.held, "value": self.value}
 
     def message(self) -> str:
-        """Return the outcome, in a line."""
-        asked = self.assertion
+        assertion = self.assertion
         where = self.worst and place_text(self.worst)
-        if not asked.statistic:
+        if not assertion.statistic:
             some = f"fails in {self.failed:,} of {self.frames:,}" if self.failed else f"holds in all {self.frames:,}"
-            return f"{asked.text}: {some} frames; the worst is {where} with {number_text(self.value)}"
-        found = f"{asked.text}: {asked.column.name}_{asked.statistic} is {number_text(self.value)}"
+            return f"{assertion.text}: {some} frames; the worst is {where} with {number_text(self.value)}"
+        found = f"{assertion.text}: {assertion.column.name}_{assertion.statistic} is {number_text(self.value)}"
         if self.worst is None:
             return found
-        if asked.statistic in ("first", "last"):
+        if assertion.statistic in ("first", "last"):
             return f"{found}, in {where}"
-        (cell,) = numbers([self.worst], asked.column.name)
+        (cell,) = numbers([self.worst], assertion.column.name)
         return f"{found}; the worst is {where} with {number_text(cell)}"
 
 
@@ -240,7 +224,7 @@ def parse(text: str, columns: Sequence[Column]) -> Assertion:
     column, name = _column(text, condition.name, columns)
     if not is_number(condition.bound):
         raise BadAssertionError(f"{text!r}: {condition.bound!r} is not a number such as 0.2, 500k, 2M or 20%")
-    return Assertion(condition.text, column, name, condition.sign, condition.bound)
+    return Assertion(**vars(condition), column=column, statistic=name)
 
 
 def _column(text: str, left: str, columns: Sequence[Column]) -> tuple[Column, str]:

@@ -22,7 +22,6 @@ class Column:
     """One column of a table.
 
     Attributes:
-        name: as the header has it.
         kind: type of the cells that are not empty: int, float or str.
         digits: format of a float (".6f": six decimals, ".6g": six significant digits); empty otherwise.
         unit: as people read it; empty for a plain number or a text.
@@ -73,7 +72,6 @@ class Table(Sequence[Row]):
     """Rows, each a dictionary of cells by the names of the columns.
 
     Attributes:
-        rows: in order.
         columns: name, type, unit and meaning of the cells.
     """
 
@@ -124,7 +122,6 @@ class Table(Sequence[Row]):
         )
 
     def _repr_html_(self) -> str:
-        """For Jupyter."""
         half = SHOWN // 2
         rows = list(self.rows)
         parts = [rows] if len(rows) <= SHOWN else [rows[:half], rows[-half:]]
@@ -176,11 +173,7 @@ def encode(rows: Iterable[Row], columns: Sequence[Column], form: str) -> Iterato
 
 
 def load_pyarrow() -> ModuleType:
-    """Import pyarrow.
-
-    Raises:
-        SparklodError: it is not installed.
-    """
+    """Import pyarrow."""
     with optional_import("Parquet needs pyarrow", "parquet"):
         import pyarrow
         import pyarrow.parquet
@@ -188,7 +181,6 @@ def load_pyarrow() -> ModuleType:
 
 
 def _cell(column: Column, row: Row) -> Cell:
-    """Return the value of a cell in every format."""
     value = row[column.name]
     if isinstance(value, str):
         return value.encode("utf-8", "replace").decode("utf-8") or None

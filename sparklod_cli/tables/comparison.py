@@ -83,7 +83,6 @@ class BudgetSummary:
     popping_frame: int | None
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
         return asdict(self)
 
 

@@ -29,7 +29,6 @@ class Histogram:
         counts: (B,) numbers in each bin.
         log: the bins have equal ratios instead of equal widths.
         below, above: numbers outside the range of the bins.
-        not_finite: numbers that are not finite, and in no bin.
     """
 
     edges: NDArray[np.float64]
@@ -91,7 +90,6 @@ def as_text(histogram: Histogram, *, width: int = 60, rows: int = 20) -> str:
     Args:
         histogram: whose bins are joined where there are more than `rows`.
         width: of the longest bar, in characters.
-        rows: largest number of lines for bins.
     """
     lines: list[tuple[str, int, bool]] = []
     if len(histogram.counts):

@@ -42,7 +42,7 @@ SPARK_TYPES = {
     "RAD": "rad",
 }
 
-#: What shows the others, but for those that nothing shows.
+#: Engines of the other formats, except formats that no engine shows.
 OTHER_ENGINES = {"Streamed SOG": "playcanvas", "GLB": "playcanvas", "3D Tiles": "cesium"}
 
 #: How files begin that sparklod reads and Spark 2.2.0 does not, and what they are.
@@ -78,12 +78,9 @@ class ShownFile:
     """A splat file that the page shows.
 
     Attributes:
-        path: as the user gave it.
-        name: for display.
         url: where the page finds it, relative to the page.
         format: for display: "RAD", "SPZ".
         spark_type: what Spark calls its format; None where another engine shows it.
-        header: of a RAD file.
         files: itself and what it refers to, by the names that it is served under.
         note: why Spark will not show it; None where nothing is known against it.
     """
@@ -124,7 +121,7 @@ def url_of(name: str) -> str:
 
 
 def shown_files(paths: Sequence[Path]) -> list[ShownFile]:
-    """Return the files that a page shows, each with those that it refers to.
+    """Return the files that a page shows, each with the files it refers to.
 
     Raises:
         FormatError: a file cannot be read, is of no known format, or refers to one that is missing or elsewhere; or
@@ -179,7 +176,7 @@ def _shown(path: Path, folder: str) -> ShownFile:
 
 
 def _note(name: str, head: bytes, header: RadHeader | None) -> str | None:
-    """Why Spark will not show a file, as far as its beginning tells."""
+    """Return why Spark will not show a file, judged by its beginning; None if it may."""
     for beginning, what in UNREAD:
         if re.match(beginning, head):
             return f"{name}: Spark 2.2.0 does not read {what}; bake it first with sparklod build-lod"
@@ -194,7 +191,6 @@ def _note(name: str, head: bytes, header: RadHeader | None) -> str | None:
 
 
 def _chunk_files(path: Path, header: RadHeader) -> Iterator[tuple[str, Path]]:
-    """Yield the chunk files that the header of a RAD file names."""
     for name in header.filenames:
         companion = companion_path(path, name)
         if not companion.is_file():

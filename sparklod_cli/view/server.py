@@ -1,4 +1,4 @@
-"""The server of a site: files by their names and nothing else, in ranges, to pages of its own unless told otherwise."""
+"""The server of a site: files by their names and nothing else, in ranges, to pages of its own by default."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from ..system.errors import SparklodError
 from .files import media_type
 from .site import CAMERAS, INDEX, MAX_BYTES, Site, parse_drop
 
-#: Where a server listens unless told otherwise: only programs of this machine can connect.
+#: Default address of a server: only programs of this machine can connect.
 LOOPBACK = "127.0.0.1"
 
 #: Names of this machine that a Host header may have where the server listens on loopback.
@@ -127,17 +127,15 @@ class Handler(BaseHTTPRequestHandler):
     timeout = IDLE
 
     def do_GET(self) -> None:
-        """Send a resource, or a range of it."""
         if self._is_ours():
             self._send_resource(body=True)
 
     def do_HEAD(self) -> None:
-        """Send the headers of a resource."""
         if self._is_ours():
             self._send_resource(body=False)
 
     def do_OPTIONS(self) -> None:
-        """Says what a page of another origin may send."""
+        """Send the headers and methods that a page of another origin may use."""
         if self._is_ours():
             self._answer(HTTPStatus.NO_CONTENT, {"Allow": "GET, HEAD", **(PREFLIGHT if self.server.cors else {})})
 
@@ -164,7 +162,6 @@ class Handler(BaseHTTPRequestHandler):
         self._answer(status, {"Content-Type": "application/json"}, data)
 
     def _body(self) -> bytes | None:
-        """Return the body of a request; None where it was refused."""
         length = self.headers.get("Content-Length", "")
         if not (length.isascii() and length.isdigit()) or "Transfer-Encoding" in self.headers:
             self._refuse(HTTPStatus.LENGTH_REQUIRED, "the request has no Content-Length")
@@ -190,7 +187,7 @@ class Handler(BaseHTTPRequestHandler):
         return False
 
     def _is_of_our_page(self) -> bool:
-        """Whether a request was sent by our own page, as browsers tell."""
+        """Whether a request was sent by our own page, according to the browser."""
         origin, site = self.headers.get("Origin"), self.headers.get("Sec-Fetch-Site", "same-origin")
         own = origin is None or origin.lower() == f"http://{self.headers.get('Host', '').lower()}"
         return own and site == "same-origin" and self.headers.get("Content-Type") == "application/json"
@@ -245,7 +242,7 @@ class Handler(BaseHTTPRequestHandler):
         sent = 0
         with contextlib.suppress(ConnectionError, TimeoutError):  # the browser wants no more of it
             sent = self.connection.sendfile(file, first, count)
-        if sent < count:  # the file has become shorter, too: the connection tells
+        if sent < count:  # the file has become shorter, too: the closed connection reports it
             self.close_connection = True
 
     def _refuse(self, status: HTTPStatus, text: str, headers: Mapping[str, str] | None = None) -> None:
@@ -271,7 +268,6 @@ class Handler(BaseHTTPRequestHandler):
             self.end_headers()
 
     def log_message(self, format: str, *arguments: Any) -> None:
-        """Tells of a request, as far as anybody listens."""
         self.server.log(f"{self.address_string()} {format % arguments}")
 
 

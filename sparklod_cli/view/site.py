@@ -104,7 +104,6 @@ class Libraries:
     files: Mapping[str, Path]
 
     def import_map(self) -> dict[str, dict[str, str]]:
-        """Return the content of `<script type="importmap">`."""
         imports = {
             name: self._url(package, path) for name, (package, path) in MODULE_NAMES.items() if package in self.versions
         }
@@ -176,12 +175,10 @@ def from_folder(folder: Path, engine: str = "spark") -> Libraries:
 
 
 def _install(folder: Path, engine: str) -> str:
-    """Return the command that installs the packages of an engine in a folder."""
     return f"npm install --prefix {folder} " + " ".join(f"{name}@{VERSIONS[name]}" for name in PACKAGES[engine])
 
 
 def _version(package: Path) -> str:
-    """Return the version of an installed package."""
     try:
         value = parse_json(read_text(package / "package.json"))
         return printable(str(value["version"]), 40)
@@ -281,10 +278,7 @@ class Site:
     """A site.
 
     Attributes:
-        resources: all of it, by name.
         cameras: settings of camera paths that are dropped onto the page.
-        shown: its splat files.
-        notes: what a person should know.
     """
 
     resources: Resources
@@ -307,8 +301,6 @@ def site_of(
     """Return the site of some files, of given extents.
 
     Args:
-        budget: splats; None for Spark's default on the device.
-        path: cameras that the page plays; None for none.
         cameras: settings of camera paths that are dropped onto the page.
         served: by `server`, which parses camera paths; otherwise the page can read those of sparklod itself.
     """

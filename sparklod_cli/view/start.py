@@ -39,7 +39,7 @@ FRAME = (1280, 720)
 FOV = round(math.degrees(DEFAULT_FOV_Y), 9)
 
 
-#: The feature sizes that colours tell apart, as percentiles of all: of trees, few nodes are coarse.
+#: The feature sizes that colours distinguish, as percentiles of all: of trees, few nodes are coarse.
 SIZES = 1, 99.9
 
 #: How many times smaller the splats of a large RAD tree are than those of its first chunk: some levels.

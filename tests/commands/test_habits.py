@@ -48,6 +48,18 @@ def test_an_output_named_as_of_cp_is_recognised(line: str, output: str, capsys: 
     assert refused(line, capsys) == f"error: {output} does not exist; did you mean -o {output}?"
 
 
+@pytest.mark.parametrize(
+    ("line", "flag", "output"),
+    [
+        ("inspect scene.ply report.html", "--html", "report.html"),
+        ("inspect scene.ply tree.spz report.HTM", "--html", "report.HTM"),
+        ("view scene.ply site/", "--export", "site"),
+    ],
+)
+def test_a_page_or_a_site_named_as_of_cp_is_recognised(line: str, flag: str, output: str, capsys: Capture) -> None:
+    assert refused(line, capsys) == f"error: {output} does not exist; did you mean {flag} {output}?"
+
+
 def test_an_input_whose_name_is_wrong_is_an_input(capsys: Capture) -> None:
     assert run(["build-lod", "scene.ply", "scene2.ply"]) == 1
     assert "scene2.ply: cannot be read: no such file or directory" in capsys.readouterr().err
@@ -68,6 +80,8 @@ def test_an_input_whose_name_is_wrong_is_an_input(capsys: Capture) -> None:
         ("render scene.ply --budget 500,000", "'500,000' has digits in groups; did you mean 500000 or 500k?"),
         ("traverse scene.ply --budget 250,500", "'250,500' has digits in groups; did you mean 250500?"),
         ("view scene.ply --budget 500.000", "'500.000' has digits in groups; did you mean 500000 or 500k?"),
+        ("simplify scene.ply --to 0.5 -o a.ply", "nor a count such as 500k; did you mean 50%?"),
+        ("render scene.ply --budget .05", "nor a count such as 500k; did you mean 5%?"),
         ("build-lod scene.ply --tile-splats 50.000", "'50.000' has digits in groups; did you mean 50000 or 50k?"),
     ],
 )

@@ -69,7 +69,7 @@ def test_a_name_without_suffix_is_refused_with_a_hint(command: str, name: str, t
     target, flag = tmp_path / "noname", f"--{name.replace('_', '-')}"
     assert run(arguments(command, name, target)) == 2
     err = capsys.readouterr().err
-    assert f"error: {flag} {target} has no suffix to tell the format; end it in ." in err
+    assert f"error: {flag} {target} has no suffix, which chooses the format; end it in ." in err
     assert err.endswith(", or in / for a folder\n")
     assert not any(tmp_path.iterdir())
 

@@ -159,11 +159,11 @@ def test_selection_and_axes_are_those_of_build_lod(source: Path, tmp_path: Path)
     ("arguments", "text"),
     [
         (("--to", "1%"), "Missing option '-o' / '--output'"),
-        (("-o", "x.ply"), "say how many splats are left: give one of --to, --max-bytes and --psnr"),
+        (("-o", "x.ply"), "say how many splats to keep: give one of --to, --max-bytes and --psnr"),
         (("--to", "1%", "--psnr", "30", "-o", "x.ply"), "--to and --psnr cannot be used together"),
         (("--to", "ten", "-o", "x.ply"), "'ten' is neither a share such as 5% nor a count"),
         (("--to", "1%", "-o", "x.npz"), "--output writes .ply"),
-        (("--to", "1%", "-o", "x"), "has no suffix to tell the format"),
+        (("--to", "1%", "-o", "x"), "has no suffix, which chooses the format"),
         (
             ("--to", "1%", "-o", "x.ply", "--camera-path", "c.csv"),
             "--camera-path can only be used with --psnr or --refine",

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 #: The values of --format for regions at several detail levels, and for tiles.
 STREAMED_SOG, TILES_3D = "streamed-sog", "3d-tiles"
 
-#: What builds the tree unless somebody chooses, and what builds that which detail levels or tiles are cut from.
+#: Default builders of trees, and of trees that detail levels or tiles are cut from.
 METHOD, METHOD_OF_DETAIL = METHODS[0], "quality"
 
 
@@ -151,11 +151,6 @@ class TransformOptions:
     translate: tuple[float, ...] = option("Move the scene by this, in world units, after --scale.", POINT, "0,0,0")
 
     def transform(self) -> Transform:
-        """Return the transform.
-
-        Raises:
-            click.UsageError: it is out of range.
-        """
         from ...model.transforms import Transform
 
         try:
@@ -200,7 +195,7 @@ class DetailOptions:
     )
 
 
-#: What --refine is without a number, and an example of a number that pays.
+#: Value of --refine without a number, and an example of a useful number.
 BY_SIZE, EXAMPLE_STEPS = "default", 2000
 
 
@@ -235,7 +230,7 @@ class RefineOptions:
     device: str = setting_of(FitSettings, "device")
 
     def settings(self) -> FitSettings | None:
-        """Return how merged splats are fitted; None without --refine."""
+        """Return the settings of fitting; None without --refine."""
         if self.refine is None:
             return None
         return FitSettings(steps=self.refine or None, seed=self.seed, device=self.device)
@@ -247,7 +242,7 @@ def memory_size(text: str) -> int:
     if not text.strip()[-1:].isalpha():
         raise ValueError(f"{text!r} has no unit; write {text.strip()}G or {text.strip()}MB")
     if size < 1:
-        raise ValueError(f"{text!r} is no memory to work in; give some, such as 4G")
+        raise ValueError(f"{text!r} must be positive, such as 4G")
     return size
 
 
@@ -288,7 +283,7 @@ class ClusterOptions:
     def engine(
         self, ctx: click.Context, general: General, memory: int | None, console: Console
     ) -> Iterator[ClusterEngine | None]:
-        """Yield the cluster, as long as the context lasts; None where none is requested."""
+        """Yield the cluster for the duration of the context; None without --workers and --scheduler."""
         if self.workers is None and self.scheduler is None:
             yield None
             return
@@ -301,5 +296,5 @@ class ClusterOptions:
             yield engine
 
 
-#: Parameters of trees, of which a file that is only converted back has nothing.
+#: Parameters of trees, without an effect where leaves are extracted.
 OF_TREES = parameters_of(TreeOptions, SelectionOptions, TransformOptions)

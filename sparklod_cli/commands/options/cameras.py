@@ -34,7 +34,7 @@ PATHS = ("camera_path", "orbit", "dolly", "keyframes")
 #: Name of the default source: cameras around the scene.
 AROUND = "around"
 
-#: Options that only mean something with some sources, AROUND among them.
+#: Sources with which these options have an effect, AROUND among them.
 ONLY_WITH = {
     "camera_format": ("camera_path",),
     "camera_axes": ("camera_path",),
@@ -137,11 +137,9 @@ class Cameras:
 
     @property
     def all_views(self) -> tuple[Any, ...]:
-        """The views of `--view`."""
         return ()
 
     def check(self, ctx: click.Context) -> None:
-        """Raise a `click.UsageError` where options contradict each other, or have no effect."""
         sources = [flag_of(ctx, name) for name in SOURCES if getattr(self, name, None)]
         if len(sources) > 1:
             raise click.UsageError(f"{' and '.join(sources)} cannot be used together; give one source of cameras")
@@ -159,11 +157,10 @@ class Cameras:
 
     @property
     def _orbits(self) -> bool:
-        """Whether the cameras go around the scene."""
         return self.orbit is not None or (self.source == AROUND and not self.still)
 
     def least_count(self) -> int:
-        """Return the number of cameras, or the least number as far as it is known before a file is read."""
+        """Return the least number of cameras known before a file is read."""
         if self.all_views:
             return len(self.all_views)
         if self.dolly or self.keyframes:
@@ -171,7 +168,7 @@ class Cameras:
         return -(-(self.orbit or 1) // self.every)
 
     def files(self) -> list[Path]:
-        """Return the file that the text of --world-transform names, if it does."""
+        """Return the file that --world-transform names, if any."""
         matrix = self.world_transform and file_of(self.world_transform)
         return [matrix] if matrix else []
 
@@ -199,8 +196,7 @@ class Cameras:
         """Return settings that override those of a camera file.
 
         Raises:
-            click.UsageError: the numbers of --world-transform are no transform.
-            CameraPathError: its file is none; names the file.
+            CameraPathError: its file holds no transform; names the file.
         """
         from ...cameras.frame import Settings
 
@@ -217,7 +213,7 @@ class Cameras:
 
     @contextlib.contextmanager
     def usage_errors(self) -> Iterator[None]:
-        """Turn errors that the values of options cause into usage errors; of too many cameras one names the option."""
+        """Turn errors about values of options into usage errors; that of too many cameras names the option."""
         from ...api.jobs import UnfitError
 
         try:

@@ -59,10 +59,6 @@ class Messages:
     quiet: bool = quiet_flag("Print nothing but errors.")
     verbose: bool = verbose_flag("Print how long each stage took, and which settings were chosen.")
 
-    def console(self) -> Console:
-        """Return the console for messages."""
-        return Console(quiet=self.quiet, verbose=self.verbose)
-
 
 @dataclass(frozen=True)
 class General(Messages):
@@ -110,12 +106,7 @@ def plot_option(help: str, **attributes: Any) -> Any:
 
 
 def table_form(flag: str, output: Path | None, form: str | None = None) -> str:
-    """Return the format of a table, by its option or by the name of the output; CSV on standard output.
-
-    Raises:
-        click.UsageError: nothing is written by that suffix, or it promises something else than `form`, or there is
-            neither.
-    """
+    """Return the format of a table, by its option or by the name of the output; CSV on standard output."""
     from ...codecs.formats import FORMATS
     from ...images.defaults import MOVING, STILL, SUFFIXES
     from ...tables.columns import FORMS

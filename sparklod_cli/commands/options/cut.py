@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -68,14 +67,13 @@ class Inputs:
 
     @property
     def first(self) -> Path | None:
-        """The file that outputs are named after; None where there is no input."""
+        """The file that outputs are named after; None without an input."""
         return self.scene or next(iter(self.files), None)
 
     def instances(self) -> list[Instance]:
         """Return the instances: each FILE once, untransformed, or those of the instances file.
 
         Raises:
-            click.UsageError: there is neither, or there are both.
             InstancesFileError: the instances file cannot be read.
         """
         from ...model.instances import instances_of
@@ -86,10 +84,6 @@ class Inputs:
         if self.files and self.scene is not None:
             raise click.UsageError("FILE cannot be used with --scene, which names the files")
         return instances_of(self.files) if self.scene is None else read_instances(self.scene)
-
-    def read(self, instances: Sequence[Instance]) -> list[Path]:
-        """Return the splat files of instances, for `keep_apart`: an instances file names them."""
-        return [instance.file for instance in instances if instance.file is not None]
 
 
 def _parse_budgets(text: str) -> tuple[Budget, ...]:
@@ -149,11 +143,7 @@ class CutOptions:
     )
 
     def one_budget(self) -> Budget:
-        """Return the budget, or that of the preset, times --lod-splat-scale.
-
-        Raises:
-            click.UsageError: several are given, or it is out of range.
-        """
+        """Return the budget, or that of the preset, times --lod-splat-scale."""
         from ...lod.budget import LARGEST, Budget
 
         if self.budget is not None and len(self.budget) > 1:
@@ -176,7 +166,6 @@ class CutOptions:
         return scaled
 
     def settings(self) -> LodSettings:
-        """Return settings of the cuts, but for the budget."""
         return replace(self.lod, foveation=self._foveation())
 
     def _foveation(self) -> Foveation:
@@ -226,13 +215,18 @@ class PictureStreaming:
     streaming: StreamingSettings = field(default_factory=StreamingSettings)
 
     def check(self, ctx: click.Context) -> None:
-        """Raise a `click.UsageError` where an option has no effect."""
         if self.after is None:
             refuse(ctx, LOADING, "can only be used with --after")
 
     def loading(self) -> tuple[StreamingSettings, float] | None:
-        """Return how chunks get to a viewer, and the seconds that it has had for them; None where all are resident."""
+        """Return how chunks are fetched and for how many seconds; None where all are resident."""
         return None if self.after is None else (self.streaming, self.after)
+
+
+def files_read(options: RenderOptions | TraverseOptions, instances: list[Instance]) -> dict[str, list[Path]]:
+    """For `keep_apart`: by the name of an option, the files that it names without being one."""
+    splats = [instance.file for instance in instances if instance.file is not None]
+    return {"scene": splats, "world_transform": options.cameras.files()}
 
 
 def viewed_files(options: RenderOptions | TraverseOptions, instances: list[Instance], console: Console) -> ViewedFiles:

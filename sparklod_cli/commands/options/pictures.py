@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from ...lod.budget import Budget
     from ...tables.assertions import Assertion
 
-#: Options that styles, and backends, have no use for.
+#: Options without an effect on some styles and backends.
 UNSTYLED = {
     "points": ("profile", "sort"),
     "billboards": ("profile", "sort"),
@@ -38,7 +38,7 @@ UNKNOWN_TO = {"open3d": ("profile", "sort")}
 #: The budgets to compare, unless others are given.
 DEFAULT_BUDGETS = "2%,5%,10%,25%,50%"
 
-#: Options that --compare, and --thumbnail, have no use for.
+#: Options without an effect on --compare and --thumbnail.
 NOT_COMPARED = (
     *("full", "preset", "lod_splat_scale", "background", "alpha", "supersample", "style", "color_by", "no_bar"),
     *("through", "diff", "gain", "sheet", "jobs", "thumbnail", "jpeg_quality"),
@@ -86,7 +86,6 @@ class Appearance:
     )
 
     def check(self, ctx: click.Context) -> None:
-        """Raise a `click.UsageError` where options contradict each other, or have no effect."""
         render, raster = self.render, self.render.raster
         if not raster.near < raster.far:
             raise click.UsageError(f"--near {raster.near:g} must be less than --far {raster.far:g}")
@@ -111,15 +110,10 @@ class Appearance:
 
     @property
     def keeps_alpha(self) -> bool:
-        """Whether pictures of pixels keep alpha."""
         return self.alpha or self.background is None
 
     def background_for(self, ctx: click.Context, form: str) -> Color | None:
-        """Return the background of a file of some form; None keeps alpha, as floats do unless a background is given.
-
-        Raises:
-            click.UsageError: a file of this form has no alpha.
-        """
+        """Return the background of a file of some form; None keeps alpha, as floats do unless a background is given."""
         from ...images.output import WITH_ALPHA
 
         if self.keeps_alpha and form not in WITH_ALPHA:
@@ -127,10 +121,10 @@ class Appearance:
         return None if self.keeps_alpha or (form == "npy" and not is_set(ctx, "background")) else self.background
 
     def settings(self, say: Callable[[str], None]) -> RenderSettings:
-        """Return the settings of pictures, with the options of the backend and the device that there is, which it says.
+        """Return the settings of pictures with the options of the backend; `say` receives a line on the device.
 
         Raises:
-            BackendError: a card is asked for, and there is none that can be used.
+            BackendError: a card is requested, and none is usable.
         """
         options = {"sorting": self.sorting, "throttle": self.sort_throttle}
         known = {name: value for name, value in options.items() if value is not None}
@@ -138,7 +132,7 @@ class Appearance:
         return dataclasses.replace(self.render, device=device, options=known)
 
     def of_pictures(self) -> tuple[str, ...]:
-        """Return the options that cannot be used with a file of numbers, by what its numbers are."""
+        """Return the options that have no effect on a .npy file."""
         return ("no_bar", "background", "alpha") if self.render.color_by in OF_PIXELS else ("no_bar",)
 
 
@@ -172,7 +166,6 @@ class ComparisonOptions:
     )
 
     def check(self, ctx: click.Context, appearance: Appearance) -> None:
-        """Raise a `click.UsageError` where options contradict each other, or have no effect."""
         if self.compare:
             return
         if self.diff is None:
@@ -190,11 +183,7 @@ class ComparisonOptions:
         return parse_budgets(DEFAULT_BUDGETS) if budgets is None else budgets
 
     def assertions(self, budgets: Sequence[Budget]) -> list[tuple[int | None, Assertion]]:
-        """Return the assertions, each with the index of its budget, which stands before a colon; None for all budgets.
-
-        Raises:
-            click.UsageError: an assertion cannot be understood.
-        """
+        """Return the assertions, each with the index of the budget before its colon; None for all budgets."""
         from ...tables import assertions
         from ...tables.comparison import COLUMNS
 
@@ -243,9 +232,6 @@ class PictureFiles:
 
         Args:
             scene: the file beside which an output goes that has no name, and whose name it has.
-
-        Raises:
-            click.UsageError: the cameras do not fit into the output.
         """
         from ...images.output import output_for
 

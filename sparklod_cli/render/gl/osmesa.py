@@ -276,7 +276,6 @@ def on_gl_thread(work: Callable[..., _T], *arguments: Any) -> _T:
 
 @functools.cache
 def _thread() -> tuple[ThreadPoolExecutor, int]:
-    """Return the thread, and the id of its process."""
     return ThreadPoolExecutor(1, "sparklod-gl"), os.getpid()
 
 

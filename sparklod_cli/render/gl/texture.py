@@ -60,7 +60,6 @@ class DataTexture(ABC):
         return recolored, moved
 
     def _rows(self, kind: np.dtype[Any], count: int) -> NDArray[Any]:
-        """Return (count,) records of the texture."""
         return self.texture.reshape(-1, 4 * self.texels_a_splat).view(kind)[:count, 0]
 
     @abstractmethod

@@ -187,7 +187,6 @@ class Child:
         self.most_entries = MOST_ENTRIES_OF_OLD_MESA if mesa and int(mesa[1]) < NEW_MESA else MOST_ENTRIES
 
     def alive(self) -> bool:
-        """Return whether the process is running."""
         return self._process.poll() is None
 
     def ask(self, request: dict[str, Any], splats: Array) -> Array:

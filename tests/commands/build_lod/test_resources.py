@@ -122,7 +122,7 @@ def test_standard_input_is_baked_out_of_core(
     ("arguments", "words"),
     [
         (["--memory", "much"], "'much' is not a size"),
-        (["--memory", "0B"], "'0B' is no memory to work in"),
+        (["--memory", "0B"], "'0B' must be positive"),
         (["--memory", "4"], "'4' has no unit; write 4G or 4MB"),
         (["--memory", "600000000"], "'600000000' has no unit"),
         (["--unlod", "--memory", "1G"], "--memory cannot be used with --unlod"),
@@ -161,7 +161,7 @@ def test_scenes_that_are_there_are_skipped(tmp_path: Path, capsys: Capture) -> N
         "skipped": True,
     }
     assert second["sh_degree"] == 3
-    assert f"{scenes[0]}  ->  {tmp_path / 'web' / 'a-lod.spz'}  is there already" in err
+    assert f"{scenes[0]}  ->  {tmp_path / 'web' / 'a-lod.spz'}  exists already" in err
     assert not list(tmp_path.rglob(f"*{SUFFIX}"))
 
 

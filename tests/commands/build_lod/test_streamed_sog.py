@@ -220,7 +220,7 @@ def test_the_same_bake_is_skipped(town: Path, tmp_path: Path, capsys: Capture) -
     before = files(web)
     assert f"{MANIFEST}.sparklod.json" in before
     assert build(*given) == 0
-    assert "is there already" in capsys.readouterr().err
+    assert "exists already" in capsys.readouterr().err
     assert build(*given, "--levels", "30%") == 1
     assert "detail.levels was None and is [0.3]; add --overwrite" in capsys.readouterr().err
     image = next(web.glob("0_0/*.webp"))

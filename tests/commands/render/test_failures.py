@@ -52,7 +52,7 @@ from tests.conftest import Capture
         ([TREE, "--diff", TREE, "--color-by", "level"], "--color-by cannot be used with --diff"),
         ([TREE, "--diff", TREE, "--alpha"], "--diff compares pictures without alpha; name a --background"),
         ([TREE, "-o", "x.tif"], "--output x.tif does not end in .png, .jpg, .webp, .npy, .gif, .mp4 or .webm"),
-        ([TREE, "-o", "x"], "--output x has no suffix to tell the format; end it in .png"),
+        ([TREE, "-o", "x"], "--output x has no suffix, which chooses the format; end it in .png"),
         ([TREE, "--orbit", "3", "-o", "x.png"], "there are 3 cameras: write frames (x.%04d.png)"),
         ([TREE, "--orbit", "3", "-o", "-"], "standard output takes one picture, not 3"),
         ([TREE, "--orbit", "3", "-o", "%d.%d.png"], "does not name frames"),
