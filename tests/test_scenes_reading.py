@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import itertools
-from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -137,15 +138,15 @@ def test_precision_float16_is_what_float16_holds() -> None:
         assert np.array_equal(half[name], exact[name])
 
 
-def test_a_file_is_read_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_is_opened_once(monkeypatch: pytest.MonkeyPatch) -> None:
     read: list[Path] = []
-    original: Callable[..., object] = reading.read_scene
+    original = reading.opened
 
-    def counted(file: Path, **settings: object) -> object:
+    def counted(file: Path) -> contextlib.AbstractContextManager[Any]:
         read.append(file)
-        return original(file, **settings)
+        return original(file)
 
-    monkeypatch.setattr(reading, "read_scene", counted)
+    monkeypatch.setattr(reading, "opened", counted)
     assert len(read_scenes(five()).trees) == 3
     assert read == [TREE, TOWN, HAND]
 

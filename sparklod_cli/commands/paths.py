@@ -153,15 +153,14 @@ def keep_apart(ctx: click.Context, stands_for: Mapping[str, Iterable[Place]] | N
         else:
             inputs += [*(values if isinstance(kind, InputPath) else []), *(more or ())]
     files, places = set[tuple[int, int]](), dict[str, str]()
-    for path in _all_read(inputs):
+    written = [(path, status) for path in outputs if path != DASH and not _is_stream(status := _status(path))]
+    # An output that does not exist is no companion of an input, which would have to be opened to find that out.
+    for path in _all_read(inputs, companions=any(status is not None for _, status in written)):
         places[_place(path)] = INPUT
         status = _status(path)
         if status is not None:
             files.add((status.st_dev, status.st_ino))
-    for path in outputs:
-        status = _status(path)
-        if path == DASH or _is_stream(status):
-            continue
+    for path, status in written:
         place = _place(path)
         is_input = status is not None and (status.st_dev, status.st_ino) in files
         taken = INPUT if is_input else places.get(place)
@@ -216,17 +215,17 @@ def is_same_place(one: Place, other: Place) -> bool:
     return _place(one) == _place(other) or (all(statuses) and os.path.samestat(*statuses))  # type: ignore[arg-type]
 
 
-def _all_read(paths: Iterable[Place]) -> Iterator[Place]:
-    """Yield each path and its companion files."""
-    from ..cameras.formats.table import NAMES
-    from ..io import companions
-
+def _all_read(paths: Iterable[Place], *, companions: bool) -> Iterator[Place]:
+    """Yield each path, and its companion files if asked."""
     for path in dict.fromkeys(paths):
         if path == DASH:
             continue
         yield path
-        if isinstance(path, Path):
-            yield from companions(path, NAMES)
+        if companions and isinstance(path, Path):
+            from ..cameras.formats.table import NAMES
+            from ..io.local_files import companions as companions_of
+
+            yield from companions_of(path, NAMES)
 
 
 def _status(path: Place) -> os.stat_result | None:

@@ -52,9 +52,12 @@ class RadFile:
             FormatError: it cannot be read, or breaks a promise without which its chunks cannot be.
         """
         with _opened(path) as found:
-            if found is None:
-                return None
-            reader = RadReader.open(*found)
+            return None if found is None else cls.of(path, *found)
+
+    @classmethod
+    def of(cls, path: Path, file: BinaryIO, open_companion: Any) -> RadFile:
+        """As `open`, of a file that is open already, and need not stay so."""
+        reader = RadReader.open(file, open_companion)
         return cls(path, reader.header, reader)
 
     @property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 from collections.abc import Collection, Sequence
 from dataclasses import replace
@@ -10,11 +11,14 @@ from pathlib import Path
 import numpy as np
 
 from ..codecs.formats import PRECISIONS
+from ..codecs.reader import Source
 from ..codecs.rounding import after
-from ..io import read_parts, read_scene, size_of_input
+from ..io import opened, size_of_input
 from ..io.details import read_level_files
+from ..io.rad_file import FORMAT as RAD
 from ..io.rad_file import RadFile
-from ..model.instances import Instance, Source
+from ..model.instances import Instance
+from ..model.instances import Source as InstanceSource
 from ..model.lod_tree import CHUNK_NODES, LodTree
 from ..model.scene import DetailScene, Scene
 from ..model.selection import Selection, describe
@@ -75,17 +79,19 @@ def read_scenes(
         if _key(source) in loaded:
             continue
         file = source if isinstance(source, Path) else None
-        pages = _pages(source, precision, threads) if paged and through is None else None
-        if pages is not None:
-            assert file is not None
-            empty = replace(pages.file.scene, tree=LodTree(np.zeros(0, np.uint16), np.zeros(0, np.uint32)))
-            entry: LoadedScene = PagedScene(file, size_of_input(file) or 0, empty, empty.splats, chunks, pages=pages)
-        elif (runs := _runs(source, threads, progress)) is not None:
-            entry = _loaded_runs(file, runs, through, chunks, threads)
-            notes += (f"{entry.name}: {note}" for note in runs.notes)
+        found: Pages | Scene | DetailScene | TileScene
+        if isinstance(source, Path):
+            to_read = columns if trees_only else COLUMNS
+            found = _read(source, to_read, precision if paged and through is None else None, threads, progress)
         else:
-            name = file or UNNAMED
-            scene = _read(source, columns if trees_only else COLUMNS, threads, progress)
+            found = source
+        if isinstance(found, Pages):
+            assert file is not None
+            empty = replace(found.file.scene, tree=LodTree(np.zeros(0, np.uint16), np.zeros(0, np.uint32)))
+            entry: LoadedScene = PagedScene(file, size_of_input(file) or 0, empty, empty.splats, chunks, pages=found)
+        elif isinstance(found, Scene):
+            name, scene = file or UNNAMED, found
+            _check_tree(name, scene)
             if scene.tree is None and trees_only:
                 raise FormatError(
                     f"{name}: it is not a Level-of-Detail tree, Streamed SOG or 3D Tiles; bake it first with sparklod"
@@ -96,27 +102,17 @@ def read_scenes(
                 scene = _drawable(str(name), scene, notes)
             size = bytes_of(scene.splats) if file is None else size_of_input(file) or 0
             entry = LoadedScene(file, size, scene, after(through, Path(name), scene, threads), chunks)
+        else:
+            entry = _loaded_runs(file, found, through, chunks, threads)
+            notes += (f"{entry.name}: {note}" for note in found.notes)
         loaded[_key(source)] = entry
         chunks += entry.chunks
     of_instance = [loaded[_key(instance.source)] for instance in instances]
     return Scenes(instances, list(loaded.values()), of_instance, notes, precision, threads)
 
 
-def _key(source: Source) -> Path | int:
+def _key(source: InstanceSource) -> Path | int:
     return source if isinstance(source, Path) else id(source)
-
-
-def _runs(source: Source, threads: int, progress: Progress) -> DetailScene | TileScene | None:
-    """Return a scene at several detail levels, or of tiles; None for others."""
-    if isinstance(source, Scene):
-        return None
-    if not isinstance(source, Path):
-        return source
-    try:
-        with memory_errors_translated():
-            return None if source == DASH else read_parts(source, threads=threads, progress=progress)
-    except SparklodError as error:
-        raise type(error)(f"{source}: {error}") from None
 
 
 def _loaded_runs(
@@ -133,35 +129,39 @@ def _loaded_runs(
     return LoadedDetail(file, int(files.sizes.sum()) + files.manifest, scene, drawn, chunks, detail=found, files=files)
 
 
-def _pages(source: Source, precision: str, threads: int) -> Pages | None:
-    """Return the pages of a file too large to be read whole; None for others, and where reading will fail."""
-    if not isinstance(source, Path) or source == DASH:
-        return None
+def _read(
+    path: Path, columns: Collection[str], paged: str | None, threads: int, progress: Progress
+) -> Pages | Scene | DetailScene | TileScene:
+    """Read a file: a scene, or one at several detail levels, or of tiles.
+
+    Args:
+        paged: precision of the pages that a file too large to be read whole becomes; None to read it nevertheless.
+    """
     try:
-        file = RadFile.open(source)
-    except FormatError:
-        return None
-    if file is None or file.fits or not file.header.lod_tree or file.header.chunk_size != CHUNK_NODES:
-        return None
-    return Pages(file, str(source), functools.partial(nodes_of, precision=precision, threads=1), threads)
+        with memory_errors_translated(), opened(path) as (file, form, more):
+            if paged is not None and form.name == RAD and path != DASH:
+                with contextlib.suppress(FormatError):  # which is raised below
+                    rad = RadFile.of(path, file, more["open_companion"])
+                    if not rad.fits and rad.header.lod_tree and rad.header.chunk_size == CHUNK_NODES:
+                        nodes = functools.partial(nodes_of, precision=paged, threads=1)
+                        return Pages(rad, str(path), nodes, threads)
+            if form.parts is not None and path != DASH:
+                parts: DetailScene | TileScene = form.codec().decode_parts(
+                    file, threads=threads, progress=progress, **more
+                )
+                return parts
+            reader = replace(form.codec().open_content(Source(file, threads=threads, **more)), threads=threads)
+            scene: Scene = reader.scene(columns=columns, progress=progress, validate=False)
+            return scene
+    except SparklodError as error:
+        raise type(error)(f"{path}: {error}") from None
 
 
-def _read(source: Source, columns: Collection[str], threads: int, progress: Progress) -> Scene:
-    """Return the scene of a source; its tree, if it has one, is sound."""
-    assert isinstance(source, (Path, Scene))
-    name = UNNAMED if isinstance(source, Scene) else source
+def _check_tree(name: Path | str, scene: Scene) -> None:
     try:
-        if isinstance(source, Scene):
-            scene = source
-        else:
-            with memory_errors_translated():
-                scene = read_scene(source, columns=columns, threads=threads, progress=progress, validate=False)
         scene.check_tree()
     except TreeError as error:
         raise TreeError(f"{name}: its tree is broken: {error}") from None
-    except SparklodError as error:
-        raise type(error)(f"{name}: {error}") from None
-    return scene
 
 
 def _drawable(name: str, scene: Scene, notes: list[str]) -> Scene:
