@@ -13,7 +13,7 @@ from .codecs.losses import Losses, settled_with_losses
 from .codecs.options import WriteOptions
 from .codecs.spz import like
 from .codecs.validation import check_scene
-from .io import read_scene, scene_sink
+from .io import read_scene, scene_output, write_scene
 from .model.scene import Scene
 from .system.addresses import Place
 from .system.errors import FormatError, memory_errors_translated
@@ -71,13 +71,13 @@ def extract_leaves(
         suffix: of the format, one of `WRITABLE`.
 
     Raises:
-        FormatError, OutputError: see `io.read_scene` and `io.scene_sink`; the file has no tree.
+        FormatError, OutputError: see `io.read_scene` and `io.scene_output`; the file has no tree.
         InvalidSplatsError: a leaf is invalid.
         OutOfMemoryError: it does not fit into memory.
     """
     with memory_errors_translated():
         form = WRITABLE[suffix]
-        write = scene_sink(target, form, chunked=options.rad.chunked, overwrite=overwrite)
+        out = scene_output(target, form, chunked=options.rad.chunked, overwrite=overwrite)
         start = time.perf_counter()
         scene = read_scene(source, threads=threads, progress=progress)
         leaves = leaves_of(scene)
@@ -86,7 +86,7 @@ def extract_leaves(
         # As they are: their opacities make up for nothing.
         chosen = dataclasses.replace(like(scene.header, options), covering=False)
         chosen, losses = settled_with_losses(leaves, form, chosen, threads)
-        size = write(leaves, chosen, threads=threads, progress=progress)
+        size = write_scene(out, form, leaves, chosen, threads=threads, progress=progress)
         seconds = {"read": read_done - start, "write": time.perf_counter() - read_done}
     return Extracted(
         format=scene.format,

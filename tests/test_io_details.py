@@ -13,14 +13,15 @@ import numpy as np
 import pytest
 
 from sparklod_cli.bake.identity import files_of
-from sparklod_cli.io import companions, read_parts, read_scene
-from sparklod_cli.io.details import detail_files, detail_sink
+from sparklod_cli.io import companions, parts_output, read_parts, read_scene
 from sparklod_cli.io.local_files import leads_away
+from sparklod_cli.io.writing import PARTS
 from sparklod_cli.system import atomic
 from sparklod_cli.system.addresses import Address
 from sparklod_cli.system.errors import OutputError
 from tests.conftest import FIXTURES
-from tests.system.test_atomic_set import held
+from tests.outputs import write_files
+from tests.system.test_output_sets import held
 
 posix = pytest.mark.skipif(os.name != "posix", reason="POSIX only")
 GOLDEN = FIXTURES / "golden" / "sh1-streamed-sog"
@@ -50,7 +51,7 @@ def put(folder: Path, files: dict[str, bytes]) -> None:
 
 
 def write(target: Path, files: dict[str, bytes], *, overwrite: bool = False) -> int:
-    return detail_sink(target, overwrite=overwrite)(pieces(files))
+    return write_files(parts_output(target, overwrite=overwrite), pieces(files))
 
 
 @pytest.mark.parametrize("name", ["lod-meta.json", "web.json"])
@@ -60,7 +61,7 @@ def test_the_folders_of_chunks_stand_beside_the_manifest(name: str, tmp_path: Pa
     assert write(target, files) == sum(map(len, files.values()))
     manifest = files.pop("lod-meta.json")
     assert held(target.parent) == files | {name: manifest}
-    assert sorted(path.relative_to(target.parent).as_posix() for path in detail_files(target)) == sorted(files)
+    assert sorted(PARTS["lod-meta.json"].existing(target)) == sorted(files)
 
 
 def test_a_former_output_is_replaced_and_its_further_chunks_are_removed(tmp_path: Path) -> None:
@@ -99,7 +100,7 @@ def test_what_is_not_of_a_former_output_is_in_the_way(name: str, overwrite: bool
 def test_the_first_chunk_is_looked_at_before_any_work(tmp_path: Path) -> None:
     put(tmp_path, {"0_0/x": b"precious", "env/x": b"precious"})
     with pytest.raises(OutputError, match="0_0 exists"):
-        detail_sink(tmp_path / "lod-meta.json", overwrite=True)
+        parts_output(tmp_path / "lod-meta.json", overwrite=True)
     (tmp_path / "0_0" / "x").unlink()
     write(tmp_path / "lod-meta.json", output("0_0"))  # an empty folder, and an env that the output has not
     assert (tmp_path / "env" / "x").read_bytes() == b"precious"
@@ -110,7 +111,7 @@ def test_an_existing_manifest_is_refused_before_any_work(tmp_path: Path) -> None
     write(target, output("0_0"))
     before = held(tmp_path)
     with pytest.raises(OutputError, match="exists, add --overwrite to replace it"):
-        detail_sink(target, overwrite=False)
+        parts_output(target, overwrite=False)
     assert held(tmp_path) == before
 
 
@@ -170,7 +171,7 @@ def test_an_error_on_the_way_leaves_what_was_there(error: BaseException, existin
         raise error
 
     with pytest.raises(KeyboardInterrupt if isinstance(error, KeyboardInterrupt) else OutputError):
-        detail_sink(target, overwrite=existing)(broken())
+        write_files(parts_output(target, overwrite=existing), broken())
     assert held(tmp_path) == before
 
 
@@ -180,17 +181,17 @@ def test_a_folder_that_appears_meanwhile_is_named_by_the_error(tmp_path: Path) -
         put(tmp_path, {"0_1/meta.json": b"another's"})
 
     with pytest.raises(OutputError, match=r"meta\.json exists, add --overwrite"):
-        detail_sink(tmp_path / "lod-meta.json", overwrite=False)(some())
+        write_files(parts_output(tmp_path / "lod-meta.json", overwrite=False), some())
     assert held(tmp_path) == {"0_1/meta.json": b"another's"}
 
 
 def test_places_for_no_or_one_file_are_refused(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="is a directory"):
-        detail_sink(tmp_path, overwrite=True)
+        parts_output(tmp_path, overwrite=True)
     with pytest.raises(OutputError, match="standard output cannot take several files"):
-        detail_sink(Path("-"), overwrite=True)
+        parts_output(Path("-"), overwrite=True)
     with pytest.raises(OutputError, match="is a pipe or a device"):
-        detail_sink(Path(os.devnull), overwrite=True)
+        parts_output(Path(os.devnull), overwrite=True)
 
 
 # --- Addresses --------------------------------------------------------------------------------------------------------
@@ -210,23 +211,23 @@ def held_at(address: Address) -> dict[str, bytes]:
 @pytest.mark.slow
 def test_an_output_at_an_address_replaces_a_former_one(address: Address) -> None:
     old = output("0_0", "0_1", "env")
-    assert detail_sink(address, overwrite=False)(pieces(old)) == sum(map(len, old.values()))
+    assert write_files(parts_output(address, overwrite=False), pieces(old)) == sum(map(len, old.values()))
     assert held_at(address) == old
     with pytest.raises(OutputError, match="exists, add --overwrite"):
-        detail_sink(address, overwrite=False)
+        parts_output(address, overwrite=False)
     (address.parent / "0_1/notes").write([b"precious"])
     new = output("0_0", "1_0", mark="new")
-    detail_sink(address, overwrite=True)(pieces(new))
+    write_files(parts_output(address, overwrite=True), pieces(new))
     assert held_at(address) == new | {"0_1/notes": b"precious"}
 
 
 @pytest.mark.slow
 def test_what_is_in_the_way_at_an_address_is_told_before_anything_is_removed(address: Address) -> None:
-    detail_sink(address, overwrite=False)(pieces(output("0_0")))
+    write_files(parts_output(address, overwrite=False), pieces(output("0_0")))
     (address.parent / "2_0/meta.json").write([b"precious"])
     before = held_at(address)
     with pytest.raises(OutputError, match=r"2_0 exists, and lod-meta\.json there does not name it"):
-        detail_sink(address, overwrite=True)
+        parts_output(address, overwrite=True)
     assert held_at(address) == before
 
 
@@ -237,14 +238,17 @@ def test_what_was_sent_is_removed_where_the_rest_cannot_be_made(address: Address
         raise OSError(errno.EIO, "broken")
 
     with pytest.raises(OutputError, match=r"cannot write memory://.*: broken"):
-        detail_sink(address, overwrite=False)(broken())
+        write_files(parts_output(address, overwrite=False), broken())
     assert held_at(address) == {}
 
 
 @pytest.mark.slow
 def test_an_output_at_an_address_is_read_from_there(address: Address) -> None:
     files = {name: (GOLDEN / name).read_bytes() for name in GOLDEN_NAMES if name != "lod-meta.json"}
-    detail_sink(address, overwrite=False)(pieces(files | {"lod-meta.json": (GOLDEN / "lod-meta.json").read_bytes()}))
+    write_files(
+        parts_output(address, overwrite=False),
+        pieces(files | {"lod-meta.json": (GOLDEN / "lod-meta.json").read_bytes()}),
+    )
     for place in (address, address.parent):
         np.testing.assert_array_equal(read_scene(place).splats.center, read_scene(GOLDEN).splats.center)
     assert read_parts(address.parent).counts.tolist() == read_parts(GOLDEN).counts.tolist()

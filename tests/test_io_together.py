@@ -12,9 +12,11 @@ import pytest
 from sparklod_cli.codecs import file_names
 from sparklod_cli.codecs.rad import rad_header
 from sparklod_cli.codecs.rad.rad_header import RadChunkEntry, RadHeader
-from sparklod_cli.io import chunk_files, companions, sink_together, write_together
+from sparklod_cli.io import companions, siblings_of
 from sparklod_cli.system.errors import OutputError
+from sparklod_cli.system.output import Output
 from tests.conftest import IS_ROOT
+from tests.outputs import write_files
 
 posix = pytest.mark.skipif(os.name != "posix", reason="POSIX only")
 
@@ -26,6 +28,14 @@ def files(count: int, stem: str = "x") -> Iterator[tuple[str, Iterable[bytes]]]:
     yield f"{stem}.rad", [b"header"]
 
 
+def output(path: Path, *, overwrite: bool) -> Output:
+    return Output(path, overwrite=overwrite, siblings=siblings_of(path))
+
+
+def write_set(path: Path, content: Iterable[tuple[str, Iterable[bytes]]], *, overwrite: bool) -> int:
+    return write_files(output(path, overwrite=overwrite), content)
+
+
 def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
@@ -33,11 +43,11 @@ def names(folder: Path) -> list[str]:
 @pytest.mark.parametrize("name", ["x.rad", "x.RAD", "x"])
 def test_chunks_stand_beside_the_header(name: str, tmp_path: Path) -> None:
     target = tmp_path / "new" / name
-    assert write_together(target, files(12), overwrite=False) == 10 * 7 + 2 * 8 + 6
+    assert write_set(target, files(12), overwrite=False) == 10 * 7 + 2 * 8 + 6
     assert target.read_bytes() == b"header"
     chunks = [f"x-{number}.radc" for number in range(12)]
     assert names(target.parent) == sorted([name, *chunks])
-    assert [path.name for path in chunk_files(target)] == chunks
+    assert siblings_of(target).existing(target) == chunks
     assert (target.parent / "x-11.radc").read_bytes() == b"chunk 11"
 
 
@@ -53,11 +63,11 @@ def test_names_that_are_not_of_chunks_are_told_apart() -> None:
 
 def test_chunks_of_a_longer_output_are_removed_and_nothing_else(tmp_path: Path) -> None:
     target = tmp_path / "x.rad"
-    write_together(target, files(12), overwrite=False)
+    write_set(target, files(12), overwrite=False)
     others = ["x-01.radc", "x-7-lod.rad", "x-lod-11.radc", "y-11.radc", "x-11.radc.bak", "x-11.spz"]
     for name in others:
         (tmp_path / name).write_bytes(b"precious")
-    write_together(target, files(2), overwrite=True)
+    write_set(target, files(2), overwrite=True)
     assert names(tmp_path) == sorted([*others, "x.rad", "x-0.radc", "x-1.radc"])
 
 
@@ -65,9 +75,9 @@ def test_chunks_of_a_longer_output_are_removed_and_nothing_else(tmp_path: Path) 
 def test_an_existing_file_is_refused_before_any_work(taken: str, tmp_path: Path) -> None:
     (tmp_path / taken).write_bytes(b"precious")
     with pytest.raises(OutputError, match=rf"{taken} exists, add --overwrite to replace it"):
-        sink_together(tmp_path / "x.rad", overwrite=False)
+        output(tmp_path / "x.rad", overwrite=False)
     with pytest.raises(OutputError, match="exists"):
-        write_together(tmp_path / "x.rad", files(2), overwrite=False)
+        write_set(tmp_path / "x.rad", files(2), overwrite=False)
     assert names(tmp_path) == [taken]
     assert (tmp_path / taken).read_bytes() == b"precious"
 
@@ -78,22 +88,22 @@ def test_a_chunk_that_appears_meanwhile_is_named_by_the_error(tmp_path: Path) ->
         (tmp_path / "x-1.radc").write_bytes(b"another's")
 
     with pytest.raises(OutputError, match=r"x-1\.radc exists, add --overwrite"):
-        write_together(tmp_path / "x.rad", some(), overwrite=False)
+        write_set(tmp_path / "x.rad", some(), overwrite=False)
     assert names(tmp_path) == ["x-1.radc"]
 
 
 def test_folders_and_pipes_are_refused(tmp_path: Path) -> None:
     (tmp_path / "x-1.radc").mkdir()
     with pytest.raises(OutputError, match=r"x-1\.radc is not a file; move it away"):
-        sink_together(tmp_path / "x.rad", overwrite=True)
+        output(tmp_path / "x.rad", overwrite=True)
     with pytest.raises(OutputError, match="is a directory"):
-        sink_together(tmp_path, overwrite=True)
+        output(tmp_path, overwrite=True)
     with pytest.raises(OutputError, match="standard output cannot take several files"):
-        sink_together(Path("-"), overwrite=True)
+        output(Path("-"), overwrite=True)
     with pytest.raises(OutputError, match="is a pipe or a device"):
-        sink_together(Path(os.devnull), overwrite=True)
+        output(Path(os.devnull), overwrite=True)
     with pytest.raises(OutputError, match="file name too long"):
-        write_together(tmp_path / ("n" * 249 + ".rad"), files(1, "n" * 249), overwrite=True)
+        write_set(tmp_path / ("n" * 249 + ".rad"), files(1, "n" * 249), overwrite=True)
     assert names(tmp_path) == ["x-1.radc"]
 
 
@@ -102,20 +112,21 @@ def test_where_a_link_leads_all_files_are_together(tmp_path: Path) -> None:
     (tmp_path / "store").mkdir()
     link = tmp_path / "link.rad"
     link.symlink_to(tmp_path / "store" / "x.rad")
-    write_together(link, files(2), overwrite=False)
+    write_set(link, files(2), overwrite=False)
     assert names(tmp_path / "store") == ["x-0.radc", "x-1.radc", "x.rad"]
     assert link.is_symlink()
-    assert len(chunk_files(link)) == 2
+    assert len(siblings_of(link).existing(link.resolve())) == 2
 
 
 def test_images_of_a_sog_are_those_of_its_names(tmp_path: Path) -> None:
     for name in ("shN_labels.webp", "means_l.webp", "other.webp", "meta-0.radc", "meta.json"):
         (tmp_path / name).write_bytes(b"x")
-    assert [path.name for path in chunk_files(tmp_path / "meta.json")] == ["means_l.webp", "shN_labels.webp"]
+    target = tmp_path / "meta.json"
+    assert siblings_of(target).existing(target) == ["means_l.webp", "shN_labels.webp"]
     some = [("quats.webp", [b"image"]), ("meta.json", [b"{", b"}"])]
     with pytest.raises(OutputError, match=r"meta\.json exists"):
-        write_together(tmp_path / "meta.json", some, overwrite=False)
-    assert write_together(tmp_path / "meta.json", some, overwrite=True) == 7
+        write_set(tmp_path / "meta.json", some, overwrite=False)
+    assert write_set(tmp_path / "meta.json", some, overwrite=True) == 7
     assert names(tmp_path) == ["meta-0.radc", "meta.json", "other.webp", "quats.webp"]
 
 
@@ -126,7 +137,7 @@ def test_a_full_disk_is_an_error_that_names_the_header(tmp_path: Path) -> None:
 
     some = [("x-0.radc", [b"chunk"]), ("x-1.radc", full()), ("x.rad", [b"header"])]
     with pytest.raises(OutputError, match=r"cannot write .*x\.rad: no space left on device"):
-        write_together(tmp_path / "x.rad", some, overwrite=False)
+        write_set(tmp_path / "x.rad", some, overwrite=False)
     assert names(tmp_path) == []
 
 
@@ -135,7 +146,7 @@ def test_a_folder_that_may_not_be_written_to(tmp_path: Path) -> None:
     closed = tmp_path / "closed"
     closed.mkdir(0o500)
     with pytest.raises(OutputError, match=r"cannot write .*x\.rad: permission denied"):
-        write_together(closed / "x.rad", files(1), overwrite=False)
+        write_set(closed / "x.rad", files(1), overwrite=False)
     assert names(closed) == []
     closed.chmod(0o700)
 

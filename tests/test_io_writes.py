@@ -12,12 +12,15 @@ from typing import Any
 
 import pytest
 
-from sparklod_cli.io import check_writable, sink_together, write_stdout, write_whole
-from sparklod_cli.io.details import detail_sink
+from sparklod_cli.io import parts_output
 from sparklod_cli.system import atomic
 from sparklod_cli.system.errors import FormatError, OutputError
+from sparklod_cli.system.output import check_writable, write_file
+from sparklod_cli.system.stdio import write_stdout
 from tests.conftest import FIXTURES, IS_ROOT
+from tests.outputs import write_files
 from tests.system.test_atomic import has_unnamed_files
+from tests.test_io_together import output
 
 posix = pytest.mark.skipif(os.name != "posix", reason="POSIX only")
 
@@ -28,7 +31,7 @@ def names(directory: Path) -> list[str]:
 
 def test_pieces_become_a_file(tmp_path: Path) -> None:
     target = tmp_path / "out.spz"
-    assert write_whole(target, [b"ab", b"", b"cde"], overwrite=False) == 5
+    assert write_file(target, [b"ab", b"", b"cde"], overwrite=False) == 5
     assert target.read_bytes() == b"abcde"
     assert names(tmp_path) == ["out.spz"]
 
@@ -37,9 +40,9 @@ def test_an_existing_file_is_replaced_only_when_asked_for(tmp_path: Path) -> Non
     target = tmp_path / "out.spz"
     target.write_bytes(b"old")
     with pytest.raises(OutputError, match=r"out\.spz exists, add --overwrite to replace it"):
-        write_whole(target, [b"new"], overwrite=False)
+        write_file(target, [b"new"], overwrite=False)
     assert target.read_bytes() == b"old"
-    assert write_whole(target, [b"new"], overwrite=True) == 3
+    assert write_file(target, [b"new"], overwrite=True) == 3
     assert target.read_bytes() == b"new"
     assert names(tmp_path) == ["out.spz"]
 
@@ -49,20 +52,20 @@ def failing(error: BaseException) -> Iterator[bytes]:
     raise error
 
 
-@pytest.mark.parametrize("write", [write_whole, sink_together, detail_sink])
+@pytest.mark.parametrize("write", [write_file, output, parts_output])
 def test_folders_of_an_output_that_fails_are_removed(write: Callable[..., Any], tmp_path: Path) -> None:
     (tmp_path / "a").mkdir()
     target = tmp_path / "a" / "b" / "c" / "lod-meta.json"
 
     def broken() -> Iterator[Any]:
-        yield b"half a" if write is write_whole else (target.name, [b"half a"])
+        yield b"half a" if write is write_file else (target.name, [b"half a"])
         raise FormatError("too large for the format")
 
     with pytest.raises(FormatError, match="too large"):
-        if write is write_whole:
+        if write is write_file:
             write(target, broken(), overwrite=True)
         else:
-            write(target, overwrite=True)(broken())
+            write_files(write(target, overwrite=True), broken())
     assert names(tmp_path) == ["a"] and names(tmp_path / "a") == []
 
 
@@ -74,7 +77,7 @@ def test_a_folder_that_vanishes_while_a_file_is_written_is_made_again(tmp_path: 
         if has_unnamed_files(tmp_path):
             target.parent.rmdir()  # as another run does that made it, and failed
 
-    write_whole(target, pieces(), overwrite=False)
+    write_file(target, pieces(), overwrite=False)
     assert target.read_bytes() == b"x"
 
 
@@ -87,7 +90,7 @@ def test_an_interruption_leaves_nothing_and_spoils_nothing(
     if existing:
         target.write_bytes(b"old")
     with pytest.raises(type(error)):
-        write_whole(target, failing(error), overwrite=True)
+        write_file(target, failing(error), overwrite=True)
     assert names(tmp_path) == (["out.spz"] if existing else [])
     if existing:
         assert target.read_bytes() == b"old"
@@ -109,7 +112,7 @@ def test_no_file_has_the_final_name_before_it_is_whole(
             seen.append(names(tmp_path))
             yield b"x"
 
-    write_whole(target, pieces(), overwrite=False)
+    write_file(target, pieces(), overwrite=False)
     assert [len(files) for files in seen] == [int(named)] * 2
     assert all("out.spz" not in files for files in seen)
     if named:  # hidden, and beside the target: a rename does not cross file systems
@@ -121,9 +124,9 @@ def test_two_at_once_do_not_share_a_temporary_file(tmp_path: Path) -> None:
 
     def pieces() -> Iterator[bytes]:
         yield b"outer"
-        write_whole(target, [b"inner"], overwrite=True)
+        write_file(target, [b"inner"], overwrite=True)
 
-    write_whole(target, pieces(), overwrite=True)
+    write_file(target, pieces(), overwrite=True)
     assert target.read_bytes() == b"outer"
     assert names(tmp_path) == ["out.spz"]
 
@@ -133,7 +136,7 @@ def test_two_at_once_do_not_share_a_temporary_file(tmp_path: Path) -> None:
 def test_permissions_are_what_the_umask_says(mask: int, tmp_path: Path) -> None:
     before = os.umask(mask)
     try:
-        write_whole(tmp_path / "out.spz", [b"x"], overwrite=False)
+        write_file(tmp_path / "out.spz", [b"x"], overwrite=False)
     finally:
         os.umask(before)
     assert stat.S_IMODE((tmp_path / "out.spz").stat().st_mode) == 0o666 & ~mask
@@ -147,7 +150,7 @@ def test_a_symbolic_link_is_followed(there: bool, tmp_path: Path) -> None:
     if there:
         real.write_bytes(b"old")
     link.symlink_to(real)
-    write_whole(link, [b"new"], overwrite=there)
+    write_file(link, [b"new"], overwrite=there)
     assert link.is_symlink()
     assert real.read_bytes() == b"new"
     assert (names(tmp_path), names(tmp_path / "store")) == (["link.spz", "store"], ["real.spz"])
@@ -156,7 +159,7 @@ def test_a_symbolic_link_is_followed(there: bool, tmp_path: Path) -> None:
 @posix
 def test_a_device_is_written_to_and_not_replaced() -> None:
     null = Path(os.devnull)
-    assert write_whole(null, [b"gone"], overwrite=False) == 4
+    assert write_file(null, [b"gone"], overwrite=False) == 4
     assert stat.S_ISCHR(null.stat().st_mode)
 
 
@@ -166,7 +169,7 @@ def test_a_pipe_is_written_to_and_not_replaced(tmp_path: Path) -> None:
     os.mkfifo(pipe)
     reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
     try:
-        assert write_whole(pipe, [b"through"], overwrite=False) == 7
+        assert write_file(pipe, [b"through"], overwrite=False) == 7
         assert os.read(reader, 100) == b"through"
     finally:
         os.close(reader)
@@ -179,7 +182,7 @@ def test_a_pipe_by_its_number_is_written_to() -> None:
     """What a shell makes of `-o >(upload)`, and /dev/stdout in a pipeline: a link to nothing that has a path."""
     reader, writer = os.pipe()
     try:
-        assert write_whole(Path(f"/dev/fd/{writer}"), [b"through"], overwrite=False) == 7
+        assert write_file(Path(f"/dev/fd/{writer}"), [b"through"], overwrite=False) == 7
         assert os.read(reader, 100) == b"through"
     finally:
         os.close(reader)
@@ -190,7 +193,7 @@ def test_a_pipe_by_its_number_is_written_to() -> None:
 @pytest.mark.parametrize("size", [1, 1_000_000])
 def test_a_full_disk_is_an_error(size: int) -> None:
     with pytest.raises(OutputError, match="cannot write /dev/full: no space left on device"):
-        write_whole(Path("/dev/full"), [bytes(size)], overwrite=False)
+        write_file(Path("/dev/full"), [bytes(size)], overwrite=False)
     assert stat.S_ISCHR(Path("/dev/full").stat().st_mode)
 
 
@@ -200,11 +203,11 @@ def test_a_file_that_may_not_grow_leaves_nothing(tmp_path: Path) -> None:
     code = (
         "import resource, signal, sys, pathlib\n"
         "from sparklod_cli.system.errors import OutputError\n"
-        "from sparklod_cli.io import write_whole\n"
+        "from sparklod_cli.system.output import write_file\n"
         "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))\n"
         "try:\n"
-        "    write_whole(pathlib.Path(sys.argv[1]), [bytes(400)] * 1000, overwrite=False)\n"
+        "    write_file(pathlib.Path(sys.argv[1]), [bytes(400)] * 1000, overwrite=False)\n"
         "except OutputError as error:\n"
         "    print(error)\n"
     )
@@ -226,7 +229,7 @@ def test_a_path_that_cannot_be_a_file_is_an_error(tmp_path: Path) -> None:
     for name, reason in refused.items():
         for check in (
             lambda path: check_writable(path, overwrite=True),
-            lambda path: write_whole(path, [b"x"], overwrite=True),
+            lambda path: write_file(path, [b"x"], overwrite=True),
         ):
             with pytest.raises(OutputError, match=reason):
                 check(tmp_path / name)
@@ -237,7 +240,7 @@ def test_a_path_that_cannot_be_a_file_is_an_error(tmp_path: Path) -> None:
 def test_every_name_that_the_file_system_takes_is_taken(length: int, tmp_path: Path) -> None:
     """The temporary file's name is made of it, and must not be too long because of that."""
     target = tmp_path / ("n" * (length - 4) + ".spz")
-    write_whole(target, [b"x"], overwrite=False)
+    write_file(target, [b"x"], overwrite=False)
     assert names(tmp_path) == [target.name]
 
 
@@ -246,7 +249,7 @@ def test_a_directory_that_may_not_be_written_to(tmp_path: Path) -> None:
     closed = tmp_path / "closed"
     closed.mkdir(0o500)
     with pytest.raises(OutputError, match=r"cannot write .*: permission denied"):
-        write_whole(closed / "out.spz", [b"x"], overwrite=False)
+        write_file(closed / "out.spz", [b"x"], overwrite=False)
     closed.chmod(0)
     with pytest.raises(OutputError, match="permission denied"):
         check_writable(closed / "out.spz", overwrite=False)
@@ -257,11 +260,11 @@ def test_folders_are_made_when_there_is_something_to_write(tmp_path: Path) -> No
     target = tmp_path / "a" / "b" / "out.spz"
     check_writable(target, overwrite=False)
     assert names(tmp_path) == []
-    write_whole(target, [b"x"], overwrite=False)
+    write_file(target, [b"x"], overwrite=False)
     assert target.read_bytes() == b"x"
     link = tmp_path / "link.spz"
     link.symlink_to(tmp_path / "c" / "out.spz")
-    write_whole(link, [b"y"], overwrite=False)
+    write_file(link, [b"y"], overwrite=False)
     assert (tmp_path / "c" / "out.spz").read_bytes() == b"y"
 
 
@@ -292,7 +295,7 @@ def test_a_name_that_is_taken_meanwhile_is_not_replaced(tmp_path: Path) -> None:
         yield b"ours"
 
     with pytest.raises(OutputError, match="exists, add --overwrite"):
-        write_whole(target, pieces(), overwrite=False)
+        write_file(target, pieces(), overwrite=False)
     assert target.read_bytes() == b"another's"
     assert names(tmp_path) == ["out.spz"]
 
@@ -302,6 +305,6 @@ def test_a_replaced_file_keeps_its_permissions(tmp_path: Path) -> None:
     target.write_bytes(b"old")
     target.chmod(0o600)
     before = target.stat().st_ino
-    write_whole(target, [b"new"], overwrite=True)
+    write_file(target, [b"new"], overwrite=True)
     assert target.stat().st_mode & 0o777 == 0o600
     assert target.stat().st_ino != before  # renamed to, not written into

@@ -12,9 +12,10 @@ from ..inspection import expectations, leaves
 from ..inspection.expectations import Expectations
 from ..inspection.findings import Finding
 from ..inspection.report import Report, ReportSettings, inspect
-from ..io import check_writable, read_scene, write_whole
+from ..io import read_scene
 from ..model.scene import Scene
 from ..system.errors import FormatError, SparklodError, memory_errors_translated
+from ..system.output import check_writable, write_file
 from ..system.progress import Progress
 from ..system.threads import on_threads
 from ..tables.output import TableOutput
@@ -121,7 +122,7 @@ def inspect_file(path: Path, settings: InspectSettings) -> Inspected:
         picture, problem = _picture(report, scene, settings)
         size = None
         if picture is not None and settings.plot is not None:
-            size = picture.description, write_whole(settings.plot, [picture.png], overwrite=settings.overwrite)
+            size = picture.description, write_file(settings.plot, [picture.png], overwrite=settings.overwrite)
         section = None
         if settings.html is not None:
             from ..inspection.html import section_of
@@ -201,4 +202,4 @@ def write_page(path: Path, sections: Sequence[FileSection], *, overwrite: bool) 
     """Write the page of some files, and return its bytes."""
     from ..inspection.html import page
 
-    return write_whole(path, [page(sections).encode()], overwrite=overwrite)
+    return write_file(path, [page(sections).encode()], overwrite=overwrite)

@@ -16,12 +16,12 @@ import numpy as np
 
 from ..cameras.frame import Point, direction_of
 from ..cameras.framing import reach
-from ..io import check_writable, write_whole
 from ..model.instances import instances_of
 from ..model.splats import COLUMNS
 from ..scenes.finder import CutFinder, CutSource
 from ..scenes.pages import TRAVERSED
 from ..scenes.reading import read_scenes
+from ..system.output import check_writable, write_file
 from ..system.progress import Progress, silent
 from ..system.threads import on_threads
 
@@ -259,7 +259,7 @@ def compare_files(
         from ..figures.charts import plot_comparison as chart
 
         series = list(zip((budget.text for budget in budgets), groups, strict=True))
-        write_whole(plot, [chart(series, scenes.title)], overwrite=overwrite)
+        write_file(plot, [chart(series, scenes.title)], overwrite=overwrite)
     outcomes = [each for at, what in asserts for each in check([what], rows if at is None else groups[at], empty=EMPTY)]
     summary = summarize(rows, [budget.text for budget in budgets])
     return Compared(len(rows), path, comparison.leaves, summary, outcomes)

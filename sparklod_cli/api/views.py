@@ -345,13 +345,13 @@ class Picture:
             OutputError: the file exists, or cannot be written.
             ValueError: its name does not end in .png.
         """
-        from ..io import write_whole
+        from ..system.output import write_file
 
         path = file_path(path)
         if path.suffix.lower() != ".png":
             raise ValueError(f"{path}: a picture is saved as .png, which the name does not end in")
 
-        write_whole(path, [self.png], overwrite=overwrite)
+        write_file(path, [self.png], overwrite=overwrite)
 
 
 def show(image: NDArray[np.float32], *, background: tuple[float, float, float] | None = (0.0, 0.0, 0.0)) -> Picture:

@@ -9,11 +9,11 @@ from types import NoneType
 from typing import TYPE_CHECKING
 
 from ..codecs.file_names import MANIFEST
-from ..io import scene_sink, sink
-from ..io.details import detail_sink
+from ..io import parts_output, scene_output, write_scene
 from ..model.scene import Scene
 from ..system.defaults import DEFAULT_COMPRESSION
 from ..system.errors import FormatError, InvalidSplatsError, memory_errors_translated
+from ..system.output import Output
 from ..system.threads import thread_count
 from .arguments import ProgressLike, file_path, progress_callback, scene_like
 from .files import naming, pack
@@ -130,14 +130,15 @@ def write(
         with naming(path):
             check_scene(scene, count)
         if streamed:
-            output = DetailOutput(detail or DetailSettings(), options, detail_sink(path, overwrite=overwrite))
+            output = DetailOutput(detail or DetailSettings(), options, parts_output(path, overwrite=overwrite))
             return _write_levels(path, scene, environment, output, count, callback)
         if form is None or (scene.tree is not None and not form.trees):
             known = ", ".join(ending for ending, each in WRITABLE.items() if each.trees or scene.tree is None)
             what = "a tree" if scene.tree is not None else "a scene"
             raise FormatError(f"{path}: {what} is written as {known}, which the name does not end in")
-        save = scene_sink(path, form, chunked=rad.chunked, overwrite=overwrite)
-        return Written(path, form.name, save(scene, options, threads=count, progress=callback))
+        out = scene_output(path, form, chunked=rad.chunked, overwrite=overwrite)
+        size = write_scene(out, form, scene, options, threads=count, progress=callback)
+        return Written(path, form.name, size)
 
 
 def _write_levels(
@@ -162,8 +163,9 @@ def _write_arrays(path: Path, scene: Scene, encoding: str, *, overwrite: bool, t
     if path.suffix.lower() not in (NPZ, *RAW_SUFFIXES):
         known = ", ".join((NPZ, *RAW_SUFFIXES))
         raise FormatError(f"{path}: arrays are written as {known}, which the name does not end in")
-    save = sink(path, overwrite=overwrite)
+    out = Output(path, overwrite=overwrite)
     with naming(path):
         arrays = pack(scene, encoding, threads=threads)
     pieces = dump.encode_raw(arrays) if path.suffix.lower() in RAW_SUFFIXES else dump.encode_npz(arrays)
-    return Written(path, encoding, save(pieces))
+    with out:
+        return Written(path, encoding, out.write(path.name, pieces))

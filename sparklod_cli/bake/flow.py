@@ -57,7 +57,7 @@ def bake(
 
     Raises:
         FormatError, InvalidSplatsError, OutputError: see `open_source`, `Selection.check`, `validation.check_scene` and
-            `io.writing.scene_sink`; or the input has a tree, and the settings do not keep it.
+            `system.output.Output`; or the input has a tree, and the settings do not keep it.
         ScratchError: the scratch folder is full, in use, or belongs to another bake.
         OutOfMemoryError: the scene does not fit into memory.
         CameraPathError: the training cameras cannot be read.

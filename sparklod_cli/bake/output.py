@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from pathlib import PurePath
+from typing import Any, cast
 
 from ..codecs import clamps
 from ..codecs.encoder import CLAMPED, Encoder, Get, Stored, windows_of
@@ -15,12 +16,13 @@ from ..codecs.options import DEFAULTS, WriteOptions
 from ..codecs.rad.rad_layout import OPTIONS
 from ..codecs.statistics import Statistics
 from ..io.reading import opened, read_stored
-from ..io.writing import SceneSink, Sink, scene_sink, sink
+from ..io.writing import parts_output, scene_output
 from ..model.lod_tree import CHUNK_NODES
 from ..model.scene import Scene
 from ..model.splats import Splats, same_rows
 from ..system.addresses import Place
 from ..system.errors import FormatError
+from ..system.output import Files, Output
 from ..system.progress import Progress
 from .records import BuiltTree, Clock, WrittenTree
 from .settings import SPZ, BakeSettings
@@ -58,26 +60,25 @@ def output_of(
     """Return the output that settings ask for; fail now if it cannot be written later.
 
     Raises:
-        OutputError: see `io.writing.scene_sink` and `io.details.detail_sink`.
+        OutputError: see `system.output.Output`.
     """
     if settings.detail is not None or settings.tiles is not None:  # which most bakes do without
-        from ..io.details import detail_sink
         from .parts_output import DetailOutput, TileOutput
     if settings.detail is not None:
-        return DetailOutput(settings.detail, settings.options, detail_sink(target, overwrite=overwrite))
+        return DetailOutput(settings.detail, settings.options, parts_output(target, overwrite=overwrite))
     if settings.tiles is not None:
-        return TileOutput(settings.tiles, settings.options, detail_sink(target, overwrite=overwrite))
+        return TileOutput(settings.tiles, settings.options, parts_output(target, overwrite=overwrite))
     if settings.simplify is not None:
         from .simplifying import SimplifiedOutput, Simplifier
 
         form = WRITABLE[settings.suffix]
-        write = scene_sink(target, form, chunked=settings.options.rad.chunked, overwrite=overwrite)
-        return SimplifiedOutput(form, settings.options, write, Simplifier.of(settings, say))
+        out = scene_output(target, form, chunked=settings.options.rad.chunked, overwrite=overwrite)
+        return SimplifiedOutput(form, settings.options, out, Simplifier.of(settings, say))
     if settings.encoding is not None:
-        return ArrayOutput(settings.encoding, settings.raw, sink(target, overwrite=overwrite))
+        return ArrayOutput(settings.encoding, settings.raw, Output(target, overwrite=overwrite))
     form, chunked = WRITABLE[settings.suffix], settings.options.rad.chunked
-    write = scene_sink(target, form, chunked=chunked, overwrite=overwrite)
-    return FileOutput(form, settings.options, write, in_chunks=settings.suffix == RAD)
+    out = scene_output(target, form, chunked=chunked, overwrite=overwrite)
+    return FileOutput(form, settings.options, out, in_chunks=settings.suffix == RAD)
 
 
 def output_of_existing_tree(
@@ -123,7 +124,7 @@ def output_of_existing_tree(
         return dataclasses.replace(output, options=stored.like(options), stored=stored, before=scene.splats), True
     if is_same and dataclasses.replace(options, rad=dataclasses.replace(options.rad, chunked=False)) == DEFAULTS:
         assert not isinstance(source, Merged)
-        return RepackedOutput(source, output.sink), False
+        return RepackedOutput(source, output.out), False
     return dataclasses.replace(output, options=dataclasses.replace(options, covering=False)), False
 
 
@@ -138,14 +139,15 @@ class ArrayOutput(BakeOutput):
 
     encoding: str
     raw: bool
-    sink: Sink
+    out: Output
 
     def write(self, tree: BuiltTree, encode: Encode, clock: Clock, threads: int, progress: Progress) -> WrittenTree:
         """Pack the nodes and write the arrays."""
         from ..codecs.gpu import dump
 
         arrays = dump.pack(tree.scene, self.encoding, threads)
-        size = self.sink(dump.encode_raw(arrays) if self.raw else dump.encode_npz(arrays))
+        with self.out as out:
+            size = out.write(out.target.name, dump.encode_raw(arrays) if self.raw else dump.encode_npz(arrays))
         shapes = {name: words.shape for name, words in arrays.items()}
         clock.end("write")
         return WrittenTree(output_format=self.encoding, bytes=size, arrays=shapes)
@@ -156,13 +158,18 @@ class RepackedOutput(BakeOutput):
     """RAD file with the chunks of another one."""
 
     source: Place
-    sink: SceneSink
+    out: Output
 
     def write(self, tree: BuiltTree, encode: Encode, clock: Clock, threads: int, progress: Progress) -> WrittenTree:
         """Copy the chunks."""
         with opened(self.source) as (file, form, more):
             chunks = form.codec().RadReader.open(file, **more)
-            size, encodings = self.sink.repack(chunks), chunks.encodings
+            with self.out as out:
+                name = out.target.name
+                whole = out.siblings is None
+                files = [(name, chunks.in_one_file())] if whole else chunks.in_files(PurePath(name).stem)
+                size = sum(out.write(*file) for file in files)
+            encodings = chunks.encodings
         clock.end("write")
         return WrittenTree(
             output_format="rad" if chunks.header.chunked else "rad-chunked",
@@ -185,7 +192,7 @@ class FileOutput(BakeOutput):
 
     form: Format
     options: WriteOptions
-    sink: SceneSink
+    out: Output
     in_chunks: bool
     stored: Stored | None = None
     before: Splats | None = None
@@ -214,7 +221,13 @@ class FileOutput(BakeOutput):
         """Encode the windows and write the file."""
         encoder = self.encoder(tree, threads, progress)
         get, options, count = encode(tree, encoder), encoder.options, encoder.count
-        size = self.sink.assemble(encoder, get, threads=threads, progress=progress)
+        with self.out as out:
+            name = out.target.name
+            if out.siblings is None:
+                size = out.write(name, encoder.pieces(get, threads=threads, progress=progress))
+            else:
+                files: Files = cast(Any, encoder).files(get, PurePath(name).stem, progress=progress)
+                size = sum(out.write(*file) for file in files)
         numbers = range(len(windows_of(count)) if encoder.ranges else 0)
         beyond = clamps.Clamps()
         if numbers:

@@ -9,12 +9,12 @@ import numpy as np
 
 from ..codecs.file_names import ENVIRONMENT, folders_of
 from ..codecs.options import WriteOptions
-from ..io.writing import Files, SinkTogether
 from ..lod.detail_rule import DetailSettings
 from ..lod.tile_settings import TileSettings
 from ..model.scene import DetailScene, Scene
 from ..model.splats import Splats
 from ..model.tile_scene import TileScene
+from ..system.output import Output
 from ..system.progress import Progress
 from ..system.threads import on_threads
 from .output import BakeOutput, Encode
@@ -50,7 +50,7 @@ class DetailOutput(BakeOutput):
 
     settings: DetailSettings
     options: WriteOptions
-    sink: SinkTogether
+    out: Output
 
     def write(self, tree: BuiltTree, encode: Encode, clock: Clock, threads: int, progress: Progress) -> WrittenTree:
         """Make the levels of a tree and write them."""
@@ -63,14 +63,11 @@ class DetailOutput(BakeOutput):
         from ..codecs.streamed_sog.codec import encode_files
 
         made = detail_levels(scene, environment, self.settings, clock, threads=threads, progress=progress)
-        names: list[str] = []
-
-        def noted(files: Files) -> Files:
-            for name, pieces in files:
+        size, names = 0, list[str]()
+        with self.out as out:
+            for name, pieces in encode_files(made, self.options, self.settings, threads=threads, progress=progress):
+                size += out.write(name, pieces)
                 names.append(name)
-                yield name, pieces
-
-        size = self.sink(noted(encode_files(made, self.options, self.settings, threads=threads, progress=progress)))
         clock.end("write")
         return WrittenTree(output_format="streamed-sog", bytes=size, detail=_written_detail(made, names))
 
@@ -95,7 +92,7 @@ class TileOutput(BakeOutput):
 
     settings: TileSettings
     options: WriteOptions
-    sink: SinkTogether
+    out: Output
 
     def write(self, tree: BuiltTree, encode: Encode, clock: Clock, threads: int, progress: Progress) -> WrittenTree:
         """Make the tiles of a tree and write them."""
@@ -108,7 +105,9 @@ class TileOutput(BakeOutput):
             made = make(scene.splats, scene.tree, self.settings, progress=progress)
         made = dataclasses.replace(made, antialiased=scene.antialiased, up=scene.up)
         clock.end("tiles")
-        size = self.sink(encode_files(made, self.options, threads=threads, progress=progress))
+        with self.out as out:
+            files = encode_files(made, self.options, threads=threads, progress=progress)
+            size = sum(out.write(*file) for file in files)
         clock.end("write")
         return WrittenTree(output_format="3d-tiles", bytes=size, tiles=_written(made))
 

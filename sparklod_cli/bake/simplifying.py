@@ -17,12 +17,13 @@ from ..codecs.formats import Format
 from ..codecs.losses import settled_with_losses
 from ..codecs.options import WriteOptions
 from ..fitting.settings import FitSettings
-from ..io.writing import SceneSink
+from ..io.writing import encoded, write_scene
 from ..lod.detail_levels import RefinementOrder, with_plain_opacity
 from ..model.falloff import MIN_ALPHA
 from ..model.scene import Scene
 from ..model.splats import Splats
 from ..system.errors import FormatError, SparklodError
+from ..system.output import Output
 from ..system.progress import Progress
 from ..system.threads import on_threads
 from ..system.units import count_of
@@ -239,7 +240,7 @@ class SimplifiedOutput(BakeOutput):
 
     form: Format
     options: WriteOptions
-    sink: SceneSink
+    out: Output
     simplifier: Simplifier
 
     def write(self, tree: BuiltTree, encode: Encode, clock: Clock, threads: int, progress: Progress) -> WrittenTree:
@@ -251,7 +252,7 @@ class SimplifiedOutput(BakeOutput):
             chosen = self.simplifier.choose(tree.scene, bytes_of=bytes_of, threads=threads, progress=progress)
         settled, losses = settled_with_losses(chosen.scene, self.form, options, threads)
         clock.end("simplify")
-        size = self.sink(chosen.scene, settled, threads=threads, progress=progress)
+        size = write_scene(self.out, self.form, chosen.scene, settled, threads=threads, progress=progress)
         clock.end("write")
         count = len(chosen.scene)
         share = round(count / tree.splats, 6)
@@ -262,7 +263,5 @@ class SimplifiedOutput(BakeOutput):
 
     def _bytes(self, scene: Scene, *, options: WriteOptions, threads: int) -> int:
         """Return the size of a file without writing it."""
-        whole = self.sink.whole and (lambda pieces: sum(map(len, pieces)))
-        together = self.sink.together and (lambda files: sum(sum(map(len, pieces)) for _, pieces in files))
-        counted = dataclasses.replace(self.sink, whole=whole, together=together)
-        return counted(scene, self.form.codec().settled(scene, options), threads=threads)
+        files = encoded(self.out, self.form, scene, self.form.codec().settled(scene, options), threads=threads)
+        return sum(sum(map(len, pieces)) for _, pieces in files)

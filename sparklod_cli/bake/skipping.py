@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from ..io.reading import readable
-from ..io.writing import check_writable, sink
 from ..system.addresses import Address, Place, size_of
-from ..system.errors import OutputError, UnreadableError
+from ..system.errors import OutputError, UnreadableError, reason_of
+from ..system.output import Output, check_writable
 from ..system.untrusted import parse_json
 from .flow import bake, has_published
 from .identity import BakeIdentity, content_of, files_of
@@ -53,16 +53,17 @@ def bake_unless_there(
             return None
         if not overwrite:
             raise OutputError(f"{target} exists, but {'; '.join(differences)}; add --overwrite to bake it again")
-    write_note = sink(note_path, overwrite=True)
+    note_output = Output(note_path, overwrite=True)
     try:
         note_path.unlink(missing_ok=True)  # so that it never lies beside an output of another bake
     except OSError as error:
-        raise OutputError(f"cannot replace {note_path}: {(error.strerror or str(error)).lower()}") from None
+        raise OutputError(f"cannot replace {note_path}: {reason_of(error)}") from None
     baked = bake(source, target, settings, overwrite=overwrite, **how)
     if baked.refine is None or baked.refine.is_complete:  # otherwise another run improves it further
         files = {_within(target, file): _record_of(file) for file in files_of(target)}
         note = {"bake": dataclasses.asdict(identity), "output": files}
-        write_note([json.dumps(note, indent=1).encode() + b"\n"])
+        with note_output:
+            note_output.write(note_path.name, [json.dumps(note, indent=1).encode() + b"\n"])
     return baked
 
 

@@ -182,14 +182,15 @@ def keep_apart(ctx: click.Context, stands_for: Mapping[str, Iterable[Place]] | N
 
 def with_chunks(headers: Iterable[Place]) -> list[Place]:
     """Return outputs of several files, and the files beside them that are replaced or removed with them."""
-    from ..io import chunk_files
-    from ..io.details import FILE_SETS, detail_files
+    from ..io import siblings_of
 
-    chunks: list[Place] = []
+    files = list[Place]()
     for header in headers:
-        others = detail_files if header.name in FILE_SETS else chunk_files
-        chunks += [header, *(others(header) if isinstance(header, Path) else ())]
-    return chunks
+        files.append(header)
+        if isinstance(header, Path):
+            target = Path(os.path.realpath(header))
+            files += [target.parent / name for name in siblings_of(header).existing(target)]
+    return files
 
 
 def claim_stdout(ctx: click.Context, name: str, *, as_json: bool, binary: bool = False) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..io import check_free, check_writable
+from ..system.output import check_free, check_writable
 from .defaults import MOVING, SHEETS, STILL, SUFFIXES
 
 #: Formats with an alpha channel.

@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras.frame import DEFAULT_FPS
-from ..io import write_stdout, write_whole
 from ..render.renderer import Renderer
 from ..render.settings import OF_PIXELS
+from ..system.output import write_file
 from ..system.progress import Progress, silent
+from ..system.stdio import DASH
 from ..system.threads import on_threads, ordered_map
 from . import pixels as codes
 from .animation import animate
@@ -245,10 +246,7 @@ class _Writer:
         return codes.encode(pixels, self._output.form, self._settings.jpeg_quality)
 
     def _write(self, target: Path | None, pieces: Iterable[bytes]) -> None:
-        if target is None:
-            self._bytes += write_stdout(pieces)
-        else:
-            self._bytes += write_whole(target, pieces, overwrite=self._overwrite)
+        self._bytes += write_file(target or DASH, pieces, overwrite=self._overwrite)
 
 
 def _pixels(frame: _Frame) -> Pixels:

@@ -16,18 +16,4 @@ from .reading import (
     size_of_input,
 )
 from .streams import PlacedFile, open_reader, open_readers, read_scene
-from .writing import (
-    SceneSink,
-    Sink,
-    SinkTogether,
-    check_free,
-    check_writable,
-    chunk_files,
-    scene_sink,
-    sink,
-    sink_together,
-    try_place,
-    write_stdout,
-    write_together,
-    write_whole,
-)
+from .writing import parts_output, scene_output, siblings_of, write_scene

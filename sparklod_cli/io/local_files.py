@@ -12,11 +12,11 @@ from collections.abc import Collection, Iterable
 from pathlib import Path, PurePath
 from typing import BinaryIO
 
-from ..codecs.file_names import FIRST_FILES, MANIFEST, META, TILESET, rad_chunk_number, sog_image_number
+from ..codecs.file_names import FIRST_FILES, MANIFEST, META, TILESET
 from ..codecs.formats import FORMATS, head_of, sniff
 from ..codecs.lookalikes import POINTER, SHORT, is_pointer
 from ..system.addresses import Place
-from ..system.errors import FormatError, UnreadableError
+from ..system.errors import FormatError, UnreadableError, reason_of
 from ..system.printable import near
 from ..system.stdio import DASH
 from ..system.untrusted import quoted_value
@@ -44,16 +44,6 @@ def leads_away(name: str, *, folders: bool = False) -> bool:
     return name in ("", ".", "..") or any(mark in name for mark in "/\\:") or not is_file_name(name)
 
 
-def number_of(name: str, header: str) -> int | None:
-    """Return the place of a file among those of an output that one called `header` names; None if it is none of them.
-
-    They are the images of a meta.json, and the chunks of any other header.
-    """
-    if header.lower() == META:
-        return sog_image_number(name)
-    return rad_chunk_number(name, PurePath(header).stem)
-
-
 def reason_unreadable(error: OSError) -> str:
     """Return what the system says of an input that cannot be read, and a file of a similar name if it is missing."""
     reason = reason_of(error)
@@ -66,11 +56,6 @@ def reason_unreadable(error: OSError) -> str:
     except OSError:
         return reason
     return reason + near(name, names, cutoff=SIMILAR, folder=folder)
-
-
-def reason_of(error: OSError) -> str:
-    """Return what the system says of an error, to stand after a colon."""
-    return (error.strerror or str(error)).lower()
 
 
 #: For reading; neither follows a link nor waits for the other end of a pipe.

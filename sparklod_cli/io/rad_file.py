@@ -17,9 +17,9 @@ from ..codecs.validation import check_rules
 from ..model.lod_tree import LodTree
 from ..model.scene import FileCoding, Scene
 from ..model.splats import FloatArray, Splats
-from ..system.errors import UnreadableError
+from ..system.errors import UnreadableError, reason_of
 from ..system.machine import available_memory
-from .local_files import open_named, reason_of
+from .local_files import open_named
 from .reading import opened
 
 #: Name of the format in `codecs.formats`.

@@ -20,10 +20,9 @@ from ..model.splats import COLUMNS
 from ..model.transforms import Transform
 from ..system import atomic
 from ..system.addresses import Address, Place
-from ..system.errors import FormatError, OutputError
+from ..system.errors import FormatError, OutputError, reason_of
 from ..system.progress import Progress, silent
 from ..system.stdio import DASH, name_of
-from .local_files import reason_of
 from .reading import open_splats, readable
 
 #: Files that stay open together, of one scene, and of those that were closed or that another process opened: each has

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..io import check_free, check_writable, write_whole
+from ..system.output import check_free, check_writable, write_file
 from ..system.progress import Progress, silent
 from ..tables.output import Filter, TableOutput
 from .summary import Lookout
@@ -149,7 +149,7 @@ def _write_indices(frame: SimulatedFrame, outputs: FrameOutputs) -> None:
             nodes = np.concatenate([nodes, np.zeros(-len(nodes) % ROW, np.uint32)]).reshape(-1, ROW)
         out = io.BytesIO()
         np.save(out, nodes)
-        write_whole(file, [out.getvalue()], overwrite=outputs.overwrite)
+        write_file(file, [out.getvalue()], overwrite=outputs.overwrite)
 
 
 def _plot(simulation: Simulation, path: CameraPath, target: Path, data: _ChartData, *, overwrite: bool) -> str | None:
@@ -167,5 +167,5 @@ def _plot(simulation: Simulation, path: CameraPath, target: Path, data: _ChartDa
     )
     marked = {moment.criterion: moment.frame for moment in data.lookout.moments()}
     drawn = traversal_chart.plot(data.rows, marked, simulation.scenes.title, scene)
-    write_whole(target, [drawn.png], overwrite=overwrite)
+    write_file(target, [drawn.png], overwrite=overwrite)
     return drawn.note

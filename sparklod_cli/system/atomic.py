@@ -1,7 +1,8 @@
-"""Atomic file writes: a file gets its name only when it is complete.
+"""Atomic writes on this machine: a file gets its name when it is complete, files that belong together get all or none.
 
-On systems with unnamed files (Linux), a writer that is killed leaves nothing behind. Elsewhere the file has a temporary
-name, and is locked while its writer is alive, so that the next run can recognise and remove what was left behind.
+On systems with unnamed files (Linux), a killed writer of one file leaves nothing behind. Elsewhere the file has a
+temporary name. Files that belong together are filled in a hidden folder beside their places. Such a file or folder is
+locked while its writer is alive, so that the next run can recognise and remove what a killed one left behind.
 """
 
 from __future__ import annotations
@@ -14,8 +15,8 @@ import re
 import secrets
 import shutil
 import stat
-from collections.abc import Iterable, Iterator
-from pathlib import Path
+from collections.abc import Collection, Iterable, Iterator
+from pathlib import Path, PurePosixPath
 from typing import BinaryIO
 
 try:
@@ -30,6 +31,9 @@ PARTS, STAGES = ".sparklod-{}.part", ".sparklod-{}.parts"
 
 #: Folders are removed with all that is in them, so their names must be ours to the letter.
 _STAGE = re.compile(r"\.sparklod-[0-9a-f]{16}\.parts")
+
+#: The folder inside the hidden one for the files that are being replaced.
+FORMER = "former"
 
 
 def unique(name: str) -> str:
@@ -287,3 +291,131 @@ def created(folder: Path) -> Iterator[None]:
         with contextlib.suppress(OSError):  # the first that has something in it ends this
             for each in new:
                 each.rmdir()
+
+
+@contextlib.contextmanager
+def staged(folder: Path) -> Iterator[Path]:
+    """Create a locked, hidden folder in a folder for files that belong together; it is removed at the end."""
+    sweep(folder)
+    stage, descriptor = _open_stage(folder)
+    try:
+        yield stage
+    finally:
+        shutil.rmtree(stage, ignore_errors=True)
+        if descriptor is not None:
+            os.close(descriptor)
+
+
+def _open_stage(folder: Path) -> tuple[Path, int | None]:
+    """Create a locked, hidden folder; its path, and the descriptor that holds the lock, None without locks."""
+    while True:
+        stage = folder / unique(STAGES)
+        stage.mkdir(0o700)
+        if not HAS_LOCKS:
+            return stage, None
+        with contextlib.suppress(FileNotFoundError):  # another process removed it before it was locked
+            descriptor = os.open(stage, os.O_RDONLY | os.O_CLOEXEC)
+            lock(descriptor)
+            if stage.exists():
+                return stage, descriptor
+            os.close(descriptor)
+
+
+def add(stage: Path, name: str, pieces: Iterable[bytes]) -> int:
+    """Write and sync a file in the hidden folder, in folders there ("0_0/means_l.webp"); return its size in bytes."""
+    (stage / name).parent.mkdir(parents=True, exist_ok=True)
+    with (stage / name).open("xb") as file:
+        return fill(file, pieces)
+
+
+def publish(stage: Path, names: Collection[str], header: str, *, overwrite: bool, outdated: Iterable[str] = ()) -> None:
+    """Give files that were added to a hidden folder their names beside it: all of them, or none.
+
+    Where files are replaced, the header is taken away before any other is touched, and is the last to get its name:
+    for some milliseconds there is none. An error or an interrupt at any time leaves the former files; a kill within
+    these milliseconds leaves new files without a header. A folder that a removed file leaves empty is removed, too.
+    Other files in it are not touched. Permissions are those of `write`.
+
+    Args:
+        names: all files that were added.
+        header: the one of them that readers open first.
+        outdated: existing files that are removed where `overwrite` is set.
+
+    Raises:
+        FileExistsError: a file exists, and `overwrite` is not set; or the place of a folder is taken by something else,
+            such as a link. It has the path.
+        OSError: the file system reported an error.
+    """
+    folder, names = stage.parent, [*(name for name in names if name != header), header]
+    folders = _folders_of(names)
+    new = [each for each in folders if not os.path.lexists(folder / each)]
+    try:
+        for each in folders:
+            if (folder / each).is_symlink() or ((folder / each).exists() and not (folder / each).is_dir()):
+                raise FileExistsError(errno.EEXIST, "is not a folder", str(folder / each))
+        gone = [name for name in outdated if name not in names] if overwrite else []
+        if overwrite:
+            (stage / FORMER).mkdir()
+            for name in (header, *names[:-1], *gone):
+                _put_aside(stage, name)
+        else:
+            _refuse_existing(folder / name for name in names)
+        for each in folders:
+            (folder / each).mkdir(exist_ok=True)
+        for name in names:
+            rename(stage / name, folder / name, overwrite)
+        _remove_empty(folder / each for each in _folders_of(gone))
+    except BaseException:
+        _undo(stage, names)
+        _remove_empty(folder / each for each in new)
+        raise
+
+
+def _folders_of(names: Iterable[str]) -> list[str]:
+    """Return the folders of files, by their names, outer folders first."""
+    found = {str(parent) for name in names for parent in PurePosixPath(name).parents if parent.name}
+    return sorted(found, key=lambda folder: (folder.count("/"), folder))
+
+
+def _remove_empty(folders: Iterable[Path]) -> None:
+    for folder in reversed(list(folders)):
+        with contextlib.suppress(OSError):
+            folder.rmdir()
+
+
+def _refuse_existing(paths: Iterable[Path]) -> None:
+    for path in paths:
+        if os.path.lexists(path):
+            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
+
+
+def _put_aside(stage: Path, name: str) -> None:
+    """Move a file that will be replaced into the hidden folder; the new one gets its permissions."""
+    former, part = stage.parent / name, stage / name
+    with contextlib.suppress(FileNotFoundError):
+        mode = former.stat().st_mode
+        if not stat.S_ISREG(mode):
+            raise FileExistsError(errno.EEXIST, "is not a file", str(former))
+        if part.exists():
+            part.chmod(stat.S_IMODE(mode) & 0o777)
+        (stage / FORMER / name).parent.mkdir(parents=True, exist_ok=True)
+        former.rename(stage / FORMER / name)
+
+
+def _undo(stage: Path, names: Collection[str]) -> None:
+    """Take names away from new files again and give former files theirs back, the header, which is last, last.
+
+    The folders show which steps were done, so that an interrupt between two steps is undone, too.
+    """
+    *rest, header = names
+    for name in (header, *reversed(rest)):
+        path, part = stage.parent / name, stage / name
+        with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+            if not part.exists() or path.samefile(part):
+                path.unlink()
+    former = stage / FORMER
+    found = {path.relative_to(former).as_posix(): path for path in former.rglob("*") if not path.is_dir()}
+    for name in sorted(found, key=lambda name: name == header):
+        target = stage.parent / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        found[name].replace(target)

@@ -119,6 +119,11 @@ class OutOfMemoryError(SparklodError):
     """The operation needs more memory than there is."""
 
 
+def reason_of(error: OSError) -> str:
+    """Return the reason of an error of the system, to stand after a colon."""
+    return (error.strerror or str(error)).lower()
+
+
 @contextlib.contextmanager
 def memory_errors_translated() -> Iterator[None]:
     """Translate every error of the body that means memory ran out into an `OutOfMemoryError` that names the array."""

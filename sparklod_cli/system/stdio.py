@@ -6,7 +6,7 @@ import contextlib
 import functools
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -122,3 +122,23 @@ def _copy_of(stream: Any) -> BinaryIO:
     file: BinaryIO = tempfile.TemporaryFile(prefix="sparklod-")  # noqa: SIM115
     shutil.copyfileobj(stream.buffer, file, 1 << 20)
     return file
+
+
+def write_stdout(pieces: Iterable[bytes], *, may_end: bool = False) -> int:
+    """Write to standard output and return the number of bytes; raise `StdoutError` if they cannot be written.
+
+    Args:
+        may_end: a reader may close after the first lines, as head does, which raises `ReaderGoneError`; otherwise that
+            is a `StdoutError`, too.
+    """
+    size = 0
+    with guarded():
+        try:
+            for piece in pieces:
+                size += sys.stdout.buffer.write(piece)
+            sys.stdout.buffer.flush()
+        except ReaderGoneError as error:
+            if may_end:
+                raise
+            raise StdoutError(str(error)) from None
+    return size

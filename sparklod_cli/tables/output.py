@@ -6,7 +6,8 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..io import check_writable, write_stdout, write_whole
+from ..system.output import check_writable, write_file
+from ..system.stdio import DASH
 from .columns import Column, Row, encode, load_pyarrow
 
 #: What the bytes of a table are passed through on their way to standard output.
@@ -53,7 +54,6 @@ class TableOutput:
                 pass
             return
         data: Iterable[bytes] = encode(iter(rows), self.columns, self.form)
-        if self.path is not None:
-            write_whole(self.path, data, overwrite=self.overwrite)
-        else:
-            write_stdout(passed(data) if passed is not None else data, may_end=self.form != "parquet")
+        if self.path is None and passed is not None:
+            data = passed(data)
+        write_file(self.path or DASH, data, overwrite=self.overwrite, may_end=self.form != "parquet")

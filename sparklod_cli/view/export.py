@@ -8,9 +8,10 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
-from ..io import read_text, try_place, write_whole
-from ..io.local_files import open_plain, reason_of
-from ..system.errors import OutputError, SparklodError
+from ..io import read_text
+from ..io.local_files import open_plain
+from ..system.errors import OutputError, SparklodError, reason_of
+from ..system.output import try_place, write_file
 from ..system.progress import Progress, silent
 from ..system.untrusted import parse_json
 from .site import GENERATOR, SETTINGS, Site
@@ -86,7 +87,7 @@ def export(site: Site, folder: Path, *, overwrite: bool, progress: Progress = si
         part.mkdir()
         for name, content in site.resources.items():
             pieces = [content] if isinstance(content, bytes) else _pieces(content)
-            done += write_whole(part / name, pieces, overwrite=False)
+            done += write_file(part / name, pieces, overwrite=False)
             progress("export", done, total, "B")
         _replace(real, part)
     except OSError as error:

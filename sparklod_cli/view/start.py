@@ -19,13 +19,13 @@ from ..codecs.gpu.layout_loss import MOST_PAGED_DEGREE, sample_loss
 from ..codecs.rad.rad_header import RadHeader
 from ..codecs.rad.rad_reader import count_leaves, file_of, read_chunk
 from ..io import read_parts, read_scene
-from ..io.local_files import open_plain, reason_of
+from ..io.local_files import open_plain
 from ..model.balls import Balls, balls_of
 from ..model.scene import DetailScene
 from ..model.splats import Splats
 from ..model.tile_scene import TileScene
 from ..system.defaults import ELEVATION
-from ..system.errors import InvalidSplatsError, SparklodError, UnreadableError
+from ..system.errors import InvalidSplatsError, SparklodError, UnreadableError, reason_of
 from ..system.progress import Progress, silent
 from .files import ShownFile
 

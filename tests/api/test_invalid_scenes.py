@@ -17,11 +17,11 @@ from sparklod_cli.codecs.formats import ENCODINGS, WRITABLE
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
 from sparklod_cli.codecs.splat_encoding import SplatEncoding
 from sparklod_cli.extract_leaves import extract_leaves
-from sparklod_cli.io import write_whole
 from sparklod_cli.lod.detail_rule import DetailSettings
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene, Tree
 from sparklod_cli.system.errors import InvalidSplatsError, TreeError
+from sparklod_cli.system.output import write_file
 from tests.scenes import random_splats
 
 #: Encodings of RAD that hold any float.
@@ -106,7 +106,7 @@ def spoiled_file(request: pytest.FixtureRequest, tree: Tree, tmp_path_factory: p
     """A tree as another program may write it: with all of its floats, whatever they are."""
     path = tmp_path_factory.mktemp("spoiled") / "tree.rad"
     pieces = WRITABLE[".rad"].codec().encode(spoiled(tree, request.param), WriteOptions(rad=FLOATS))
-    write_whole(path, pieces, overwrite=False)
+    write_file(path, pieces, overwrite=False)
     return path
 
 

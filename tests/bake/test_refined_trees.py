@@ -20,12 +20,13 @@ from sparklod_cli.codecs.gpu import lod_tree
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
 from sparklod_cli.fitting import cameras, fit
 from sparklod_cli.fitting.settings import SHARES, FitSettings
-from sparklod_cli.io import read_parts, read_scene, scene_sink
+from sparklod_cli.io import read_parts, read_scene
 from sparklod_cli.lod.detail_rule import DetailSettings
 from sparklod_cli.lod.traversal import Forest, Traversal, TreeInstance
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import same_rows
 from sparklod_cli.scenes.finder import view_of
+from sparklod_cli.system.output import write_file
 from tests.conftest import FIXTURES
 from tests.lod.trees import check_tree, sorted_rows
 
@@ -53,7 +54,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, small_pictures: None) -> Pa
     splats = read_scene(FIXTURES / "demo.ply").splats
     near = np.argsort(np.linalg.norm(splats.center - np.median(splats.center, axis=0), axis=1), kind="stable")
     scene = Scene(splats.take(np.sort(near[:COUNT])))
-    scene_sink(folder / "scene.ply", WRITABLE[".ply"], overwrite=False)(scene, WriteOptions())
+    write_file(folder / "scene.ply", WRITABLE[".ply"].codec().encode(scene), overwrite=False)
     bake(folder / "scene.ply", folder / "tree.rad", SETTINGS)
     return folder
 
@@ -94,7 +95,7 @@ def test_the_report_tells_of_no_budget_that_lost(baked: Baked) -> None:
 @pytest.mark.parametrize("name", ["fitted.spz", "fitted-2.spz", "plain.rad"])
 def test_every_format_holds_it_and_a_check_finds_no_fault(folder: Path, fitted: Scene, name: str) -> None:
     options = WriteOptions(spz_version=2) if "2" in name else WriteOptions()
-    scene_sink(folder / name, WRITABLE[Path(name).suffix], overwrite=False)(fitted, options)
+    write_file(folder / name, WRITABLE[Path(name).suffix].codec().encode(fitted, options), overwrite=False)
     found = read_scene(folder / name)
     assert fitted.tree is not None
     assert found.tree is not None

@@ -15,10 +15,11 @@ from sparklod_cli.codecs.formats import WRITABLE
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
 from sparklod_cli.codecs.splat_encoding import SplatEncoding
 from sparklod_cli.fitting.settings import FitSettings
-from sparklod_cli.io import read_scene, scene_sink
+from sparklod_cli.io import read_scene
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import same_rows
 from sparklod_cli.system.errors import CameraPathError, FormatError, InvalidSplatsError, OutOfMemoryError, OutputError
+from sparklod_cli.system.output import write_file
 from tests.conftest import FIXTURES
 from tests.fittings import StandIn
 from tests.fittings import stand_in as stand_in
@@ -226,7 +227,7 @@ def test_a_tree_with_numbers_that_are_none_is_refused(tmp_path: Path, stand_in: 
     rgb = scene.splats.rgb.copy()
     rgb[5] = np.nan
     spoiled = dataclasses.replace(scene, splats=dataclasses.replace(scene.splats, rgb=rgb))
-    scene_sink(plain, WRITABLE[".rad"], overwrite=True)(spoiled, floats)
+    write_file(plain, WRITABLE[".rad"].codec().encode(spoiled, floats), overwrite=True)
     with pytest.raises(InvalidSplatsError, match="splats is not finite"):
         bake(plain, tmp_path / "out.rad", dataclasses.replace(REFINE, suffix=".rad"))
     assert not stand_in.calls

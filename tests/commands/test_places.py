@@ -15,8 +15,8 @@ from pathlib import Path
 import pytest
 
 from sparklod_cli.cli import run
-from sparklod_cli.io import check_writable, try_place
 from sparklod_cli.system.errors import OutputError
+from sparklod_cli.system.output import check_writable, try_place
 from tests.commands.test_keep_apart import OUTPUTS, PLAIN
 from tests.conftest import FIXTURES, IS_ROOT, Capture
 

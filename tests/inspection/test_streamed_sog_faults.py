@@ -20,14 +20,14 @@ from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.codecs.streamed_sog import codec
 from sparklod_cli.codecs.streamed_sog.manifest_rules import ERRORS, WARNINGS
 from sparklod_cli.inspection.report import Report, ReportSettings, inspect
-from sparklod_cli.io import read_parts
-from sparklod_cli.io.details import detail_sink
+from sparklod_cli.io import parts_output, read_parts
 from sparklod_cli.lod import detail_levels, quick
 from sparklod_cli.lod.detail_rule import DetailSettings
 from sparklod_cli.system.errors import FormatError
 from tests.inspection.streamed_sog_files import COUNTS, Folder, Node, folder, regions, splats
 from tests.inspection.test_schema import faults as schema_faults
 from tests.inspection.test_schema import places
+from tests.outputs import write_files
 from tests.scenes import random_splats
 
 SOUND = folder()
@@ -222,7 +222,7 @@ def test_what_we_write_has_no_findings(tmp_path: Path) -> None:
     errors = np.arange(3) * np.ones((scene.regions, 1))
     scene = replace(scene, errors=errors, environment=random_splats(50, sh_degree=0, seed=1))
     path = tmp_path / "lod-meta.json"
-    detail_sink(path, overwrite=False)(codec.encode_files(scene, WriteOptions(), settings))
+    write_files(parts_output(path, overwrite=False), codec.encode_files(scene, WriteOptions(), settings))
     assert checked(path).findings == []
     assert checked(path).value_at("streamed_sog.regions") > 3
     for name in ("scene.sog", "sog/meta.json"):

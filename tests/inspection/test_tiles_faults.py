@@ -18,7 +18,7 @@ from sparklod_cli.codecs.options import PROFILES, WriteOptions
 from sparklod_cli.codecs.tiles_3d import tile_writer, tileset_rules
 from sparklod_cli.codecs.tiles_3d.tileset_rules import ERRORS, WARNINGS
 from sparklod_cli.inspection.report import Report, ReportSettings, inspect
-from sparklod_cli.io.details import detail_sink
+from sparklod_cli.io import parts_output
 from sparklod_cli.lod import quality
 from sparklod_cli.lod.tile_settings import TileSettings
 from sparklod_cli.lod.tiles import make
@@ -26,6 +26,7 @@ from sparklod_cli.model.scene import Scene
 from tests.codecs.cases import linear
 from tests.conftest import FIXTURES
 from tests.inspection.test_schema import faults as schema_faults
+from tests.outputs import write_files
 from tests.scenes import random_splats
 
 Node = dict[str, Any]
@@ -208,7 +209,7 @@ def test_what_we_write_has_no_findings(up: str | None, profile: str, tmp_path: P
     made = dataclasses.replace(made, up=up)
     path = tmp_path / "tileset.json"
     files = tile_writer.encode_files(made, WriteOptions(glb_profile=profile), most_tiles=40)
-    size = detail_sink(path, overwrite=False)(files)
+    size = write_files(parts_output(path, overwrite=False), files)
     report = checked(path)
     assert report.findings == []
     assert (report.bytes, report.up, report.splats) == (size, up, 2_000)

@@ -200,7 +200,7 @@ def test_a_part_swept_before_it_is_locked_is_made_again(tmp_path: Path, monkeypa
 #: Modules that write files, and what: outputs (whole, or to a device or an address), the cache of kernels, what the
 #: process of Open3D says, a line in the settings of a shell.
 WRITERS = {
-    *("io/writing.py", "system/addresses.py", "system/atomic.py", "system/atomic_set.py"),
+    *("system/output.py", "system/addresses.py", "system/atomic.py"),
     *("render/open3d/backend.py", "commands/completion.py"),
 }
 
@@ -228,4 +228,4 @@ def test_only_these_modules_write_files() -> None:
         if any(map(writes, calls)):
             found.add(path.relative_to(ROOT / "sparklod_cli").as_posix())
     assert found <= WRITERS
-    assert "io/writing.py" in found  # so it finds what there is
+    assert "system/output.py" in found  # so it finds what there is

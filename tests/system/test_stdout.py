@@ -11,7 +11,7 @@ import pytest
 
 from sparklod_cli import cli
 from sparklod_cli.cli import run
-from sparklod_cli.io import write_stdout
+from sparklod_cli.system.stdio import write_stdout
 from tests.conftest import FIXTURES, ROOT
 
 pytestmark = pytest.mark.slow

@@ -139,14 +139,14 @@ def test_a_failure_leaves_everything_as_it_was(
         export(static, folder, overwrite=False)
         (folder / "old").write_text("of the site before")
     found = everything(tmp_path)
-    write, calls = exporting.write_whole, iter(range(100))
+    write, calls = exporting.write_file, iter(range(100))
 
     def write_some(*arguments: object, **more: object) -> int:
         if next(calls) == 5:
             raise error
         return write(*arguments, **more)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(exporting, "write_whole", write_some)
+    monkeypatch.setattr(exporting, "write_file", write_some)
     with pytest.raises((OutputError, KeyboardInterrupt)):
         export(static, folder, overwrite=True)
     assert everything(tmp_path) == found

@@ -14,12 +14,12 @@ from sparklod_cli.codecs.options import DEFAULTS
 from sparklod_cli.codecs.sog import codec as sog
 from sparklod_cli.codecs.streamed_sog import codec
 from sparklod_cli.codecs.streamed_sog.manifest import parse
-from sparklod_cli.io import read_parts, read_scene
-from sparklod_cli.io.details import detail_sink
+from sparklod_cli.io import parts_output, read_parts, read_scene
 from sparklod_cli.model import morton
 from sparklod_cli.model.scene import DetailScene, Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.system.errors import FormatError
+from tests.outputs import write_files
 
 from .scenes import CHILDREN, COUNTS, SETTINGS, detail_scene, files_of, levels_of
 
@@ -154,7 +154,7 @@ def test_progress_ends_with_all_splats() -> None:
 def test_an_output_is_read_by_its_folder_and_by_its_manifest(tmp_path: Path) -> None:
     scene = detail_scene()
     files = codec.encode_files(scene, DEFAULTS, SETTINGS)
-    assert detail_sink(tmp_path / "lod-meta.json", overwrite=False)(files) == sum(
+    assert write_files(parts_output(tmp_path / "lod-meta.json", overwrite=False), files) == sum(
         path.stat().st_size for path in tmp_path.rglob("*") if path.is_file()
     )
     whole, levels = read_scene(tmp_path), read_parts(tmp_path / "lod-meta.json", threads=2)

@@ -18,8 +18,7 @@ from fixtures import demo_scene
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.codecs.streamed_sog import codec
-from sparklod_cli.io import read_scene
-from sparklod_cli.io.details import detail_sink
+from sparklod_cli.io import parts_output, read_scene
 from sparklod_cli.lod import detail_levels, quality
 from sparklod_cli.lod.detail_rule import DetailSettings
 from sparklod_cli.model.scene import DetailScene
@@ -30,6 +29,7 @@ from tests.interop.engines import PACKAGES, recipes
 from tests.interop.engines.browser import Browser
 from tests.interop.engines.splat_transform import SplatTransform
 from tests.interop.pictures import cameras_around
+from tests.outputs import write_files
 
 SIZE = 320, 180
 
@@ -119,7 +119,7 @@ def sky() -> Splats:
 def written(scene: DetailScene, folder: Path, size: tuple[int, int] = SIZE) -> Shot:
     """Write a scene as Streamed SOG, and return it with a camera that sees the demo scene."""
     file = folder / recipes.MANIFEST
-    detail_sink(file, overwrite=False)(codec.encode_files(scene, WriteOptions(), DETAIL))
+    write_files(parts_output(file, overwrite=False), codec.encode_files(scene, WriteOptions(), DETAIL))
     level = slice(0, int(scene.counts[:, 0].sum()))
     return Shot(file, read_scene(file).splats, cameras_around(scene.splats.center[level], *size)[1])
 

@@ -6,17 +6,21 @@ import contextlib
 import errno
 import os
 import random
+import re
 import stat
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
 import pytest
 
-from sparklod_cli.system import atomic, atomic_set
+from sparklod_cli.system import atomic
+from sparklod_cli.system.errors import OutputError
+from sparklod_cli.system.output import Output, Siblings
 from tests.conftest import ROOT
+from tests.outputs import write_files
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="POSIX only")
 
@@ -30,9 +34,19 @@ def files(content: dict[str, bytes]) -> Iterable[tuple[str, Iterable[bytes]]]:
     return ((name, [data[:2], data[2:]]) for name, data in content.items())
 
 
-def longer(names: Collection[str]) -> list[str]:
-    """The chunk that only `OLD` has."""
-    return ["a-2"] if "a-2" not in names else []
+def write(
+    folder: Path, content: Iterable[tuple[str, Iterable[bytes]]], *, overwrite: bool, former: Sequence[str] = ()
+) -> int:
+    """Write files whose header is "a"; those of a former output are removed."""
+    is_member = re.compile(r"a-[0-3]|\d/[xy]").fullmatch
+    siblings = Siblings(lambda name: is_member(name) is not None, str.isdigit, "0", lambda target: former)
+    if not any("/" in name for name in former):
+        siblings = Siblings(siblings.is_member, named=siblings.named)
+    return write_files(Output(folder / "a", overwrite=overwrite, siblings=siblings), content)
+
+
+#: What a former header names.
+FORMER = list(OLD)[:-1]
 
 
 def put(folder: Path, *contents: dict[str, bytes]) -> None:
@@ -65,23 +79,22 @@ def test_files_appear_together(tmp_path: Path) -> None:
             seen.append({path.name for path in tmp_path.iterdir() if not path.name.startswith(".sparklod-")})
             yield each
 
-    assert atomic_set.write(tmp_path, some(), overwrite=False) == sum(map(len, NEW.values()))
+    assert write(tmp_path, some(), overwrite=False) == sum(map(len, NEW.values()))
     assert seen == [set()] * len(NEW)
     assert held(tmp_path) == NEW
 
 
 def test_files_are_replaced_together_and_outdated_ones_removed(tmp_path: Path) -> None:
     put(tmp_path, OLD, OTHERS)
-    atomic_set.write(tmp_path, files(NEW), overwrite=True, outdated=longer)
+    write(tmp_path, files(NEW), overwrite=True, former=FORMER)
     assert held(tmp_path) == NEW | OTHERS
 
 
 @pytest.mark.parametrize("taken", NEW)
 def test_nothing_is_replaced_without_leave(taken: str, tmp_path: Path) -> None:
     put(tmp_path, {taken: b"precious"})
-    with pytest.raises(FileExistsError) as raised:
-        atomic_set.write(tmp_path, files(NEW), overwrite=False, outdated=longer)
-    assert raised.value.filename == str(tmp_path / taken)
+    with pytest.raises(OutputError, match=f"^{tmp_path / taken} exists, add --overwrite"):
+        write(tmp_path, files(NEW), overwrite=False, former=FORMER)
     assert held(tmp_path) == {taken: b"precious"}
 
 
@@ -92,9 +105,9 @@ def test_a_name_that_is_taken_meanwhile_is_not_replaced(
     def later(paths: Iterable[Path]) -> None:
         put(tmp_path, {taken: b"another's"})
 
-    monkeypatch.setattr(atomic_set, "_refuse_existing", later)
-    with pytest.raises(FileExistsError):
-        atomic_set.write(tmp_path, files(NEW), overwrite=False)
+    monkeypatch.setattr(atomic, "_refuse_existing", later)
+    with pytest.raises(OutputError, match=f"^{tmp_path / taken} exists, add --overwrite"):
+        write(tmp_path, files(NEW), overwrite=False)
     assert held(tmp_path) == {taken: b"another's"}
 
 
@@ -102,8 +115,8 @@ def test_a_folder_with_the_name_of_a_file_is_left_alone(tmp_path: Path) -> None:
     put(tmp_path, OLD)
     (tmp_path / "a-1").unlink()
     (tmp_path / "a-1").mkdir()
-    with pytest.raises(FileExistsError, match="is not a file"):
-        atomic_set.write(tmp_path, files(NEW), overwrite=True, outdated=longer)
+    with pytest.raises(OutputError, match="a-1 is not a file"):
+        write(tmp_path, files(NEW), overwrite=True, former=FORMER)
     (tmp_path / "a-1").rmdir()
     assert held(tmp_path) == {name: data for name, data in OLD.items() if name != "a-1"}
 
@@ -121,9 +134,9 @@ def test_an_error_while_they_are_filled_changes_nothing(
 
     before = OLD | OTHERS if existing else OTHERS
     put(tmp_path, before)
-    with pytest.raises(type(error)):
+    with pytest.raises(OutputError if isinstance(error, OSError) else type(error)):
         some = ((name, pieces(place == number)) for place, name in enumerate(NEW))
-        atomic_set.write(tmp_path, some, overwrite=existing, outdated=longer)
+        write(tmp_path, some, overwrite=existing, former=FORMER)
     assert held(tmp_path) == before
 
 
@@ -155,7 +168,7 @@ def broken_off(
     before: dict[str, bytes],
     new: dict[str, bytes],
     others: dict[str, bytes],
-    outdated: Callable[[Collection[str]], list[str]],
+    former: Sequence[str],
 ) -> int:
     """Break a write off at each call of a step by turns: all is as before, or as it is to be; return the calls."""
     for call in range(20):
@@ -166,7 +179,7 @@ def broken_off(
             wrapped, calls = breaking(getattr(*step), call, after, KeyboardInterrupt())
             patch.setattr(*step, wrapped)
             with contextlib.suppress(KeyboardInterrupt):
-                atomic_set.write(folder, files(new), overwrite=bool(before), outdated=outdated)
+                write(folder, files(new), overwrite=bool(before), former=former)
                 expected = new | others
         if len(calls) <= call:
             return call
@@ -189,7 +202,7 @@ def test_an_error_or_interrupt_at_any_step_leaves_what_was_there(
             raise PermissionError(1, "Operation not permitted")
 
         monkeypatch.setattr(os, "link", refused)
-    reached = broken_off(step, after, tmp_path, monkeypatch, OLD if existing else {}, NEW, OTHERS, longer)
+    reached = broken_off(step, after, tmp_path, monkeypatch, OLD if existing else {}, NEW, OTHERS, FORMER)
     expected = {("rename", True): 4, ("replace", True): 3, ("chmod", True): 3, ("link", False): 3}
     assert reached == (3 if not links and step[1] == "replace" else expected.get((step[1], existing), 0))
 
@@ -200,13 +213,12 @@ NEW_FOLDERS = {"0/x": b"new 0x", "2/x": b"new 2x", "a": b"new"}
 OTHER_FOLDERS = {"3/notes": b"precious", "4/x": b"precious"}
 
 
-def no_more(names: Collection[str]) -> list[str]:
-    return [name for name in OLD_FOLDERS if name not in names]
+FORMER_FOLDERS = list(OLD_FOLDERS)[:-1]
 
 
 def test_folders_are_made_and_removed_with_their_files_and_no_others_are(tmp_path: Path) -> None:
     put(tmp_path, OLD_FOLDERS, OTHER_FOLDERS)
-    atomic_set.write(tmp_path, files(NEW_FOLDERS), overwrite=True, outdated=no_more)
+    write(tmp_path, files(NEW_FOLDERS), overwrite=True, former=FORMER_FOLDERS)
     assert held(tmp_path) == NEW_FOLDERS | OTHER_FOLDERS
     assert not (tmp_path / "1").exists()
 
@@ -218,7 +230,7 @@ def test_an_interrupt_at_any_step_leaves_folders_as_they_were(
     step: tuple[object, str], existing: bool, after: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = OLD_FOLDERS if existing else {}
-    reached = broken_off(step, after, tmp_path, monkeypatch, before, NEW_FOLDERS, OTHER_FOLDERS, no_more)
+    reached = broken_off(step, after, tmp_path, monkeypatch, before, NEW_FOLDERS, OTHER_FOLDERS, FORMER_FOLDERS)
     never = {("link", True), ("rename", False), ("replace", False), ("chmod", False), ("rmdir", False)}
     assert reached or (step[1], existing) in never
 
@@ -227,16 +239,33 @@ def test_an_interrupt_at_any_step_leaves_folders_as_they_were(
 def test_what_is_no_folder_is_left_alone(overwrite: bool, tmp_path: Path) -> None:
     put(tmp_path, {"2": b"precious", "elsewhere/x": b"precious"})
     before = held(tmp_path)
-    with pytest.raises(FileExistsError, match="is not a folder") as raised:
-        atomic_set.write(tmp_path, files(NEW_FOLDERS), overwrite=overwrite, outdated=no_more)
-    assert raised.value.filename == str(tmp_path / "2")
+    with pytest.raises(OutputError, match="2 exists, and a there does not name it"):
+        write(tmp_path, files(NEW_FOLDERS), overwrite=overwrite, former=FORMER_FOLDERS)
     (tmp_path / "2").rename(tmp_path / "moved")
     (tmp_path / "2").symlink_to(tmp_path / "elsewhere")
-    with pytest.raises(FileExistsError, match="is not a folder"):
-        atomic_set.write(tmp_path, files(NEW_FOLDERS), overwrite=overwrite, outdated=no_more)
+    with pytest.raises(OutputError, match="2 exists, and a there does not name it"):
+        write(tmp_path, files(NEW_FOLDERS), overwrite=overwrite, former=FORMER_FOLDERS)
     (tmp_path / "2").unlink()
     (tmp_path / "moved").rename(tmp_path / "2")
     assert held(tmp_path) == before
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+@pytest.mark.parametrize("link", [False, True])
+def test_what_takes_the_name_of_a_folder_meanwhile_is_left_alone(overwrite: bool, link: bool, tmp_path: Path) -> None:
+    put(tmp_path, {"elsewhere/x": b"precious"})
+
+    def some() -> Iterator[tuple[str, Iterable[bytes]]]:
+        yield from files(NEW_FOLDERS)
+        if link:
+            (tmp_path / "2").symlink_to(tmp_path / "elsewhere")
+        else:
+            put(tmp_path, {"2": b"another's"})
+
+    with pytest.raises(OutputError, match=r"2 (exists|is not a file)"):
+        write(tmp_path, some(), overwrite=overwrite, former=FORMER_FOLDERS)
+    (tmp_path / "2").unlink()
+    assert held(tmp_path) == {"elsewhere/x": b"precious"}
 
 
 @pytest.mark.parametrize("mask", [0o022, 0o077])
@@ -252,10 +281,10 @@ def test_permissions_are_those_of_what_is_replaced_or_of_the_umask(mask: int, tm
 
     before = os.umask(mask)
     try:
-        atomic_set.write(tmp_path, some(), overwrite=True)
+        write(tmp_path, some(), overwrite=True)
     finally:
         os.umask(before)
-    assert seen == [0o700] * 3
+    assert seen == [0o700] * 2  # there is none before the first file is written
     modes = {name: stat.S_IMODE((tmp_path / name).stat().st_mode) for name in NEW}
     assert modes == {"a-0": 0o666 & ~mask, "a-1": 0o640, "a": 0o666 & ~mask}
 
@@ -263,9 +292,9 @@ def test_permissions_are_those_of_what_is_replaced_or_of_the_umask(mask: int, tm
 def stage(folder: Path, name: str = "0123456789abcdef") -> Path:
     """A hidden folder as a killed writer leaves it."""
     left = folder / atomic.STAGES.format(name)
-    (left / atomic_set.FORMER).mkdir(parents=True)
+    (left / atomic.FORMER).mkdir(parents=True)
     put(left, NEW)
-    put(left / atomic_set.FORMER, OLD)
+    put(left / atomic.FORMER, OLD)
     return left
 
 
@@ -276,9 +305,9 @@ def test_the_next_run_removes_what_killed_writers_left(one: bool, tmp_path: Path
     if one:
         atomic.write(tmp_path / "a", [b"x"], overwrite=False)
     else:
-        atomic_set.write(tmp_path, files(NEW), overwrite=False)
+        write(tmp_path, files(NEW), overwrite=False)
     assert {path.name for path in tmp_path.iterdir()} == {kept.name, *(["a"] if one else NEW)}
-    assert (kept / atomic_set.FORMER / "a").exists()
+    assert (kept / atomic.FORMER / "a").exists()
 
 
 def test_the_folder_of_a_running_process_is_left_alone(tmp_path: Path) -> None:
@@ -288,7 +317,7 @@ def test_the_folder_of_a_running_process_is_left_alone(tmp_path: Path) -> None:
             atomic.write(tmp_path / "other", [b"inner"], overwrite=True)
             yield each
 
-    atomic_set.write(tmp_path, some(), overwrite=False)
+    write(tmp_path, some(), overwrite=False)
     assert held(tmp_path) == NEW | {"other": b"inner"}
 
 
@@ -303,7 +332,7 @@ def test_a_folder_swept_before_it_is_locked_is_made_again(tmp_path: Path, monkey
         lock(descriptor)
 
     monkeypatch.setattr(atomic, "lock", late)
-    atomic_set.write(tmp_path, files(NEW), overwrite=False)
+    write(tmp_path, files(NEW), overwrite=False)
     assert len(rounds) == 2
     assert held(tmp_path) == NEW
 
@@ -311,12 +340,15 @@ def test_a_folder_swept_before_it_is_locked_is_made_again(tmp_path: Path, monkey
 #: Replaces a set by another one for ever; all of its files say which they belong to.
 WRITER = """
 import itertools, pathlib, sys
-from sparklod_cli.system import atomic_set
+from sparklod_cli.system.output import Output, Siblings
+siblings = Siblings(lambda name: name != "a")
 folder = pathlib.Path(sys.argv[1])
 print("ready", flush=True)
 for number in itertools.count():
     text = [str(number).encode() * 1000]
-    atomic_set.write(folder, ((name, text) for name in ("a-0", "a-1", "a-2", "a")), overwrite=True)
+    with Output(folder / "a", overwrite=True, siblings=siblings) as out:
+        for name in ("a-0", "a-1", "a-2", "a"):
+            out.write(name, text)
 """
 
 
