@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from ..codecs.reader import Reader
     from .settings import BakeSettings
 
-#: Part of the memory available that a bake may take unless told otherwise: other programs need some, and figures for it
-#: are estimates. Chosen.
+#: Default share of the available memory that a bake may take: other programs need some, and these figures are
+#: estimates. Chosen.
 MEMORY_SHARE = 0.75
 
 #: Factor of the memory that an error asks for, since `format_size` rounds by up to 5 %.
@@ -27,39 +27,38 @@ ENOUGH = 1.05
 #: Bytes of a process with numba and all kernels, before it has read anything.
 PROCESS = 200_000_000
 
-#: Bytes of a splat of the input while its tree is refined, besides the tree, and of the pictures for that. Measured
-#: with up to 700,000 nodes.
+#: Bytes per splat of the input while its tree is refined, besides the tree, and bytes of the pictures. Measured with up
+#: to 700,000 nodes.
 OF_REFINED, PICTURES = SplatBytes(500, 40), 310_000_000
 
-#: Most and least splats of a block. More make a block no faster, and fewer make its margins too large a part of it.
+#: Most and least splats of a block. More are no faster, and fewer make its margins too large a part of it.
 MOST_BLOCK_SPLATS, LEAST_BLOCK_SPLATS = 1 << 21, 1 << 16
 
-
-#: Out of core, a node of those that are read, gathered or encoded at once, and how many these are.
+#: Out of core, bytes per node of a window, which is read, gathered or encoded at once, and its nodes.
 OF_WINDOW, WINDOW = SplatBytes(230, 50), 1 << 19
 
-#: Out of core, a splat of the whole scene while its nodes are put in order, before and after that for streaming.
+#: Out of core, bytes per splat of the whole scene while its nodes are ordered, other than for streaming.
 OF_ORDER = 20
 
-#: Families a splat of the input, bytes of each while parts of them are put in the order for streaming, and besides
-#: while they are divided into parts. Measured with 40 million.
+#: Families per splat of the input, bytes of each while parts of them are ordered for streaming, and further bytes while
+#: they are divided into parts. Measured with 40 million.
 FAMILIES, OF_FAMILY, OF_DIVIDED = 0.4, 40, 50
 
 
 def default_memory() -> int | None:
-    """Return bytes that a bake may take unless told otherwise; None where the system does not say what is available."""
+    """Return the default memory of a bake in bytes; None if the system does not report what is available."""
     available = machine.available_memory()
     return None if available is None else int(MEMORY_SHARE * available)
 
 
 def in_memory_bytes(method: str, splats: int, sh_degree: int, *, refines: bool = False) -> int:
-    """Return bytes that a bake in memory takes at its peak; `refines` if its tree is refined."""
+    """Return the peak memory of a bake in memory, bytes; `refines` if its tree is refined."""
     refining = PICTURES + OF_REFINED.of(splats, sh_degree) if refines else 0
     return PROCESS + BUILDERS[method].in_memory.of(splats, sh_degree) + refining
 
 
 def in_memory_bytes_of(header: Reader, settings: BakeSettings) -> int:
-    """Return bytes that the bake of an input in memory takes at its peak."""
+    """Return the peak memory of the bake of an input in memory, bytes."""
     refines = settings.refine is not None
     return in_memory_bytes(settings.method, header.count, header.sh_degree, refines=refines)
 
@@ -73,11 +72,12 @@ def most_in_memory(memory: int, method: str, sh_degree: int, *, refines: bool = 
 def out_of_core_bytes(
     method: str, splats: int, sh_degree: int, block_splats: int, *, in_chunks: bool = False, threads: int = 1
 ) -> int:
-    """Return bytes that a bake out of core takes at its peak.
+    """Return the peak memory of a bake out of core, bytes.
 
     Args:
-        splats, sh_degree: of the input; `sh_degree` as far as it is kept.
-        in_chunks: families are put in an order for streaming at the end.
+        splats: of the input.
+        sh_degree: of the tree.
+        in_chunks: the output has the order for streaming.
     """
     from ..lod.chunk_order import MOST_FAMILIES, family_bytes  # takes long to load, and this is asked out of core only
 
@@ -90,7 +90,7 @@ def out_of_core_bytes(
 
 
 def windows_within(memory: int | None, splats: int, sh_degree: int, threads: int) -> int:
-    """Return how many windows of nodes the memory of a bake holds at once: no more than threads, and at least one."""
+    """Return the number of windows of nodes that fit into memory at once, from one to `threads`."""
     window = OF_WINDOW.of(min(2 * splats, WINDOW), sh_degree)
     if memory is None or not window:
         return threads
@@ -98,24 +98,20 @@ def windows_within(memory: int | None, splats: int, sh_degree: int, threads: int
 
 
 def scratch_bytes(method: str, splats: int, sh_degree: int) -> int:
-    """Return bytes that the scratch folder takes at its peak, without what is unpacked of the input.
-
-    Args:
-        splats, sh_degree: of the input; `sh_degree` as far as it is kept.
-    """
+    """Return the peak size of the scratch folder, bytes, without the unpacked input; arguments as `out_of_core_bytes`."""
     return BUILDERS[method].in_scratch.of(splats, sh_degree)
 
 
 def block_splats_within(
     memory: int | None, method: str, splats: int, sh_degree: int, *, in_chunks: bool = False, threads: int = 1
 ) -> int:
-    """Return the splats of a block, a power of two, so that nearly the same memory gives the same blocks.
+    """Return the size of blocks, a power of two, so that nearly the same memory gives the same blocks.
 
     Args:
         memory: bytes that a bake may take; None for any number.
 
     Raises:
-        OutOfMemoryError: the memory is too little for blocks of `LEAST_BLOCK_SPLATS`.
+        OutOfMemoryError: too little memory for blocks of `LEAST_BLOCK_SPLATS`.
     """
     size = MOST_BLOCK_SPLATS
     needed = functools.partial(out_of_core_bytes, method, splats, sh_degree, in_chunks=in_chunks, threads=threads)

@@ -159,7 +159,7 @@ def test_too_little_memory_for_a_whole_tree_is_refused(tmp_path: Path, stand_in:
 def test_blocks_that_were_asked_for_are_not_used(tmp_path: Path, stand_in: StandIn) -> None:
     said: list[str] = []
     bake(SOURCE, tmp_path / "out.spz", REFINE, resources=Resources(block_splats=1 << 16), say=said.append)
-    assert said[0].endswith("goes on in memory, although blocks were asked for: --refine fits a whole tree")
+    assert said[0].endswith("goes on in memory, although blocks were requested: --refine fits a whole tree")
     assert said[1] == "fit 1 of 1: 2 % 30.0 -> 32.5 dB"
 
 

@@ -1,4 +1,4 @@
-"""Blocks that a scene is cut into, of about as many splats each, and the tree of stages that joins them."""
+"""Division of a scene into blocks of about as many splats each, and the tree of stages that joins them."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from numpy.typing import NDArray
 from ...lod.stage_records import Region
 from ...model.splats import FloatArray
 
-#: The most regions that a join takes: three splits in two.
+#: The most regions that are joined at once: those of three splits.
 CHILDREN = 8
 
-#: Share of the centres at either end of an axis that do not count for its extent: a few splats of a scan lie far away.
+#: Share of the centres at either end of an axis that is left out of its extent: a few splats of a scan lie far away.
 OUTLIERS = 0.02
 
 
 @dataclass(frozen=True)
 class BuildStage:
-    """A stage of the build.
+    """Stage of the build.
 
     Attributes:
-        number: of the stage; those that it joins have smaller ones.
-        region: of the scene; None for all of it, which is the last stage.
-        block: of splats that it begins with; None where it joins other stages.
-        children: numbers of the stages that it joins, in ascending order of their blocks.
-        blocks: how many blocks lie below it.
+        number: greater than those of its children.
+        region: of the scene; None for the whole scene, the last stage.
+        block: that the stage builds on; None for a join of other stages.
+        children: numbers of the joined stages, in ascending order of their blocks.
+        blocks: number of blocks below the stage.
     """
 
     number: int
@@ -44,7 +44,7 @@ class BlockDivision:
     Attributes:
         splits: (axis, value, low, high) of each split: centres below the value are on the low side. A side is the
             number of another split, or ~number of a block.
-        stages: by number, in an order in which they can be built.
+        stages: by number, children first.
     """
 
     splits: tuple[tuple[int, float, int, int], ...]
@@ -57,7 +57,7 @@ class BlockDivision:
 
     @property
     def groups(self) -> tuple[range, ...]:
-        """Runs of blocks whose stages are joined by the same one."""
+        """Ranges of blocks whose stages have the same parent."""
         parents = {child: stage.number for stage in self.stages for child in stage.children}
         joined = [parents.get(stage.number) for stage in self.stages if stage.block is not None]
         ends = [*(k for k in range(1, self.count) if joined[k] != joined[k - 1]), self.count]
@@ -67,7 +67,7 @@ class BlockDivision:
         """Sort splats by their blocks, stably.
 
         Returns:
-            (N,) the splats, and (blocks + 1,) where those of each block begin.
+            (N,) the splats, and (blocks + 1,) the first one of each block, and N.
         """
         parts: list[NDArray[np.int64]] = [np.empty(0, np.int64)] * self.count
         pending = [(0 if self.splits else ~0, np.arange(len(center)))]
@@ -84,7 +84,7 @@ class BlockDivision:
 
 @dataclass(frozen=True)
 class _Part:
-    """A part of the scene: a block, or two halves."""
+    """Part of a scene: a block, or two halves."""
 
     side: int
     region: Region
@@ -92,7 +92,7 @@ class _Part:
 
 
 class _Cut:
-    """Cuts a scene by a sample of its centres."""
+    """Division of a scene by a sample of its centres, while it is made."""
 
     def __init__(self, sample: FloatArray) -> None:
         self.sample = sample
@@ -101,7 +101,7 @@ class _Cut:
         self.blocks = 0
 
     def part(self, index: NDArray[np.int64], count: int, region: Region) -> _Part:
-        """Cut a region, which has these centres of the sample, into at most so many blocks."""
+        """Divide a region, which has these centres of the sample, into at most `count` blocks."""
         split = self._split(index, count) if count > 1 else None
         if split is None:
             self.blocks += 1
@@ -116,7 +116,7 @@ class _Cut:
         return _Part(number, region, (low, high))
 
     def _split(self, index: NDArray[np.int64], count: int) -> tuple[int, float] | None:
-        """Return the axis, and where to cut it; None where all centres are the same."""
+        """Return the axis and the value of a split; None if all centres are the same."""
         center = self.sample[index]
         if not len(center):
             return None
@@ -130,7 +130,7 @@ class _Cut:
         return None
 
     def stage(self, part: _Part, region: Region | None) -> BuildStage:
-        """Make the stages of a part, the last one of this region."""
+        """Make the stages of a part; the last one has this region."""
         below = [self.stage(each, each.region) for each in _joined(part)] if part.halves else []
         stage = BuildStage(
             number=len(self.stages),
@@ -145,20 +145,19 @@ class _Cut:
 
 def _joined(part: _Part) -> list[_Part]:
     """Return the parts, at most `CHILDREN`, that one stage joins."""
-    found = [part]
+    parts = [part]
     for _ in range(int(math.log2(CHILDREN))):
-        found = [each for some in found for each in some.halves or (some,)]
-    return found
+        parts = [half for each in parts for half in each.halves or (each,)]
+    return parts
 
 
 def _moved(corner: tuple[float, float, float], axis: int, value: float) -> tuple[float, float, float]:
-    """Return a corner with another coordinate."""
     x, y, z = (value if each == axis else corner[each] for each in range(3))
     return x, y, z
 
 
 def cut_into_blocks(sample: FloatArray, count: int, block_splats: int) -> BlockDivision:
-    """Cut a scene into blocks of at most about `block_splats`, by a sample of its centres.
+    """Divide a scene into blocks of about `block_splats` at most, by a sample of its centres.
 
     Args:
         sample: (n, 3) centres, evenly drawn; without any, the scene is one block.

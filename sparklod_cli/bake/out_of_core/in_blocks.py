@@ -1,4 +1,4 @@
-"""A bake out of core: the splats of an input are scattered to blocks in a store, and stages build their tree."""
+"""A bake out of core: splats are sorted into blocks in a store, and stages build their tree."""
 
 from __future__ import annotations
 
@@ -32,14 +32,25 @@ from .job import ORDER, PUBLISHED, ROOT, Engine, Job, Task, clean_of, encoded_of
 from .order import WINDOW_NODES, Rows, encode, encoded_chunk, fill_rows, node_stream, put_order, rows_of, splats_of
 from .store import Arrays
 
-#: How many times larger than requested a block may be before the scene is cut again, by what was found of all of it.
+#: Largest size of a block, as a multiple of the requested one; a scene with a larger block is divided again. Chosen.
 SLACK = 1.3
 
-#: How often a scene is cut at most: by the first look, and by an even sample of what is kept.
+#: How often a scene is divided at most: by samples of the input, then by an even sample of the selected splats.
 ROUNDS = 2
 
 #: Work of a join for each splat below it, as a share of that of a block: a few per cent of the nodes are left. Chosen.
 JOIN_WORK = 0.1
+
+#: Splats of an input part, unless blocks are smaller, and the most parts: a part makes a file for each group of blocks,
+#: of which there should not be too many. Chosen.
+PART_SPLATS, MAX_PARTS = 1 << 19, 256
+
+#: Ranges of the input that are sampled first: for each block, at least, and at most; and splats of each. The sizes of
+#: blocks then differ by a few per cent, even if neighbours in the file are neighbours in space. Chosen.
+RANGES_OF_BLOCK, MIN_RANGES, MAX_RANGES, RANGE_SPLATS = 32, 64, 512, 256
+
+#: Splats of the sample that a builder plans by, or a few more. Chosen.
+SAMPLE_SPLATS = 1 << 18
 
 
 @dataclass
@@ -47,10 +58,9 @@ class InBlocks:
     """Workspace in a scratch folder, with the steps of `in_memory.InMemory`.
 
     Attributes:
-        job: of all tasks; `build` and `order` add what they find out.
-        block_splats: of a block, about.
-        windows: how many windows of nodes are encoded at once.
-        progress: called with how much of a stage is done.
+        job: of all tasks; `build` and `order` fill it in.
+        block_splats: approximate size of a block.
+        windows: number of windows of nodes that are encoded at once.
     """
 
     job: Job
@@ -66,11 +76,11 @@ class InBlocks:
         stream, settings = self.job.stream, self.job.settings
         if not stream.count:
             settings.selection.check(SelectionTally())
-        findings = self.scatter()
+        summary = self._scatter()
         self.clock.end("read")
-        self.output.check(findings.statistics)
+        self.output.check(summary.statistics)
         setting = getattr(settings, BUILDERS[settings.method].setting)
-        plan = self.job.builder().plan(findings.bounds, splats_of(findings.sample), setting)
+        plan = self.job.builder().plan(summary.bounds, splats_of(summary.sample), setting)
         self.job = job = dataclasses.replace(self.job, plan=plan)
         self.engine.run("building", list(_stages(job)), job, self.progress)
         self.clock.end("build")
@@ -80,14 +90,14 @@ class InBlocks:
             format=stream.format,
             notes=settings.notes_on(stream),
             read=stream.count,
-            splats=findings.tally.selected,
-            dropped=findings.tally.dropped,
+            splats=summary.tally.selected,
+            dropped=summary.tally.dropped,
             method=settings.method,
             blocks=job.blocks.count,
         )
 
     def order(self, tree: BuiltTree) -> None:
-        """Put the order of all nodes into the store."""
+        """Order the nodes; put the plan of each window into the store."""
         job = self.job
         stages = [job.store.get(stage_of(stage.number)) for stage in job.blocks.stages]
         self.job = job = dataclasses.replace(job, families=tuple(int(stage["counts"][0]) for stage in stages))
@@ -103,7 +113,7 @@ class InBlocks:
         tree.nodes = node_stream(job, count)
 
     def encode(self, tree: BuiltTree, encoder: Encoder) -> Get:
-        """Encode the windows of the tree; whatever interrupts the rest finds its output published, or a part of it."""
+        """Encode the windows of the tree; the output may be in place if the bake is interrupted from then on."""
         job = dataclasses.replace(self.job, encoder=encoder)
         tasks = [
             Task(encoded_of(window), encode, (window,), weight=part.stop - part.start, together=self.windows)
@@ -114,17 +124,20 @@ class InBlocks:
         job.store.put(PUBLISHED, {})
         return functools.partial(encoded_chunk, job.store)
 
-    def scatter(self) -> Findings:
-        """Read the input and put its splats into blocks, of which `job` knows then; return what was found.
+    def _scatter(self) -> InputSummary:
+        """Divide the scene into blocks and sort the splats of the input into them.
 
         Raises:
             InvalidSplatsError: no tree can be made of them.
         """
-        job, block_splats = self.job, self.block_splats
-        job = dataclasses.replace(job, parts=parts_of(job.stream.count, block_splats))
-        center, share = first_look(job.stream, job.settings, -(-job.stream.count // block_splats))
-        blocks = cut_into_blocks(center, math.ceil(share * job.stream.count), block_splats)
-        job = dataclasses.replace(job, blocks=blocks)
+        job, block_splats, count = self.job, self.block_splats, self.job.stream.count
+        part_splats = max(min(block_splats, PART_SPLATS), -(-count // MAX_PARTS))
+        center, share = _sample_centers(job.stream, job.settings, -(-count // block_splats))
+        job = dataclasses.replace(
+            job,
+            parts=(0, *(part.stop for part in blocks_of(count, part_splats))),
+            blocks=cut_into_blocks(center, math.ceil(share * count), block_splats),
+        )
         while True:
             tasks = [
                 Task(job.part(number), scatter, (number,), weight=stop - start)
@@ -132,22 +145,150 @@ class InBlocks:
             ]
             self.engine.run("reading", tasks, job, self.progress)
             arrays = [job.store.get(task.name) for task in tasks]
-            parts = [Findings.from_arrays(each) for each in arrays]
-            findings = Findings.merged(parts)
-            check_findings(findings, job.settings)
+            parts = [InputSummary.from_arrays(each) for each in arrays]
+            summary = InputSummary.merged(parts)
+            job.settings.selection.check(summary.tally)
+            check_transformed(summary.beyond)
+            check_visible(summary.bounds.smallest)
             selected = tuple(itertools.accumulate((part.tally.selected for part in parts), initial=0))
             self.job = job = dataclasses.replace(job, selected=selected)
             largest = int(np.sum([np.diff(each["first"]) for each in arrays], axis=0).max())
-            again = cut_into_blocks(findings.sample[:, :3], findings.tally.selected, block_splats)
+            again = cut_into_blocks(summary.sample[:, :3], summary.tally.selected, block_splats)
             if largest <= SLACK * block_splats or job.round + 1 == ROUNDS or again == job.blocks:
-                return findings
+                return summary
             for part, group in itertools.product(range(len(parts)), range(len(job.blocks.groups))):
                 job.store.remove(job.splats(part, group))
             job = dataclasses.replace(job, blocks=again, round=job.round + 1)
 
 
+def _read_leaves(
+    stream: Reader, start: int, stop: int, settings: BakeSettings
+) -> Iterator[tuple[Splats, SelectionTally, int]]:
+    """Yield the leaves of a range of the input in pieces.
+
+    Yields:
+        selected splats, transformed; the tally of all; and how many selected splats left the range of float32.
+    """
+    for splats in stream.blocks(start, stop):
+        selected, tally = select(splats, settings, start=start, total=stream.count)
+        start += len(splats)
+        leaves, beyond = transform(selected, settings.transform)
+        yield leaves, tally, beyond
+
+
+def _sample_centers(stream: Reader, settings: BakeSettings, blocks: int) -> tuple[FloatArray, float]:
+    """Return (n, 3) centres of selected splats, from ranges all over the input, and the share of selected splats.
+
+    Args:
+        blocks: approximate number of blocks; for one, nothing is read.
+    """
+    if blocks == 1:
+        return np.empty((0, 3), np.float32), 1.0
+    ranges = min(max(blocks * RANGES_OF_BLOCK, MIN_RANGES), MAX_RANGES)
+    starts = np.linspace(0, max(0, stream.count - RANGE_SPLATS), ranges).astype(np.int64).tolist()
+    centers, seen, end = [np.empty((0, 3), np.float32)], 0, 0
+    for start in starts:
+        begin, end = max(start, end), min(start + RANGE_SPLATS, stream.count)
+        for leaves, tally, _ in _read_leaves(stream, begin, end, settings):
+            seen += tally.count
+            centers.append(leaves.center[leaves.is_valid()])
+    center = np.concatenate(centers)
+    return center, len(center) / max(1, seen)
+
+
+@dataclass(frozen=True, eq=False)
+class InputSummary:
+    """Counts, bounds, sample and statistics of the splats of an input, or a part of it.
+
+    Attributes:
+        tally: of selected and dropped splats.
+        beyond: number of selected splats that left the range of float32 when they were transformed.
+        limits: (2, 4) float64 least and largest centre and size of selected splats, see `Bounds`.
+        sample: even sample of selected splats.
+        statistics: of selected splats.
+    """
+
+    tally: SelectionTally
+    beyond: int
+    limits: NDArray[np.float64]
+    sample: Rows
+    statistics: Statistics
+
+    @classmethod
+    def of(
+        cls, splats: Splats, tally: SelectionTally, beyond: int, stride: int, needed: Collection[str]
+    ) -> InputSummary:
+        """Examine selected splats, sampled at this stride."""
+        bounds = Bounds.of(splats)
+        limits = np.array([[*bounds.low, bounds.smallest], [*bounds.high, bounds.largest]])
+        sample = rows_of(splats.take(slice(None, None, stride)))
+        return cls(tally, beyond, limits, sample, Statistics.of(splats, needed=needed))
+
+    @classmethod
+    def merged(cls, parts: Sequence[InputSummary]) -> InputSummary:
+        """Merge the summaries of one or more parts, in their order."""
+        limits = np.stack([part.limits for part in parts])
+        return cls(
+            functools.reduce(SelectionTally.then, [part.tally for part in parts]),
+            sum(part.beyond for part in parts),
+            np.stack([limits[:, 0].min(axis=0), limits[:, 1].max(axis=0)]),
+            np.concatenate([part.sample for part in parts]),
+            Statistics.merged([part.statistics for part in parts]),
+        )
+
+    def arrays(self) -> Arrays:
+        """Return arrays for `from_arrays`."""
+        first = -1 if self.tally.first_invalid is None else self.tally.first_invalid
+        counts = [self.beyond, self.tally.count, first, *(self.tally.dropped.get(reason, 0) for reason in REASONS)]
+        return {
+            "counts": np.array(counts, np.int64),
+            "limits": self.limits,
+            "sample": self.sample,
+            "statistics": self.statistics.array(),
+        }
+
+    @classmethod
+    def from_arrays(cls, arrays: Arrays) -> InputSummary:
+        """Return the summary of `arrays`."""
+        beyond, count, first, *dropped = arrays["counts"].tolist()
+        reasons = {reason: number for reason, number in zip(REASONS, dropped, strict=True) if number}
+        tally = SelectionTally(count, reasons, None if first < 0 else first)
+        return cls(tally, beyond, arrays["limits"], arrays["sample"], Statistics.from_array(arrays["statistics"]))
+
+    @property
+    def bounds(self) -> Bounds:
+        """Bounds of selected splats."""
+        (*low, smallest), (*high, largest) = self.limits.tolist()
+        return Bounds(np.array(low), np.array(high), smallest, largest)
+
+
+def scatter(job: Job, number: int, *, threads: int, progress: Progress) -> None:
+    """Sort the splats of an input part into blocks; a task.
+
+    Results, by group of blocks: `rows`, sorted by block, and `index`, places among the selected splats of this part;
+    then the summary, with `first`, the first splat of each block.
+    """
+    start, stop = job.parts[number : number + 2]
+    rows = np.empty((stop - start, width_of(job.sh_degree)), np.float32)
+    used, tally, beyond = 0, SelectionTally(), 0
+    for leaves, read, outside in _read_leaves(job.stream, start, stop, job.settings):
+        fill_rows(leaves, rows[used : used + len(leaves)], threads)
+        used += len(leaves)
+        tally, beyond = tally.then(read), beyond + outside
+        progress("reading", tally.count, stop - start, "splat")
+    rows = rows[:used]
+    index, first = job.blocks.sort(rows[:, :3])
+    for group, members in enumerate(job.blocks.groups):
+        here = index[first[members.start] : first[members.stop]]
+        job.store.put(job.splats(number, group), {"rows": rows[here], "index": here.astype(np.int32)})
+    stride = max(1, job.stream.count // SAMPLE_SPLATS)
+    with on_threads(threads):
+        summary = InputSummary.of(splats_of(rows, threads), tally, beyond, stride, job.needed)
+    job.store.put(job.part(number), {**summary.arrays(), "first": first})
+
+
 def _stages(job: Job) -> Iterator[Task]:
-    """Yield the tasks of all stages, and those that remove what they no longer need, as soon as that can be."""
+    """Yield the tasks of all stages, and those that remove splats as soon as no stage needs them."""
     blocks = job.blocks
     ends = {group.stop - 1: number for number, group in enumerate(blocks.groups)}
     share = job.selected[-1] // blocks.count
@@ -164,8 +305,8 @@ def _stages(job: Job) -> Iterator[Task]:
 def build_stage(job: Job, number: int, *, threads: int, progress: Progress) -> None:
     """Run a stage of the build; a task.
 
-    Results: families, whose nodes are `rows`; nodes without a parent, or the root of the last stage; at last numbers
-    and statistics of the nodes.
+    Results: families, whose nodes are `rows`; nodes without a parent, or the root of the last stage; then counts and
+    statistics of the nodes.
     """
     stage, builder = job.blocks.stages[number], job.builder()
     with on_threads(threads):
@@ -193,15 +334,14 @@ def clean(job: Job, group: int, *, threads: int, progress: Progress) -> None:
 
 
 def _begun(job: Job, stage: BuildStage, threads: int) -> Pending:
-    """Return the nodes that a stage begins with."""
+    """Return the nodes that a stage builds on."""
     if stage.block is None:
         return Pending.concat([Pending(job.store.get(pending_of(child))) for child in stage.children])
-    splats, index = block_of(job, stage.block, threads)
-    return job.builder().leaves(splats, index, job.plan)
+    return job.builder().leaves(*_read_block(job, stage.block, threads), job.plan)
 
 
-def block_of(job: Job, block: int, threads: int) -> tuple[Splats, NDArray[np.int64]]:
-    """Return the splats of a block, and the place of each among all that are kept."""
+def _read_block(job: Job, block: int, threads: int) -> tuple[Splats, NDArray[np.int64]]:
+    """Return the splats of a block, and the place of each among all selected splats."""
     group = next(number for number, blocks in enumerate(job.blocks.groups) if block in blocks)
     begin = job.blocks.groups[group].start
     ranges = []
@@ -220,167 +360,3 @@ def block_of(job: Job, block: int, threads: int) -> tuple[Splats, NDArray[np.int
         index[here] += job.selected[part]
         at = here.stop
     return splats_of(rows, threads), index
-
-
-#: Splats of a part, unless blocks are smaller, and the most parts: their splats of all blocks are pieces of files, of
-#: which there should not be too many. Chosen.
-PART_SPLATS, MAX_PARTS = 1 << 19, 256
-
-#: Ranges of the input that are read for a first look: for each block, at least, and at most; and splats of each. Blocks
-#: differ by a few per cent in their splats then, even where neighbours in the file are neighbours in space. Chosen.
-RANGES_OF_BLOCK, MIN_RANGES, MAX_RANGES, RANGE_SPLATS = 32, 64, 512, 256
-
-#: Splats of the sample that a builder plans by, or a few more. Chosen.
-SAMPLE_SPLATS = 1 << 18
-
-
-def parts_of(count: int, block_splats: int) -> tuple[int, ...]:
-    """Return where each part of the input begins, and at last the count; an empty input has no part."""
-    length = max(min(block_splats, PART_SPLATS), -(-count // MAX_PARTS))
-    return (0, *(part.stop for part in blocks_of(count, length)))
-
-
-def leaves_of(
-    stream: Reader, start: int, stop: int, settings: BakeSettings
-) -> Iterator[tuple[Splats, SelectionTally, int]]:
-    """Yield the leaves that a range of the input becomes, block by block.
-
-    Yields:
-        those that are kept, transformed; the tally of all; and how many of those that are kept left the range of
-        float32.
-    """
-    for splats in stream.blocks(start, stop):
-        selected, tally = select(splats, settings, start=start, total=stream.count)
-        start += len(splats)
-        leaves, beyond = transform(selected, settings.transform)
-        yield leaves, tally, beyond
-
-
-def first_look(stream: Reader, settings: BakeSettings, blocks: int) -> tuple[FloatArray, float]:
-    """Return (n, 3) centres of selected splats, from ranges all over the input, and the share of selected splats.
-
-    Args:
-        blocks: that the scene will be cut into, about; for a single one nothing is read.
-    """
-    if blocks == 1:
-        return np.empty((0, 3), np.float32), 1.0
-    ranges = min(max(blocks * RANGES_OF_BLOCK, MIN_RANGES), MAX_RANGES)
-    starts = np.linspace(0, max(0, stream.count - RANGE_SPLATS), ranges).astype(np.int64).tolist()
-    centers, seen, end = [np.empty((0, 3), np.float32)], 0, 0
-    for start in starts:
-        begin, end = max(start, end), min(start + RANGE_SPLATS, stream.count)
-        for leaves, tally, _ in leaves_of(stream, begin, end, settings):
-            seen += tally.count
-            centers.append(leaves.center[leaves.is_valid()])
-    center = np.concatenate(centers)
-    return center, len(center) / max(1, seen)
-
-
-@dataclass(frozen=True, eq=False)
-class Findings:
-    """Counts, bounds, sample and statistics of splats that were read.
-
-    Attributes:
-        tally: what became of them.
-        beyond: how many of those that are kept left the range of float32 when they were transformed.
-        box: (2, 3) float64 corners of the box of the centres that are kept, world units; infinite without any.
-        sizes: (2,) float64 range of their sizes, 2 * max(scale), world units.
-        sample: rows of an even sample of them.
-    """
-
-    tally: SelectionTally
-    beyond: int
-    box: NDArray[np.float64]
-    sizes: NDArray[np.float64]
-    sample: Rows
-    statistics: Statistics
-
-    @classmethod
-    def of(cls, splats: Splats, tally: SelectionTally, beyond: int, stride: int, needed: Collection[str]) -> Findings:
-        """Examine splats that are kept; every so many are the sample."""
-        bounds = Bounds.of(splats)
-        sample = rows_of(splats.take(slice(None, None, stride)))
-        found = Statistics.of(splats, needed=needed)
-        sizes = np.array([bounds.smallest, bounds.largest])
-        return cls(tally, beyond, np.stack([bounds.low, bounds.high]), sizes, sample, found)
-
-    @classmethod
-    def merged(cls, parts: Sequence[Findings]) -> Findings:
-        """Return those of one part or more, in the order of the parts."""
-        tally = SelectionTally()
-        for part in parts:
-            tally = tally.then(part.tally)
-        boxes, sizes = (np.stack([getattr(part, name) for part in parts]) for name in ("box", "sizes"))
-        return cls(
-            tally,
-            sum(part.beyond for part in parts),
-            np.stack([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)]),
-            np.array([sizes[:, 0].min(), sizes[:, 1].max()]),
-            np.concatenate([part.sample for part in parts]),
-            Statistics.merged([part.statistics for part in parts]),
-        )
-
-    def arrays(self) -> Arrays:
-        """As arrays, of which `from_arrays` makes them again."""
-        first = -1 if self.tally.first_invalid is None else self.tally.first_invalid
-        counts = [self.beyond, self.tally.count, first, *(self.tally.dropped.get(reason, 0) for reason in REASONS)]
-        return {
-            "counts": np.array(counts, np.int64),
-            "box": self.box,
-            "sizes": self.sizes,
-            "sample": self.sample,
-            "statistics": self.statistics.array(),
-        }
-
-    @classmethod
-    def from_arrays(cls, arrays: Arrays) -> Findings:
-        """Return the findings of `arrays`."""
-        beyond, count, first, *dropped = arrays["counts"].tolist()
-        reasons = {reason: number for reason, number in zip(REASONS, dropped, strict=True) if number}
-        return cls(
-            SelectionTally(count, reasons, None if first < 0 else first),
-            beyond,
-            arrays["box"],
-            arrays["sizes"],
-            arrays["sample"],
-            Statistics.from_array(arrays["statistics"]),
-        )
-
-    @property
-    def bounds(self) -> Bounds:
-        """Bounds of the splats that are kept."""
-        smallest, largest = self.sizes.tolist()
-        return Bounds(self.box[0], self.box[1], smallest, largest)
-
-
-def check_findings(findings: Findings, settings: BakeSettings) -> None:
-    """Check that a tree can be made of a whole scene; raise `InvalidSplatsError` as `bake` does."""
-    settings.selection.check(findings.tally)
-    check_transformed(findings.beyond)
-    check_visible(float(findings.sizes[0]))
-
-
-def scatter(job: Job, number: int, *, threads: int, progress: Progress) -> None:
-    """Put the splats of a part of the input into blocks; a task.
-
-    Results, by group of blocks: `rows`, sorted by block, and `index`, places among those that are kept of this part; at
-    last the findings, with `first`, where the splats of each block begin.
-    """
-    start, stop = job.parts[number : number + 2]
-    rows = np.empty((stop - start, width_of(job.sh_degree)), np.float32)
-    used, tally, beyond = 0, SelectionTally(), 0
-    for leaves, dropped, outside in leaves_of(job.stream, start, stop, job.settings):
-        fill_rows(leaves, rows[used : used + len(leaves)], threads)
-        used += len(leaves)
-        tally, beyond = tally.then(dropped), beyond + outside
-        progress("reading", tally.count, stop - start, "splat")
-    rows = rows[:used]
-    blocks = job.blocks
-    index, first = blocks.sort(rows[:, :3])
-    for group, members in enumerate(blocks.groups):
-        here = index[first[members.start] : first[members.stop]]
-        job.store.put(job.splats(number, group), {"rows": rows[here], "index": here.astype(np.int32)})
-    stride = max(1, job.stream.count // SAMPLE_SPLATS)
-    with on_threads(threads):
-        findings = Findings.of(splats_of(rows, threads), tally, beyond, stride, job.needed)
-    job.store.put(job.part(number), {**findings.arrays(), "first": first})
