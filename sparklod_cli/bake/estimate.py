@@ -98,7 +98,7 @@ def windows_within(memory: int | None, splats: int, sh_degree: int, threads: int
 
 
 def scratch_bytes(method: str, splats: int, sh_degree: int) -> int:
-    """Return the peak size of the scratch folder, bytes, without the unpacked input; arguments as `out_of_core_bytes`."""
+    """Return the peak size of the scratch folder, bytes, without the unpacked input."""
     return BUILDERS[method].in_scratch.of(splats, sh_degree)
 
 

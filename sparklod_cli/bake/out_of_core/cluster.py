@@ -1,4 +1,4 @@
-"""Dask clusters: one that runs already, or one of processes on this machine, for as long as it is needed."""
+"""Dask clusters: a running one, or processes on this machine that are started and ended with a bake."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from ...system.threads import thread_count
 from ..estimate import default_memory
 from .cluster_engine import ClusterEngine, Connection
 
-#: Seconds that a scheduler, or the workers of a cluster, are waited for.
+#: Seconds to wait for a scheduler, or for workers.
 PATIENCE = 30
 
-#: How often a task is tried on another worker after one was lost with it.
+#: How often a task is repeated on another worker after one was lost with it.
 LOSSES = 2
 
-#: Part of the machine's free memory beyond which a worker of our own is ended, before the system ends something else.
+#: Share of the machine's free memory at which a worker started here is ended, before the system ends another process.
 MEMORY_SHARE = 0.9
 
-#: Part of the memory of a worker of a cluster that runs that its tasks take: Dask ends it at 0.95, and pauses at 0.8.
+#: Share of the memory of a worker of a running cluster for its tasks: Dask pauses it at 0.8 and ends it at 0.95.
 TASK_SHARE = 0.7
 
-#: Bytes that a process takes before it has read anything: Python, Dask, numba and compiled kernels.
+#: Bytes of a process that has read nothing: Python, Dask, numba and compiled kernels.
 LEAST_MEMORY = 500_000_000
 
-#: How Dask runs processes of our own.
+#: Dask configuration of processes started here.
 OWN_CONFIG = {
     # It would set variables in this process's environment, too.
     "distributed.nanny.pre-spawn-environ": {},
@@ -46,16 +46,16 @@ OWN_CONFIG = {
     "distributed.worker.http.routes": [],
 }
 
-#: Loggers of Dask and what it is made of, and a level that nothing reaches.
+#: Loggers of Dask and its libraries, and a level that no message reaches.
 TALKERS, SILENT = ("distributed", "tornado"), logging.CRITICAL + 1
 
-#: What listens for requests on this machine alone.
+#: Address that only this machine reaches.
 LOOPBACK = "127.0.0.1"
 
-#: How the address of a scheduler begins that knows its clients by their certificates.
+#: Scheme of schedulers that authenticate their clients by certificates.
 TLS = "tls://"
 
-#: Variables by which Dask is given the files for that.
+#: Variables that name the files of certificates for Dask.
 CERTIFICATES = "DASK_DISTRIBUTED__COMM__TLS__CA_FILE, ..__CLIENT__CERT and ..__CLIENT__KEY"
 
 
@@ -64,9 +64,9 @@ class ClusterSettings:
     """Cluster that runs the tasks of a bake.
 
     Attributes:
-        scheduler: address of one that runs, as tcp://host:8786; None starts one on this machine.
-        workers: processes of the latter.
-        threads: of a task of a cluster that runs; those that the processes of a new one share.
+        scheduler: address of a running cluster, as tcp://host:8786; None starts processes on this machine.
+        workers: number of these processes.
+        threads: of a task on a running cluster; shared by all processes started here.
     """
 
     scheduler: str | None = None
@@ -81,16 +81,15 @@ def cluster(
     memory: int | None = None,
     say: Callable[[str], None] = lambda text: None,
 ) -> Iterator[ClusterEngine]:
-    """Yield an engine on a cluster, which is left alone at the end, or ended if it was started here.
+    """Yield an engine on a cluster, which is ended with the context if it was started here.
 
     Args:
-        memory: bytes that workers of our own share, or that a task of a cluster that runs may take; None for the part
-            of what is available, or of the memory of a worker, that is usual.
-        say: is told the address of the dashboard of a cluster that runs, whether anybody can give it tasks, and of
-            workers that are lost.
+        memory: bytes shared by workers started here, or for a task of a running cluster; None for the default share of
+            the available memory, or of the memory of a worker.
+        say: receives one-line messages for the user.
 
     Raises:
-        SparklodError: there is no distributed, or no scheduler or worker answers.
+        SparklodError: distributed is not installed, or no scheduler or worker answers.
     """
     with optional_import("--workers and --scheduler need Dask", "cluster"):
         import distributed  # noqa: F401  # sets its loggers up
@@ -117,7 +116,7 @@ def cluster(
 
 @contextlib.contextmanager
 def _connected(address: str) -> Iterator[Any]:
-    """Yield a client of a cluster that runs."""
+    """Yield a client of a running cluster."""
     from distributed import Client
 
     whole = address if "://" in address else f"tcp://{address}"
@@ -136,14 +135,14 @@ def _connected(address: str) -> Iterator[Any]:
             ) from None
         yield client
     finally:
-        with contextlib.suppress(TimeoutError):  # a scheduler that is gone
+        with contextlib.suppress(TimeoutError):  # the scheduler is gone
             client.close(timeout=1)
 
 
 def _credentials(address: str) -> Any:
-    """Return the certificates that Dask's configuration names; fail where an address needs some, or none can be read.
+    """Return the certificates that Dask's configuration names; fail if they are missing or unreadable.
 
-    Without them, Dask fails at the end of the process, after a minute.
+    Without this check, Dask fails at the end of the process, after a minute.
     """
     from distributed import Security
 
@@ -159,7 +158,7 @@ def _credentials(address: str) -> Any:
 
 @contextlib.contextmanager
 def _started(workers: int, threads: int, memory: int | None) -> Iterator[Any]:
-    """Yield a client of processes on this machine, which answer nobody else: other users reach their ports."""
+    """Yield a client of processes on this machine. They answer no other client: other users reach their ports."""
     import dask
     from distributed import Client, LocalCluster, Security
 
@@ -167,7 +166,7 @@ def _started(workers: int, threads: int, memory: int | None) -> Iterator[Any]:
         security = Security.temporary()  # for this cluster alone; workers get the key through pipes
     with contextlib.ExitStack() as stack:
         check_current_folder()
-        stack.enter_context(safe_path())  # until the end, as workers that are lost are started again
+        stack.enter_context(safe_path())  # until the end, as lost workers are started again
         folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="sparklod-"))
         # An argument of LocalCluster reaches its workers only, and the scheduler has a folder, too.
         stack.enter_context(dask.config.set(OWN_CONFIG | {"temporary-directory": folder}))
@@ -193,7 +192,7 @@ def _started(workers: int, threads: int, memory: int | None) -> Iterator[Any]:
 
 
 def _end(own: Any) -> None:
-    """End workers, what they do included: all that is wanted of them is in the store."""
+    """End workers and their tasks: all results needed are in the store."""
     for nanny in list(own.workers.values()):
         process = getattr(getattr(nanny, "process", None), "process", None)
         nanny.auto_restart = False
@@ -205,21 +204,21 @@ def _end(own: Any) -> None:
 
 
 def _least_memory(client: Any, memory: int | None) -> int | None:
-    """Return bytes that a task may take on each worker of a running cluster, and by --memory; None for no limit."""
+    """Return the memory of a task in bytes: the least of all workers and of --memory; None for no limit."""
     workers = client.scheduler_info()["workers"].values()
     limits = [each["memory_limit"] // each["nthreads"] for each in workers if each["memory_limit"]]
     return min([int(TASK_SHARE * limit) for limit in limits] + ([] if memory is None else [memory]), default=None)
 
 
 def _memory_limit(workers: int, memory: int | None) -> int:
-    """Return bytes beyond which a worker of our own is ended: its share of --memory, or of free memory if more."""
+    """Return the memory at which a worker started here is ended: its share of --memory, or of free memory if more."""
     free = machine.available_memory() or 0
     return max(LEAST_MEMORY, max(memory or 0, int(MEMORY_SHARE * free)) // workers)
 
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep Dask's own messages off the screen: what they tell of workers and schedulers, the engine says."""
+    """Silence Dask's own messages; the engine reports worker and scheduler problems itself."""
     names = [name for name in logging.Logger.manager.loggerDict if name.partition(".")[0] in TALKERS]
     before = {name: logging.getLogger(name).level for name in names}
     for name in names:

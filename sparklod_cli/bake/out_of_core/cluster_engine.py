@@ -1,4 +1,4 @@
-"""An engine that hands tasks to the workers of a Dask cluster, and what these run."""
+"""Engine that runs tasks on a Dask cluster: retries, lost workers and a lost scheduler; and the code of workers."""
 
 from __future__ import annotations
 
@@ -31,217 +31,19 @@ from .store import Store
 
 _INSTALL = f"install sparklod {__version__} with its extra cluster there, and start it again"
 
-
-class ClusterEngine:
-    """Runs tasks on a Dask cluster.
-
-    The client holds the graph: a task is submitted when all that it needs is done. Workers return two numbers, so that
-    one which is lost takes no result with it: what it had put is in the store.
-
-    Attributes:
-        memory: bytes that a task may take; None where nobody knows.
-    """
-
-    def __init__(self, connection: Connection, *, threads: int, memory: int | None = None) -> None:
-        """Take the connection to a cluster, and what `threads` and `memory` say."""
-        self._connection, self.threads, self.memory = connection, threads, memory
-        self._checked: tuple[str, frozenset[str]] | None = None
-
-    def run(self, stage: str, tasks: Sequence[Task], job: Any, progress: Progress) -> None:
-        """See `Engine.run`."""
-        store: Store = job.store
-        left = {task.name: (place, task) for place, task in enumerate(tasks) if not store.has(task.name)}
-        total = sum(task.weight for task in tasks)
-        done = total - sum(task.weight for _, task in left.values())
-        progress(stage, done, total, "splat")
-        if not left:
-            return
-        here = str(store), frozenset(self._connection.workers())
-        if here != self._checked:  # other workers may have come
-            self.check(store)
-            self._checked = here
-        packed = pickle.dumps(job)
-        needs = {name: {need for need in task.needs if need in left} for name, (_, task) in left.items()}
-        heirs: dict[str, list[str]] = {}
-        for name, wanted in needs.items():
-            for need in wanted:
-                heirs.setdefault(need, []).append(name)
-        with Pool(self._connection, stage) as pool:
-
-            def submit(name: str) -> None:
-                place, task = left[name]
-                pool.submit(name, place, run_task, packed, task, self.threads)
-
-            for name in [name for name, wanted in needs.items() if not wanted]:
-                submit(name)
-            while pool:
-                name, result, error = pool.next()
-                if error is None:
-                    written, read = result
-                    store.traffic.add(written=written, read=read)
-                elif not store.has(name):
-                    raise error
-                done += left[name][1].weight
-                progress(stage, done, total, "splat")
-                for heir in heirs.get(name, ()):
-                    needs[heir].discard(name)
-                    if not needs[heir]:
-                        submit(heir)
-
-    @contextlib.contextmanager
-    def map_calls(
-        self, stage: str, call: Callable[..., Any], arguments: Sequence[tuple[Any, ...]], progress: Progress, unit: str
-    ) -> Iterator[Iterator[Any]]:
-        """Call a function with each tuple of arguments, side by side, until the context ends.
-
-        Args:
-            call: a function of a module that takes `threads` besides, and returns something small.
-            arguments: small, and can be pickled.
-            unit: what a call is called.
-
-        Yields:
-            what came of each call, in their order: a `SparklodError` where it failed with one.
-        """
-        with Pool(self._connection, stage) as pool:
-            for place, each in enumerate(arguments):
-                pool.submit(str(place), place, functools.partial(call, threads=self.threads), *each)
-            yield self._outcomes(pool, stage, len(arguments), progress, unit)
-
-    def _outcomes(self, pool: Pool, stage: str, count: int, progress: Progress, unit: str) -> Iterator[Any]:
-        outcomes = dict[str, Any]()
-        for place in range(count):
-            while str(place) not in outcomes:
-                progress(stage, place + len(outcomes), count, unit)
-                name, result, error = pool.next()
-                if error is not None and not isinstance(error, SparklodError):
-                    raise error
-                outcomes[name] = result if error is None else error
-            yield outcomes.pop(str(place))
-
-    def check(self, store: Store | None, files: Sequence[Place] = ()) -> None:
-        """Raise a `SparklodError` where a worker cannot do its share: another sparklod, or a folder it does not see.
-
-        Args:
-            files: that tasks read; those that are not here are left to the tasks.
-        """
-        here = [file for file in files if isinstance(file, Path) and file.exists()]
-        name = f"{PROBE}/{uuid.uuid4().hex}"
-        if store is not None:
-            store.put(name, {PROBE: np.arange(2)})
-        try:
-            with self._connection.guarded():
-                found = self._connection.client.run(probe, store, name, here, on_error="return")
-        finally:
-            if store is not None:
-                store.remove(name)
-        for worker, answer in found.items():
-            _check_answer(worker, answer, store)
-
-    def remove(self, folder: Path) -> None:
-        """Remove a folder on the machines of all workers, and on this one."""
-        shutil.rmtree(folder, ignore_errors=True)
-        if self._connection.alive:
-            with contextlib.suppress(SparklodError), self._connection.guarded():
-                self._connection.client.run(shutil.rmtree, folder, ignore_errors=True)
-
-
-def _check_answer(worker: str, answer: Any, store: Store | None) -> None:
-    """Raise a `SparklodError` for what a worker said of itself."""
-    if not isinstance(answer, Probed):  # an error: it has no sparklod, or one that knows no such question
-        raise SparklodError(f"worker {worker} does not run sparklod {__version__} ({answer}): {_INSTALL}")
-    place = f"worker {worker} on {answer.host}"
-    if answer.version != __version__:
-        raise SparklodError(f"{place} has sparklod {answer.version}, not {__version__} as here: {_INSTALL}")
-    if not answer.reads:
-        raise SparklodError(
-            f"{place} does not see what was written to {store}: give --scratch-dir a folder that all machines share, or"
-            " a URL such as s3://bucket/scratch"
-        )
-    if answer.writes:
-        raise SparklodError(f"{place} cannot write to {store}: {answer.writes}")
-    if answer.missing:
-        raise SparklodError(
-            f"{place} does not see {', '.join(answer.missing)}: put inputs into a folder that all machines share, or at"
-            " a URL"
-        )
-
-
-#: What a probe has.
-PROBE = "probe"
-
-
-@dataclass(frozen=True)
-class Probed:
-    """Result of probing a worker.
-
-    Attributes:
-        reads: it reads the result that the client wrote.
-        writes: empty, or why it cannot write one.
-        missing: of the files that were asked for, those that it does not see.
-    """
-
-    version: str
-    host: str
-    reads: bool
-    writes: str
-    missing: tuple[str, ...]
-
-
-def probe(store: Store | None, name: str, files: Sequence[Path]) -> Probed:
-    """Try whether this worker can read what the client wrote, by the name of the result, and write what it reads."""
-    reads, writes = True, ""
-    if store is not None:
-        mine = f"{name}-{uuid.uuid4().hex}"
-        try:
-            store.put(mine, {PROBE: np.arange(2)})
-            store.remove(mine)
-        except Exception as error:
-            writes = f"{type(error).__name__}: {error}"
-        try:
-            reads = store.has(name) and len(store.get(name)[PROBE]) > 0
-        except Exception:
-            reads = False
-    missing = tuple(str(path) for path in files if not path.exists())
-    return Probed(__version__, socket.gethostname(), reads, writes, missing)
-
-
-def run_task(packed: bytes, task: Task, threads: int) -> tuple[int, int]:
-    """Run a task, unless its result is there: a worker may have been lost after it had put that.
-
-    Args:
-        packed: the job, pickled; a copy for each task, so that each counts its own bytes.
-
-    Returns:
-        bytes that it wrote to the store, and read there.
-    """
-    job = pickle.loads(packed)
-    if not job.store.has(task.name):
-        with memory_errors_translated():
-            task.run(job, *task.arguments, threads=threads, progress=silent)
-        machine.release_memory()
-    return job.store.traffic.written, job.store.traffic.read
-
-
-def dask_setup(worker: Any) -> None:
-    """Prepare a worker process that sparklod started: it has no dashboard, and the client ends it, no Ctrl-C."""
-    worker.http_server.stop()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    os.environ.setdefault("NUMBA_NUM_THREADS", "1")
-
-
-#: Seconds to wait before a call that failed is tried again: networks recover, and shared folders show files late.
+#: Seconds to wait before a failed call is repeated: networks recover, and shared folders show files late.
 PAUSES = (1.0, 5.0)
 
-#: Seconds between two looks at the cluster while nothing ends.
+#: Seconds between checks of the cluster while no call ends.
 TICK = 1.0
 
-#: Seconds after which a cluster without workers is mentioned.
+#: Seconds after which a cluster without workers is reported.
 PATIENCE = 10.0
 
-#: Errors of the system that another try does not mend: no room, no right.
+#: Error numbers that repeating a call does not help: no room, no permission.
 LASTING = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EFBIG, errno.ENAMETOOLONG}
 
-#: Seconds to wait for the message of a nanny that ended a worker for its memory: it may come after the loss.
+#: Seconds to wait for the message of a nanny that ended a worker for its memory; it may come after the loss.
 NANNY_DELAY = 3.0
 
 #: Topics of the scheduler's messages about workers, and of the nannies' about memory.
@@ -250,20 +52,20 @@ TOPICS = ("all", "worker-restart-memory")
 #: States of a future that has ended. Others are "pending", and "lost" with the worker that held its result.
 ENDED = {"finished", "error", "cancelled"}
 
-#: Names of tasks that a message lists.
+#: Most task names in a message.
 LISTED = 3
 
 LESS_MEMORY = (
-    "give a smaller --memory, which makes smaller blocks, or let fewer workers share a machine; what is done is kept,"
-    " and --resume continues"
+    "give a smaller --memory, which makes smaller blocks, or let fewer workers share a machine; finished work is"
+    " kept, and --resume continues"
 )
 
 
 class Connection:
-    """A client of a cluster, and what is known of its workers. Used as a context manager."""
+    """Client of a cluster that reports lost workers. A context manager."""
 
     def __init__(self, client: Any, say: Callable[[str], None]) -> None:
-        """Take a `distributed.Client`, and what is told of workers that are lost."""
+        """Take a `distributed.Client`; `say` receives one-line messages for the user."""
         self.client, self.say = client, say
         self._losses: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
         self._starved = set[str]()
@@ -281,32 +83,32 @@ class Connection:
 
     @property
     def alive(self) -> bool:
-        """Whether the scheduler is there."""
+        """Whether the scheduler answers."""
         return bool(self.client.status == "running")
 
     def workers(self) -> dict[str, Any]:
-        """Return what the scheduler knows of each worker, by its address."""
+        """Return the scheduler's information on each worker, by address."""
         with self.guarded():
             known: dict[str, Any] = dict(self.client.scheduler_info()["workers"])
         return known
 
     @contextlib.contextmanager
     def guarded(self) -> Iterator[None]:
-        """Turn an error of the connection into one for people."""
+        """Translate errors of the connection."""
         try:
             yield
         except (OSError, CancelledError, RuntimeError, AttributeError):
             raise self.gone() from None
 
     def gone(self) -> SparklodError:
-        """Return the error where the scheduler does not answer any more."""
+        """Return the error for a scheduler that no longer answers."""
         return SparklodError(
-            "the scheduler of the cluster does not answer any more; what is done is kept: start the cluster again, and"
-            " add --resume"
+            "the scheduler of the cluster no longer answers; finished work is kept: start the cluster again, and add"
+            " --resume"
         )
 
     def look(self) -> None:
-        """Tell of workers that were lost, and where there are none; raise a `SparklodError` without a scheduler."""
+        """Report lost workers, and a cluster without workers; raise a `SparklodError` without a scheduler."""
         self.tell_losses()
         if not self.alive:
             raise self.gone()
@@ -319,7 +121,7 @@ class Connection:
             self._alone_since = float("inf")
 
     def tell_losses(self) -> None:
-        """Say which workers were lost, and what is done again because of it."""
+        """Report lost workers and the tasks that are repeated."""
         with contextlib.suppress(queue.Empty):
             while True:
                 lost = self._losses.get_nowait()
@@ -330,7 +132,7 @@ class Connection:
                 self.say(f"worker {lost['worker']} {why}{again}")
 
     def failure(self, name: str, future: Any) -> Exception:
-        """Return the error of a call that did not end well."""
+        """Return the error of a failed call."""
         if future.status == "cancelled":
             return self.gone()
         with self.guarded():
@@ -348,14 +150,13 @@ class Connection:
         return error
 
     def _was_starved(self, worker: str) -> bool:
-        """Return whether a nanny ended this lost worker for its memory."""
         deadline = time.monotonic() + NANNY_DELAY
         while worker not in self._starved and time.monotonic() < deadline:
             time.sleep(TICK / 20)
         return worker in self._starved
 
     def _keep(self, event: tuple[float, Any]) -> None:
-        """Keep what the scheduler tells; called on the client's own thread."""
+        """Record a message of the scheduler; called on the client's thread."""
         message = event[1]
         if not isinstance(message, dict):
             return
@@ -366,12 +167,11 @@ class Connection:
 
 
 def _name_of(key: Any) -> str:
-    """Return what a person calls a call, by its key."""
     return str(key[-1] if isinstance(key, tuple) else key)
 
 
 class Pool:
-    """Calls that were handed to a cluster and have not ended. Used as a context manager, which cancels what is left."""
+    """Calls on a cluster that have not ended. A context manager, which cancels unfinished calls."""
 
     def __init__(self, connection: Connection, stage: str) -> None:
         self._connection = connection
@@ -395,12 +195,12 @@ class Pool:
         return bool(self._calls)
 
     def submit(self, name: str, place: int, *call: Any) -> None:
-        """Hand a call to the cluster.
+        """Submit a call.
 
         Args:
-            name: its own in this pool.
-            place: calls of lower places come first.
-            call: a function, and its arguments.
+            name: unique in this pool.
+            place: calls with lower places come first.
+            call: function and arguments.
         """
         self._calls[name] = place, call
         key = (f"{self._prefix}-{self._tries.get(name, 0)}", name)
@@ -410,16 +210,16 @@ class Pool:
         future.add_done_callback(lambda _: self._ended.put(name))
 
     def next(self) -> tuple[str, Any, Exception | None]:
-        """Wait for a call that ends: its name, its result, and the error that it failed with, if it did."""
+        """Wait for a call that ends; return its name, its result and its error, if it failed."""
         while True:
-            self._go_on()
+            self._submit_paused()
             try:
                 name = self._ended.get(timeout=TICK)
             except queue.Empty:
                 self._connection.look()
                 continue
             status = self._futures[name].status
-            if status not in ENDED:  # its worker was lost since: the scheduler has it done again
+            if status not in ENDED:  # its worker was lost since; the scheduler repeats it
                 self._ask_again(name)
                 continue
             future = self._futures.pop(name)
@@ -434,13 +234,13 @@ class Pool:
                 return name, None, error
 
     def _ask_again(self, name: str) -> None:
-        """Look at a call once more, after a while."""
+        """Check a call again after a while."""
         self._connection.look()
         loop = self._connection.client.loop
         loop.add_callback(loop.call_later, TICK, self._ended.put, name)
 
     def _is_worth_another(self, name: str, error: Exception) -> bool:
-        """Return whether a call is tried again, after a pause."""
+        """Return whether a failed call is repeated; it is, after a pause."""
         tried = self._tries.get(name, 0)
         if not isinstance(error, OSError) or error.errno in LASTING or tried >= len(PAUSES):
             return False
@@ -448,10 +248,206 @@ class Pool:
         self._paused.append((time.monotonic() + PAUSES[tried], name))
         return True
 
-    def _go_on(self) -> None:
-        """Submit calls that have paused long enough."""
+    def _submit_paused(self) -> None:
         due = [name for when, name in self._paused if when <= time.monotonic()]
         self._paused = [each for each in self._paused if each[1] not in due]
         for name in due:
             place, call = self._calls[name]
             self.submit(name, place, *call)
+
+
+class ClusterEngine:
+    """Engine on a Dask cluster.
+
+    The client holds the graph: a task is submitted when all its needs are done. Workers return two numbers only, so a
+    lost worker takes no result with it: results are in the store.
+
+    Attributes:
+        memory: bytes that a task may take; None if unknown.
+    """
+
+    def __init__(self, connection: Connection, *, threads: int, memory: int | None = None) -> None:
+        """Take the connection to a cluster, the threads of a task, and `memory`."""
+        self._connection, self.threads, self.memory = connection, threads, memory
+        self._checked: tuple[str, frozenset[str]] | None = None
+
+    def run(self, stage: str, tasks: Sequence[Task], job: Any, progress: Progress) -> None:
+        """Run tasks as `Engine.run`."""
+        store: Store = job.store
+        left = {task.name: (place, task) for place, task in enumerate(tasks) if not store.has(task.name)}
+        total = sum(task.weight for task in tasks)
+        done = total - sum(task.weight for _, task in left.values())
+        progress(stage, done, total, "splat")
+        if not left:
+            return
+        here = str(store), frozenset(self._connection.workers())
+        if here != self._checked:  # new workers may have joined
+            self.check(store)
+            self._checked = here
+        packed = pickle.dumps(job)
+        needs = {name: {need for need in task.needs if need in left} for name, (_, task) in left.items()}
+        heirs: dict[str, list[str]] = {}
+        for name, names in needs.items():
+            for need in names:
+                heirs.setdefault(need, []).append(name)
+        with Pool(self._connection, stage) as pool:
+
+            def submit(name: str) -> None:
+                place, task = left[name]
+                pool.submit(name, place, run_task, packed, task, self.threads)
+
+            for name in [name for name, names in needs.items() if not names]:
+                submit(name)
+            while pool:
+                name, result, error = pool.next()
+                if error is None:
+                    written, read = result
+                    store.traffic.add(written=written, read=read)
+                elif not store.has(name):
+                    raise error
+                done += left[name][1].weight
+                progress(stage, done, total, "splat")
+                for heir in heirs.get(name, ()):
+                    needs[heir].discard(name)
+                    if not needs[heir]:
+                        submit(heir)
+
+    @contextlib.contextmanager
+    def map_calls(
+        self, stage: str, call: Callable[..., Any], arguments: Sequence[tuple[Any, ...]], progress: Progress, unit: str
+    ) -> Iterator[Iterator[Any]]:
+        """Call a function with each tuple of arguments in parallel until the context ends.
+
+        Args:
+            call: function of a module that also takes `threads`, and returns something small.
+            arguments: small, and can be pickled.
+            unit: word for a call in the progress.
+
+        Yields:
+            the result of each call, in their order, or the `SparklodError` that it failed with.
+        """
+        with Pool(self._connection, stage) as pool:
+            for place, each in enumerate(arguments):
+                pool.submit(str(place), place, functools.partial(call, threads=self.threads), *each)
+            yield self._outcomes(pool, stage, len(arguments), progress, unit)
+
+    def _outcomes(self, pool: Pool, stage: str, count: int, progress: Progress, unit: str) -> Iterator[Any]:
+        outcomes = dict[str, Any]()
+        for place in range(count):
+            while str(place) not in outcomes:
+                progress(stage, place + len(outcomes), count, unit)
+                name, result, error = pool.next()
+                if error is not None and not isinstance(error, SparklodError):
+                    raise error
+                outcomes[name] = result if error is None else error
+            yield outcomes.pop(str(place))
+
+    def check(self, store: Store | None, files: Sequence[Place] = ()) -> None:
+        """Raise a `SparklodError` if a worker has another sparklod, or does not see the store or the files.
+
+        Args:
+            files: that tasks read; tasks report those missing on this machine.
+        """
+        here = [file for file in files if isinstance(file, Path) and file.exists()]
+        name = f"{PROBE}/{uuid.uuid4().hex}"
+        if store is not None:
+            store.put(name, {PROBE: np.arange(2)})
+        try:
+            with self._connection.guarded():
+                answers = self._connection.client.run(probe, store, name, here, on_error="return")
+        finally:
+            if store is not None:
+                store.remove(name)
+        for worker, answer in answers.items():
+            _check_answer(worker, answer, store)
+
+    def remove(self, folder: Path) -> None:
+        """Remove a folder on the machines of all workers, and on this one."""
+        shutil.rmtree(folder, ignore_errors=True)
+        if self._connection.alive:
+            with contextlib.suppress(SparklodError), self._connection.guarded():
+                self._connection.client.run(shutil.rmtree, folder, ignore_errors=True)
+
+
+def _check_answer(worker: str, answer: Any, store: Store | None) -> None:
+    """Raise a `SparklodError` for a worker that cannot run tasks."""
+    if not isinstance(answer, Probed):  # an error: it has no sparklod, or one without `probe`
+        raise SparklodError(f"worker {worker} does not run sparklod {__version__} ({answer}): {_INSTALL}")
+    place = f"worker {worker} on {answer.host}"
+    if answer.version != __version__:
+        raise SparklodError(f"{place} has sparklod {answer.version}, not {__version__} as here: {_INSTALL}")
+    if not answer.reads:
+        raise SparklodError(
+            f"{place} does not see what was written to {store}: give --scratch-dir a folder that all machines share, or"
+            " a URL such as s3://bucket/scratch"
+        )
+    if answer.writes:
+        raise SparklodError(f"{place} cannot write to {store}: {answer.writes}")
+    if answer.missing:
+        raise SparklodError(
+            f"{place} does not see {', '.join(answer.missing)}: put inputs into a folder that all machines share, or at"
+            " a URL"
+        )
+
+
+#: Result of a probe, and its array.
+PROBE = "probe"
+
+
+@dataclass(frozen=True)
+class Probed:
+    """Result of probing a worker.
+
+    Attributes:
+        reads: it can read the result that the client wrote.
+        writes: why it cannot write a result; empty if it can.
+        missing: files that it does not see.
+    """
+
+    version: str
+    host: str
+    reads: bool
+    writes: str
+    missing: tuple[str, ...]
+
+
+def probe(store: Store | None, name: str, files: Sequence[Path]) -> Probed:
+    """Try on a worker to read the result that the client wrote, to write one, and to see files."""
+    reads, writes = True, ""
+    if store is not None:
+        mine = f"{name}-{uuid.uuid4().hex}"
+        try:
+            store.put(mine, {PROBE: np.arange(2)})
+            store.remove(mine)
+        except Exception as error:
+            writes = f"{type(error).__name__}: {error}"
+        try:
+            reads = store.has(name) and len(store.get(name)[PROBE]) > 0
+        except Exception:
+            reads = False
+    missing = tuple(str(path) for path in files if not path.exists())
+    return Probed(__version__, socket.gethostname(), reads, writes, missing)
+
+
+def run_task(packed: bytes, task: Task, threads: int) -> tuple[int, int]:
+    """Run a task on a worker, unless its result exists: another worker may have been lost after putting the result.
+
+    Args:
+        packed: pickled job; each task unpickles its own, so that it counts its own bytes.
+
+    Returns:
+        bytes that the task wrote to the store, and read from it.
+    """
+    job = pickle.loads(packed)
+    if not job.store.has(task.name):
+        with memory_errors_translated():
+            task.run(job, *task.arguments, threads=threads, progress=silent)
+        machine.release_memory()
+    return job.store.traffic.written, job.store.traffic.read
+
+
+def dask_setup(worker: Any) -> None:
+    """Prepare a worker process started here: it has no dashboard, and the client ends it, not Ctrl-C."""
+    worker.http_server.stop()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.environ.setdefault("NUMBA_NUM_THREADS", "1")

@@ -149,7 +149,7 @@ def test_workers_that_do_not_fit_are_refused(
             engine.check(job.store)
     with pytest.raises(SparklodError, match=r"does not see what was written to .*--scratch-dir a folder that all"):
         engine.check(_Elsewhere(tmp_path / "here"))
-    assert not list(tmp_path.rglob("*.result"))
+    assert not list(tmp_path.rglob("*.npy"))
 
 
 class _Elsewhere(Store):

@@ -130,7 +130,7 @@ def test_a_bake_goes_on_after_its_scheduler_went_away(running: Any, one: Cluster
     expected = baked(DEMO, tmp_path / "none.spz", BakeSettings(), None)
     close = Once(lambda: running.loop.add_callback(running.scheduler.close))
     target = tmp_path / "gone.spz"
-    with pytest.raises(SparklodError, match=r"scheduler of the cluster does not answer any more; what is done is kept"):
+    with pytest.raises(SparklodError, match=r"scheduler of the cluster no longer answers; finished work is kept"):
         baked(DEMO, target, BakeSettings(), one, close)
     assert not target.exists()
     stages: list[tuple[str, int]] = []

@@ -89,7 +89,7 @@ def test_a_scheduler_that_goes_away_keeps_what_is_done(scheduler: Any, tmp_path:
             scheduler.loop.add_callback(scheduler.scheduler.close)
 
         threading.Thread(target=close, daemon=True).start()
-        with pytest.raises(SparklodError, match=r"scheduler of the cluster does not answer any more.*add --resume"):
+        with pytest.raises(SparklodError, match=r"scheduler of the cluster no longer answers.*add --resume"):
             engine.run("building", tasks, job, silent)
     assert job.store.has(tasks[0].name) and not job.store.has(tasks[-1].name)
 
