@@ -11,7 +11,6 @@ import numpy as np
 
 from ..system.errors import CameraPathError, TooManyCamerasError
 from .camera import Camera
-from .formats import own_csv
 from .formats.source import Files, Parsed
 from .formats.table import FORMATS, PathFormat
 from .frame import DEFAULT_FPS, MAX_FRAMES, MAX_GENERATED, Sampled, Settings, camera_of
@@ -82,16 +81,18 @@ def read(files: Files, *, format: str | None = None, settings: Settings | None =
     form = _known(files) if format is None else next(form for form in FORMATS if form.name == format)
     if settings.axes and form.axes is None:
         raise CameraPathError(f"{form.title} has targets instead of axes, so --camera-axes cannot be used with it")
-    parsed = form.parser().parse(files, settings)
+    parsed = form.parse(files, settings)
     if settings.up is not None and (parsed.turned or not form.looking):
         raise CameraPathError("its cameras have their own up axes, so --up cannot be used with them")
     return cameras_of(parsed, form, settings)
 
 
 def _known(files: Files) -> PathFormat:
-    form = next((form for form in FORMATS if form.parser().recognises(files)), None)
-    if form is None and own_csv.resembles(files):
-        form = next(form for form in FORMATS if form.parser() is own_csv)  # whose error names the missing columns
+    form = next((form for form in FORMATS if form.recognises(files)), None)
+    from .formats import own
+
+    if form is None and own.resembles_csv(files):
+        form = next(form for form in FORMATS if form.name == "csv")  # whose error names the missing columns
     if form is None:
         names = ", ".join(form.name for form in FORMATS)
         raise CameraPathError(f"its content is of no known format; name the format with --camera-format ({names})")

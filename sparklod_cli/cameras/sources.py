@@ -16,7 +16,7 @@ import numpy as np
 from .. import io
 from ..system.defaults import ELEVATION
 from ..system.errors import CameraPathError, SparklodError
-from ..system.untrusted import parse_json
+from ..system.untrusted import Origin, parse_json
 from . import framing, generators
 from .camera import Matrix
 from .formats.source import Files, Json, Parsed, finite
@@ -239,7 +239,7 @@ def similarity(text: str) -> Matrix:
     words = re.split(r"[\s,;]+", text.strip())
     try:
         if text.lstrip().startswith("["):
-            numbers = Json(parse_json(text), "matrix").matrix(4)
+            numbers = Json(parse_json(text), Origin("matrix", CameraPathError)).matrix(4)
         else:
             numbers = [finite(word, "matrix") for word in words]
     except ValueError:

@@ -22,12 +22,12 @@ from ..system.defaults import MAX_SH_DEGREE
 from ..system.errors import FormatError, NotSplatsError, TruncatedError
 from ..system.progress import Progress
 from ..system.threads import blocks_of, ordered_map
-from ..system.untrusted import ZIP_ERRORS, quoted, quoted_value
+from ..system.untrusted import quoted, quoted_value
 from . import quantize
 from .left_out import HARMLESS, left_out
 from .reader import Positioned, Reader, Source, Target, size_of
 from .tensor_pickle import Tensor, unpickled
-from .zip_folder import ZIP
+from .zip_folder import ZIP, ZIP_ERRORS
 
 #: Bytes of data.pkl at most. That of nerfstudio, with the state of its optimisers, has some 50,000. Chosen.
 MOST_PICKLE = 1 << 24

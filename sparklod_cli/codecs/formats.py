@@ -13,7 +13,7 @@ from pathlib import PurePath
 from typing import Any, BinaryIO, Literal
 
 from ..system import defaults
-from ..system.json_text import keys_of_object
+from ..system.untrusted import keys_of_object
 from .lookalikes import lookalike_of
 
 #: Bytes at the beginning of a file by which its format is recognized, and of a JSON object, whose first value may be

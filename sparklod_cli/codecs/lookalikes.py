@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 from typing import NamedTuple
 
-from ..system.json_text import keys_of_object
 from ..system.printable import printable
+from ..system.untrusted import keys_of_object
 
 #: What a clone that was made without Git LFS has in place of a file, of any kind.
 POINTER = "a Git LFS pointer; run git lfs pull to get the file"

@@ -4,20 +4,25 @@ from __future__ import annotations
 
 import contextlib
 import io
+import struct
 import threading
 import zipfile
+import zlib
 from collections.abc import Iterator
 from pathlib import PurePosixPath
 from typing import IO, BinaryIO
 
 from ..system.errors import ChecksumError, FormatError, NotSplatsError
-from ..system.untrusted import ZIP_ERRORS, quoted, quoted_value
+from ..system.untrusted import quoted, quoted_value
 from .compression import check_promise
 from .file_names import MANIFEST, META, TILESET
 from .reader import size_of
 
 #: Beginning of a zip that is not empty.
 ZIP = b"PK\x03\x04"
+
+#: What `zipfile` raises on archives that are damaged, encrypted or of a kind that it does not read.
+ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, ValueError, struct.error)
 
 #: Compression methods that are read, and the flag of an encrypted member.
 METHODS, ENCRYPTED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED), 1

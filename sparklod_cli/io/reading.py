@@ -20,9 +20,9 @@ from ..model.splats import FloatArray
 from ..model.tile_scene import TileScene
 from ..system.addresses import Place, size_of
 from ..system.errors import FormatError, UnknownFormatError, UnreadableError
-from ..system.json_text import decoded_text
 from ..system.progress import Progress, silent
 from ..system.stdio import DASH, spooled
+from ..system.untrusted import decoded_text
 from .local_files import in_folder, open_named, reason_unreadable
 
 if TYPE_CHECKING:

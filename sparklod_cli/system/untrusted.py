@@ -1,18 +1,23 @@
-"""Untrusted file contents: bounded JSON and TOML, and text that is safe to quote."""
+"""Untrusted file contents: bounded JSON and TOML, typed access to JSON, and text that is safe to quote.
+
+Imports nothing heavy: `--help` needs the table of formats, which are told by keys.
+"""
 
 from __future__ import annotations
 
+import codecs
 import json
+import math
 import re
 import reprlib
-import struct
 import sys
-import zipfile
-import zlib
-from typing import Any
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, overload
 
-from .json_text import decoded_text
 from .printable import printable
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 #: Maximum nesting depth, so that code can recurse through values; real files have a few levels.
 MAX_DEPTH = 64
@@ -29,8 +34,10 @@ QUOTED = 100
 _SURROGATE = re.compile("[\ud800-\udfff]")
 _ESCAPED_SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
 
-#: What `zipfile` raises on archives that are damaged, encrypted or of a kind that it does not read.
-ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, ValueError, struct.error)
+#: For a value at a time; `float` takes any number of digits in time proportional to it.
+_DECODER = json.JSONDecoder(parse_int=float)
+
+T = TypeVar("T")
 
 
 def parse_json(data: str | bytes, *, keep_surrogates: bool = False, depth: int = MAX_DEPTH) -> Any:
@@ -117,3 +124,182 @@ def quoted_value(value: Any) -> str:
 def quoted(error: Exception) -> str:
     """Return the message of a library's error, shortened: it may itself quote much of a file."""
     return printable(str(error), 2 * QUOTED)
+
+
+def decoded_text(data: bytes, errors: str = "strict") -> str:
+    """Decode a text in UTF-8, or in UTF-16 where a byte order mark says so, as Windows programs write it.
+
+    Raises:
+        ValueError: it is not text.
+    """
+    marked = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    return str(data, "utf-16" if marked else "utf-8-sig", errors)
+
+
+def keys_of_object(beginning: bytes) -> list[str]:
+    """Return the keys of a JSON object as far as its beginning shows them; none of any other data."""
+    text, keys, at, mark = decoded_text(beginning, "replace"), list[str](), 0, "{"
+    try:
+        while text[at := _past_blanks(text, at)] == mark:
+            key, at = _DECODER.raw_decode(text, _past_blanks(text, at + 1))
+            if not isinstance(key, str) or text[at := _past_blanks(text, at)] != ":":
+                break
+            keys.append(key)
+            _, at = _DECODER.raw_decode(text, _past_blanks(text, at + 1))
+            mark = ","
+    except (ValueError, IndexError, RecursionError):
+        pass  # the beginning ends there, or it is not JSON
+    return keys
+
+
+def _past_blanks(text: str, at: int) -> int:
+    """Return the place of the next character that is no blank; `IndexError` at the end."""
+    while text[at] in " \t\r\n":
+        at += 1
+    return at
+
+
+class Origin(NamedTuple):
+    """A JSON file as errors call it, and the class of these errors."""
+
+    called: str
+    error: Callable[[str], Exception]
+
+
+class Json:
+    """A value of an untrusted JSON file and its place there: `lods[3].file of lod-meta.json: expected a text, not 5`.
+
+    The arguments `way` are keys and indices that lead from here to a value. A key whose value is null is missing, as
+    it is for viewers. A method raises the error of the file if a value, also one on the way, is of another kind.
+    """
+
+    __slots__ = ("_above", "_key", "value")
+
+    def __init__(self, value: Any, above: Json | Origin, key: str | int = "") -> None:
+        self.value, self._above, self._key = value, above, key
+
+    @classmethod
+    def parse(cls, data: str | bytes, origin: Origin, *, most: int | None = None, **options: Any) -> Self:
+        """Parse a file of at most `most` bytes; `options` are those of `parse_json`."""
+        if most is not None and len(data) > most:
+            raise origin.error(f"{origin.called} has more than {most:,} bytes")
+        try:
+            return cls(parse_json(data, **options), origin)
+        except ValueError as error:
+            raise origin.error(f"{origin.called or 'it'} is not JSON: {quoted(error)}") from None
+
+    @property
+    def place(self) -> str:
+        """Keys and indices that lead to it from the top of the file; empty there."""
+        words, here = list[str](), self
+        while isinstance(here._above, Json):
+            words.append(f"[{here._key}]" if isinstance(here._key, int) else f".{printable(here._key, QUOTED)}")
+            here = here._above
+        return "".join(reversed(words)).removeprefix(".")
+
+    def error(self, problem: str) -> Exception:
+        """Return an error about this value, which begins with its place."""
+        top: Json | Origin = self
+        while isinstance(top, Json):
+            top = top._above
+        subject = " of ".join(filter(None, (self.place, top.called)))
+        return top.error(f"{subject}: {problem}" if subject else problem)
+
+    def unexpected(self, kind: str) -> Exception:
+        """Return the error for a value that is missing or not of a kind."""
+        found = "but it is missing" if self.value is None else f"not {quoted_value(self.value)}"
+        return self.error(f"expected {kind}, {found}")
+
+    def get(self, *way: str | int) -> Self:
+        """Return a value, whose own value is None if it is missing."""
+        here = self
+        for key in way:
+            value = here.value
+            if isinstance(key, str):
+                if not isinstance(value, dict):
+                    raise here.unexpected("an object")
+                value = value.get(key)
+            else:
+                if not isinstance(value, list):
+                    raise here.unexpected("a list")
+                value = value[key] if key < len(value) else None
+            here = type(self)(value, here, key)
+        return here
+
+    def has(self, *keys: str) -> bool:
+        """Return True if this is an object with all of these keys."""
+        return isinstance(self.value, dict) and all(self.value.get(key) is not None for key in keys)
+
+    @overload
+    def optional(self, key: str, read: Callable[[Self], T]) -> T | None: ...
+
+    @overload
+    def optional(self, key: str, read: Callable[[Self], T], default: T) -> T: ...
+
+    def optional(self, key: str, read: Callable[[Self], T], default: T | None = None) -> T | None:
+        """Return what a method returns for a key; the default if the key is missing."""
+        found = self.get(key)
+        return default if found.value is None else read(found)
+
+    def items(self, *way: str | int) -> Iterator[Self]:
+        """Return the items of a list."""
+        here = self.get(*way)
+        if not isinstance(here.value, list):
+            raise here.unexpected("a list")
+        return (type(self)(value, here, index) for index, value in enumerate(here.value))
+
+    def entries(self, *way: str | int) -> Iterator[tuple[str, Self]]:
+        """Return the keys and values of an object."""
+        here = self.get(*way)
+        if not isinstance(here.value, dict):
+            raise here.unexpected("an object")
+        return ((key, type(self)(value, here, key)) for key, value in here.value.items() if value is not None)
+
+    def whole(self, *way: str | int, least: int = 0, most: float = math.inf) -> int:
+        """Return a whole number in a range."""
+        value = (self.get(*way) if way else self).value
+        if type(value) is int and least <= value <= most:
+            return value
+        bounds = f"of {least:,} or more" if most == math.inf else f"from {least:,} to {most:,}"
+        raise self.get(*way).unexpected(f"a whole number {bounds}")
+
+    def number(self, *way: str | int, most: float = LARGEST) -> float:
+        """Return a finite number of at most this magnitude."""
+        number = self._number((self.get(*way) if way else self).value)
+        if number is not None and abs(number) <= most:
+            return number
+        raise self.get(*way).unexpected("a finite number" if most == LARGEST else f"a number up to {most:g}")
+
+    def _number(self, value: Any) -> float | None:
+        return float(value) if type(value) in (int, float) else None
+
+    def numbers(self, *counts: int, most: float = LARGEST) -> list[float]:
+        """Return a list of numbers, of one of these lengths; of any length without them."""
+        if not isinstance(self.value, list) or (counts and len(self.value) not in counts):
+            raise self.unexpected(f"a list of {''.join(f'{count} or ' for count in counts)[:-3]}numbers")
+        return [item.number(most=most) for item in self.items()]
+
+    def matrix(self, *rows: int, columns: int = 4, most: float = LARGEST) -> list[float]:
+        """Return the numbers of a matrix, row by row, from a list of rows or of all numbers.
+
+        Args:
+            rows: accepted numbers of rows.
+        """
+        value = self.value
+        if isinstance(value, list) and len(value) in rows and all(isinstance(row, list) for row in value):
+            return [number for row in self.items() for number in row.numbers(columns, most=most)]
+        return self.numbers(*(columns * count for count in rows), most=most)
+
+    def text(self, *way: str | int) -> str:
+        """Return a text."""
+        value = (self.get(*way) if way else self).value
+        if not isinstance(value, str):
+            raise self.get(*way).unexpected("a text")
+        return value
+
+    def flag(self, *way: str | int) -> bool:
+        """Return true or false."""
+        value = (self.get(*way) if way else self).value
+        if not isinstance(value, bool):
+            raise self.get(*way).unexpected("true or false")
+        return value

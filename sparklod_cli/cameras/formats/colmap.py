@@ -89,7 +89,7 @@ MODELS = (
 Cameras = dict[int, tuple[Model, Intrinsics]]
 
 
-def recognises(files: Files) -> bool:
+def recognises_colmap(files: Files) -> bool:
     """Return whether its names or its first comment are COLMAP's, or it begins with an image and a rotation."""
     if any(files.contents.keys() >= set(names) for names in NAMES):
         return True
@@ -118,7 +118,7 @@ def _is_comment(line: str) -> bool:
     return not line.strip() or line.lstrip().startswith("#")
 
 
-def parse(files: Files, settings: Settings) -> Parsed:
+def parse_colmap(files: Files, settings: Settings) -> Parsed:
     """Return its images, sorted by name: COLMAP writes them in any order."""
     cameras = None
     if "cameras.bin" in files.contents:

@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from ...system import untrusted
 from ...system.errors import CameraPathError
-from ...system.json_text import decoded_text
-from ...system.untrusted import LARGEST, parse_json, quoted_value
+from ...system.untrusted import LARGEST, Origin, decoded_text, quoted_value
 from ..camera import Matrix
 from ..frame import Frame
 from ..pose import pose, rotation_of
 
 #: Most pixels along a side of an image.
 MAX_SIDE = 1 << 16
+
+#: Errors are prefixed with the name of the file where it is known.
+ORIGIN = Origin("", CameraPathError)
 
 
 @dataclass(frozen=True)
@@ -45,8 +48,8 @@ class Files:
     def json(self) -> Json | None:
         """The first file as JSON; None if it is not JSON."""
         try:
-            return Json(parse_json(self.text or ""))
-        except ValueError:
+            return Json.parse(self.text or "", ORIGIN)
+        except CameraPathError:
             return None
 
     def lines(self) -> list[str]:
@@ -79,79 +82,38 @@ class Parsed:
     turned: bool = False
 
 
-@dataclass(frozen=True)
-class Json:
-    """A value of a JSON file and the keys that lead to it, as one text.
+class Json(untrusted.Json):
+    """A value of a camera file, whose numbers may be written as texts; its errors are `CameraPathError`."""
 
-    Every method raises `CameraPathError`, which names the keys, if the value is not of the required type.
-    """
+    __slots__ = ()
 
-    value: Any
-    way: str = ""
+    def __init__(self, value: Any, above: untrusted.Json | Origin = ORIGIN, key: str | int = "") -> None:
+        super().__init__(value, above, key)
 
-    def has(self, *keys: str) -> bool:
-        """Return whether it is an object with all of these keys, none of them null."""
-        return isinstance(self.value, dict) and all(self.value.get(key) is not None for key in keys)
+    def _number(self, value: Any) -> float | None:
+        return _finite(value)
 
-    def get(self, key: str) -> Json:
-        """Return the value of a key of an object."""
-        if not self.has(key):
-            raise CameraPathError(f"{self.way or 'it'} has no {key!r}")
-        return Json(self.value[key], f"{self.way}.{key}" if self.way else key)
-
-    def first(self, *keys: str) -> Json | None:
-        """Return the value of the first of these keys that an object has; None if it has none."""
-        return next((self.get(key) for key in keys if self.has(key)), None)
-
-    def find(self, *keys: str) -> Json | None:
-        """Return the value at the end of nested keys; None if one is missing."""
-        here: Json | None = self
-        for key in keys:
-            here = here.first(key) if here else None
-        return here
-
-    def items(self) -> Iterator[Json]:
-        """Return the items of a list."""
-        if not isinstance(self.value, list):
-            raise CameraPathError(f"{self.way or 'it'} is not a list")
-        return (Json(item, f"{self.way}[{index}]") for index, item in enumerate(self.value))
-
-    def number(self) -> float:
-        """Return a finite number."""
-        return finite(self.value, self.way)
-
-    def numbers(self, *counts: int) -> list[float]:
-        """Return a list of finite numbers, of one of the lengths `counts`; of any length without them."""
-        if not isinstance(self.value, list) or (counts and len(self.value) not in counts):
-            raise CameraPathError(f"{self.way} is not a list of {' or '.join(map(str, counts)) or 'some'} numbers")
-        return [finite(item, self.way) for item in self.value]
+    def first_has(self, *keys: str) -> bool:
+        """Return True if this is a list whose first item has all of these keys."""
+        return isinstance(self.value, list) and bool(self.value) and self.get(0).has(*keys)
 
     def pair(self) -> tuple[float, float]:
         """Return two finite numbers."""
         first, second = self.numbers(2)
         return first, second
 
-    def matrix(self, *rows: int, columns: int = 4) -> list[float]:
-        """Return the finite numbers of a matrix, row by row, from a list of rows or of all numbers.
-
-        Args:
-            rows: numbers of rows that are accepted.
-            columns: number of columns.
-        """
-        value = self.value
-        if isinstance(value, list) and len(value) in rows and all(isinstance(row, list) for row in value):
-            return [number for row in self.items() for number in row.numbers(columns)]
-        return self.numbers(*(columns * count for count in rows))
+    def positive(self) -> float:
+        """Return a number above 0."""
+        if not (number := self.number()) > 0:
+            raise self.unexpected("a number above 0")
+        return number
 
     def side(self) -> int:
         """Return pixels along a side of an image."""
-        return side(self.number(), self.way)
-
-    def text(self) -> str:
-        """Return a text."""
-        if not isinstance(self.value, str):
-            raise CameraPathError(f"{self.way} is not a text")
-        return self.value
+        number = self.number()
+        if not _is_side(number):
+            raise self.unexpected("a number of pixels")
+        return int(number)
 
     def label(self, key: str) -> str:
         """Return the text of a key that only names its object: of a number its digits, empty without the key."""
@@ -178,13 +140,18 @@ def posed(quat_wxyz: Sequence[float], position: Sequence[float], way: str) -> Ma
 
 def finite(value: Any, way: str) -> float:
     """Return a finite number from a number or its digits; `CameraPathError`, naming its place, for anything else."""
+    number = _finite(value)
+    if number is None:
+        raise CameraPathError(f"{way} has {repr(value)[:30]}, which is not a finite number")
+    return number
+
+
+def _finite(value: Any) -> float | None:
     try:
         number = float(value) if not isinstance(value, bool) else math.nan
     except (TypeError, ValueError, OverflowError):
-        number = math.nan
-    if not abs(number) < LARGEST:
-        raise CameraPathError(f"{way} has {brief(value)}, which is not a finite number")
-    return number
+        return None
+    return number if abs(number) < LARGEST else None
 
 
 def whole(number: float, way: str) -> int:
@@ -194,13 +161,12 @@ def whole(number: float, way: str) -> int:
     return int(number)
 
 
-def brief(value: Any) -> str:
-    """Return a value of a file as an error quotes it: on one line, and shortened."""
-    return f"a {type(value).__name__}" if isinstance(value, (dict, list)) else repr(value)[:30]
-
-
 def side(number: float, way: str) -> int:
     """Return pixels along a side of an image; `CameraPathError`, naming its place, for an impossible number."""
-    if not 1 <= number <= MAX_SIDE or number != int(number):
+    if not _is_side(number):
         raise CameraPathError(f"{way} of {number:g} is not a number of pixels")
     return int(number)
+
+
+def _is_side(number: float) -> bool:
+    return 1 <= number <= MAX_SIDE and number == int(number)

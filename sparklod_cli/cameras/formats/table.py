@@ -8,7 +8,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
+
+if TYPE_CHECKING:
+    from ..frame import Settings
+    from .source import Files, Parsed
 
 
 class Axes(Enum):
@@ -48,7 +52,7 @@ class PathFormat:
 
     Attributes:
         name: value of `--camera-format`.
-        module: in this package; has `recognises(files) -> bool` and `parse(files, settings) -> Parsed`.
+        module: in this package; has the functions `recognises_NAME` and `parse_NAME`, see the methods.
         axes: of its matrices; None if it has eyes and targets instead.
         looking: its cameras have, or may have, an eye and a target, which need an up axis.
         world: note for a path without `--world-transform`: the world of its cameras may not be that of the splats.
@@ -63,28 +67,35 @@ class PathFormat:
     world: str = ""
     names: tuple[tuple[str, ...], ...] = ()
 
-    def parser(self) -> Any:
-        """Return the module, imported when it is needed."""
-        return import_module(f".{self.module}", __package__)
+    def recognises(self, files: Files) -> bool:
+        """Return whether files are of this format."""
+        return bool(self._function("recognises")(files))
+
+    def parse(self, files: Files, settings: Settings) -> Parsed:
+        """Parse files; raises `CameraPathError` if they are not of this format."""
+        return cast("Parsed", self._function("parse")(files, settings))
+
+    def _function(self, verb: str) -> Any:
+        return getattr(import_module(f".{self.module}", __package__), f"{verb}_{self.name.replace('-', '_')}")
 
 
 #: The formats, in the order in which they are tried.
 FORMATS = (
-    PathFormat("sparklod", "sparklod's JSON", "own_json", Axes.OPENGL_C2W, looking=True),
-    PathFormat("csv", "sparklod's CSV", "own_csv", Axes.OPENGL_C2W, looking=True),
+    PathFormat("sparklod", "sparklod's JSON", "own", Axes.OPENGL_C2W, looking=True),
+    PathFormat("csv", "sparklod's CSV", "own", Axes.OPENGL_C2W, looking=True),
     PathFormat(
         "nerfstudio",
         "nerfstudio's camera path",
-        "nerfstudio",
+        "trainers",
         Axes.OPENGL_C2W,
         world="nerfstudio's viewer works in a world that it centred, turned and scaled, as are the splats that it"
         " exports; splats trained elsewhere need --world-transform.",
     ),
-    PathFormat("transforms", "transforms.json", "transforms", Axes.OPENGL_C2W, names=(("transforms.json",),)),
-    PathFormat("inria", "Inria's cameras.json", "inria", Axes.OPENCV_C2W, names=(("cameras.json",),)),
-    PathFormat("supersplat", "SuperSplat", "supersplat", None, looking=True, world=PLAYCANVAS),
-    PathFormat("camera-track", "splat-transform's camera track", "camera_track", None, looking=True, world=PLAYCANVAS),
-    PathFormat("open3d", "Open3D's camera trajectory", "open3d_trajectory", Axes.OPENCV_W2C),
+    PathFormat("transforms", "transforms.json", "trainers", Axes.OPENGL_C2W, names=(("transforms.json",),)),
+    PathFormat("inria", "Inria's cameras.json", "trainers", Axes.OPENCV_C2W, names=(("cameras.json",),)),
+    PathFormat("supersplat", "SuperSplat", "playcanvas", None, looking=True, world=PLAYCANVAS),
+    PathFormat("camera-track", "splat-transform's camera track", "playcanvas", None, looking=True, world=PLAYCANVAS),
+    PathFormat("open3d", "Open3D's camera trajectory", "trajectories", Axes.OPENCV_W2C),
     PathFormat(
         "colmap",
         "COLMAP",
@@ -92,7 +103,7 @@ FORMATS = (
         Axes.OPENCV_W2C,
         names=(("images.bin", "cameras.bin"), ("images.txt", "cameras.txt")),
     ),
-    PathFormat("tum", "TUM trajectory", "tum", Axes.OPENCV_C2W),
+    PathFormat("tum", "TUM trajectory", "trajectories", Axes.OPENCV_C2W),
 )
 
 #: Sets of files that are searched for in a folder, and beside a file of one of them: COLMAP's first.

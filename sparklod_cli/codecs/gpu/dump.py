@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from ...model.scene import Scene
 from ...system.errors import FormatError
-from ...system.untrusted import ZIP_ERRORS, quoted, quoted_value
+from ...system.untrusted import quoted, quoted_value
 from .. import rgba
 from ..formats import ENCODINGS
+from ..zip_folder import ZIP_ERRORS
 
 Arrays = dict[str, NDArray[Any]]
 

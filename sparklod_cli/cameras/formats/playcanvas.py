@@ -1,7 +1,7 @@
-"""SuperSplat: the settings.json of its viewer, of both versions, and the document.json of its projects.
+"""PlayCanvas: settings.json of SuperSplat's viewer, document.json of its projects, and splat-transform's camera track.
 
-All have keys of position, target and field of view on a time line counted in frames, and a smoothness; frames between
-the keys are interpolated as in SuperSplat.
+SuperSplat's files have keys of position, target and field of view on a time line counted in frames, and a smoothness;
+frames between the keys are interpolated as in SuperSplat.
 """
 
 from __future__ import annotations
@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...system.errors import CameraPathError
+from ...system.untrusted import quoted_value
 from ..camera import Matrix
 from ..frame import Frame, Intrinsics, Settings, sampled
 from ..generators import along, cardinal_tangents, frame_looking, hermite
-from .source import Files, Json, Parsed, brief
+from .source import Files, Json, Parsed
 
 UP = (0.0, 1.0, 0.0)
 FRAME_RATE = 30.0
@@ -28,8 +29,8 @@ FOV_TRACK, FOV_VIEW = 60.0, 75.0
 VERSION = 2
 
 
-def recognises(files: Files) -> bool:
-    """Return whether it is one of the three."""
+def recognises_supersplat(files: Files) -> bool:
+    """Return whether it has poses, animations or cameras as in one of the three files."""
     root = files.json
     if root is None:
         return False
@@ -42,43 +43,40 @@ def recognises(files: Files) -> bool:
 
 
 @np.errstate(all="ignore")  # numbers may have any size; the resulting poses are checked
-def parse(files: Files, settings: Settings) -> Parsed:
-    """Return the frames of its first animation, or else its views."""
+def parse_supersplat(files: Files, settings: Settings) -> Parsed:
+    """Parse the first animation, or else the views."""
     root = files.object()
     if root.has("poseSets"):
         return _of_document(root, settings)
-    if root.has("version") and root.get("version").value != VERSION:
-        raise CameraPathError(f"version {brief(root.value['version'])} of SuperSplat's settings is unknown")
-    tracks = list(root.get("animTracks").items()) if root.has("animTracks") else []
+    if root.has("version") and root.value["version"] != VERSION:
+        raise CameraPathError(f"version {quoted_value(root.value['version'])} of SuperSplat's settings is unknown")
+    tracks = list(root.items("animTracks")) if root.has("animTracks") else []
     if tracks:
-        fov = root.find("camera", "fov")
-        path = _of_track(tracks[0], fov.number() if fov else FOV_TRACK, not root.has("version"), settings)
+        path = _of_track(tracks[0], _fov(root), not root.has("version"), settings)
         notes = (f"Only the first of its {len(tracks):,} animations was read.",) if len(tracks) > 1 else ()
         return dataclasses.replace(path, notes=notes)
-    if root.has("cameras"):
-        views = [camera.get("initial") for camera in root.get("cameras").items()]
-    else:
-        views = [root.get("camera")]
+    single = [root.get("camera")]
+    views = [camera.get("initial") for camera in root.items("cameras")] if root.has("cameras") else single
     return Parsed([_looking(_values(view, FOV_VIEW), None, settings) for view in views])
 
 
 def _of_track(track: Json, fov: float, first_version: bool, settings: Settings) -> Parsed:
     """Return an item of animTracks. Version 1 has one field of view for all keys, and at first counted in seconds."""
-    rate = _positive(track, "frameRate", FRAME_RATE)
-    times = np.array(track.get("keyframes").get("times").numbers())
+    rate = track.optional("frameRate", Json.positive, FRAME_RATE)
+    times = np.array(track.get("keyframes", "times").numbers())
     if not track.has("frameRate"):
         times = times * FRAME_RATE
-    values = track.get("keyframes").get("values")
+    values = track.get("keyframes", "values")
     points = np.empty((len(times), 7))
     for column, key in ((0, "position"), (3, "target")):
         points[:, column : column + 3] = np.reshape(values.get(key).numbers(3 * len(times)), (-1, 3))
     points[:, 6] = values.get("fov").numbers(len(times)) if values.has("fov") else fov
-    duration = _positive(track, "duration", 0)
-    smoothness = track.get("smoothness").number() if track.has("smoothness") else float(not first_version)
+    duration = track.get("duration").positive()
+    smoothness = track.optional("smoothness", Json.number, float(not first_version))
     length = None
-    if len(times) and track.has("loopMode") and track.get("loopMode").value == "repeat":
+    if len(times) and track.has("loopMode") and track.value["loopMode"] == "repeat":
         length = (duration + (duration == times[-1] / rate)) * rate
-    step = track.has("interpolation") and track.get("interpolation").value == "step"
+    step = track.has("interpolation") and track.value["interpolation"] == "step"
     at = _curve(times, points, smoothness, length, step)
     return _sampled(at, _whole(duration * rate), rate, settings)
 
@@ -86,22 +84,21 @@ def _of_track(track: Json, fov: float, first_version: bool, settings: Settings) 
 def _of_document(root: Json, settings: Settings) -> Parsed:
     """Return the frames of a project; poses beyond the end of its time line are ignored, with a note."""
     line = root.get("timeline")
-    count, rate = line.get("frames").number(), _positive(line, "frameRate", FRAME_RATE)
-    fov = root.find("camera", "fov")
+    count, rate = line.number("frames"), line.optional("frameRate", Json.positive, FRAME_RATE)
     keys = {}
     late = 0
-    sets = list(root.get("poseSets").items())  # SuperSplat writes one set or none
-    for index, pose in enumerate(pose for one in sets[:1] for pose in one.get("poses").items()):
-        frame = pose.get("frame").number() if pose.has("frame") else index * rate
+    sets = list(root.items("poseSets"))  # SuperSplat writes one set or none
+    for index, pose in enumerate(pose for one in sets[:1] for pose in one.items("poses")):
+        frame = pose.optional("frame", Json.number, index * rate)
         if frame < count:
-            keys[frame] = _values(pose, fov.number() if fov else FOV_TRACK)
+            keys[frame] = _values(pose, _fov(root))
         else:
             late += 1
     notes = [f"Only the first of its {len(sets):,} pose sets was read."] if len(sets) > 1 else []
     if late:
         notes.append(f"Poses beyond the end of its time line were ignored ({late:,}).")
-    smoothness = line.get("smoothness").number() if line.has("smoothness") else 1.0
-    looping = not line.has("loop") or line.get("loop").value is True
+    smoothness = line.optional("smoothness", Json.number, 1.0)
+    looping = not line.has("loop") or line.value["loop"] is True
     times = np.array(sorted(keys))
     points = np.array([keys[time] for time in times]).reshape(-1, 7)
     curve = _curve(times, points, smoothness, count if looping else None, False)
@@ -114,16 +111,14 @@ def _whole(frames: float) -> float:
 
 
 def _values(view: Json, fov: float) -> list[float]:
-    """Position, target and field of view in degrees."""
-    degrees = view.get("fov").number() if view.has("fov") else fov
+    """Return position, target and field of view in degrees."""
+    degrees = view.optional("fov", Json.number, fov)
     return [*view.get("position").numbers(3), *view.get("target").numbers(3), degrees]
 
 
-def _positive(place: Json, key: str, default: float) -> float:
-    value = place.get(key).number() if place.has(key) else default
-    if not value > 0:
-        raise CameraPathError(f"{place.way}.{key} is not positive")
-    return value
+def _fov(root: Json) -> float:
+    camera = root.get("camera")
+    return camera.number("fov") if camera.has("fov") else FOV_TRACK
 
 
 def _curve(
@@ -167,3 +162,22 @@ def _looking(sample: Matrix | list[float], time: float | None, settings: Setting
     """Return a frame whose field of view spans the longer side of the image."""
     lens = Intrinsics(fov=math.radians(sample[6]), fov_along="longer")
     return frame_looking(sample[:3], sample[3:6], settings.up or UP, lens, time)
+
+
+def recognises_camera_track(files: Files) -> bool:
+    """Return whether its frames have a position and a target."""
+    root = files.json
+    return root is not None and root.has("frames") and root.get("frames").first_has("position", "target")
+
+
+def parse_camera_track(files: Files, settings: Settings) -> Parsed:
+    """Parse the plain camera track of splat-transform: `{frameRate, frames: [{position, target, fov, up}]}`."""
+    root = files.object()
+    fps, items = root.optional("frameRate", Json.positive), list(root.items("frames"))
+
+    def frame(item: Json) -> Frame:
+        lens = Intrinsics(fov=item.optional("fov", lambda fov: math.radians(fov.number())))  # vertical
+        up = item.optional("up", lambda up: up.numbers(3)) or settings.up or UP
+        return frame_looking(item.get("position").numbers(3), item.get("target").numbers(3), up, lens)
+
+    return Parsed(list(map(frame, items)), fps=fps, turned=all(item.has("up") for item in items))
