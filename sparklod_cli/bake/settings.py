@@ -9,7 +9,6 @@ from typing import Any
 from ..codecs.options import WriteOptions
 from ..codecs.reader import Reader
 from ..fitting.settings import FitSettings
-from ..images.metrics import MOST_PSNR
 from ..lod.budget import Budget
 from ..lod.builders import METHODS
 from ..lod.detail_rule import DetailSettings
@@ -43,6 +42,8 @@ class SimplifyGoal:
     psnr: float | None = None
 
     def __post_init__(self) -> None:
+        from ..images.metrics import MOST_PSNR
+
         if sum(each is not None for each in (self.to, self.max_bytes, self.psnr)) != 1:
             raise ValueError("give one of to, max_bytes and psnr")
         if self.max_bytes is not None and self.max_bytes < 1:

@@ -16,6 +16,7 @@ from ..codecs.file_names import MANIFEST, TILESET
 from ..codecs.file_names import RAD_SUFFIX as RAD
 from ..codecs.formats import ENCODINGS, FORMATS, NPZ, RAW_SUFFIXES, WRITABLE, ending_of
 from ..codecs.options import RadOptions, SogOptions, WriteOptions
+from ..fitting.settings import FitSettings
 from ..lod.detail_rule import DetailSettings
 from ..lod.tile_settings import TileSettings
 from ..system import interrupts
@@ -268,11 +269,6 @@ class BakedFiles:
         """Whether the chunks of a RAD are files of their own."""
         return self.form is not None and FORMS[self.form][1]
 
-    @property
-    def format_is_chosen(self) -> bool:
-        """Whether --format or a name chose the format."""
-        return self.form is not None or self.named_suffix in TREES or self.manifest is not None
-
     def target(self, source: Place) -> Place:
         return self.output or (self.output_dir or source.parent) / self._name(source)
 
@@ -409,7 +405,7 @@ class BuildLodOptions:
         """Return the settings of bakes; loads numpy."""
         from ..bake.settings import BakeSettings
 
-        files = self.files
+        files, refining = self.files, self.files.refining
         return BakeSettings(
             **self.tree.settings(only_cuts=files.manifest is not None),
             selection=self.selection.selection(),
@@ -424,9 +420,11 @@ class BuildLodOptions:
             tiles=self.tiles if files.manifest == TILES_3D else None,
             environment=self.detail.environment,
             environment_beyond=self.detail.environment_beyond,
-            refine=files.refining.settings(),
-            camera_path=files.refining.camera_path,
-            converts=files.format_is_chosen,
+            refine=None
+            if refining.refine is None
+            else FitSettings(refining.refine or None, refining.seed, device=refining.device),
+            camera_path=refining.camera_path,
+            converts=files.form is not None or files.named_suffix in TREES or files.manifest is not None,
             unused=tuple(flags_set(ctx, (*OF_TREES, "environment_beyond"))),
         )
 
@@ -472,11 +470,11 @@ def build_lod(ctx: click.Context, /, **_: Any) -> None:
     instances = files.instances()
     _check(ctx, options, [instance.file for instance in instances if instance.file is not None])
     failed = False
-    memory = options.resources.memory
-    with (
-        Console(quiet=general.quiet, verbose=general.verbose) as console,
-        options.cluster.engine(ctx, general, memory, console) as engine,
-    ):
+    cluster, console = options.cluster, Console(quiet=general.quiet, verbose=general.verbose)
+    engines: contextlib.AbstractContextManager[ClusterEngine | None] = contextlib.nullcontext()
+    if cluster.workers is not None or cluster.scheduler is not None:
+        engines = cluster.engine(ctx, general, options.resources.memory, console)
+    with console, engines as engine:
         report: Callable[..., None] = report_extracted if files.unlod else report_baked
         pairs = files.jobs(instances, console.say)
         for (source, target), outcome in zip(pairs, _outcomes(ctx, options, pairs, console, engine), strict=True):

@@ -57,7 +57,7 @@ def report_baked(console: Console, source: Place, target: Place, baked: Baked) -
     """Print a line about the file, and one for each thing that a person should know."""
     console.say(
         f"{name_of(source)}  {count_of(baked.splats, 'splat')}, SH {baked.sh_degree}  ->  {_name(target)} "
-        f" {_contents(baked)}, {format_size(baked.bytes)}, {_total(baked.seconds)}"
+        f" {_contents(baked)}, {format_size(baked.bytes)}, {sum(baked.seconds.values()):.1f} s"
     )
     if baked.detail is not None and len(baked.detail.levels) > 1:
         console.say(f"  {_levels(baked.detail)}")
@@ -67,14 +67,16 @@ def report_baked(console: Console, source: Place, target: Place, baked: Baked) -
     consequences = _consequences(baked)
     if consequences:
         console.say(f"  {consequences}")
+    if not console.verbose:
+        return
     for clamp in baked.clamps:
-        console.detail(f"  {_clamped(clamp, baked)}")
+        console.say(f"  {_clamped(clamp, baked)}")
     tree = f"{baked.method} tree" if baked.method is not None else "the same tree"
     tree += ", refined" if baked.refine is not None else ""
-    console.detail(f"  {baked.format} -> {tree} -> {_written(baked)}; {_stages(baked.seconds)}")
+    console.say(f"  {baked.format} -> {tree} -> {_written(baked)}; {_stages(baked.seconds)}")
     if baked.blocks is not None:
         written, read = (format_size(size or 0) for size in (baked.scratch_bytes_written, baked.scratch_bytes_read))
-        console.detail(f"  out of core in {count_of(baked.blocks, 'block')}; scratch: {written} written, {read} read")
+        console.say(f"  out of core in {count_of(baked.blocks, 'block')}; scratch: {written} written, {read} read")
 
 
 def _report_tree(console: Console, baked: Baked, refine: Refined | None) -> None:
@@ -181,7 +183,7 @@ def report_extracted(console: Console, source: Place, target: Place, extracted: 
     console.say(
         f"{name_of(source)}  {count_of(extracted.nodes, 'node')}  ->  {_name(target)} "
         f" {count_of(extracted.splats, 'splat')}, SH {extracted.sh_degree}, {format_size(extracted.bytes)},"
-        f" {_total(extracted.seconds)}"
+        f" {sum(extracted.seconds.values()):.1f} s"
     )
     _report_losses(console, extracted, extracted.splats, extracted.output_format)
     console.detail(f"  {extracted.format}; {_stages(extracted.seconds)}")
@@ -195,7 +197,7 @@ def report_simplified(console: Console, source: Source, target: Place, baked: Ba
     console.say(
         f"{name_of(source)}  {count_of(baked.splats, 'splat')}, SH {baked.sh_degree}  ->  {_name(target)} "
         f" {count_of(made.splats, 'splat')} ({percent_of(made.share)}){measured}, {format_size(baked.bytes)},"
-        f" {_total(baked.seconds)}"
+        f" {sum(baked.seconds.values()):.1f} s"
     )
     _report_tree(console, baked, made.refine)
     if made.faint > LEAST_SHARE * made.splats:
@@ -222,10 +224,6 @@ def _report_losses(console: Console, losses: Extracted | WrittenSet, splats: int
 
 def _name(target: Place) -> str:
     return "standard output" if target == DASH else str(target)
-
-
-def _total(seconds: dict[str, float]) -> str:
-    return f"{sum(seconds.values()):.1f} s"
 
 
 def _stages(seconds: dict[str, float]) -> str:

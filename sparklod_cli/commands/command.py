@@ -420,14 +420,10 @@ MAX_SIDE, DIGITS = 1 << 16, 6
 
 def click_type(kind: Any) -> click.ParamType | None:
     """Return the parameter type for the kind of a `Setting`."""
-    if isinstance(kind, Range):
-        return _range_type(kind)
     if isinstance(kind, Quantity):
         return Text(kind)
-    return Choice(kind) if isinstance(kind, tuple) else kind
-
-
-def _range_type(kind: Range) -> click.ParamType:
+    if not isinstance(kind, Range):
+        return Choice(kind) if isinstance(kind, tuple) else kind
     base: type[Any] = Whole if kind.whole else Real
     least, most = (kind.least, kind.above), (kind.most, kind.below)
     low, high = (next((end for end in ends if end is not None), None) for ends in (least, most))

@@ -130,15 +130,9 @@ def for_screen(pieces: Iterable[bytes]) -> Iterator[bytes]:
 
 
 def _echo(text: str) -> None:
-    with _unheard():
-        click.echo(text, err=True)
-
-
-@contextlib.contextmanager
-def _unheard() -> Iterator[None]:
-    """Ignore failures to print: work goes on where standard error is closed, gone or full."""
+    """Print a line on standard error; work goes on where that is closed, gone or full."""
     try:
-        yield
+        click.echo(text, err=True)
     except OSError:
         silence(sys.stderr)
 
@@ -146,11 +140,12 @@ def _unheard() -> Iterator[None]:
 class Console:
     """Prints lines on standard error, and the progress of each stage of work: a bar on a terminal, lines in a log.
 
-    Used as a context manager, which clears the bar. Its `progress` is a `sparklod_cli.system.progress.Progress`.
+    Used as a context manager, which clears the bar. With `verbose` it prints details. Its `progress` is a
+    `system.progress.Progress`.
     """
 
     def __init__(self, *, quiet: bool, verbose: bool) -> None:
-        self._quiet, self._verbose = quiet, verbose
+        self._quiet, self.verbose = quiet, verbose
         self._bars = not quiet and is_terminal(sys.stderr)
         self._bar: Any = None
         self._stage, self._start, self._logged = "", 0.0, 0.0
@@ -183,7 +178,7 @@ class Console:
 
     def detail(self, text: str) -> None:
         """Print a line with `--verbose` only."""
-        if self._verbose:
+        if self.verbose:
             self.say(text)
 
     @contextlib.contextmanager

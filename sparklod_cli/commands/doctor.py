@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ..system.printable import printable
-from .command import command, values_of
+from .command import command, flag, values_of
 from .console import Console, count_of, print_json
-from .options.common import Messages, quiet_flag, verbose_flag
+from .options.common import QUIET, VERBOSE, Messages
 
 if TYPE_CHECKING:
     from ..doctor import Check
@@ -28,8 +28,8 @@ EXAMPLES = """\
 
 @dataclass(frozen=True)
 class _Messages(Messages):
-    quiet: bool = quiet_flag("Print problems only.")
-    verbose: bool = verbose_flag("Print what is being checked.")
+    quiet: bool = flag("Print problems only.", flags=QUIET)
+    verbose: bool = flag("Print what is being checked.", **VERBOSE)
 
 
 @command("doctor", _Messages, examples=EXAMPLES)

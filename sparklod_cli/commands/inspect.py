@@ -22,7 +22,7 @@ from ..system.stdio import name_of
 from ..system.units import format_size, parse_size
 from .command import COMMON, argument, command, flag, option, refuse, values_of
 from .console import Console, count_of, rows
-from .options.common import General, assert_errors, assert_option, overwrite_flag, plot_option, quiet_flag, table_form
+from .options.common import QUIET, General, assert_errors, assert_option, overwrite_flag, plot_option, table_form
 from .paths import InputPath, OutputPath, keep_apart, name_outputs
 
 if TYPE_CHECKING:
@@ -193,7 +193,7 @@ def check_usage(ctx: click.Context, count: int, checks: Checks, output: InspectO
 
 @dataclass(frozen=True)
 class _InspectGeneral(General):
-    quiet: bool = quiet_flag("Print only what other options ask for, and errors.")
+    quiet: bool = flag("Print only what other options ask for, and errors.", flags=QUIET)
 
 
 @dataclass(frozen=True)

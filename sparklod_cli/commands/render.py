@@ -14,10 +14,10 @@ import click
 from ..images.defaults import THUMBNAIL_SIZE, THUMBNAIL_SUPERSAMPLE
 from ..system.stdio import DASH
 from ..system.units import format_size
-from .command import COMMON, check_declared, command, flags_set, refuse, values_of
+from .command import COMMON, check_declared, command, flag, flags_set, refuse, values_of
 from .console import Console, count_of, for_screen, is_terminal, print_json
 from .options.cameras import PictureCameras
-from .options.common import General, json_flag, question_budgets, report_outcomes, table_form
+from .options.common import JSON, General, question_budgets, report_outcomes, table_form
 from .options.cut import Inputs, PictureCut, PictureStreaming, check_scenes, files_read, notes_on_loading, viewed_files
 from .options.pictures import Appearance, ComparisonOptions, PictureFiles, check_sizes
 from .paths import Folder, claim_stdout, keep_apart, name_outputs
@@ -60,7 +60,7 @@ HEADINGS = (
 
 @dataclass(frozen=True)
 class _RenderGeneral(General):
-    as_json: bool = json_flag("Print what was drawn as one JSON object on standard output.")
+    as_json: bool = flag("Print what was drawn as one JSON object on standard output.", flags=JSON)
 
 
 @dataclass(frozen=True)

@@ -20,10 +20,10 @@ from .command import COMMON, check_declared, command, flag, option, refuse, valu
 from .console import WIDTH, Console, count_of, for_screen, is_terminal, print_json, rows
 from .options.cameras import Cameras
 from .options.common import (
+    JSON,
     General,
     assert_errors,
     assert_option,
-    json_flag,
     output_option,
     overwrite_flag,
     plot_option,
@@ -135,8 +135,8 @@ HEADINGS = (COMMON, "Inputs", "Cameras", "Cut", "Streamed SOG", "Streaming", "Ou
 
 @dataclass(frozen=True)
 class _TraverseGeneral(General):
-    as_json: bool = json_flag(
-        "Print the summary as one JSON object on standard output; write a table only to --output."
+    as_json: bool = flag(
+        "Print the summary as one JSON object on standard output; write a table only to --output.", flags=JSON
     )
 
 

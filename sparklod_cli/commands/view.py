@@ -18,7 +18,7 @@ from ..system.setting_fields import Quantity, Range, whole
 from ..system.units import format_size, parse_count
 from .command import COMMON, VIEW, argument, check_declared, command, flag, option, values_of
 from .console import Console, count_of, print_json
-from .options.common import General, json_flag, overwrite_flag, quiet_flag, up_option, verbose_flag
+from .options.common import JSON, QUIET, VERBOSE, General, overwrite_flag, up_option
 from .paths import InputPath, OutputPath, keep_apart
 
 if TYPE_CHECKING:
@@ -94,9 +94,9 @@ class _Place:
 
 @dataclass(frozen=True)
 class _ViewGeneral(General):
-    as_json: bool = json_flag("Print the address and the files as one JSON object on standard output.")
-    quiet: bool = quiet_flag("Print nothing but the address, and errors.")
-    verbose: bool = verbose_flag("Print each request.")
+    as_json: bool = flag("Print the address and the files as one JSON object on standard output.", flags=JSON)
+    quiet: bool = flag("Print nothing but the address, and errors.", flags=QUIET)
+    verbose: bool = flag("Print each request.", **VERBOSE)
 
 
 @dataclass(frozen=True)

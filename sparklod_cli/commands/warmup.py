@@ -9,9 +9,9 @@ from typing import Any
 import click
 
 from ..system.setting_fields import whole
-from .command import command, option, values_of
+from .command import command, flag, option, values_of
 from .console import Console, count_of, print_json
-from .options.common import Messages, processors_to_use, verbose_flag
+from .options.common import VERBOSE, Messages, processors_to_use
 
 EXAMPLES = """\
   sparklod warmup                                # once, after pip install
@@ -28,7 +28,7 @@ class _Options(Messages):
         lambda: min(processors_to_use(), 4),
         show_default="processors, up to 4",
     )
-    verbose: bool = verbose_flag("Print which kernels are missing.")
+    verbose: bool = flag("Print which kernels are missing.", **VERBOSE)
 
 
 @command("warmup", _Options, examples=EXAMPLES)

@@ -229,12 +229,6 @@ class RefineOptions:
     seed: int = setting_of(FitSettings, "seed")
     device: str = setting_of(FitSettings, "device")
 
-    def settings(self) -> FitSettings | None:
-        """Return the settings of fitting; None without --refine."""
-        if self.refine is None:
-            return None
-        return FitSettings(steps=self.refine or None, seed=self.seed, device=self.device)
-
 
 def memory_size(text: str) -> int:
     """Parse an amount of memory such as 4G or "600 MB"; raise `ValueError` for one without a unit."""
@@ -282,11 +276,8 @@ class ClusterOptions:
     @contextlib.contextmanager
     def engine(
         self, ctx: click.Context, general: General, memory: int | None, console: Console
-    ) -> Iterator[ClusterEngine | None]:
-        """Yield the cluster for the duration of the context; None without --workers and --scheduler."""
-        if self.workers is None and self.scheduler is None:
-            yield None
-            return
+    ) -> Iterator[ClusterEngine]:
+        """Yield the cluster for the duration of the context."""
         from ...bake.out_of_core.cluster import ClusterSettings, cluster
 
         threads = general.threads if self.scheduler is None or is_set(ctx, "threads") else None

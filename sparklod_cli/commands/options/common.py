@@ -36,28 +36,18 @@ def processors_to_use() -> int:
     return min(processors(), MAX_THREADS)
 
 
-def json_flag(help: str) -> Any:
-    """Return the field of `--json`."""
-    return flag(help, flags=("--json",))
-
-
-def quiet_flag(help: str) -> Any:
-    """Return the field of `-q`, `--quiet`."""
-    return flag(help, flags=("-q", "--quiet"))
-
-
-def verbose_flag(help: str) -> Any:
-    """Return the field of `-v`, `--verbose`, which `cli.run` reads, too."""
-    return flag(help, flags=("-v", "--verbose"), callback=_note_verbosity)
+#: Flags of options of every command; `cli.run` reads the verbosity, too.
+JSON, QUIET = ("--json",), ("-q", "--quiet")
+VERBOSE: dict[str, Any] = {"flags": ("-v", "--verbose"), "callback": _note_verbosity}
 
 
 @dataclass(frozen=True)
 class Messages:
     """Options of every command. Commands override the fields whose help differs."""
 
-    as_json: bool = json_flag("Print one JSON object on standard output.")
-    quiet: bool = quiet_flag("Print nothing but errors.")
-    verbose: bool = verbose_flag("Print how long each stage took, and which settings were chosen.")
+    as_json: bool = flag("Print one JSON object on standard output.", flags=JSON)
+    quiet: bool = flag("Print nothing but errors.", flags=QUIET)
+    verbose: bool = flag("Print how long each stage took, and which settings were chosen.", **VERBOSE)
 
 
 @dataclass(frozen=True)
@@ -67,7 +57,7 @@ class General(Messages):
     threads: int = option(
         "Number of threads to work on.", whole(1, MAX_THREADS), processors_to_use, show_default="all processors"
     )
-    as_json: bool = json_flag("Print one JSON object for each file on standard output.")
+    as_json: bool = flag("Print one JSON object for each file on standard output.", flags=JSON)
 
 
 def overwrite_flag(**attributes: Any) -> Any:
