@@ -5,8 +5,6 @@ from typing import TYPE_CHECKING
 __version__: str
 
 if TYPE_CHECKING:  # mypy then resolves the modules first, which import this one
-    from .api.cameras import orbit as orbit
-    from .api.cameras import read_cameras as read_cameras
     from .api.files import inspect as inspect
     from .api.files import pack as pack
     from .api.files import read as read
@@ -23,7 +21,9 @@ if TYPE_CHECKING:  # mypy then resolves the modules first, which import this one
     from .api.views import Picture as Picture
     from .api.views import compare as compare
     from .api.views import cut as cut
+    from .api.views import orbit as orbit
     from .api.views import psnr as psnr
+    from .api.views import read_cameras as read_cameras
     from .api.views import render as render
     from .api.views import show as show
     from .api.views import ssim as ssim

@@ -166,9 +166,8 @@ def _thumbnail(report: Report, scene: Scene, threads: int) -> DescribedPicture |
     """Return the scene as a viewer draws it; None where it is broken, or too large to be drawn at once."""
     from ..figures.tree_plot import DescribedPicture
     from ..inspection.arrays import NO_CHILDREN
-    from .cameras import orbit
     from .files import as_tree
-    from .views import cut, render, show
+    from .views import cut, orbit, render, show
 
     count = len(scene.splats)
     if not count or scene.splats.invalid() or NO_CHILDREN in report.notes:

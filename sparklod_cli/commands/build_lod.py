@@ -212,18 +212,6 @@ class BakedFiles:
     def is_merged(self) -> bool:
         return self.merge or self.scene is not None
 
-    def instances(self) -> list[Instance]:
-        """Return the instances of the instances file; none without one.
-
-        Raises:
-            InstancesFileError: it cannot be read.
-        """
-        if self.scene is None:
-            return []
-        from ..scenes.instances_file import read_instances
-
-        return read_instances(self.scene)
-
     def jobs(self, instances: Sequence[Instance], say: Callable[[str], None]) -> list[tuple[Source, Place]]:
         """Return pairs of an input and its output; `say` gets a line on attributes of instances that are ignored."""
         from ..bake.sources import Merged
@@ -299,13 +287,17 @@ def check_inputs(ctx: click.Context, files: BakedFiles) -> None:
         raise click.UsageError(f"{flag} makes one file of all inputs; name it with --output")
 
 
-def record_of(source: Source) -> dict[str, Any]:
-    """Return the input as a line of JSON has it: "input", or "inputs" where several are one scene."""
+def record_of(source: Source, target: Place, outcome: Outcome) -> dict[str, Any]:
+    """Return the JSON of a result; several inputs that are one scene are "inputs"."""
     from ..bake.sources import Merged
 
+    record: dict[str, Any] = {"input": str(source)}
     if isinstance(source, Merged):
-        return {"inputs": [str(each.file) for each in source.files]}
-    return {"input": str(source)}
+        record = {"inputs": [str(each.file) for each in source.files]}
+    if isinstance(outcome, SparklodError):
+        return {**record, "error": shortened(str(outcome), MOST)}
+    more = {"skipped": True} if outcome is None else dataclasses.asdict(outcome)
+    return {**record, "output": str(target), **more}
 
 
 def check_formats(ctx: click.Context, outputs: BakedFiles) -> None:
@@ -467,7 +459,11 @@ def build_lod(ctx: click.Context, /, **_: Any) -> None:
     options = values_of(ctx, BuildLodOptions)
     files, general = options.files, options.general
     check_inputs(ctx, files)
-    instances = files.instances()
+    instances: list[Instance] = []
+    if files.scene is not None:
+        from ..scenes.instances_file import read_instances
+
+        instances = read_instances(files.scene)
     _check(ctx, options, [instance.file for instance in instances if instance.file is not None])
     failed = False
     cluster, console = options.cluster, Console(quiet=general.quiet, verbose=general.verbose)
@@ -481,15 +477,12 @@ def build_lod(ctx: click.Context, /, **_: Any) -> None:
             if isinstance(outcome, SparklodError):
                 failed = True
                 console.error(f"{name_of(source)}: {outcome}")
-                record = {**record_of(source), "error": shortened(str(outcome), MOST)}
             elif outcome is None:
                 console.say(f"{name_of(source)}  ->  {target}  exists already")
-                record = {**record_of(source), "output": str(target), "skipped": True}
             else:
                 report(console, source, target, outcome)
-                record = {**record_of(source), "output": str(target), **dataclasses.asdict(outcome)}
             if general.as_json:
-                print_json(record)
+                print_json(record_of(source, target, outcome))
             if interrupts.came():  # during fitting, which then ends early
                 console.clear()
                 say("interrupted")

@@ -64,8 +64,7 @@ def report_baked(console: Console, source: Place, target: Place, baked: Baked) -
     if baked.tiles is not None and baked.tiles.levels > 1:
         console.say(f"  splats level by level: {', '.join(f'{count:,}' for count in baked.tiles.splats)}")
     _report_tree(console, baked, baked.refine)
-    consequences = _consequences(baked)
-    if consequences:
+    if baked.clamps and (consequences := _consequences(baked)):
         console.say(f"  {consequences}")
     if not console.verbose:
         return

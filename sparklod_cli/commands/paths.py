@@ -6,7 +6,7 @@ import functools
 import os
 import stat
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -154,8 +154,14 @@ def keep_apart(ctx: click.Context, stands_for: Mapping[str, Iterable[Place]] | N
             inputs += [*(values if isinstance(kind, InputPath) else []), *(more or ())]
     files, places = set[tuple[int, int]](), dict[str, str]()
     written = [(path, status) for path in outputs if path != DASH and not _is_stream(status := _status(path))]
+    read = [path for path in dict.fromkeys(inputs) if path != DASH]
     # An output that does not exist is no companion of an input, which would have to be opened to find that out.
-    for path in _all_read(inputs, companions=any(status is not None for _, status in written)):
+    if any(status is not None for _, status in written):
+        from ..cameras.formats.table import NAMES
+        from ..io.local_files import companions
+
+        read += [each for path in read if isinstance(path, Path) for each in companions(path, NAMES)]
+    for path in read:
         places[_place(path)] = INPUT
         status = _status(path)
         if status is not None:
@@ -214,19 +220,6 @@ def is_same_place(one: Place, other: Place) -> bool:
         return False
     statuses = _status(one), _status(other)
     return _place(one) == _place(other) or (all(statuses) and os.path.samestat(*statuses))  # type: ignore[arg-type]
-
-
-def _all_read(paths: Iterable[Place], *, companions: bool) -> Iterator[Place]:
-    """Yield each path, and its companion files if asked."""
-    for path in dict.fromkeys(paths):
-        if path == DASH:
-            continue
-        yield path
-        if companions and isinstance(path, Path):
-            from ..cameras.formats.table import NAMES
-            from ..io.local_files import companions as companions_of
-
-            yield from companions_of(path, NAMES)
 
 
 def _status(path: Place) -> os.stat_result | None:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ..images.defaults import THUMBNAIL_SIZE, THUMBNAIL_SUPERSAMPLE
+from ..render.settings import OF_PIXELS
 from ..system.stdio import DASH
 from ..system.units import format_size
 from .command import COMMON, check_declared, command, flag, flags_set, refuse, values_of
@@ -182,7 +183,8 @@ def _place(
 
     look, output = options.appearance, _output(ctx, options, len(path.cameras))
     if output.form == "npy":
-        refuse(ctx, look.of_pictures(), "cannot be used with a .npy, which holds numbers")
+        without = ("no_bar",) if look.render.color_by not in OF_PIXELS else ("no_bar", "background", "alpha")
+        refuse(ctx, without, "cannot be used with a .npy, which holds numbers")
     settings = PictureSettings(
         background=look.background_for(ctx, output.form),
         bar=not look.no_bar,

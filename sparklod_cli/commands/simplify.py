@@ -227,8 +227,7 @@ def simplify(ctx: click.Context, /, **_: Any) -> None:
             )
         report_simplified(console, files.source, files.output, baked)
         if general.as_json:
-            record = {**record_of(files.source), "output": str(files.output), **dataclasses.asdict(baked)}
-            print_json(record)
+            print_json(record_of(files.source, files.output, baked))
         if interrupts.came():  # during fitting, which then ends early
             console.clear()
             say("interrupted")

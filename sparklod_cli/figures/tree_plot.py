@@ -32,6 +32,7 @@ from ..render.color_scales import (
 )
 from ..system.defaults import DEFAULT_BASE, PLOT_BY
 from ..system.errors import SparklodError
+from ..system.units import count_of
 from .pyvista_scene import (
     Points,
     PyvistaStage,
@@ -177,24 +178,20 @@ def _subject(
         if depth is not None:
             raise SparklodError("it has no depths to draw: it is not a Level-of-Detail tree")
         index, others, depths = np.flatnonzero(drawable), none, None
-        title = _counted(len(index), "splat")
+        title = count_of(len(index), "splat")
     else:
         depths = find_depths(scene.tree.child_count, scene.tree.child_start, spark_size(scene.splats))[0]
         leaf = scene.tree.is_leaf & drawable & (depths >= 0)
         if depth is None:
             index, others = np.flatnonzero(leaf), none
-            title = f"{_counted(len(index), 'leaf', 'leaves')} of a tree of depth {depths.max()}"
+            title = f"{count_of(len(index), 'leaf', 'leaves')} of a tree of depth {depths.max()}"
         else:
             index, others = np.flatnonzero(drawable & (depths == depth)), np.flatnonzero(leaf & (depths < depth))
-            title = f"Depth {depth} of {depths.max()}: {_counted(len(index), 'node')}"
+            title = f"Depth {depth} of {depths.max()}: {count_of(len(index), 'node')}"
         if not len(index):
             what = "leaf" if depth is None else f"node of depth {depth}"
             raise SparklodError(f"there is no {what} to draw: the tree has depths 0 to {depths.max()}")
     return index, others, depths, title
-
-
-def _counted(count: int, one: str, many: str = "") -> str:
-    return f"{count:,} {one if count == 1 else many or one + 's'}"
 
 
 def _voxels(stage: PyvistaStage, splats: Splats, low: Points, high: Points, eye: Points) -> str:
@@ -210,7 +207,7 @@ def _voxels(stage: PyvistaStage, splats: Splats, low: Points, high: Points, eye:
     occupied = cells(splats.center[inside], step)
     if len(occupied) <= MOST_CELLS:
         stage.lines(box_lines(occupied, occupied + step), VOXELS, 0.4)
-        return f"blue: the {_counted(len(occupied), 'voxel')} {said} that hold them"
+        return f"blue: the {count_of(len(occupied), 'voxel')} {said} that hold them"
     every = max(1, round(nice_step(float((high - low).max()) / (MOST_LINES * step))))
     stage.lines(wall_lines(low, high, np.where(eye > (low + high) / 2, low, high), every * step), VOXELS, 0.35)
     line = f", every {every}{'nd' if every == 2 else 'th'} line" if every > 1 else ""

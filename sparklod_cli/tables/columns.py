@@ -198,11 +198,8 @@ def _csv(rows: Iterable[Row], columns: Sequence[Column]) -> Iterator[bytes]:
 def _field(column: Column, row: Row) -> str:
     """Return a field of CSV; a ' before a formula makes it a text."""
     text = column.text(_cell(column, row))
-    return _quoted("'" + text if column.kind is str and text.startswith(FORMULAS) else text)
-
-
-def _quoted(text: str) -> str:
-    """Return a quoted field of CSV. The module csv quotes carriage returns in some versions of Python only."""
+    text = "'" + text if column.kind is str and text.startswith(FORMULAS) else text
+    # The module csv quotes carriage returns in some versions of Python only.
     return '"' + text.replace('"', '""') + '"' if any(mark in text for mark in QUOTED) else text
 
 

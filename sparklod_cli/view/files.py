@@ -115,11 +115,6 @@ def media_type(name: str) -> str:
     return MEDIA_TYPES.get(Path(name).suffix.lower(), BYTES)
 
 
-def url_of(name: str) -> str:
-    """Return a resource's name as a relative address."""
-    return quote(os.fsencode(name))
-
-
 def shown_files(paths: Sequence[Path]) -> list[ShownFile]:
     """Return the files that a page shows, each with the files it refers to.
 
@@ -172,7 +167,7 @@ def _shown(path: Path, folder: str) -> ShownFile:
         files |= {f"{folder}/{chunk}": companion for chunk, companion in _chunk_files(path, header)}
     note = _note(path.name, head, header)
     file_type = SPARK_TYPES.get(form.name)
-    return ShownFile(path, printable(path.name), url_of(name), form.name, file_type, header, files, note)
+    return ShownFile(path, printable(path.name), quote(os.fsencode(name)), form.name, file_type, header, files, note)
 
 
 def _note(name: str, head: bytes, header: RadHeader | None) -> str | None:

@@ -13,7 +13,7 @@ import click
 from ...codecs.rounding import ROUND_TRIPS
 from ...images.defaults import JPEG_QUALITY, MOVING, STILL, THUMBNAIL_SIZE, THUMBNAIL_SUPERSAMPLE
 from ...render.devices import uses_card
-from ...render.settings import OF_PIXELS, SORTINGS, RenderSettings
+from ...render.settings import SORTINGS, RenderSettings
 from ...system import defaults
 from ...system.setting_fields import Range, whole
 from ..command import COLOR, COMMON, flag, is_set, option, refuse
@@ -130,10 +130,6 @@ class Appearance:
         known = {name: value for name, value in options.items() if value is not None}
         device = "cuda" if uses_card(self.render.device, say) else "cpu"
         return dataclasses.replace(self.render, device=device, options=known)
-
-    def of_pictures(self) -> tuple[str, ...]:
-        """Return the options that have no effect on a .npy file."""
-        return ("no_bar", "background", "alpha") if self.render.color_by in OF_PIXELS else ("no_bar",)
 
 
 @dataclass(frozen=True)
