@@ -12,7 +12,7 @@ from .codecs.formats import WRITABLE
 from .codecs.losses import Losses, settled_with_losses
 from .codecs.options import WriteOptions
 from .codecs.spz import like
-from .codecs.validation import check_scene
+from .codecs.validation import check_valid
 from .io import read_scene, scene_output, write_scene
 from .model.scene import Scene
 from .system.addresses import Place
@@ -81,7 +81,7 @@ def extract_leaves(
         start = time.perf_counter()
         scene = read_scene(source, threads=threads, progress=progress)
         leaves = leaves_of(scene)
-        check_scene(leaves, threads)
+        check_valid(leaves.splats, threads)
         read_done = time.perf_counter()
         # As they are: their opacities make up for nothing.
         chosen = dataclasses.replace(like(scene.header, options), covering=False)

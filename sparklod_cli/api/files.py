@@ -94,12 +94,12 @@ def pack(scene: Scene, encoding: str, *, threads: int | None = None) -> dict[str
     """
     from ..codecs.formats import ENCODINGS
     from ..codecs.gpu import dump
-    from ..codecs.validation import check_scene
+    from ..codecs.validation import check_valid
 
     if encoding not in ENCODINGS:
         raise ValueError(f"there is no encoding {encoding!r}; give one of {', '.join(ENCODINGS)}")
     count = thread_count(threads)
-    check_scene(scene_like(scene), count)
+    check_valid(scene_like(scene).splats, count)
     return dump.pack(scene, encoding, count)
 
 

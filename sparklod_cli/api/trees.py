@@ -12,6 +12,7 @@ from ..bake.settings import BakeSettings, SimplifyGoal
 from ..bake.simplifying import Simplifier
 from ..cameras.camera import Camera
 from ..cameras.path import CameraPath
+from ..codecs.validation import check_valid
 from ..fitting.settings import STEPS, FitSettings
 from ..lod.builders import BUILDERS, METHODS
 from ..model.scene import Scene, Tree
@@ -130,6 +131,8 @@ def simplify(
         )
     elif selection is not None or max_sh != MAX_SH_DEGREE:
         raise ValueError("selection and max_sh are for scenes without a tree; give the splats that it was built from")
+    else:
+        check_valid(scene.splats, thread_count(threads))
     with on_threads(threads) as count, progress_callback(progress) as callback, memory_errors_translated():
         simplifier = Simplifier(goal, fitting, None if path is None else path.cameras)
         chosen = simplifier.choose(scene, bytes_of=len, threads=count, progress=callback).scene
@@ -176,6 +179,7 @@ def refine(
     """
     if scene_like(tree).tree is None:
         raise FormatError("the scene has no Level-of-Detail tree; build_lod makes one")
+    check_valid(tree.splats, thread_count(threads))
     settings = FitSettings(steps, seed, None if cameras is None else path_like(cameras), device)
     with progress_callback(progress) as callback, memory_errors_translated():
         return refined_tree(tree, settings, thread_count(threads), callback, say)

@@ -93,7 +93,7 @@ def write(
     from ..codecs.formats import WRITABLE, ending_of
     from ..codecs.options import RadOptions, SogOptions, WriteOptions
     from ..codecs.splat_encoding import SplatEncoding
-    from ..codecs.validation import check_scene
+    from ..codecs.validation import check_valid
     from ..lod.detail_rule import DetailSettings
 
     path, count = file_path(path), thread_count(threads)
@@ -128,7 +128,9 @@ def write(
         if encoding is not None:
             return _write_arrays(path, scene, encoding, overwrite=overwrite, threads=count)
         with naming(path):
-            check_scene(scene, count)
+            check_valid(scene.splats, count)
+            if environment is not None:
+                check_valid(scene_like(environment).splats, count)
         if streamed:
             output = DetailOutput(detail or DetailSettings(), options, parts_output(path, overwrite=overwrite))
             return _write_levels(path, scene, environment, output, count, callback)

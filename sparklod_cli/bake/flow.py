@@ -56,7 +56,7 @@ def bake(
         say: receives one-line messages for the user.
 
     Raises:
-        FormatError, InvalidSplatsError, OutputError: see `open_source`, `Selection.check`, `validation.check_scene` and
+        FormatError, InvalidSplatsError, OutputError: see `open_source`, `Selection.check`, `validation.check_valid` and
             `system.output.Output`; or the input has a tree, and the settings do not keep it.
         ScratchError: the scratch folder is full, in use, or belongs to another bake.
         OutOfMemoryError: the scene does not fit into memory.

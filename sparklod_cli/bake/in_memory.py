@@ -10,7 +10,7 @@ import numpy as np
 from ..codecs.encoder import Encoder, Get, results
 from ..codecs.reader import Reader
 from ..codecs.statistics import Statistics
-from ..codecs.validation import check_scene
+from ..codecs.validation import check_valid
 from ..lod.builders import BUILDERS
 from ..model.lod_tree import LodTree
 from ..model.scene import Scene
@@ -61,6 +61,7 @@ class InMemory:
         antialiased, up = scene.antialiased, settings.up_of(scene.up)
         if scene.tree is not None:
             tree.output, tree.is_ordered = output_of_existing_tree(self.output, self.source, scene, settings)
+            check_valid(scene.splats, threads)
             tree.splats = int(np.count_nonzero(scene.tree.is_leaf))
             tree.nodes = Scene(scene.splats, scene.tree, antialiased, up=up)
             self.clock.end("read")
@@ -87,9 +88,8 @@ class InMemory:
         return tree
 
     def order(self, tree: BuiltTree) -> None:
-        """Check a tree, put its nodes into the order of its output, and count them."""
+        """Put the nodes of a tree into the order of its output, and count them."""
         scene, output = tree.scene, tree.output
-        check_scene(scene, self.threads)
         assert scene.tree is not None
         tree.levels = int(scene.tree.depths().max()) + 1
         if output.in_chunks and not tree.is_ordered:

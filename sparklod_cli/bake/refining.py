@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..codecs.validation import check_valid
 from ..fitting.settings import FitReport, FitSettings
 from ..model.scene import Scene
 from ..model.splats import Splats
@@ -63,13 +62,11 @@ def refined(
         say: told what came of each stage.
 
     Raises:
-        InvalidSplatsError: a node has numbers that no splat has, as only a file of another program can.
         KeyboardInterrupt: the fitting was interrupted before it gained anything.
     """
     from ..fitting.fit import fit
 
     assert scene.tree is not None
-    check_valid(scene.splats, threads)
     start = time.perf_counter()
     with interrupts.deferred() as interrupted:
         nodes, report = fit(

@@ -62,7 +62,7 @@ def with_valid_tree(scene: Scene) -> Scene:
 
 
 def is_valid_and_visible(splats: Splats, threads: int) -> tuple[bool, bool]:
-    """Return whether splats are beyond doubt valid, and visible; where not, `Splats.invalid` and `Selection` tell.
+    """Return whether all splats are certainly valid, and visible; otherwise `Splats.invalid` and `Selection` decide.
 
     Rounding differs from theirs, so a rotation has to be nearer to a unit one.
     """
@@ -78,17 +78,6 @@ def is_valid_and_visible(splats: Splats, threads: int) -> tuple[bool, bool]:
 
 
 def check_valid(splats: Splats, threads: int) -> None:
-    """Check that splats can be written; raises `InvalidSplatsError` if one is invalid."""
+    """Check splats where they enter: from a file or from the API; `InvalidSplatsError` if one is invalid."""
     if not is_valid_and_visible(splats, threads)[0] and (invalid := splats.invalid()):
         raise InvalidSplatsError(f"{describe_invalid(invalid)}; such splats are not written, leave them out")
-
-
-def check_scene(scene: Scene, threads: int) -> None:
-    """Check that a scene can be written: `check_valid`, and its tree if it has one.
-
-    Raises:
-        InvalidSplatsError: a splat is invalid.
-        TreeError: the tree is broken, or of another number of nodes.
-    """
-    scene.check_tree()
-    check_valid(scene.splats, threads)

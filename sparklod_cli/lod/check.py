@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..codecs.validation import check_valid
 from ..model.splats import Splats
 from ..system.errors import InvalidSplatsError
 from ..system.threads import BLOCK_ROWS, threads_for
@@ -44,11 +43,10 @@ def check_setting(name: str, value: float, least: float, most: float) -> None:
 
 
 def check(splats: Splats) -> Bounds:
-    """Return the bounds of splats; raise `InvalidSplatsError` without any, or if one is invalid or invisible."""
+    """Return the bounds of valid splats; raise `InvalidSplatsError` without any, or if one is invisible."""
     if len(splats) == 0:
         raise InvalidSplatsError("no splat is left to build a tree of")
-    with threads_for(len(splats)) as threads:
-        check_valid(splats, threads)
+    with threads_for(len(splats)):
         bounds = Bounds.of(splats)
     check_visible(bounds.smallest, float(splats.opacity.min()))
     return bounds

@@ -62,7 +62,7 @@ def build(splats: Splats, growth: float = DEFAULT_GROWTH, *, progress: Progress 
         M >= N splats and their tree.
 
     Raises:
-        InvalidSplatsError: there are no splats, or one is invalid or invisible.
+        InvalidSplatsError: there are no splats, or one is invisible.
         ValueError: the growth is out of range.
     """
     check_setting("growth", growth, MIN_GROWTH, MAX_GROWTH)

@@ -71,7 +71,7 @@ def build(splats: Splats, base: float = DEFAULT_BASE, *, progress: Progress = si
         M >= N splats and their tree; merged ones have linear opacities up to 1000.
 
     Raises:
-        InvalidSplatsError: there are no splats, or one is invalid or invisible.
+        InvalidSplatsError: there are no splats, or one is invisible.
         ValueError: the base is out of range.
     """
     check_setting("base", base, MIN_BASE, MAX_BASE)

@@ -85,6 +85,19 @@ def test_invalid_splats_are_never_written(wrong: str, scene: Scene, tree: Tree, 
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("wrong", WRONG)
+def test_invalid_splats_reach_neither_a_builder_nor_the_fitting(wrong: str, scene: Scene, tree: Tree) -> None:
+    whole, nodes = spoiled(scene, wrong), spoiled(tree, wrong)
+    for work in (
+        lambda: sparklod.build_lod(whole),
+        lambda: sparklod.simplify(whole, to=20),
+        lambda: sparklod.simplify(nodes, to=20),
+        lambda: sparklod.refine(nodes, steps=1),
+    ):
+        with pytest.raises(InvalidSplatsError, match=r"1 of .* splats is"):
+            work()
+
+
 def test_broken_trees_are_never_written(tree: Tree, tmp_path: Path) -> None:
     start = tree.tree.child_start.copy()
     start[0] = 2**32 - 1

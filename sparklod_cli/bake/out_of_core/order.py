@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...codecs.encoder import windows_of
-from ...codecs.validation import check_valid
 from ...lod.builders import BUILDERS
 from ...lod.chunk_order import MOST_FAMILIES, family_order
 from ...lod.families import band_order
@@ -275,7 +274,6 @@ def encode(job: Job, window: int, *, threads: int, progress: Progress) -> None:
     start = window * WINDOW_NODES
     stop = min(start + WINDOW_NODES, encoder.count)
     splats, tree = _read(job.store, width_of(job.sh_degree), start, stop, threads)
-    check_valid(splats, threads)
 
     def encoded(part: slice) -> dict[str, NDArray[np.generic]]:
         return encoder.encode(splats.rows(part), tree.rows(part), start + part.start)

@@ -26,7 +26,6 @@ from ..clamps import CodeRange
 from ..file_names import META, SOG_IMAGES
 from ..file_notes import note_of
 from ..options import DEFAULTS, WriteOptions
-from ..validation import check_valid
 from . import texel_codings as codings
 from .sog_container import MAX_SIDE, Texels, encode_webp, image_of, size_for, zipped
 from .texel_codings import codebook, even_codebook, nearest
@@ -72,7 +71,6 @@ def settled(scene: Scene, options: WriteOptions) -> WriteOptions:
     Raises:
         FormatError: the scene has a tree or no splats, or values that SOG cannot hold: opacities above 1, more splats
             than an image has texels.
-        InvalidSplatsError: a splat is invalid.
     """
     codes = options.sog.sh_codes
     if scene.tree is not None:
@@ -95,7 +93,6 @@ def held(options: WriteOptions, sh_degree: int) -> tuple[CodeRange, ...]:
 
 def _check(splats: Splats) -> None:
     """Raise a `FormatError` where splats have values that SOG cannot hold."""
-    check_valid(splats, threads=1)
     most = float(splats.opacity.max())
     if most > 1:
         raise FormatError(f"opacities reach {most:.6g}, and SOG holds 0 to 1; clip them first")
