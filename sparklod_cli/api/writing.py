@@ -19,8 +19,7 @@ from .arguments import ProgressLike, file_path, progress_callback, scene_like
 from .files import naming, pack
 
 if TYPE_CHECKING:
-    from ..bake.parts_output import DetailOutput
-    from ..codecs.options import RadOptions, SogOptions
+    from ..codecs.options import RadOptions, SogOptions, WriteOptions
     from ..lod.detail_rule import DetailSettings
     from ..system.progress import Progress
 
@@ -89,7 +88,6 @@ def write(
         TypeError: an option is of another type.
         ValueError: an option is out of its range, or is of another format.
     """
-    from ..bake.parts_output import DetailOutput
     from ..codecs.formats import WRITABLE, ending_of
     from ..codecs.options import RadOptions, SogOptions, WriteOptions
     from ..codecs.splat_encoding import SplatEncoding
@@ -132,8 +130,8 @@ def write(
             if environment is not None:
                 check_valid(scene_like(environment).splats, count)
         if streamed:
-            output = DetailOutput(detail or DetailSettings(), options, parts_output(path, overwrite=overwrite))
-            return _write_levels(path, scene, environment, output, count, callback)
+            out = parts_output(path, overwrite=overwrite)
+            return _write_levels(out, scene, environment, detail or DetailSettings(), options, count, callback)
         if form is None or (scene.tree is not None and not form.trees):
             known = ", ".join(ending for ending, each in WRITABLE.items() if each.trees or scene.tree is None)
             what = "a tree" if scene.tree is not None else "a scene"
@@ -144,10 +142,19 @@ def write(
 
 
 def _write_levels(
-    path: Path, scene: Scene, environment: Scene | None, output: DetailOutput, threads: int, progress: Progress
+    out: Output,
+    scene: Scene,
+    environment: Scene | None,
+    settings: DetailSettings,
+    options: WriteOptions,
+    threads: int,
+    progress: Progress,
 ) -> Written:
+    from ..bake.parts_output import write_levels
     from ..bake.records import Clock
 
+    path = out.place
+    assert isinstance(path, Path)
     if scene.tree is None:
         raise FormatError(f"{path}: detail levels are cuts of a tree; build_lod makes one, best by method='quality'")
     if environment is not None and scene_like(environment).tree is not None:
@@ -155,7 +162,8 @@ def _write_levels(
     if environment is not None and not len(environment.splats):
         raise InvalidSplatsError(f"{path}: the environment has no splats to write")
     always = None if environment is None else environment.splats
-    return Written(path, "Streamed SOG", output.write_levels(scene, always, Clock(), threads, progress).bytes)
+    written = write_levels(scene, always, out, settings, options, Clock(), threads, progress)
+    return Written(path, "Streamed SOG", written.bytes)
 
 
 def _write_arrays(path: Path, scene: Scene, encoding: str, *, overwrite: bool, threads: int) -> Written:

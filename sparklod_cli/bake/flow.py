@@ -17,7 +17,7 @@ from ..system.progress import Progress, silent
 from ..system.stdio import DASH
 from . import estimate
 from .in_memory import InMemory
-from .output import output_of
+from .output import output_of, write_tree
 from .records import Baked, Clock
 from .settings import BakeSettings, Resources
 from .sources import Source, open_source
@@ -102,7 +102,7 @@ def bake(
             tree.nodes, fit = refined(tree.scene, fitting, threads=threads, progress=progress, say=say)
             clock.end("refine")
         work.order(tree)
-        written = tree.output.write(tree, work.encode, clock, threads, progress)
+        written = write_tree(tree, work.encode, clock, threads, progress)
         traffic = None if blocks is None else blocks.job.store.traffic
     return Baked(
         **vars(written),

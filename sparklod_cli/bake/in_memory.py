@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..codecs.encoder import Encoder, Get, results
+from ..codecs.encoder import Encoder, Windows, results
 from ..codecs.reader import Reader
 from ..codecs.statistics import Statistics
 from ..codecs.validation import check_valid
@@ -17,7 +17,7 @@ from ..model.scene import Scene
 from ..model.splats import Splats
 from ..system.progress import Progress
 from ..system.threads import on_threads
-from .output import BakeOutput, FileOutput, output_of_existing_tree
+from .output import BakeOutput, output_of_existing_tree
 from .records import BuiltTree, Clock
 from .selecting import read_environment, select, split_environment, transformed
 from .settings import BakeSettings
@@ -75,7 +75,7 @@ class InMemory:
         if far is not None and tree.environment is None:
             tree.environment = transformed(far, settings.transform, threads)
         self.clock.end("read")
-        if isinstance(self.output, FileOutput):
+        if self.output.form is not None:
             self._leaves = Statistics.of_blocks(splats, np.ones(len(splats), np.bool_), self.output.needed, threads)
             self.output.check(self._leaves)  # before building, so that what does not fit is said at once
         tree.splats, tree.dropped, tree.method = len(splats), tally.dropped, settings.method
@@ -103,18 +103,17 @@ class InMemory:
                 del scene  # `reordered` frees the nodes as it goes
                 tree.nodes = scene = Scene(*reordered(built, order, child_start), antialiased=antialiased, up=up)
             self.clock.end("arrange")
-        if isinstance(output, FileOutput) and self._leaves is not None:
+        if output.form is not None and self._leaves is not None:
             assert scene.tree is not None
             inner = scene.splats.take(~scene.tree.is_leaf)
             merged = Statistics.of_blocks(inner, np.zeros(len(inner), np.bool_), output.needed, self.threads)
             tree.statistics = Statistics.merged([self._leaves, merged])
-        elif isinstance(output, FileOutput):
+        elif output.form is not None:
             tree.statistics = Statistics.of_scene(scene, output.needed, threads=self.threads)
 
-    def encode(self, tree: BuiltTree, encoder: Encoder) -> Get:
-        """Encode the windows of a tree that is in order; return what reads their results."""
-        encoded = list(results(encoder, tree.scene, self.threads, self.progress, "encoding"))
-        return lambda number, name: encoded[number][name]
+    def encode(self, tree: BuiltTree, encoder: Encoder) -> Windows:
+        """Encode the windows of a tree that is in order."""
+        return list(results(encoder, tree.scene, self.threads, self.progress, "encoding"))
 
 
 def build_tree(

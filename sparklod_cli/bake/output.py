@@ -1,4 +1,4 @@
-"""Outputs of a bake: a file that is written in windows, or what is made of all nodes at once, in memory."""
+"""Output of a bake: what is settled of it before the tree is built, and how the tree is written."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import PurePath
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any
 
 from ..codecs import clamps
-from ..codecs.encoder import CLAMPED, Encoder, Get, Stored, windows_of
+from ..codecs.encoder import CLAMPED, Encoder, Stored, Windows, windows_of
 from ..codecs.file_names import RAD_SUFFIX as RAD
 from ..codecs.formats import WRITABLE, Format
 from ..codecs.options import DEFAULTS, WriteOptions
@@ -22,36 +22,57 @@ from ..model.scene import Scene
 from ..model.splats import Splats, same_rows
 from ..system.addresses import Place
 from ..system.errors import FormatError
-from ..system.output import Files, Output
+from ..system.output import Output
 from ..system.progress import Progress
 from .records import BuiltTree, Clock, WrittenTree
 from .settings import SPZ, BakeSettings
 from .sources import Merged, Source
 
-#: Encodes the windows of a tree, and returns what reads their results.
-Encode = Callable[[BuiltTree, Encoder], Get]
+if TYPE_CHECKING:
+    from .simplifying import Simplifier
+
+#: Encodes the windows of a tree.
+Encode = Callable[[BuiltTree, Encoder], Windows]
 
 
+@dataclass(frozen=True)
 class BakeOutput:
-    """Destination of a tree; by default one that is made of all nodes at once, in memory, and holds any tree.
+    """Destination of a tree, and what is settled of it.
 
     Attributes:
-        in_chunks: it is read in chunks, so that nodes are put in an order for that first.
+        out: its files, which were tried.
+        options: of its format.
+        form: of an SPZ or RAD file, which is written in windows; None for what is made of all nodes at once, in memory,
+            and takes any tree.
+        simplifier: of a simplified scene, else None.
+        stored: codes that nodes keep which still have the values of `before`; None without.
+        before: (N,) nodes with these codes.
+        repacked: RAD file whose chunks are copied; None without.
     """
 
-    in_chunks: bool = False
+    out: Output
+    settings: BakeSettings
+    options: WriteOptions
+    form: Format | None = None
+    simplifier: Simplifier | None = None
+    stored: Stored | None = None
+    before: Splats | None = None
+    repacked: Place | None = None
+
+    @property
+    def in_chunks(self) -> bool:
+        """Whether it is read in chunks, so that nodes are put in an order for that first."""
+        return self.form is not None and self.form is WRITABLE[RAD]
 
     @property
     def needed(self) -> frozenset[str]:
-        """Statistics of all nodes by which it is written, see `codecs.statistics`."""
-        return frozenset()
+        """Statistics of all nodes by which the codec settles options, see `codecs.statistics`."""
+        return frozenset() if self.form is None else self.form.codec().needed(self.options)
 
     def check(self, leaves: Statistics) -> None:
-        """Raise `FormatError` where a tree of leaves with these statistics cannot be written."""
-
-    def write(self, tree: BuiltTree, encode: Encode, clock: Clock, threads: int, progress: Progress) -> WrittenTree:
-        """Write a tree whose nodes are in order; in memory, unless this is a `FileOutput`."""
-        raise NotImplementedError
+        """Raise `FormatError` where the format cannot hold a tree of leaves with these statistics."""
+        if self.form is not None:
+            self.form.codec().settled(leaves, self.options)
 
 
 def output_of(
@@ -61,24 +82,20 @@ def output_of(
 
     Raises:
         OutputError: see `system.output.Output`.
+        CameraPathError: see `Simplifier.of`.
     """
-    if settings.detail is not None or settings.tiles is not None:  # which most bakes do without
-        from .parts_output import DetailOutput, TileOutput
-    if settings.detail is not None:
-        return DetailOutput(settings.detail, settings.options, parts_output(target, overwrite=overwrite))
-    if settings.tiles is not None:
-        return TileOutput(settings.tiles, settings.options, parts_output(target, overwrite=overwrite))
-    if settings.simplify is not None:
-        from .simplifying import SimplifiedOutput, Simplifier
+    options = settings.options
+    if settings.detail is not None or settings.tiles is not None:
+        return BakeOutput(parts_output(target, overwrite=overwrite), settings, options)
+    if settings.encoding is not None and settings.simplify is None:
+        return BakeOutput(Output(target, overwrite=overwrite), settings, options)
+    form = WRITABLE[settings.suffix]
+    out = scene_output(target, form, chunked=options.rad.chunked, overwrite=overwrite)
+    if settings.simplify is None:
+        return BakeOutput(out, settings, options, form)
+    from .simplifying import Simplifier
 
-        form = WRITABLE[settings.suffix]
-        out = scene_output(target, form, chunked=settings.options.rad.chunked, overwrite=overwrite)
-        return SimplifiedOutput(form, settings.options, out, Simplifier.of(settings, say))
-    if settings.encoding is not None:
-        return ArrayOutput(settings.encoding, settings.raw, Output(target, overwrite=overwrite))
-    form, chunked = WRITABLE[settings.suffix], settings.options.rad.chunked
-    out = scene_output(target, form, chunked=chunked, overwrite=overwrite)
-    return FileOutput(form, settings.options, out, in_chunks=settings.suffix == RAD)
+    return BakeOutput(out, settings, options, simplifier=Simplifier.of(settings, say))
 
 
 def output_of_existing_tree(
@@ -115,7 +132,7 @@ def output_of_existing_tree(
             f"it has a tree, which {kept}; leave out {', '.join(settings.unused)}, or give the splats that"
             " the tree was built from"
         )
-    if not isinstance(output, FileOutput):
+    if output.form is None:
         return output, False
     options = output.options
     if is_same and settings.refine is not None:
@@ -124,130 +141,106 @@ def output_of_existing_tree(
         return dataclasses.replace(output, options=stored.like(options), stored=stored, before=scene.splats), True
     if is_same and dataclasses.replace(options, rad=dataclasses.replace(options.rad, chunked=False)) == DEFAULTS:
         assert not isinstance(source, Merged)
-        return RepackedOutput(source, output.out), False
+        return dataclasses.replace(output, form=None, repacked=source), False
     return dataclasses.replace(output, options=dataclasses.replace(options, covering=False)), False
 
 
-@dataclass(frozen=True)
-class ArrayOutput(BakeOutput):
-    """Arrays in the layout of a viewer's memory.
+def write_tree(tree: BuiltTree, encode: Encode, clock: Clock, threads: int, progress: Progress) -> WrittenTree:
+    """Write a tree whose nodes are in order to its output; in memory, unless it is written in windows."""
+    output = tree.output
+    settings, options = output.settings, output.options
+    if output.form is not None:
+        return _write_windows(tree, output.form, encode, clock, threads, progress)
+    if output.repacked is not None:
+        return _repack(output.repacked, output.out, clock)
+    if settings.detail is not None or settings.tiles is not None:
+        from .parts_output import write_levels, write_tiles
 
-    Attributes:
-        encoding: of `codecs.formats.ENCODINGS`.
-        raw: their words alone, rather than a .npz.
-    """
-
-    encoding: str
-    raw: bool
-    out: Output
-
-    def write(self, tree: BuiltTree, encode: Encode, clock: Clock, threads: int, progress: Progress) -> WrittenTree:
-        """Pack the nodes and write the arrays."""
-        from ..codecs.gpu import dump
-
-        arrays = dump.pack(tree.scene, self.encoding, threads)
-        with self.out as out:
-            size = out.write(out.target.name, dump.encode_raw(arrays) if self.raw else dump.encode_npz(arrays))
-        shapes = {name: words.shape for name, words in arrays.items()}
-        clock.end("write")
-        return WrittenTree(output_format=self.encoding, bytes=size, arrays=shapes)
-
-
-@dataclass(frozen=True)
-class RepackedOutput(BakeOutput):
-    """RAD file with the chunks of another one."""
-
-    source: Place
-    out: Output
-
-    def write(self, tree: BuiltTree, encode: Encode, clock: Clock, threads: int, progress: Progress) -> WrittenTree:
-        """Copy the chunks."""
-        with opened(self.source) as (file, form, more):
-            chunks = form.codec().RadReader.open(file, **more)
-            with self.out as out:
-                name = out.target.name
-                whole = out.siblings is None
-                files = [(name, chunks.in_one_file())] if whole else chunks.in_files(PurePath(name).stem)
-                size = sum(out.write(*file) for file in files)
-            encodings = chunks.encodings
-        clock.end("write")
-        return WrittenTree(
-            output_format="rad" if chunks.header.chunked else "rad-chunked",
-            bytes=size,
-            chunks=len(chunks.header.chunks),
-            encodings=encodings,
-            sh_codes=chunks.header.sh_code_count,
+        if settings.tiles is not None:
+            return write_tiles(tree.scene, output.out, settings.tiles, options, clock, threads, progress)
+        assert settings.detail is not None
+        return write_levels(
+            tree.scene, tree.environment, output.out, settings.detail, options, clock, threads, progress
         )
+    if output.simplifier is not None:
+        from .simplifying import write_simplified
+
+        return write_simplified(tree, output.simplifier, clock, threads, progress)
+    assert settings.encoding is not None
+    return _write_arrays(tree.scene, output.out, settings.encoding, clock, threads, raw=settings.raw)
 
 
-@dataclass(frozen=True)
-class FileOutput(BakeOutput):
-    """SPZ or RAD file, written in windows.
-
-    Attributes:
-        in_chunks: see `BakeOutput`; RAD is.
-        stored: codes that nodes keep which still have the values of `before`; None where there are none.
-        before: (N,) nodes with these codes.
-    """
-
-    form: Format
-    options: WriteOptions
-    out: Output
-    in_chunks: bool
-    stored: Stored | None = None
-    before: Splats | None = None
-
-    @property
-    def needed(self) -> frozenset[str]:
-        """Statistics by which the codec settles options."""
-        needed: frozenset[str] = self.form.codec().needed(self.options)
-        return needed
-
-    def check(self, leaves: Statistics) -> None:
-        """Fail where the format cannot hold a tree of these leaves."""
-        self.form.codec().settled(leaves, self.options)
-
-    def encoder(self, tree: BuiltTree, threads: int, progress: Progress) -> Encoder:
-        """Return the encoder of a tree, which counts what it clamps."""
-        codec: Any = self.form.codec()
-        options: WriteOptions = codec.settled(tree.statistics, self.options)
-        ranges = tuple(codec.held(options, tree.sh_degree))
-        encoder: Encoder = codec.encoder(tree.nodes, options, ranges, threads=threads, progress=progress)
-        if self.stored is None or self.before is None:
-            return encoder
-        return self.stored.keeping(encoder, same_rows(tree.scene.splats, self.before))
-
-    def write(self, tree: BuiltTree, encode: Encode, clock: Clock, threads: int, progress: Progress) -> WrittenTree:
-        """Encode the windows and write the file."""
-        encoder = self.encoder(tree, threads, progress)
-        get, options, count = encode(tree, encoder), encoder.options, encoder.count
-        with self.out as out:
-            name = out.target.name
-            if out.siblings is None:
-                size = out.write(name, encoder.pieces(get, threads=threads, progress=progress))
-            else:
-                files: Files = cast(Any, encoder).files(get, PurePath(name).stem, progress=progress)
-                size = sum(out.write(*file) for file in files)
-        numbers = range(len(windows_of(count)) if encoder.ranges else 0)
-        beyond = clamps.Clamps()
-        if numbers:
-            beyond = clamps.clamps_of(clamps.merged([get(number, CLAMPED) for number in numbers]), encoder.ranges)
-        clock.end("write")
-        if not self.in_chunks:
-            return WrittenTree(
-                output_format="spz",
-                bytes=size,
-                version=options.spz_version,
-                fractional_bits=options.fractional_bits,
-                clamped=beyond.splats,
-                clamps=beyond.ends,
-            )
+def _write_windows(
+    tree: BuiltTree, form: Format, encode: Encode, clock: Clock, threads: int, progress: Progress
+) -> WrittenTree:
+    """Encode the windows of an SPZ or RAD file and write them."""
+    output, codec = tree.output, form.codec()
+    settled: WriteOptions = codec.settled(tree.statistics, output.options)
+    ranges = tuple(codec.held(settled, tree.sh_degree))
+    encoder: Any = codec.encoder(tree.nodes, settled, ranges, threads=threads, progress=progress)
+    if output.stored is not None and output.before is not None:
+        encoder = output.stored.keeping(encoder, same_rows(tree.scene.splats, output.before))
+    windows, options, count, size = encode(tree, encoder), encoder.options, encoder.count, 0
+    numbers = range(len(windows_of(count)))
+    with output.out as out:
+        name = out.target.name
+        if out.siblings is None:
+            for piece in encoder.pieces(windows, threads=threads, progress=progress):
+                size += out.write(name, (piece,))
+        else:
+            chunks = map(windows.__getitem__, numbers)
+            for each, pieces in encoder.files(chunks, PurePath(name).stem, progress=progress):
+                size += out.write(each, pieces)
+    beyond = clamps.Clamps()
+    if encoder.ranges:
+        tallies = [windows[number][CLAMPED] for number in numbers]
+        beyond = clamps.clamps_of(clamps.merged(tallies), encoder.ranges)
+    clock.end("write")
+    if not output.in_chunks:
         return WrittenTree(
-            output_format="rad-chunked" if options.rad.chunked else "rad",
+            output_format="spz",
             bytes=size,
-            chunks=-(-count // CHUNK_NODES),
-            encodings={name: getattr(options.rad, name) for name in OPTIONS if encoder.sh_degree or name != "sh"},
-            sh_codes=min(options.rad.sh_codes, count) if options.rad.sh_codes and encoder.sh_degree else None,
+            version=options.spz_version,
+            fractional_bits=options.fractional_bits,
             clamped=beyond.splats,
             clamps=beyond.ends,
         )
+    return WrittenTree(
+        output_format="rad-chunked" if options.rad.chunked else "rad",
+        bytes=size,
+        chunks=-(-count // CHUNK_NODES),
+        encodings={name: getattr(options.rad, name) for name in OPTIONS if encoder.sh_degree or name != "sh"},
+        sh_codes=min(options.rad.sh_codes, count) if options.rad.sh_codes and encoder.sh_degree else None,
+        clamped=beyond.splats,
+        clamps=beyond.ends,
+    )
+
+
+def _repack(source: Place, out: Output, clock: Clock) -> WrittenTree:
+    """Write a RAD file with the chunks of another one."""
+    with opened(source) as (file, form, more), out:
+        chunks = form.codec().RadReader.open(file, **more)
+        name = out.target.name
+        files = [(name, chunks.in_one_file())] if out.siblings is None else chunks.in_files(PurePath(name).stem)
+        size = sum(out.write(*each) for each in files)
+        encodings = chunks.encodings
+    clock.end("write")
+    return WrittenTree(
+        output_format="rad" if chunks.header.chunked else "rad-chunked",
+        bytes=size,
+        chunks=len(chunks.header.chunks),
+        encodings=encodings,
+        sh_codes=chunks.header.sh_code_count,
+    )
+
+
+def _write_arrays(scene: Scene, out: Output, encoding: str, clock: Clock, threads: int, *, raw: bool) -> WrittenTree:
+    """Write arrays in the layout of a viewer's memory: as .npz, or their words alone."""
+    from ..codecs.gpu import dump
+
+    arrays = dump.pack(scene, encoding, threads)
+    with out:
+        size = out.write(out.target.name, dump.encode_raw(arrays) if raw else dump.encode_npz(arrays))
+    shapes = {name: words.shape for name, words in arrays.items()}
+    clock.end("write")
+    return WrittenTree(output_format=encoding, bytes=size, arrays=shapes)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,8 +16,7 @@ from ..model.tile_scene import TileScene
 from ..system.output import Output
 from ..system.progress import Progress
 from ..system.threads import on_threads
-from .output import BakeOutput, Encode
-from .records import BuiltTree, Clock, WrittenDetail, WrittenLevel, WrittenTiles, WrittenTree
+from .records import Clock, WrittenDetail, WrittenLevel, WrittenTiles, WrittenTree
 
 
 def detail_levels(
@@ -44,32 +42,27 @@ def detail_levels(
     return dataclasses.replace(made, errors=errors, environment=environment, antialiased=antialiased, up=up)
 
 
-@dataclass(frozen=True)
-class DetailOutput(BakeOutput):
-    """A Streamed SOG."""
+def write_levels(
+    scene: Scene,
+    environment: Splats | None,
+    out: Output,
+    settings: DetailSettings,
+    options: WriteOptions,
+    clock: Clock,
+    threads: int,
+    progress: Progress,
+) -> WrittenTree:
+    """Make the levels of a tree and write them as a Streamed SOG, with the splats of an environment."""
+    from ..codecs.streamed_sog.codec import encode_files
 
-    settings: DetailSettings
-    options: WriteOptions
-    out: Output
-
-    def write(self, tree: BuiltTree, encode: Encode, clock: Clock, threads: int, progress: Progress) -> WrittenTree:
-        """Make the levels of a tree and write them."""
-        return self.write_levels(tree.scene, tree.environment, clock, threads, progress)
-
-    def write_levels(
-        self, scene: Scene, environment: Splats | None, clock: Clock, threads: int, progress: Progress
-    ) -> WrittenTree:
-        """Make the levels of a tree and write them, with the splats of an environment."""
-        from ..codecs.streamed_sog.codec import encode_files
-
-        made = detail_levels(scene, environment, self.settings, clock, threads=threads, progress=progress)
-        size, names = 0, list[str]()
-        with self.out as out:
-            for name, pieces in encode_files(made, self.options, self.settings, threads=threads, progress=progress):
-                size += out.write(name, pieces)
-                names.append(name)
-        clock.end("write")
-        return WrittenTree(output_format="streamed-sog", bytes=size, detail=_written_detail(made, names))
+    made = detail_levels(scene, environment, settings, clock, threads=threads, progress=progress)
+    size, names = 0, list[str]()
+    with out:
+        for name, pieces in encode_files(made, options, settings, threads=threads, progress=progress):
+            size += out.write(name, pieces)
+            names.append(name)
+    clock.end("write")
+    return WrittenTree(output_format="streamed-sog", bytes=size, detail=_written_detail(made, names))
 
 
 def _written_detail(made: DetailScene, names: list[str]) -> WrittenDetail:
@@ -86,33 +79,32 @@ def _written_detail(made: DetailScene, names: list[str]) -> WrittenDetail:
     )
 
 
-@dataclass(frozen=True)
-class TileOutput(BakeOutput):
-    """3D Tiles."""
+def write_tiles(
+    scene: Scene,
+    out: Output,
+    settings: TileSettings,
+    options: WriteOptions,
+    clock: Clock,
+    threads: int,
+    progress: Progress,
+) -> WrittenTree:
+    """Make the tiles of a tree and write them as 3D Tiles."""
+    from ..codecs.tiles_3d.codec import encode_files
+    from ..lod.tiles import make
 
-    settings: TileSettings
-    options: WriteOptions
-    out: Output
-
-    def write(self, tree: BuiltTree, encode: Encode, clock: Clock, threads: int, progress: Progress) -> WrittenTree:
-        """Make the tiles of a tree and write them."""
-        from ..codecs.tiles_3d.codec import encode_files
-        from ..lod.tiles import make
-
-        scene = tree.scene
-        assert scene.tree is not None
-        with on_threads(threads):
-            made = make(scene.splats, scene.tree, self.settings, progress=progress)
-        made = dataclasses.replace(made, antialiased=scene.antialiased, up=scene.up)
-        clock.end("tiles")
-        with self.out as out:
-            files = encode_files(made, self.options, threads=threads, progress=progress)
-            size = sum(out.write(*file) for file in files)
-        clock.end("write")
-        return WrittenTree(output_format="3d-tiles", bytes=size, tiles=_written(made))
+    assert scene.tree is not None
+    with on_threads(threads):
+        made = make(scene.splats, scene.tree, settings, progress=progress)
+    made = dataclasses.replace(made, antialiased=scene.antialiased, up=scene.up)
+    clock.end("tiles")
+    with out:
+        files = encode_files(made, options, threads=threads, progress=progress)
+        size = sum(out.write(*file) for file in files)
+    clock.end("write")
+    return WrittenTree(output_format="3d-tiles", bytes=size, tiles=_written_tiles(made))
 
 
-def _written(made: TileScene) -> WrittenTiles:
+def _written_tiles(made: TileScene) -> WrittenTiles:
     """Return the statistics of tiles that were written."""
     levels = int(made.level.max()) + 1
     splats = tuple(int(made.counts[made.at_level(level)].sum()) for level in range(levels))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import itertools
 import math
 from collections.abc import Callable, Sequence
@@ -13,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras.camera import Camera
-from ..codecs.formats import Format
+from ..codecs.formats import WRITABLE
 from ..codecs.losses import settled_with_losses
-from ..codecs.options import WriteOptions
 from ..fitting.settings import FitSettings
 from ..io.writing import encoded, write_scene
 from ..lod.detail_levels import RefinementOrder, with_plain_opacity
@@ -23,11 +21,9 @@ from ..model.falloff import MIN_ALPHA
 from ..model.scene import Scene
 from ..model.splats import Splats
 from ..system.errors import FormatError, SparklodError
-from ..system.output import Output
 from ..system.progress import Progress
 from ..system.threads import on_threads
 from ..system.units import count_of
-from .output import BakeOutput, Encode
 from .records import BuiltTree, Clock, WrittenSet, WrittenTree
 from .refining import Refined, fit_settings, refined
 from .settings import BakeSettings, SimplifyGoal
@@ -234,34 +230,27 @@ class Simplifier:
         return Chosen(scene, faint, measured, report)
 
 
-@dataclass(frozen=True)
-class SimplifiedOutput(BakeOutput):
-    """File of a simplified scene."""
+def write_simplified(
+    tree: BuiltTree, simplifier: Simplifier, clock: Clock, threads: int, progress: Progress
+) -> WrittenTree:
+    """Cut a tree and write the cut, a scene without a tree."""
+    out, form = tree.output.out, WRITABLE[tree.output.settings.suffix]
+    # The opacities of a tree that was read make up for the rounding of its scales already.
+    options = dataclasses.replace(tree.output.options, covering=tree.method is not None)
 
-    form: Format
-    options: WriteOptions
-    out: Output
-    simplifier: Simplifier
-
-    def write(self, tree: BuiltTree, encode: Encode, clock: Clock, threads: int, progress: Progress) -> WrittenTree:
-        """Cut the tree and write the cut."""
-        # The opacities of a tree that was read make up for the rounding of its scales already.
-        options = dataclasses.replace(self.options, covering=tree.method is not None)
-        with on_threads(threads):
-            bytes_of = functools.partial(self._bytes, options=options, threads=threads)
-            chosen = self.simplifier.choose(tree.scene, bytes_of=bytes_of, threads=threads, progress=progress)
-        settled, losses = settled_with_losses(chosen.scene, self.form, options, threads)
-        clock.end("simplify")
-        size = write_scene(self.out, self.form, chosen.scene, settled, threads=threads, progress=progress)
-        clock.end("write")
-        count = len(chosen.scene)
-        share = round(count / tree.splats, 6)
-        made = WrittenSet(
-            **vars(losses), splats=count, share=share, faint=chosen.faint, psnr=chosen.psnr, refine=chosen.refine
-        )
-        return WrittenTree(output_format=self.form.name, bytes=size, simplified=made)
-
-    def _bytes(self, scene: Scene, *, options: WriteOptions, threads: int) -> int:
-        """Return the size of a file without writing it."""
-        files = encoded(self.out, self.form, scene, self.form.codec().settled(scene, options), threads=threads)
+    def bytes_of(scene: Scene) -> int:
+        files = encoded(out, form, scene, form.codec().settled(scene, options), threads=threads)
         return sum(sum(map(len, pieces)) for _, pieces in files)
+
+    with on_threads(threads):
+        chosen = simplifier.choose(tree.scene, bytes_of=bytes_of, threads=threads, progress=progress)
+    settled, losses = settled_with_losses(chosen.scene, form, options, threads)
+    clock.end("simplify")
+    size = write_scene(out, form, chosen.scene, settled, threads=threads, progress=progress)
+    clock.end("write")
+    count = len(chosen.scene)
+    share = round(count / tree.splats, 6)
+    made = WrittenSet(
+        **vars(losses), splats=count, share=share, faint=chosen.faint, psnr=chosen.psnr, refine=chosen.refine
+    )
+    return WrittenTree(output_format=form.name, bytes=size, simplified=made)

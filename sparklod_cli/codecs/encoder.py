@@ -7,7 +7,7 @@ machines share; then the pieces of the file are made of the results.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -28,8 +28,18 @@ if TYPE_CHECKING:  # Python 3.10 has none
 #: The result of a window: arrays by name.
 Encoded = dict[str, NDArray[Any]]
 
-#: An array of a window's result, by the window's number and the array's name; may be asked for again.
-Get = Callable[[int, str], NDArray[Any]]
+
+class Named(Protocol):
+    """Arrays by name, such as `Encoded`; each may be read again."""
+
+    def __getitem__(self, name: str, /) -> NDArray[Any]: ...
+
+
+class Windows(Protocol):
+    """Results of the windows of a file by number: a list of them, or those in a store."""
+
+    def __getitem__(self, number: int, /) -> Named: ...
+
 
 #: Name of the array that counts what a window clamps, see `clamps.tally`.
 CLAMPED = "clamped"
@@ -82,7 +92,7 @@ class Encoder(ABC):
         return encoded
 
     @abstractmethod
-    def pieces(self, get: Get, *, threads: int, progress: Progress) -> Iterator[bytes]:
+    def pieces(self, windows: Windows, *, threads: int, progress: Progress) -> Iterator[bytes]:
         """Return the bytes of the file, piece by piece, made of the results of all windows."""
 
 

@@ -24,7 +24,7 @@ from ..system.threads import blocks_of, ordered_map
 from . import clamps, compression, coverage, quantize
 from .clamps import CodeRange
 from .compression import DataRun
-from .encoder import Encoded, Encoder, Get, results, windows_of
+from .encoder import Encoded, Encoder, Windows, results, windows_of
 from .file_notes import comment_of
 from .options import DEFAULTS, WriteOptions
 from .quantize import Bytes
@@ -182,11 +182,11 @@ class SpzEncoder(Encoder):
                 codes[name][unchanged] = stored[here][unchanged, : codes[name].shape[1]]
         return codes
 
-    def pieces(self, get: Get, *, threads: int, progress: Progress) -> Iterator[bytes]:
+    def pieces(self, windows: Windows, *, threads: int, progress: Progress) -> Iterator[bytes]:
         """Return the header and all streams, piece by piece: as one gzip member, or those of version 4."""
         layout = self.layout
         if layout.version not in TREE_SPZ_VERSIONS:
-            yield from self._pieces_v4(get, threads, progress)
+            yield from self._pieces_v4(windows, threads, progress)
             return
         fields = layout.version, layout.count, layout.sh_degree, layout.fractional_bits, layout.flags, 0
 
@@ -194,7 +194,7 @@ class SpzEncoder(Encoder):
             yield HEADER.pack(MAGIC, *fields)
             for stream in layout.streams():
                 for number in range(len(windows_of(layout.count))):
-                    yield get(number, stream.name)
+                    yield windows[number][stream.name]
 
         runs = [
             DataRun(stream.size * layout.count, WAYS.get(stream.name, compression.MIXED)) for stream in layout.streams()
@@ -205,12 +205,12 @@ class SpzEncoder(Encoder):
         level = self.options.compression_level
         yield from compression.gzip_member(data(), runs, level, threads, progress, comment=comment.encode())
 
-    def _pieces_v4(self, get: Get, threads: int, progress: Progress) -> Iterator[bytes]:
+    def _pieces_v4(self, windows: Windows, threads: int, progress: Progress) -> Iterator[bytes]:
         """Return the header, the extensions, the table of streams, and the streams, which are compressed before."""
         layout, streams, frames = self.layout, self.layout.streams(), list[bytes]()
 
         def packed(stream: SpzStream) -> bytes:
-            parts = (get(number, stream.name) for number in range(len(windows_of(layout.count))))
+            parts = (windows[number][stream.name] for number in range(len(windows_of(layout.count))))
             return compression.zstd_frame(parts, stream.size * layout.count, self.options.compression_level)
 
         sizes = [stream.size * layout.count for stream in streams]
@@ -294,7 +294,7 @@ def encode(
     """
     of_scene = encoder(scene, settled(scene, options))
     windows = list(results(of_scene, scene, threads, progress, "encoding"))
-    yield from of_scene.pieces(lambda number, name: windows[number][name], threads=threads, progress=progress)
+    yield from of_scene.pieces(windows, threads=threads, progress=progress)
 
 
 @dataclass(frozen=True, eq=False)

@@ -139,9 +139,13 @@ class Address:
         with tempfile.NamedTemporaryFile(prefix="sparklod-") as file:
             size = sum(map(file.write, pieces))
             file.flush()
-            with self._opened() as (system, path):
-                system.put_file(file.name, path)
+            self.send(file.name)
         return size
+
+    def send(self, file: str) -> None:
+        """Copy a file of this machine to the address, where it appears when all of it is there."""
+        with self._opened() as (system, path):
+            system.put_file(file, path)
 
     def unlink(self, missing_ok: bool = False) -> None:
         """Remove the file."""

@@ -117,39 +117,67 @@ def write(target: Path, pieces: Iterable[bytes | memoryview], *, overwrite: bool
         FileExistsError: the file exists, and `overwrite` is not set.
         OSError: the file system reported an error.
     """
-    sweep(target.parent)
-    descriptor = _open_unnamed(target, overwrite)
-    if descriptor is None:
-        return _write_named(target, pieces, overwrite, sync)
-    with os.fdopen(descriptor, "w+b") as file:
-        size = fill(file, pieces, sync=sync)
-        target.parent.mkdir(parents=True, exist_ok=True)  # another run that failed may have removed it as empty
-        try:
-            _name(file, target, overwrite)
-        except FileExistsError:
-            raise
-        except OSError:  # a file system without links
-            file.seek(0)
-            _write_named(target, iter(lambda: file.read(_COPY_BYTES), b""), overwrite, sync)
+    with contextlib.closing(NewFile(target, overwrite=overwrite)) as new:
+        size = fill(new.file, pieces, sync=sync)
+        new.publish()
     return size
 
 
+class NewFile:
+    """A file that is filled, and gets its name by `publish`; until then, `close` leaves nothing behind.
+
+    Attributes:
+        file: open for writing and reading.
+    """
+
+    def __init__(self, target: Path, *, overwrite: bool) -> None:
+        sweep(target.parent)
+        self._target, self._overwrite, self._part = target, overwrite, None
+        descriptor = _open_unnamed(target, overwrite)
+        if descriptor is None:
+            self._part, descriptor = _open_part(target, overwrite)
+        self.file = os.fdopen(descriptor, "w+b")
+
+    def publish(self) -> None:
+        """Give the file, which is complete and flushed, its name; raise `FileExistsError` if that is taken."""
+        target = self._target
+        if self._part is not None:
+            mode = _replaced_mode(target, self._overwrite)
+            if mode is not None:
+                self._part.chmod(mode)
+            if not HAS_LOCKS:
+                self.file.close()  # Windows cannot rename an open file
+            rename(self._part, target, self._overwrite)
+            return
+        target.parent.mkdir(parents=True, exist_ok=True)  # another run that failed may have removed it as empty
+        try:
+            _name(self.file, target, self._overwrite)
+        except FileExistsError:
+            raise
+        except OSError:  # a file system without links
+            self.file.seek(0)
+            self._part, descriptor = _open_part(target, self._overwrite)
+            with os.fdopen(descriptor, "w+b") as part:
+                fill(part, iter(lambda: self.file.read(_COPY_BYTES), b""))
+                self.publish()
+
+    def close(self) -> None:
+        """Close the file; remove it, if it has no name of its own."""
+        try:
+            self.file.close()
+        finally:
+            if self._part is not None:
+                self._part.unlink(missing_ok=True)
+
+
 def attempt(folder: Path) -> None:
-    """Try to write a file in a folder, as `write` does, and leave nothing behind.
+    """Try to write a file in a folder, and leave nothing behind.
 
     Raises:
         OSError: the file system refuses it, or is full.
     """
-    target = folder / unique(PARTS)
-    descriptor, temporary = _open_unnamed(target, overwrite=False), None
-    if descriptor is None:
-        temporary, descriptor = _open_part(target, overwrite=False)
-    try:
-        with os.fdopen(descriptor, "w+b") as file:
-            file.write(bytes(_TRIED_BYTES))
-    finally:
-        if temporary is not None:
-            temporary.unlink(missing_ok=True)
+    with contextlib.closing(NewFile(folder / unique(PARTS), overwrite=False)) as new:
+        new.file.write(bytes(_TRIED_BYTES))
 
 
 def check_replaceable(path: Path) -> None:
@@ -229,23 +257,6 @@ def _name(file: BinaryIO, target: Path, overwrite: bool) -> None:
 def _link(number: int, path: Path) -> None:
     # src_dir_fd has no other effect than that Python follows the symbolic link in /proc.
     os.link(OPEN_FILES / str(number), path, src_dir_fd=number, follow_symlinks=True)
-
-
-def _write_named(target: Path, pieces: Iterable[bytes | memoryview], overwrite: bool, sync: bool) -> int:
-    """Write a file as `write` does, under a temporary name until it is complete."""
-    temporary, descriptor = _open_part(target, overwrite)
-    try:
-        with os.fdopen(descriptor, "w+b") as file:
-            size = fill(file, pieces, sync=sync)
-            mode = _replaced_mode(target, overwrite)
-            if mode is not None:
-                temporary.chmod(mode)
-            if not HAS_LOCKS:
-                file.close()  # Windows cannot rename an open file
-            rename(temporary, target, overwrite)
-    finally:
-        temporary.unlink(missing_ok=True)
-    return size
 
 
 def _part_of(target: Path) -> Path:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
+from typing import Any, BinaryIO
 
 from . import atomic
 from .addresses import Address, Place
@@ -74,7 +75,7 @@ class Siblings:
 class Output:
     """An output, tried when it is made, before any work; its files appear at the end of the context, all or none.
 
-    A file alone is whole when `write` returns. With `overwrite`, existing files are replaced, and those of a former
+    With `overwrite`, existing files are replaced, and those of a former
     output that have no successor are removed. An error or an interrupt leaves the former files. See `atomic.publish`
     for a kill. At an address, files are sent one by one: the former first file is removed first, the new one must be
     written last, and an error removes what was sent.
@@ -100,6 +101,8 @@ class Output:
         self._written, self._former = list[str](), list[str]()
         self._folders = set[str]()
         self._stage: Path | None = None
+        self._new: atomic.NewFile | None = None
+        self._file: BinaryIO | None = None
         if siblings is not None:
             self._check_together(siblings)
         elif place != DASH:
@@ -109,7 +112,7 @@ class Output:
         return self
 
     def write(self, name: str, pieces: Iterable[bytes]) -> int:
-        """Write a file and return its size in bytes.
+        """Write a file and return its size in bytes; further calls continue the file of an output of one.
 
         Args:
             name: in the folder of the output; a name that is none of its siblings is that of the first file.
@@ -117,7 +120,8 @@ class Output:
         if self.place == DASH:
             return write_stdout(pieces, may_end=self._may_end)
         if self.siblings is None:
-            return self._write_alone(pieces)
+            self._file = self._file or self._opened()
+            return sum(map(self._file.write, pieces))
         if not self._written:
             self._begin(self.siblings)
         name = name if self.siblings.is_member(name) else self.target.name
@@ -131,16 +135,20 @@ class Output:
         assert self._stage is not None
         return atomic.add(self._stage, name, pieces)
 
-    def _write_alone(self, pieces: Iterable[bytes]) -> int:
+    def _opened(self) -> BinaryIO:
+        """Open the file of an output of one: the device itself, or a new file that gets its name at the end."""
         if isinstance(self.target, Address):
-            check_free(self.target, overwrite=self._overwrite)
-            return self.target.write(pieces)
+            import tempfile  # as every command loads this module
+
+            file: Any = self._stack.enter_context(tempfile.NamedTemporaryFile(prefix="sparklod-"))  # noqa: SIM115
+            return file
         assert isinstance(self.place, Path)
         if _is_no_file(self.place):
-            with self.place.open("wb") as file:
-                return sum(map(file.write, pieces))
-        with atomic.created(self.target.parent):
-            return atomic.write(self.target, pieces, overwrite=self._overwrite)
+            return self._stack.enter_context(self.place.open("wb"))
+        self._stack.enter_context(atomic.created(self.target.parent))
+        self._new = atomic.NewFile(self.target, overwrite=self._overwrite)
+        self._stack.enter_context(contextlib.closing(self._new))
+        return self._new.file
 
     def _begin(self, siblings: Siblings) -> None:
         self._former = siblings.former(self.target)
@@ -158,8 +166,7 @@ class Output:
             with self._stack:
                 if error is not None:
                     raise error
-                if self._written:
-                    self._publish()
+                self._publish()
         except BaseException as failure:
             if isinstance(self.target, Address):
                 for name in reversed(self._written):
@@ -175,12 +182,18 @@ class Output:
             raise OutputError(f"cannot write {self.place}: {reason_of(failure)}") from None
 
     def _publish(self) -> None:
-        if isinstance(self.target, Address):
-            for name in self._former:
+        if self._new is not None:
+            atomic.fill(self._new.file, ())
+            self._new.publish()
+        elif isinstance(self.target, Address) and self._file is not None:
+            check_free(self.target, overwrite=self._overwrite)
+            self._file.flush()
+            self.target.send(self._file.name)
+        elif isinstance(self.target, Address):
+            for name in self._former if self._written else ():
                 if name not in self._written:
                     (self.target.parent / name).unlink(missing_ok=True)
-        else:
-            assert self._stage is not None
+        elif self._stage is not None:
             header, overwrite = self.target.name, self._overwrite
             atomic.publish(self._stage, self._written, header, overwrite=overwrite, outdated=self._former)
 

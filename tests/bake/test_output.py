@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sparklod_cli.bake.output import BakeOutput, output_of
+from sparklod_cli.bake.output import BakeOutput, output_of, write_tree
 from sparklod_cli.bake.records import BuiltTree, Clock, WrittenTree
 from sparklod_cli.bake.settings import BakeSettings
 from sparklod_cli.codecs import encoder
@@ -42,13 +42,12 @@ def files_of(folder: Path) -> dict[str, bytes]:
 def written(output: BakeOutput, nodes: Scene | NodeStream, found: Statistics) -> WrittenTree:
     """Writes a tree window by window."""
 
-    def encode(tree: BuiltTree, made: encoder.Encoder) -> encoder.Get:
+    def encode(tree: BuiltTree, made: encoder.Encoder) -> encoder.Windows:
         read = nodes.read if isinstance(nodes, NodeStream) else node_stream(nodes).read
         parts = encoder.windows_of(made.count)
-        results = [made.encode(*read(part.start, part.stop), part.start) for part in parts]
-        return lambda number, name: results[number][name]
+        return [made.encode(*read(part.start, part.stop), part.start) for part in parts]
 
-    return output.write(BuiltTree(nodes=nodes, output=output, statistics=found), encode, Clock(), 2, silent)
+    return write_tree(BuiltTree(nodes=nodes, output=output, statistics=found), encode, Clock(), 2, silent)
 
 
 @pytest.mark.parametrize("name", SETTINGS)
@@ -77,18 +76,19 @@ def test_windows_that_cannot_be_read_leave_no_output(scene: Scene, tmp_path: Pat
         output = output_of(tmp_path / f"{name}{SETTINGS[name].suffix}", SETTINGS[name], overwrite=False)
         nodes, found = node_stream(scene), Statistics.of_scene(scene, output.needed)
 
-        def encode(tree: BuiltTree, made: encoder.Encoder) -> encoder.Get:
+        def encode(tree: BuiltTree, made: encoder.Encoder) -> encoder.Windows:
             encoded = made.encode(*tree.nodes.read(0, len(scene)), 0)
 
-            def gone(number: int, key: str) -> np.ndarray:
-                if number:
-                    raise OSError("gone")
-                return encoded[key]
+            class Gone(list):
+                def __getitem__(self, number: int) -> dict[str, np.ndarray]:
+                    if number:
+                        raise OSError("gone")
+                    return encoded
 
-            return gone
+            return Gone()
 
         tree = BuiltTree(nodes=nodes, output=output, statistics=found)
         with pytest.MonkeyPatch.context() as patch, pytest.raises(OutputError, match="gone"):
             patch.setattr(encoder, "CHUNK_NODES", 900)
-            output.write(tree, encode, Clock(), 1, silent)
+            write_tree(tree, encode, Clock(), 1, silent)
     assert not list(tmp_path.iterdir())

@@ -49,7 +49,7 @@ def test_windows_are_encoded_anywhere_and_count_what_they_clamp(
     found = {}
     for number, part in reversed(list(enumerate(encoder.windows_of(len(scene))))):
         found[number] = pickle.loads(sent).encode(*nodes.read(part.start, part.stop), part.start)
-    pieces = pickle.loads(sent).pieces(lambda number, name: found[number][name], threads=1, progress=silent)
+    pieces = pickle.loads(sent).pieces(found, threads=1, progress=silent)
     assert b"".join(pieces) == b"".join(codec.encode(scene, PALETTE, threads=2))
     tallies = [found[number][encoder.CLAMPED] for number in sorted(found)]
     expected = clamps.find(scene.splats, ranges=ranges, tree=scene.tree)
@@ -74,7 +74,7 @@ def test_chunk_files_are_made_of_the_results_of_windows(options: WriteOptions, m
     assert [name for name, _ in whole] == ["town-0.radc", "town-1.radc", "town-2.radc", "town.rad"]
     chunks = rad.encoder(scene, rad.settled(scene, options))
     found = list(encoder.results(chunks, scene, 1, silent, "encoding"))
-    assembled = chunks.files(lambda number, name: found[number][name], "town")
+    assembled = chunks.files(found, "town")
     assert [(name, b"".join(pieces)) for name, pieces in assembled] == whole
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ...codecs.encoder import Encoder, Get
+from ...codecs.encoder import Encoder, Windows
 from ...codecs.reader import Reader
 from ...codecs.statistics import Statistics
 from ...lod.builders import BUILDERS
@@ -29,7 +29,7 @@ from ..selecting import check_transformed, select, transform
 from ..settings import BakeSettings
 from .blocks import BuildStage, cut_into_blocks
 from .job import ORDER, PUBLISHED, ROOT, Engine, Job, Task, clean_of, encoded_of, families_of, pending_of, stage_of
-from .order import WINDOW_NODES, Rows, encode, encoded_chunk, fill_rows, node_stream, put_order, rows_of, splats_of
+from .order import WINDOW_NODES, EncodedChunks, Rows, encode, fill_rows, node_stream, put_order, rows_of, splats_of
 from .store import Arrays
 
 #: Largest size of a block, as a multiple of the requested one; a scene with a larger block is divided again. Chosen.
@@ -112,7 +112,7 @@ class InBlocks:
         tree.statistics = Statistics.merged([Statistics.from_array(stage["statistics"]) for stage in stages])
         tree.nodes = node_stream(job, count)
 
-    def encode(self, tree: BuiltTree, encoder: Encoder) -> Get:
+    def encode(self, tree: BuiltTree, encoder: Encoder) -> Windows:
         """Encode the windows of the tree; the output may be in place if the bake is interrupted from then on."""
         job = dataclasses.replace(self.job, encoder=encoder)
         tasks = [
@@ -122,7 +122,7 @@ class InBlocks:
         self.engine.run("encoding", tasks, job, self.progress)
         self.clock.end("encode")
         job.store.put(PUBLISHED, {})
-        return functools.partial(encoded_chunk, job.store)
+        return EncodedChunks(job.store)
 
     def _scatter(self) -> InputSummary:
         """Divide the scene into blocks and sort the splats of the input into them.

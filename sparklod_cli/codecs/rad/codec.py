@@ -69,7 +69,7 @@ def encode_chunked(
     """
     of_scene = encoder(scene, settled(scene, options), threads=threads, progress=progress)
     windows = results(of_scene, scene, threads, progress, "writing")
-    yield from of_scene.files(lambda number, name: next(windows)[name], stem)
+    yield from of_scene.files(windows, stem)
 
 
 @dataclass(frozen=True, eq=False)

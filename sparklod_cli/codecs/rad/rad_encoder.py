@@ -20,7 +20,7 @@ from ...system.progress import Progress, silent
 from ...system.threads import blocks_of
 from .. import coverage, sh_palette, spark_codings
 from ..clamps import CodeRange
-from ..encoder import Encoded, Encoder, Get, windows_of
+from ..encoder import Encoded, Encoder, Named, Windows, windows_of
 from ..file_notes import comment_of
 from ..options import WriteOptions
 from ..splat_encoding import SplatEncoding
@@ -125,19 +125,19 @@ class RadEncoder(Encoder):
         chunk = np.frombuffer(self._chunk(splats, tree, start), np.uint8)
         return {CHUNK: chunk, SIZE: np.array([len(chunk)])}
 
-    def pieces(self, get: Get, *, threads: int, progress: Progress) -> Iterator[bytes]:
+    def pieces(self, windows: Windows, *, threads: int, progress: Progress) -> Iterator[bytes]:
         """Return the bytes of one file, piece by piece."""
         numbers = range(len(windows_of(self.count)))
-        sizes = [int(get(number, SIZE)[0]) for number in numbers]
-        yield from self.one_file(sizes, (get(number, CHUNK).tobytes() for number in numbers), progress)
+        sizes = [int(windows[number][SIZE][0]) for number in numbers]
+        yield from self.one_file(sizes, (windows[number][CHUNK].tobytes() for number in numbers), progress)
 
     def one_file(self, sizes: Sequence[int], chunks: Iterable[bytes], progress: Progress) -> Iterator[bytes]:
         """Return the bytes of one file, piece by piece, of the sizes and the bytes of its chunks."""
         return in_one_file(self._header, sizes, self._counted(chunks, progress))
 
-    def files(self, get: Get, stem: str, *, progress: Progress = silent) -> Files:
+    def files(self, windows: Iterable[Named], stem: str, *, progress: Progress = silent) -> Files:
         """Return the name and the bytes of each file of a scene with a file a chunk; see `rad_header.in_files`."""
-        chunks = (get(number, CHUNK).tobytes() for number in range(len(windows_of(self.count))))
+        chunks = (window[CHUNK].tobytes() for window in windows)
         return in_files(self._header, self._counted(chunks, progress), stem)
 
     def _counted(self, chunks: Iterable[bytes], progress: Progress) -> Iterator[bytes]:

@@ -24,6 +24,7 @@ from sparklod_cli.lod.chunk_order import arrange
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
+from sparklod_cli.system.output import Output
 from sparklod_cli.system.progress import silent
 from tests.bake.out_of_core.plain import Loop, reader_of
 from tests.scenes import random_splats
@@ -49,7 +50,8 @@ def _small_windows() -> Iterator[None]:
 def built(folder: str, splats: Splats, how: BakeSettings, block: int, engine: Loop, *, in_chunks: bool) -> BuiltTree:
     """A tree in a store, of blocks of about so many splats."""
     job = Job(Store(Path(folder)), reader_of(Scene(splats)), how, ALL, in_chunks)
-    blocks = InBlocks(job, BakeOutput(), Clock(), engine, block, 1, silent)
+    output = BakeOutput(Output(Path(folder) / "out", overwrite=False), how, how.options)
+    blocks = InBlocks(job, output, Clock(), engine, block, 1, silent)
     tree = blocks.build()
     blocks.order(tree)
     return tree
