@@ -239,7 +239,7 @@ plausible = st.fixed_dictionaries({"file": st.text(min_size=1)}, optional=option
 def test_endless_or_huge_instances_files_are_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(SparklodError, match="it is a pipe or a device"):
         read_instances(Path("/dev/zero"))
-    monkeypatch.setattr("sparklod_cli.io.reading.MAX_TEXT", 100)
+    monkeypatch.setattr("sparklod_cli.io.local_files.MAX_TEXT", 100)
     (tmp_path / "large.json").write_bytes(b" " * 101)
     with pytest.raises(SparklodError, match=r"large\.json is larger than"):
         read_instances(tmp_path / "large.json")

@@ -10,7 +10,7 @@ import pytest
 
 from sparklod_cli.cli import run
 from sparklod_cli.codecs.formats import FORMATS
-from sparklod_cli.io import read_scene, reading
+from sparklod_cli.io import local_files, read_scene
 from sparklod_cli.system.errors import FormatError, UnreadableError
 from tests.conftest import FIXTURES, IS_ROOT
 
@@ -82,16 +82,16 @@ def test_texts_must_be_regular_files_below_a_size(tmp_path: Path, monkeypatch: p
     """Whatever is named, what is read is bounded, and nothing waits for what never comes."""
     text, pipe = tmp_path / "a.json", tmp_path / "pipe"
     text.write_bytes(b"\xef\xbb\xbf{}")
-    assert reading.read_text(text) == "{}"
+    assert local_files.read_text(text) == "{}"
     os.mkfifo(pipe)
     for path in (pipe, tmp_path, Path("/dev/zero"), Path("/dev/null"), tmp_path / "missing"):
         with pytest.raises(UnreadableError, match=re.escape(f"{path} cannot be read: ")):
-            reading.read_text(path)
-    monkeypatch.setattr(reading, "MAX_TEXT", 5)
-    assert reading.read_text(text) == "{}"
+            local_files.read_text(path)
+    monkeypatch.setattr(local_files, "MAX_TEXT", 5)
+    assert local_files.read_text(text) == "{}"
     text.write_bytes(b"123456")
     with pytest.raises(UnreadableError, match="is larger than"):
-        reading.read_text(text)
+        local_files.read_text(text)
 
 
 @pytest.mark.parametrize("option", ["--scene", "--camera-path", "--world-transform"])

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..codecs.reader import Reader
+from ..io.reading import Source, open_reader
 from ..system.addresses import Place
 from ..system.errors import FormatError, memory_errors_translated
 from ..system.progress import Progress, silent
@@ -20,7 +21,6 @@ from .in_memory import InMemory
 from .output import output_of, write_tree
 from .records import Baked, Clock
 from .settings import BakeSettings, Resources
-from .sources import Source, open_source
 
 if TYPE_CHECKING:
     from .out_of_core.job import Engine
@@ -56,8 +56,9 @@ def bake(
         say: receives one-line messages for the user.
 
     Raises:
-        FormatError, InvalidSplatsError, OutputError: see `open_source`, `Selection.check`, `validation.check_valid` and
-            `system.output.Output`; or the input has a tree, and the settings do not keep it.
+        FormatError, InvalidSplatsError, OutputError: see `io.open_reader`, `Selection.check`,
+            `validation.check_valid` and `system.output.Output`; or the input has a tree, and the settings do not keep
+            it.
         ScratchError: the scratch folder is full, in use, or belongs to another bake.
         OutOfMemoryError: the scene does not fit into memory.
         CameraPathError: the training cameras cannot be read.
@@ -73,7 +74,7 @@ def bake(
         output, clock = output_of(target, settings, overwrite=overwrite, say=say), Clock()
         opened, blocks = contextlib.ExitStack(), None
         stack.enter_context(opened)
-        reader = opened.enter_context(open_source(source, threads=threads))
+        reader = opened.enter_context(open_reader(source, threads=threads))
         if not reader.has_tree and _may_need_blocks(reader, source, target, settings, resources, engine):
             from .out_of_core.planning import blocks_for
 
@@ -140,7 +141,7 @@ def fits_in_memory(source: Source, settings: BakeSettings, memory: int | None) -
         memory: bytes; None for any number.
     """
     try:
-        with open_source(source) as header:
+        with open_reader(source) as header:
             return header.has_tree or memory is None or estimate.in_memory_bytes_of(header, settings) <= memory
     except FormatError:  # reported when it is baked
         return True

@@ -18,13 +18,12 @@ import numpy as np
 from .. import __version__
 from ..cameras.formats.table import NAMES
 from ..io.local_files import companions
-from ..io.reading import file_of, readable
+from ..io.reading import Source, file_of, placement_of, places_of, readable
 from ..system.addresses import Address, Place
 from ..system.errors import UnreadableError
 from ..system.stdio import DASH, name_of
 from ..system.untrusted import quoted_value
 from .settings import BakeSettings
-from .sources import Source, placement_of, places_of
 
 #: Settings that are not part of an identity: `files` are inputs, and bakes with the others are not skipped or resumed.
 NO_PART = ("unused", "simplify", "rgba", "environment", "camera_path")

@@ -11,6 +11,7 @@ from ..codecs.encoder import Encoder, Windows, results
 from ..codecs.reader import Reader
 from ..codecs.statistics import Statistics
 from ..codecs.validation import check_valid
+from ..io.reading import Source
 from ..lod.builders import BUILDERS
 from ..model.lod_tree import LodTree
 from ..model.scene import Scene
@@ -21,7 +22,6 @@ from .output import BakeOutput, output_of_existing_tree
 from .records import BuiltTree, Clock
 from .selecting import read_environment, select, split_environment, transformed
 from .settings import BakeSettings
-from .sources import Source
 
 
 @dataclass

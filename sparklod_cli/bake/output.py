@@ -15,7 +15,7 @@ from ..codecs.formats import WRITABLE, Format
 from ..codecs.options import DEFAULTS, WriteOptions
 from ..codecs.rad.rad_layout import OPTIONS
 from ..codecs.statistics import Statistics
-from ..io.reading import opened, read_stored
+from ..io.reading import Merged, Source, opened, read_stored
 from ..io.writing import parts_output, scene_output
 from ..model.lod_tree import CHUNK_NODES
 from ..model.scene import Scene
@@ -26,7 +26,6 @@ from ..system.output import Output
 from ..system.progress import Progress
 from .records import BuiltTree, Clock, WrittenTree
 from .settings import SPZ, BakeSettings
-from .sources import Merged, Source
 
 if TYPE_CHECKING:
     from .simplifying import Simplifier

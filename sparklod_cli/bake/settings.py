@@ -9,6 +9,8 @@ from typing import Any
 from ..codecs.options import WriteOptions
 from ..codecs.reader import Reader
 from ..fitting.settings import FitSettings
+from ..io.reading import Merged as Merged
+from ..io.reading import Source as Source
 from ..lod.budget import Budget
 from ..lod.builders import METHODS
 from ..lod.detail_rule import DetailSettings

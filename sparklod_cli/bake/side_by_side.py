@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from ..io.reading import Source, absolute_source, places_of
 from ..system.addresses import Place, absolute
 from ..system.errors import SparklodError
 from ..system.progress import Progress, silent
@@ -14,7 +15,6 @@ from .flow import bake, fits_in_memory
 from .out_of_core.cluster_engine import ClusterEngine
 from .records import Baked
 from .settings import BakeSettings, Resources
-from .sources import Source, absolute_source, places_of
 
 
 def bake_side_by_side(

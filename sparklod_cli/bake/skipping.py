@@ -11,7 +11,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from ..io.reading import readable
+from ..io.reading import Source, readable
 from ..system.addresses import Address, Place, size_of
 from ..system.errors import OutputError, UnreadableError, reason_of
 from ..system.output import Output, check_writable
@@ -20,7 +20,6 @@ from .flow import bake, has_published
 from .identity import BakeIdentity, content_of, files_of
 from .records import Baked
 from .settings import BakeSettings, Resources
-from .sources import Source
 
 #: Suffix of the file beside an output, and the largest size that is read.
 SUFFIX, MAX_BYTES = ".sparklod.json", 1 << 24

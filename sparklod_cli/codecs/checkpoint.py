@@ -25,7 +25,7 @@ from ..system.threads import blocks_of, ordered_map
 from ..system.untrusted import quoted, quoted_value
 from . import quantize
 from .left_out import HARMLESS, left_out
-from .reader import Positioned, Reader, Source, Target, size_of
+from .reader import OpenFile, Positioned, Reader, Target, size_of
 from .tensor_pickle import Tensor, unpickled
 from .zip_folder import ZIP, ZIP_ERRORS
 
@@ -98,7 +98,7 @@ class _StoredColumn:
         return rows.astype(np.float32)
 
 
-def open_content(source: Source) -> Reader:
+def open_content(source: OpenFile) -> Reader:
     """Open a checkpoint of gsplat or of nerfstudio's splatfacto.
 
     Raises:

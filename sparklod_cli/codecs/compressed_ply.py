@@ -17,7 +17,7 @@ from ..system.units import count_of
 from . import quantize
 from .left_out import HARMLESS, left_out
 from .ply_header import PlyHeader, offset_of, read_header
-from .reader import Positioned, Reader, Rows, Source, Target, decode_rows, rows_between, size_of
+from .reader import OpenFile, Positioned, Reader, Rows, Target, decode_rows, rows_between, size_of
 
 #: Splats of a chunk, which share bounds.
 CHUNK_SPLATS = 256
@@ -33,7 +33,7 @@ BOUNDS = {
 }
 
 
-def open_content(source: Source) -> Reader:
+def open_content(source: OpenFile) -> Reader:
     """Open a compressed PLY file, with or without bounds of colours and SH.
 
     Raises:

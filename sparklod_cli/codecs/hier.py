@@ -21,7 +21,7 @@ from ..system.errors import FormatError, TruncatedError
 from ..system.progress import Progress
 from ..system.threads import BLOCK_ROWS, blocks_of, ordered_map
 from . import quantize
-from .reader import Positioned, Reader, Source, Target, rows_between, size_of
+from .reader import OpenFile, Positioned, Reader, Target, rows_between, size_of
 
 #: Before the columns, the number of splats, negative where numbers are halves; before the nodes, their number.
 COUNT = np.dtype("<i4")
@@ -88,7 +88,7 @@ COLUMNS = (
 )
 
 
-def open_content(source: Source) -> Reader:
+def open_content(source: OpenFile) -> Reader:
     """Open a hierarchy.
 
     Raises:

@@ -20,7 +20,7 @@ from ..system.errors import FormatError, TruncatedError, VersionError
 from ..system.progress import Progress
 from ..system.units import count_of
 from . import quantize
-from .reader import Positioned, Reader, Rows, Source, Target, decode_rows, rows_between, size_of
+from .reader import OpenFile, Positioned, Reader, Rows, Target, decode_rows, rows_between, size_of
 
 HEADER = np.dtype(
     {
@@ -104,7 +104,7 @@ class KsplatSection:
     steps: int
 
 
-def open_content(source: Source) -> Reader:
+def open_content(source: OpenFile) -> Reader:
     """Open a .ksplat file of any compression level.
 
     Raises:

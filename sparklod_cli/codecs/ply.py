@@ -31,7 +31,7 @@ from .file_notes import comment_of, read_comment
 from .left_out import HARMLESS, left_out
 from .options import DEFAULTS, WriteOptions
 from .ply_header import PlyHeader, first_value, offset_of, read_header
-from .reader import Positioned, Reader, Rows, Scratch, Source, Target, decode_rows, encode_rows, rows_between, size_of
+from .reader import OpenFile, Positioned, Reader, Rows, Scratch, Target, decode_rows, encode_rows, rows_between, size_of
 
 Coding = Callable[[FloatArray], FloatArray]
 
@@ -80,7 +80,7 @@ class _Column(NamedTuple):
     decode: Coding
 
 
-def open_content(source: Source) -> Reader:
+def open_content(source: OpenFile) -> Reader:
     """Open a PLY file. An ascii file is unpacked to `scratch`, as binary rows.
 
     Raises:

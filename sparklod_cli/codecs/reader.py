@@ -144,7 +144,7 @@ OpenCompanion = Callable[[str], BinaryIO]
 
 
 @dataclass(frozen=True, eq=False)
-class Source:
+class OpenFile:
     """Open file for a codec.
 
     Attributes:
@@ -169,7 +169,7 @@ class Target:
         start: number in the file of the first.
         tree: (n,) nodes to fill; None in a file without a tree.
         columns: of `Splats` to fill; a codec may fill the others, too.
-        once: these are all rows of the file and are read once, so that they need not be unpacked to `Source.scratch`.
+        once: these are all rows of the file and are read once, so that they need not be unpacked to `OpenFile.scratch`.
     """
 
     splats: Splats
@@ -315,5 +315,5 @@ def decode_file(
     **more: Any,
 ) -> Scene:
     """Read a whole scene from an open file by the module of its format; `more` is passed on to `Reader.scene`."""
-    reader: Reader = codec.open_content(Source(file, open_companion, threads=threads))
+    reader: Reader = codec.open_content(OpenFile(file, open_companion, threads=threads))
     return dataclasses.replace(reader, threads=threads).scene(progress=progress, **more)

@@ -16,7 +16,7 @@ from ..system.errors import FormatError, UnsupportedError
 from ..system.progress import Progress, silent
 from ..system.threads import ordered_map
 from ..system.untrusted import quoted_value
-from .reader import Fill, OpenCompanion, Reader, Source, Target, size_of
+from .reader import Fill, OpenCompanion, OpenFile, Reader, Target, size_of
 from .validation import error_of
 
 
@@ -72,7 +72,7 @@ class SceneFiles:
     open_companion: OpenCompanion | None
     manifest: str
     code: str
-    open_content: Callable[[str, Source], Reader]
+    open_content: Callable[[str, OpenFile], Reader]
 
     def open(self, name: str, pieces: Sequence[Piece] | None = None, row: int = 0) -> Chunk:
         """Read the header of a file.
@@ -170,7 +170,7 @@ class SceneFiles:
         return fill
 
     @contextlib.contextmanager
-    def _opened(self, name: str) -> Iterator[Source]:
+    def _opened(self, name: str) -> Iterator[OpenFile]:
         """Open a file, and what opens the files beside it; errors of the body name it."""
         if self.open_companion is None:
             raise FormatError(f"{self.manifest} names {quoted_value(name)}, but other files cannot be opened here")
@@ -185,7 +185,7 @@ class SceneFiles:
             raise error_of(self.code, str(error)) from None
         with opened as file:
             try:
-                yield Source(file, beside)
+                yield OpenFile(file, beside)
             except UnsupportedError as error:  # the file is sound
                 raise UnsupportedError(f"{quoted_value(name)}: {error}") from None
             except FormatError as error:

@@ -15,7 +15,7 @@ from ..system.progress import Progress, silent
 from . import quantize
 from .clamps import CodeRange
 from .options import DEFAULTS, WriteOptions
-from .reader import Positioned, Reader, Source, Target, decode_rows, encode_rows, rows_between, size_of
+from .reader import OpenFile, Positioned, Reader, Target, decode_rows, encode_rows, rows_between, size_of
 
 ROW = np.dtype(
     [
@@ -32,7 +32,7 @@ assert ROW.itemsize == 32
 HELD = (CodeRange("rgb", -0.5 / 255, 255.5 / 255), CodeRange("sh", 0, 0))
 
 
-def open_content(source: Source) -> Reader:
+def open_content(source: OpenFile) -> Reader:
     """Open a .splat file. The format has no header: any file whose size is a multiple of 32 is accepted.
 
     Raises:

@@ -28,7 +28,7 @@ from .encoder import Encoded, Encoder, Windows, results, windows_of
 from .file_notes import comment_of
 from .options import DEFAULTS, WriteOptions
 from .quantize import Bytes
-from .reader import Source
+from .reader import OpenFile
 from .spz_extensions import SYSTEM_OF_UP, extensions_of
 from .spz_streams import (
     ANTIALIASED,
@@ -335,4 +335,4 @@ class StoredSpz:
 
 def stored(file: BinaryIO) -> StoredSpz:
     """Read the codes of a file; raises `FormatError` as `open_content`."""
-    return StoredSpz(*read_codes(Source(file)))
+    return StoredSpz(*read_codes(OpenFile(file)))

@@ -27,7 +27,7 @@ from . import compression, quantize
 from .file_notes import FileNote, read_comment
 from .inflate import GZIP_MAGIC, Inflate
 from .quantize import Bytes
-from .reader import Positioned, Read, Reader, Source, Target, rows_between, rows_of, size_of
+from .reader import OpenFile, Positioned, Read, Reader, Target, rows_between, rows_of, size_of
 from .spz_extensions import MOST_BYTES, Extensions, read_extensions
 from .statistics import ALL_BITS
 
@@ -151,7 +151,7 @@ READABLE = (1, 2, 3, 4)
 CODING = FileCoding((ScaleCoding("spz"),), 1)
 
 
-def open_content(source: Source) -> Reader:
+def open_content(source: OpenFile) -> Reader:
     """Open any SPZ file, plain or LoD. With `scratch`, its streams are unpacked to that.
 
     The header of its scene has the flags, the reserved byte and, once all is read, the number of bytes after the data.
@@ -163,7 +163,7 @@ def open_content(source: Source) -> Reader:
     return _open(source)[0]
 
 
-def read_codes(source: Source) -> tuple[Layout, dict[str, Bytes]]:
+def read_codes(source: OpenFile) -> tuple[Layout, dict[str, Bytes]]:
     """Read the layout of a file, and (N, bytes) codes of each of its streams, by name; raises as `open_content`."""
     _, layout, rows = _open(source)
     codes = {each.name: np.empty((layout.count, each.size), np.uint8) for each in layout.streams()}
@@ -172,7 +172,7 @@ def read_codes(source: Source) -> tuple[Layout, dict[str, Bytes]]:
     return layout, codes
 
 
-def _open(source: Source) -> tuple[Reader, Layout, Iterator[StreamRows]]:
+def _open(source: OpenFile) -> tuple[Reader, Layout, Iterator[StreamRows]]:
     """Open a file: its content, its layout, and the rows of its streams, which can be read once."""
     file, note, extensions, header = source.file, FileNote(), Extensions(), dict[str, int]()
     size = size_of(file)

@@ -69,8 +69,7 @@ from .paths import (
 if TYPE_CHECKING:
     from ..bake.out_of_core.cluster_engine import ClusterEngine
     from ..bake.records import Baked
-    from ..bake.settings import BakeSettings
-    from ..bake.sources import Source
+    from ..bake.settings import BakeSettings, Source
     from ..extract_leaves import Extracted
     from ..model.instances import Instance
 
@@ -214,7 +213,7 @@ class BakedFiles:
 
     def jobs(self, instances: Sequence[Instance], say: Callable[[str], None]) -> list[tuple[Source, Place]]:
         """Return pairs of an input and its output; `say` gets a line on attributes of instances that are ignored."""
-        from ..bake.sources import Merged
+        from ..bake.settings import Merged
 
         if not self.is_merged:
             return [(place, self.target(place)) for place in self.inputs]
@@ -289,7 +288,7 @@ def check_inputs(ctx: click.Context, files: BakedFiles) -> None:
 
 def record_of(source: Source, target: Place, outcome: Outcome) -> dict[str, Any]:
     """Return the JSON of a result; several inputs that are one scene are "inputs"."""
-    from ..bake.sources import Merged
+    from ..bake.settings import Merged
 
     record: dict[str, Any] = {"input": str(source)}
     if isinstance(source, Merged):

@@ -12,7 +12,7 @@ from .console import Console, count_of
 if TYPE_CHECKING:
     from ..bake.records import Baked, WrittenDetail, WrittenSet
     from ..bake.refining import Refined
-    from ..bake.sources import Source
+    from ..bake.settings import Source
     from ..codecs.clamps import Clamp
     from ..extract_leaves import Extracted
 

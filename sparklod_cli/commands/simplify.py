@@ -58,8 +58,7 @@ from .paths import (
 )
 
 if TYPE_CHECKING:
-    from ..bake.settings import BakeSettings, SimplifyGoal
-    from ..bake.sources import Source
+    from ..bake.settings import BakeSettings, SimplifyGoal, Source
 
 EXAMPLES = """\
   sparklod simplify scene.ply --to 10% -o small.ply
@@ -138,7 +137,7 @@ class SimplifiedFiles:
 
     @property
     def source(self) -> Source:
-        from ..bake.sources import Merged
+        from ..bake.settings import Merged
 
         return self.inputs[0] if len(self.inputs) == 1 else Merged.of(self.inputs)
 

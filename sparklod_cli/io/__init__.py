@@ -3,17 +3,23 @@
 What most jobs need is imported here; `rad_file` and `details` are imported by those who need them.
 """
 
-from .local_files import companions, is_file_name
-from .reading import (
+from .local_files import (
     MAX_TEXT,
-    opened,
-    read_arrays,
-    read_parts,
+    companions,
+    is_file_name,
     read_rgba,
-    read_stored,
     read_text,
     read_together,
     size_of_input,
 )
-from .streams import PlacedFile, open_reader, open_readers, read_scene
+from .reading import (
+    Merged,
+    PlacedFile,
+    open_reader,
+    opened,
+    read_arrays,
+    read_parts,
+    read_scene,
+    read_stored,
+)
 from .writing import parts_output, scene_output, siblings_of, write_scene

@@ -1,4 +1,4 @@
-"""Names and places of files: plain files, files that belong to another one, and why one cannot be opened."""
+"""Plain files: their names and places, files that belong to another one, texts, and why one cannot be opened."""
 
 from __future__ import annotations
 
@@ -15,11 +15,12 @@ from typing import BinaryIO
 from ..codecs.file_names import FIRST_FILES, MANIFEST, META, TILESET
 from ..codecs.formats import FORMATS, head_of, sniff
 from ..codecs.lookalikes import POINTER, SHORT, is_pointer
-from ..system.addresses import Place
+from ..model.splats import FloatArray
+from ..system.addresses import Place, size_of
 from ..system.errors import FormatError, UnreadableError, reason_of
 from ..system.printable import near
-from ..system.stdio import DASH
-from ..system.untrusted import quoted_value
+from ..system.stdio import DASH, spooled
+from ..system.untrusted import decoded_text, quoted_value
 
 #: Names in a folder that are compared with one that is missing: more take longer than a person expects of an error.
 MOST_NAMES = 10_000
@@ -118,7 +119,7 @@ def _named_in(path: Path) -> list[Path]:
             return []
         from ..codecs.glb.glb_container import GltfFile
         from ..codecs.rad import rad_header
-        from ..codecs.reader import Source  # what most jobs do without, as what follows
+        from ..codecs.reader import OpenFile  # what most jobs do without, as what follows
         from ..codecs.streamed_sog.manifest import MAX_MANIFEST, parse
         from ..codecs.tiles_3d.tileset import MAX_TILESET
 
@@ -127,7 +128,7 @@ def _named_in(path: Path) -> list[Path]:
         if form is not None and form.parts == "tiles":
             return _tiles_of(path, file.read(MAX_TILESET + 1))
         if form is not None and form.name in GLTF:
-            return _companion_paths(path, GltfFile(Source(file)).names(), folders=True)
+            return _companion_paths(path, GltfFile(OpenFile(file)).names(), folders=True)
         if form is not None and form.folders:
             metas = _companion_paths(path, parse(file.read(MAX_MANIFEST + 1)).names(), folders=True)
             return [*metas, *itertools.chain(*map(_images_of, metas))]
@@ -217,3 +218,89 @@ def open_named(first: Place, name: str, *, folders: bool = False) -> BinaryIO:
 def _check_name(name: str, *, folders: bool = False) -> None:
     if leads_away(name, folders=folders):
         raise FormatError(f"it names {quoted_value(name)}, which is not a file beside it")
+
+
+def size_of_input(path: Place) -> int | None:
+    """Return bytes of a file, or of standard input; None where that cannot be told."""
+    try:
+        if path == DASH:
+            return spooled().seek(0, os.SEEK_END)
+        return size_of(path) if path.is_file() else None
+    except UnreadableError:
+        return None
+    except OSError:
+        return None
+
+
+#: Bytes of a text that is read whole: instances, expectations, matrices. Parsed it may take thirty times as much.
+MAX_TEXT = 1 << 24
+
+
+def read_text(path: Path) -> str:
+    """Return a text file of at most `MAX_TEXT` bytes; `UnreadableError`, naming it, where that cannot be."""
+    try:
+        return decoded_text(_read_up_to(path, MAX_TEXT))
+    except (OSError, ValueError) as error:
+        reason = reason_unreadable(error) if isinstance(error, OSError) else "it is not text"
+        raise UnreadableError(f"{path} cannot be read: {reason}") from None
+
+
+def read_together(path: Path, sets: Collection[Collection[str]], limit: int) -> dict[str, bytes]:
+    """Return files that belong together, by name, the one that `path` names first.
+
+    Args:
+        path: of a file, or of a folder that holds one of the sets.
+        sets: names of files that belong together; where `path` is one of a set, the others beside it are read, too.
+
+    Raises:
+        UnreadableError: there is no such file or set, or one is too large; the text names it.
+    """
+    try:
+        if path.is_dir():
+            folder = path
+            names = next((names for names in sets if all((folder / name).is_file() for name in names)), None)
+            if names is None:
+                known = ", or ".join(" and ".join(names) for names in sets)
+                raise UnreadableError(f"{path} cannot be read: is a directory, without {known}")
+        else:
+            folder = path.parent
+            others = next((names for names in sets if path.name in names), ())
+            names = [path.name, *(name for name in others if name != path.name and (folder / name).is_file())]
+        return {name: _read_up_to(folder / name, limit) for name in names}
+    except OSError as error:
+        raise UnreadableError(f"{path} cannot be read: {reason_unreadable(error)}") from None
+
+
+def read_rgba(path: Path, count: int, rows: slice | None = None) -> FloatArray:
+    """Return colours and opacities for the `count` splats of a scene, or for a range of them, see `rgba.decode`.
+
+    Raises:
+        FormatError: it cannot be read or is not such a file; names it.
+    """
+    from ..codecs import rgba
+
+    try:
+        if path.exists() and not path.is_file():
+            raise FormatError("cannot be read: it is a directory, a pipe or a device")
+        with path.open("rb") as file:
+            if is_pointer(file.read(SHORT)):
+                raise FormatError(f"cannot be read: it is {POINTER}")
+            file.seek(0)
+            return rgba.decode(file, count, rows)
+    except OSError as error:
+        raise FormatError(f"{path} cannot be read: {reason_unreadable(error)}") from None
+    except FormatError as error:
+        raise type(error)(f"{path} {error}") from None
+
+
+def _read_up_to(path: Path, limit: int) -> bytes:
+    if path.is_dir():
+        raise UnreadableError(f"{path} cannot be read: is a directory")
+    if path.exists() and not path.is_file():
+        raise UnreadableError(f"{path} cannot be read: it is a pipe or a device; save it to a file first")
+    if path.stat().st_size > limit:
+        raise UnreadableError(f"{path} is larger than {limit >> 20:,} MiB, which nothing of its kind is")
+    data = path.read_bytes()
+    if is_pointer(data):
+        raise UnreadableError(f"{path} cannot be read: it is {POINTER}")
+    return data

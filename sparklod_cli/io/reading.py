@@ -1,32 +1,128 @@
-"""Splat files of any format, which their content tells, and small files that are read whole."""
+"""Splat files of any format, which their content tells, alone or several as one scene: whole, in parts, in blocks."""
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import functools
-import os
-from collections.abc import Collection, Iterator
+import hashlib
+import tempfile
+import threading
+import weakref
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
-from ..codecs import rgba
 from ..codecs.encoder import Stored
 from ..codecs.formats import FORMATS, NPZ, RAW_SUFFIXES, Format, head_of, sniff
-from ..codecs.lookalikes import POINTER, SHORT, is_pointer, lookalike_of
-from ..codecs.reader import OpenCompanion
+from ..codecs.lookalikes import lookalike_of
+from ..codecs.reader import OpenCompanion, OpenFile, Reader, Target
 from ..codecs.zip_folder import ZIP, ZipFolder
-from ..model.scene import DetailScene
-from ..model.splats import FloatArray
+from ..model.instances import Instance
+from ..model.scene import DetailScene, Scene
+from ..model.splats import COLUMNS
 from ..model.tile_scene import TileScene
-from ..system.addresses import Place, size_of
-from ..system.errors import FormatError, UnknownFormatError, UnreadableError
+from ..model.transforms import Transform
+from ..system import atomic
+from ..system.addresses import Address, Place, absolute
+from ..system.errors import FormatError, OutputError, UnknownFormatError, UnreadableError, reason_of
 from ..system.progress import Progress, silent
-from ..system.stdio import DASH, spooled
-from ..system.untrusted import decoded_text
+from ..system.stdio import DASH, name_of, spooled
+from ..system.units import count_of
 from .local_files import in_folder, open_named, reason_unreadable
 
 if TYPE_CHECKING:
     from ..codecs.gpu import dump
+
+#: Files that stay open together, of one scene, and of those that were closed or that another process opened: each has
+#: a palette of up to 12 MB. Chosen.
+MOST = 4
+
+_LOCK = threading.Lock()
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedFile:
+    """A file and where its splats stand.
+
+    Attributes:
+        file: of any format that is read, without a tree.
+        transform: turns, scales and moves them.
+    """
+
+    file: Place
+    transform: Transform = field(default_factory=Transform)
+
+
+@dataclass(frozen=True, eq=False)
+class Merged:
+    """Several files, with where each stands, that are one scene; one may be named more than once."""
+
+    files: tuple[PlacedFile, ...]
+
+    @classmethod
+    def of(cls, places: Sequence[Place]) -> Merged:
+        """Return files where their own coordinates put them."""
+        return cls(tuple(PlacedFile(place) for place in places))
+
+    @classmethod
+    def of_instances(cls, instances: Sequence[Instance]) -> Merged:
+        """Return the files of instances, where these stand."""
+        return cls(tuple(PlacedFile(each.file, each.transform) for each in instances if each.file is not None))
+
+    def __str__(self) -> str:
+        return count_of(len(self.files), "file")
+
+
+#: A file, which may be standard input (-), or several.
+Source = Place | Merged
+
+
+def places_of(source: Source) -> list[Place]:
+    """Return the files of a source, in order."""
+    return [each.file for each in source.files] if isinstance(source, Merged) else [source]
+
+
+def absolute_source(source: Source) -> Source:
+    """Return the same source for processes whose working folders are others."""
+    if not isinstance(source, Merged):
+        return absolute(source)
+    return Merged(tuple(dataclasses.replace(each, file=absolute(each.file)) for each in source.files))
+
+
+def placement_of(source: Source) -> dict[str, Any]:
+    """Return where the files of a source stand, as a recipe has it; nothing for a single file."""
+    if not isinstance(source, Merged):
+        return {}
+    return {"merged": [_numbers(each.transform) for each in source.files]}
+
+
+def _numbers(transform: Transform) -> list[float]:
+    """Return the rotation row by row, the scale, the translation."""
+    return [float(each) for each in (*transform.rotation.flat, transform.scale, *transform.translation)]
+
+
+def read_scene(
+    path: Place,
+    *,
+    columns: Collection[str] = COLUMNS,
+    threads: int = 1,
+    progress: Progress = silent,
+    validate: bool = True,
+) -> Scene:
+    """Read a splat file of any known format, told by its content, or else by its suffix.
+
+    Args:
+        path: of a file, or of a folder that holds an unpacked SOG or a Streamed SOG; - is standard input.
+        columns: of the splats that are needed; the others may be 0.
+        validate: refuse a broken tree.
+
+    Raises:
+        FormatError: it is not a file, empty, of no known format, or broken.
+    """
+    with open_reader(path, threads=threads) as reader:
+        return reader.scene(columns=columns, progress=progress, validate=validate)
 
 
 def read_stored(path: Place) -> Stored:
@@ -151,85 +247,159 @@ def file_of(path: Place) -> contextlib.AbstractContextManager[BinaryIO]:
     return contextlib.nullcontext(spooled()) if path == DASH else path.open("rb")
 
 
-def size_of_input(path: Place) -> int | None:
-    """Return bytes of a file, or of standard input; None where that cannot be told."""
-    try:
-        if path == DASH:
-            return spooled().seek(0, os.SEEK_END)
-        return size_of(path) if path.is_file() else None
-    except UnreadableError:
-        return None
-    except OSError:
-        return None
+@contextlib.contextmanager
+def open_reader(source: Source, *, scratch: Path | None = None, threads: int = 1) -> Iterator[Reader]:
+    """Open a file of any known format, or several as one scene, see `merging.merged`.
 
-
-#: Bytes of a text that is read whole: instances, expectations, matrices. Parsed it may take thirty times as much.
-MAX_TEXT = 1 << 24
-
-
-def read_text(path: Path) -> str:
-    """Return a text file of at most `MAX_TEXT` bytes; `UnreadableError`, naming it, where that cannot be."""
-    try:
-        return decoded_text(_read_up_to(path, MAX_TEXT))
-    except (OSError, ValueError) as error:
-        reason = reason_unreadable(error) if isinstance(error, OSError) else "it is not text"
-        raise UnreadableError(f"{path} cannot be read: {reason}") from None
-
-
-def read_together(path: Path, sets: Collection[Collection[str]], limit: int) -> dict[str, bytes]:
-    """Return files that belong together, by name, the one that `path` names first.
+    Only its header is read now. Any range of splats can be read until the end, on several threads. Columns that lie one
+    after the other (SPZ, SOG), and text, are unpacked once, when a block is first read; see docs/formats.md for the
+    room that takes.
 
     Args:
-        path: of a file, or of a folder that holds one of the sets.
-        sets: names of files that belong together; where `path` is one of a set, the others beside it are read, too.
+        scratch: folder for what is unpacked, which stays there, so that other processes find it; whoever owns the
+            folder removes it. The reader can be pickled then. None for one of the system's temporary files.
 
     Raises:
-        UnreadableError: there is no such file or set, or one is too large; the text names it.
+        FormatError: as `io.read_scene`. What is wrong behind the header is raised by reading; so is `OutputError`,
+            where there is no room for what is unpacked. Of several files, errors name the file.
+        HasTreeError: one of several files has a tree.
     """
+    with contextlib.ExitStack() as closing:
+        if isinstance(source, Merged):
+            yield _merged(source, scratch, threads, closing)
+            return
+        with readable():
+            version = _version(source, scratch)
+            reader = _opened(source, version, scratch, threads, closing)
+        fill = _FillFromFile(source, version, scratch, threads, reader.count, reader.sh_degree, reader)
+        yield dataclasses.replace(reader, fill=fill)
+
+
+def _version(path: Place, scratch: Path | None) -> tuple[Any, ...]:
+    """Return what changes with a file; nothing where finding out takes a request that only large scenes are worth."""
+    if path == DASH or (isinstance(path, Address) and scratch is None):
+        return ()
+    if isinstance(path, Address):
+        return (path.version(),)
+    status = path.stat()
+    return status.st_size, status.st_mtime_ns
+
+
+def _opened(
+    path: Place, version: tuple[Any, ...], folder: Path | None, threads: int, closing: contextlib.ExitStack
+) -> Reader:
+    """Open a file until `closing` closes it, and what is unpacked of it."""
+    lock, unpacked = threading.Lock(), list[BinaryIO]()
+
+    def scratch(pieces: Callable[[], Iterable[bytes]]) -> BinaryIO:
+        with lock, _room(folder):
+            if not unpacked:
+                place = folder and folder / f"{_digest(path, version)}.unpacked"
+                file = _temporary(pieces) if place is None else _kept(place, pieces)
+                unpacked.append(closing.enter_context(file))
+        return unpacked[0]
+
+    file, form, more = open_splats(path, closing)
+    reader: Reader = form.codec().open_content(OpenFile(file, scratch=scratch, threads=threads, **more))
+    return dataclasses.replace(reader, threads=threads)
+
+
+def _temporary(pieces: Callable[[], Iterable[bytes]]) -> BinaryIO:
+    """Write a file without a name, which is gone with this process at the latest."""
+    file: BinaryIO = tempfile.TemporaryFile(prefix="sparklod-")  # noqa: SIM115
     try:
-        if path.is_dir():
-            folder = path
-            names = next((names for names in sets if all((folder / name).is_file() for name in names)), None)
-            if names is None:
-                known = ", or ".join(" and ".join(names) for names in sets)
-                raise UnreadableError(f"{path} cannot be read: is a directory, without {known}")
-        else:
-            folder = path.parent
-            others = next((names for names in sets if path.name in names), ())
-            names = [path.name, *(name for name in others if name != path.name and (folder / name).is_file())]
-        return {name: _read_up_to(folder / name, limit) for name in names}
-    except OSError as error:
-        raise UnreadableError(f"{path} cannot be read: {reason_unreadable(error)}") from None
+        for piece in _readable(pieces):
+            file.write(piece)
+        file.flush()
+    except BaseException:
+        file.close()
+        raise
+    return file
 
 
-def read_rgba(path: Path, count: int, rows: slice | None = None) -> FloatArray:
-    """Return colours and opacities for the `count` splats of a scene, or for a range of them, see `rgba.decode`.
+def _kept(target: Path, pieces: Callable[[], Iterable[bytes]]) -> BinaryIO:
+    """Write a file unless it is there; it appears whole or not at all."""
+    if not target.exists():
+        target.parent.mkdir(parents=True, exist_ok=True)
+        atomic.write(target, _readable(pieces), overwrite=True)
+    return target.open("rb")
 
-    Raises:
-        FormatError: it cannot be read or is not such a file; names it.
-    """
+
+def _readable(pieces: Callable[[], Iterable[bytes]]) -> Iterator[bytes]:
+    with readable():
+        yield from pieces()
+
+
+def _digest(path: Place, version: tuple[Any, ...]) -> str:
+    """Return a name for this version of a file."""
+    parts = (path.url if isinstance(path, Address) else path.absolute(), *version)
+    return hashlib.sha256("\n".join(map(str, parts)).encode("utf-8", "surrogateescape")).hexdigest()[:32]
+
+
+@contextlib.contextmanager
+def _room(folder: Path | None) -> Iterator[None]:
+    """Turn an `OSError` of the body into an `OutputError`."""
     try:
-        if path.exists() and not path.is_file():
-            raise FormatError("cannot be read: it is a directory, a pipe or a device")
-        with path.open("rb") as file:
-            if is_pointer(file.read(SHORT)):
-                raise FormatError(f"cannot be read: it is {POINTER}")
-            file.seek(0)
-            return rgba.decode(file, count, rows)
+        yield
     except OSError as error:
-        raise FormatError(f"{path} cannot be read: {reason_unreadable(error)}") from None
-    except FormatError as error:
-        raise type(error)(f"{path} {error}") from None
+        where = folder or tempfile.gettempdir()
+        raise OutputError(f"cannot write to the scratch folder {where}: {reason_of(error)}") from None
 
 
-def _read_up_to(path: Path, limit: int) -> bytes:
-    if path.is_dir():
-        raise UnreadableError(f"{path} cannot be read: is a directory")
-    if path.exists() and not path.is_file():
-        raise UnreadableError(f"{path} cannot be read: it is a pipe or a device; save it to a file first")
-    if path.stat().st_size > limit:
-        raise UnreadableError(f"{path} is larger than {limit >> 20:,} MiB, which nothing of its kind is")
-    data = path.read_bytes()
-    if is_pointer(data):
-        raise UnreadableError(f"{path} cannot be read: it is {POINTER}")
-    return data
+@dataclass(frozen=True, eq=False)
+class _FillFromFile:
+    """`Reader.fill` of a file, which is opened again in another process, where it was closed, and where it changed."""
+
+    path: Place
+    version: tuple[Any, ...]
+    scratch: Path | None
+    threads: int
+    count: int
+    sh_degree: int
+    reader: Reader | None = None
+    lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def __call__(self, target: Target, threads: int, progress: Progress) -> None:
+        with readable():
+            reader, version = self.reader, _version(self.path, self.scratch)
+            if reader is None or version != self.version:
+                with _LOCK:
+                    reader = _opened_again(self.path, version, self.scratch, self.threads)
+            if (reader.count, reader.sh_degree) != (self.count, self.sh_degree):
+                raise FormatError("it was changed while it was read; start again")
+            with contextlib.nullcontext() if reader.concurrent else self.lock:
+                reader.fill(target, threads, progress)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _FillFromFile, (self.path, self.version, self.scratch, self.threads, self.count, self.sh_degree)
+
+
+@functools.lru_cache(MOST)
+def _opened_again(path: Place, version: tuple[Any, ...], scratch: Path | None, threads: int) -> Reader:
+    """Open a file, which is closed when many others have been opened since and nobody reads it."""
+    closing = contextlib.ExitStack()
+    with contextlib.ExitStack() as after_an_error:
+        after_an_error.enter_context(closing)
+        reader = _opened(path, version, scratch, threads, closing)
+        after_an_error.pop_all()
+    weakref.finalize(reader, closing.close)
+    return reader
+
+
+def _merged(source: Merged, scratch: Path | None, threads: int, closing: contextlib.ExitStack) -> Reader:
+    """Open several files; the header of one that is named twice is read once."""
+    from ..codecs.merging import Placed, merged, naming  # what a single file does without
+
+    closing.callback(_opened_again.cache_clear)
+    readers = dict[Place, Reader]()
+    for file in dict.fromkeys(places_of(source)):
+        with naming(name_of(file)), contextlib.ExitStack() as own:
+            reader = own.enter_context(open_reader(file, scratch=scratch, threads=threads))
+            reader.check_plain()
+            if len(readers) < MOST:
+                closing.push(own.pop_all())
+            else:  # it is opened again when it is read
+                assert isinstance(reader.fill, _FillFromFile)
+                reader = dataclasses.replace(reader, fill=dataclasses.replace(reader.fill, reader=None))
+            readers[file] = reader
+    return merged([Placed(readers[each.file], name_of(each.file), each.transform) for each in source.files])

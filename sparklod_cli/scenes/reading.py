@@ -11,14 +11,13 @@ from pathlib import Path
 import numpy as np
 
 from ..codecs.formats import PRECISIONS
-from ..codecs.reader import Source
+from ..codecs.reader import OpenFile
 from ..codecs.rounding import after
 from ..io import opened, size_of_input
 from ..io.details import read_level_files
 from ..io.rad_file import FORMAT as RAD
 from ..io.rad_file import RadFile
-from ..model.instances import Instance
-from ..model.instances import Source as InstanceSource
+from ..model.instances import Instance, Source
 from ..model.lod_tree import CHUNK_NODES, LodTree
 from ..model.scene import DetailScene, Scene
 from ..model.selection import Selection, describe
@@ -111,7 +110,7 @@ def read_scenes(
     return Scenes(instances, list(loaded.values()), of_instance, notes, precision, threads)
 
 
-def _key(source: InstanceSource) -> Path | int:
+def _key(source: Source) -> Path | int:
     return source if isinstance(source, Path) else id(source)
 
 
@@ -150,7 +149,7 @@ def _read(
                     file, threads=threads, progress=progress, **more
                 )
                 return parts
-            reader = replace(form.codec().open_content(Source(file, threads=threads, **more)), threads=threads)
+            reader = replace(form.codec().open_content(OpenFile(file, threads=threads, **more)), threads=threads)
             scene: Scene = reader.scene(columns=columns, progress=progress, validate=False)
             return scene
     except SparklodError as error:

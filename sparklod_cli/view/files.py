@@ -18,7 +18,7 @@ from ..codecs.formats import head_of
 from ..codecs.glb.codec import open_content as open_glb
 from ..codecs.glb.glb_container import MAGIC as GLB_MAGIC
 from ..codecs.rad.rad_header import CHUNK_MAGIC, MAGIC, RadHeader, read_header
-from ..codecs.reader import Source
+from ..codecs.reader import OpenFile
 from ..codecs.streamed_sog.manifest import MAX_MANIFEST, parse
 from ..codecs.streamed_sog.manifest_rules import files_of_chunk
 from ..codecs.tiles_3d.codec import names_of
@@ -150,7 +150,7 @@ def _shown(path: Path, folder: str) -> ShownFile:
         form = recognised(head, path)
         if head.startswith(MAGIC):
             header = read_header(file)
-        elif head.startswith(GLB_MAGIC) and open_glb(Source(file)).format != "GLB":
+        elif head.startswith(GLB_MAGIC) and open_glb(OpenFile(file)).format != "GLB":
             raise NotSplatsError("PlayCanvas does not read the SPZ in it; write it with --glb-profile khronos")
         elif form.unbundled == META and not head.startswith(ZIP):
             raise NotSplatsError("Spark does not read an unpacked SOG; zip its files into a .sog")

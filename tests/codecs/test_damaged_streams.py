@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from fixtures import by_hand_sog
-from sparklod_cli.codecs.reader import Source, decode_file
+from sparklod_cli.codecs.reader import OpenFile, decode_file
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.system.errors import FormatError, HasTreeError
 from tests.codecs.test_damaged import FILES, WORDS, content, files_of, format_of, header, insides, members
@@ -52,7 +52,7 @@ def compare(name: str, data: bytes) -> str:
     more = {"open_companion": open_companion} if form.folders else {}
 
     def streamed() -> Splats:
-        reader = codec.open_content(Source(io.BytesIO(data), scratch=in_memory, **more))
+        reader = codec.open_content(OpenFile(io.BytesIO(data), scratch=in_memory, **more))
         return Splats.concat([Splats.empty(0, reader.sh_degree), *reader.blocks()])
 
     whole, found = outcome(lambda: decode_file(codec, io.BytesIO(data), **more).splats), outcome(streamed)

@@ -15,7 +15,7 @@ from fixtures import by_hand_glb
 from sparklod_cli.codecs.glb import codec as glb
 from sparklod_cli.codecs.glb import glb_container, log_scales
 from sparklod_cli.codecs.options import WriteOptions
-from sparklod_cli.codecs.reader import Source, decode_file
+from sparklod_cli.codecs.reader import OpenFile, decode_file
 from sparklod_cli.inspection.report import ReportSettings, inspect
 from sparklod_cli.io import companions, open_reader, read_scene
 from sparklod_cli.model.scene import Scene
@@ -429,5 +429,5 @@ def test_scales_of_any_size_are_looked_at_without_a_warning(value: float) -> Non
 
 def test_an_empty_primitive_has_no_scales_to_tell() -> None:
     data = by_hand_glb.split(A)[0]["accessors"]
-    content = glb.open_content(Source(io.BytesIO(with_root(A, accessors=[each | {"count": 0} for each in data]))))
+    content = glb.open_content(OpenFile(io.BytesIO(with_root(A, accessors=[each | {"count": 0} for each in data]))))
     assert content.count == 0 and content.notes == ()

@@ -14,8 +14,8 @@ import pytest
 from sparklod_cli.codecs.merging import Placed, merged
 from sparklod_cli.codecs.reader import Reader
 from sparklod_cli.codecs.sog.sog_container import SogFiles
-from sparklod_cli.io import PlacedFile, open_reader, open_readers, read_scene
-from sparklod_cli.io.streams import MOST
+from sparklod_cli.io import Merged, PlacedFile, open_reader, read_scene
+from sparklod_cli.io.reading import MOST
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.model.transforms import Transform
@@ -113,7 +113,7 @@ def test_several_files_are_one_scene_and_one_that_is_named_twice_is_read_twice(t
     parts += [Placed(reader_of(scenes["PLY"]), "", turned)]
     expected = merged(parts).scene().splats
     for scratch in (None, tmp_path):
-        with open_readers(files, scratch=scratch) as stream:
+        with open_reader(Merged(tuple(files)), scratch=scratch) as stream:
             assert_rows([stream.scene().splats], expected)
             assert_rows(list(stream.blocks(150, 250)), expected.take(slice(150, 250)))
         assert len(list(tmp_path.glob("*.unpacked"))) == (scratch is not None)
@@ -127,9 +127,9 @@ def test_errors_on_one_of_several_files_name_it(tmp_path: Path) -> None:
         (tree, HasTreeError, "it is a Level-of-Detail file"),
         (bad / "x", UnreadableError, "cannot"),
     ):
-        with pytest.raises(kind, match=rf"{file.name}: {text}"), open_readers([PlacedFile(good), PlacedFile(file)]):
+        with pytest.raises(kind, match=rf"{file.name}: {text}"), open_reader(Merged.of([good, file])):
             pass
-    with open_readers([PlacedFile(good), PlacedFile(bad)]) as stream, pytest.raises(FormatError, match=r"bad\.ply: "):
+    with open_reader(Merged.of([good, bad])) as stream, pytest.raises(FormatError, match=r"bad\.ply: "):
         list(stream.blocks())
 
 
@@ -157,7 +157,7 @@ def test_few_of_many_files_are_open_at_a_time(tmp_path: Path) -> None:
     for number in range(3 * MOST):
         (tmp_path / f"{number}.ply").write_bytes((FIXTURES / "one.ply").read_bytes())
     before = len(os.listdir("/proc/self/fd"))  # noqa: PTH208
-    with open_readers([PlacedFile(path) for path in sorted(tmp_path.glob("*.ply"))]) as reader:
+    with open_reader(Merged.of(sorted(tmp_path.glob("*.ply")))) as reader:
         assert len(reader.scene()) == 3 * MOST
         assert len(os.listdir("/proc/self/fd")) <= before + 2 * MOST  # noqa: PTH208
     assert len(os.listdir("/proc/self/fd")) == before  # noqa: PTH208

@@ -14,7 +14,7 @@ from sparklod_cli.cli import run
 from sparklod_cli.codecs.zip_folder import ZipFolder
 from sparklod_cli.io import read_parts, read_scene
 from sparklod_cli.io.details import read_level_files
-from sparklod_cli.io.streams import open_reader
+from sparklod_cli.io.reading import open_reader
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS
 from sparklod_cli.system.errors import FormatError, NotSplatsError

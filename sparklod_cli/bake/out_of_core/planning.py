@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from ...codecs.reader import Reader
+from ...io.reading import Source, absolute_source, open_reader
 from ...system.addresses import Place, absolute
 from ...system.errors import OutOfMemoryError, ScratchError
 from ...system.progress import Progress
@@ -21,7 +22,6 @@ from ..identity import BakeIdentity
 from ..output import BakeOutput
 from ..records import Clock
 from ..settings import BakeSettings, Resources
-from ..sources import Source, absolute_source, open_source
 from .in_blocks import InBlocks
 from .job import Engine, Job, LocalEngine
 from .scratch_folder import at_work
@@ -167,4 +167,4 @@ def _opened(source: Source, folder: Place, threads: int, engine: Engine | None) 
                 # The scratch folder is at an address, so each machine unpacks what it needs.
                 unpacked = Path(tempfile.gettempdir()) / f"sparklod-{uuid.uuid4().hex}"
                 stack.callback(engine.remove, unpacked)
-        yield stack.enter_context(open_source(absolute_source(source), scratch=unpacked, threads=threads))
+        yield stack.enter_context(open_reader(absolute_source(source), scratch=unpacked, threads=threads))

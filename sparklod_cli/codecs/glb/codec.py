@@ -30,7 +30,7 @@ from .. import spz
 from ..compression import check_promise
 from ..file_notes import FileNote, read_note
 from ..left_out import left_out
-from ..reader import Reader, Source, Target
+from ..reader import OpenFile, Reader, Target
 from ..scene_files import copy_rows
 from . import log_scales
 from .attributes import (
@@ -81,7 +81,7 @@ class PlacedPrimitive:
     transform: Transform
 
 
-def open_content(source: Source) -> Reader:
+def open_content(source: OpenFile) -> Reader:
     """Open a glTF with primitives of splats, each placed by its nodes; y is up, as glTF demands.
 
     A file of sparklod that notes the axis which points up is read in the axes of its splats, without the turn of the
@@ -189,7 +189,7 @@ def _parts(file: GltfFile, primitives: Mapping[Key, dict[str, Any]]) -> tuple[li
     return parts or [PlacedPrimitive(key, Transform()) for key in primitives], notes
 
 
-def _opened(file: GltfFile, primitive: dict[str, Any], source: Source, generator: object, *, alone: bool) -> Reader:
+def _opened(file: GltfFile, primitive: dict[str, Any], source: OpenFile, generator: object, *, alone: bool) -> Reader:
     """Open a primitive in the axes of its mesh; `alone` if it is the whole scene, so that its rows are read once."""
     extensions = _extensions(primitive)
     extension = extensions.get(EXTENSION, {})

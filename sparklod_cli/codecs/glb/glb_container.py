@@ -26,7 +26,7 @@ from ...model.splats import FloatArray
 from ...system.errors import FormatError, TruncatedError, UnsupportedError, VersionError
 from ...system.untrusted import parse_json, quoted, quoted_value
 from ..json_trees import leads_away
-from ..reader import Positioned, Source, size_of
+from ..reader import OpenFile, Positioned, size_of
 
 #: The header of a binary file, magic, version and length, and of a chunk, length and type.
 HEADER, CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
@@ -133,7 +133,7 @@ class GltfFile:
         FormatError: the file is no glTF 2, or cut short.
     """
 
-    def __init__(self, source: Source) -> None:
+    def __init__(self, source: OpenFile) -> None:
         self._file, self._open_companion = source.file, source.open_companion
         self._size = size_of(self._file)
         self._chunk: Buffer | None = None

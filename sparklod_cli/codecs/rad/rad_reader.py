@@ -20,7 +20,7 @@ from ...system.errors import FormatError, TruncatedError
 from ...system.progress import Progress
 from ...system.threads import ordered_map
 from .. import compression
-from ..reader import OpenCompanion, Reader, Source, Target, size_of
+from ..reader import OpenCompanion, OpenFile, Reader, Target, size_of
 from ..validation import RuleViolation, check_rules, error_of
 from . import rad_rules
 from .chunk_decoder import PackedChunk, fill
@@ -230,7 +230,7 @@ class RadReader:
         )
 
 
-def open_content(source: Source) -> Reader:
+def open_content(source: OpenFile) -> Reader:
     """Open a RAD file, whole or with chunks in files of their own; raises `FormatError` as `RadReader.open`."""
     return RadReader.open(source.file, source.open_companion).content()
 

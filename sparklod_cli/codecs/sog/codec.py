@@ -23,7 +23,7 @@ from .. import quantize
 from ..compression import check_promise
 from ..file_notes import read_note
 from ..kernels import texels
-from ..reader import Positioned, Reader, Source, Target
+from ..reader import OpenFile, Positioned, Reader, Target
 from . import texel_codings as codings
 from .sog_container import Meta, Pixels, SogFiles
 from .sog_writer import encode as encode
@@ -63,7 +63,7 @@ def code_of(note: str) -> str:
     return "container.lossy" if note.startswith(LOSSY) else "container.left-out"
 
 
-def open_content(source: Source) -> Reader:
+def open_content(source: OpenFile) -> Reader:
     """Open a .sog archive, or the meta.json of an unpacked one. With `scratch`, the images are unpacked to that.
 
     Raises:

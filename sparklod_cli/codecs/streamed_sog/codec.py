@@ -19,7 +19,7 @@ from ...system.units import count_of
 from ...system.untrusted import quoted_value
 from ..compression import check_promise
 from ..file_names import MANIFEST
-from ..reader import OpenCompanion, Reader, Source, size_of
+from ..reader import OpenCompanion, OpenFile, Reader, size_of
 from ..scene_files import Chunk, Piece
 from ..validation import check_rules, error_of
 from .manifest import MAX_MANIFEST, VERSION, Manifest, parse
@@ -29,7 +29,7 @@ from .streamed_writer import encode_files as encode_files
 Index = NDArray[np.int64]
 
 
-def open_content(source: Source) -> Reader:
+def open_content(source: OpenFile) -> Reader:
     """Open level 0, chunk after chunk, and then the environment.
 
     Nothing is unpacked to `scratch`: where blocks are read, one chunk at a time stays in memory.
@@ -50,7 +50,7 @@ def decode_parts(
     Raises:
         FormatError: as `open_content`; also where another fatal rule of `manifest_rules` is broken.
     """
-    layout, content = _open(Source(file, open_companion, threads=threads), full_detail=False)
+    layout, content = _open(OpenFile(file, open_companion, threads=threads), full_detail=False)
     bounds, children, errors = layout.bounds(), layout.children(), layout.errors()
     scene, environment = replace(content, threads=threads).scene(progress=progress), None
     splats = scene.splats
@@ -119,7 +119,7 @@ def layout_of(manifest: Manifest) -> RegionLayout:
     return RegionLayout(manifest, file, offset, count, level, region, counts)
 
 
-def _open(source: Source, *, full_detail: bool) -> tuple[RegionLayout, Reader]:
+def _open(source: OpenFile, *, full_detail: bool) -> tuple[RegionLayout, Reader]:
     """Read a manifest, and open its chunks: those of level 0, or all."""
     size, beside = size_of(source.file), chunk_files(source.open_companion)
     manifest = parse(source.file.read(MAX_MANIFEST + 1))

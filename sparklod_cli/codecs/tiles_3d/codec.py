@@ -25,7 +25,7 @@ from ..compression import check_promise
 from ..file_names import TILESET
 from ..glb import codec as glb
 from ..glb.placement import transform_of
-from ..reader import OpenCompanion, Reader, Source
+from ..reader import OpenCompanion, OpenFile, Reader
 from ..scene_files import Chunk, SceneFiles
 from ..validation import check_rules, error_of
 from .tile_writer import encode_files as encode_files
@@ -39,7 +39,7 @@ NOT_PLACED = "the transform of the tileset, its place on the Earth, is not appli
 Matrix = NDArray[np.float64]
 
 
-def open_content(source: Source) -> Reader:
+def open_content(source: OpenFile) -> Reader:
     """Open the tiles without children, one after the other.
 
     The transform of the root is not applied: splats are where they are in the axes of the scene, not on the Earth.
@@ -63,7 +63,7 @@ def decode_parts(
     Raises:
         FormatError: as `open_content`; or a bounding volume is a region, or a number is wrong.
     """
-    source = Source(file, open_companion, threads=threads)
+    source = OpenFile(file, open_companion, threads=threads)
     tileset = _read(file, open_companion)
     order, parent, level = _hierarchy(tileset)
     held = [number for number in order if tileset.tiles[number].uri is not None]
@@ -107,7 +107,7 @@ def names_of(data: bytes, open_companion: OpenCompanion) -> list[str]:
             return open_companion(opened[-1])
 
         with open_companion(name) as file:
-            glb.open_content(Source(file, open_buffer))
+            glb.open_content(OpenFile(file, open_buffer))
         names |= dict.fromkeys(opened)
     return list(names)
 
@@ -136,7 +136,7 @@ def _hierarchy(tileset: Tileset) -> tuple[list[int], NDArray[np.int32], NDArray[
     return order, np.array(parent, np.int32), np.array(level, np.int32)
 
 
-def _open(source: Source, tileset: Tileset, wanted: Sequence[int]) -> tuple[Reader, list[Chunk]]:
+def _open(source: OpenFile, tileset: Tileset, wanted: Sequence[int]) -> tuple[Reader, list[Chunk]]:
     """Return the content of some tiles, one after the other, and the files of these."""
     if not wanted:
         raise FormatError("no tile of it has splats")
@@ -172,7 +172,7 @@ def _open(source: Source, tileset: Tileset, wanted: Sequence[int]) -> tuple[Read
 def tile_files(open_companion: OpenCompanion | None, matrices: dict[str, Matrix]) -> SceneFiles:
     """Return the glTF files of tiles, each read where its (4, 4) transform puts it."""
 
-    def open_tile(name: str, source: Source) -> Reader:
+    def open_tile(name: str, source: OpenFile) -> Reader:
         content = glb.open_content(source)
         matrix = matrices.get(name)
         if matrix is None or np.array_equal(matrix, np.eye(4)):
