@@ -125,7 +125,7 @@ def bake(
 
 
 def has_published(source: Source, target: Place, settings: BakeSettings, resources: Resources) -> bool:
-    """Return whether a bake resumes one that was interrupted when its output, or a part of it, may have been there."""
+    """Return whether a bake resumes one that was interrupted when all or part of its output may have been in place."""
     if not resources.resume:
         return False
     from .out_of_core.job import PUBLISHED

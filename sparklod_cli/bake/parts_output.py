@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,7 +17,56 @@ from ..model.tile_scene import TileScene
 from ..system.output import Output
 from ..system.progress import Progress
 from ..system.threads import on_threads
-from .records import Clock, WrittenDetail, WrittenLevel, WrittenTiles, WrittenTree
+from .records import Clock, WrittenTree
+
+
+@dataclass(frozen=True)
+class WrittenLevel:
+    """Detail level of a Streamed SOG.
+
+    Attributes:
+        splats: of all regions.
+        share: of the splats of level 0.
+        worst_error: largest error of a region.
+    """
+
+    splats: int
+    share: float
+    worst_error: float
+
+
+@dataclass(frozen=True)
+class WrittenDetail:
+    """Detail levels of a Streamed SOG.
+
+    Attributes:
+        levels: full detail first.
+        regions, chunks: how many; each chunk is a folder.
+        environment: number of splats that are always drawn.
+    """
+
+    levels: tuple[WrittenLevel, ...]
+    regions: int
+    chunks: int
+    environment: int
+
+
+@dataclass(frozen=True)
+class WrittenTiles:
+    """Tiles of a tileset.
+
+    Attributes:
+        tiles, levels: how many.
+        splats: of each level's cut, the root's first; the last has full detail.
+        error: geometric error of the root.
+        georeferenced: the tileset stands on the Earth.
+    """
+
+    tiles: int
+    levels: int
+    splats: tuple[int, ...]
+    error: float
+    georeferenced: bool
 
 
 def detail_levels(

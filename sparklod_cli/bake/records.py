@@ -1,4 +1,4 @@
-"""Records that the steps of a bake exchange and report: the built tree, and the result."""
+"""Records that the steps of a bake exchange and report: the built tree and the result."""
 
 from __future__ import annotations
 
@@ -7,14 +7,15 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from ..codecs.clamps import Clamp
-from ..codecs.losses import Losses
 from ..codecs.statistics import Statistics
 from ..model.scene import NodeStream, Scene
 from ..model.splats import Splats
 
 if TYPE_CHECKING:
     from .output import BakeOutput
+    from .parts_output import WrittenDetail, WrittenTiles
     from .refining import Refined
+    from .simplifying import WrittenSet
 
 
 class Clock:
@@ -33,20 +34,20 @@ class Clock:
 
 @dataclass(kw_only=True, eq=False)
 class BuiltTree:
-    """A tree on its way from the splats of an input to a file.
+    """Tree on its way from the splats of an input to a file.
 
     Attributes:
-        nodes: of the tree, in memory or in a store; None while a step replaces them.
+        nodes: in memory or in a store; None while a step replaces them.
         format, notes: of the input, for display.
-        read: number of splats of the input, which are nodes where it has a tree.
-        splats: leaves of the tree.
-        dropped: number of splats that were left out, by reason (`selection.REASONS`).
-        method: that built the tree; None for the tree of the input.
-        environment: splats beside the tree that are always drawn; None without.
-        levels: depth and 1, so that a tree of one node has one.
-        statistics: of all nodes, as far as `output.needed`; None where it is made as a whole.
+        read: number of splats of the input, or of its nodes if it has a tree.
+        splats: number of leaves.
+        dropped: number of dropped splats by reason (`selection.REASONS`).
+        method: builder of the tree; None for the tree of the input.
+        environment: splats that are always drawn; None without.
+        levels: depth plus 1.
+        statistics: those of all nodes that `output.needed` names; None for an output that needs none.
         is_ordered: the nodes have the order of the output.
-        blocks: number of blocks that it was built of, out of core; None in memory.
+        blocks: number of blocks, out of core; None in memory.
     """
 
     nodes: Scene | NodeStream | None
@@ -82,73 +83,6 @@ class BuiltTree:
         return self.nodes.splats.sh_degree if isinstance(self.nodes, Scene) else self.nodes.sh_degree
 
 
-@dataclass(frozen=True)
-class WrittenLevel:
-    """Detail level of a Streamed SOG.
-
-    Attributes:
-        splats: of all regions.
-        share: of the splats of level 0.
-        worst_error: largest error of a region.
-    """
-
-    splats: int
-    share: float
-    worst_error: float
-
-
-@dataclass(frozen=True)
-class WrittenDetail:
-    """Detail levels of a Streamed SOG.
-
-    Attributes:
-        levels: full detail first.
-        regions, chunks: how many; each chunk is a folder.
-        environment: number of splats that are always drawn.
-    """
-
-    levels: tuple[WrittenLevel, ...]
-    regions: int
-    chunks: int
-    environment: int
-
-
-@dataclass(frozen=True)
-class WrittenTiles:
-    """Tiles of a tileset.
-
-    Attributes:
-        tiles, levels: how many.
-        splats: of each level's cut, the root's first; the last has full detail.
-        error: geometric error of the root.
-        georeferenced: the tileset stands on the Earth.
-    """
-
-    tiles: int
-    levels: int
-    splats: tuple[int, ...]
-    error: float
-    georeferenced: bool
-
-
-@dataclass(frozen=True)
-class WrittenSet(Losses):
-    """A simplified scene.
-
-    Attributes:
-        splats, share: how many, and their share of full detail.
-        faint: number of merged splats whose opacity is too low to be drawn.
-        psnr: mean over the cameras and a black and a white background, dB; None where it was not measured.
-        refine: result of fitting it; None without `--refine`.
-    """
-
-    splats: int
-    share: float
-    faint: int
-    psnr: float | None
-    refine: Refined | None
-
-
 @dataclass(frozen=True, kw_only=True)
 class WrittenTree:
     """Result of writing a tree.
@@ -156,7 +90,7 @@ class WrittenTree:
     Attributes:
         output_format: "spz", "rad", "rad-chunked", "streamed-sog", "3d-tiles", the name of the encoding of
             arrays, or the name of the format of a simplified scene.
-        bytes: of the output, all of its files.
+        bytes: size of all files of the output.
         version, fractional_bits: of an SPZ output, else None.
         chunks: of a RAD output, else None.
         encodings: of a RAD output, by the field of `RadOptions`.
@@ -165,8 +99,8 @@ class WrittenTree:
         detail: of a Streamed SOG, else None.
         tiles: of 3D Tiles, else None.
         simplified: of a simplified scene, else None.
-        clamped: by the column of `Splats`, the number of nodes with a value that the output cannot hold.
-        clamps: at which ends, and how far beyond.
+        clamped: number of nodes with a value that the output cannot hold, by column of `Splats`.
+        clamps: at which ends of the range, and how far beyond.
     """
 
     output_format: str

@@ -1,4 +1,4 @@
-"""Fits the merged splats of a tree that is baked: `--refine`."""
+"""Fitting of the merged splats of a tree to pictures of full detail: `--refine`."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from .settings import BakeSettings
 
 @dataclass(frozen=True, kw_only=True)
 class Refined(FitReport):
-    """Result of fitting the merged splats, as `--json` has it.
+    """Result of fitting merged splats, as reported by `--json`.
 
     Attributes:
-        seed: of the cameras and budgets that were drawn at random.
-        seconds: that it took.
+        seed: of the random cameras and budgets.
+        seconds: duration.
     """
 
     seed: int
@@ -35,7 +35,7 @@ def fit_settings(settings: BakeSettings) -> FitSettings | None:
     """Return the settings of fitting, with the cameras of the file they name; None without `--refine`.
 
     Raises:
-        CameraPathError: that file cannot be read, or has no cameras; names it.
+        CameraPathError: the file cannot be read, or has no cameras; names it.
     """
     if settings.refine is None or settings.camera_path is None:
         return settings.refine
@@ -53,16 +53,16 @@ def refined(
     progress: Progress,
     say: Callable[[str], None],
 ) -> tuple[Scene, Refined]:
-    """Return a tree whose merged splats are fitted, and what that brought.
+    """Fit the merged splats of a tree; return the tree and the result.
 
-    A first Ctrl-C ends the fitting early: what the finished stages gained is kept.
+    A first Ctrl-C ends the fitting early, with the improvements of finished stages.
 
     Args:
         fixed: see `fitting.fit.fit`.
-        say: told what came of each stage.
+        say: receives one-line messages for the user.
 
     Raises:
-        KeyboardInterrupt: the fitting was interrupted before it gained anything.
+        KeyboardInterrupt: the fitting was interrupted before it improved anything.
     """
     from ..fitting.fit import fit
 
@@ -84,7 +84,7 @@ def refined(
         if not report.kept:
             say("Stopped before --refine improved anything; no file written.")
             raise KeyboardInterrupt
-        say("interrupted; what the finished stages gained is written, and a second Ctrl-C ends without an output")
+        say("Interrupted: writing the improvements of the finished stages; another Ctrl-C ends without an output.")
     seconds = round(time.perf_counter() - start, 4)
     return dataclasses.replace(scene, splats=_within(nodes, scene)), Refined(
         **vars(report), seed=settings.seed, seconds=seconds
@@ -92,9 +92,9 @@ def refined(
 
 
 def _within(nodes: Splats, scene: Scene) -> Splats:
-    """Return nodes that stay in the box of all centres before.
+    """Return nodes whose centres stay in their former box, so that a format needs no other number of bits for them.
 
-    A format that holds these with some number of bits then still does; with another one, leaves would move.
+    With another number, leaves would move.
     """
     before = scene.splats.center
     return dataclasses.replace(nodes, center=nodes.center.clip(before.min(axis=0), before.max(axis=0)))

@@ -1,9 +1,9 @@
-"""The errors of regions at their detail levels, measured on pictures.
+"""Errors of regions at their detail levels, measured on pictures.
 
-As splat-transform 3.7 measures them, so that its numbers and ours mean the same: each region is drawn alone from six
-directions, from so far away that the pictures have next to no perspective. An error is the squared difference to the
-pictures of the first level, of colours premultiplied by alpha and of alpha, divided by the squares of those; the same
-for a region of any size and place. See benchmarks/notes/rounding-and-levels.md.
+The method of splat-transform 3.7, whose numbers can be compared: each region is drawn alone from six directions, from
+so far away that there is hardly any perspective. An error is the squared difference from the pictures of the first
+level, of colours premultiplied by alpha and of alpha, divided by the squares of those: independent of the size and
+place of the region. See benchmarks/notes/rounding-and-levels.md.
 """
 
 from __future__ import annotations
@@ -28,27 +28,27 @@ from ..system.threads import on_threads
 
 Errors = NDArray[np.float64]
 
-#: Rotation w x y z of the axes that regions are seen along, from both sides: 45, 20 and 35 degrees about x, y and z, as
-#: in splat-transform 3.7. Along the world's axes many spherical harmonics are 0, and errors of them would not be seen.
+#: Rotation w x y z of the viewing axes, used in both directions: 45, 20 and 35 degrees about x, y and z, as in
+#: splat-transform 3.7. Along the world's axes many spherical harmonics are 0, which would hide their errors.
 TURN = (0.8877160, 0.3111847, 0.2663317, 0.2102186)
 
 #: Signs of the axes of a camera that looks back, if two of its axes are exchanged.
 BACK = np.array([[1.0], [1.0], [-1.0]])
 
-#: Distance of the camera from the middle of a region, and half the width of the picture there, in radii of the region;
-#: those of splat-transform 3.7.
+#: Distance of the camera from the middle of a region, and half the width of the picture there, in radii of the region,
+#: as in splat-transform 3.7.
 DISTANCE, HALF_WIDTH = 200.0, 1.05
 
-#: Least radius of a region, as a share of its coordinates and 1: float32 holds what is divided by it. Chosen.
+#: Least radius of a region, as a share of its coordinates and 1, so that float32 holds quotients by it. Chosen.
 LEAST_RADIUS = 1e-30
 
 #: Least and largest width of a picture, pixels. Measured against 256 and 512, see the page above.
 LEAST_WIDTH, MOST_WIDTH = 64, 128
 
-#: Pixels across the diameter of the small splats of a region: these are its FINE quantile by their longest axis.
+#: Pixels across the diameter of a small splat: the FINE quantile of a region by the longest axis.
 PIXELS, FINE = 4, 0.1
 
-#: Splats of a region that these are found from.
+#: Splats of a region that this quantile is estimated from.
 SAMPLE = 4096
 
 #: Splats whose pictures are drawn between two reports of progress.
@@ -56,10 +56,10 @@ BATCH = 1 << 21
 
 
 def measured(scene: DetailScene, *, threads: int | None = None, progress: Progress = silent) -> Errors:
-    """Return (R, L) float64 error of each region at each detail level.
+    """Return the (R, L) float64 error of each region at each detail level.
 
-    0 at the first level that a region has, not decreasing, and the same for any number of threads. A level that a
-    region lacks has the error of the level before.
+    It is 0 at the first level of a region, does not decrease, and does not depend on the number of threads. A missing
+    level has the error of the level before.
 
     Args:
         scene: its errors are not read.
@@ -69,11 +69,11 @@ def measured(scene: DetailScene, *, threads: int | None = None, progress: Progre
     sums = _differences(scene, runs, threads, progress)
     energy = sums[:, :1].copy()
     sums[:, 0] = 0
-    # Where the first level cannot be seen, a level that can be seen is wrong altogether.
+    # If the first level is invisible, a visible level has an error of 1.
     errors = np.where(energy > 0, sums / np.where(energy > 0, energy, 1), (sums > 0).astype(np.float64))
-    found = np.zeros_like(errors)
-    np.put_along_axis(found, order, errors, 1)
-    return np.maximum.accumulate(found, axis=1)
+    placed = np.zeros_like(errors)
+    np.put_along_axis(placed, order, errors, 1)
+    return np.maximum.accumulate(placed, axis=1)
 
 
 def _differences(
@@ -108,7 +108,7 @@ def _turns() -> NDArray[np.float64]:
 
 
 def _poses(bounds: NDArray[np.float64], turns: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Return (R, 6, 3, 4) world to camera, in radii of each region, whose middle is DISTANCE in front of the camera."""
+    """Return (R, 6, 3, 4) world-to-camera matrices in radii of each region, DISTANCE in front of the camera."""
     radius = np.linalg.norm(bounds[:, 1] - bounds[:, 0], axis=1) / 2
     least = LEAST_RADIUS * np.maximum(np.abs(bounds).max(axis=(1, 2)), 1)
     matrices = turns / np.maximum(np.where(radius > 0, radius, 1), least)[:, None, None, None]
@@ -129,11 +129,11 @@ def _basis(turns: NDArray[np.float64], coefficients: int) -> NDArray[np.float32]
 
 
 def _widths(scene: DetailScene, runs: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return (R,) widths of the pictures of each region, pixels, so that small splats of its first level show."""
+    """Return (R,) widths of the pictures of each region, pixels, at which small splats of its first level show."""
     diameter = np.linalg.norm(scene.bounds[:, 1] - scene.bounds[:, 0], axis=1)
-    wanted = np.empty(scene.regions)
+    width = np.empty(scene.regions)
     for region, (start, count) in enumerate(runs[:, 0]):
         longest = scene.splats.scale[start : start + count : max(1, count // SAMPLE)].max(axis=1)
         small = 2 * float(np.quantile(longest, FINE)) if len(longest) else 0.0
-        wanted[region] = PIXELS * diameter[region] / small if small > 0 else MOST_WIDTH
-    return (np.ceil(np.clip(wanted, LEAST_WIDTH, MOST_WIDTH) / TILE) * TILE).astype(np.int64)
+        width[region] = PIXELS * diameter[region] / small if small > 0 else MOST_WIDTH
+    return (np.ceil(np.clip(width, LEAST_WIDTH, MOST_WIDTH) / TILE) * TILE).astype(np.int64)

@@ -1,4 +1,4 @@
-"""Several scenes on a cluster: each that a worker can hold is one task, and larger ones are baked by blocks."""
+"""Several scenes on a cluster: a scene that fits into a worker is one task, a larger one is baked by blocks."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ def bake_side_by_side(
     overwrite: bool = False,
     progress: Progress = silent,
 ) -> Iterator[Any]:
-    """Bake scenes; yields what came of each, a `Baked` or a `SparklodError`, in their order as soon as it is known.
+    """Bake scenes; yield the result of each, a `Baked` or a `SparklodError`, in their order.
 
     Args:
         pairs: inputs and outputs, which all workers see.
-        resources: of a worker; a scene that its memory holds is one task.
-        bake_large: bakes one that none can, and returns what came of it.
-        make: bakes one; a function of a module.
+        resources: of a worker; a scene that fits into its memory is one task.
+        bake_large: bakes a scene too large for one worker, and returns the result.
+        make: function of a module that bakes a scene.
     """
     small = [fits_in_memory(source, settings, resources.memory) for source, _ in pairs]
     settings = dataclasses.replace(settings, **{name: path.absolute() for name, path in settings.files.items()})
@@ -51,7 +51,7 @@ def bake_side_by_side(
 
 
 def _checked_outcome(outcome: Any, target: Place) -> Any:
-    """Return the outcome of a bake, or a `SparklodError` if this machine does not see the output."""
+    """Return the result of a bake, or a `SparklodError` if this machine does not see the output."""
     if isinstance(outcome, Baked) and isinstance(target, Path) and not target.exists():
         return SparklodError(
             f"a worker wrote {target} into a folder that is not seen here: give --output-dir a folder that all machines"
@@ -70,5 +70,5 @@ def _bake_small(
     *,
     threads: int,
 ) -> Baked | None:
-    """Return what a worker does."""
+    """Bake a scene on a worker."""
     return make(source, target, settings, overwrite=overwrite, threads=threads, resources=resources)

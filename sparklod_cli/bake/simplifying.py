@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..cameras.camera import Camera
 from ..codecs.formats import WRITABLE
-from ..codecs.losses import settled_with_losses
+from ..codecs.losses import Losses, settled_with_losses
 from ..fitting.settings import FitSettings
 from ..io.writing import encoded, write_scene
 from ..lod.detail_levels import RefinementOrder, with_plain_opacity
@@ -24,7 +24,7 @@ from ..system.errors import FormatError, SparklodError
 from ..system.progress import Progress
 from ..system.threads import on_threads
 from ..system.units import count_of
-from .records import BuiltTree, Clock, WrittenSet, WrittenTree
+from .records import BuiltTree, Clock, WrittenTree
 from .refining import Refined, fit_settings, refined
 from .settings import BakeSettings, SimplifyGoal
 
@@ -228,6 +228,24 @@ class Simplifier:
         measured = None if fidelity is None else fidelity.fitted(fixed, fitted.splats)
         scene = dataclasses.replace(fitted, splats=fitted.splats.take(fixed), tree=None)
         return Chosen(scene, faint, measured, report)
+
+
+@dataclass(frozen=True)
+class WrittenSet(Losses):
+    """A simplified scene.
+
+    Attributes:
+        splats, share: how many, and their share of full detail.
+        faint: number of merged splats whose opacity is too low to be drawn.
+        psnr: mean over the cameras and a black and a white background, dB; None where it was not measured.
+        refine: result of fitting it; None without `--refine`.
+    """
+
+    splats: int
+    share: float
+    faint: int
+    psnr: float | None
+    refine: Refined | None
 
 
 def write_simplified(

@@ -10,9 +10,11 @@ from ..system.units import format_size, percent_of
 from .console import Console, count_of
 
 if TYPE_CHECKING:
-    from ..bake.records import Baked, WrittenDetail, WrittenSet
+    from ..bake.parts_output import WrittenDetail
+    from ..bake.records import Baked
     from ..bake.refining import Refined
     from ..bake.settings import Source
+    from ..bake.simplifying import WrittenSet
     from ..codecs.clamps import Clamp
     from ..extract_leaves import Extracted
 

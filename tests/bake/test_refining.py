@@ -190,7 +190,7 @@ def test_what_was_interrupted_is_written_and_is_not_there_already(tmp_path: Path
     assert not baked.refine.is_complete
     assert target.exists()
     assert not target.with_name(f"{target.name}{SUFFIX}").exists()
-    assert "what the finished stages gained is written" in said[-1]
+    assert "writing the improvements of the finished stages" in said[-1]
 
 
 def test_what_gained_nothing_before_it_was_interrupted_is_not_written(tmp_path: Path, stand_in: StandIn) -> None:

@@ -224,7 +224,7 @@ def test_ctrl_c_keeps_what_was_gained(tmp_path: Path) -> None:
     code, err = interrupted(tmp_path, signal.SIGINT, more=(str(FIXTURES / "one.ply"),))
     assert code == 130
     assert err.endswith("interrupted\n")
-    assert "what the finished stages gained is written" in err
+    assert "writing the improvements of the finished stages" in err
     assert f"refined in {STEPS} steps, interrupted: held-out PSNR" in err
     assert [path.name for path in tmp_path.iterdir()] == ["sh2-lod.spz"]  # and the other input is not begun
     assert read_scene(tmp_path / "sh2-lod.spz").tree is not None
