@@ -5,16 +5,17 @@ Imports nothing heavy: `--help` names them.
 
 from __future__ import annotations
 
+import functools
 import re
 from collections.abc import Collection
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import PurePath
-from typing import Any, BinaryIO, Literal
+from typing import Any, BinaryIO, Literal, NamedTuple
 
 from ..system import defaults
+from ..system.printable import printable
 from ..system.untrusted import keys_of_object
-from .lookalikes import lookalike_of
 
 #: Bytes at the beginning of a file by which its format is recognized, and of a JSON object, whose first value may be
 #: long.
@@ -179,10 +180,14 @@ def ending_of(name: str) -> str:
 def head_of(file: BinaryIO) -> bytes:
     """Read the bytes at the beginning of a file by which its format is recognized, and return to it."""
     head = file.read(HEAD)
-    if len(head) == HEAD and keys_of_object(head) and sniff(head, "") is None:
+    if len(head) == HEAD and _keys(head) and sniff(head, "") is None:
         head += file.read(JSON_HEAD - HEAD)
     file.seek(0)
     return head
+
+
+#: The keys of the object that a file begins with, see `keys_of_object`: several functions ask for those of one head.
+_keys = functools.lru_cache(1)(keys_of_object)
 
 
 def sniff(head: bytes, suffix: str) -> Format | None:
@@ -191,8 +196,72 @@ def sniff(head: bytes, suffix: str) -> Format | None:
     The suffix decides only for formats that may begin with any bytes, and not if the file is recognized as something
     else.
     """
-    keys = keys_of_object(head)
+    keys = _keys(head)
     by_content = next((form for form in FORMATS if form.begins(head, keys)), None)
     if by_content is not None or lookalike_of(head) is not None:
         return by_content
     return next((form for form in FORMATS if form.unmarked and suffix.lower() in form.suffixes), None)
+
+
+#: What a clone that was made without Git LFS has in place of a file, of any kind.
+POINTER = "a Git LFS pointer; run git lfs pull to get the file"
+POINTED = rb"version https://git-lfs\.github\.com/spec/v1\s"
+
+#: Bytes at the beginning of a file that suffice to recognize a pointer.
+SHORT = 64
+
+#: Keys of an unknown object that a message names, and the characters that they may take.
+FEW, QUOTED = 5, 100
+
+
+class Lookalike(NamedTuple):
+    """A kind of file that holds no splats, or none that are read.
+
+    Attributes:
+        text: what it is, and what to do, to stand after "not a splat file, but".
+        beginning: a regular expression that the first bytes match; None if any JSON object with the keys is one.
+        keys: that it has at the top level.
+    """
+
+    text: str
+    beginning: bytes | None = None
+    keys: tuple[str, ...] = ()
+
+
+_CAMERAS = "a file of cameras; give it as --camera-path"
+
+#: In the order in which they are tried.
+LOOKALIKES = (
+    Lookalike(POINTER, POINTED),
+    Lookalike("a web page, perhaps of a download that failed", rb"\s*<(?i:!doctype html|html)"),
+    Lookalike("a glTF without splats", keys=("asset", "nodes")),
+    Lookalike(_CAMERAS, keys=("frames",)),
+    Lookalike(_CAMERAS, keys=("cameras",)),
+    Lookalike(_CAMERAS, keys=("keyframes",)),
+    Lookalike(_CAMERAS, keys=("camera_path",)),
+    Lookalike("the manifest of an LCC scene; convert it to another format", keys=("totalLevel",)),
+    # Longer than two bytes, as a .splat or .hier file may begin with any number.
+    Lookalike(
+        "a JSON list; if it holds cameras, give it as --camera-path",
+        rb"(?:\xef\xbb\xbf)?\s*\[\s*\{\s*\"\w+\"\s*:",
+    ),
+)
+
+
+def lookalike_of(head: bytes) -> str | None:
+    """Return the text of a file of no known format by its first bytes; None if these tell nothing."""
+    keys = _keys(head)
+    for each in LOOKALIKES:
+        if each.beginning is not None and re.match(each.beginning, head):
+            return each.text
+        if each.keys and set(each.keys) <= set(keys):
+            return each.text
+    if not keys:
+        return None
+    named = printable(", ".join(keys[:FEW]), QUOTED) + (", ..." if len(keys) > FEW else "")
+    return f"a JSON object of no format that holds splats ({named})"
+
+
+def is_pointer(head: bytes) -> bool:
+    """Return True if a file that begins so is a pointer of Git LFS."""
+    return re.match(POINTED, head) is not None

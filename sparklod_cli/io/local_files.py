@@ -13,8 +13,7 @@ from pathlib import Path, PurePath
 from typing import BinaryIO
 
 from ..codecs.file_names import FIRST_FILES, MANIFEST, META, TILESET
-from ..codecs.formats import FORMATS, head_of, sniff
-from ..codecs.lookalikes import POINTER, SHORT, is_pointer
+from ..codecs.formats import FORMATS, POINTER, SHORT, head_of, is_pointer, sniff
 from ..model.splats import FloatArray
 from ..system.addresses import Place, size_of
 from ..system.errors import FormatError, UnreadableError, reason_of

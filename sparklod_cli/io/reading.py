@@ -15,8 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 from ..codecs.encoder import Stored
-from ..codecs.formats import FORMATS, NPZ, RAW_SUFFIXES, Format, head_of, sniff
-from ..codecs.lookalikes import lookalike_of
+from ..codecs.formats import FORMATS, NPZ, RAW_SUFFIXES, Format, head_of, lookalike_of, sniff
 from ..codecs.reader import OpenCompanion, OpenFile, Reader, Target
 from ..codecs.zip_folder import ZIP, ZipFolder
 from ..model.instances import Instance
