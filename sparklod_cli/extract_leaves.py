@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .codecs.clamps import Losses, settled_with_losses
 from .codecs.formats import WRITABLE
-from .codecs.losses import Losses, settled_with_losses
 from .codecs.options import WriteOptions
 from .codecs.spz import like
 from .codecs.validation import check_valid

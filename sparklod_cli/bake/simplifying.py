@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras.camera import Camera
+from ..codecs.clamps import Losses, settled_with_losses
 from ..codecs.formats import WRITABLE
-from ..codecs.losses import Losses, settled_with_losses
 from ..fitting.settings import FitSettings
 from ..io.writing import encoded, write_scene
 from ..lod.detail_levels import RefinementOrder, with_plain_opacity

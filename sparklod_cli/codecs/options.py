@@ -102,8 +102,8 @@ class WriteOptions(CheckedSettings):
         sog: of SOG.
         sh_bits: upper bits kept of each SH byte of SPZ, 4 to 8; None for as many as colours need (`statistics.enough`).
             Merged splats keep 4, and 5 of degree 1, as other writers do with all splats.
-        covering: opacities make up for the rounding of scales, see `coverage`; False where splats of a tree are written
-            in another format, so that they keep their opacities.
+        covering: opacities make up for the rounding of scales, see `quantize.compensated`; False where splats of a tree
+            are written in another format, so that they keep their opacities.
     """
 
     HEADING: ClassVar[str] = "File format"

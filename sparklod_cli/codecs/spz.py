@@ -21,7 +21,7 @@ from ..system.defaults import DEFAULT_SPZ_VERSION, MAX_FRACTIONAL_BITS, TREE_SPZ
 from ..system.errors import FormatError
 from ..system.progress import Progress, silent
 from ..system.threads import blocks_of, ordered_map
-from . import clamps, compression, coverage, quantize
+from . import clamps, compression, quantize
 from .clamps import CodeRange
 from .compression import DataRun
 from .encoder import Encoded, Encoder, Windows, results, windows_of
@@ -29,7 +29,6 @@ from .file_notes import comment_of
 from .options import DEFAULTS, WriteOptions
 from .quantize import Bytes
 from .reader import OpenFile
-from .spz_extensions import SYSTEM_OF_UP, extensions_of
 from .spz_streams import (
     ANTIALIASED,
     EXTENSIONS,
@@ -38,9 +37,11 @@ from .spz_streams import (
     LOD,
     MAGIC,
     STREAM_SIZES,
+    SYSTEM_OF_UP,
     Layout,
     SpzStream,
     column_of,
+    extensions_of,
     read_codes,
 )
 from .spz_streams import open_content as open_content
@@ -266,7 +267,7 @@ def opacities(splats: Splats, fractional_bits: int, *, covering: bool) -> FloatA
     if not covering:
         return splats.opacity
     rounded = quantize.decode_log_scale(quantize.encode_log_scale(splats.scale))
-    return coverage.compensated(splats.opacity, splats.scale, rounded, 2.0**-fractional_bits)
+    return quantize.compensated(splats.opacity, splats.scale, rounded, 2.0**-fractional_bits)
 
 
 def sh_codes(sh: FloatArray, is_leaf: NDArray[np.bool_] | None, sh_bits: int) -> Bytes:

@@ -1,6 +1,8 @@
 """The streams of SPZ files: their codings, one table for reading and writing, and the reader.
 
 Versions 1 to 3 are a header and streams in a gzip member, version 4 a plain header and a zstd frame for each stream.
+Extension records, of which the coordinate system is read and written, follow the streams, in version 4 the header. A
+record has its type, the bytes of its payload, and the payload.
 """
 
 from __future__ import annotations
@@ -28,7 +30,6 @@ from .file_notes import FileNote, read_comment
 from .inflate import GZIP_MAGIC, Inflate
 from .quantize import Bytes
 from .reader import OpenFile, Positioned, Read, Reader, Target, rows_between, rows_of, size_of
-from .spz_extensions import MOST_BYTES, Extensions, read_extensions
 from .statistics import ALL_BITS
 
 MAGIC = 0x5053474E  # "NGSP"
@@ -297,7 +298,7 @@ def _extensions_behind(inflate: Inflate, layout: Layout) -> Extensions:
         if not piece:
             return Extensions()
         left -= len(piece)
-    data = bytes(inflate.read(MOST_BYTES))
+    data = bytes(inflate.read(MOST_EXTENSION_BYTES))
     return read_extensions(data, len(data))
 
 
@@ -321,7 +322,7 @@ def _read_v4(file: BinaryIO, size: int, header: dict[str, int]) -> tuple[Layout,
     extensions = Extensions()
     if flags & EXTENSIONS:
         between = table - HEADER_V4.size
-        extensions = read_extensions(file.read(min(between, MOST_BYTES)), between)
+        extensions = read_extensions(file.read(min(between, MOST_EXTENSION_BYTES)), between)
     file.seek(table)
     sizes = list(STREAM_SIZES.iter_unpack(file.read(streams * STREAM_SIZES.size)))
     for stream, (packed, unpacked) in zip(expected, sizes, strict=False):
@@ -343,3 +344,91 @@ def _read_v4(file: BinaryIO, size: int, header: dict[str, int]) -> tuple[Layout,
         header["trailing_bytes"] = size - end if streams == len(expected) else 0
 
     return layout, rows(), extensions
+
+
+#: Type of an extension record, and bytes of its payload.
+RECORD = struct.Struct("<II")
+
+#: Record of the coordinate system in which the coordinates stand: a uint32, an index of `SYSTEMS` from 1 on.
+COORDINATE_SYSTEM = 0xADBE0003
+
+#: Names of the other types that are published.
+TYPES = {0xADBE0002: "SPZ_ADOBE_safe_orbit_camera"}
+
+#: The coordinate systems: where x, y and z point, of left or right, down or up, back or front.
+SYSTEMS = (
+    *("LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF"),
+    *("LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU"),
+)
+
+_DIRECTIONS = {"R": (1, 0, 0), "L": (-1, 0, 0), "U": (0, 1, 0), "D": (0, -1, 0), "B": (0, 0, 1), "F": (0, 0, -1)}
+
+#: Bytes of extension records that are read of a file.
+MOST_EXTENSION_BYTES = 1 << 20
+
+#: Kinds of unknown records that are named.
+MOST_NAMED = 8
+
+
+#: By the axis that points up, the right-handed system whose x points right. None has x pointing up.
+SYSTEM_OF_UP = {"y": "RUB", "-y": "RDF", "z": "RFU", "-z": "RBD"}
+
+
+@dataclass(frozen=True)
+class Extensions:
+    """Contents of the extension records of a file.
+
+    Attributes:
+        up: as in `Scene`, by the coordinate system.
+        has_system: they name a coordinate system, be it an unknown one.
+        notes: what is left out of them, as sentences for `Scene.notes`.
+    """
+
+    up: str | None = None
+    notes: tuple[str, ...] = ()
+    has_system: bool = False
+
+
+def read_extensions(data: bytes, size: int) -> Extensions:
+    """Parse extension records; unknown ones are skipped, and what is broken is noted.
+
+    Args:
+        data: the records, or their first `MOST_EXTENSION_BYTES`.
+        size: bytes of all of them.
+    """
+    at, up, notes, unknown, has_system = 0, None, list[str](), dict[str, int](), False
+    while at + RECORD.size <= len(data):
+        kind, length = RECORD.unpack_from(data, at)
+        payload = at + RECORD.size
+        if length > size - payload:
+            break
+        at = payload + length
+        has_system |= kind == COORDINATE_SYSTEM
+        if kind != COORDINATE_SYSTEM:
+            name = TYPES.get(kind, f"{kind:#010x}")
+            unknown[name] = unknown.get(name, 0) + length
+        elif up is None:
+            system = int.from_bytes(data[payload : payload + 4], "little") if length >= 4 else 0
+            if 1 <= system <= len(SYSTEMS):
+                name = SYSTEMS[system - 1]
+                place = next(at for at, letter in enumerate(name) if letter in "UD")
+                up = "-" * (name[place] == "D") + "xyz"[place]
+                if np.linalg.det([_DIRECTIONS[letter] for letter in name]) < 0:
+                    notes.append(f"its axes are left-handed ({name}) and stay as they are: viewers mirror the scene")
+            elif not notes:
+                notes.append(f"its coordinate system {system} is unknown, and ignored")
+    names = list(unknown)
+    notes += [f"extension {name} ({unknown[name]:,} bytes) is left out" for name in names[:MOST_NAMED]]
+    if names[MOST_NAMED:]:
+        notes.append(f"{len(names) - MOST_NAMED:,} more kinds of extensions are left out")
+    if at < size:
+        notes.append(f"the last {size - at:,} bytes of its extensions are no records that can be read")
+    return Extensions(up, tuple(notes), has_system)
+
+
+def extensions_of(up: str | None) -> bytes:
+    """Return the extension records of a file in which this axis points up, one of `SYSTEM_OF_UP`; b"" for None."""
+    if up is None:
+        return b""
+    number = SYSTEMS.index(SYSTEM_OF_UP[up]) + 1
+    return RECORD.pack(COORDINATE_SYSTEM, 4) + number.to_bytes(4, "little")

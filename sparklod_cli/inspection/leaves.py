@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..codecs import coverage
+from ..codecs import quantize
 from ..codecs.rad.property_codings import CODINGS
 from ..codecs.rad.rad_encoder import rounded
 from ..codecs.rad.rad_layout import PROPERTIES, Row
@@ -98,7 +98,7 @@ def of_spz(scene: Scene, leaves: Splats, *, covering: bool) -> LeafCoding:
     Args:
         scene: with a tree.
         leaves: of the tree.
-        covering: opacities make up for the rounding of scales, see `coverage`; only sparklod writes so.
+        covering: opacities make up for the rounding of scales, see `quantize.compensated`; only sparklod writes so.
     """
     version, bits = max(2, int(scene.header["version"])), int(scene.header["fractional_bits"])
     degree = scene.splats.sh_degree
@@ -183,7 +183,7 @@ def _covering(splats: Splats, facts: RadFacts, bits: int | None) -> Splats:
         return splats
     scale = CODINGS[found.encoding].rounded(splats.scale, found.min or 0.0, found.max or 0.0)
     blur = 0.0 if bits is None else 2.0**-bits
-    return dataclasses.replace(splats, opacity=coverage.compensated(splats.opacity, splats.scale, scale, blur))
+    return dataclasses.replace(splats, opacity=quantize.compensated(splats.opacity, splats.scale, scale, blur))
 
 
 def _rad_codes(splats: Splats, row: Row, found: PropertyFacts, encoding: str) -> NDArray[np.int32]:

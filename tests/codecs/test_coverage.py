@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sparklod_cli.codecs import coverage, quantize, spz
+from sparklod_cli.codecs import quantize, spz
 from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.codecs.rad import codec as rad
 from sparklod_cli.codecs.reader import decode_file
@@ -38,9 +38,9 @@ def integral(opacity: np.ndarray) -> np.ndarray:
 def test_a_splat_covers_what_it_did(seed: int) -> None:
     splats = random_splats(300, seed=seed)
     held = rounded(splats.scale)
-    before = splats.opacity * coverage.faces(splats.scale, 0)
-    area = coverage.faces(held, 0)
-    kept = coverage.compensated(splats.opacity, splats.scale, held, 0.0)
+    before = splats.opacity * quantize.faces(splats.scale, 0)
+    area = quantize.faces(held, 0)
+    kept = quantize.compensated(splats.opacity, splats.scale, held, 0.0)
     off = np.abs(kept * area / before - 1)
     assert (off[kept < 1] < 1e-5).all()
     assert (off <= np.abs(splats.opacity * area / before - 1) + 1e-6).all()  # saturated ones gain as much as they can
@@ -55,7 +55,7 @@ def test_a_file_is_nearer_to_what_splats_cover(seed: int) -> None:
     splats.opacity[:] = splats.opacity.clip(0.2, 0.93)
     back = again(spz, Scene(splats), WriteOptions())
     blur = 2.0 ** -back.header["fractional_bits"]
-    expected, area = splats.opacity * coverage.faces(splats.scale, blur), coverage.faces(back.splats.scale, blur)
+    expected, area = splats.opacity * quantize.faces(splats.scale, blur), quantize.faces(back.splats.scale, blur)
     left = np.abs(back.splats.opacity * area / expected - 1)
     before = np.abs(splats.opacity * area / expected - 1)
     assert (left <= 0.51 / 255 / splats.opacity * 1.08 + 1e-4).all()
@@ -66,13 +66,13 @@ def test_merged_splats_cover_what_they_did() -> None:
     splats = random_splats(400, seed=3)
     opacity = np.geomspace(1.2, 1000, 400).astype(np.float32)
     held = rounded(splats.scale)
-    kept = coverage.compensated(opacity, splats.scale, held, 0.0)
-    expected, area = integral(opacity) * coverage.faces(splats.scale, 0), coverage.faces(held, 0)
+    kept = quantize.compensated(opacity, splats.scale, held, 0.0)
+    expected, area = integral(opacity) * quantize.faces(splats.scale, 0), quantize.faces(held, 0)
     off = np.abs(integral(kept) * area / expected - 1)
     assert off.max() < 0.012  # of 0.06
     assert (np.abs(kept - opacity) > 0).all()
     barely = np.full(400, 1.001, np.float32)
-    assert (coverage.compensated(barely, splats.scale, held, 0.0) > 1).all()  # they keep their falloff
+    assert (quantize.compensated(barely, splats.scale, held, 0.0) > 1).all()  # they keep their falloff
 
 
 @pytest.mark.parametrize("opacity", [0.0, 0.5, 1.0, 1.5, 1000.0])
@@ -80,7 +80,7 @@ def test_merged_splats_cover_what_they_did() -> None:
 def test_what_is_not_rounded_stays_bit_for_bit(opacity: float, blur: float) -> None:
     scale = np.concatenate([random_splats(50).scale, np.zeros((1, 3), np.float32)])
     column = np.full(len(scale), opacity, np.float32)
-    assert coverage.compensated(column, scale, scale.copy(), blur).tobytes() == column.tobytes()
+    assert quantize.compensated(column, scale, scale.copy(), blur).tobytes() == column.tobytes()
 
 
 def test_what_is_thinner_than_a_step_of_positions_makes_no_splat_fainter() -> None:
@@ -88,19 +88,19 @@ def test_what_is_thinner_than_a_step_of_positions_makes_no_splat_fainter() -> No
     opacity, least = np.full(2, 0.8, np.float32), np.float32(np.exp(-10))
     scale = np.array([[1e-9, 1e-9, 1e-9], [0.5, 1e-8, 1e-7]], np.float32)
     held = np.maximum(scale, least)
-    assert (coverage.compensated(opacity, scale, held, 1e-3) > 0.79).all()
+    assert (quantize.compensated(opacity, scale, held, 1e-3) > 0.79).all()
     # In a scene of such splats a pixel is as small, up to what cannot be told from a speck.
-    np.testing.assert_allclose(coverage.compensated(opacity, scale, held, 0.0), [0.8 * coverage.LEAST_GROWTH] * 2)
+    np.testing.assert_allclose(quantize.compensated(opacity, scale, held, 0.0), [0.8 * quantize.LEAST_GROWTH] * 2)
 
 
 @pytest.mark.filterwarnings("error")
 def test_what_shrinks_to_the_largest_code_does_not_get_dense() -> None:
     opacity = np.array([0.5, 2, 1000], np.float32)
     scale = np.full((3, 3), 1e9, np.float32)
-    kept = coverage.compensated(opacity, scale, rounded(scale), 1.0)
-    assert kept[0] == pytest.approx(0.5 * coverage.MOST_GROWTH)
+    kept = quantize.compensated(opacity, scale, rounded(scale), 1.0)
+    assert kept[0] == pytest.approx(0.5 * quantize.MOST_GROWTH)
     assert np.isfinite(kept).all()
-    assert np.isfinite(coverage.compensated(opacity, np.zeros_like(scale), np.zeros_like(scale), 0.0)).all()
+    assert np.isfinite(quantize.compensated(opacity, np.zeros_like(scale), np.zeros_like(scale), 0.0)).all()
 
 
 def again(codec: ModuleType, scene: Scene, options: WriteOptions) -> Scene:

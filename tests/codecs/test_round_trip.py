@@ -11,7 +11,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from sparklod_cli.codecs import coverage, spz
+from sparklod_cli.codecs import quantize, spz
 from sparklod_cli.codecs.formats import FORMATS
 from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.codecs.rad import codec as rad
@@ -84,7 +84,7 @@ def assert_close(back: Splats, source: Splats, allowed: Precision) -> None:
     assert rotation_degrees(back.quat_xyzw, source.quat_xyzw).max() <= allowed.degrees
     opacity = source.opacity
     if allowed.blur is not None:
-        opacity = coverage.compensated(opacity, source.scale, back.scale, allowed.blur)
+        opacity = quantize.compensated(opacity, source.scale, back.scale, allowed.blur)
     off = np.abs(lod_opacity(back.opacity) - lod_opacity(opacity))
     assert (off <= np.where(opacity > 1, allowed.merged, allowed.opacity)).all()
     assert (np.abs(back.rgb - np.clip(source.rgb, *allowed.rgb_range)) <= allowed.rgb).all()

@@ -18,7 +18,7 @@ from fixtures import by_hand
 from sparklod_cli.codecs import clamps, quantize, spz
 from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.codecs.reader import decode_file
-from sparklod_cli.codecs.spz_extensions import MOST_BYTES
+from sparklod_cli.codecs.spz_streams import MOST_EXTENSION_BYTES
 from sparklod_cli.codecs.statistics import Statistics
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
@@ -402,7 +402,7 @@ def test_extension_records_say_what_is_up(what: str, version: int) -> None:
 
 @pytest.mark.parametrize("version", [3, 4])
 def test_records_beyond_a_megabyte_are_left_out(version: int) -> None:
-    records = record(UNKNOWN, bytes(MOST_BYTES)) + EXTENSIONS["y down"][0]
+    records = record(UNKNOWN, bytes(MOST_EXTENSION_BYTES)) + EXTENSIONS["y down"][0]
     data = zstd(flags=0x02, extension=records) if version == 4 else gzipped(flags=0x02, more=records)
     scene = decode_file(spz, io.BytesIO(data))
     assert (scene.up, scene.up_by) == ("y", "SPZ")

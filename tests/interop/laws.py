@@ -8,7 +8,7 @@ import io
 import numpy as np
 from numpy.typing import NDArray
 
-from sparklod_cli.codecs import coverage, spz
+from sparklod_cli.codecs import quantize, spz
 from sparklod_cli.codecs.options import DEFAULTS, WriteOptions
 from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.model.gaussian import lod_opacity
@@ -113,7 +113,7 @@ def check_close(got: ExtSplats, splats: Splats, version: int, fractional_bits: i
     assert degrees_between(got.quat_xyzw, splats.quat_xyzw).max() <= SPZ_DEGREES[version] + EXT_DEGREES
     # The opacity makes up for the rounding of scales.
     codes = np.rint(16 * (got.log_scale.astype(np.float64) + 10))
-    opacity = coverage.compensated(splats.opacity, splats.scale, np.exp(codes / 16 - 10), 2.0**-fractional_bits)
+    opacity = quantize.compensated(splats.opacity, splats.scale, np.exp(codes / 16 - 10), 2.0**-fractional_bits)
     if got.nodes is None:
         within(got.alpha, opacity, 1 / 510 + HALF + TINY)
     else:

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli.cli import run
-from sparklod_cli.codecs import coverage
+from sparklod_cli.codecs import quantize
 from sparklod_cli.codecs.gpu import packed_splats
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import codec as rad
@@ -216,7 +216,7 @@ def check_close(spark: Spark, path: Path, scene: Scene, options: RadOptions) -> 
     within(got.center, center, step + (0 if chosen.center_bits is None else 2.0**-chosen.center_bits / 2))
     held = decode_file(rad, io.BytesIO(path.read_bytes())).splats.scale
     blur = 0.0 if chosen.center_bits is None else 2.0**-chosen.center_bits
-    opacity = coverage.compensated(
+    opacity = quantize.compensated(
         splats.opacity, splats.scale, held, blur
     )  # which makes up for the rounding of scales
     alpha = encode_lod_alpha(opacity) if scene.tree else opacity

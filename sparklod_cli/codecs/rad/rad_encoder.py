@@ -18,7 +18,7 @@ from ...model.sh import COEFFICIENTS
 from ...model.splats import COLUMNS, FloatArray, Splats
 from ...system.progress import Progress, silent
 from ...system.threads import blocks_of
-from .. import coverage, sh_palette, spark_codings
+from .. import quantize, sh_palette, spark_codings
 from ..clamps import CodeRange
 from ..encoder import Encoded, Encoder, Named, Windows, windows_of
 from ..file_notes import comment_of
@@ -216,7 +216,7 @@ class RadEncoder(Encoder):
         for part in blocks_of(len(splats), BLOCK):
             scale = splats.scale[part]
             rounded = CODINGS[self.options.rad.scales].rounded(scale, *ends)
-            kept[part] = coverage.compensated(splats.opacity[part], scale, rounded, blur)
+            kept[part] = quantize.compensated(splats.opacity[part], scale, rounded, blur)
         return kept
 
     def _deflated(self, codes: NDArray[Any], encoding: str) -> bytes:

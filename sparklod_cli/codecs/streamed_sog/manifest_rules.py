@@ -24,8 +24,7 @@ from ..scene_files import Chunk, SceneFiles
 from ..sog import codec as sog
 from ..sog import texel_codings
 from ..sog.sog_container import MAX_META, image_names
-from ..splat_bounds import count_outside
-from ..validation import RuleViolation
+from ..validation import RuleViolation, count_outside
 from ..zip_folder import ZIP
 from .manifest import MAX_MANIFEST, Bound, Manifest, ManifestNode, Run, parse
 

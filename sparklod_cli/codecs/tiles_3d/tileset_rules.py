@@ -18,8 +18,7 @@ from ..glb.attributes import COMPRESSION, EXTENSION
 from ..glb.placement import product
 from ..json_trees import leads_away
 from ..scene_files import Chunk, SceneFiles
-from ..splat_bounds import LOOSE_BOUND, count_outside
-from ..validation import RuleViolation
+from ..validation import LOOSE_BOUND, RuleViolation, count_outside
 from .tileset import CONTENT_GLTF, OLD_VERSION, REPLACE, SPLATS, UNREAD, VERSION, TileRecord, Tileset
 from .volumes import Volume, to_tileset, volume_of
 
