@@ -1,4 +1,4 @@
-"""The falloff of a splat, in one place: alpha by the distance from its centre, its slopes, its end, and what it covers.
+"""The falloff of a splat, in one place: alpha by the distance from its centre, its slopes, end and coverage.
 
 A splat of D up to 1 has the alpha D exp(-z^2 / 2), z being the distance in standard deviations; one of linear opacity A
 above 1, or D = sqrt(1 + e ln A), has 1 - (1 - exp(-z^2 / 2)) ** A, which is that of A equal splats on top of each other
@@ -33,12 +33,12 @@ LEAST_REST = f32(1e-30)
 #: Least argument of `exp2`, which is exact down to -126. 1 + 2 ** -120 is 1 in float32.
 LEAST_EXPONENT = f32(-120)
 
-#: How far out a splat is drawn, in standard deviations, and its square: Spark's `maxStdDev`, sqrt(8); a merged one
-#: farther, by this for each that its D is above 1.
+#: Radius to which a splat is drawn, in standard deviations, and its square: Spark's `maxStdDev`, sqrt(8); that of a
+#: merged one is larger, by STD_DEV_PER_D per unit of D above 1.
 SQUARE_STD_DEV = 8
 MAX_STD_DEV, STD_DEV_PER_D = SQUARE_STD_DEV**0.5, 0.7
 
-#: Where a splat adds less than half a step of 8 bits, it is not drawn: Spark's `minAlpha`.
+#: Least alpha that is drawn, half a step of 8 bits: Spark's `minAlpha`.
 MIN_ALPHA = 0.5 / 255
 
 #: Area that a splat covers out to MAX_STD_DEV, over the square of its feature size, 2 standard deviations.
@@ -65,7 +65,7 @@ def merged_parts(t, power):
     """Return g = 2 ** t, r = 1 - g, log2(r), and r ** power, which is 1 - alpha of a splat with D above 1."""
     g = exp2(t)
     rest = max(f32(1) - g, LEAST_REST)
-    # The power multiplies what 1 - g is rounded by, so that is added: it is 0 where g is 1/2 or more.
+    # The power multiplies the rounding error of 1 - g, which is therefore added: it is 0 where g is 1/2 or more.
     log = log2(rest) + LOG2E * ((f32(1) - rest) - g)
     return g, rest, log, exp2(max(power * log, LEAST_EXPONENT))
 
@@ -119,7 +119,7 @@ def merged_slopes(t, power):
 
 @kernel(inline=True)
 def deviations_of(d, std_devs, std_devs_per_d):
-    """Return how far out a splat is drawn, in standard deviations, as far as its alpha suffices."""
+    """Return the radius to which a splat is drawn, in standard deviations, if its alpha suffices."""
     return std_devs + std_devs_per_d * max(d - f32(1), f32(0))
 
 

@@ -27,7 +27,7 @@ COEFFICIENTS = (0, 3, 8, 15, 24)
 
 
 def width_of(sh_degree: int) -> int:
-    """Return the numbers of a splat: 14 of its centre, scale, rotation, opacity and colour, and those of SH."""
+    """Return how many numbers a splat has: 14 of centre, scale, rotation, opacity and colour, and its SH."""
     return 14 + 3 * COEFFICIENTS[sh_degree]
 
 

@@ -15,8 +15,8 @@ from .sh import COEFFICIENTS, degree_of
 
 FloatArray = NDArray[np.floating[Any]]
 
-#: Kinds of invalid splats, in the order in which they are checked, and how reports name them. Such numbers do
-#: not describe a Gaussian. A splat of opacity 0 or scale 0 is valid, but invisible.
+#: Kinds of invalid splats, in the order in which they are checked, and how reports name them. They do not
+#: describe a Gaussian. A splat of opacity 0 or scale 0 is valid, but invisible.
 INVALID = {
     "non_finite": "not finite",
     "bad_rotation": "rotation not of length 1",
@@ -98,7 +98,7 @@ class Splats:
         return cls(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in COLUMNS})
 
     def frozen(self) -> Splats:
-        """Return these splats with read-only columns: views, so that whoever has the arrays keeps theirs writable."""
+        """Return these splats with read-only columns: views, so that the arrays of other owners stay writable."""
         columns = {name: read_only(getattr(self, name)) for name in COLUMNS}
         return self if all(columns[name] is getattr(self, name) for name in COLUMNS) else Splats(**columns)
 

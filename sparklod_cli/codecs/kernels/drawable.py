@@ -13,16 +13,11 @@ LARGEST = np.finfo(np.float32).max
 
 @kernel(f4[:], f4[:], f4[:], f4[:], f4[:], f4[:], f4, nogil=True)
 def count_doubtful(center, scale, quat, opacity, rgb, sh, tolerance):
-    """Count the tests of validity that splats fail, and the invisible ones; no test fails only if all are valid.
+    """Count the tests of validity that splats fail, and the splats without opacity or scale.
 
-    Comparisons are written so that a NaN fails them; sums of their results are vectorized by LLVM.
-
-    Args:
-        center, scale, quat, opacity, rgb, sh: float32 columns as in `Splats`, each in one dimension.
-        tolerance: of a rotation's squared length.
-
-    Returns:
-        failed tests, and splats without opacity or scale.
+    No test fails only if all splats are valid. Comparisons are written so that a NaN fails them; sums of their results
+    are vectorized by LLVM. Columns are those of `Splats`, each in one dimension; `tolerance` is of a rotation's squared
+    length.
     """
     doubtful = invisible = 0
     for column in (center, rgb, sh):

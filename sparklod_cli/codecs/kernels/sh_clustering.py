@@ -2,8 +2,11 @@
 
 A cell is a range of `members`, the indices of its rows; it is halved across the direction in which it spreads most.
 Codes are in groups of GROUP whose codes are near each other, so that the neighbours of a code are found in the groups
-that are nearest to its own. Distances are squared, and computed for many codes at a time: of a block of codes, the
-same coefficient is beside itself in memory.
+that are nearest to its own. Distances are squared, and computed for many codes at a time: of a block of codes, the same
+coefficient is beside itself in memory.
+
+Arrays that kernels share: `rows` (N, D); `weight` (N,), positive, in float64; `cell` (n,), rows of a cell; `members`
+(M,), rows, cell after cell or code after code; `begin`, where each of these begins in `members`; `codes` (C, D).
 """
 
 from __future__ import annotations
@@ -46,11 +49,7 @@ def along(rows, i, axis):
 def find_direction(rows, weight, cell, mean, axis):
     """Fill the weighted mean of a cell's rows, and the unit vector along which they spread most; both of a sample.
 
-    Args:
-        rows: (N, D) float32.
-        weight: (N,) float64, positive.
-        cell: (n,) uint32 rows, at least 2.
-        mean, axis: (D,) float64, filled. The axis is 0 if the rows of the sample are equal.
+    A cell has at least 2 rows. The axis is 0 if the rows of the sample are equal.
     """
     width = rows.shape[1]
     step = max(1, len(cell) // SAMPLE)
@@ -127,11 +126,9 @@ def partition(cell, place, threshold):
 
 @kernel()
 def squared_error(rows, weight, cell, origin):
-    """Return the weighted sum of squared distances of rows to their weighted mean.
+    """Return the weighted sum of squared distances of a cell's rows to their weighted mean.
 
-    Args:
-        rows, weight, cell: as for `find_direction`.
-        origin: (D,) float64 near the rows, from which sums are taken, so that little cancels.
+    Sums are taken from `origin` (D,), near the rows, so that little cancels.
     """
     width = rows.shape[1]
     total, squares = np.zeros(width), np.zeros(width)
@@ -154,13 +151,10 @@ def halve_cells(start, stop, rows, weight, members, begin, end, cuts, errors, pl
     """Sort the members of each cell into two halves.
 
     Args:
-        rows: (N, D) float32.
-        weight: (N,) float64, positive.
-        members: (M,) uint32 rows, reordered within each cell.
-        begin, end: (n,) int64, the range of members of each cell; ranges do not overlap.
-        cuts: (n,) int64, filled with where the second half begins; a cell with one member is not cut.
-        errors: (n, 2) float64, filled with the squared error of each half.
-        places: (M,) float64, for intermediate results.
+        begin, end: (n,) the range of members of each cell; ranges do not overlap.
+        cuts: (n,) filled with where the second half begins; a cell with one member is not cut.
+        errors: (n, 2) filled with the squared error of each half.
+        places: (M,) for intermediate results.
     """
     width = rows.shape[1]
     for k in range(start, stop):
@@ -185,15 +179,7 @@ def halve_cells(start, stop, rows, weight, members, begin, end, cuts, errors, pl
 
 @kernel(i8, f4[:, :], f8[:], u4[:], i8[:], out(f4[:, :]), ranges=True)
 def average_cells(start, stop, rows, weight, members, begin, codes):
-    """Fill each code with the weighted mean of the rows of its cell; codes of empty cells are left as they are.
-
-    Args:
-        rows: (N, D) float32.
-        weight: (N,) float64, positive.
-        members: (M,) uint32 rows, cell after cell.
-        begin: (C + 1,) int64, where each cell begins in `members`.
-        codes: (C, D) float32, filled.
-    """
+    """Fill each code with the weighted mean of the rows of its cell; codes of empty cells are left as they are."""
     width = rows.shape[1]
     for c in range(start, stop):
         if begin[c] < begin[c + 1]:
@@ -220,12 +206,11 @@ def find_neighbours(start, stop, codes, blocks, groups, search, near, distance):
     """Fill the nearest other codes of each code, nearest first, from the groups that are nearest to its own.
 
     Args:
-        codes: (C, D) float32.
-        blocks: (G, D, GROUP) float32, the codes of each group.
-        groups: (G, D) float32, the mean of each.
+        blocks: (G, D, GROUP) the codes of each group.
+        groups: (G, D) the mean of each.
         search: number of groups to search, at most G.
-        near: (C, n) int32, filled; the code itself where there are not as many others.
-        distance: (C, n) float32, filled with squared distances, infinite there.
+        near: (C, n) filled; the code itself where there are not as many others.
+        distance: (C, n) filled with squared distances, infinite there.
     """
     width, count = codes.shape[1], near.shape[1]
     for g in range(start, stop):
@@ -256,20 +241,16 @@ def find_neighbours(start, stop, codes, blocks, groups, search, near, distance):
 
 @kernel(i8, f4[:, :], u4[:], i8[:], f4[:, :], i4[:, :], f4[:, :], out(i4[:]), out(f4[:]), ranges=True)
 def choose_codes(start, stop, rows, members, begin, codes, near, distance, labels, errors):
-    """Fill the nearest code of each row, of the one that it has and that one's neighbours.
+    """Fill the nearest code of each row, among its present code and that code's neighbours.
 
-    No further neighbour is looked at than is twice as far from the code as the row is: by the triangle inequality, none
+    The search ends at neighbours that are twice as far from the code as the row is: by the triangle inequality, none
     beyond is nearer to the row.
 
     Args:
-        rows: (N, D) float32.
-        members: (M,) uint32 rows, code after code.
-        begin: (C + 1,) int64, where the rows of each code begin in `members`.
-        codes: (C, D) float32.
-        near: (C, n) int32, the neighbours of each code, nearest first; n is a multiple of LANES.
-        distance: (C, n) float32, at most their squared distances.
-        labels: (N,) int32, filled for all members.
-        errors: (N,) float32, filled with the squared distance of each row to its code.
+        near: (C, n) the neighbours of each code, nearest first; n is a multiple of LANES.
+        distance: (C, n) at most their squared distances.
+        labels: (N,) filled for all members.
+        errors: (N,) filled with the squared distance of each row to its code.
     """
     width, parts = codes.shape[1], near.shape[1] // LANES
     block, sums = np.empty((parts, width, LANES), np.float32), np.empty(LANES, np.float32)
@@ -309,12 +290,7 @@ SHIFT = np.uint64(29)
 
 @kernel(i8, u4[:, :], out(u8[:]), ranges=True)
 def hash_rows(start, stop, bits, hashes):
-    """Fill a hash of each row: equal for equal rows, different for nearly all others.
-
-    Args:
-        bits: (N, D) uint32.
-        hashes: (N,) uint64, filled.
-    """
+    """Fill a hash of each row of (N, D) words: equal for equal rows, different for nearly all others."""
     for i in range(start, stop):
         mixed = SPREAD
         for d in range(bits.shape[1]):

@@ -13,13 +13,7 @@ _8, _16, _24 = np.uint32(8), np.uint32(16), np.uint32(24)
 
 @kernel(u4[:], out(u1[:, :]), i8, nogil=True)
 def place_bytes(pixels, out, place):
-    """Put red, green and blue into one byte of each of three words.
-
-    Args:
-        pixels: (N,) uint32.
-        out: (N, 12) bytes of the words.
-        place: of the byte in its word.
-    """
+    """Put red, green and blue into byte `place` of each of the three words of (N, 12) bytes."""
     for i in range(len(pixels)):
         p = pixels[i]
         out[i, place] = p >> _16 & _BYTE
@@ -45,15 +39,10 @@ def look_up(pixels, shifts, tables, out):
 
 @kernel(u4[:], f4[:], out(f4[:, :]), nogil=True)
 def fill_quats(pixels, components, out):
-    """Fill (N, 4) quaternions x y z w.
+    """Fill (N, 4) quaternions x y z w; `components` has the value of each of 256 codes.
 
     Red, green and blue are the codes of all components but the largest, in the order w x y z; alpha minus 252 is the
     index of that, and anything below gives NaN.
-
-    Args:
-        pixels: (N,) uint32.
-        components: (256,) float32 of each code.
-        out: filled.
     """
     one = np.float32(1)
     for i in range(len(pixels)):
@@ -82,12 +71,7 @@ def fill_quats(pixels, components, out):
 
 @kernel(u4[:], f4[:, :], out(f4[:, :]), nogil=True)
 def gather_rows(pixels, rows, out):
-    """Fill rows by their labels, red + 256 * green, unless one is beyond the last.
-
-    Args:
-        pixels: (N,) uint32.
-        rows: (P, D) float32.
-        out: (N, D) float32, filled.
+    """Fill `out` (N, D) with the rows of labels, red + 256 * green, unless one is beyond the last row.
 
     Returns:
         the largest label.

@@ -20,11 +20,7 @@ ROW_THREADS = 32
 
 @cuda_kernel(f4[:, :, :], u2[:, :, :], out(f8[:, :]))
 def squared_differences(image, full, sums):
-    """Fill (H, 2) sums of squared differences on black and on white, a block for each row of pixels.
-
-    Args:
-        image, full: of `kernels.view.squared_differences`.
-    """
+    """Fill sums as `kernels.view.squared_differences` does, a block for each row of pixels."""
     parts = cuda.shared.array((ROW_THREADS, 2), np.float64)
     y, thread = cuda.blockIdx.x, cuda.threadIdx.x
     black, white = f64(0), f64(0)
@@ -64,11 +60,9 @@ def by_image(image, full, weights, result):
 
 @cuda_kernel(f4[:, :], i4[:], f4[:], f4[:, :], f4[:, :], out(f4[:, :]), out(f4[:, :, :]))
 def by_sh(center, index, eye, colors, gradients, by_color, by_coefficients):
-    """Fill derivatives by a splat's own colour, and by its SH; see `render.gradients.by_sh`.
+    """Fill derivatives by a splat's own colour (M, 3), and by its SH (M, K, 3); see `render.gradients.by_sh`.
 
-    Args:
-        center: (N, 3). index: (M,). eye: (3,). colors: (N, 3) that the camera saw. gradients: of `carry_back`.
-        by_color: (M, 3) filled. by_coefficients: (M, K, 3) filled.
+    `colors` (N, 3) are what the camera saw, `gradients` those of `carry_back`.
     """
     i = cuda.grid(1)
     if i >= index.shape[0]:
@@ -118,13 +112,9 @@ def step(
 ):
     """Move the merged splats that were drawn; see `kernels.adam.step`.
 
-    Args:
-        center to sh, old_center to old_sh: columns of N nodes, as they are now, and as they were at first.
-        index: (M,) drawn nodes. slots: (N,) rows in the moments, -1 for leaves.
-        gradients: (M, GRADIENT_COLUMNS). by_color, by_coefficients: of `by_sh`.
-        rates: (6,) numbers of `Rates`. most_d, most_growth: of `FitBounds`.
-        first, first_sh, second, count: of `Moments`.
-        moved: (M, 4) filled with centre and feature size of each node.
+    Columns are of N nodes, as they are now and, `old_`, as they were at first; `gradients` are (M, GRADIENT_COLUMNS),
+    `by_color` and `by_coefficients` of `by_sh`; then the numbers of `Rates`, `FitBounds` and `Moments`. `moved` (M, 4)
+    is filled with centre and feature size of each node.
     """
     i = cuda.grid(1)
     if i >= index.shape[0]:

@@ -27,12 +27,9 @@ class _CardExample:
 
 
 class CardOptimiser(Optimiser):
-    """Adam on a card for the merged splats of a tree.
+    """Adam on a card for the merged splats of a tree; BackendError if the memory of the card does not suffice.
 
     The columns of the nodes in memory are those of the last `synchronize`.
-
-    Raises:
-        BackendError: the memory of the card does not suffice.
     """
 
     def __init__(self, nodes: FittedNodes) -> None:
@@ -47,7 +44,7 @@ class CardOptimiser(Optimiser):
             moments = (*(np.zeros(shape, np.float32) for shape in shapes), np.zeros(count, np.int32))
             self._moments = adam.Moments(*map(to_card, moments))
             self._rates = on_card(len(adam.Rates._fields))
-        # By identity: those of a fit live as long as it does.
+        # By identity: the pictures of a fit live as long as the fit.
         self._examples: dict[int, _CardExample] = {}
 
     def step(self, picture: FullDetailPicture, index: Index, rates: adam.Rates) -> None:

@@ -1,1 +1,1 @@
-"""Compiled parts of fitting: what a camera sees of nodes, differences of pictures, and steps of the optimiser."""
+"""Compiled parts of fitting: visible nodes, differences of pictures, and steps of the optimiser."""

@@ -39,8 +39,8 @@ TINY = f32(1e-30)
 
 SIZE_PER_D = f32(gaussian.SIZE_PER_D)
 
-#: Added to the root of a second moment. Derivatives of splats that matter are above 1e-6; the squares of those that are
-#: hidden behind others may be 0 in float32.
+#: Added to the root of a second moment. Derivatives of splats that matter are above 1e-6; their squares may be 0
+#: in float32 for splats that are hidden behind others.
 EPSILON = f32(1e-8)
 
 rotation_matrix = kernel(inline=True)(gaussian.rotation_matrix)
@@ -48,77 +48,56 @@ rotation_matrix = kernel(inline=True)(gaussian.rotation_matrix)
 
 @fields(f4[:, :], f4[:, :], f4[:, :], f4[:], f4[:, :], f4[:, :, :])
 class Columns(NamedTuple):
-    """Columns of N nodes, float32.
+    """Columns of N nodes, float32."""
 
-    Attributes:
-        center: (N, 3). scale: (N, 3). quat_xyzw: (N, 4). lod_opacity: (N,). rgb: (N, 3). sh: (N, K, 3).
-    """
-
-    center: Any
-    scale: Any
-    quat_xyzw: Any
-    lod_opacity: Any
-    rgb: Any
-    sh: Any
+    center: Any  # (N, 3)
+    scale: Any  # (N, 3)
+    quat_xyzw: Any  # (N, 4)
+    lod_opacity: Any  # (N,)
+    rgb: Any  # (N, 3)
+    sh: Any  # (N, K, 3)
 
 
 @fields(f4[:, :], f4[:, :], f4[:, :], f4[:], f4[:, :], f4[:, :, :])
 class Gradients(NamedTuple):
-    """Derivatives by the properties of M drawn splats, float32; see `render.gradients.SplatGradients`.
+    """Derivatives by the properties of M drawn splats, float32; see `render.gradients.SplatGradients`."""
 
-    Attributes:
-        center: (M, 3). log_scale: (M, 3). turn: (M, 3). lod_opacity: (M,). rgb: (M, 3). sh: (M, K, 3).
-    """
-
-    center: Any
-    log_scale: Any
-    turn: Any
-    lod_opacity: Any
-    rgb: Any
-    sh: Any
+    center: Any  # (M, 3)
+    log_scale: Any  # (M, 3)
+    turn: Any  # (M, 3)
+    lod_opacity: Any  # (M,)
+    rgb: Any  # (M, 3)
+    sh: Any  # (M, K, 3)
 
 
 @fields(out(f4[:, :]), out(f4[:, :, :]), out(f4[:, :]), out(i4[:]))
 class Moments(NamedTuple):
-    """State of Adam for each merged splat.
+    """State of Adam for each merged splat."""
 
-    Attributes:
-        first: (S, FIRST) float32. first_sh: (S, K, 3) float32. second: (S, SECOND) float32. count: (S,) int32 steps.
-    """
-
-    first: Any
-    first_sh: Any
-    second: Any
-    count: Any
+    first: Any  # (S, FIRST) float32
+    first_sh: Any  # (S, K, 3) float32
+    second: Any  # (S, SECOND) float32
+    count: Any  # (S,) int32 steps
 
 
 @fields(f4, f4, f4, f4, f4, f4)
 class Rates(NamedTuple):
-    """Step sizes, float32.
+    """Step sizes, float32."""
 
-    Attributes:
-        center: in scales. log_scale: ln. turn: radians. lod_opacity: D. rgb: 0..1. sh: of rgb.
-    """
-
-    center: Any
-    log_scale: Any
-    turn: Any
-    lod_opacity: Any
-    rgb: Any
-    sh: Any
+    center: Any  # in scales
+    log_scale: Any  # ln
+    turn: Any  # radians
+    lod_opacity: Any  # D
+    rgb: Any  # 0..1
+    sh: Any  # of rgb
 
 
 @fields(f4, f4)
 class FitBounds(NamedTuple):
-    """Bounds of the splats that change, float32.
+    """Bounds of the splats that change, float32."""
 
-    Attributes:
-        most_d: largest D.
-        most_growth: factor that the feature size may change by, either way; see `size_of`.
-    """
-
-    most_d: Any
-    most_growth: Any
+    most_d: Any  # largest D
+    most_growth: Any  # factor that the feature size may change by, either way; see `size_of`
 
 
 @kernel(inline=True)
@@ -239,14 +218,9 @@ def step(start, stop, nodes, old, index, slots, gradients, rates, moments, bound
     """Move the merged splats that were drawn against their gradients.
 
     Args:
-        nodes: `Columns`, changed.
-        old: `Columns` as they were at first, from which scale and centre do not go too far.
-        index: (M,) int64 node of each drawn splat.
-        slots: (N,) int32 row of each node in `moments`; -1 for leaves.
-        gradients: `Gradients` of the drawn splats.
-        rates: `Rates`.
-        moments: `Moments`, changed.
-        bounds: `FitBounds`.
+        old: columns as they were at first, from which scale and centre do not go too far.
+        index: (M,) node of each drawn splat.
+        slots: (N,) row of each node in `moments`; -1 for leaves.
     """
     for i in range(start, stop):
         step_of(i, nodes, old, index, slots, gradients, rates, moments, bounds)

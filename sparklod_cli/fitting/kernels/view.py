@@ -18,17 +18,7 @@ LEVEL = f32(1 / 65535)
 
 @kernel(i8, f4[:, :], f4[:], i8[:], f4[:, :], Lens, Limits, out(b1[:]), ranges=True)
 def mark_seen(start, stop, center, lod_opacity, index, world_to_camera, lens, limits, seen):
-    """Mark the nodes that `project` may draw: between near and far, with a centre in or near the picture.
-
-    Args:
-        center: (N, 3) float32 world units.
-        lod_opacity: (N,) float32.
-        index: (M,) int64 nodes.
-        world_to_camera: (3, 4) float32.
-        lens: `project.Lens`.
-        limits: `project.Limits`.
-        seen: (M,) bool, filled.
-    """
+    """Mark the nodes of `index` that `project` may draw: between near and far, with a centre in or near the picture."""
     m = world_to_camera
     half_width, half_height = f32(0.5) * lens.width, f32(0.5) * lens.height
     for i in range(start, stop):
@@ -64,12 +54,11 @@ def differences(image, full, y, x, c):
 
 @kernel(i8, f4[:, :, :], u2[:, :, :], out(f8[:, :]), ranges=True)
 def squared_differences(start, stop, image, full, sums):
-    """Fill the sums of squared differences over the pixels of each row.
+    """Fill (H, 2) sums of squared differences over the pixels of each row, on black and on white.
 
     Args:
-        image: (H, W, 4) float32, colours multiplied by alpha, and alpha.
-        full: (H, W, 4) uint16, the same in units of `LEVEL`.
-        sums: (H, 2) float64, filled: on black and on white.
+        image: (H, W, 4) colours multiplied by alpha, and alpha.
+        full: (H, W, 4) the same in units of `LEVEL`.
     """
     width = image.shape[1]
     for y in range(start, stop):
@@ -98,12 +87,7 @@ def by_pixel(image, full, y, x, on_black, on_white, result):
 def by_image(start, stop, image, full, on_black, on_white, result):
     """Fill the derivative of half the squared differences on either background, times `on_black` and `on_white`.
 
-    A value that is clipped counts only if it is to come back.
-
-    Args:
-        image, full: of `squared_differences`.
-        on_black, on_white: float32.
-        result: (H, W, 4) float32, filled: derivative by each value of `image`.
+    It is (H, W, 4), by each value of `image`. A clipped value counts only if it has to return.
     """
     width = image.shape[1]
     for y in range(start, stop):

@@ -1,9 +1,9 @@
 """Merges the nodes of each cell of the quick builder's grid: the cheapest pairs of neighbours, round by round.
 
 A cell's nodes lie along a curve. In each round, every node looks for its cheapest partner among the next few on either
-side, in its own cell only, and pairs that chose each other become one node that covers the union of both. What was
-merged into one node during all rounds of a level becomes one family. As nothing outside of a cell matters, a tree can
-be built in parts.
+side, in its own cell only, and pairs that chose each other become one node that covers the union of both. The nodes
+merged into one during all rounds of a level become a family. As nothing outside a cell matters, a tree can be built in
+parts.
 
 Node rows are those of `pair_cost.py`. The cells of a span of nodes are worked on together, in columns, so that LLVM
 vectorizes over nodes; results do not depend on how cells are put together.
@@ -65,13 +65,7 @@ LOG2_E = f32(math.log2(math.e))
 
 @kernel(inline_late=True)
 def on_plane(axx, ayy, axy, bxx, byy, bxy, x, y, density_a, density_b):
-    """Return coverage on a plane, divided by 2 pi, of two Gaussians' overlap, and of both; float32.
-
-    Args:
-        axx, ayy, axy, bxx, byy, bxy: their covariances on the plane.
-        x, y: from one centre to the other.
-        density_a, density_b: their heights.
-    """
+    """Return coverage on a plane / (2 pi) of two Gaussians' overlap, and of both; heights are `density_a` and `_b`."""
     area_a = math.sqrt(max(axx * ayy - axy * axy, f32(0)))
     area_b = math.sqrt(max(bxx * byy - bxy * bxy, f32(0)))
     xx, yy, xy = axx + bxx, ayy + byy, axy + bxy
@@ -87,13 +81,10 @@ def unite(a, b):
     """Replace nodes by the unions of each with another one.
 
     The overlap of two nodes covers a share h of what both cover, at most 0.5, which is measured on the planes of the
-    three axes. It is in the middle, and about half as wide as the two: its moments are those of the union less. What
-    stays, ((1 - h / 2) (u P + v Q) + u v d d^T) / (1 - h), is always a covariance; u and v are the nodes' shares of the
-    coverage, P and Q their covariances, d is the offset from one to the other.
-
-    Args:
-        a: (WIDTH * GROUP,) float32 columns of node rows, one after the other; replaced.
-        b: (WIDTH * GROUP,) float32, of the nodes that they are united with.
+    three axes. It is in the middle, and about half as wide as the two: its moments are those of the union less. The
+    remaining covariance, ((1 - h / 2) (u P + v Q) + u v d d^T) / (1 - h), is always positive semidefinite; u and v are
+    the nodes' shares of the coverage, P and Q their covariances, d is the offset from one to the other. `a` and `b` are
+    (WIDTH * GROUP,) columns of node rows, one after the other.
     """
     # The stride and the number of nodes are constants, so that LLVM vectorizes without a doubt about what overlaps.
     for i in range(GROUP):
@@ -123,7 +114,7 @@ def unite(a, b):
         xy, xz, yz = own * (u * pxy + v * qxy), own * (u * pxz + v * qxz), own * (u * pyz + v * qyz)
         xx, yy, zz = xx + apart * dx * dx, yy + apart * dy * dy, zz + apart * dz * dz
         xy, xz, yz = xy + apart * dx * dy, xz + apart * dx * dz, yz + apart * dy * dz
-        # A mean that rounding cannot put outside of the two, and so of their cell.
+        # Clamped, so that rounding cannot put the mean outside the two, and so outside their cell.
         qx, qy, qz = b[i], b[GROUP + i], b[2 * GROUP + i]
         a[i] = min(max(u * px + v * qx, min(px, qx)), max(px, qx))
         a[GROUP + i] = min(max(u * py + v * qy, min(py, qy)), max(py, qy))
@@ -165,17 +156,12 @@ def finish_row(lanes, i, row):
 
 @kernel()
 def find_partners_in_cells(lanes, count, cell, place, largest, cost, best, at):
-    """Fill the cheapest partner of each node of a span, by its place in the cell, or -1.
+    """Fill `best` and `at`: cost and place in the cell, or -1, of each node's cheapest partner in a span.
 
     Among equal costs, that partner wins whose place differs from the node's in the lowest bits, so that among many
-    equal nodes half choose each other.
-
-    Args:
-        lanes: (WIDTH, at least count) float32 columns of node rows.
-        count: number of nodes.
-        cell, place: (count,) int32 number of each node's cell, and place of the node in it.
-        largest: largest trace of the covariance of a pair, units squared.
-        cost, best, at: (at least count,) filled; `best` with the costs.
+    equal nodes half choose each other. `lanes` has (WIDTH, at least count) columns of node rows; `cell` and `place` are
+    the number of each node's cell and its place in it; `largest` bounds the trace of a pair's covariance, units
+    squared; `cost` is working memory.
     """
     most = f32(LARGEST_COST) if largest == NEVER else NEVER
     for i in range(count):
@@ -201,15 +187,15 @@ def find_partners_in_cells(lanes, count, cell, place, largest, cost, best, at):
 
 @kernel()
 def merge_span(nodes, is_first, rows, largest, begin, end, made, owner, row):
-    """Merge the nodes of whole cells, those from `begin` to `end`; see `merge_in_cells`."""
+    """Merge the nodes `begin` to `end`, of whole cells; see `merge_in_cells`."""
     size = end - begin
-    columns = rows.shape[1]  # not WIDTH where loops over nodes are inside: LLVM takes long to unroll so many
+    columns = rows.shape[1]  # a variable, as LLVM takes long to unroll WIDTH loops over nodes
     lanes = np.empty((WIDTH, size + PADDING), np.float32)
     a, b = np.ones(WIDTH * GROUP, np.float32), np.ones(WIDTH * GROUP, np.float32)
     cell, place, at = np.empty(size, np.int32), np.empty(size, np.int32), np.empty(size, np.int32)
     cost, best = np.empty(size, np.float32), np.empty(size, np.float32)
-    # Lists are filled without branches, which nobody can predict: what is not to stay is written, and then overwritten.
-    # So they have room for one more. Indices are unsigned, as numba asks of signed ones whether they are negative.
+    # Lists are filled without branches, which would be mispredicted: every entry is written, and overwritten by the
+    # next one unless it is kept. So they have room for one more. Indices are unsigned: numba checks signs.
     first, second = np.empty(size + 1, np.uint64), np.empty(size + 1, np.uint64)
     kept, done, ends = np.empty(size + 1, np.uint64), np.empty(size + 1, np.uint64), np.empty(size + 1, np.uint64)
     slot, joined, members = np.empty(size, np.uint64), np.empty(size, np.uint64), np.ones(size, np.int64)
@@ -262,7 +248,7 @@ def merge_span(nodes, is_first, rows, largest, begin, end, made, owner, row):
             cell[left], slot[left] = cell[i], own
             left += lives & again
             finished += lives & (np.uint8(1) - again)
-        # Those that are done: without a merge, their cells would not change in another round.
+        # Finished nodes: without a merge, their cells would not change in another round.
         for k in range(finished):
             i, own = done[k], ends[k]
             trace = lanes[COVARIANCE, i] + lanes[COVARIANCE + 1, i] + lanes[COVARIANCE + 2, i]
@@ -289,13 +275,12 @@ def merge_in_cells(start, stop, nodes, is_first, rows, largest, made, owner, row
     The rows of a range are spans: SPAN nodes, but for those whose cell begins before, with the rest of the last cell.
 
     Args:
-        nodes: (n,) uint32 rows, by cell and then along a curve.
-        is_first: (n,) bool, true where a cell begins.
+        nodes: (n,) rows, by cell and then along a curve.
+        is_first: (n,) true where a cell begins.
         rows: node rows; up to n // 2 of them, from `made` on, are filled.
-        largest: float32, largest trace of the covariance of a merged node, units squared.
-        made: the first row to fill.
-        owner: (n,) int64, filled with the place in `nodes` of the first member of each node's family, or its own.
-        row: (n,) uint32; the row of each family is filled in at the place of its first member.
+        largest: largest trace of the covariance of a merged node, units squared.
+        owner: (n,) filled with the place in `nodes` of the first member of each node's family, or its own.
+        row: (n,) the row of each family is filled in at the place of its first member.
     """
     n = len(nodes)
     for span in range(start, stop):
@@ -310,17 +295,13 @@ def merge_in_cells(start, stop, nodes, is_first, rows, largest, made, owner, row
 
 @kernel(u4[:], i8[:], u4[:])
 def split_families(nodes, owner, row):
-    """Separate the members of families from the nodes that are left as they are.
-
-    Args:
-        nodes: (n,) uint32 rows.
-        owner, row: of `merge_in_cells`.
+    """Separate the members of families from the nodes without a parent; `owner` and `row` are of `merge_in_cells`.
 
     Returns:
-        members: (C,) uint32, the members of one family after the other, in the order of their first members.
+        members: (C,) the members of one family after the other, in the order of their first members.
         first: (F + 1,) int64, where each family begins in `members`.
-        made: (F,) uint32 rows of the families.
-        survivors: (S,) uint32, the nodes without a parent: a family's node replaces the first of its members.
+        made: (F,) rows of the families.
+        survivors: (S,) the nodes without a parent: a family's node replaces the first of its members.
     """
     n = len(nodes)
     size = np.zeros(n, np.int64)

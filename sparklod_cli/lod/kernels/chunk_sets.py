@@ -3,6 +3,10 @@
 Sets of families are split in two, again and again, until each set is a chunk. A set is a slice of `sequence`, an array
 of families, in descending order of size, parents before their children. Its *roots* are the families whose parents'
 families are not in it; each family of a set has one root above it.
+
+Arrays that kernels share: `members`, the families of the set; `set_of` (F,), the number of each family's set; `root`
+(F,), the root above each family, or itself; `weight` (F,), for roots, the nodes of the families of the set below it,
+its own included.
 """
 
 from __future__ import annotations
@@ -50,35 +54,19 @@ DEEP = 63
 
 @fields(i4[:], i4[:], i4[:, :], u1[:, :])
 class Families(NamedTuple):
-    """The families of a tree, in descending order of size; for a kernel to read.
+    """The families of a tree, in descending order of size; for a kernel to read."""
 
-    Attributes:
-        parent: (F,) int32, the family that has its parent; -1 for the root's.
-        count: (F,) int32, its nodes.
-        rank: (F, 3) int32, the place of its parent's centre among all, along x, y, z.
-        demand: (F, V) uint8, of `fill_demand`.
-    """
-
-    parent: Any
-    count: Any
-    rank: Any
-    demand: Any
+    parent: Any  # (F,) int32, the family that has its parent; -1 for the root's
+    count: Any  # (F,) int32, its nodes
+    rank: Any  # (F, 3) int32, the place of its parent's centre among all, along x, y, z
+    demand: Any  # (F, V) uint8, of `fill_demand`
 
 
 @kernel()
 def find_roots(families, members, number, set_of, root, weight):
-    """Find the roots of a set, and the nodes below each.
+    """Fill `set_of` and `root` of the members of a set, and the `weight` of its roots; return the number of roots.
 
-    Args:
-        families: `Families`.
-        members: (S,) int32, the set.
-        number: of the set, which no other set had.
-        set_of: (F,) int32, filled for members: the number of the set.
-        root: (F,) int32, filled for members: the root above, or the family itself.
-        weight: (F,) int64, filled for roots: nodes of the families of the set below it, its own included.
-
-    Returns:
-        the number of roots.
+    `number` is that of the set, which no other set had.
     """
     for i in range(len(members)):
         set_of[members[i]] = number
@@ -107,13 +95,7 @@ def sum_of(values):
 
 @kernel()
 def fill_bins(families, members, root, weight, nodes, greatest):
-    """Fill the bins of a set, along each axis.
-
-    Args:
-        families, members, root, weight: as for `find_roots`, which filled the last two.
-        nodes: (AXES, BINS) int64 of zeros, filled with the nodes of each bin.
-        greatest: (AXES, BINS, V) uint8 of zeros, filled with the greatest demands in it.
-    """
+    """Add nodes (AXES, BINS) and greatest demands (AXES, BINS, V) of the bins of a set along each axis."""
     low, high = np.full(3, len(families.count)), np.zeros(3, np.int64)
     for i in range(len(members)):
         family = members[i]
@@ -141,7 +123,7 @@ def fill_bins(families, members, root, weight, nodes, greatest):
 
 @kernel()
 def choose_split(nodes, greatest, size, chunks):
-    """Return the split of a set after which viewers are expected to fetch the fewest bytes.
+    """Return axis (x, y, z or SIZE) and chunks of the first part of the split that is expected to save most bytes.
 
     A part is expected to be fetched as a whole by those who need any of it, as in the surface area heuristic of ray
     tracing: the cost of a split is the sum over both parts of nodes x viewers, and viewers are counted by the greatest
@@ -151,10 +133,6 @@ def choose_split(nodes, greatest, size, chunks):
         nodes, greatest: of `fill_bins`.
         size: nodes of a chunk.
         chunks: number of chunks that the set fills, the last one perhaps partly; 2 or more.
-
-    Returns:
-        axis: x, y, z or SIZE.
-        share: number of chunks in the first part.
     """
     total = nodes[SIZE].sum()
     lanes = greatest.shape[2]
@@ -188,19 +166,10 @@ def choose_split(nodes, greatest, size, chunks):
 
 @kernel()
 def mark_first_part(families, members, root, weight, axis, room):
-    """Mark what goes into the first part of a split, by a weight of -1.
+    """Mark the families of the first part of a split, which has room for `room` nodes, by a weight of -1.
 
-    Families are taken in order as long as there is room; those that do not fit are passed over, so that the room is
-    used up but for very few nodes.
-
-    Args:
-        families, members, root, weight: as for `find_roots`, which filled the last two. Filled again: for a split by
-            size each family is its own root.
-        axis: of the split.
-        room: nodes of the first part.
-
-    Returns:
-        whether anything was marked.
+    Families are taken in order as long as there is room; larger ones are passed over, so that the room is used up but
+    for very few nodes. In a split by size each family becomes its own root. Returns whether any was marked.
     """
     marked = False
     if axis == SIZE:
@@ -234,15 +203,7 @@ def mark_first_part(families, members, root, weight, axis, room):
 
 @kernel()
 def move_first_part(members, root, weight, spare):
-    """Move the marked families to the beginning; both parts keep their order.
-
-    Args:
-        members, root, weight: as for `mark_first_part`.
-        spare: (S,) int32, working memory.
-
-    Returns:
-        the number of marked families.
-    """
+    """Move the marked families to the beginning, both parts in their order; return how many there are."""
     length, rest = 0, 0
     for i in range(len(members)):
         family = members[i]
@@ -262,14 +223,11 @@ def split_sets(start, stop, families, sets, sequence, set_of, root, weight, spar
     """Split each set in two; the first part of each fills whole chunks, but for very few nodes.
 
     Args:
-        families: `Families`.
-        sets: (S, 6) int64: begin and end in `sequence`; a number that no set had before; nodes of a chunk; number of
-            chunks that the set fills; nodes that the first part has room for if it is to be split by size, or 0.
-        sequence: (F,) int32, reordered within each set.
-        set_of, root: (F,) int32, working memory.
-        weight: (F,) int64, working memory.
-        spare: (F,) int32, working memory.
-        lengths: (S,) int64, filled with the number of families of each first part.
+        sets: (S, 6) begin and end in `sequence`; a number that no set had before; nodes of a chunk; number of chunks
+            that the set fills; nodes that the first part has room for if it is to be split by size, or 0.
+        sequence: (F,) reordered within each set.
+        set_of, root, weight, spare: (F,) working memory.
+        lengths: (S,) filled with the number of families of each first part.
     """
     lanes = families.demand.shape[1]
     for i in range(start, stop):
@@ -298,11 +256,10 @@ def fill_demand(start, stop, families, parent, views, least, most, demand):
     `least` and `most` nodes. The rows of a range are groups of LANES viewpoints.
 
     Args:
-        families: (F,) `pixel_scale.NODE`, the parents of families, parents before their children.
-        parent: (F,) int32, the family to which each parent belongs; -1 for the root.
-        views: (V,) `pixel_scale.VIEW`; V is a multiple of `LANES`.
-        least, most: budgets in nodes, float64; `least` is less than `most`.
-        demand: (F, V) uint8, filled: 255 for certain. No family has more than its parent.
+        families: (F,) the parents of families, parents before their children.
+        parent: (F,) the family to which each parent belongs; -1 for the root.
+        views: (V,), a multiple of `LANES`.
+        demand: (F, V) filled: 255 for certain. No family has more than its parent.
     """
     span = math.log(most / least)
     bucket = np.empty((len(families), LANES), np.int16)
@@ -339,13 +296,12 @@ def sort_within_chunks(start, stop, bounds, parent, rank, axis_bits, sequence, c
     their children.
 
     Args:
-        bounds: (C + 1,) int64, where each chunk begins in `sequence`, and the end.
-        parent: (F,) int32, the family that has its parent; -1 for the root's.
-        rank: (F, 3) int32, place of the parent's centre among all, along each axis.
+        bounds: (C + 1,) where each chunk begins in `sequence`, and the end.
+        parent, rank: of `Families`.
         axis_bits: bits of the greatest rank.
-        sequence: (F,) int32 families, parents first; reordered.
-        chunk_of: (F,) int32 of no chunk's number; filled. Another thread may not have reached the parent's chunk yet.
-        depth: (F,) int32, working memory.
+        sequence: (F,) families, parents first; reordered.
+        chunk_of: (F,) of no chunk's number; filled. Another thread may not have reached the parent's chunk yet.
+        depth: (F,) working memory.
     """
     up, down = np.uint64(max(AXIS_BITS - axis_bits, 0)), np.uint64(max(axis_bits - AXIS_BITS, 0))
     for chunk in range(start, stop):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...system.jit import kernel
+from ...system.jit import kernel, prefetch
 from ...system.jit_types import f4, out
 from .cut_arrays import (
     BASE,
@@ -33,9 +33,9 @@ from .cut_arrays import (
     limit_bits,
     put,
     request_chunks,
+    to_bits,
 )
-from .pixel_scale import ZERO
-from .refine import comes_before, lowered, refine, sift_down, sift_up, visit_roots
+from .pixel_scale import INFINITE, ZERO
 
 #: The first threshold without a guess, as a share of the largest root's pixel scale. The cut does not depend on it.
 FIRST_STEP = np.float32(1 / 8)
@@ -54,19 +54,16 @@ def find_cut(trees, stop, guess, slots, demand, cut):
     its children are resident.
 
     Args:
-        trees: `Trees`.
-        stop: `Stop`.
-        guess: float32, the first threshold, such as the last cut's, or 0; the cut does not depend on it.
-        slots: `Slots`, working memory.
-        demand: (chunks,) float32 of all trees, filled: the largest limit of the nodes that are, or should be, refined
-            and have children in the chunk; 0 if there is none.
-        cut: `CutNodes` of more than `stop.budget` nodes, filled.
+        guess: the first threshold, such as the last cut's, or 0; the cut does not depend on it.
+        demand: (chunks,) of all trees, filled: the largest limit of the nodes that are, or should be, refined and have
+            children in the chunk; 0 if there is none.
+        cut: room for more than `stop.budget` nodes, filled.
 
     Returns:
         selected: number of nodes in the cut.
         reason: BUDGET, PIXEL, MISSING, EXHAUSTED or FULL.
-        missing: number of nodes in the cut that would be refined if their children were resident, and of roots that
-            are not resident.
+        missing: number of roots that are not resident, and of nodes in the cut whose children would be refined if
+            resident.
         least: the least limit of a refined node; infinite if none was refined.
         last: the slot of the node that would have exceeded the budget, or -1.
     """
@@ -106,17 +103,11 @@ def sum_from_top(slots, low):
 
 @kernel(nogil=True)
 def stopping_bucket(trees, slots, budget, low, below):
-    """Return the next bucket in which the budget may end: that of a node whose children are missing, or else `low`.
+    """Return the next bucket below `below` in which the budget may end: of a node with missing children, or else `low`.
 
     As in Spark, refinement also ends at a node whose children would exceed the budget but are not resident. They are in
     no sum. So the budget may end in a bucket where it does not suffice for all that the bucket adds and such children.
-
-    Args:
-        trees: `Trees`.
-        slots: `Slots`, after `sum_from_top`.
-        budget: number of nodes of a cut.
-        low: the bucket in which resident nodes exceed the budget, -1 if they do not.
-        below: only buckets below this one.
+    `slots` are those that `sum_from_top` filled; resident nodes exceed the budget in bucket `low`, -1 if they do not.
     """
     nodes, views, _, _ = trees
     node, limit, instance, first, queue, _, _, sums, tally = slots
@@ -135,13 +126,11 @@ def stopping_bucket(trees, slots, budget, low, below):
 def collect(trees, stop, slots, demand, cut, low):
     """Collect the nodes of the cut when all nodes of the buckets above `low` are refined, and none of `low`.
 
-    Args:
-        trees, stop, wanted, cut: as for `find_cut`.
-        slots: `Slots`; `heap` gets the slots of nodes in the bucket `low`, which are left to `finish`.
-        low: the bucket in which the budget may end, -1 if it does not.
+    `low` is the bucket in which the budget may end, -1 if it does not; `slots.heap` gets the slots of its nodes, for
+    `finish`.
 
     Returns:
-        number of collected nodes; number of nodes in `heap`; number of nodes whose children are missing; whether a node
+        numbers of collected nodes, of nodes in `heap`, and of nodes whose children are missing; whether a node
         with children is too small to be refined; bits of the least limit of a refined node.
     """
     nodes, views, _, _ = trees
@@ -151,7 +140,7 @@ def collect(trees, stop, slots, demand, cut, low):
     demand[:] = 0
     for run in range(runs if tally[GAPS] else 0):
         at = queue[run]
-        if first[run] == first[run + 1]:  # missing: no longer a leaf where the queue decides, and again one above
+        if first[run] == first[run + 1]:  # children missing: marked as a leaf above `low`, where no queue decides
             limit[at] &= ~LEAF
             limit[at] |= LEAF if limit[at] >> BUCKET_BITS > low else 0
     selected, queued, missing, small = np.int64(0), np.int64(0), np.int64(0), np.int64(0)
@@ -191,16 +180,14 @@ def collect(trees, stop, slots, demand, cut, low):
 
 @kernel(nogil=True)
 def finish(trees, stop, slots, demand, cut, low, collected):
-    """Add what is drawn of the last bucket to the nodes that `collect` has found.
+    """Add the nodes of bucket `low`, refined in the order of the queue, to the nodes of `collect`.
 
-    The nodes of that bucket go through the queue. Those that are there from the start have their own pixel scale as
-    their limit, since their parents are in a larger bucket. Children of one of them are queued by their own pixel
-    scale, too, with their limit kept apart. Leaves that are there from the start stay out of the queue, which is
-    faster: those among them count as taken out that come before the least node that was.
+    Nodes that are in the bucket from the start have their own pixel scale as their limit, since their parents are in a
+    larger bucket. Children of one of them are queued by their own pixel scale, too, with their limit kept apart. Leaves
+    that are there from the start stay out of the queue, which is faster: those among them count as taken out that come
+    before the least node that was.
 
     Args:
-        trees, stop, slots, wanted, cut: as for `find_cut`.
-        low: the bucket in which the budget may end, -1 if it does not.
         collected: result of `collect`.
 
     Returns:
@@ -277,3 +264,182 @@ def finish(trees, stop, slots, demand, cut, low, collected):
                 selected += 1
             count += 1
     return selected, BUDGET, missing, from_bits(least), -1
+
+
+#: Nodes ahead of the one being refined whose own record, and whose children, are fetched into the processor's cache.
+#: Chosen among 8 to 24 and 6 to 12, which differ little (benchmarks/notes/cuts-and-chunks.md).
+OWN_AHEAD, CHILDREN_AHEAD = 16, 6
+
+#: Nodes of 24 bytes in a cache line of 64, rounded up.
+LINE_NODES = 3
+
+#: Least and most share to which a round lowers the threshold. The cut does not depend on them: lowering it too far
+#: costs visits of nodes that are not refined, and too little costs rounds.
+LEAST_STEP, MOST_STEP = 1 / 8, 0.95
+
+#: Buckets in which pixel scales double.
+OCTAVE = 1 << (23 - BUCKET_BITS)
+
+#: Least and most power of 1 / threshold to which the number of nodes is taken to grow; -2 where splats cover surfaces.
+LEAST_POWER, MOST_POWER = 0.5, 4.0
+
+#: Share by which a threshold is lowered beyond the estimate, since a few nodes too many cost less than another round.
+BEYOND = 0.98
+
+
+@kernel(nogil=True)
+def visit_roots(trees, stop, slots):
+    """Put the resident roots into the slots; returns the bits of the largest limit."""
+    nodes, views, resident, _ = trees
+    node, limit, instance, _, _, pending, _, sums, tally = slots
+    sums[:] = 0
+    tally[:] = 0
+    count, waiting = 0, 0
+    largest = np.int32(0)
+    for number in range(len(views)):
+        if not resident[views[number].chunk_base]:
+            continue
+        node[count], instance[count] = 0, number
+        limit[count] = limit_bits(nodes[views[number].node_base], views[number], INFINITE_BITS)
+        largest = max(largest, limit[count])
+        pending[waiting] = count
+        waiting += limit[count] > stop.smallest
+        count += 1
+    slots.first[0] = count
+    tally[COUNT], tally[WAITING], tally[BASE], tally[DRAWN] = count, waiting, count, count
+    return largest
+
+
+@kernel(nogil=True)
+def refine(trees, stop, slots, threshold):
+    """Refine the nodes with a limit above a threshold, in the order in which they are in memory; update `slots.tally`.
+
+    Where they come to more than the budget, the threshold is raised, to the bucket in which that happens.
+    """
+    nodes, views, _, _ = trees
+    smallest, budget = stop
+    node, limit, instance, first, queue, pending, _, sums, tally = slots
+    count, runs, waiting, gaps = tally[COUNT], tally[RUNS], tally[WAITING], tally[GAPS]
+    low = np.int64(to_bits(threshold) >> BUCKET_BITS)
+    drawn = tally[BASE]
+    for bucket in range(low, BUCKETS):
+        drawn += sums[bucket]
+    done, ready, left = runs, runs, np.int64(0)
+    for entry in range(waiting):
+        at = pending[entry]
+        due = limit[at] >> BUCKET_BITS >= low
+        queue[ready] = at
+        ready += due
+        pending[left] = at
+        left += not due
+    while done < ready:
+        at = queue[done]
+        ahead = queue[min(done + OWN_AHEAD, ready - 1)]
+        prefetch(nodes, views[instance[ahead]].node_base + node[ahead])
+        ahead = queue[min(done + CHILDREN_AHEAD, ready - 1)]
+        base = views[instance[ahead]].node_base
+        start = base + np.int64(nodes[base + node[ahead]].child_start)
+        for line in range(LINE_NODES):
+            prefetch(nodes, start + LINE_NODES * line)
+        done += 1
+        above = limit[at]
+        bucket = above >> BUCKET_BITS
+        if bucket < low:  # the threshold has been raised since
+            pending[left] = at
+            left += 1
+            continue
+        queue[runs] = at
+        first[runs] = count
+        runs += 1
+        number = instance[at]
+        view = views[number]
+        base = view.node_base
+        start = np.int64(nodes[base + node[at]].child_start)
+        children = np.int64(nodes[base + node[at]].child_count)
+        if not is_resident(trees, view, start, children):
+            limit[at] |= LEAF  # from here on a leaf
+            gaps += 1
+            continue
+        if count + children >= len(node):
+            tally[OVERFLOW] = 1
+            return
+        drawn += children - 1
+        sums[bucket] += children - 1
+        while drawn - sums[low] > budget:
+            drawn -= sums[low]
+            low += 1
+        for child in range(start, start + children):
+            own = limit_bits(nodes[base + child], view, above)
+            node[count] = child
+            limit[count] = own
+            instance[count] = number
+            # Branch-free, as the branches could not be predicted.
+            can_refine = own > smallest
+            due = own >> BUCKET_BITS >= low
+            queue[ready] = count
+            ready += can_refine & due
+            pending[left] = count
+            left += can_refine & (not due)
+            count += 1
+    first[runs] = count
+    tally[COUNT], tally[RUNS], tally[WAITING], tally[GAPS] = count, runs, left, gaps
+    tally[DRAWN], tally[LOW] = drawn, low
+
+
+@kernel(nogil=True)
+def lowered(slots, threshold, budget):
+    """Return the next threshold, at which the cut is likely to have a little more than `budget` nodes.
+
+    `threshold` is the last one; the nodes refined down to it are fewer than `budget`.
+    """
+    # The number of nodes grows as a power of 1 / threshold, which is estimated by the last octave.
+    drawn = slots.tally[DRAWN]
+    before, largest = drawn, np.int32(0)
+    low = np.int64(to_bits(threshold) >> BUCKET_BITS)
+    for bucket in range(low, min(low + OCTAVE, BUCKETS)):
+        before -= slots.sums[bucket]
+    if drawn == before or threshold == INFINITE:
+        # Nothing was added in the last octave; perhaps nothing is in several more.
+        for entry in range(slots.tally[WAITING]):
+            largest = max(largest, slots.limit[slots.pending[entry]])
+        return min(from_bits(largest), threshold * np.float32(LEAST_STEP))
+    power = min(MOST_POWER, max(LEAST_POWER, np.log2(drawn / max(before, 1))))
+    step = BEYOND * (drawn / budget) ** (1 / power)
+    return threshold * np.float32(min(MOST_STEP, max(LEAST_STEP, step)))
+
+
+@kernel(inline=True)
+def comes_before(node, limit, instance, a, b):
+    """Return whether slot `a` is refined before `b`: by pixel scale, instance, index, the greatest first."""
+    if limit[a] != limit[b]:
+        return limit[a] > limit[b]
+    if instance[a] != instance[b]:
+        return instance[a] > instance[b]
+    return node[a] > node[b]
+
+
+@kernel(nogil=True)
+def sift_up(node, limit, instance, heap, at):
+    """Move the heap's entry at `at` up to where the heap is in order."""
+    while at > 0:
+        above = (at - 1) >> 1
+        if not comes_before(node, limit, instance, heap[at], heap[above]):
+            return
+        heap[at], heap[above] = heap[above], heap[at]
+        at = above
+
+
+@kernel(nogil=True)
+def sift_down(node, limit, instance, heap, length):
+    """Move the heap's first entry down to where the heap is in order."""
+    at = 0
+    while True:
+        child = 2 * at + 1
+        if child >= length:
+            return
+        if child + 1 < length and comes_before(node, limit, instance, heap[child + 1], heap[child]):
+            child += 1
+        if not comes_before(node, limit, instance, heap[child], heap[at]):
+            return
+        heap[at], heap[child] = heap[child], heap[at]
+        at = child

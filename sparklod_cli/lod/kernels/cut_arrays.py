@@ -31,76 +31,45 @@ TALLIES = 8
 
 @fields(NODES, VIEWS, b1[:], i8)
 class Trees(NamedTuple):
-    """Instances of trees as one camera sees them.
+    """Instances of trees as one camera sees them."""
 
-    Attributes:
-        nodes: `NODE` of all trees, one after the other.
-        views: (instances,) `VIEW`.
-        resident: (chunks,) bool, of all trees: the chunk is loaded. A node is not refined unless its children
-            are.
-        chunk_bits: a chunk has 2 ** chunk_bits nodes.
-    """
-
-    nodes: Any
-    views: Any
-    resident: Any
-    chunk_bits: Any
+    nodes: Any  # `NODE` of all trees, one after the other
+    views: Any  # (instances,) `VIEW`
+    resident: Any  # (chunks,) bool, of all trees: the chunk is loaded. A node is not refined unless its children are.
+    chunk_bits: Any  # a chunk has 2 ** chunk_bits nodes
 
 
 @fields(i4, i8)
 class Stop(NamedTuple):
-    """Limits of refinement.
+    """Limits of refinement."""
 
-    Attributes:
-        smallest: int32 bits of a pixel scale; nodes up to it are not refined.
-        budget: int64, number of nodes of a cut; at least one for each instance.
-    """
-
-    smallest: Any
-    budget: Any
+    smallest: Any  # int32 bits of a pixel scale; nodes up to it are not refined
+    budget: Any  # int64, number of nodes of a cut; at least one for each instance
 
 
 @fields(u4[:], i4[:], u2[:])
 class CutNodes(NamedTuple):
-    """The nodes of a cut.
+    """The nodes of a cut."""
 
-    Attributes:
-        node: uint32 indices in their trees.
-        limit: int32 bits of their limits, see `find_cut`; LEAF marks those that the queue took out, which are not all
-            leaves.
-        instance: uint16.
-    """
-
-    node: Any
+    node: Any  # uint32 indices in their trees
+    # int32 bits of their limits, see `find_cut`; LEAF marks nodes that the queue took out, which are not all leaves
     limit: Any
-    instance: Any
+    instance: Any  # uint16
 
 
 @fields(u4[:], i4[:], u2[:], i4[:], i4[:], i4[:], i4[:], i4[:], i8[:])
 class Slots(NamedTuple):
-    """Working memory for nodes that have been visited: of roots, then of the children of each refined node, run by run.
+    """Working memory for visited nodes: the roots, then the children of each refined node, run by run."""
 
-    Attributes:
-        node: (slots,) uint32 index in its tree.
-        limit: (slots,) int32, see `limit_bits`.
-        instance: (slots,) uint16.
-        first: (slots,) int32, the first slot of each run.
-        queue: (slots,) int32 slots that have been refined, one for each run, then those that will be.
-        pending: (slots,) int32 slots below the threshold.
-        heap: (slots,) int32.
-        sums: (BUCKETS,) int32, for each bucket of limits the number of nodes that refining its nodes adds to the cut.
-        tally: (TALLIES,) int64, see COUNT.
-    """
-
-    node: Any
-    limit: Any
-    instance: Any
-    first: Any
-    queue: Any
-    pending: Any
-    heap: Any
-    sums: Any
-    tally: Any
+    node: Any  # (slots,) uint32 index in its tree
+    limit: Any  # (slots,) int32, see `limit_bits`
+    instance: Any  # (slots,) uint16
+    first: Any  # (slots,) int32, the first slot of each run
+    queue: Any  # (slots,) int32 refined slots, one for each run, then slots to refine
+    pending: Any  # (slots,) int32 slots below the threshold
+    heap: Any  # (slots,) int32
+    sums: Any  # (BUCKETS,) int32, for each bucket of limits the number of nodes that refining its nodes adds to the cut
+    tally: Any  # (TALLIES,) int64, see COUNT
 
 
 @kernel(inline=True)

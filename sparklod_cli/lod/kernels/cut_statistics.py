@@ -31,37 +31,24 @@ CLEAR_WORDS = 4
 
 @fields(f4, f4, f4, f8)
 class Screen(NamedTuple):
-    """A camera's picture.
+    """A camera's picture."""
 
-    Attributes:
-        tan_x, tan_y: float32 tangents of half the fields of view.
-        pixel_limit: float32, the pixel scale of a pixel.
-        area: square pixels, float64; no splat covers more.
-    """
-
-    tan_x: Any
+    tan_x: Any  # tangents of half the fields of view
     tan_y: Any
-    pixel_limit: Any
-    area: Any
+    pixel_limit: Any  # float32, the pixel scale of a pixel
+    area: Any  # square pixels, float64; no splat covers more
 
 
 @kernel(NODES, i4[:], VIEWS, CutNodes, Screen, out(i8[:, :]), out(f4[:]), out(u2[:]), nogil=True)
 def measure_cut(nodes, depths, views, cut, screen, counts, sizes, owners):
-    """Count the nodes of a cut by where their centres are, and measures those inside the frustum.
+    """Count the nodes of a cut by where their centres are, and measure those inside the frustum; return their number.
 
     Args:
-        nodes: `NODE` of all trees.
-        depths: (nodes,) int32, edges from the root, of all trees.
-        views: (instances,) `VIEW`.
-        cut: `CutNodes`, as `find_cut` fills it.
-        screen: `Screen`.
-        counts: (instances, COUNTS) int64, filled.
-        sizes: (cut,) float32, filled from the start with the feature sizes, in pixels on the screen, of nodes inside
-            the frustum; without NaN.
-        owners: (cut,) uint16, filled with the instance of each of these.
-
-    Returns:
-        number of sizes.
+        depths: (nodes,) edges from the root, of all trees.
+        cut: as `find_cut` fills it.
+        counts: (instances, COUNTS) filled.
+        sizes: (cut,) filled from the start with the feature sizes, pixels, of nodes inside the frustum; without NaN.
+        owners: (cut,) filled with the instance of each of these.
     """
     node, limit, instance = cut
     counts[:] = 0
@@ -89,7 +76,7 @@ def measure_cut(nodes, depths, views, cut, screen, counts, sizes, owners):
             to = at - begin
             x[to], y[to], z[to], size[to] = record.x, record.y, record.z, record.size
             leaves += record.child_count == 0
-            frontier += limit[at] >= 0  # not what the queue has taken out
+            frontier += limit[at] >= 0  # without nodes that the queue has taken out
             depth = np.int64(depths[index])
             least, most = min(least, depth), max(most, depth)
             total += depth
@@ -112,20 +99,11 @@ def measure_cut(nodes, depths, views, cut, screen, counts, sizes, owners):
 
 @kernel(nogil=True)
 def measure_block(x, y, z, size, count, view, screen):
-    """Measure the splats of a block.
-
-    Args:
-        x, y, z: (BLOCK_NODES,) float32 centres.
-        size: (BLOCK_NODES,) float32; overwritten with feature sizes in pixels, -1 of splats that are not inside the
-            frustum.
-        count: number of splats.
-        view: a record of `VIEW`.
-        screen: `Screen`.
+    """Replace (BLOCK_NODES,) sizes by feature sizes in pixels, -1 of splats whose centres are not inside the frustum.
 
     Returns:
-        inside: number inside the frustum.
-        behind: number behind the camera.
-        area: that those inside cover, in 1 / AREA_PARTS square pixels.
+        number of splats inside the frustum, number behind the camera, area of those inside in 1 / AREA_PARTS square
+        pixels.
     """
     tan_x, tan_y, pixel_limit, most_area = screen
     origin_x, origin_y, origin_z = view.origin_x, view.origin_y, view.origin_z
@@ -153,13 +131,7 @@ def measure_block(x, y, z, size, count, view, screen):
 
 @kernel(f4[:], i8[:], out(f4[:]), nogil=True)
 def select(values, places, found):
-    """Fill the values that would be at some places if all were in ascending order.
-
-    Args:
-        values: (n,) float32, at least 0.
-        places: (k,) int64, ascending.
-        found: (k,) float32, filled.
-    """
+    """Fill the values, all at least 0, that would be at some ascending places if all were in ascending order."""
     # The upper halves of their bits put them into buckets; only the buckets that are asked for are sorted.
     bits = values.view(np.int32)
     ends = np.zeros(BUCKETS, np.int32)
@@ -186,15 +158,13 @@ def select(values, places, found):
 
 @kernel(out(u4[:]), out(u4[:]), i8[:], u4[:], u2[:], u4[:], u2[:], out(i8[:, :]), nogil=True)
 def replace_drawn(drawn, before, base, node, instance, old_node, old_instance, counts):
-    """Count the nodes of a cut, and those that the cut before it had, too.
+    """Fill (instances, 2) counts: the nodes of a cut, and the nodes that it shares with the cut before.
 
     Args:
-        drawn: uint32 words of zeros, a bit for each node of each instance; filled with the nodes of the cut.
+        drawn: words of zeros, a bit for each node of each instance; filled with the nodes of the cut.
         before: the same for the cut before; set to zeros.
-        base: (instances,) int64, the first bit of each.
-        node, instance: of the cut.
-        old_node, old_instance: of the cut before.
-        counts: (instances, 2) int64, filled with the number of nodes in the cut, and in both.
+        base: (instances,) the first bit of each.
+        node, instance, old_node, old_instance: of the cut, and of the cut before.
     """
     counts[:] = 0
     one = np.uint32(1)

@@ -31,11 +31,11 @@ THOMSEN_P32, THOMSEN_ROOT, THIRD = np.float32(THOMSEN_P), np.float32(1 / THOMSEN
 SCALE_FLOOR = 1e-30
 rotation_matrix = kernel(inline=True)(gaussian.rotation_matrix)
 
-#: Sweeps over the three off-diagonal elements: all matrices get so many, which suffice as a rule, as Jacobi's method
-#: converges quadratically. Of 68,802 merges of two real scenes, 2 % need all 4 of them, and none needs more.
+#: Sweeps over the three off-diagonal elements of every matrix; they usually suffice, as Jacobi's method converges
+#: quadratically. Of 68,802 merges of two real scenes, 2 % need all 4 of them, and none needs more.
 SURE_SWEEPS = 4
 
-#: Sweeps at most, of a matrix that has not converged before.
+#: Most sweeps of a matrix, if it does not converge before.
 MAX_SWEEPS = 16
 
 #: Converged: sum of squares of the off-diagonal elements, of a matrix whose largest diagonal element is 1. An error of
@@ -48,16 +48,12 @@ ROWS = 10
 
 @fields(f4[:, :], f4[:, :], f4[:, :], f4[:])
 class SplatColumns(NamedTuple):
-    """Geometry of N splats, float32 columns as in `Splats`, for a kernel to read.
+    """Geometry of N splats, float32 columns as in `Splats`, for a kernel to read."""
 
-    Attributes:
-        center: (N, 3). scale: (N, 3). quat_xyzw: (N, 4). opacity: (N,).
-    """
-
-    center: Any
-    scale: Any
-    quat_xyzw: Any
-    opacity: Any
+    center: Any  # (N, 3)
+    scale: Any  # (N, 3)
+    quat_xyzw: Any  # (N, 4)
+    opacity: Any  # (N,)
 
 
 @kernel()
@@ -78,12 +74,7 @@ def ellipsoid_area(a, b, c):
 
 @kernel(i8, f4[:, :], f4[:, :], out(f8[:, :]), out(f8[:, :]), ranges=True)
 def find_bounds(start, stop, center, scale, low, high):
-    """Fill the least and the greatest x, y, z and largest scale of each of the blocks that splats are divided into.
-
-    Args:
-        center, scale: (N, 3) float32.
-        low, high: (blocks, 4) float64, filled.
-    """
+    """Fill (blocks, 4) least and greatest x, y, z and largest scale of each of the blocks of splats."""
     n, blocks = len(center), len(low)
     for c in range(start, stop):
         x0 = y0 = z0 = s0 = np.float32(np.inf)
@@ -115,12 +106,9 @@ def covariance(a, b, c, x, y, z, w):
 def decompose(m, count):
     """Replace the first `count` columns of `m` by their eigenvalues and eigenvectors.
 
-    What becomes of a matrix does not depend on those beside it, to the last bit.
-
-    Args:
-        m: (ROWS, at least count) float64. On entry, rows 0 to 5 are xx, yy, zz, xy, xz, yz. On return, rows 0 to 2
-            are the eigenvalues, and rows 6 to 9 the rotation from their axes to the world's, a unit quaternion x y z w.
-        count: number of matrices.
+    The result for a matrix does not depend on those beside it, to the last bit. Of (ROWS, at least count) `m`, rows 0
+    to 5 are xx, yy, zz, xy, xz, yz on entry. On return, rows 0 to 2 are the eigenvalues, and rows 6 to 9 the rotation
+    from their axes to the world's, a unit quaternion x y z w.
     """
     scale = np.empty(count, np.float64)
     for i in range(count):
@@ -167,10 +155,7 @@ def sweep(m, begin, end):
 
 @kernel()
 def rotation(p, q, off):
-    """Return the rotation by at most 45 degrees that makes the off-diagonal element 0.
-
-    Args:
-        p, q: the two diagonal elements. off: the element between them.
+    """Return the rotation by at most 45 degrees that makes the element `off` between diagonal elements p and q 0.
 
     Returns:
         tan, cos and sin of the angle, then cos and sin of half the angle.

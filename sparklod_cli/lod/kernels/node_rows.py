@@ -1,4 +1,9 @@
-"""Node rows from splats, merged splats from node rows, Morton codes of nodes, and columns in the final order."""
+"""Node rows from splats, merged splats from node rows, Morton codes of nodes, and columns in the final order.
+
+Arrays that kernels share: `rows`, node rows (see `pair_cost.py`); nodes from `leaves` on are merged; `row` (nodes -
+leaves,), the row of each merged node; `order` (M,), the node of each final index; `index` (n,), the input splat of each
+leaf.
+"""
 
 from __future__ import annotations
 
@@ -40,28 +45,15 @@ LINE = 16
 
 @fields(f8[:], f8)
 class Space(NamedTuple):
-    """The builder's coordinates: (world - middle) / unit.
+    """The builder's coordinates: (world - middle) / unit."""
 
-    Attributes:
-        middle: (3,) float64, world units. unit: float64, world units.
-    """
-
-    middle: Any
-    unit: Any
+    middle: Any  # (3,) float64, world units
+    unit: Any  # float64, world units
 
 
 @kernel(i8, u4[:], SplatColumns, f4[:, :], Space, out(f4[:, :]), out(f4[:]), ranges=True)
 def fill_leaf_rows(start, stop, index, splats, rgb, space, rows, size):
-    """Fill row i from splat index[i].
-
-    Args:
-        index: (n,) uint32.
-        splats: `SplatColumns`.
-        rgb: (N, 3) float32 of the splats.
-        space: `Space`.
-        rows: node rows, see `pair_cost.py`; the first n are filled.
-        size: (nodes,) float32; the first n are filled with the feature size, in units.
-    """
+    """Fill row i, and its feature size in units, from splat index[i]; `rgb` (N, 3) is that of the splats."""
     center, scale, quat, opacity = splats
     middle, unit = space
     for i in range(start, stop):
@@ -92,14 +84,7 @@ def fill_leaf_rows(start, stop, index, splats, rgb, space, rows, size):
 
 @kernel(i8, u4[:], u4[:], i8, out(u4[:]), ranges=True)
 def fill_rows_of(start, stop, nodes, row, leaves, found):
-    """Fill the rows of nodes: those of leaves are their own.
-
-    Args:
-        nodes: (n,) uint32.
-        row: (nodes - leaves,) uint32 row of each merged node.
-        leaves: number of leaves; nodes from there on are merged.
-        found: (n,) uint32, filled.
-    """
+    """Fill the rows of nodes: a leaf's is its own."""
     for i in range(start, stop):
         node = nodes[np.uint64(i)]
         found[np.uint64(i)] = node if node < leaves else row[np.uint64(node - leaves)]
@@ -109,12 +94,8 @@ def fill_rows_of(start, stop, nodes, row, leaves, found):
 def fill_morton_keys(start, stop, rows, nodes, low, step, keys):
     """Fill the Morton codes of nodes, of CURVE_BITS per axis; centres outside the curve's box are clamped to it.
 
-    Args:
-        rows: node rows, or any whose first columns are the centre.
-        nodes: (n,) uint32 indices of rows.
-        low: (3,) float64, the lowest corner of the box, units.
-        step: edge of a cell, float64, units.
-        keys: (n,) uint64, filled.
+    `low` (3,) is the lowest corner of the box and `step` the edge of a cell, units; of `rows` only the first columns,
+    the centre, are read.
     """
     most = float((1 << CURVE_BITS) - 1)
     for i in range(start, stop):
@@ -127,16 +108,7 @@ def fill_morton_keys(start, stop, rows, nodes, low, step, keys):
 
 @kernel(i8, u4[:], i8, u4[:], f4[:, :], Space, out(f4[:, :]), out(f4[:, :]), out(f4[:, :]), out(f4[:]), ranges=True)
 def fill_merged_splats(start, stop, order, leaves, row, rows, space, center, scale, quat, opacity):
-    """Fill the geometry of merged splats in final order; leaves are left as they are.
-
-    Args:
-        order: (M,) uint32, the node of each final index.
-        leaves: number of leaves; nodes from there on are merged.
-        row: (nodes - leaves,) uint32 row of each merged node.
-        rows: node rows.
-        space: `Space`.
-        center, scale, quat, opacity: columns of M splats.
-    """
+    """Fill the columns of M splats with the geometry of merged ones in final order; leaves are left as they are."""
     middle, unit = space
     moments = np.empty((ROWS, BLOCK), np.float64)
     found, source = np.empty(BLOCK, np.int64), np.empty(BLOCK, np.int64)
@@ -166,14 +138,7 @@ def fill_merged_splats(start, stop, order, leaves, row, rows, space, center, sca
 
 @kernel(i8, u4[:], u4[:], f4[:, :], out(f4[:, :]), ranges=True)
 def fill_leaves(start, stop, order, index, column, out):
-    """Fill the leaves of a column in final order; rows of merged nodes are left as they are.
-
-    Args:
-        order: (M,) uint32, the node of each final index; those below n are leaves.
-        index: (n,) uint32, the input splat of each leaf.
-        column: (n, J) float32 of the input splats.
-        out: (M, J) float32.
-    """
+    """Fill the leaves of `out` (M, J) from `column` (n, J) in final order; rows of merged nodes are left alone."""
     n, width, flat = len(order), column.shape[1], column.reshape(-1)
     for i in range(start, stop):
         ahead = order[min(i + LEAVES_AHEAD, n - 1)]
@@ -199,9 +164,8 @@ def merge_colors(start, stop, parents, child_start, child_count, order, weight, 
     Args:
         parents: (G,) final indices of the nodes.
         child_start, child_count: of the whole tree.
-        order: (M,) uint32, the node of each final index.
         weight: (nodes,) of each node.
-        color: (M, J) float32 in final order; rows `parents` are filled.
+        color: (M, J) in final order; rows `parents` are filled.
     """
     width = color.shape[1]
     total = np.empty(width, np.float64)

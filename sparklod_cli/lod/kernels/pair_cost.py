@@ -2,6 +2,7 @@
 
 The quality builder's node row is one cache line: 16 float32 for each node of the growing tree. Lengths are in a unit
 near the median scale, with the origin in the middle of the scene, so that float32 holds their squares and products.
+`nodes` (n,) are indices of rows in the order of the curve; `partner` and the costs are (n,), too.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ LANES = 14
 BLOCK = 512
 
 #: The number of pairs whose costs are computed at once is a multiple of this, which vectors divide: the rest of a loop
-#: takes as long for each pair as a vector. What is computed beyond the pairs is not used. Chosen.
+#: takes as long for each pair as a vector. Results beyond the pairs are not used. Chosen.
 SIDE_BY_SIDE = 16
 
 #: Cost of a squared colour difference of 1 (channels are 0..1), in nats of shape. Between 3 and 10 it matters little
@@ -73,12 +74,9 @@ def pair_costs(lanes, first, step, count, largest, cost):
     nodes one by one.
 
     Args:
-        lanes: (LANES, at least first + count + step) float32 columns of node rows, C-contiguous.
-        first: the first node.
-        step: distance between the nodes of a pair.
-        count: number of pairs.
-        largest: float32, units squared; a pair is never merged if its covariance has a larger trace.
-        cost: (at least count,) float32, filled.
+        lanes: (LANES, at least first + count + step) columns of node rows, C-contiguous.
+        largest: units squared; a pair is never merged if its covariance has a larger trace.
+        cost: (at least count,) filled.
     """
     start, distance = np.uint64(first), np.uint64(step)
     for i in range(count):
@@ -104,16 +102,7 @@ def pair_costs(lanes, first, step, count, largest, cost):
 
 @kernel(i8, f4[:, :], u4[:], i8, f4, out(i4[:]), out(f4[:]), ranges=True)
 def find_partners(start, stop, rows, nodes, window, largest, partner, lowest):
-    """Find the cheapest partner of each node among its neighbours in a list.
-
-    Args:
-        rows: node rows, see above.
-        nodes: (n,) uint32 indices of rows, in the order of the curve.
-        window: largest distance of a partner in the list.
-        largest: see `pair_costs`.
-        partner: (n,) int32, filled with an index into `nodes`, -1 for none.
-        lowest: (n,) float32, filled with the cost of merging with it.
-    """
+    """Fill `partner`, an index into `nodes` or -1, at most `window` places away, and its cost."""
     lanes = np.empty((LANES, BLOCK + 2 * window + SIDE_BY_SIDE), np.float32)
     cost = np.empty(BLOCK + window + SIDE_BY_SIDE, np.float32)
     best, at = np.empty(BLOCK + 2 * window, np.float32), np.empty(BLOCK + 2 * window, np.int32)
@@ -142,14 +131,7 @@ def keep_cheaper(cost, count, best, at, here, there):
     """Set best[i] to cost[i] and at[i], the partner of here + i, to there + i, where that cost is less.
 
     Among equal costs, that partner wins whose index differs from the node's in the lowest bits. That relation is
-    symmetric, so among many equal splats half choose each other.
-
-    Args:
-        cost: (at least count,) float32, of pairs (here + i, there + i).
-        count: number of pairs.
-        best: (at least count,) float32, updated.
-        at: (at least count,) int32, updated.
-        here, there: indices of the first pair's node and its partner.
+    symmetric, so among many equal splats half choose each other. `cost` is of pairs (here + i, there + i).
     """
     for i in range(count):
         own, new = np.int32(here + i), np.int32(there + i)
@@ -167,13 +149,9 @@ def is_mutual(i, partner, cost, limit):
 
 @kernel(i8, i4[:], f4[:], f4, out(i8[:, :]), ranges=True)
 def count_pairs(start, stop, partner, cost, limit, counts):
-    """Count the pairs of nodes that are each other's cheapest partner.
+    """Count the pairs of nodes that are each other's cheapest partner, at a cost of at most `limit`.
 
-    Args:
-        start, stop: blocks of nodes, of `len(counts)` of about one size.
-        partner, cost: of `find_partners`.
-        limit: largest cost of a pair, float32.
-        counts: (blocks, 2) int64, filled: nodes of the block that are the first, and the second, of a pair.
+    `counts` (blocks, 2) gets the nodes of each block that are the first, and the second, of a pair.
     """
     n, blocks = len(partner), len(counts)
     for block in range(start, stop):
@@ -187,15 +165,13 @@ def count_pairs(start, stop, partner, cost, limit, counts):
 
 @kernel(i8, u4[:], i4[:], f4[:], f4, i8, i8[:, :], out(u4[:, :]), out(u4[:]), ranges=True)
 def list_pairs(start, stop, nodes, partner, cost, limit, made, before, pairs, rest):
-    """List those pairs, and the nodes after they have merged.
+    """List the pairs of `count_pairs`, and the nodes after they have merged.
 
     Args:
-        start, stop, partner, cost, limit: of `count_pairs`.
-        nodes: (n,) uint32.
         made: the node that the first pair is merged into; the next pair's is one more.
-        before: (blocks, 2) int64 sums of `counts` of the blocks before.
-        pairs: (P, 2) uint32, filled.
-        rest: (n - P,) uint32, filled with the nodes in their order; a merged one replaces the first of its pair.
+        before: (blocks, 2) sums of `counts` of the blocks before.
+        pairs: (P, 2) filled.
+        rest: (n - P,) filled with the nodes in their order; a merged one replaces the first of its pair.
     """
     n, blocks = len(nodes), len(before)
     for block in range(start, stop):

@@ -23,8 +23,7 @@ from .profile import NEEDLE, is_needle, profile_of, size_factor
 #: Least semi-axis of a merged node, in the builder's unit, so that it has an area. Chosen.
 SHORTEST = 1e-20
 
-#: A covariance whose eigenvalues differ by less, as a share of their mean, is a sphere: the difference is float64's
-#: rounding. Chosen.
+#: Difference of eigenvalues, as a share of their mean, that float64's rounding gives those of a sphere. Chosen.
 SPHERICAL = 1e-12
 
 #: Added to the diagonal of P + Q, so that flat splats in one plane can be inverted: a share of its trace, which widens
@@ -39,12 +38,11 @@ LEAST_UNION = 0.5
 #: touch, and the background shows between them. Measured (benchmarks/notes/quality-builder.md).
 CLOSING = 0.12
 
-#: Overlaps, as such shares, from which on less is kept, and nothing: splats that overlap as much leave no cracks. Two
-#: opaque equals in one place overlap by a quarter. Measured (benchmarks/notes/quality-builder.md).
+#: Overlaps, as shares of coverage: from LOOSE on a node keeps less, from DENSE on nothing, as splats that overlap as
+#: much leave no cracks. Two opaque equals in one place overlap by a quarter. Measured, too.
 LOOSE, DENSE = 0.15, 0.19
 
-#: A node is in a layer if its shortest axis is no more than the first share of the second one, and in none from the
-#: second share on. Chosen.
+#: Ratios of a node's shortest axis to its second: up to FLAT it is in a layer, from ROUND on it is in none. Chosen.
 FLAT, ROUND = 0.1, 0.35
 
 #: Weight of opacity relative to each colour channel in the error of a picture, which may have any background. Chosen.
@@ -143,11 +141,9 @@ def merge_pair(a, b, planes, merged):
 
 @kernel(inline=True)
 def closing(overlap, large, middle, small):
-    """Return the part of an overlap, as a share of the pair's coverage, that a merged node keeps to close a layer.
+    """Return the share of the pair's coverage, of its overlap's, that a merged node keeps to close a layer.
 
-    Args:
-        overlap: of `merge_pair`.
-        large, middle, small: semi-axes of the merged node; needles are in no layer.
+    `large`, `middle` and `small` are the merged node's semi-axes; needles are in no layer.
     """
     flat = (ROUND - small / middle) / (ROUND - FLAT) if middle >= NEEDLE * large else 0.0
     loose = (DENSE - overlap) / (DENSE - LOOSE)
@@ -173,15 +169,11 @@ def row_times(x, y, z, symmetric, divisor):
 
 @kernel(inline=True)
 def without(moment, of_product, hidden, first, second):
-    """Return a second moment of two nodes less that of their overlap.
+    """Return a second moment of two nodes, about their mean, less that of their overlap.
 
-    The mean moves by -hidden / (1 - hidden) of the middle.
-
-    Args:
-        moment: of the two nodes, about their mean.
-        of_product: the covariance of the product of their Gaussians.
-        hidden: the overlap's coverage, as a share of the sum of the two.
-        first, second: coordinates of the product's centre, from the mean of the two.
+    The mean moves by -hidden / (1 - hidden) of the middle. `of_product` is the covariance of the product of their
+    Gaussians, `hidden` the overlap's coverage as a share of the sum of the two, `first` and `second` are coordinates of
+    the product's centre, from the mean of the two.
     """
     left = 1 - hidden
     return (moment - hidden * of_product) / left - hidden / (left * left) * first * second
@@ -189,21 +181,20 @@ def without(moment, of_product, hidden, first, second):
 
 @kernel(i8, u4[:, :], i8, i8, out(f4[:, :]), out(u4[:]), out(u4[:]), out(u4[:, :]), out(f4[:]), out(f4[:]), ranges=True)
 def merge_pairs(start, stop, pairs, made, leaves, rows, row, spare, children, size, error):
-    """Merge each pair of nodes into one, which takes over the row that is to spare in the tree of the first.
+    """Merge each pair of nodes into one, which takes over the spare row in the tree of the first.
 
     Args:
-        pairs: (P, 2) uint32 nodes.
+        pairs: (P, 2) nodes.
         made: the first node to fill; the next pair's is one more.
         leaves: number of leaves, the nodes below it; `row` and the rest are of merged nodes.
         rows: (leaves, WIDTH) node rows, see `pair_cost.py`; that of a leaf is its own.
-        row: (leaves,) uint32, filled with their rows.
-        spare: (leaves,) uint32, filled with a row that is to spare in their trees.
-        children: (leaves, 2) uint32, filled.
-        size: (2 * leaves,) float32, of all nodes, filled with the feature size of the splat that will be drawn, in
-            units.
-        error: (leaves,) float32, filled with `picture_error`.
+        row: (leaves,) filled with their rows.
+        spare: (leaves,) filled with a spare row in their trees.
+        children: (leaves, 2) filled.
+        size: (2 * leaves,) of all nodes, filled with the feature size of the splat that will be drawn, units.
+        error: (leaves,) filled with `picture_error`.
     """
-    merged = np.empty(WIDTH, np.float32)  # the row that it gets may be that of its first node
+    merged = np.empty(WIDTH, np.float32)  # its row may be that of its first node
     for pair in range(start, stop):
         first, second, node = pairs[pair, 0], pairs[pair, 1], made + pair - leaves
         a = rows[first if first < leaves else row[first - leaves]]
@@ -236,14 +227,9 @@ def merge_pairs(start, stop, pairs, made, leaves, rows, row, spare, children, si
 
 
 class OnPlane(NamedTuple):
-    """Integrals over a plane, divided by 2 pi, of Gaussians of height 1 that are projected onto it, in float64.
+    """Integrals over a plane, divided by 2 pi, of Gaussians of height 1 that are projected onto it, in float64."""
 
-    Attributes:
-        both: of the product of the two.
-        first, second: of either.
-    """
-
-    both: Any
+    both: Any  # of the product of the two
     first: Any
     second: Any
 
@@ -292,12 +278,7 @@ def overlaps(a, b):
 
 @kernel()
 def overlap_share(planes, density_a, density_b):
-    """Return the coverage of two nodes' overlap, as a share of the sum of their coverages; over the three planes.
-
-    Args:
-        planes: `overlaps` of the two.
-        density_a, density_b: DENSITY of the two.
-    """
+    """Return the coverage of two nodes' overlap, as a share of the sum of their coverages; over the three `planes`."""
     shared = alone = 0.0
     density_a, density_b = np.float64(density_a), np.float64(density_b)
     for both, area_a, area_b in planes:
@@ -311,11 +292,7 @@ def overlap_share(planes, density_a, density_b):
 def picture_error(a, b, merged, planes):
     """Return squared difference between the picture of a merged node and that of its two nodes.
 
-    It is summed over red, green, blue and opacity, and over the three planes.
-
-    Args:
-        a, b, merged: node rows.
-        planes: `overlaps` of a and b.
+    It is summed over red, green, blue and opacity, and over the three planes; `planes` are `overlaps` of a and b.
     """
     high_a, high_b, high = min(a[DENSITY], 1.0), min(b[DENSITY], 1.0), min(merged[DENSITY], 1.0)
     aa = bb = mm = ab = am = bm = 0.0

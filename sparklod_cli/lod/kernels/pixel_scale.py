@@ -54,12 +54,8 @@ def foveation_at(view, dx, dy, dz, inverse):
     """Return the foveation weight of a node's pixel scale.
 
     Cones: 1 inside the inner one, falling linearly in the cosine to `side` at the outer one, and on to `behind` at 90
-    degrees. Frustum: 1 inside, `side` outside, `behind` behind the camera.
-
-    Args:
-        view: a record of `VIEW`.
-        dx, dy, dz: from the camera to the node, object space.
-        inverse: 1 / distance.
+    degrees. Frustum: 1 inside, `side` outside, `behind` behind the camera. `dx`, `dy`, `dz` lead from the camera to the
+    node, object space; `inverse` is 1 / distance.
     """
     ahead = (dx * view.forward_x + dy * view.forward_y) + dz * view.forward_z
     if ahead <= ZERO:
@@ -79,12 +75,7 @@ def foveation_at(view, dx, dy, dz, inverse):
 
 @kernel(inline=True)
 def pixel_scale(node, view):
-    """Size over distance, times `lod_scale` and the foveation weight; float32, operation by operation as Spark's.
-
-    Args:
-        node: a record of `NODE`.
-        view: a record of `VIEW`.
-    """
+    """Return size over distance, times `lod_scale` and foveation weight; float32, operation by operation as Spark's."""
     dx, dy, dz = node.x - view.origin_x, node.y - view.origin_y, node.z - view.origin_z
     distance = np.sqrt((dx * dx + dy * dy) + dz * dz)
     if not distance > NEAREST:
@@ -98,15 +89,7 @@ def pixel_scale(node, view):
 
 @kernel(NODES, i8[:], VIEWS, i8, out(f4[:]), nogil=True)
 def pixel_scales(nodes, index, views, number, scales):
-    """Absolute pixel scales of some nodes, with NaN as infinity, as cuts order them.
-
-    Args:
-        nodes: `NODE` of one tree.
-        index: (n,) int64 nodes of it.
-        views: (instances,) `VIEW`.
-        number: of the instance.
-        scales: (n,) float32, filled.
-    """
+    """Fill absolute pixel scales of nodes `index` of one tree, with NaN as infinity, as cuts order them."""
     view = views[number]
     for i in range(len(index)):
         scale = abs(pixel_scale(nodes[index[i]], view))

@@ -66,8 +66,7 @@ def is_needle(a, b, c):
 def profile_of(density, needle):
     """Return linear opacity and spread of a splat, or a needle, of a density; its variance is spread * sigma^2.
 
-    Above the density of the largest D the spread is smaller than the profile's, which makes sigma larger, so that the
-    coverage is kept.
+    Above the density of the largest D the spread is smaller than the profile's: a larger sigma keeps the coverage.
     """
     if density <= 1:
         return max(density, MIN_OPACITY), 1.0

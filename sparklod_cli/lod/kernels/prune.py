@@ -1,8 +1,11 @@
 """Prunes a binary tree: drops the least useful nodes, so that cuts of the remaining tree are nearly as good.
 
 A node is drawn while the traversal's threshold is between its size and its parent's. While it is drawn it replaces k
-children by one splat, at the cost of some error; its usefulness is the span of ln(size) over which that happens x
-(k - 1 - error cost) x a rarity weight. When a node is dropped, its children become its parent's.
+children by one splat, at the cost of some error; its usefulness is the span of ln(size) over which that happens x (k -
+1 - error cost) x a rarity weight. When a node is dropped, its children become its parent's.
+
+Arrays are those of `pruning.fill_usefulness_terms` and `pruning.drop_nodes`: nodes from `leaves` on, of T, are merged.
+Blocks of a range are of about one size; there are as many as rows of `counts`, which is added to.
 """
 
 from __future__ import annotations
@@ -46,7 +49,7 @@ ABOVE_ALL = np.float32(1e6)
 #: Span of ln(size) of a node whose parent is that root. The mean is 0.26 before pruning and 0.43 after it, measured.
 UNKNOWN_SPAN = np.float32(0.3)
 
-#: What such a root has less in `saved` of `pruning.drop_nodes`: it may have any number of children.
+#: Taken off such a root's count in `saved` of `pruning.drop_nodes`, so that it may have any number of children.
 ROOM = 1 << 30
 
 #: The rank of a node that is dropped.
@@ -70,11 +73,10 @@ def link(children, leaves, lost, parent, log_size, step_of, inner, sums):
     One after the other, so that threads do not change the rounding of the sums.
 
     Args:
-        children, leaves, lost, log_size: of `pruning.fill_usefulness_terms`; `log_size` is replaced from `leaves` on.
-        parent: (top + 1,) uint32, the root for all nodes; filled.
-        step_of: (T - leaves,) uint16, filled with the size steps of merged nodes.
-        inner: (STEPS * OCTAVES,) int64, added to: the number of merged nodes of each step.
-        sums: (STEPS * OCTAVES,) float64, added to: what their pictures lose.
+        log_size: sizes; replaced from `leaves` on.
+        parent: (top + 1,) the root for all nodes; filled.
+        step_of: (T - leaves,) filled with the size steps of merged nodes.
+        inner, sums: (STEPS * OCTAVES,) added to: the number of merged nodes of each step, and what their pictures lose.
     """
     total = leaves + len(children)
     if len(parent) > total:
@@ -91,13 +93,7 @@ def link(children, leaves, lost, parent, log_size, step_of, inner, sums):
 
 @kernel(i8, i8, u4[:], out(f4[:]), out(i8[:, :]), ranges=True)
 def count_leaves(begin, end, leaves, parent, log_size, counts):
-    """Replace the sizes of leaves by their logarithms, and count them by size step.
-
-    Args:
-        begin, end: blocks of leaves, of `len(counts)` of about one size.
-        leaves, parent, log_size: of `link`.
-        counts: (blocks, STEPS * OCTAVES) int64, added to: the leaves of each step.
-    """
+    """Replace the sizes of leaves by their logarithms, and count blocks of them by size step."""
     blocks = len(counts)
     for block in range(begin, end):
         for leaf in range(leaves * block // blocks, leaves * (block + 1) // blocks):
@@ -111,11 +107,8 @@ def fill_terms(start, stop, step_of, common, rare, mean, lost, weight):
     """Fill the rarity weights and error costs of merged nodes.
 
     Args:
-        step_of: of `link`.
-        common: (STEPS * OCTAVES,) float64 rarity weight of each step.
-        rare: (STEPS * OCTAVES,) float64 share of the error cost that counts in its cuts.
-        mean: (STEPS * OCTAVES,) float64 of what the pictures of its nodes lose.
-        lost, weight: of `pruning.fill_usefulness_terms`.
+        common, rare, mean: (STEPS * OCTAVES,) rarity weight of each step, share of the error cost that counts in its
+            cuts, and mean error of the pictures of its nodes.
     """
     for slot in range(start, stop):
         step = step_of[slot]
@@ -136,12 +129,10 @@ def count_by_key(begin, end, kept, leaves, children, log_size, lost, weight, sav
     """Update the parents of merged nodes, and count those that can be dropped by the keys of their usefulness.
 
     Args:
-        begin, end: blocks of `kept`, of `len(counts)` of about one size.
-        kept: (n,) uint32 merged nodes but the root, less `leaves`, parents first.
-        leaves, log_size, lost, weight, saved, parent: of `pruning.drop_nodes`.
+        kept: (n,) merged nodes but the root, less `leaves`, parents first.
         children: the most of a node.
-        keys: (T - leaves - 1,) uint16, filled for `kept`; LAST_KEY if the node cannot be dropped.
-        counts: (blocks, 1 << KEY_BITS) int32, added to.
+        keys: (T - leaves - 1,) filled for `kept`; LAST_KEY if the node cannot be dropped.
+        counts: (blocks, 1 << KEY_BITS).
     """
     blocks = len(counts)
     for block in range(begin, end):
@@ -157,12 +148,10 @@ def count_by_key(begin, end, kept, leaves, children, log_size, lost, weight, sav
 
 @kernel(i8, i8, i8, i8, u4[:], f4[:], f4[:], out(u4[:]), out(u2[:]), out(f4[:]), out(i4[:]))
 def drop_below(threshold, most, leaves, children, parent, log_size, weight, kept, keys, lost, saved):
-    """Drop nodes whose keys are no larger than a threshold; return how many.
+    """Drop at most `most` nodes whose keys are no larger than a threshold; return how many.
 
-    Args:
-        most: number of nodes to drop.
-        leaves, children, parent, log_size, weight, keys, lost, saved: of `count_by_key`; the last three are updated.
-        kept: of `count_by_key`; those that are still kept move to its end.
+    Of the arrays of `count_by_key`, `keys`, `lost` and `saved` are updated, and the nodes still kept move to the end of
+    `kept`.
     """
     after = len(kept)
     dropped = 0
@@ -199,7 +188,7 @@ def skip_dropped(start, stop, leaves, saved, parent):
 def find_parent(node, leaves, saved, parent):
     """Update the parent of a node: the nearest ancestor that is kept.
 
-    Dropped nodes keep the parent that they had, so that no thread reads what another one writes.
+    The parents of dropped nodes do not change, so that no thread reads a value that another one writes.
     """
     while saved[parent[node] - leaves] == -1:  # once for each round at most
         parent[node] = parent[parent[node]]
@@ -222,15 +211,10 @@ def usefulness(node, leaves, parent, log_size, lost, weight, saved):
 
 @kernel(i8, f4, u4[:], f4[:], i4[:], i4[:])
 def size_ranks(leaves, highest, parent, log_size, saved, latest):
-    """Return the ranks of merged nodes in the final order: size steps below the highest, above the parent's.
+    """Return (T - leaves,) int32 ranks of merged nodes in the final order, NO_RANK for dropped nodes.
 
-    Args:
-        leaves, parent, log_size, saved: as for `pruning.drop_nodes`.
-        highest: ln(size) of rank 0.
-        latest: (leaves,) int32 rank that the leaves' parents must be below; or empty.
-
-    Returns:
-        (T - leaves,) int32, NO_RANK for dropped nodes.
+    A rank is the number of size steps below `highest`, the ln(size) of rank 0; it is above the parent's. `latest` is
+    empty or has for each leaf the rank that its parent must be below.
     """
     total = len(parent)
     rank = np.full(total - leaves, NO_RANK, np.int32)
@@ -259,10 +243,8 @@ def lay_out_children(inner, leaves, parent, saved, order, child_start, child_cou
     """Assign final indices: the root is 0, siblings are consecutive, and come in the order of their parents.
 
     Args:
-        inner: (I,) uint32, the merged nodes that are kept, parents before their children.
-        leaves: number of leaves.
-        parent, saved: of `pruning.drop_nodes`.
-        order: (M,) uint32, filled with the node of each final index.
+        inner: (I,) the merged nodes that are kept, parents before their children.
+        order: (M,) filled with the node of each final index.
         child_start, child_count: columns of a `LodTree` of M nodes, filled.
 
     Returns:

@@ -29,17 +29,11 @@ PART_BITS = 3
 
 @dataclass(frozen=True, eq=False)
 class Parts:
-    """The parts of the cells of a level, in units of `node_rows.Space`.
+    """The parts of the cells of a level, in units of `node_rows.Space`."""
 
-    Attributes:
-        step: edge of a part; that of a cell is 2 ** PART_BITS times it.
-        low: (3,) int64, the lowest part of the scene's lowest cell: the origin of offsets.
-        axis_bits: number of bits of the largest offset of a part, up to 63.
-    """
-
-    step: np.float64
-    low: NDArray[np.int64]
-    axis_bits: int
+    step: np.float64  # edge of a part; that of a cell is 2 ** PART_BITS times it
+    low: NDArray[np.int64]  # (3,) int64, the lowest part of the scene's lowest cell: the origin of offsets
+    axis_bits: int  # number of bits of the largest offset of a part, up to 63
 
     @property
     def words(self) -> int:
@@ -79,11 +73,10 @@ def fill_cell_words(start, stop, geometry, nodes, step, low, word, words):
 
     Args:
         geometry: node rows of `pair_cost.py`; or any whose first columns are the centre.
-        nodes: (n,) uint32 rows of it.
-        step: edge of a cell, float64.
-        low: (3,) int64, the lowest cell on each axis, so that offsets from it are not negative.
+        nodes: (n,) rows of it.
+        step: edge of a cell.
+        low: (3,) the lowest cell on each axis, so that offsets from it are not negative.
         word: index of the word, the lowest first; each has AXIS_BITS bits per axis.
-        words: (n,) uint64, filled.
     """
     shift = np.uint64(AXIS_BITS * word)
     for i in range(start, stop):
@@ -100,14 +93,7 @@ def cell_words(geometry: FloatArray, nodes: Nodes, grid: Parts, word: int) -> Ke
 
 @kernel(i8, u8[:], i8, out(i8[:, :]), ranges=True)
 def count_keys(begin, end, keys, shift, counts):
-    """Count the keys by some of their bits.
-
-    Args:
-        begin, end: blocks of keys, of `len(counts)` of about one size.
-        keys: (n,) uint64.
-        shift: the lowest of the bits.
-        counts: (blocks, 1 << bits) int64, added to: for each block, the keys with each value of the bits.
-    """
+    """Count the keys of blocks of about one size by the bits from `shift` on, into (blocks, 1 << bits) `counts`."""
     low, mask = np.uint64(shift), np.uint64(counts.shape[1] - 1)
     for block in range(begin, end):
         for i in range(len(keys) * block // len(counts), len(keys) * (block + 1) // len(counts)):
@@ -116,13 +102,9 @@ def count_keys(begin, end, keys, shift, counts):
 
 @kernel(i8, u8[:], u4[:], i8, out(i8[:, :]), out(u8[:]), out(u4[:]), ranges=True)
 def place_keys(begin, end, keys, values, shift, places, keys_out, values_out):
-    """Put keys in the order of some of their bits, and values with them.
+    """Put keys in the order of the bits of `count_keys`, and values with them, into `keys_out` and `values_out`.
 
-    Args:
-        begin, end, keys, shift: of `count_keys`.
-        values: (n,) uint32.
-        places: (blocks, 1 << bits) int64 where the first key of each block with each value of the bits goes; changed.
-        keys_out, values_out: (n,), filled.
+    `places` has where the first key of each block with each value of the bits goes; it is changed.
     """
     low, mask = np.uint64(shift), np.uint64(places.shape[1] - 1)
     for block in range(begin, end):
@@ -135,16 +117,9 @@ def place_keys(begin, end, keys, values, shift, places, keys_out, values_out):
 
 
 def sort_by_key(keys: Keys, values: Nodes, key_bits: int, blocks: int) -> tuple[Keys, Nodes]:
-    """Sort values by their keys, stably; overwrites its inputs.
+    """Return (n,) uint64 keys below 2 ** key_bits and (n,) values, sorted stably by key; overwrites its inputs.
 
-    Args:
-        keys: (n,) uint64 below 2 ** key_bits.
-        values: (n,) uint32.
-        key_bits: number of bits to sort by.
-        blocks: ranges to process in parallel; the result does not depend on it.
-
-    Returns:
-        the (n,) keys and (n,) values, sorted.
+    `blocks` are ranges to process in parallel; the result does not depend on it.
     """
     passes = max(1, -(-key_bits // DIGIT_BITS))
     bits = max(1, -(-key_bits // passes))
@@ -166,13 +141,11 @@ def sort_by_cell(
 
     Args:
         geometry, nodes: as for `fill_cell_words`.
-        grid: of the parts.
         blocks: ranges to process in parallel; the result does not depend on it.
         within: whether to sort within cells, too; otherwise a cell's nodes stay in their order.
 
     Returns:
-        nodes: (n,) uint32, sorted.
-        is_first: (n,) bool, true at the first node of each cell.
+        the (n,) sorted nodes, and (n,) whether each is the first of its cell.
     """
     axis_bits, words, in_cell = grid.axis_bits, grid.words, np.uint64(3 * PART_BITS)
     is_first = np.zeros(len(nodes), np.bool_)
@@ -193,17 +166,14 @@ def sort_by_cell(
 
 @kernel(i8, f4[:, :], f4[:, :], f8[:], f8, i8[:], i8, out(u8[:]), out(i4[:]), ranges=True)
 def fill_level_keys(begin, end, center, scale, steps, grid, low, cell_bits, keys, levels):
-    """Fill sort keys that order splats by level and, within a level, along a Morton curve.
+    """Fill sort keys that order splats by level, an index into `steps`, and along a Morton curve; and their levels.
 
     Args:
-        center, scale: (n, 3) float32.
-        steps: (L,) float64, the cell edge of each level, a rising geometric series. The last is at least the largest
-            size; splats smaller than the first belong to it.
-        grid: edge of the cells of the curve, float64.
-        low: (3,) int64, the lowest cell of the curve.
+        steps: (L,) the cell edge of each level, a rising geometric series. The last is at least the largest size;
+            splats smaller than the first belong to it.
+        grid: edge of the cells of the curve.
+        low: (3,) the lowest cell of the curve.
         cell_bits: number of bits for the curve; the level's bits are above them.
-        keys: (n,) uint64, filled.
-        levels: (n,) int32, filled with indices into `steps`.
     """
     start = math.log(steps[0])
     per_level = (len(steps) - 1) / (math.log(steps[-1]) - start)
@@ -222,16 +192,7 @@ def fill_level_keys(begin, end, center, scale, steps, grid, low, cell_bits, keys
 
 @kernel(u4[:], f4[:, :], f4[:], f4[:])
 def split_box(nodes, geometry, below, above):
-    """Separate nodes whose centres lie between two corners from the others.
-
-    Args:
-        nodes: (n,) uint32 rows of geometry.
-        geometry: node rows of `pair_cost.py`.
-        below, above: (3,) float32; centres between them on all axes are inside.
-
-    Returns:
-        inside, outside: uint32, the nodes in their order.
-    """
+    """Return the nodes with centres between two corners, (3,) `below` and `above`, and the others, in their order."""
     inside, outside = np.empty(len(nodes), np.uint32), np.empty(len(nodes), np.uint32)
     n = m = 0
     for i in range(len(nodes)):

@@ -1,4 +1,8 @@
-"""Linear-time checks and statistics of the parent-child links of a tree that may be invalid."""
+"""Linear-time checks and statistics of the parent-child links of a tree that may be invalid.
+
+Arrays are (N,), a value for each node: `child_count` and `child_start` of any unsigned type, `size` in any unit,
+`parent` and `depth` of `find_parents` and `find_depths`.
+"""
 
 from __future__ import annotations
 
@@ -21,18 +25,13 @@ LEAST_AREA = 1e-300
 
 @kernel(u2[:], u4[:], f4[:], nogil=True)
 def find_depths(child_count, child_start, size):
-    """Return depths of the nodes that are reachable from the root.
+    """Return depths and limits of the nodes that are reachable from the root; N is at least 1.
 
     Takes linear time for any links: at most MAX_LINKS per node are followed.
 
-    Args:
-        child_count: (N,) of any unsigned type; N is at least 1.
-        child_start: (N,) of any unsigned type.
-        size: (N,) of each node, any unit.
-
     Returns:
-        depth: (N,) int32, edges from the root on the first path found; -1 if there is none.
-        limit: (N,) float32, the least size on that path, the node's included; 0 if there is none.
+        depth: int32, edges from the root on the first path found; -1 if there is none.
+        limit: float32, the least size on that path, the node's included; 0 if there is none.
     """
     count = len(child_count)
     depth = np.full(count, -1, np.int32)
@@ -79,14 +78,10 @@ def find_depths(child_count, child_start, size):
 def find_parents(child_count, child_start):
     """Return parents of all nodes.
 
-    Args:
-        child_count: (N,) of any unsigned type.
-        child_start: (N,) of any unsigned type.
-
     Returns:
-        parent: (N,) int32, the last node that has it as a child; -1 if none has, or none of the MAX_LINKS per node that
-            are followed.
-        references: (N,) int32, the number of nodes that have it as a child.
+        parent: int32, the last node that has it as a child; -1 if none has, or none of the MAX_LINKS per node that are
+            followed.
+        references: int32, the number of nodes that have it as a child.
     """
     count = len(child_count)
     parent = np.full(count, -1, np.int32)
@@ -110,14 +105,9 @@ def find_parents(child_count, child_start):
 
 @kernel(i4[:], f4[:], f4[:, :], f4[:], out(f8[:]), nogil=True)
 def fill_weights(parent, size, scale, opacity, weight):
-    """Fill the weights of nodes in the mean size of their parents' children: opacity times surface area.
+    """Fill the weights of nodes in the mean size of their parents' children: opacity (linear) times surface area.
 
-    Args:
-        parent: (n,) int32, of `find_parents`.
-        size: (n,) of each node, any unit.
-        scale: (n, 3) float32.
-        opacity: (n,) float32, linear.
-        weight: (n,) float64, filled; -1 of nodes without a parent, a positive opacity or a positive, finite size.
+    It is -1 for nodes without a parent, a positive opacity or a positive, finite size.
     """
     for node in range(len(parent)):
         weight[node] = -1
@@ -128,13 +118,9 @@ def fill_weights(parent, size, scale, opacity, weight):
 
 @kernel(i4[:], f4[:], f8[:], out(f8[:]), out(f8[:]), nogil=True)
 def add_weighted(parent, size, weight, sums, weights):
-    """Add some nodes to the sums of their parents' children, so that the mean size of these is `sums` over `weights`.
+    """Add a block of nodes to the sums of their parents' children, whose mean size is `sums` over `weights`.
 
-    As sums grow in the order of nodes, blocks of nodes give what all nodes at once give.
-
-    Args:
-        parent, size, weight: of n nodes, as for `fill_weights`.
-        sums, weights: (N,) float64 of all nodes.
+    Sums grow in the order of nodes, so that they are the same for blocks of nodes as for all nodes at once.
     """
     for node in range(len(parent)):
         if not weight[node] < 0:
@@ -144,15 +130,7 @@ def add_weighted(parent, size, weight, sums, weights):
 
 @kernel(i4[:], i4[:], nogil=True)
 def find_cycles(parent, depth):
-    """Return nodes on a cycle or below one: parents lead from them neither to the root nor to a node without a parent.
-
-    Args:
-        parent: (N,) int32, of `find_parents`.
-        depth: (N,) int32, of `find_depths`.
-
-    Returns:
-        (N,) bool.
-    """
+    """Return whether each node is on a cycle, or below one: its ancestors are neither the root nor without a parent."""
     unknown, ends, cycle, passed = 0, 1, 2, 3
     state = np.zeros(len(parent), np.uint8)
     for node in range(len(parent)):
@@ -173,11 +151,6 @@ def find_cycles(parent, depth):
 @kernel(i4[:], u2[:], f4[:], nogil=True)
 def sum_by_depth(depth, child_count, size):
     """Return numbers of nodes and sums of their sizes by depth; nodes of depth -1 are left out of both.
-
-    Args:
-        depth: (N,) int32.
-        child_count: (N,) uint16.
-        size: (N,) of each node, any unit.
 
     Returns:
         nodes, leaves: (depths,) int64 numbers.
@@ -200,16 +173,10 @@ def sum_by_depth(depth, child_count, size):
 
 @kernel(u2[:], u4[:], f4[:], i8, out(i8[:]), nogil=True)
 def count_limits(child_count, child_start, limit, chunk_bits, counts):
-    """Count inner nodes by their limits.
-
-    Args:
-        child_count, child_start: (N,) of any unsigned type.
-        limit: (N,) float32, 0 or more.
-        chunk_bits: a chunk has 2 ** chunk_bits nodes.
-        counts: (1 << LIMIT_BITS,) int64, to which nodes with limits above 0 are added, by the upper bits of these.
+    """Add inner nodes with limits above 0 to (1 << LIMIT_BITS,) counts, by the upper bits of their limits.
 
     Returns:
-        number of inner nodes, whatever their limit, whose children lie in more than one chunk.
+        number of inner nodes, whatever their limit, whose children lie in more than one chunk of 2 ** chunk_bits nodes.
     """
     bits = limit.view(np.uint32)
     split = 0
@@ -224,17 +191,7 @@ def count_limits(child_count, child_start, limit, chunk_bits, counts):
 
 @kernel(u2[:], u4[:], f4[:], f8, out(b1[:]), nogil=True)
 def mark_small(child_count, child_start, size, ratio, marks):
-    """Mark nodes whose size is less than `ratio` times that of one of their children, of finite size.
-
-    Args:
-        child_count, child_start: (N,) of any unsigned type.
-        size: (N,) float32.
-        ratio: float64.
-        marks: (N,) bool, zeros, filled.
-
-    Returns:
-        number of marked nodes.
-    """
+    """Mark nodes whose size is less than `ratio` times that of a child of finite size; return how many there are."""
     count, marked, steps = len(child_count), 0, 0
     for node in range(count):
         start = np.int64(child_start[node])
@@ -254,15 +211,10 @@ def mark_small(child_count, child_start, size, ratio, marks):
 
 @kernel(i4[:], f4[:], nogil=True)
 def find_limits(parent, size):
-    """Return depths and limits of the nodes that have children.
+    """Return int32 depths, edges from the root, and float32 limits of the nodes that have children.
 
-    Args:
-        parent: (F,) int32 place here of the parent of each of these nodes, which comes before it; -1 for the root.
-        size: (F,) float32 of each node, any unit.
-
-    Returns:
-        depth: (F,) int32 edges from the root.
-        limit: (F,) float32 the least size from the root to the node, its own included.
+    `parent` is the place here of each node's parent, which comes before it, -1 for the root; a limit is the least size
+    from the root to the node, its own included.
     """
     depth, limit = np.zeros(len(parent), np.int32), np.empty(len(parent), np.float32)
     for family in range(len(parent)):

@@ -1,4 +1,4 @@
-"""Kernels for the way back from a picture to its splats on a card; see `kernels.backward`, of which they are the same.
+"""Kernels of the backward pass on a card, with the formulas of `kernels.backward`.
 
 No two threads write to the same place, and all sums have a fixed order, so that gradients are the same every time: each
 tile writes a row of sums for each of its splats, which are added in the order of the splat's tiles.
@@ -62,7 +62,7 @@ BATCH = 32
 #: Threads of a block that adds up rows, a warp for each splat.
 ADDERS = 4 * WARP
 
-#: Shared memory that stands in for the instructions of warps in the simulator.
+#: Shared memory with which the simulator replaces the instructions of warps.
 SCRATCH = (PIXELS if SIMULATED else 1, SUMS)
 
 #: All lanes of a warp.
@@ -193,11 +193,7 @@ def weigh_tiles(screen, keys, boxes, ends, start, pairs, across, least, image, b
 
 @cuda_kernel(u8[:], i4[:], i8[:], f4[:, :], out(f8[:, :]))
 def add_rows(keys, count, ends, sums, totals):
-    """Fill (M, SUMS) sums of the rows of each splat, a warp for each, that are drawn.
-
-    Args:
-        keys, count, ends: of `forward`. sums: of `weigh_tiles`.
-    """
+    """Fill (M, SUMS) sums of the rows, of `weigh_tiles`, of each splat that is drawn, a warp for each splat."""
     scratch = cuda.shared.array(SCRATCH, np.float64)
     values = cuda.local.array(SUMS, np.float64)
     thread = cuda.threadIdx.x
@@ -221,12 +217,9 @@ def add_rows(keys, count, ends, sums, totals):
     *(f4[:, :], f4[:], f4[:, :], i4[:], f8[:, :], out(f4[:, :])),
 )
 def carry_back(center, scale, quat, lod_opacity, colors, index, matrix, view, screen, count, totals, gradients):
-    """Compute the derivatives by the properties of splats; see `kernels.backward.carry_back`.
+    """Fill (M, GRADIENT_COLUMNS) derivatives, 0 for splats that are not drawn; see `kernels.backward.carry_back`.
 
-    Args:
-        center, scale, quat, lod_opacity, colors, index, matrix, view, screen, count: of `forward.project`.
-        totals: of `add_rows`.
-        gradients: (M, GRADIENT_COLUMNS) filled, 0 for splats that are not drawn.
+    Arguments are those of `forward.project`, and `totals` of `add_rows`.
     """
     i = cuda.grid(1)
     if i >= index.shape[0]:

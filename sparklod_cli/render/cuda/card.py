@@ -28,30 +28,20 @@ LEAST_CAPABILITY = (5, 0)
 
 @dataclass(frozen=True)
 class Card:
-    """A card.
+    """A card."""
 
-    Attributes:
-        name: for display. memory, free: bytes.
-        driver: version of CUDA that its driver supports.
-        sorter: "cupy", or "numpy" where arrays are sorted by the processor, which is slow.
-    """
-
-    name: str
-    memory: int
-    free: int
-    driver: tuple[int, int]
-    sorter: str
+    name: str  # for display
+    memory: int  # bytes
+    free: int  # bytes
+    driver: tuple[int, int]  # version of CUDA that its driver supports
+    sorter: str  # "cupy", or "numpy" where arrays are sorted by the processor, which is slow
 
     def __str__(self) -> str:
         return f"{self.name} ({self.memory / 1e9:.0f} GB, CUDA {self.driver[0]}.{self.driver[1]})"
 
 
 def find_card() -> Card:
-    """Return the card that numba uses.
-
-    Raises:
-        BackendError: there is none, or it cannot be used; in one line that says why.
-    """
+    """Return the card that numba uses; a BackendError says in one line why none can be used."""
     check_numba_settings()
     with optional_import("--device cuda needs numba-cuda", "cuda", BackendError):
         from numba import cuda
@@ -61,7 +51,7 @@ def find_card() -> Card:
         return Card("numba's simulator", 0, 0, LEAST_DRIVER, "numpy")
     try:
         driver = tuple(cuda.current_context().device.compute_capability), cuda.cudadrv.driver.driver.get_version()
-    except Exception as error:  # numba has no common class for what a driver may lack
+    except Exception as error:  # numba has no common class for errors of drivers
         lines = str(error).split()
         raise BackendError(f"no usable NVIDIA card and driver ({' '.join(lines)})") from None
     capability, version = driver
@@ -83,7 +73,7 @@ def _sorter() -> str:
 
 
 def print_card() -> None:
-    """Print the card and versions of packages; exit with the reason if there is none that can be used."""
+    """Print the card and versions of packages; exit with the reason if no card can be used."""
     from importlib import metadata
 
     try:
@@ -115,8 +105,7 @@ def _is_of_memory(error: Exception) -> bool:
 def card_errors(splats: int) -> Iterator[None]:
     """Turn errors of the card inside into `BackendError`; if memory does not suffice, it names how many splats fit.
 
-    Args:
-        splats: number of splats that are drawn or fitted; memory is proportional to it, but for pixels.
+    Memory is proportional to the number of splats that are drawn or fitted, but for pixels.
     """
     try:
         yield

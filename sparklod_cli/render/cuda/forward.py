@@ -86,10 +86,10 @@ def project(
     Args:
         center, scale, quat, lod_opacity, rgb, sh: columns of N splats.
         degree: of the spherical harmonics, 0 for none.
-        index: (M,) int32, which splats to draw.
+        index: (M,) which splats to draw.
         eye: (3,) position of the camera. matrix: (3, 4) world to camera. view: numbers of `Lens` and `Limits`.
         radial: splats are sorted by distance from the camera, not by depth.
-        colors: (N, 3), filled for the M splats: what the camera sees.
+        colors: (N, 3) filled for the M splats: what the camera sees.
         screen, keys, boxes: of `kernels.project.project`, filled for the M splats.
         count: (M,) tiles that each overlaps, 0 if it is not drawn.
     """
@@ -129,9 +129,7 @@ def count_in_order(keys, count, ends):
 def list_pairs(keys, boxes, ends, across, pairs):
     """List the tiles of each splat: tile in the upper half of a number, rank of the splat from the front in the lower.
 
-    Args:
-        keys: (M,) sorted. boxes: of `project`. ends: (M,) running sums of `count_in_order`. across: tiles in a row.
-        pairs: (ends[-1],) filled.
+    `keys` are sorted; `ends` (M,) are the running sums of `count_in_order`; `pairs` has (ends[-1],) numbers.
     """
     k = cuda.grid(1)
     if k >= keys.shape[0] or keys[k] == NOT_DRAWN:

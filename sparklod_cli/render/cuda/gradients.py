@@ -13,15 +13,10 @@ from .rasterizer import CardPicture, CardSplats, CardView
 
 
 def gradients_on_card(splats: CardSplats, picture: CardPicture, view: CardView, by_image: CardArray) -> CardArray:
-    """Return derivatives of a loss by each of the M splats that a picture was drawn of.
+    """Return (M, GRADIENT_COLUMNS) derivatives of a loss by each of the splats that a picture was drawn of.
 
-    Args:
-        splats: as they were when the picture was drawn.
-        picture: drawn with the profile spark.
-        by_image: (height, width, 4) float32 derivatives of the loss by the picture.
-
-    Returns:
-        (M, `kernels.backward.GRADIENT_COLUMNS`) float32, the same every time; see `gradients.SplatGradients`.
+    They are the same every time; see `gradients.SplatGradients`. The splats are as they were when the picture was
+    drawn, with the profile spark; `by_image` (height, width, 4) are the derivatives of the loss by the picture.
     """
     across, down = rasterizer.tiles_across(view.camera)
     seen, number, new = picture, picture.index.shape[0], splats.memory.array

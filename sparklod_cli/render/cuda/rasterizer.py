@@ -20,22 +20,16 @@ from .card import CardArray, CardMemory, add_up, card_errors, find_card, on_card
 
 @dataclass(frozen=True)
 class CardSplats:
-    """N splats on the card, float32.
+    """N splats on the card, float32."""
 
-    Attributes:
-        center: (N, 3). scale: (N, 3). quat_xyzw: (N, 4). lod_opacity: (N,). rgb: (N, 3). sh: (N, K, 3).
-        colors: (N, 3), working memory: colours that the last camera saw.
-        memory: other working memory, which the next picture overwrites.
-    """
-
-    center: CardArray
-    scale: CardArray
-    quat_xyzw: CardArray
-    lod_opacity: CardArray
-    rgb: CardArray
-    sh: CardArray
-    colors: CardArray
-    memory: CardMemory = field(default_factory=CardMemory)
+    center: CardArray  # (N, 3)
+    scale: CardArray  # (N, 3)
+    quat_xyzw: CardArray  # (N, 4)
+    lod_opacity: CardArray  # (N,)
+    rgb: CardArray  # (N, 3)
+    sh: CardArray  # (N, K, 3)
+    colors: CardArray  # (N, 3), working memory: colours that the last camera saw
+    memory: CardMemory = field(default_factory=CardMemory)  # other working memory, which the next picture overwrites
 
     @classmethod
     def of(cls, *columns: NDArray[np.float32]) -> CardSplats:
@@ -51,17 +45,13 @@ class CardSplats:
 
 @dataclass(frozen=True)
 class CardView:
-    """A camera and raster settings on the card.
-
-    Attributes:
-        eye: (3,). matrix: (3, 4). view: numbers of `Lens` and `Limits`. See `forward.project`.
-    """
+    """A camera and raster settings on the card."""
 
     camera: Camera
     settings: RasterSettings
-    eye: CardArray
-    matrix: CardArray
-    view: CardArray
+    eye: CardArray  # (3,)
+    matrix: CardArray  # (3, 4)
+    view: CardArray  # numbers of `Lens` and `Limits`. See `forward.project`.
 
     @classmethod
     def of(cls, camera: Camera, settings: RasterSettings) -> CardView:
@@ -74,24 +64,17 @@ class CardView:
 
 @dataclass(frozen=True)
 class CardPicture:
-    """A picture on the card, of M splats, and how it was drawn; the next one of the same splats overwrites it.
+    """A picture on the card, of M splats, and how it was drawn; the next one of the same splats overwrites it."""
 
-    Attributes:
-        image: (height, width, 4) float32.
-        index: (M,) int32, which splats. screen, keys, boxes, count: of `forward.project`, the keys sorted.
-        ends: (M,) int64, running sums of the tiles of splats in the order of `keys`.
-        start: (T + 1,) int64, where in `pairs` tiles begin. pairs: (total,) uint64, of `forward.list_pairs`.
-    """
-
-    image: CardArray
-    index: CardArray
-    screen: CardArray
+    image: CardArray  # (height, width, 4) float32
+    index: CardArray  # (M,) int32, which splats
+    screen: CardArray  # these four of `forward.project`, the keys sorted
     keys: CardArray
     boxes: CardArray
     count: CardArray
-    ends: CardArray
-    start: CardArray
-    pairs: CardArray
+    ends: CardArray  # (M,) int64, running sums of the tiles of splats in the order of `keys`
+    start: CardArray  # (T + 1,) int64, where in `pairs` tiles begin
+    pairs: CardArray  # (total,) uint64, of `forward.list_pairs`
 
 
 def draw_on_card(splats: CardSplats, index: CardArray, view: CardView) -> CardPicture:
@@ -123,11 +106,7 @@ def draw_on_card(splats: CardSplats, index: CardArray, view: CardView) -> CardPi
 
 
 def draw(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> Image:
-    """Draw what a camera sees, as `rasterizer.draw` does, on the card.
-
-    Raises:
-        BackendError: there is no card that can be used, or its memory does not suffice.
-    """
+    """Draw what a camera sees, as `rasterizer.draw` does; BackendError without a usable card or enough memory on it."""
     find_card()
     with card_errors(len(splats)):
         no_sh = np.empty((len(splats), 0, 3), np.float32)

@@ -104,8 +104,7 @@ _MAKE: dict[str, Callable[[], Any]] = {"osmesa": _osmesa, "egl": _egl}
 def create(kind: str) -> Any:
     """Return a moderngl.Context over one of `PACKAGES`, current on this thread.
 
-    Raises:
-        NoContextError: it cannot be created; a broken driver may end the process instead, see `probe`.
+    NoContextError if it cannot be created; a broken driver may end the process instead, see `probe`.
     """
     try:
         context = _MAKE[kind]()

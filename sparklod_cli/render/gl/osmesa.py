@@ -140,12 +140,8 @@ def draw(
 ) -> Image:
     """Draw the picture of a camera: (height, width, 4) float32 red, green, blue (premultiplied) and alpha, 0..1.
 
-    OpenGL objects are reused from frame to frame.
-
-    Args:
-        splats, camera, raster: the splats, the camera and the settings of the rasterizer.
-        precision: one of `gl.texture.PRECISIONS`.
-        sorting, throttle: see `gl.order.Order`.
+    OpenGL objects are reused from frame to frame. `precision` is one of `gl.texture.PRECISIONS`; `sorting` and
+    `throttle` are those of `Order`.
 
     Raises:
         BackendError: OpenGL is not available, or the picture or the scene exceeds its limits.
@@ -293,8 +289,7 @@ def _translated(work: Callable[..., _T], *arguments: Any) -> _T:
 def open_context() -> Any:
     """Return the moderngl.Context of this process, created on the first call; call and use it `on_gl_thread` only.
 
-    Raises:
-        BackendError: OpenGL is not available; names the packages to install.
+    Where OpenGL is not available, BackendError names the packages to install.
     """
     with optional_import("the backend osmesa needs moderngl", "render", BackendError, package="moderngl"):
         import moderngl  # noqa: F401

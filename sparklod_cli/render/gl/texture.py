@@ -26,10 +26,8 @@ Words = NDArray[np.uint32]
 class DataTexture(ABC):
     """The texels of the last splats, cached so that unchanged parts are not computed or uploaded again.
 
-    Attributes:
-        texels_a_splat: number of consecutive texels of a splat.
-        splats_a_row: number of splats in a row, a power of two.
-        texture: (height, splats_a_row * texels_a_splat, 4) uint32, row by row from splat 0; unused texels are 0.
+    `texture` is (height, splats_a_row * texels_a_splat, 4) uint32, row by row from splat 0; unused texels are 0.
+    `splats_a_row` is a power of two.
     """
 
     texels_a_splat: int
@@ -40,12 +38,9 @@ class DataTexture(ABC):
         self._last: ShadedSplats | None = None
 
     def update(self, shaded: ShadedSplats) -> tuple[bool, bool]:
-        """Update the texture to these splats.
+        """Update the texture; return whether it has changed, and whether anything but colours has.
 
         Compares values, not array identity: every frame has new arrays, mostly with the same values.
-
-        Returns:
-            whether the texture has changed, and whether anything but colours has changed.
         """
         before, self._last = self._last, shaded
         moved = before is None or not _same(before, shaded, GEOMETRY)

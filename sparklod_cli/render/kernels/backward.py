@@ -1,4 +1,4 @@
-"""The way back from a picture to its splats: what a loss changes by with each splat on the screen, and in the world.
+"""The backward pass of the rasterizer: derivatives of a loss by splats on the screen, and in the world.
 
 The loss is any function of a picture; its derivatives by the picture's values are given. A tile passes its splats from
 near to far, as the forward pass does, and for each it writes a row of sums over the tile's pixels, so that no two tiles
@@ -46,8 +46,8 @@ f32, f64 = np.float32, np.float64
 BY_X, BY_Y, BY_XX, BY_XY, BY_YY, BY_SHAPE, BY_RED, BY_GREEN, BY_BLUE = range(9)
 SUMS = 9
 
-#: What is kept of LANES adjacent pixels, after the sums of one splat over the rows of pixels above: transmittance; what
-#: is yet to be drawn, as the loss weighs it; the derivatives of the loss by red, green and blue.
+#: State of LANES adjacent pixels, after the sums of one splat over the rows of pixels above: transmittance; the rest of
+#: the picture behind, weighed by the loss; the derivatives of the loss by red, green and blue.
 THROUGH, REST, OF_RED, OF_GREEN, OF_BLUE = range(SUMS, SUMS + 5)
 FIELDS = SUMS + 5
 
@@ -67,20 +67,14 @@ GRADIENT_COLUMNS = 13
 
 @fields(f4[:, :], i2[:, :], i8[:], i4[:], i8[:], i8)
 class Drawn(NamedTuple):
-    """A picture's splats and tiles.
+    """A picture's splats and tiles."""
 
-    Attributes:
-        screen, boxes: (N, COLUMNS) float32 and (N, 4) int16 of `project`.
-        start, splats, stop: of `draw_tiles`.
-        across: number of tiles in a row of them.
-    """
-
-    screen: Any
-    boxes: Any
-    start: Any
+    screen: Any  # (N, COLUMNS) float32 of `project`
+    boxes: Any  # (N, 4) int16 of it
+    start: Any  # these three of `draw_tiles`
     splats: Any
     stop: Any
-    across: Any
+    across: Any  # number of tiles in a row of them
 
 
 @kernel(i2[:, :])
@@ -99,19 +93,13 @@ def first_rows(boxes):
 def weigh(record, i, alpha, by_z2, by_shape, is_drawn, red, green, blue, v, dy):
     """Move one pixel behind a splat, and write the terms of the splat's sums; branch-free, as `raster.blend`.
 
-    Args:
-        record: (RECORD + SUMS * LANES,) float32 of the pixels and the beginning of the next.
-        i: which lane.
-        alpha: of the splat.
-        by_z2, by_shape: derivatives of alpha.
-        is_drawn: the splat is drawn at the pixel.
-        red, green, blue: of the splat.
-        v, dy: from its centre to the pixel; see `SUMS`.
+    `record` has (RECORD + SUMS * LANES,) values of the pixels and the beginning of the next; `i` is the lane; `v` and
+    `dy` lead from the splat's centre to the pixel, see `SUMS`; derivatives `by_z2` and `by_shape` are of alpha.
     """
     alpha = alpha if is_drawn else f32(0)
     through = record[THROUGH * LANES + i]
     r, g, b = alpha * red, alpha * green, alpha * blue
-    # A colour that is clamped to 1 depends on nothing.
+    # The derivative of a colour that is clamped to 1 is 0.
     of_red = record[OF_RED * LANES + i] if r < f32(1) else f32(0)
     of_green = record[OF_GREEN * LANES + i] if g < f32(1) else f32(0)
     of_blue = record[OF_BLUE * LANES + i] if b < f32(1) else f32(0)
@@ -164,7 +152,7 @@ def weigh_lanes(record, row, x, dy, least):
 
 @kernel(inline_late=True)
 def start_pixels(records, left, top, rows, columns, image, by_image):
-    """Fill what is kept of a tile's pixels before the first splat."""
+    """Fill the state of a tile's pixels before the first splat."""
     records[:] = 0
     for line in range(rows):
         for i in range(columns):
@@ -188,12 +176,11 @@ def weigh_tiles(begin, end, drawn, first, least, image, by_image, sums):
     """Sum for each splat over the pixels of each tile that its box overlaps.
 
     Args:
-        drawn: `Drawn`.
         first: of `first_rows`.
-        least: float32, least alpha that is drawn.
-        image: (height, width, 4) float32 of `draw_tiles`.
-        by_image: (height, width, 4) float32 derivatives of the loss by it.
-        sums: (first[-1], SUMS) float32, filled; 0 for splats that a tile is opaque before.
+        least: least alpha that is drawn.
+        image: (height, width, 4) of `draw_tiles`.
+        by_image: (height, width, 4) derivatives of the loss by it.
+        sums: (first[-1], SUMS) filled; 0 for splats that a tile is opaque before.
     """
     height, width = image.shape[:2]
     across = drawn.across
@@ -229,17 +216,11 @@ def weigh_tiles(begin, end, drawn, first, least, image, by_image, sums):
 
 @fields(f4[:, :], i8[:], f4[:, :])
 class Rows(NamedTuple):
-    """Splats on the screen, and their sums, tile by tile.
+    """Splats on the screen, and their sums, tile by tile."""
 
-    Attributes:
-        screen: (N, COLUMNS) float32 of `project`.
-        first: (N + 1,) int64 of `first_rows`.
-        sums: (first[-1], SUMS) float32 of `weigh_tiles`.
-    """
-
-    screen: Any
-    first: Any
-    sums: Any
+    screen: Any  # (N, COLUMNS) float32 of `project`
+    first: Any  # (N + 1,) int64 of `first_rows`
+    sums: Any  # (first[-1], SUMS) float32 of `weigh_tiles`
 
 
 @kernel(inline=True)
@@ -262,15 +243,10 @@ def weighed(a, u, b, v, c, w):
 
 @kernel(i8, ShadedColumns, f4[:, :], Lens, Limits, Rows, out(f4[:, :]), ranges=True)
 def carry_back(start, stop, splats, world_to_camera, lens, limits, rows, gradients):
-    """Compute the derivatives by the properties of splats; see `SplatGradients`.
+    """Compute the derivatives by the properties of splats that are drawn, (N, GRADIENT_COLUMNS); see `SplatGradients`.
 
     The box of a splat and where it ends are held constant, and so is the shape of one whose axes are shortened to the
     largest radius.
-
-    Args:
-        splats, world_to_camera, lens, limits: of `project.project_splat`.
-        rows: `Rows`.
-        gradients: (N, GRADIENT_COLUMNS) float32, filled for the splats that are drawn.
     """
     for i in range(start, stop):
         if rows.first[i] == rows.first[i + 1]:
@@ -326,7 +302,7 @@ def carry_splat_back(splats, i, m, lens, limits, seen, total, row):
         by_width = -total[BY_XX] / HALF_LOG2E * c / det  # by a - b^2 / c, the variance along a row of pixels
         by_shear = -two * total[BY_XY] * along / HALF_LOG2E  # by b / c
         by_a = by_width
-        by_b = -shear * by_width + half * by_shear / c  # half of it, since b stands twice in the covariance
+        by_b = -shear * by_width + half * by_shear / c  # half of it, since b is twice in the covariance
         by_c = shear * shear * by_width - shear * by_shear / c - total[BY_YY] / (c * c)
     by_a += by_blurred
     by_c += by_blurred

@@ -16,15 +16,7 @@ f32 = np.float32
 
 @kernel(i8, f4[:], f4[:], f4[:], f4[:, :], f4, out(f4[:, :, :]), ranges=True)
 def draw_discs(top, bottom, x, y, radius, rgb, alpha, image):
-    """Blend discs in their order, each over those before it.
-
-    Args:
-        x, y: (N,) float32 centres, pixels from the upper left corner.
-        radius: (N,) float32, pixels.
-        rgb: (N, 3) float32.
-        alpha: float32, of all discs.
-        image: (height, width, 4) float32 to draw on: red, green and blue, premultiplied by alpha, and alpha.
-    """
+    """Blend discs on a picture in their order, each over those before it; centres and radii in pixels."""
     width = image.shape[1]
     for i in range(len(x)):
         r = radius[i]
@@ -46,14 +38,11 @@ def draw_discs(top, bottom, x, y, radius, rgb, alpha, image):
 
 @kernel(i8, f4[:, :], u8[:], b1, f4, out(i4[:, :]), ranges=True)
 def count_fragments(top, bottom, screen, keys, design, least, counts):
-    """Count the splats that cover each pixel, hidden ones included.
+    """Add the number of splats that cover each pixel, hidden ones included, to (height, width) counts.
 
     Args:
-        screen: (N, COLUMNS) of `project`.
-        keys: (M,) uint64 of it, of splats that are drawn, in any order.
-        design: merged splats have the falloff `shifted`, that of Spark's LoD design.
-        least: float32, least alpha that is drawn.
-        counts: (height, width) int32, added to.
+        screen, keys: of `project`; the (M,) keys are those of splats that are drawn, in any order.
+        design, least: of `raster.draw_tiles`.
     """
     width = counts.shape[1]
     for key in keys:

@@ -32,11 +32,7 @@ rotation_matrix = kernel(inline=True)(gaussian.rotation_matrix)
 
 @fields(f4, f4, f4, f4, f4, f4)
 class Lens(NamedTuple):
-    """A camera's picture; pixels, float32.
-
-    Attributes:
-        focal_x, focal_y: focal lengths. principal_x, principal_y: principal point. width, height: of the picture.
-    """
+    """A camera's picture; pixels, float32."""
 
     focal_x: Any
     focal_y: Any
@@ -48,51 +44,33 @@ class Lens(NamedTuple):
 
 @fields(f4, f4, f4, f4, f4, f4, f4, f4)
 class Limits(NamedTuple):
-    """Limits on what is drawn, float32; see `RasterSettings` and the constants in its module.
+    """Limits on what is drawn, float32; see `RasterSettings` and the constants in its module."""
 
-    Attributes:
-        near, far: range of depths, world units.
-        clip: largest distance of a centre from the picture's, in half pictures.
-        blur: variance added to a splat's on the screen, pixels squared.
-        min_alpha: least alpha.
-        std_devs: radius of a splat, in standard deviations. std_devs_per_d: added to it per unit of D above 1.
-        max_radius: pixels.
-    """
-
-    near: Any
-    far: Any
-    clip: Any
-    blur: Any
-    min_alpha: Any
-    std_devs: Any
-    std_devs_per_d: Any
-    max_radius: Any
+    near: Any  # depth, world units
+    far: Any  # depth, world units
+    clip: Any  # largest distance of a centre from the picture's, in half pictures
+    blur: Any  # variance added to a splat's on the screen, pixels squared
+    min_alpha: Any  # least alpha
+    std_devs: Any  # radius of a splat, in standard deviations
+    std_devs_per_d: Any  # added to it per unit of D above 1
+    max_radius: Any  # pixels
 
 
 class OnScreen(NamedTuple):
-    """A splat on the screen, before it is drawn; float32 but for `is_seen`.
+    """A splat on the screen, before it is drawn; float32 but for `is_seen`."""
 
-    Attributes:
-        is_seen: it is drawn, as far as depth, place and opacity tell.
-        x, y: its centre, pixels from the upper left corner.
-        a, b, c: its covariance xx, xy and yy, pixels squared, after the blur; det: its determinant.
-        d: D after the blur.
-        deviations: its radius in standard deviations; longest: the longer half axis, pixels.
-        depth: along the camera's axis; square: of the distance from the camera.
-    """
-
-    is_seen: Any
-    x: Any
+    is_seen: Any  # drawn, by its depth, place and opacity
+    x: Any  # its centre, pixels from the upper left corner
     y: Any
-    a: Any
+    a: Any  # its covariance xx, xy and yy, pixels squared, after the blur
     b: Any
     c: Any
-    det: Any
-    d: Any
-    deviations: Any
-    longest: Any
-    depth: Any
-    square: Any
+    det: Any  # of the covariance
+    d: Any  # D after the blur
+    deviations: Any  # its radius in standard deviations
+    longest: Any  # the longer half axis, pixels
+    depth: Any  # along the camera's axis
+    square: Any  # of the distance from the camera
 
 
 @kernel(inline=True)
@@ -109,17 +87,14 @@ def in_camera(m, x, y, z):
 def jacobian(lens, inverse, dx, dy):
     """Return pixels per unit of a camera's axes at a point: x by right, y by down, x and y by forward.
 
-    Args:
-        lens: `Lens`.
-        inverse: 1 / depth of the point.
-        dx, dy: from the principal point to the point, pixels.
+    `inverse` is 1 / depth of the point; `dx`, `dy` lead from the principal point to it, pixels.
     """
     return lens.focal_x * inverse, lens.focal_y * inverse, -dx * inverse, -dy * inverse
 
 
 @kernel(inline=True)
 def per_world_unit(m, row, sideways, forward):
-    """Return pixels per unit of the world's axes, of those per unit of axis `row` of a camera and its forward axis."""
+    """Return pixels per unit of the world's axes, from pixels per unit of a camera's axis `row` and forward axis."""
     return (
         sideways * m[row, 0] + forward * m[2, 0],
         sideways * m[row, 1] + forward * m[2, 1],
@@ -141,15 +116,8 @@ def turned(t, r):
 def on_screen(center, scale, quat, lod_opacity, world_to_camera, lens, limits):
     """Return the covariance of a splat on the screen, as Spark's vertex shader has it.
 
-    Args:
-        center, scale, quat: three, three and four float32.
-        lod_opacity: float32.
-        world_to_camera: (3, 4) float32; the camera looks along z, with y down.
-        lens: `Lens`.
-        limits: `Limits`.
-
-    Returns:
-        `OnScreen`; where the splat is not seen, numbers may be anything.
+    The camera of `world_to_camera` (3, 4) looks along z, with y down. The result is an `OnScreen`; where the splat is
+    not seen, its numbers may be anything.
     """
     m = world_to_camera
     x, y, z = center
@@ -193,12 +161,7 @@ def on_screen(center, scale, quat, lod_opacity, world_to_camera, lens, limits):
 
 @kernel(inline=True)
 def shortened(a, b, c, det, deviations, max_radius):
-    """Return the covariance of a splat, its axes shortened each by itself to `max_radius` pixels, and its determinant.
-
-    Args:
-        a, b, c, det, deviations: of `OnScreen`.
-        max_radius: pixels, float32.
-    """
+    """Return the covariance of a splat, each axis shortened by itself to `max_radius` pixels, and its determinant."""
     one = f32(1)
     mean = f32(0.5) * (a + c)
     spread = np.sqrt(max(mean * mean - det, f32(0)))
@@ -219,14 +182,9 @@ def shortened(a, b, c, det, deviations, max_radius):
 
 @kernel(inline=True)
 def ellipse(a, b, c, det, d, deviations, min_alpha):
-    """Return the columns that tell where a splat is drawn.
+    """Return where a splat is drawn, from its `OnScreen` after `shortened`.
 
-    Args:
-        a, b, c, det, d, deviations: of `OnScreen`, after `shortened`.
-        min_alpha: least alpha, float32.
-
-    Returns:
-        ALONG, SHEAR, ACROSS, LOG, LEAST, HALF_WIDTH, HALF_HEIGHT, SLOPE and TALL.
+    The columns are ALONG, SHEAR, ACROSS, LOG, LEAST, HALF_WIDTH, HALF_HEIGHT, SLOPE and TALL.
     """
     log = log2(d)
     end = end_of(d, log, deviations, min_alpha)

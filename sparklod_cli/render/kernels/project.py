@@ -32,7 +32,7 @@ COLUMNS = 16
 #: Splats that are projected together: their fields, 9 KB, stay in the first-level cache. Chosen.
 GROUP = 64
 
-#: Fields of a splat while it is projected, besides its columns: what it is made of, and those of `OnScreen`, float32.
+#: Fields of a splat while it is projected, besides its columns: its geometry, and the fields of `OnScreen`, float32.
 CENTER, SCALE, QUAT = 16, 19, 22
 SEEN, XX, XY, YY, DET, DEVIATIONS, LONGEST, DEPTH, SQUARE = range(26, 35)
 FIELDS = 35
@@ -57,17 +57,13 @@ linear_opacity_above_1 = kernel(inline=True)(gaussian.linear_opacity_above_1)
 
 @fields(f4[:, :], f4[:, :], f4[:, :], f4[:], f4[:, :])
 class ShadedColumns(NamedTuple):
-    """Columns of `ShadedSplats`, float32.
+    """Columns of `ShadedSplats`, float32."""
 
-    Attributes:
-        center: (N, 3). scale: (N, 3). quat_xyzw: (N, 4). lod_opacity: (N,). rgb: (N, 3).
-    """
-
-    center: Any
-    scale: Any
-    quat_xyzw: Any
-    lod_opacity: Any
-    rgb: Any
+    center: Any  # (N, 3)
+    scale: Any  # (N, 3)
+    quat_xyzw: Any  # (N, 4)
+    lod_opacity: Any  # (N,)
+    rgb: Any  # (N, 3)
 
 
 @kernel(inline=True)
@@ -92,17 +88,11 @@ def is_in_picture(x, y, half_width, half_height, lens):
 
 @kernel(inline_late=True)
 def project_splat(splats, i, world_to_camera, lens, limits, radial, row):
-    """Project a splat onto the screen, as Spark's vertex shader does.
-
-    Args:
-        splats: `ShadedColumns`.
-        i: which of them.
-        world_to_camera, lens, limits: of `on_screen`.
-        radial: splats are sorted by distance from the camera, not by depth.
-        row: (COLUMNS,) float32, filled if the splat is drawn.
+    """Project splat `i` onto the screen, as Spark's vertex shader does, into a row of (COLUMNS,) if it is drawn.
 
     Returns:
-        float32 distance to sort by, world units; NOT_SEEN if the splat is not drawn.
+        distance to sort by, world units: from the camera if `radial`, or else depth; NOT_SEEN if the splat is not
+            drawn.
     """
     center, scale, quat, rgb = splats.center[i], splats.scale[i], splats.quat_xyzw[i], splats.rgb[i]
     place, size = (center[0], center[1], center[2]), (scale[0], scale[1], scale[2])
@@ -152,14 +142,13 @@ def index_of(key):
 
 @kernel(i8, ShadedColumns, f4[:, :], Lens, Limits, b1, out(f4[:, :]), out(u8[:]), out(i2[:, :]), ranges=True)
 def project(start, stop, splats, world_to_camera, lens, limits, radial, screen, keys, boxes):
-    """Project splats onto the screen; see `project_splat`, of which this is the same for many splats at once.
+    """Project splats onto the screen: the same as `project_splat`, but for many splats at once.
 
     Args:
-        splats, world_to_camera, lens, limits, radial: of `project_splat`.
-        screen: (N, COLUMNS) float32, filled for splats that are drawn.
-        keys: (N,) uint64, filled with distance and index, so that they sort from near to far, and among equal
-            distances the last splat is in front, as in Spark; NOT_DRAWN for splats that are not drawn.
-        boxes: (N, 4) int16, filled with the `tiles_of` splats that are drawn, and for others with an empty box.
+        screen: (N, COLUMNS) filled for splats that are drawn.
+        keys: (N,) filled with distance and index, so that they sort from near to far, and among equal distances the
+            last splat is in front, as in Spark; NOT_DRAWN for splats that are not drawn.
+        boxes: (N, 4) filled with the `tiles_of` splats that are drawn, and for others with an empty box.
     """
     fields = np.empty((FIELDS, GROUP), np.float32)
     for first in range(start, stop, GROUP):
@@ -172,7 +161,7 @@ def project(start, stop, splats, world_to_camera, lens, limits, radial, screen, 
 def project_group(splats, start, count, world_to_camera, lens, limits, fields):
     """Fill the fields of `count` splats from `start` on, but POWER and colours.
 
-    Loops over fields, not over splats: LLVM vectorizes those without branches.
+    Its loops are branch-free and over one field each, so that LLVM vectorizes them.
     """
     for k in range(count):
         i = start + k

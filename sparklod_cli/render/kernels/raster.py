@@ -45,15 +45,15 @@ SLACK = f32(1.01)
 LEAST_SQUARE = f32(1e-6)
 
 #: Splats of a tile that are fetched and measured together before they are drawn; between two batches is a check for
-#: OPAQUE. The rows of a tile's splats lie anywhere in memory: a processor fetches several at once where nothing that
-#: has to be guessed stands between them. Measured: benchmarks/notes/rasterizer.md.
+#: OPAQUE. The rows of a tile's splats lie anywhere in memory: a processor fetches several at once if no
+#: unpredictable branch is between them. Measured: benchmarks/notes/rasterizer.md.
 BATCH = 16
 
 #: Rows of LANES pixels that a batch may have to be blended into, and one column that is written beyond the last.
 ROWS = (BATCH * BLOCKS + 1) * TILE
 
-#: What is listed of a row of pixels, see `list_rows`: which of a tile's rows it is, and which of the batch's splats is
-#: blended into it; and of the exponent t of that splat's falloff, MIDDLE and MOST: i pixels right of the row's first,
+#: Entries of a list of rows of pixels, see `list_rows`: the row's place in its tile, and the batch's splat blended into
+#: it; and MIDDLE and MOST of the exponent t of that splat's falloff: i pixels right of the row's first,
 #: t = MOST - (ALONG i - MIDDLE)^2.
 PLACE, SPLAT = range(2)
 MIDDLE, MOST = range(2)
@@ -68,11 +68,10 @@ def count_in_tiles(begin, end, keys, boxes, across, sorted_boxes, counts):
 
     Args:
         begin, end: blocks of splats, of `len(counts)` of about one size.
-        keys: (M,) uint64 of `project`, sorted, without NOT_DRAWN.
-        boxes: (N, 4) int16 of it.
+        keys: (M,) of `project`, sorted, without NOT_DRAWN.
         across: number of tiles in a row of them.
-        sorted_boxes: (M, 4) int16, filled.
-        counts: (blocks, tiles) int32, added to: for each block, the splats of each tile.
+        sorted_boxes: (M, 4) filled.
+        counts: (blocks, tiles) added to: for each block, the splats of each tile.
     """
     words = boxes.reshape(-1)
     for block in range(begin, end):
@@ -91,12 +90,11 @@ def count_in_tiles(begin, end, keys, boxes, across, sorted_boxes, counts):
 
 @kernel(i8, u8[:], i2[:, :], i8, out(i8[:, :]), out(i4[:]), ranges=True)
 def list_in_tiles(begin, end, keys, sorted_boxes, across, at, splats):
-    """List the splats of each tile, in the order of their keys.
+    """List the splats of each tile, in the order of their keys; for the other arguments see `count_in_tiles`.
 
     Args:
-        begin, end, keys, sorted_boxes, across: of `count_in_tiles`.
-        at: (blocks, tiles) int64 where the splats of each block begin in the list of each tile; changed.
-        splats: (total,) int32, filled: the lists, one after another.
+        at: (blocks, tiles) where the splats of each block begin in the list of each tile; changed.
+        splats: (total,) filled: the lists, one after another.
     """
     for block in range(begin, end):
         for k in range(len(keys) * block // len(at), len(keys) * (block + 1) // len(at)):
@@ -113,7 +111,7 @@ def list_in_tiles(begin, end, keys, sorted_boxes, across, at, splats):
 
 @kernel(inline=True)
 def blend(lanes, i, alpha, is_drawn, red, green, blue):
-    """Blend a splat behind what a pixel has so far; branch-free, so that LLVM vectorizes over the pixels of a row.
+    """Blend a splat behind the splats of a pixel; branch-free, so that LLVM vectorizes over the pixels of a row.
 
     Colours are clamped to 1 after they are multiplied by alpha, as in an 8-bit picture.
     """
@@ -130,15 +128,12 @@ def list_rows(splats, k, lines, rows, terms, end):
     """List the rows of pixels in which a splat may be drawn; branch-free, as their number cannot be foreseen.
 
     Args:
-        splats: (COLUMNS, BATCH) float32 splats of a batch, after `measure`.
-        k: which of them.
-        lines: (BLOCKS, 2) int32 of `measure`.
-        rows: (2, ROWS) uint32, PLACE and SPLAT, filled from `end` on, and up to TILE columns beyond the last row.
-        terms: (2, ROWS) float32, MIDDLE and MOST, filled likewise.
-        end: where the list ends.
+        splats: (COLUMNS, BATCH) splats of a batch, after `measure`; this is the one in column `k`.
+        rows, terms: (2, ROWS) PLACE and SPLAT, and MIDDLE and MOST, filled from `end` on, and up to TILE columns beyond
+            the last row.
 
     Returns:
-        where it ends now.
+        the end of the list.
     """
     x, y, along, shear = splats[X, k], splats[Y, k], splats[ALONG, k], splats[SHEAR, k]
     across, log = splats[ACROSS, k], splats[LOG, k]
@@ -166,14 +161,10 @@ def listed(splats, rows, terms, j):
 
 @kernel(inline=True)
 def blend_rows(pixels, splats, rows, terms, first, last, design, least):
-    """Blend splats into the rows of a list; they are all merged ones, or all others.
+    """Blend splats into the rows `first` to `last` of a list; they are all merged ones, or all others.
 
-    Args:
-        pixels: (BLOCKS * TILE, 4, LANES) float32: transmittance, red, green and blue.
-        splats, rows, terms: of `list_rows`.
-        first, last: which rows of the list, the last excluded; at least one.
-        design: merged splats have the falloff `shifted`, that of Spark's LoD design.
-        least: float32, least alpha that is drawn.
+    `pixels` are (BLOCKS * TILE, 4, LANES) transmittance, red, green and blue; `last` is excluded, and more than
+    `first`.
     """
     if splats[OPACITY, rows[SPLAT, first]] <= 1:
         for j in range(first, last):
@@ -207,7 +198,7 @@ def blend_rows(pixels, splats, rows, terms, first, last, design, least):
 def blend_batch(pixels, splats, count, lines, rows, terms, design, least):
     """Blend a batch of `count` splats, after `measure`, from near to far; for the arguments see `blend_rows`.
 
-    Rows of several splats are blended in one loop, as loops over those of each would end where no processor foresees.
+    Rows of several splats are blended in one loop: the ends of a loop for each splat would be mispredicted.
     """
     k = 0
     while k < count:
@@ -222,16 +213,11 @@ def blend_batch(pixels, splats, count, lines, rows, terms, design, least):
 
 @kernel(inline=True)
 def measure(row, left, top, rows, columns, lines):
-    """Return rows of pixels in which a splat may be drawn, in each column of blocks of a tile; branch-free.
+    """Fill (BLOCKS, 2) rows of pixels, the last excluded, that a splat may cover in each column of blocks of a tile.
 
-    The ellipse of an elongated splat fills half its box or less. Its side is lowest in the column at its lowest point,
-    or else at the column's nearer edge.
-
-    Args:
-        row: the splat, a row of `screen`; X and Y are made those from the middle of the tile's first pixel.
-        left, top: pixels left of and above the tile.
-        rows, columns: of the tile's pixels.
-        lines: (BLOCKS, 2) int32, filled; the last is excluded.
+    Branch-free. The ellipse of an elongated splat fills half its box or less. Its side is lowest in the column at its
+    lowest point, or else at the column's nearer edge. X and Y of `row` become those from the middle of the tile's first
+    pixel; `left`, `top` are pixels left of and above the tile, `rows`, `columns` those of the tile.
     """
     x, y = row[X] - f32(left) - f32(0.5), row[Y] - f32(top) - f32(0.5)
     row[X], row[Y] = x, y
@@ -298,9 +284,9 @@ def draw_tiles(begin, end, screen, start, splats, across, design, least, image, 
         start, splats: of `rasterizer.sort_into_tiles`.
         across: number of tiles in a row of them.
         design: merged splats have the falloff `shifted`, that of Spark's LoD design.
-        least: float32, least alpha that is drawn.
-        image: (height, width, 4) float32, filled: red, green and blue, premultiplied by alpha, and alpha.
-        stop: (tiles,) int64, filled: up to where in `splats` each tile was drawn; it is opaque before the rest.
+        least: least alpha that is drawn.
+        image: (height, width, 4) filled: red, green and blue, premultiplied by alpha, and alpha.
+        stop: (tiles,) filled: up to where in `splats` each tile was drawn; it is opaque before the rest.
     """
     for tile in range(begin, end):
         stop[tile] = draw_tile(screen, start, splats, tile, across, design, least, image)

@@ -23,19 +23,12 @@ DIGIT_BITS = 9
 
 
 class View(NamedTuple):
-    """View of a region.
+    """View of a region."""
 
-    Attributes:
-        world_to_camera: (3, 4) float32, which also scales.
-        basis: (K,) float32 values of the spherical harmonics in the direction of the view.
-        lens: `Lens` of a square picture.
-        limits: `Limits`.
-    """
-
-    world_to_camera: Any
-    basis: Any
-    lens: Any
-    limits: Any
+    world_to_camera: Any  # (3, 4) float32, which also scales
+    basis: Any  # (K,) float32 values of the spherical harmonics in the direction of the view
+    lens: Any  # `Lens` of a square picture
+    limits: Any  # `Limits`
 
 
 @kernel(
@@ -56,16 +49,15 @@ def compare_levels(begin, end, splats, sh, runs, poses, basis, sizes, focal, lim
     """Sum squared differences between pictures of regions at their detail levels and at the first.
 
     Args:
-        splats: `ShadedColumns` of all levels, with colours that lack the spherical harmonics of degree 1 and above.
-        sh: (N, K, 3) float32 coefficients of these.
-        runs: (R, L, 2) int64 first splat and number of splats of each region at each level.
-        poses: (R, V, 3, 4) float32 world to camera.
-        basis: (V, K) float32 values of the spherical harmonics in the direction of each view.
-        sizes: (R,) int64 width and height of each region's pictures, a multiple of TILE.
-        focal: float32 focal length, in widths of the picture.
-        limits: `Limits`.
-        differences: (R, V, L) float64, filled with sums over pixels and channels; for level 0 with the sum of its own
-            squares, and for a level without splats with 0.
+        splats: of all levels, with colours that lack the spherical harmonics of degree 1 and above.
+        sh: (N, K, 3) coefficients of these.
+        runs: (R, L, 2) first splat and number of splats of each region at each level.
+        poses: (R, V, 3, 4) world to camera.
+        basis: (V, K) values of the spherical harmonics in the direction of each view.
+        sizes: (R,) width and height of each region's pictures, a multiple of TILE.
+        focal: focal length, in widths of the picture.
+        differences: (R, V, L) filled with sums over pixels and channels; for level 0 with the sum of its own squares,
+            and for a level without splats with 0.
     """
     regions = len(poses)
     for job in range(begin, end):

@@ -75,15 +75,7 @@ def add_sh_of(i, center, sh, eye, degree, rgb):
 
 @kernel(i8, f4[:, :], f4[:, :, :], f4[:], i8, out(f4[:, :]), ranges=True)
 def add_sh(start, stop, center, sh, eye, degree, rgb):
-    """Add the terms of degree 1 and above to colours.
-
-    Args:
-        center: (N, 3) float32.
-        sh: (N, K, 3) float32 coefficients of degree 1 and above, K = 3, 8 or 15.
-        eye: (3,) float32 position of the camera.
-        degree: 1 to 3.
-        rgb: (N, 3) float32, added to.
-    """
+    """Add the terms of degree 1 to `degree` to (N, 3) colours, seen from `eye`; `sh` is (N, K, 3), K = 3, 8 or 15."""
     for i in range(start, stop):
         add_sh_of(i, center, sh, eye, degree, rgb)
 
@@ -108,12 +100,6 @@ def sh_gradient_of(center, node, eye, by_rgb, by_sh, i):
 
 @kernel(i8, f4[:, :], f4[:], f4[:, :], out(f4[:, :, :]), ranges=True)
 def sh_gradients(start, stop, center, eye, by_rgb, by_sh):
-    """Compute derivatives by SH coefficients: the basis in a splat's direction, times the derivatives by its colour.
-
-    Args:
-        center, eye: of `add_sh`.
-        by_rgb: (N, 3) float32 derivatives by colours.
-        by_sh: (N, K, 3) float32, filled, K = 3, 8 or 15.
-    """
+    """Fill (N, K, 3) derivatives by SH coefficients: the basis in a splat's direction times (N, 3) `by_rgb`."""
     for i in range(start, stop):
         sh_gradient_of(center, i, eye, by_rgb, by_sh, i)
