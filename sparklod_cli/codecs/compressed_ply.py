@@ -17,7 +17,7 @@ from ..system.units import count_of
 from . import quantize
 from .left_out import HARMLESS, left_out
 from .ply_header import PlyHeader, offset_of, read_header
-from .reader import OpenFile, Positioned, Reader, Rows, Target, decode_rows, rows_between, size_of
+from .reader import OpenFile, Positioned, Reader, Rows, Target, decode_rows, rows_of, size_of
 
 #: Splats of a chunk, which share bounds.
 CHUNK_SPLATS = 256
@@ -47,7 +47,7 @@ def open_content(source: OpenFile) -> Reader:
 
     def read(name: str, start: int, stop: int) -> Iterator[Rows]:
         offset, row_type, rows = elements[name]
-        return rows_between(file, offset, row_type, start, stop, rows)
+        return rows_of(file.read, offset, row_type, start, stop, rows)
 
     bounds = _bounds(read("chunk", 0, -(-count // CHUNK_SPLATS)))
 

@@ -21,7 +21,7 @@ from ..system.errors import FormatError, TruncatedError
 from ..system.progress import Progress
 from ..system.threads import BLOCK_ROWS, blocks_of, ordered_map
 from . import quantize
-from .reader import OpenFile, Positioned, Reader, Target, rows_between, size_of
+from .reader import OpenFile, Positioned, Reader, Target, rows_of, size_of
 
 #: Before the columns, the number of splats, negative where numbers are halves; before the nodes, their number.
 COUNT = np.dtype("<i4")
@@ -114,7 +114,7 @@ def open_content(source: OpenFile) -> Reader:
             splats = target.splats.rows(slice(first, last))
             some = rows[first:last] - part.start
             for column, row_type, start in zip(COLUMNS, types, starts[:-1], strict=True):
-                between = rows_between(file, int(start), row_type, part.start, part.stop, count)
+                between = rows_of(file.read, int(start), row_type, part.start, part.stop, count)
                 values = np.concatenate([values for _, values in between])
                 column.put(splats, values[some].astype(np.float32))
             return target.start + int(last)
@@ -143,7 +143,7 @@ def _leaves(file: Positioned, at: int, node: np.dtype[Any], nodes: int, count: i
     Hierarchies that were cut to a chunk have nodes that lost their children.
     """
     runs = [np.empty((0, 2), np.int64)]
-    for _, some in rows_between(file, at, node, 0, nodes, nodes, "nodes"):
+    for _, some in rows_of(file.read, at, node, 0, nodes, nodes, "nodes"):
         start, leaves, merged, depth, children, first_child = (
             some[name].astype(np.int64) for name in ("start", "leaves", "merged", "depth", "children", "first_child")
         )

@@ -20,7 +20,7 @@ from ..system.errors import FormatError, TruncatedError, VersionError
 from ..system.progress import Progress
 from ..system.units import count_of
 from . import quantize
-from .reader import OpenFile, Positioned, Reader, Rows, Target, decode_rows, rows_between, size_of
+from .reader import OpenFile, Positioned, Reader, Rows, Target, decode_rows, rows_of, size_of
 
 HEADER = np.dtype(
     {
@@ -133,7 +133,7 @@ def open_content(source: OpenFile) -> Reader:
     def rows(start: int, stop: int) -> Iterator[Rows]:
         for section in sections:
             first, last = max(start - section.first, 0), min(stop - section.first, section.count)
-            for part, some in rows_between(positioned, section.offset, section.row_type, first, last, section.count):
+            for part, some in rows_of(positioned.read, section.offset, section.row_type, first, last, section.count):
                 yield slice(section.first + part.start, section.first + part.stop), some
 
     @np.errstate(invalid="ignore", over="ignore")  # absurd numbers overflow

@@ -31,7 +31,7 @@ from .file_notes import comment_of, read_comment
 from .left_out import HARMLESS, left_out
 from .options import DEFAULTS, WriteOptions
 from .ply_header import PlyHeader, first_value, offset_of, read_header
-from .reader import OpenFile, Positioned, Reader, Rows, Scratch, Target, decode_rows, encode_rows, rows_between, size_of
+from .reader import OpenFile, Positioned, Reader, Rows, Scratch, Target, decode_rows, encode_rows, rows_of, size_of
 
 Coding = Callable[[FloatArray], FloatArray]
 
@@ -257,7 +257,7 @@ def _rows(
             return _text_rows(file, header, needed)
         with lock:  # it seeks
             source, offset = opened()
-        return rows_between(source, offset, row_type, target.start, target.stop, count, "vertices")
+        return rows_of(source.read, offset, row_type, target.start, target.stop, count, "vertices")
 
     return read
 

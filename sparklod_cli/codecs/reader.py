@@ -8,7 +8,7 @@ import os
 import threading
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any, BinaryIO, Protocol
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,8 +28,9 @@ BLOCK_BYTES = 1 << 18
 #: A block of rows: which rows, and their content.
 Rows = tuple[slice, NDArray[Any]]
 
-#: Reads the next `size` bytes, or fewer at the end of the data.
+#: Reads the next `size` bytes, or fewer at the end of the data; or those from a place on.
 Read = Callable[[int], bytes | memoryview]
+ReadAt = Callable[[int, int], bytes | memoryview]
 
 
 def size_of(file: BinaryIO) -> int:
@@ -66,36 +67,14 @@ class Positioned:
             data += more
         return data
 
-    def reader(self, at: int) -> Read:
-        """Return a reader that resumes at an offset (not thread-safe)."""
-
-        def read(size: int) -> bytes:
-            nonlocal at
-            data = self.read(at, size)
-            at += len(data)
-            return data
-
-        return read
-
-
-def rows_between(
-    file: Positioned,
-    offset: int,
-    row_type: np.dtype[Any],
-    start: int,
-    stop: int,
-    count: int,
-    subject: str = "splats",
-) -> Iterator[Rows]:
-    """Read rows from `start` to `stop`, of `count` that begin at `offset` in a file; blocks and errors as `rows_of`."""
-    read = file.reader(offset + start * row_type.itemsize)
-    return rows_of(read, row_type, start, stop, count, subject)
-
 
 def rows_of(
-    read: Read, row_type: np.dtype[Any], start: int, stop: int, count: int, subject: str = "splats"
+    read: ReadAt, offset: int, row_type: np.dtype[Any], start: int, stop: int, count: int, subject: str = "splats"
 ) -> Iterator[Rows]:
-    """Read rows from `start` to `stop`, of `count`, in blocks of at least `BLOCK_ROWS` rows and `BLOCK_BYTES` bytes.
+    """Read rows from `start` to `stop`, in blocks of at least `BLOCK_ROWS` rows and `BLOCK_BYTES` bytes.
+
+    Args:
+        offset: of the first of the `count` rows of the file.
 
     Raises:
         TruncatedError: the data ends early.
@@ -103,7 +82,7 @@ def rows_of(
     step = max(BLOCK_ROWS, BLOCK_BYTES // row_type.itemsize)
     for first in range(start, stop, step):
         part = slice(first, min(first + step, stop))
-        data = read((part.stop - part.start) * row_type.itemsize)
+        data = read(offset + first * row_type.itemsize, (part.stop - first) * row_type.itemsize)
         whole = len(data) // row_type.itemsize
         if part.start + whole < part.stop:
             raise TruncatedError(f"cut short after {part.start + whole:,} of {count:,} {subject}")
@@ -192,15 +171,8 @@ class Target:
         return None if self.tree is None else self.tree.rows(slice(part.start - self.start, part.stop - self.start))
 
 
-class Fill(Protocol):
-    """Reads and decodes rows; raises `FormatError` if the file is cut short or corrupt."""
-
-    def __call__(self, target: Target, threads: int, progress: Progress) -> None: ...
-
-
-def plain_coding() -> FileCoding:
-    """Return the coding of files that hold numbers as they are."""
-    return PLAIN
+#: Reads and decodes rows on some threads; raises `FormatError` if the file is cut short or corrupt.
+Fill = Callable[[Target, int, Progress], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,7 +186,7 @@ class Reader:
         fill: reads and decodes rows.
         header: as in `Scene`; reading all splats may add to it.
         has_tree: whether the splats are the nodes of a tree.
-        coding: called when all splats have been read, returns `Scene.coding`.
+        coding: called when all splats have been read, returns `Scene.coding`; None for `scene.PLAIN`.
         block: splats that are read together at least; blocks are whole ones.
         up_by: as in `Scene`.
         concurrent: several threads may call `fill` at a time.
@@ -231,15 +203,14 @@ class Reader:
     up: str | None = None
     has_tree: bool = False
     chunk_bytes: tuple[int, ...] | None = None
-    coding: Callable[[], FileCoding] = plain_coding
+    coding: Callable[[], FileCoding] | None = None
     block: int = 1
     up_by: str = ""
     concurrent: bool = False
     threads: int = 1
 
     def __getstate__(self) -> dict[str, Any]:
-        # The coding belongs to an open file, and blocks do without it.
-        return {**vars(self), "header": dict(self.header), "coding": plain_coding}
+        return {**vars(self), "header": dict(self.header), "coding": None}  # which belongs to an open file
 
     def read(
         self,
@@ -277,7 +248,8 @@ class Reader:
             FormatError: the file is cut short or corrupt, or its tree is broken.
         """
         splats, tree = self.read(0, self.count, columns, progress, once=True)
-        scene = Scene(splats, tree, chunk_bytes=self.chunk_bytes, coding=self.coding(), **facts_of(self))
+        coding = PLAIN if self.coding is None else self.coding()
+        scene = Scene(splats, tree, chunk_bytes=self.chunk_bytes, coding=coding, **facts_of(self))
         return with_valid_tree(scene) if validate else scene
 
     def blocks(self, start: int = 0, stop: int | None = None) -> Iterator[Splats]:

@@ -15,7 +15,7 @@ from ..system.progress import Progress, silent
 from . import quantize
 from .clamps import CodeRange
 from .options import DEFAULTS, WriteOptions
-from .reader import OpenFile, Positioned, Reader, Target, decode_rows, encode_rows, rows_between, size_of
+from .reader import OpenFile, Positioned, Reader, Target, decode_rows, encode_rows, rows_of, size_of
 
 ROW = np.dtype(
     [
@@ -52,7 +52,7 @@ def open_content(source: OpenFile) -> Reader:
             splats.opacity[:] = quantize.decode_unorm8(rows["opacity"])
             splats.quat_xyzw[:] = quantize.decode_quat_bytes(rows["quat_wxyz"])[:, [1, 2, 3, 0]]
 
-        rows = rows_between(file, 0, ROW, target.start, target.stop, count)
+        rows = rows_of(file.read, 0, ROW, target.start, target.stop, count)
         decode_rows(rows, decode_part, count, threads, progress)
 
     return Reader(count, 0, "SPLAT", fill, concurrent=True)

@@ -29,7 +29,7 @@ from . import compression, quantize
 from .file_notes import FileNote, read_comment
 from .inflate import GZIP_MAGIC, Inflate
 from .quantize import Bytes
-from .reader import OpenFile, Positioned, Read, Reader, Target, rows_between, rows_of, size_of
+from .reader import OpenFile, Positioned, Read, Reader, Target, rows_of, size_of
 from .statistics import ALL_BITS
 
 MAGIC = 0x5053474E  # "NGSP"
@@ -200,8 +200,8 @@ def _open(source: OpenFile) -> tuple[Reader, Layout, Iterator[StreamRows]]:
             return
         positioned, offset = Positioned(source.scratch(unpacked)), 0
         for each in layout.streams():
-            between = rows_between(
-                positioned, offset, each.row_type, target.start, target.stop, layout.count, each.name
+            between = rows_of(
+                positioned.read, offset, each.row_type, target.start, target.stop, layout.count, each.name
             )
             for part, codes in between:
                 yield each, part, codes
@@ -257,7 +257,9 @@ def _checked(layout: Layout, file_size: int, header: dict[str, int]) -> Layout:
 
 
 def _rows(layout: Layout, read: Read, stream: SpzStream) -> Iterator[StreamRows]:
-    for part, codes in rows_of(read, stream.row_type, 0, layout.count, layout.count, stream.name):
+    for part, codes in rows_of(
+        lambda at, size: read(size), 0, stream.row_type, 0, layout.count, layout.count, stream.name
+    ):
         yield stream, part, codes
 
 

@@ -69,7 +69,7 @@ def test_decoding_takes_little_memory_beside_the_splats(kind: str) -> None:
 def test_rows_that_are_missing_are_counted() -> None:
     file = io.BytesIO(bytes(4 * (BLOCK_ROWS + 10) + 3))
     with pytest.raises(FormatError, match=f"cut short after {BLOCK_ROWS + 10:,} of {2 * BLOCK_ROWS:,} splats"):
-        list(rows_of(file.read, np.dtype("<u4"), 0, 2 * BLOCK_ROWS, 2 * BLOCK_ROWS))
+        list(rows_of(lambda at, size: file.read(size), 0, np.dtype("<u4"), 0, 2 * BLOCK_ROWS, 2 * BLOCK_ROWS))
 
 
 @pytest.mark.parametrize("threads", [1, 2, 3])
