@@ -21,7 +21,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +35,6 @@ from ..system.threads import threads_for
 from .check import Bounds, check, check_setting
 from .kernels.pair_cost import WIDTH
 from .kernels.sort import PART_BITS, Keys, Nodes, cell_words, sort_by_cell, sort_by_key
-from .stage_records import NO_FAMILY, STAGE_BITS, Pending, Region, StageFamilies
 from .voxel_grid import Margins, VoxelGrid
 from .voxel_tree import (
     MERGED,
@@ -46,8 +45,10 @@ from .voxel_tree import (
     VoxelTree,
     fill_rows,
     joining,
-    sorted_leaves,
 )
+
+if TYPE_CHECKING:  # builds in memory do without
+    from .stage_records import Pending, Region, StageFamilies
 
 #: Level of splats that have not joined the tree yet: they do so at the level of their size.
 NEW = -1
@@ -79,7 +80,7 @@ def build(splats: Splats, base: float = DEFAULT_BASE, *, progress: Progress = si
     bounds = check(splats)
     with threads_for(n) as threads:
         grid = VoxelGrid.of(bounds, base)
-        index, joins = sorted_leaves(splats.center, splats.scale, grid, threads)
+        index, joins = grid.sorted_leaves(splats.center, splats.scale, threads)
         arrivals = Arrivals(n, joining(index, joins, lambda some, rows: fill_rows(some, splats, grid.space, rows)))
         tree = VoxelTree(n, n, grid.space)
         ((_, root),) = grow(tree, grid, arrivals, None, progress)
@@ -116,12 +117,13 @@ def grow(
         the nodes without a parent, by the level that they wait for; only the root if there are no margins.
     """
     active, level, joined = np.empty(0, np.uint32), 0, 0
+    last = max(0, int(np.searchsorted(grid.steps, grid.largest)))  # a splat joins at its level at most
     left: list[tuple[int, NodeRows]] = []
     while True:
         if level in arrivals.waiting:
             active = tree.join(active, arrivals.waiting.pop(level))
             active = _by_cell(tree, grid, level - 1, active, within=False)[0]
-        if level > grid.last_level and not arrivals.waiting and len(active) <= 1:
+        if level > last and not arrivals.waiting and len(active) <= 1:
             break
         if margins is not None:
             margins.widen(level)
@@ -133,14 +135,14 @@ def grow(
             active = tree.join(active, new)
             progress("building", joined, arrivals.splats, "splat")
         if margins is not None:
-            active, outside = margins.split(active, tree.nodes)
-            left.append((level, tree.take(outside)))
+            active, outside = margins.split(active, tree.rows.node)
+            left.append((level, tree.rows.take(outside)))
         if len(active) > 1:
             with threads_for(len(active)):
                 active = tree.tidy(active)
                 active = tree.merge_cells(level, *_by_cell(tree, grid, level, active), grid.largest_trace(level))
         level += 1
-    left.append((level, tree.take(active)))
+    left.append((level, tree.rows.take(active)))
     unjoined = [(level, splats.rows()) for level, splats in arrivals.joining.items()]
     return left + unjoined + list(arrivals.waiting.items())
 
@@ -150,7 +152,7 @@ def _by_cell(
 ) -> tuple[Nodes, NDArray[np.bool_]]:
     """`sort_by_cell` of the cells of a level."""
     with threads_for(len(nodes)) as threads:
-        return sort_by_cell(tree.nodes, nodes, grid.parts(level), threads, within=within)
+        return sort_by_cell(tree.rows.node, nodes, grid.parts(level), threads, within=within)
 
 
 def plan(bounds: Bounds, sample: Splats, setting: float) -> VoxelGrid:
@@ -161,6 +163,8 @@ def plan(bounds: Bounds, sample: Splats, setting: float) -> VoxelGrid:
 
 def leaves(splats: Splats, index: NDArray[np.int64], plan: VoxelGrid) -> Pending:
     """Return splats that have not joined the tree."""
+    from .stage_records import NO_FAMILY, Pending
+
     n = len(splats)
     rows = np.empty((n, WIDTH), np.float32)
     fill_rows(np.arange(n, dtype=np.uint32), splats, plan.space, rows)
@@ -175,6 +179,8 @@ def advance(
 
     Families with the same batch and key come from one stage: a stable sort keeps them as they are.
     """
+    from .stage_records import NO_FAMILY, STAGE_BITS, Pending
+
     given = dict(pending.columns)
     del pending
     with threads_for(len(given["level"])) as threads:
@@ -213,6 +219,8 @@ def _arrivals(given: Mapping[str, NDArray[Any]], grid: VoxelGrid, threads: int) 
     New splats have the first numbers, by level, curve and index, as in memory; then come other splats, then merged
     ones. The last value is the number of the first of these.
     """
+    from .stage_records import NO_FAMILY
+
     is_new = given["level"] == NEW
     new, old = (np.flatnonzero(mask).astype(np.uint32) for mask in (is_new, ~is_new))
     index, order = given["index"][new], None
@@ -221,7 +229,7 @@ def _arrivals(given: Mapping[str, NDArray[Any]], grid: VoxelGrid, threads: int) 
         order = sort_by_key(index.astype(np.uint64), order, int(index.max()).bit_length(), threads)[1]
     every = len(old) == 0
     center, scale = (column if every else column[new] for column in (given["center"], given["scale"]))
-    order, joins = sorted_leaves(center, scale, grid, threads, order)
+    order, joins = grid.sorted_leaves(center, scale, threads, order)
     new = new[order]
     is_merged = given["family"][old] != NO_FAMILY
     merged = len(old) - int(np.count_nonzero(is_merged))
@@ -252,6 +260,8 @@ def _keys(grid: VoxelGrid, level: int, rows: FloatArray) -> Keys:
 
 def _families(tree: VoxelTree, final: Final, family: NDArray[np.int64], tops: int, words: int) -> StageFamilies:
     """Return the families of a stage, from its nodes and their families; the first are without a parent."""
+    from .stage_records import StageFamilies
+
     batches = tree.batches[::-1]
     number = np.array([LEVELS - batch.level for batch in batches], np.int32)  # coarse levels first
     parents = final.nodes.take(final.parents)

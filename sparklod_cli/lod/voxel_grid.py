@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..model.splats import FloatArray
 from .check import Bounds
 from .kernels.node_rows import Space
-from .kernels.sort import PART_BITS, Keys, Nodes, Parts, fill_level_keys, split_box
+from .kernels.sort import PART_BITS, Nodes, Parts, fill_level_keys, sort_by_key, split_box
 
 #: Largest coordinate in steps of a level: parts are half a step wide, their coordinates int64, and so must be their
 #: differences. No level is finer than this allows.
@@ -100,13 +100,10 @@ class VoxelGrid:
         size = LIMIT * float(self.step(level))
         return np.float32(0.75 * size * size if size < FARTHEST**1.2 else math.inf)
 
-    def shift(self, level: int) -> NDArray[np.int64]:
-        """Return the (3,) parts, fewer than a cell has, by which the grid of a level is shifted."""
-        return np.floor(np.array(SHIFT) * level % 1 * PARTS).astype(np.int64)
-
-    def part_edge(self, level: int) -> np.float64:
-        """Edge of the parts of a level, in units."""
-        return self.step(level) * np.float64(CELL / PARTS)
+    def edge_and_shift(self, level: int) -> tuple[np.float64, NDArray[np.int64]]:
+        """Return the edge of the parts of a level, units, and how many its grid is shifted: fewer than a cell has."""
+        shift = np.floor(np.array(SHIFT) * level % 1 * PARTS).astype(np.int64)
+        return self.step(level) * np.float64(CELL / PARTS), shift
 
     def box(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the corners of the box of all centres, in units, as rows hold them."""
@@ -115,25 +112,33 @@ class VoxelGrid:
 
     def parts(self, level: int) -> Parts:
         """Return the parts of a level; the scene's box bounds all, as a mean is in the box of its terms."""
-        edge, shift = self.part_edge(level), self.shift(level)
+        edge, shift = self.edge_and_shift(level)
         low, high = (np.floor(corner / edge).astype(np.int64) for corner in self.box())
         lowest = (low - shift) // PARTS * PARTS + shift
         return Parts(edge, lowest, int((high - lowest).max()).bit_length())
 
-    def leaf_keys(self, center: FloatArray, scale: FloatArray) -> tuple[Keys, NDArray[np.int32], int]:
-        """Return keys that order splats by level and along a curve, their (n,) levels, and the bits of a key."""
+    def sorted_leaves(
+        self, center: FloatArray, scale: FloatArray, threads: int, order: Nodes | None = None
+    ) -> tuple[Nodes, NDArray[np.int64]]:
+        """Return the splats by level and then along a curve, and where each level ends.
+
+        Args:
+            center, scale: (n, 3) of the splats.
+            order: (n,) the splats in the order of the scene; by default they are in it.
+        """
         steps = self.steps
         low, high = np.array(self.low), np.array(self.high)
         edge = max(float((high - low).max()) / (2**CURVE_BITS - 2), float(steps[0]))  # one cell to spare at either end
         low_cell = np.floor(low / edge).astype(np.int64)
         keys, levels = np.empty(len(scale), np.uint64), np.empty(len(scale), np.int32)
         fill_level_keys(len(scale), center, scale, steps, edge, low_cell, 3 * CURVE_BITS, keys, levels)
-        return keys, levels, 3 * CURVE_BITS + len(steps).bit_length()
-
-    @property
-    def last_level(self) -> int:
-        """The level of the largest splat, the last one that a splat joins at."""
-        return max(0, int(np.searchsorted(self.steps, self.largest)))
+        ends = np.cumsum(np.bincount(levels))
+        del levels
+        if order is None:
+            order = np.arange(len(center), dtype=np.uint32)
+        else:
+            keys = keys[order]
+        return sort_by_key(keys, order, 3 * CURVE_BITS + len(steps).bit_length(), threads)[1], ends
 
 
 class Margins:
@@ -149,7 +154,8 @@ class Margins:
 
     def widen(self, level: int) -> None:
         """Take the whole cells of a level that unknown nodes can be in; called for one level after another."""
-        edge, shift = float(self._grid.part_edge(level)), self._grid.shift(level).tolist()
+        width, shift = self._grid.edge_and_shift(level)
+        edge = float(width)
         for axis in range(3):
             below, above = self._below[axis], self._above[axis]
             # No centre lies outside of the box of the scene, known or unknown.

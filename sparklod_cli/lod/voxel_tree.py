@@ -21,8 +21,7 @@ from .kernels.cell_pairs import SPAN, merge_in_cells, split_families
 from .kernels.geometry import SplatColumns
 from .kernels.node_rows import Space, fill_leaf_rows, fill_leaves, fill_merged_splats, merge_colors
 from .kernels.pair_cost import WEIGHT, WIDTH
-from .kernels.sort import Keys, Nodes, sort_by_key
-from .voxel_grid import VoxelGrid
+from .kernels.sort import Keys, Nodes
 
 #: In place of the number of a node that was given, for a node that was made.
 MERGED = np.uint32(0xFFFFFFFF)
@@ -68,12 +67,6 @@ class NodeRows:
     def take(self, nodes: Nodes | slice) -> NodeRows:
         """Return some of the nodes."""
         return NodeRows(self.node[nodes], self.number[nodes], self.count[nodes])
-
-    def shrink(self, size: int) -> None:
-        """Give memory back but for the first rows. Nobody may have a view of them."""
-        for name in self.__dataclass_fields__:
-            column = getattr(self, name)
-            column.resize((size, *column.shape[1:]), refcheck=False)
 
     def put(self, into: NodeRows, start: int) -> None:
         """Write these rows over others, from `start` on."""
@@ -132,6 +125,7 @@ class VoxelTree:
     """Nodes without a parent, and those with one in their final order.
 
     Attributes:
+        rows: of the nodes without a parent; views of them do not outlive the next call.
         leaves: nodes that are given with a number from here on are merged ones.
         batches: in the order of the merges.
         total: number of nodes that have been written.
@@ -150,25 +144,16 @@ class VoxelTree:
         # Twice the nodes are the most that there will be; memory that is not written to is not taken. So much room is
         # enough for the rows, too: half of them for what the others are merged into.
         size = 2 * given
-        self._rows, self._used, self._awaited = NodeRows.empty(size), 0, given
+        self.rows, self._used, self._awaited = NodeRows.empty(size), 0, given
         self._center, self._scale = np.empty((size, 3), np.float32), np.empty((size, 3), np.float32)
         self._quat, self._opacity = np.empty((size, 4), np.float32), np.empty(size, np.float32)
         self._weight, self._number = np.empty(size, np.float64), np.empty(size, np.uint32)
         self._count = np.empty(size, np.uint16)
 
-    @property
-    def nodes(self) -> FloatArray:
-        """Rows of the nodes without a parent."""
-        return self._rows.node
-
-    def take(self, nodes: Nodes) -> NodeRows:
-        """Return copies of some of them."""
-        return self._rows.take(nodes)
-
     def join(self, active: Nodes, rows: NodeRows | Joining) -> Nodes:
         """Add nodes; returns where the active ones and they are. Others may be forgotten."""
         active = self.tidy(active, len(rows))
-        rows.put(self._rows, self._used)
+        rows.put(self.rows, self._used)
         self._awaited -= len(rows)
         added = np.arange(self._used, self._used + len(rows), dtype=np.uint32)
         self._used += len(rows)
@@ -176,17 +161,10 @@ class VoxelTree:
 
     def tidy(self, active: Nodes, more: int = 0) -> Nodes:
         """Make room for so many more nodes, and for what all of them are merged into; returns where the active are."""
-        need, size = len(active) + 2 * more, len(self._rows)
+        need, size = len(active) + 2 * more, len(self.rows)
         if self._used + need <= size and self._used <= 2 * len(active) + more:
             return active
-        active = self._forget(active)
-        enough = 2 * (len(active) + self._awaited)
-        if size > 2 * enough:
-            self._rows.shrink(enough)
-        return active
-
-    def _forget(self, active: Nodes) -> Nodes:
-        """Move the active nodes together, in place; returns where they are."""
+        # The active nodes move together, in place.
         kept = np.zeros(self._used, np.bool_)
         kept[active] = True
         order = np.flatnonzero(kept).astype(np.uint32)
@@ -194,21 +172,25 @@ class VoxelTree:
         place[order] = np.arange(len(order), dtype=np.uint32)
         for part in blocks_of(len(order), MOVED):
             if order[part][-1] >= part.stop:  # else they are there
-                self._rows.take(order[part]).put(self._rows, part.start)
+                self.rows.take(order[part]).put(self.rows, part.start)
         self._used = len(order)
+        enough = 2 * (len(active) + self._awaited)
+        if size > 2 * enough:  # give memory back
+            for column in vars(self.rows).values():
+                column.resize((enough, *column.shape[1:]), refcheck=False)
         return place[active]
 
     def merge_cells(self, level: int, nodes: Nodes, is_first: NDArray[np.bool_], largest: np.float32) -> Nodes:
         """Merge the nodes of each cell, as `kernels.cell_pairs.merge_in_cells`; returns the nodes without a parent."""
         owner, row = np.empty(len(nodes), np.int64), np.empty(len(nodes), np.uint32)
-        merge_in_cells(-(-len(nodes) // SPAN), nodes, is_first, self._rows.node, largest, self._used, owner, row)
+        merge_in_cells(-(-len(nodes) // SPAN), nodes, is_first, self.rows.node, largest, self._used, owner, row)
         members, first, made, survivors = split_families(nodes, owner, row)
         del owner, row
         if len(made):
             self.write(members)
-            self._rows.number[made] = self.total - first[:-1]
-            self._rows.count[made] = np.diff(first)
-            keys = self._keys(level, self._rows.node[made]) if self._keys else np.empty((0, 0), np.uint64)
+            self.rows.number[made] = self.total - first[:-1]
+            self.rows.count[made] = np.diff(first)
+            keys = self._keys(level, self.rows.node[made]) if self._keys else np.empty((0, 0), np.uint64)
             self.batches.append(Batch(level, len(made), len(members), keys))
             self._used += len(nodes) // 2
         return survivors
@@ -217,7 +199,7 @@ class VoxelTree:
         """Put nodes before all that have been written."""
         end = len(self._weight) - self.total
         part = slice(end - len(nodes), end)
-        rows, count = self._rows, len(nodes)
+        rows, count = self.rows, len(nodes)
         self._weight[part] = rows.node[nodes, WEIGHT]
         self._number[part], self._count[part] = rows.number[nodes], rows.count[nodes]
         is_merged = (self._count[part] > 0) | (self._number[part] >= self.leaves)
@@ -236,9 +218,9 @@ class VoxelTree:
             index: (given,) which of the splats each node that was given is.
             given: splats, as they are drawn.
         """
-        self._rows = tops
+        self.rows = tops
         self.write(np.arange(len(tops), dtype=np.uint32))
-        self._rows = NodeRows.empty(0)
+        self.rows = NodeRows.empty(0)
         total, part = self.total, slice(len(self._weight) - self.total, None)
         weight, number, count = self._weight[part], self._number[part], self._count[part]
         inner = np.flatnonzero(count).astype(np.uint32)
@@ -282,25 +264,6 @@ class Final:
     tree: LodTree
     number: NDArray[np.uint32]
     parents: NDArray[np.uint32]
-
-
-def sorted_leaves(
-    center: FloatArray, scale: FloatArray, grid: VoxelGrid, threads: int, order: Nodes | None = None
-) -> tuple[Nodes, Offsets]:
-    """Return the splats by level and then along a curve, and where each level ends.
-
-    Args:
-        center, scale: (n, 3) of the splats.
-        order: (n,) the splats in the order of the scene; by default they are in it.
-    """
-    keys, levels, bits = grid.leaf_keys(center, scale)
-    ends = np.cumsum(np.bincount(levels))
-    del levels
-    if order is None:
-        order = np.arange(len(center), dtype=np.uint32)
-    else:
-        keys = keys[order]
-    return sort_by_key(keys, order, bits, threads)[1], ends
 
 
 def joining(index: Nodes, ends: Offsets, fill: FillRows) -> dict[int, Joining]:
