@@ -126,12 +126,7 @@ def _extras() -> Iterator[Check]:
         missing = any(package.missing for package in packages)
         purpose = f"   # {PURPOSES[extra]}" if extra in PURPOSES else ""
         advice = f"{install_hint(extra)}{purpose}" if missing else ""
-        yield Check(
-            f"extra {extra}",
-            "note" if missing else "ok",
-            ", ".join(f"{package.name} {package.state}" for package in packages),
-            advice,
-        )
+        yield _optional(f"extra {extra}", ", ".join(f"{each.name} {each.state}" for each in packages), advice)
 
 
 # What is compiled, and what it runs on
@@ -174,22 +169,21 @@ def _kernels() -> Iterator[Check]:
         compiled = wanted - about["missing"]
         value = f"{compiled} of {wanted} kernels are compiled, {_megabytes(_size_of(Path(folder)))} in {folder}"
         advice = "sparklod warmup   # compiles the others now, instead of when they are first used"
-        yield Check("kernel cache", "note" if about["missing"] else "ok", value, advice if about["missing"] else "")
+        yield _optional("kernel cache", value, advice if about["missing"] else "")
         old = [path for path in Path(folder).parent.glob("kernels-*") if path != Path(folder)]
         if old:
             value = f"{len(old)} of other versions of sparklod, {_megabytes(sum(map(_size_of, old)))}"
             advice = f"delete the other kernels-* in {Path(folder).parent}, unless those versions are still used"
-            yield Check("old caches", "note", value, advice)
+            yield _optional("old caches", value, advice)
 
 
 def _processors() -> Iterator[Check]:
     usable, quota = processors(), machine.processor_quota()
-    value = f"{usable} of {os.cpu_count() or usable} can be used"
-    if quota is None or quota >= usable:
-        yield Check("processors", "ok", value)
-    else:
+    value, advice = f"{usable} of {os.cpu_count() or usable} can be used", ""
+    if quota is not None and quota < usable:
+        value += f", for the time of {quota:g}: a limit of the container"
         advice = f"--threads {max(1, round(quota))}, since more threads get no more time"
-        yield Check("processors", "note", f"{value}, for the time of {quota:g}: a limit of the container", advice)
+    yield _optional("processors", value, advice)
 
 
 def _memory() -> Iterator[Check]:
@@ -197,10 +191,8 @@ def _memory() -> Iterator[Check]:
     if total is None or available is None:
         yield Check("memory", "ok", "this system does not say" if total is None else f"{total / 1e9:.1f} GB")
         return
-    little = available < LITTLE_MEMORY
-    advice = "free some: a bake takes about three times the size of its PLY file" if little else ""
-    value = f"{available / 1e9:.1f} of {total / 1e9:.1f} GB are available"
-    yield Check("memory", "note" if little else "ok", value, advice)
+    advice = "free some: a bake takes about three times the size of its PLY file" if available < LITTLE_MEMORY else ""
+    yield _optional("memory", f"{available / 1e9:.1f} of {total / 1e9:.1f} GB are available", advice)
 
 
 # What draws
@@ -214,12 +206,9 @@ def _opengl() -> Iterator[Check]:
 
     reasons = {kind: probe(kind) for kind in PACKAGES}
     value = ", ".join(f"{kind} draws" if not reason else f"{kind}: {reason}" for kind, reason in reasons.items())
-    if all(reasons.values()):
-        packages = " or ".join(PACKAGES.values())
-        advice = f"on Debian and Ubuntu: apt install {packages}   # render --backend osmesa draws with it"
-        yield Check("OpenGL", "note", value, advice)
-    else:
-        yield Check("OpenGL", "ok", value)
+    packages = " or ".join(PACKAGES.values())
+    advice = f"on Debian and Ubuntu: apt install {packages}   # render --backend osmesa draws with it"
+    yield _optional("OpenGL", value, advice if all(reasons.values()) else "")
 
 
 def _open3d() -> Iterator[Check]:
@@ -238,7 +227,7 @@ def _open3d() -> Iterator[Check]:
     except (IndexError, ValueError):
         reason = f"it has crashed: {_last_line(err, code)}"
     advice = f"on Debian and Ubuntu: apt install {PACKAGES}   # render --backend open3d draws with it" if reason else ""
-    yield Check("Open3D", "note" if reason else "ok", reason or "draws", advice)
+    yield _optional("Open3D", reason or "draws", advice)
 
 
 def _card() -> Iterator[Check]:
@@ -246,13 +235,10 @@ def _card() -> Iterator[Check]:
         has_driver = shutil.which("nvidia-smi") is not None
         advice = install_hint("cuda") if has_driver else ""
         value = "not tried without numba-cuda" if has_driver else "none: no driver is installed"
-        yield Check("NVIDIA card", "note" if has_driver else "ok", value, advice)
+        yield _optional("NVIDIA card", value, advice)
         return
     code, out, err = _run(program_command(CARD))
-    if code:
-        yield Check("NVIDIA card", "note", _last_line(err, code))
-    else:
-        yield Check("NVIDIA card", "ok", out.strip())
+    yield Check("NVIDIA card", "note" if code else "ok", _last_line(err, code) if code else out.strip())
 
 
 def _ffmpeg() -> Iterator[Check]:
@@ -260,7 +246,7 @@ def _ffmpeg() -> Iterator[Check]:
         code, out, err = _run(program_command(FFMPEG))
         value = _last_line(err, code) if code else out.strip()
         advice = "install ffmpeg, or set IMAGEIO_FFMPEG_EXE to it   # .mp4 animations take it" if code else ""
-        yield Check("ffmpeg", "note" if code else "ok", value, advice)
+        yield _optional("ffmpeg", value, advice)
 
 
 # What only the tests take
@@ -271,13 +257,16 @@ def _programs() -> Iterator[Check]:
         advice = f"on Debian and Ubuntu: apt install {packages}   # only sparklod's own tests take it"
         program = shutil.which(command)
         if program is None:
-            yield Check(name, "note", "is not installed", advice)
+            yield _optional(name, "is not installed", advice)
             continue
         code, out, err = _run([program, "--version"])
-        if code:
-            yield Check(name, "note", f"{program} does not run: {_last_line(err, code)}", advice)
-        else:
-            yield Check(name, "ok", f"{_last_line(out, code)}, {program}")
+        value = f"{program} does not run: {_last_line(err, code)}" if code else f"{_last_line(out, code)}, {program}"
+        yield _optional(name, value, advice if code else "")
+
+
+def _optional(name: str, value: str, advice: str) -> Check:
+    """Return the check of something optional, a note if there is advice."""
+    return Check(name, "note" if advice else "ok", value, advice)
 
 
 def _is_installed(package: str) -> bool:

@@ -40,7 +40,6 @@ class Unit(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Return "module.function", for display."""
         return stem_of(self.kernel.py_func)
 
     @property
@@ -263,7 +262,6 @@ class CompileAhead:
             self._thread.join()
 
     def _taken(self) -> Iterator[list[Unit]]:
-        """Yield the next kernel, after the previous one is compiled."""
         while True:
             with self._changed:
                 self._current = self._left.pop() if self._left else None

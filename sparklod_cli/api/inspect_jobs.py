@@ -133,7 +133,6 @@ def inspect_file(path: Path, settings: InspectSettings) -> Inspected:
 
 
 def _checked(report: Report, scene: Scene | None, settings: InspectSettings) -> Report:
-    """Return a report whose findings include expectations that are not met."""
     expected, original = settings.expected, settings.original
     if report.format is None or not (settings.everything or expected is not None or original is not None):
         return report
@@ -149,7 +148,6 @@ def _checked(report: Report, scene: Scene | None, settings: InspectSettings) -> 
 def _picture(
     report: Report, scene: Scene | None, settings: InspectSettings
 ) -> tuple[DescribedPicture | None, str | None]:
-    """Return the requested picture, or the reason why there is none."""
     if (settings.plot is None and settings.html is None) or report.format is None:
         return None, None
     if scene is None:

@@ -81,7 +81,6 @@ def report_baked(console: Console, source: Place, target: Place, baked: Baked) -
 
 
 def _report_tree(console: Console, baked: Baked, refine: Refined | None) -> None:
-    """Print how a tree or its cut was fitted, which splats were left out, and the notes."""
     from ..model.selection import describe
 
     if refine is not None:
@@ -108,7 +107,6 @@ def _contents(baked: Baked) -> str:
 
 
 def _refined(refined: Refined) -> str:
-    """Return a phrase on the PSNR of cuts before and after the fitting, on held-out cameras."""
     gains = [
         f"{percent_of(share)} {before:.2f} -> {refined.psnr_after[share]:.2f}"
         for share, before in refined.psnr_before.items()
@@ -209,7 +207,6 @@ def report_simplified(console: Console, source: Source, target: Place, baked: Ba
 
 
 def _report_losses(console: Console, losses: Extracted | WrittenSet, splats: int, form: str) -> None:
-    """Print what a format without a tree does not hold."""
     lines = ["holds no reflections (SH)"] if losses.drops_sh else []
     lines += [
         f"clamps the {COLUMNS[column]} of {percent_of(count / splats)} of the splats"

@@ -501,7 +501,6 @@ class OptionalNumber(click.IntRange):
 
 
 def _numbers(text: str, names: str = "x,y,z") -> tuple[float, ...]:
-    """Parse finite numbers with commas between."""
     count = names.count(",") + 1
     try:
         numbers = tuple(float(part) for part in text.split(","))

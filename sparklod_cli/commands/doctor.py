@@ -56,7 +56,6 @@ def doctor(ctx: click.Context, /, **_: Any) -> None:
 
 
 def _summary(checks: list[Check]) -> str:
-    """Return the sentence that a person looks for: whether baking works, and what else there is to read above."""
     problems = sum(check.state == "problem" for check in checks)
     notes = [check.name for check in checks if check.state == "note"]
     extras = [name.removeprefix(EXTRA) for name in notes if name.startswith(EXTRA)]
@@ -72,7 +71,6 @@ def _summary(checks: list[Check]) -> str:
 
 
 def _lines(checks: list[Check]) -> list[str]:
-    """Return a line for each check, in columns, and one below it with the advice."""
     width = max((len(check.name) for check in checks), default=0)
     lines = []
     for check in checks:

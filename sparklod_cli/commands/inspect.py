@@ -256,7 +256,6 @@ def inspect(ctx: click.Context, /, **_: Any) -> None:
 def _report_settings(
     checks: Checks, output: InspectOutput, expected: Expectations | None, *, as_json: bool
 ) -> ReportSettings:
-    """Return settings of a report that has all that is printed and checked."""
     from ..inspection.report import HEADER_FIELDS, ReportSettings
 
     field = output.field or ""
@@ -290,7 +289,6 @@ class _Job:
     sections: list[FileSection] = dataclasses.field(default_factory=list)
 
     def inspect(self, file: Path) -> int:
-        """Print the report of a file and return its exit status; one too large for memory does not stop the others."""
         from ..api.inspect_jobs import inspect_file
 
         start, name = time.perf_counter(), name_of(file)
@@ -335,7 +333,6 @@ class _Job:
         return status
 
     def _print_chunks(self, name: str, report: Report) -> int:
-        """Print the table of the chunks, or its path, and return the exit status."""
         from ..inspection.chunks import lines as lines_of_chunks
 
         if report.chunks is None:
@@ -429,12 +426,16 @@ def _rad(rad: dict[str, Any]) -> Iterator[str]:
     header, first = format_size(rad["header_bytes"]), format_size(rad["first_bytes"])
     yield from rows("stored", f"{where}, header {header}, with the first chunk {first}")
     if rad["chunk_bytes"]:
-        least, median, most = (format_size(rad["chunk_bytes"][name]) for name in ("min", "median", "max"))
-        yield from rows("chunks", f"{least} to {most}, median {median}, of {rad['chunk_size']:,} splats")
+        yield from rows("chunks", f"{_sizes(rad['chunk_bytes'])}, of {rad['chunk_size']:,} splats")
     if rad["palette"]:
         yield from rows("palette", count_of(rad["palette"], "entry", "entries") + " of SH")
     if rad["ranges"]:
-        yield from rows("ranges", ", ".join(f"{name} {_ranged(value)}" for name, value in rad["ranges"].items()))
+        texts = {True: "on", False: "off"}
+        ranges = (
+            f"{name} {texts[value] if isinstance(value, bool) else f'{value:g}'}"
+            for name, value in rad["ranges"].items()
+        )
+        yield from rows("ranges", ", ".join(ranges))
     if rad["properties"]:
         yield from rows("properties", f"{'encoding':<12} {'bytes':>13} {'share':>7}  range")
     for name, found in rad["properties"].items():
@@ -451,9 +452,8 @@ def _streamed_sog(streamed: dict[str, Any]) -> Iterator[str]:
     around = " and the environment" if streamed["environment"] else ""
     yield from rows("stored", f"manifest {manifest}, with the coarsest level{around} {first}")
     if streamed["file_bytes"]:
-        least, median, most = (format_size(streamed["file_bytes"][name]) for name in ("min", "median", "max"))
         count = count_of(streamed["files"], "chunk file")
-        yield from rows("files", f"{count} of {least} to {most}, median {median}")
+        yield from rows("files", f"{count} of {_sizes(streamed['file_bytes'])}")
     splats, edge = streamed["region_splats"], streamed["region_edge"]
     regions = count_of(streamed["regions"], "region")
     yield from rows("regions", f"{regions} in a tree of depth {streamed['depth']}")
@@ -483,8 +483,7 @@ def _tiles(tiles: dict[str, Any]) -> Iterator[str]:
     nested = f" and {tiles['tilesets'] - 1:,} nested" if tiles["tilesets"] > 1 else ""
     yield from rows("stored", f"tileset.json{nested} {tileset}, with the root tile {first}")
     if tiles["file_bytes"]:
-        least, median, most = (format_size(tiles["file_bytes"][name]) for name in ("min", "median", "max"))
-        yield from rows("files", f"{count_of(tiles['tiles'], 'tile')} of {least} to {most}, median {median}")
+        yield from rows("files", f"{count_of(tiles['tiles'], 'tile')} of {_sizes(tiles['file_bytes'])}")
     splats = tiles["tile_splats"]
     yield from rows("", f"{splats['min']:,.0f} to {splats['max']:,.0f} splats each, median {splats['p50']:,.0f}")
     if tiles["geometric_error"] is not None:
@@ -504,8 +503,8 @@ def _tiles(tiles: dict[str, Any]) -> Iterator[str]:
         yield from rows("written by", tiles["generator"])
 
 
-def _ranged(value: float | bool) -> str:
-    return f"{value:g}" if not isinstance(value, bool) else "on" if value else "off"
+def _sizes(sizes: dict[str, int]) -> str:
+    return f"{format_size(sizes['min'])} to {format_size(sizes['max'])}, median {format_size(sizes['median'])}"
 
 
 def _tree(tree: dict[str, Any]) -> Iterator[str]:

@@ -38,11 +38,11 @@ class _NamedPath(click.Path):
 
     _to_do = ""
 
-    def __init__(self, *, folder: bool = False, suffixes: Sequence[str] = (), addresses: bool = False) -> None:
+    def __init__(
+        self, *, folder: bool = False, suffixes: Sequence[str] = (), addresses: bool = False, stdin: bool = False
+    ) -> None:
         super().__init__(path_type=Path, file_okay=not folder, readable=False)
-        self.folder = folder
-        self.suffixes = suffixes
-        self.addresses = addresses
+        self.folder, self.suffixes, self.addresses, self.stdin = folder, suffixes, addresses, stdin
         self.unit = "DIR" if folder else "FILE"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
@@ -64,10 +64,6 @@ class InputPath(_NamedPath):
     """
 
     _to_do = "download it first"
-
-    def __init__(self, *, stdin: bool = False, addresses: bool = False) -> None:
-        super().__init__(addresses=addresses)
-        self.stdin = stdin
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         path = super().convert(value, param, ctx)

@@ -163,7 +163,6 @@ def fit_planes(ctx: click.Context) -> bool:
 
 
 def _output(ctx: click.Context, options: RenderOptions, cameras: int) -> PictureOutput:
-    """Return the output of the pictures of some cameras."""
     assert options.inputs.first is not None  # or there would be no instances
     return options.pictures.place(
         ctx, options.inputs.first, cameras, sheet=options.pictures.sheet or len(options.cameras.views) > 1
@@ -203,7 +202,6 @@ def _place(
 
 
 def _report(console: Console, drawn: DrawnPath, seconds: float, *, as_json: bool) -> None:
-    """Print a line on the pictures, with `as_json` an object too, and a warning if nothing is visible."""
     written, output, settings = drawn.pictures, drawn.output, drawn.render
     if not any(frame["splats"] for frame in written.frames):
         console.say("warning: the picture is empty, for the first chunk has not arrived yet (--after)")
@@ -289,7 +287,6 @@ def _compare(ctx: click.Context, options: RenderOptions) -> int:
 
 
 def _table(options: RenderOptions) -> TableOutput:
-    """Return the output of the table: none if only the summary is printed, to a terminal or as JSON."""
     from ..tables.comparison import COLUMNS
     from ..tables.output import TableOutput
 

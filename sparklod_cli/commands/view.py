@@ -151,7 +151,6 @@ def view(ctx: click.Context, /, **_: Any) -> None:
 
 
 def _serve(console: Console, server: Server, *, opens: bool, as_json: bool) -> None:
-    """Serve until an interrupt, which is how a server ends."""
     with server, contextlib.suppress(KeyboardInterrupt):
         if as_json:
             print_json({"url": server.url, "files": _files(server.site)})

@@ -235,7 +235,6 @@ def plot(rows: Iterable[Row], marked: Mapping[str, int], title: str, scene: Path
 
 
 def _about(frames: Sequence[Row]) -> str:
-    """Frames, duration, image size and budget of the path, in a line."""
     said = [f"{len(frames):,} frame" + ("" if len(frames) == 1 else "s")]
     times = numbers(frames, "time_s")
     if len(set(times)) > 1:
@@ -392,7 +391,6 @@ def _above(cameras: Sequence[Camera], low: Points, high: Points, size: tuple[int
 
 
 def _path_lines(cameras: Sequence[Camera], way: Points, frame: int | None, extent: float) -> list[tuple[Points, str]]:
-    """Return the ends of the lines of the path and of its frusta, and their colours."""
     steps = np.unique([*evenly(len(way), MOST_STEPS), len(way) - 1])
     path = np.repeat(way[steps], 2, axis=0)[1:-1]
     frusta = [frustum_lines(cameras[at], LENGTH * extent) for at in evenly(len(cameras), MOST_FRUSTA)]

@@ -205,7 +205,6 @@ def _of_blocks(
     surveyed: HeaderScan | None,
     threads: int,
 ) -> Report:
-    """Return the report on a file that can be read, block by block."""
     about = blocks.about
     degree = about.splats.sh_degree
     ends, size = value_checks.ends_of(about.header), about.header.get("bytes", size)
@@ -264,7 +263,6 @@ def _of_blocks(
 
 
 def _report(path: Path, head: Head | None, surveyed: HeaderScan | None) -> Report:
-    """Return the report that headers alone give."""
     assert head is not None
     size, count = head.bytes, head.splats
     decoded = 4 * count * width_of(head.sh_degree)

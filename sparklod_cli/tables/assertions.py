@@ -228,7 +228,6 @@ def parse(text: str, columns: Sequence[Column]) -> Assertion:
 
 
 def _column(text: str, left: str, columns: Sequence[Column]) -> tuple[Column, str]:
-    """Return the column and the statistic on the left side; the statistic may be empty."""
     every = {column.name: column for column in columns}
     fitting = [
         name for name in every if left == name or (left.startswith(f"{name}_") and is_statistic(left[len(name) + 1 :]))
@@ -242,7 +241,6 @@ def _column(text: str, left: str, columns: Sequence[Column]) -> tuple[Column, st
 
 
 def _unknown(left: str, columns: Sequence[Column]) -> str:
-    """Return the error about a name that is neither a column nor a column with a statistic."""
     numeric = [column.name for column in columns if column.kind is not str]
     stem, _, last = left.rpartition("_")
     name = stem if stem and is_statistic(last) else left

@@ -187,7 +187,6 @@ class Handler(BaseHTTPRequestHandler):
         return False
 
     def _is_of_our_page(self) -> bool:
-        """Whether a request was sent by our own page, according to the browser."""
         origin, site = self.headers.get("Origin"), self.headers.get("Sec-Fetch-Site", "same-origin")
         own = origin is None or origin.lower() == f"http://{self.headers.get('Host', '').lower()}"
         return own and site == "same-origin" and self.headers.get("Content-Type") == "application/json"

@@ -169,7 +169,6 @@ class OpenGLRenderer:
         on_gl_thread(self._compile, precision)
 
     def draw(self, splats: ShadedSplats, camera: Camera, raster: RasterSettings) -> Image:
-        """Draw a frame; see the function `draw`."""
         return on_gl_thread(self._draw, splats, camera, raster)
 
     def _compile(self, precision: str) -> None:
