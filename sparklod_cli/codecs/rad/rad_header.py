@@ -10,14 +10,13 @@ import dataclasses
 import functools
 import itertools
 import json
-import math
 import struct
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, BinaryIO
 
 from ...system.errors import FormatError, NotSplatsError, PromiseError, TruncatedError, VersionError
-from ...system.untrusted import parse_json, quoted_value
+from ...system.untrusted import Json, Origin, quoted_value
 from ..file_names import RAD_SUFFIX, rad_chunk_name
 from ..file_notes import FileNote, read_comment
 from ..splat_encoding import SplatEncoding
@@ -169,78 +168,6 @@ class RadChunkHeader:
     padded_with_zeros: bool = True
 
 
-@dataclass(frozen=True)
-class JsonFields:
-    """Object of untrusted JSON, whose values are checked when they are read.
-
-    Attributes:
-        values: the object.
-        subject: what the object describes, for errors.
-
-    Raises:
-        FormatError: here it is something else than an object; in every method, a value is not of the kind.
-    """
-
-    values: Any
-    subject: str
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.values, dict):
-            raise FormatError(f"its {self.subject} is not a JSON object")
-
-    def has(self, key: str) -> bool:
-        """Return True if there is such a key, with a value other than null."""
-        return self.values.get(key) is not None
-
-    def whole(self, key: str, default: int | None = None) -> int:
-        """Return a whole number that is not negative."""
-        return int(self._get(key, "a whole number of 0 or more", _is_whole, default))
-
-    def number_or_none(self, key: str) -> float | None:
-        """Return a finite number, or None without the key."""
-        return None if not self.has(key) else float(self._get(key, "a finite number", _is_finite))
-
-    def flag(self, key: str) -> bool:
-        """Return True or False; false without the key."""
-        return bool(self._get(key, "true or false", lambda value: isinstance(value, bool), default=False))
-
-    def text(self, key: str) -> str:
-        """Return a text."""
-        return str(self._get(key, "a text", lambda value: isinstance(value, str)))
-
-    def text_or_none(self, key: str) -> str | None:
-        """Return a text, or None without the key."""
-        return self.text(key) if self.has(key) else None
-
-    def inner(self, key: str) -> JsonFields:
-        """Return an object."""
-        return JsonFields(self.values.get(key), f"{self.subject}'s {key}")
-
-    def items(self, key: str) -> Iterator[JsonFields]:
-        """Return the objects of a list."""
-        values = self._get(key, "a list", lambda value: isinstance(value, list))
-        return (JsonFields(value, f"{self.subject}'s {key}[{number}]") for number, value in enumerate(values))
-
-    def _get(self, key: str, kind: str, is_valid: Callable[[Any], bool], default: Any = None) -> Any:
-        """Return a valid value, or the default, if there is one, without the key."""
-        value = self.values.get(key)
-        if value is None and default is not None:
-            return default
-        if is_valid(value):
-            return value
-        if key not in self.values:
-            raise FormatError(f"its {self.subject} has no {key}")
-        raise FormatError(f"its {self.subject} has {key} = {quoted_value(value)}, which is not {kind}")
-
-
-def _is_whole(value: Any) -> bool:
-    return type(value) is int and value >= 0
-
-
-def _is_finite(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
-
-
 def padding(size: int) -> int:
     """Return how many zeros follow `size` bytes."""
     return -size % ALIGNMENT
@@ -257,19 +184,19 @@ def read_header(file: BinaryIO) -> RadHeader:
         raise NotSplatsError(f"a RAD file of {quoted_value(fields.text('type'))}, not of {TYPE}")
     count = fields.whole("count")
     chunks = tuple(
-        RadChunkEntry(entry.whole("offset"), entry.whole("bytes"), entry.text_or_none("filename"))
+        RadChunkEntry(entry.whole("offset"), entry.whole("bytes"), entry.optional("filename", Json.text))
         for entry in fields.items("chunks")
     )
     return RadHeader(
         count,
-        fields.whole("maxSh", 0),
-        fields.flag("lodTree"),
-        fields.whole("chunkSize", count),
+        fields.optional("maxSh", Json.whole, 0),
+        fields.optional("lodTree", Json.flag, False),
+        fields.optional("chunkSize", Json.whole, count),
         fields.whole("allChunkBytes"),
         chunks,
         _encoding(fields),
-        fields.whole("shCodeCount") if fields.has("shCodeCount") else None,
-        fields.text_or_none("comment"),
+        fields.optional("shCodeCount", Json.whole),
+        fields.optional("comment", Json.text),
         size,
         zeros,
     )
@@ -287,9 +214,9 @@ def read_chunk_header(file: BinaryIO) -> RadChunkHeader:
             entry.whole("bytes"),
             entry.text("property"),
             entry.text("encoding"),
-            entry.text_or_none("compression"),
-            entry.number_or_none("min"),
-            entry.number_or_none("max"),
+            entry.optional("compression", Json.text),
+            entry.optional("min", Json.number),
+            entry.optional("max", Json.number),
         )
         for entry in fields.items("properties")
     )
@@ -297,8 +224,8 @@ def read_chunk_header(file: BinaryIO) -> RadChunkHeader:
         fields.whole("base"),
         fields.whole("count"),
         fields.whole("payloadBytes"),
-        fields.whole("maxSh", 0),
-        fields.flag("lodTree"),
+        fields.optional("maxSh", Json.whole, 0),
+        fields.optional("lodTree", Json.flag, False),
         properties,
         _encoding(fields),
         PAYLOAD.unpack(stored)[0],
@@ -366,7 +293,7 @@ def _encoding_fields(encoding: SplatEncoding | None) -> dict[str, float | bool] 
     return None if encoding is None else {key: getattr(encoding, name) for key, name in ENCODING_KEYS.items()}
 
 
-def _read_json(file: BinaryIO, magic: bytes, limit: int, subject: str) -> tuple[JsonFields, int, bool]:
+def _read_json(file: BinaryIO, magic: bytes, limit: int, subject: str) -> tuple[Json, int, bool]:
     """Read the JSON after a magic word, how many bytes it takes with its padding, and whether that is zeros."""
     prefix = file.read(PREFIX.size)
     if len(prefix) < PREFIX.size:
@@ -382,25 +309,21 @@ def _read_json(file: BinaryIO, magic: bytes, limit: int, subject: str) -> tuple[
     pad = file.read(padding(length))
     if len(data) < length or len(pad) < padding(length):
         raise TruncatedError(f"cut short inside the {subject}")
-    try:
-        value = parse_json(data)
-    except ValueError as error:
-        raise FormatError(f"its {subject} is not JSON: {error}") from None
-    fields = JsonFields(value, subject)
+    fields = Json.parse(data, Origin(f"its {subject}", FormatError))
     if fields.whole("version") != VERSION:
         raise VersionError(f"RAD version {fields.whole('version')} is unknown, only {VERSION} is read")
     return fields, PREFIX.size + length + len(pad), not any(pad)
 
 
-def _encoding(fields: JsonFields) -> SplatEncoding | None:
+def _encoding(fields: Json) -> SplatEncoding | None:
     """Return the ranges of the codes, where the header has them; what it leaves out is Spark's default."""
     if not fields.has("splatEncoding"):
         return None
-    inner = fields.inner("splatEncoding")
-    given: dict[str, Any] = {}
-    for key, name in ENCODING_KEYS.items():
-        if inner.has(key):
-            given[name] = inner.flag(key) if name == "lod_opacity" else inner.number_or_none(key)
+    given: dict[str, Any] = {
+        ENCODING_KEYS[key]: value.flag() if key == "lodOpacity" else value.number()
+        for key, value in fields.entries("splatEncoding")
+        if key in ENCODING_KEYS
+    }
     try:
         return SplatEncoding(**given)
     except ValueError as error:

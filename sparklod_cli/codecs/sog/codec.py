@@ -12,20 +12,21 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...model.sh import COEFFICIENTS, width_of
 from ...model.splats import FloatArray, Splats
 from ...system.errors import FormatError, VersionError
 from ...system.progress import Progress
 from ...system.threads import for_blocks, ordered_map
-from ...system.untrusted import quoted_value
+from ...system.untrusted import Json, quoted_value
 from .. import quantize
 from ..compression import check_promise
 from ..file_notes import read_note
 from ..kernels import texels
 from ..reader import OpenFile, Positioned, Reader, Target
 from . import texel_codings as codings
-from .sog_container import Meta, Pixels, SogFiles
+from .sog_container import LARGEST, Pixels, SogFiles, has
 from .sog_writer import encode as encode
 from .sog_writer import encode_files as encode_files
 from .sog_writer import held as held
@@ -71,21 +72,21 @@ def open_content(source: OpenFile) -> Reader:
     """
     files = SogFiles(source.file, source.open_companion)
     meta = files.meta
-    version = meta.integer("version") if meta.has("version") else 1
+    version = meta.whole("version") if has(meta, "version") else 1
     if version not in (1, 2):
         raise VersionError(f"SOG version {version} is unknown, only 1 and 2 are read")
-    if version == 1 and meta.has("opacities"):
+    if version == 1 and has(meta, "opacities"):
         raise VersionError("SOG from before version 1, with separate opacities; only versions 1 and 2 are read")
-    count = meta.integer("count") if version == 2 else meta.integer("means", "shape", 0)
+    count = meta.whole("count") if version == 2 else meta.whole("means", "shape", 0)
     if not 0 < count <= MAX_SPLATS:
         raise FormatError(f"{count:,} splats, but a SOG holds 1 to {MAX_SPLATS:,}")
-    palette = SogPalette(files, version) if meta.has("shN") else None
+    palette = SogPalette(files, version) if has(meta, "shN") else None
     degree = COEFFICIENTS.index(palette.coefficients) if palette is not None else 0
     check_promise(count * 4 * width_of(degree), files.size)
     steps = _steps(meta, version, palette)
     lossy = ", ".join(map(quoted_value, files.lossy()))
     losses = (f"{LOSSY} ({lossy}), so that values are not those written; encode them without losses",) if lossy else ()
-    center_tables = codings.center_table(meta.numbers(3, "means", "mins"), meta.numbers(3, "means", "maxs"))
+    center_tables = codings.center_table(*_ends(meta, "means", 3))
 
     def in_order() -> list[Step]:
         """Return the steps, the largest first, so that no thread is left alone with it; SH labels need the palette."""
@@ -116,14 +117,14 @@ def open_content(source: OpenFile) -> Reader:
         rows = Target(target.splats)
         for_blocks(lambda part: _finish(center_tables, rows.rows(part)), len(target.splats), threads)
 
-    antialiased = version == 2 and (meta.root.get("antialias") is True or meta.root.get("model") == "antialiased")
+    antialiased = version == 2 and (meta.value.get("antialias") is True or meta.value.get("model") == "antialiased")
     header = {"version": version, "palette": palette.entries if palette is not None else 0, "bytes": files.size}
-    note = read_note(meta.root.get("asset"))
+    note = read_note(meta.value.get("asset"))
     form, notes = f"SOG {version}", note.problems + losses
     return Reader(count, degree, form, fill, antialiased, notes, header, note.up, concurrent=True)
 
 
-def _steps(meta: Meta, version: int, palette: SogPalette | None) -> list[Step]:
+def _steps(meta: Json, version: int, palette: SogPalette | None) -> list[Step]:
     scales = quantize.decode_log(_tables(meta, "scales", version, 3))
     colors = _tables(meta, "sh0", version, 4 if version == 1 else 3)
     byte = np.arange(256, dtype=np.uint8)
@@ -168,16 +169,25 @@ def _fill_sh(palette: SogPalette, splats: Splats, pixels: Pixels) -> str | None:
     return f"an SH label is beyond the {len(rows):,} entries of its palette" if largest >= len(rows) else None
 
 
-def _tables(meta: Meta, name: str, version: int, channels: int) -> FloatArray:
+def _tables(meta: Json, name: str, version: int, channels: int) -> FloatArray:
     """Return (channels, 256) float32 values of bytes: of a codebook in version 2, of ranges in version 1."""
     if version == 2:
         return np.tile(_codebook(meta, name), (channels, 1))
-    low, high = meta.numbers(channels, name, "mins"), meta.numbers(channels, name, "maxs")
-    return quantize.range_table(low, high, 256).astype(np.float32)
+    return quantize.range_table(*_ends(meta, name, channels), 256).astype(np.float32)
 
 
-def _codebook(meta: Meta, name: str) -> FloatArray:
-    return meta.numbers(256, name, "codebook", first_may_be_null=True).astype(np.float32)
+def _ends(meta: Json, name: str, channels: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    low, high = (meta.get(name, end).numbers(channels, most=LARGEST) for end in ("mins", "maxs"))
+    return np.array(low), np.array(high)
+
+
+def _codebook(meta: Json, name: str) -> FloatArray:
+    """Return (256,) values. An old writer left null for the first one, which the mean step extrapolates."""
+    book = meta.get(name, "codebook")
+    if isinstance(book.value, list) and len(book.value) == 256 and book.value[0] is None:
+        rest = [each.number(most=LARGEST) for each in list(book.items())[1:]]
+        return np.array([rest[0] + (rest[0] - rest[-1]) / 255, *rest], np.float32)
+    return np.array(book.numbers(256, most=LARGEST), np.float32)
 
 
 class SogPalette:
@@ -196,10 +206,10 @@ class SogPalette:
         self._files, self._lock = files, threading.Lock()
         self._values: FloatArray | None = None
         if version == 1:
-            low, high = files.meta.number("shN", "mins"), files.meta.number("shN", "maxs")
+            low, high = (files.meta.number("shN", end, most=LARGEST) for end in ("mins", "maxs"))
             self._book = quantize.range_table(low, high, 256).astype(np.float32)
             return
-        bands, count = files.meta.integer("shN", "bands"), files.meta.integer("shN", "count")
+        bands, count = files.meta.whole("shN", "bands"), files.meta.whole("shN", "count")
         if bands not in (1, 2, 3) or COEFFICIENTS[bands] != self.coefficients:
             raise FormatError(
                 f"its image of SH centroids has {self.coefficients} coefficients, not those of {bands} bands"

@@ -9,7 +9,7 @@ import struct
 import zipfile
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from typing import IO, Any, BinaryIO
+from typing import IO, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ from PIL.WebPImagePlugin import WebPImageFile
 
 from ...system.errors import FormatError, NotSplatsError
 from ...system.units import count_of
-from ...system.untrusted import parse_json, quoted_value
+from ...system.untrusted import Json, Origin, quoted_value
 from ..compression import check_promise
 from ..file_names import META, SOG_IMAGES
 from ..reader import OpenCompanion, size_of
@@ -150,93 +150,38 @@ MODE, UNIX = 0o100644 << 16, 3
 SPARE_FACTOR, SPARE_TEXELS = 4, 1 << 16
 
 
-class Meta:
-    """Values of a meta.json, which are checked when they are read; a sequence of keys leads to each."""
-
-    def __init__(self, data: bytes) -> None:
-        try:
-            self.root = parse_json(data)
-        except ValueError as error:
-            raise FormatError(f"{META} is not JSON: {error}") from None
-        if not isinstance(self.root, dict) or self.root.keys().isdisjoint(("means", "quats")):
-            raise NotSplatsError(f"its {META} is not that of a SOG")
-
-    def has(self, key: str) -> bool:
-        """Return True if there is such a key at the top level, with a value that is not null, false, "" or empty."""
-        value = self.root.get(key)
-        return bool(value) or type(value) is int
-
-    def _get(self, *way: str | int) -> Any:
-        value = self.root
-        try:
-            for key in way:
-                value = value[key]
-        except (KeyError, IndexError, TypeError):
-            raise FormatError(f"{META} has no {_spell(way)}") from None
-        return value
-
-    def integer(self, *way: str | int) -> int:
-        """Return a whole number."""
-        value = self._get(*way)
-        if type(value) is not int:
-            raise FormatError(f"{_spell(way)} of {META} is not a whole number")
-        return value
-
-    def number(self, *way: str | int) -> float:
-        """Return a finite number."""
-        return _finite(self._get(*way), way)
-
-    def numbers(self, count: int, *way: str | int, first_may_be_null: bool = False) -> NDArray[np.float64]:
-        """Return (count,) finite numbers.
-
-        Args:
-            first_may_be_null: the first number may be null, as an old writer left it in codebooks; it is extrapolated
-                by the mean step.
-        """
-        values = self._get(*way)
-        if not isinstance(values, list) or len(values) != count:
-            raise FormatError(f"{_spell(way)} of {META} is not a list of {count} numbers")
-        if first_may_be_null and values[0] is None:
-            rest = [_finite(value, way) for value in values[1:]]
-            values = [rest[0] + (rest[0] - rest[-1]) / (count - 1), *rest]
-        return np.array([_finite(value, way) for value in values])
-
-    def name(self, *way: str | int) -> str:
-        """Return a text."""
-        value = self._get(*way)
-        if not isinstance(value, str):
-            raise FormatError(f"{_spell(way)} of {META} is not the name of a file")
-        return value
+#: Largest magnitude of a number in meta.json, so that float32 holds what is computed from it.
+LARGEST = 1e38
 
 
-def _spell(way: tuple[str | int, ...]) -> str:
-    return ".".join(map(str, way))
-
-
-def _finite(value: Any, way: tuple[str | int, ...]) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < 1e38:
-        raise FormatError(f"{_spell(way)} of {META} has {str(value)[:20]!r}, which is not a finite number")
-    return float(value)
-
-
-def image_names(data: bytes) -> list[str]:
-    """Return the images of a scene that a meta.json names, texture by texture.
+def parse_meta(data: bytes) -> Json:
+    """Parse a meta.json.
 
     Raises:
-        FormatError: it lacks one.
+        FormatError: it is not JSON, or not that of a SOG.
     """
-    return _image_names(Meta(data))
+    meta = Json.parse(data, Origin(META, FormatError), most=MAX_META)
+    if not isinstance(meta.value, dict) or meta.value.keys().isdisjoint(("means", "quats")):
+        raise NotSplatsError(f"its {META} is not that of a SOG")
+    return meta
 
 
-def _image_names(meta: Meta) -> list[str]:
-    images = {texture: len(files) for texture, files in SOG_IMAGES.items() if texture != "shN" or meta.has("shN")}
-    return [meta.name(texture, "files", index) for texture, count in images.items() for index in range(count)]
+def has(meta: Json, key: str) -> bool:
+    """Return True if a meta.json has a key with a value that is not null, false, "" or empty, as viewers test it."""
+    value = meta.value.get(key)
+    return bool(value) or type(value) is int
+
+
+def image_names(meta: Json) -> list[str]:
+    """Return the images of a scene that a meta.json names, texture by texture; `FormatError` if it lacks one."""
+    images = {texture: len(files) for texture, files in SOG_IMAGES.items() if texture != "shN" or has(meta, "shN")}
+    return [meta.text(texture, "files", index) for texture, count in images.items() for index in range(count)]
 
 
 def companion_names(data: bytes) -> list[str]:
     """Return all files that a meta.json names, images or not, as far as it can be parsed; otherwise none."""
     try:
-        root = Meta(data).root
+        root = parse_meta(data).value
     except FormatError:
         return []
     lists = (value.get("files") for value in root.values() if isinstance(value, dict))
@@ -259,11 +204,8 @@ class SogFiles:
         if self._archive is not None and self._archive.first != META:
             raise NotSplatsError(f"a zip archive with {self._archive.first}, not a SOG")
         self._companion = open_companion
-        data = (self._archive.open(META) if self._archive else file).read(MAX_META + 1)
-        if len(data) > MAX_META:
-            raise FormatError(f"{META} has more than {MAX_META:,} bytes, too many for a SOG")
-        self.meta = Meta(data)
-        self._sizes = {} if self._archive else {name: self._companion_size(name) for name in _image_names(self.meta)}
+        self.meta = parse_meta((self._archive.open(META) if self._archive else file).read(MAX_META + 1))
+        self._sizes = {} if self._archive else {name: self._companion_size(name) for name in image_names(self.meta)}
         self.size += sum(self._sizes.values())
 
     def _open_companion(self, name: str) -> BinaryIO:
@@ -287,7 +229,7 @@ class SogFiles:
 
     def sides(self, texture: str, index: int, most: int) -> tuple[int, int]:
         """Return the width and height in the header of an image; `FormatError` if it has more than `most` texels."""
-        with self._opened(self.meta.name(texture, "files", index), most) as (header, _):
+        with self._opened(self.meta.text(texture, "files", index), most) as (header, _):
             return header.width, header.height
 
     def pixels(self, texture: str, index: int, count: int) -> Pixels:
@@ -296,7 +238,7 @@ class SogFiles:
         Raises:
             FormatError: it is corrupt, or has fewer, or far more.
         """
-        name = self.meta.name(texture, "files", index)
+        name = self.meta.text(texture, "files", index)
         with self._opened(name, SPARE_FACTOR * count + SPARE_TEXELS) as (header, file):
             total = header.width * header.height
             if total < count:
@@ -305,7 +247,7 @@ class SogFiles:
 
     def lossy(self) -> list[str]:
         """Return the names of the images that are compressed with losses, as far as their headers can be read."""
-        return [name for name in _image_names(self.meta) if self._is_lossy(name)]
+        return [name for name in image_names(self.meta) if self._is_lossy(name)]
 
     def _is_lossy(self, name: str) -> bool:
         try:
@@ -316,7 +258,7 @@ class SogFiles:
 
     def bytes_of(self, texture: str, index: int) -> int:
         """Return the bytes of an image, as they are stored."""
-        name = self.meta.name(texture, "files", index)
+        name = self.meta.text(texture, "files", index)
         return self._archive.bytes_of(name) if self._archive else self._sizes[name]
 
 

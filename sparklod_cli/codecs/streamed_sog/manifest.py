@@ -9,16 +9,16 @@ from __future__ import annotations
 import decimal
 import functools
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from ...system.errors import VersionError
-from ...system.untrusted import quoted_value
+from ...system.untrusted import Json, quoted_value
 from .. import quantize
 from ..file_names import MANIFEST
 from ..file_notes import FileNote, read_note
-from ..json_trees import nodes_of, parse_manifest, place_of, wrong
+from ..json_trees import nodes_of, parse_manifest, place_of
 
 #: The version that is read and written. A manifest from before versions has none.
 VERSION = 1
@@ -125,49 +125,40 @@ def parse(data: bytes) -> Manifest:
         FormatError: it is not JSON, or lacks what reading needs; names the value and its place.
     """
     root = parse_manifest(data, MANIFEST, MAX_MANIFEST)
-    version = root.get("version")
+    version = root.value.get("version")
     if version is not None and (type(version) is not int or version != VERSION):
         raise VersionError(f"Streamed SOG version {quoted_value(version)} is unknown, only {VERSION} is read")
-    levels = _integer(root.get("lodLevels"), "lodLevels", 1, MAX_LEVELS)
-    filenames = root.get("filenames")
-    if not isinstance(filenames, list) or not all(isinstance(name, str) for name in filenames):
-        raise wrong(MANIFEST, "filenames", filenames, "a list of paths")
-    environment = root.get("environment") or None  # viewers test for truth, and some writers leave "" where none is
-    if environment is not None and not isinstance(environment, str):
-        raise wrong(MANIFEST, "environment", environment, "a path")
+    levels = root.whole("lodLevels", least=1, most=MAX_LEVELS)
+    filenames = tuple(name.text() for name in root.items("filenames"))
+    # Viewers test for truth, and some writers leave "" where there is no environment.
+    environment = root.text("environment") if root.value.get("environment") else None
     nodes = _nodes(root.get("tree"), levels, len(filenames))
-    head = {key: value for key, value in root.items() if key not in ("lodLevels", "filenames", "environment", "tree")}
-    return Manifest(levels, tuple(filenames), nodes, environment, head)
+    beside = ("lodLevels", "filenames", "environment", "tree")
+    head = {key: value.value for key, value in root.entries() if key not in beside}
+    return Manifest(levels, filenames, nodes, environment, head)
 
 
-def _nodes(tree: Any, levels: int, files: int) -> tuple[ManifestNode, ...]:
+def _nodes(tree: Json, levels: int, files: int) -> tuple[ManifestNode, ...]:
     """Return the nodes of a tree, however deep, root first and depth first."""
     keys = {str(level): level for level in range(levels)}
-    rows, too_many = [], f"the tree of {MANIFEST} has more than {MAX_NODES:,} nodes"
-    for value, parent, children, place in nodes_of(tree, "tree", MANIFEST, "a node", MAX_NODES, too_many):
-        lods = value.get("lods")
-        runs = _runs(lods, keys, files, place) if lods or lods == {} else None
-        rows.append((_bound(value.get("bound")), children, runs, value.get("errors"), parent))
+    rows = []
+    for node, parent, children in nodes_of(tree, MAX_NODES):
+        lods = node.get("lods")
+        runs = _runs(lods, keys, files) if lods.value or lods.value == {} else None
+        rows.append((_bound(node.value.get("bound")), children, runs, node.value.get("errors"), parent))
     return tuple(
         ManifestNode(bound, tuple(children), runs, errors, parent) for bound, children, runs, errors, parent in rows
     )
 
 
-def _runs(lods: Any, keys: Mapping[str, int], files: int, place: Callable[[], str]) -> dict[int, Run]:
+def _runs(lods: Json, keys: Mapping[str, int], files: int) -> dict[int, Run]:
     """Return the runs of a region by detail level; `keys` has the levels by their names."""
-    if not isinstance(lods, dict):
-        raise wrong(MANIFEST, f"{place()}.lods", lods, "an object of runs")
     runs = dict[int, Run]()
-    for key, value in lods.items():
+    for key, run in lods.entries():
         if key not in keys:
-            raise wrong(MANIFEST, f"{place()}.lods", key, f"of the levels 0 to {len(keys) - 1}")
-        if not isinstance(value, dict):
-            raise wrong(MANIFEST, f"{place()}.lods.{key}", value, "a run")
-        for name, most in (("file", files - 1), ("offset", MAX_RUN), ("count", MAX_RUN)):
-            number = value.get(name)
-            if type(number) is not int or not 0 <= number <= most:
-                raise wrong(MANIFEST, f"{place()}.lods.{key}.{name}", number, f"a whole number from 0 to {most:,}")
-        runs[keys[key]] = Run(value["file"], value["offset"], value["count"])
+            raise run.error(f"there is no such level, only 0 to {len(keys) - 1}")
+        offset, count = run.whole("offset", most=MAX_RUN), run.whole("count", most=MAX_RUN)
+        runs[keys[key]] = Run(run.whole("file", most=files - 1), offset, count)
     return runs
 
 
@@ -182,12 +173,6 @@ def _bound(value: Any) -> Bound | None:
         return None
     a, b, c, d, e, f = map(float, numbers)
     return (a, b, c), (d, e, f)
-
-
-def _integer(value: Any, place: str, least: int, most: int) -> int:
-    if type(value) is not int or not least <= value <= most:
-        raise wrong(MANIFEST, place, value, f"a whole number from {least} to {most:,}")
-    return value
 
 
 def serialise(manifest: Manifest) -> bytes:

@@ -23,7 +23,7 @@ from ..reader import OpenCompanion
 from ..scene_files import Chunk, SceneFiles
 from ..sog import codec as sog
 from ..sog import texel_codings
-from ..sog.sog_container import MAX_META, image_names
+from ..sog.sog_container import MAX_META, image_names, parse_meta
 from ..validation import RuleViolation, count_outside
 from ..zip_folder import ZIP
 from .manifest import MAX_MANIFEST, Bound, Manifest, ManifestNode, Run, parse
@@ -283,7 +283,7 @@ def files_of_chunk(open_companion: OpenCompanion, name: str) -> list[str]:
         data = file.read(MAX_META + 1)
     if data.startswith(ZIP):
         return [name]
-    return [name, *(posixpath.join(posixpath.dirname(name), image) for image in image_names(data))]
+    return [name, *(posixpath.join(posixpath.dirname(name), image) for image in image_names(parse_meta(data)))]
 
 
 def scan_files(

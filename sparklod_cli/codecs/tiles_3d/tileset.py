@@ -13,10 +13,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ...system.errors import FormatError, VersionError
-from ...system.untrusted import quoted_value
+from ...system.untrusted import Json, quoted_value
 from ..file_names import TILESET
 from ..file_notes import FileNote, read_note
-from ..json_trees import nodes_of, parse_manifest, place_of, wrong
+from ..json_trees import nodes_of, parse_manifest, place_of
 from ..reader import OpenCompanion
 from ..validation import error_of
 
@@ -123,28 +123,22 @@ def parse(data: bytes, file: str = "") -> Tileset:
     """
     called = quoted_value(file) if file else TILESET
     root = parse_manifest(data, called, MAX_TILESET)
-    asset = root.get("asset")
-    if not isinstance(asset, dict):
-        raise FormatError(f"{called} has no asset, which must be an object with a version")
-    if asset.get("version") not in (VERSION, OLD_VERSION):
-        text = f"3D Tiles version {quoted_value(asset.get('version'))} is unknown, only {OLD_VERSION} and {VERSION}"
+    version = root.get("asset", "version").value
+    if version not in (VERSION, OLD_VERSION):
+        text = f"3D Tiles version {quoted_value(version)} is unknown, only {OLD_VERSION} and {VERSION}"
         raise VersionError(f"{text} are read")
-    tiles = _tiles(root.get("root"), called, file)
-    head = {key: value for key, value in root.items() if key != "root"}
+    tiles = _tiles(root.get("root"), file)
+    head = {key: value.value for key, value in root.entries() if key != "root"}
     return Tileset(head, tiles, {file: head}, len(data))
 
 
-def _tiles(root: Any, called: str, file: str) -> tuple[TileRecord, ...]:
+def _tiles(root: Json, file: str) -> tuple[TileRecord, ...]:
     """Return the tiles of a file, root first and depth first."""
-    rows, too_many = [], f"{called} has more than {MAX_TILES:,} tiles"
-    for value, parent, children, place in nodes_of(root, "root", called, "a tile", MAX_TILES, too_many):
-        content = value.get("content")
-        if content is not None and not isinstance(content, dict):
-            raise wrong(called, f"{place()}.content", content, "an object")
-        uri = None if content is None else content.get("uri")
-        if content is not None and not isinstance(uri, str):
-            raise wrong(called, f"{place()}.content.uri", uri, "a path")
-        rows.append(({key: each for key, each in value.items() if key != "children"}, uri, children, parent))
+    rows = []
+    for tile, parent, children in nodes_of(root, MAX_TILES):
+        record = {key: value for key, value in tile.value.items() if key != "children" and value is not None}
+        uri = tile.text("content", "uri") if "content" in record else None
+        rows.append((record, uri, children, parent))
     return tuple(TileRecord(record, uri, tuple(children), parent, file) for record, uri, children, parent in rows)
 
 
