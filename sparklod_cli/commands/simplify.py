@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,8 +18,9 @@ from ..lod.budget import Budget, parse_budget
 from ..system import interrupts
 from ..system.addresses import Place
 from ..system.defaults import DETAIL_GROWTH
+from ..system.errors import FormatError
 from ..system.setting_fields import Quantity, Range, setting_of, whole
-from ..system.stdio import DASH
+from ..system.stdio import DASH, name_of
 from ..system.units import parse_size
 from .build_lod import SPZ, record_of, refuse_others
 from .build_lod_text import report_simplified
@@ -213,7 +216,7 @@ def simplify(ctx: click.Context, /, **_: Any) -> None:
         settings = options.settings(ctx)
         question_budgets(console, files.to)
         console.announce_compiling(settings)
-        with console.job(stage_shares(settings)):
+        with console.job(stage_shares(settings)), _naming_input(files):
             baked = bake(
                 files.source,
                 files.output,
@@ -231,6 +234,17 @@ def simplify(ctx: click.Context, /, **_: Any) -> None:
             console.clear()
             say("interrupted")
             ctx.exit(interrupts.INTERRUPTED)
+
+
+@contextlib.contextmanager
+def _naming_input(files: SimplifiedFiles) -> Iterator[None]:
+    """Name a single input in errors of the body about it; those about several name theirs."""
+    try:
+        yield
+    except FormatError as error:
+        if len(files.inputs) > 1:
+            raise
+        raise type(error)(f"{name_of(files.source)}: {error}") from None
 
 
 def _check(ctx: click.Context, files: SimplifiedFiles, *, as_json: bool) -> None:

@@ -196,3 +196,14 @@ def test_an_output_is_replaced_only_if_told(source: Path, tmp_path: Path, capsys
     assert simplify(source, "--to", "1%", "-o", target) == 1
     assert "exists, add --overwrite" in capsys.readouterr().err
     assert target.read_bytes() == b"precious"
+
+
+@pytest.mark.parametrize(("inputs", "named"), [(["cut.ply"], "cut.ply"), (["one.ply", "cut.ply"], "cut.ply")])
+def test_errors_name_the_input(inputs: list[str], named: str, tmp_path: Path, capsys: Capture) -> None:
+    data = (FIXTURES / "one.ply").read_bytes()
+    (tmp_path / "one.ply").write_bytes(data)
+    (tmp_path / "cut.ply").write_bytes(data[:50])
+    paths = [str(tmp_path / name) for name in inputs]
+    assert run(["simplify", *paths, "-o", str(tmp_path / "out.spz"), "--to", "1k"]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line == f"error: {tmp_path / named}: the PLY header does not end"
