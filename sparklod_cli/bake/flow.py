@@ -70,7 +70,7 @@ def bake(
             from .refining import fit_settings, refined
 
             fitting = fit_settings(settings)
-        overwrite = overwrite or has_published(source, target, settings, resources)  # its own output
+        overwrite = overwrite or (resources.resume and has_published(source, target, settings, resources))
         output, clock = output_of(target, settings, overwrite=overwrite, say=say), Clock()
         opened, blocks = contextlib.ExitStack(), None
         stack.enter_context(opened)
@@ -125,9 +125,7 @@ def bake(
 
 
 def has_published(source: Source, target: Place, settings: BakeSettings, resources: Resources) -> bool:
-    """Return whether a bake resumes one that was interrupted when all or part of its output may have been in place."""
-    if not resources.resume:
-        return False
+    """Return whether the bake to be resumed was interrupted when all or part of its output may have been in place."""
     from .out_of_core.job import PUBLISHED
     from .out_of_core.store import Store
 

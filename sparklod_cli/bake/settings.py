@@ -129,7 +129,7 @@ class Resources:
     Attributes:
         memory: bytes; None for `estimate.MEMORY_SHARE` of what is available.
         scratch_dir: folder for the scratch folder of a bake out of core; None for that of the output.
-        resume: go on with what an interrupted bake left there.
+        resume: continue an interrupted bake with its results there.
         block_splats: splats of a block, out of core; None for as many as the memory allows, at most
             `estimate.MOST_BLOCK_SPLATS`.
     """

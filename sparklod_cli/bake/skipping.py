@@ -43,7 +43,8 @@ def bake_unless_there(
         check_writable(target, overwrite=overwrite)  # before all inputs are read
     identity = BakeIdentity.of(source, settings, whole=True, former=None if verify else former)
     resources = how.get("resources") or Resources()
-    if target.exists() and not target.is_dir() and not has_published(source, target, settings, resources):
+    is_resumed = resources.resume and has_published(source, target, settings, resources)
+    if target.exists() and not target.is_dir() and not is_resumed:
         if former is None:
             differences = ["there is no record of its inputs and settings"]
         else:

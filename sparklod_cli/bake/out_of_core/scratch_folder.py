@@ -24,7 +24,7 @@ from .store import Store
 #: File that the running bake has locked.
 LOCK = "lock"
 
-#: Result with the identity of the bake, and its key.
+#: Result with the identity of the bake, and its one array.
 MANIFEST = "manifest"
 
 #: Version of the names and contents of results; a bake of another version cannot be resumed.
@@ -168,7 +168,7 @@ def _opened_lock(path: Path) -> int:
     folder = path.parent
     with contextlib.suppress(FileNotFoundError):
         if not path.exists() and any(folder.iterdir()):
-            raise ScratchError(f"{folder} is not a scratch folder ; move it, or choose another --scratch-dir")
+            raise ScratchError(f"{folder} is not a scratch folder; move it, or choose another --scratch-dir")
     while True:
         folder.mkdir(parents=True, exist_ok=True)
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_CLOEXEC", 0), 0o666)
