@@ -18,7 +18,7 @@ from ..system.errors import FormatError, SparklodError, memory_errors_translated
 from ..system.output import check_writable, write_file
 from ..system.progress import Progress
 from ..system.threads import on_threads
-from ..tables.output import TableOutput
+from ..tables.columns import TableOutput
 
 if TYPE_CHECKING:
     from ..figures.tree_plot import DescribedPicture

@@ -40,9 +40,8 @@ if TYPE_CHECKING:
     from ..simulation.streaming_settings import StreamingSettings
     from ..simulation.summary import Summary
     from ..tables.assertions import Assertion, Outcome
-    from ..tables.columns import Row
+    from ..tables.columns import Filter, Row, TableOutput
     from ..tables.comparison import BudgetSummary
-    from ..tables.output import Filter, TableOutput
 
 
 @dataclass(frozen=True)

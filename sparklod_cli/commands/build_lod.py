@@ -574,9 +574,8 @@ def _outcomes(
         written: dict[str, Any] = {"suffix": files.suffix, "options": options.write_options()}
         make = functools.partial(extract_leaves, **written, threads=threads, **shared)
         return (outcome(*pair) for pair in pairs)
-    from ..bake.flow import bake
+    from ..bake.flow import bake, stage_shares
     from ..bake.settings import Resources
-    from ..bake.stage_shares import stage_shares
 
     settings = options.bake_settings(ctx)
     console.announce_compiling(settings)

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from ..inspection.findings import Finding
     from ..inspection.html import FileSection
     from ..inspection.report import Report, ReportSettings
-    from ..tables.output import TableOutput
+    from ..tables.columns import TableOutput
 
 
 EXAMPLES = """\
@@ -153,7 +153,7 @@ class InspectOutput:
 
     def table(self) -> TableOutput | None:
         from ..inspection.chunks import COLUMNS
-        from ..tables.output import TableOutput
+        from ..tables.columns import TableOutput
 
         if self.chunks_out is None:
             return None

@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     from ..lod.settings import LodSettings
     from ..model.instances import Instance
     from ..scenes.loaded import Scenes
+    from ..tables.columns import TableOutput
     from ..tables.comparison import BudgetSummary
-    from ..tables.output import TableOutput
 
 
 EXAMPLES = """\
@@ -287,8 +287,8 @@ def _compare(ctx: click.Context, options: RenderOptions) -> int:
 
 
 def _table(options: RenderOptions) -> TableOutput:
+    from ..tables.columns import TableOutput
     from ..tables.comparison import COLUMNS
-    from ..tables.output import TableOutput
 
     output = options.pictures.output
     assert not isinstance(output, Folder)  # see `name_outputs`

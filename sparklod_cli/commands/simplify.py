@@ -209,9 +209,8 @@ def simplify(ctx: click.Context, /, **_: Any) -> None:
     files, general = options.files, options.general
     _check(ctx, files, as_json=general.as_json)
     with Console(quiet=general.quiet, verbose=general.verbose) as console:
-        from ..bake.flow import bake
+        from ..bake.flow import bake, stage_shares
         from ..bake.settings import Resources
-        from ..bake.stage_shares import stage_shares
 
         settings = options.settings(ctx)
         question_budgets(console, files.to)

@@ -111,7 +111,7 @@ class FrameTable:
     def outputs(self, *, as_json: bool) -> FrameOutputs:
         from ..simulation import columns
         from ..simulation.outputs import FrameOutputs
-        from ..tables.output import TableOutput
+        from ..tables.columns import TableOutput
 
         nowhere = self.output is None and (as_json or self.summary_on_stdout(as_json=as_json))
         table = TableOutput(

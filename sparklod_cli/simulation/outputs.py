@@ -12,7 +12,7 @@ import numpy as np
 
 from ..system.output import check_free, check_writable, write_file
 from ..system.progress import Progress, silent
-from ..tables.output import Filter, TableOutput
+from ..tables.columns import Filter, TableOutput
 from .summary import Lookout
 
 if TYPE_CHECKING:

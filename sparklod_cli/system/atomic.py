@@ -357,14 +357,15 @@ def publish(stage: Path, names: Collection[str], header: str, *, overwrite: bool
             such as a link. It has the path.
         OSError: the file system reported an error.
     """
-    folder, names = stage.parent, [*(name for name in names if name != header), header]
+    folder, written = stage.parent, {*names}
+    names = [*(name for name in names if name != header), header]
     folders = _folders_of(names)
     new = [each for each in folders if not os.path.lexists(folder / each)]
     try:
         for each in folders:
             if (folder / each).is_symlink() or ((folder / each).exists() and not (folder / each).is_dir()):
                 raise FileExistsError(errno.EEXIST, "is not a folder", str(folder / each))
-        gone = [name for name in outdated if name not in names] if overwrite else []
+        gone = [name for name in outdated if name not in written] if overwrite else []
         if overwrite:
             (stage / FORMER).mkdir()
             for name in (header, *names[:-1], *gone):

@@ -98,8 +98,8 @@ class Output:
         self.target = real_target(place)
         self._overwrite, self._may_end = overwrite, may_end
         self._stack = contextlib.ExitStack()
-        self._written, self._former = list[str](), list[str]()
-        self._folders = set[str]()
+        self._written, self._former = dict[str, None](), list[str]()
+        self._ours = {""}  # folders that may hold files
         self._stage: Path | None = None
         self._new: atomic.NewFile | None = None
         self._file: BinaryIO | None = None
@@ -125,11 +125,8 @@ class Output:
         if not self._written:
             self._begin(self.siblings)
         name = name if self.siblings.is_member(name) else self.target.name
-        folder, _, file = name.partition("/")
-        if file and folder not in self._folders:
-            self._check_folder(folder)
-            self._folders.add(folder)
-        self._written.append(name)
+        self._check_folder(name.rpartition("/")[0])
+        self._written[name] = None
         if isinstance(self.target, Address):
             return (self.target.parent / name).write(pieces)
         assert self._stage is not None
@@ -151,7 +148,7 @@ class Output:
         return self._new.file
 
     def _begin(self, siblings: Siblings) -> None:
-        self._former = siblings.former(self.target)
+        self._find_former(siblings)
         if isinstance(self.target, Address):
             check_free(self.target, overwrite=self._overwrite)
             self.target.unlink(missing_ok=True)
@@ -206,20 +203,25 @@ class Output:
             raise OutputError(f"{self.place} is a pipe or a device, which cannot take several files; name a file")
         if is_remote and self._overwrite and siblings.is_folder is None:
             return
-        existing, self._former = siblings.existing(self.target), siblings.former(self.target)
+        self._find_former(siblings)
+        existing = siblings.existing(self.target)
         if siblings.is_folder is not None:
             self._check_folder(siblings.first_folder)
-            for folder in {name.partition("/")[0] for name in existing if is_remote}:
-                self._check_folder(folder)  # all of them now: nothing can be undone there later
+            for name in existing if is_remote else ():
+                self._check_folder(name.rpartition("/")[0])  # all of them now: nothing can be undone there later
         else:
             for name in existing:
                 place = self.target.parent / name
                 if not self._overwrite or (isinstance(place, Path) and _is_no_file(place)):
                     raise _taken(place)
 
+    def _find_former(self, siblings: Siblings) -> None:
+        self._former = siblings.former(self.target)
+        self._ours = {"", *(name.rpartition("/")[0] for name in self._former)}
+
     def _check_folder(self, folder: str) -> None:
         """Raise `OutputError` where a folder is not empty, and not one of the former output."""
-        if any(name.startswith(f"{folder}/") for name in self._former):
+        if folder in self._ours:
             return
         place = self.target.parent / folder
         try:
@@ -235,6 +237,7 @@ class Output:
             raise OutputError(
                 f"{place} exists, and {self.target.name} there does not name it; move it away, or name another output"
             )
+        self._ours.add(folder)
 
 
 def write_file(place: Place, pieces: Iterable[bytes], *, overwrite: bool, may_end: bool = False) -> int:

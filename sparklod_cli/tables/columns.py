@@ -1,4 +1,4 @@
-"""`Column`, name, type, precision, unit and meaning of the cells of a table, and `Table`, rows of such cells."""
+"""Tables: columns with type, precision, unit and meaning, rows, and their destination, a file or standard output."""
 
 from __future__ import annotations
 
@@ -8,10 +8,13 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from html import escape
+from pathlib import Path
 from types import ModuleType
 from typing import Any, overload
 
 from ..system.optional import optional_import
+from ..system.output import check_writable, write_file
+from ..system.stdio import DASH
 
 #: The value of a cell; None for an empty one, such as the churn of the first frame.
 Cell = int | float | str | None
@@ -251,3 +254,52 @@ FORMS: dict[str, Callable[[Iterable[Row], Sequence[Column]], Iterator[bytes]]] =
     "json": _json,
     "parquet": _parquet,
 }
+
+
+#: Wraps the bytes of a table on their way to standard output.
+Filter = Callable[[Iterable[bytes]], Iterable[bytes]]
+
+
+@dataclass(frozen=True)
+class TableOutput:
+    """Destination of a table.
+
+    Attributes:
+        path: of its file; None for standard output, or for nowhere.
+        form: a key of `FORMS`; None for nowhere: rows are computed, but not written.
+    """
+
+    path: Path | None
+    form: str | None
+    columns: Sequence[Column]
+    overwrite: bool = False
+
+    @property
+    def on_stdout(self) -> bool:
+        """Whether the table goes to standard output."""
+        return self.path is None and self.form is not None
+
+    def check(self) -> None:
+        """Raise a `SparklodError` where the table cannot be written, before work goes into it."""
+        if self.path is not None:
+            check_writable(self.path, overwrite=self.overwrite)
+        if self.form == "parquet":
+            load_pyarrow()
+
+    def write(self, rows: Iterable[Row], *, passed: Filter | None = None) -> None:
+        """Compute all rows and write each at once.
+
+        Args:
+            passed: wraps the bytes on their way to standard output; None for none.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
+        if self.form is None:
+            for _ in rows:
+                pass
+            return
+        data: Iterable[bytes] = encode(iter(rows), self.columns, self.form)
+        if self.path is None and passed is not None:
+            data = passed(data)
+        write_file(self.path or DASH, data, overwrite=self.overwrite, may_end=self.form != "parquet")
