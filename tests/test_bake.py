@@ -21,7 +21,7 @@ from sparklod_cli.bake.flow import bake
 from sparklod_cli.bake.settings import BakeSettings
 from sparklod_cli.codecs import ply, spz
 from sparklod_cli.codecs.formats import ENCODINGS
-from sparklod_cli.codecs.options import RadOptions, WriteOptions
+from sparklod_cli.codecs.options import MAX_FRACTIONAL_BITS, TREE_SPZ_VERSIONS, RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import rad_options
 from sparklod_cli.codecs.splat_encoding import log_scale_table
 from sparklod_cli.inspection import leaves, values
@@ -35,7 +35,6 @@ from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.selection import Selection
 from sparklod_cli.model.sh import COEFFICIENTS
 from sparklod_cli.model.splats import Splats
-from sparklod_cli.system.defaults import MAX_FRACTIONAL_BITS, TREE_SPZ_VERSIONS
 from sparklod_cli.system.errors import InvalidSplatsError, SparklodError
 from sparklod_cli.tables import histograms
 from tests.conftest import FIXTURES, real_scene

@@ -6,8 +6,7 @@ import re
 from pathlib import Path
 
 from sparklod_cli.codecs.formats import ENCODINGS
-from sparklod_cli.lod.builders import METHODS
-from sparklod_cli.system.defaults import MAX_BASE, MAX_GROWTH, MIN_BASE, MIN_GROWTH
+from sparklod_cli.lod.builders import MAX_BASE, MAX_GROWTH, METHODS, MIN_BASE, MIN_GROWTH
 
 from .. import laws, scenes
 from ..case import Case, LawError, Rng

@@ -14,19 +14,20 @@ from ..cameras.camera import Camera
 from ..cameras.path import CameraPath
 from ..codecs.validation import check_valid
 from ..fitting.settings import STEPS, FitSettings
-from ..lod.builders import BUILDERS, METHODS
-from ..model.scene import Scene, Tree
-from ..model.selection import Selection
-from ..system.defaults import (
+from ..lod.builders import (
+    BUILDERS,
     DEFAULT_BASE,
     DEFAULT_GROWTH,
     DETAIL_GROWTH,
     MAX_BASE,
     MAX_GROWTH,
-    MAX_SH_DEGREE,
+    METHODS,
     MIN_BASE,
     MIN_GROWTH,
 )
+from ..model import MAX_SH_DEGREE
+from ..model.scene import Scene, Tree
+from ..model.selection import Selection
 from ..system.errors import FormatError, memory_errors_translated
 from ..system.progress import Progress
 from ..system.setting_fields import Range, whole

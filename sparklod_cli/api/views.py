@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..cameras import DEFAULT_SIZE, ELEVATION
 from ..cameras.camera import Camera
 from ..cameras.formats.table import FORMATS, Axes
 from ..cameras.frame import MAX_FRAMES, Settings, direction_of
@@ -19,7 +20,7 @@ from ..cameras.sources import Orbit, read_path, similarity
 from ..codecs.formats import PRECISIONS
 from ..images import metrics
 from ..lod import detail_rule
-from ..lod.settings import LodSettings
+from ..lod.settings import BLEND, LodSettings
 from ..model.instances import Instance, names_of
 from ..model.scene import DetailScene, Scene
 from ..render.rasterizer import Image
@@ -29,7 +30,6 @@ from ..scenes.finder import CutFinder, FixedCut
 from ..scenes.loaded import Cut, Scenes
 from ..scenes.loaded_scene import UNNAMED
 from ..scenes.reading import read_scenes
-from ..system.defaults import BLEND, ELEVATION
 from ..system.errors import CameraPathError, FormatError, memory_errors_translated
 from ..system.threads import on_threads, thread_count
 from ..tables.columns import Table
@@ -448,7 +448,7 @@ def orbit(
     elevation: float = ELEVATION,
     up: Point | None = None,
     fov_y: float = 60.0,
-    size: tuple[int, int] = (1280, 720),
+    size: tuple[int, int] = DEFAULT_SIZE,
 ) -> CameraPath:
     """Return cameras once around scenes, as `--orbit` makes them.
 

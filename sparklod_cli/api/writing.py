@@ -9,9 +9,9 @@ from types import NoneType
 from typing import TYPE_CHECKING
 
 from ..codecs.file_names import MANIFEST
+from ..codecs.options import DEFAULT_COMPRESSION
 from ..io import parts_output, scene_output, write_scene
 from ..model.scene import Scene
-from ..system.defaults import DEFAULT_COMPRESSION
 from ..system.errors import FormatError, InvalidSplatsError, memory_errors_translated
 from ..system.output import Output
 from ..system.threads import thread_count

@@ -12,15 +12,15 @@ from ..fitting.settings import FitSettings
 from ..io.reading import Merged as Merged
 from ..io.reading import Source as Source
 from ..lod.budget import Budget
-from ..lod.builders import METHODS
+from ..lod.builders import DEFAULT_BASE, DEFAULT_GROWTH, METHODS
 from ..lod.detail_rule import DetailSettings
 from ..lod.tile_settings import TileSettings
+from ..model import MAX_SH_DEGREE
 from ..model.axes import line, rotated
 from ..model.scene import Scene
 from ..model.selection import Selection
 from ..model.transforms import Transform
 from ..system.addresses import Place
-from ..system.defaults import DEFAULT_BASE, DEFAULT_GROWTH, MAX_SH_DEGREE
 
 #: Suffix of the format that is written unless another one is chosen.
 SPZ = ".spz"

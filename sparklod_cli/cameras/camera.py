@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..system.errors import CameraPathError
+from . import DEFAULT_SIZE
 
 Matrix = NDArray[np.float64]
 
@@ -43,7 +44,7 @@ class Camera:
         *,
         up: Sequence[float] = (0.0, -1.0, 0.0),
         fov_y: float = 60.0,
-        size: tuple[int, int] = (1280, 720),
+        size: tuple[int, int] = DEFAULT_SIZE,
         time: float = 0.0,
         name: str = "",
     ) -> Camera:

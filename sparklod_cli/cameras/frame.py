@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 
 from ..model.axes import ASSUMED, AXES
 from ..system.errors import TooManyCamerasError
+from . import DEFAULT_SIZE
 from .camera import Camera, Matrix
 from .formats.table import Axes
 
 #: x, y and z in world units, or of a direction.
 Point = tuple[float, float, float]
 
-#: Image size in pixels, vertical field of view in radians and frame rate where neither file nor user gives one.
-DEFAULT_SIZE = (1280, 720)
+#: Vertical field of view in radians and frame rate where neither file nor user gives one.
 DEFAULT_FOV_Y = math.radians(60)
 DEFAULT_FPS = 30.0
 

@@ -9,8 +9,8 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from ..model import FARTHEST
 from ..model.balls import Balls
-from ..system.defaults import FARTHEST
 from ..system.errors import InvalidSplatsError
 from .camera import Camera, Matrix
 

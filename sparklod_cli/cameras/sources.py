@@ -14,10 +14,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .. import io
-from ..system.defaults import ELEVATION
 from ..system.errors import CameraPathError, SparklodError
 from ..system.untrusted import Origin, parse_json
-from . import framing, generators
+from . import ELEVATION, framing, generators
 from .camera import Matrix
 from .formats.source import Files, Json, Parsed, finite
 from .formats.table import NAMES, Axes, PathFormat

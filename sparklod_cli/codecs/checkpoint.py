@@ -15,10 +15,10 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+from ..model import MAX_SH_DEGREE
 from ..model.gaussian import normalized_quat
 from ..model.sh import COEFFICIENTS, notes_on_degree
 from ..model.splats import FloatArray
-from ..system.defaults import MAX_SH_DEGREE
 from ..system.errors import FormatError, NotSplatsError, TruncatedError
 from ..system.progress import Progress
 from ..system.threads import blocks_of, ordered_map

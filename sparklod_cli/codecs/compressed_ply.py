@@ -8,9 +8,9 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from ..model import MAX_SH_DEGREE
 from ..model.sh import degree_of, notes_on_degree
 from ..model.splats import FloatArray
-from ..system.defaults import MAX_SH_DEGREE
 from ..system.errors import FormatError
 from ..system.progress import Progress
 from ..system.units import count_of

@@ -12,11 +12,11 @@ from typing import Any, BinaryIO, NamedTuple
 import zstandard
 from zlib_ng import zlib_ng
 
-from ..system.defaults import DEFAULT_COMPRESSION
 from ..system.errors import ChecksumError, FormatError, PromiseError, TooLongError
 from ..system.progress import Progress
 from ..system.threads import ordered_map
 from .inflate import COMMENTED_HEAD, PLAIN_HEAD
+from .options import DEFAULT_COMPRESSION
 
 #: Bytes of a block that one thread deflates by itself, and bytes that are read at a time. That blocks of
 #: this size refer to none before them costs 0.05 to 0.2 % of a file (docs/decisions/05-spz.md).

@@ -13,7 +13,6 @@ from importlib import import_module
 from pathlib import PurePath
 from typing import Any, BinaryIO, Literal, NamedTuple
 
-from ..system import defaults
 from ..system.printable import printable
 from ..system.untrusted import keys_of_object
 
@@ -162,7 +161,7 @@ ENCODINGS = {"packed": "packed_splats", "ext": "ext_splats", "lodtree": "lod_tre
 LOADED = ("ext", "packed", "packed-pages")
 
 #: Precisions of the nodes that cuts are found with: the file's, its half floats, and what Spark has in each layout.
-PRECISIONS = (*defaults.PRECISIONS, *LOADED)
+PRECISIONS = ("float32", "float16", *LOADED)
 
 #: Suffix of dumps with a header.
 NPZ = ".npz"

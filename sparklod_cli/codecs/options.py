@@ -5,21 +5,23 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from ..system.defaults import (
-    DEFAULT_COMPRESSION,
-    DEFAULT_SPZ_VERSION,
-    MAX_COMPRESSION,
-    MAX_FRACTIONAL_BITS,
-    MAX_SH_CODES,
-    MIN_COMPRESSION,
-    MIN_SH_CODES,
-    SPZ_VERSIONS,
-)
 from ..system.setting_fields import CheckedSettings, Quantity, setting, whole
 from .rad.rad_layout import AUTO, choices
 
 if TYPE_CHECKING:
     from .splat_encoding import SplatEncoding
+
+#: SPZ versions that can be written, those that hold trees, and the default; see docs/decisions/05-spz.md.
+SPZ_VERSIONS, TREE_SPZ_VERSIONS, DEFAULT_SPZ_VERSION = (2, 3, 4), (2, 3), 3
+
+#: Largest number of fractional bits of an SPZ position.
+MAX_FRACTIONAL_BITS = 24
+
+#: Deflate levels, and the default; measured in docs/decisions/05-spz.md.
+MIN_COMPRESSION, MAX_COMPRESSION, DEFAULT_COMPRESSION = 1, 9, 5
+
+#: Entries of a palette of spherical harmonics: Spark's labels have 16 bits.
+MIN_SH_CODES, MAX_SH_CODES = 2, 65_536
 
 
 #: Entries of a palette of spherical harmonics.

@@ -16,11 +16,11 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..model import MAX_SH_DEGREE
 from ..model.gaussian import normalized_quat
 from ..model.scene import Scene
 from ..model.sh import degree_of, notes_on_degree
 from ..model.splats import FloatArray, Splats
-from ..system.defaults import MAX_SH_DEGREE
 from ..system.errors import FormatError, NotSplatsError, TruncatedError
 from ..system.progress import Progress, silent
 from ..system.threads import blocks_of

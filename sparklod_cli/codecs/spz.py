@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from ..model.lod_tree import LodTree
 from ..model.scene import NodeStream, Scene
 from ..model.splats import COLUMNS, FloatArray, Splats
-from ..system.defaults import DEFAULT_SPZ_VERSION, MAX_FRACTIONAL_BITS, TREE_SPZ_VERSIONS
 from ..system.errors import FormatError
 from ..system.progress import Progress, silent
 from ..system.threads import blocks_of, ordered_map
@@ -26,7 +25,7 @@ from .clamps import CodeRange
 from .compression import DataRun
 from .encoder import Encoded, Encoder, Windows, results, windows_of
 from .file_notes import comment_of
-from .options import DEFAULTS, WriteOptions
+from .options import DEFAULT_SPZ_VERSION, DEFAULTS, MAX_FRACTIONAL_BITS, TREE_SPZ_VERSIONS, WriteOptions
 from .quantize import Bytes
 from .reader import OpenFile
 from .spz_streams import (

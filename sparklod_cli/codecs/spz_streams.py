@@ -16,12 +16,12 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..model import MAX_SH_DEGREE
 from ..model.gaussian import linear_opacity, lod_opacity
 from ..model.lod_tree import LodTree
 from ..model.scene import FileCoding, ScaleCoding
 from ..model.sh import COEFFICIENTS, notes_on_degree
 from ..model.splats import Splats
-from ..system.defaults import MAX_SH_DEGREE
 from ..system.errors import FormatError, MembersError, NotSplatsError, TruncatedError, VersionError
 from ..system.progress import Progress
 from ..system.threads import ordered_map

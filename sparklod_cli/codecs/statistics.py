@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..model import MAX_SH_DEGREE
 from ..model.scene import Scene
 from ..model.sh import COEFFICIENTS
 from ..model.splats import FloatArray, Splats
-from ..system.defaults import MAX_SH_DEGREE
 from ..system.threads import blocks_of, ordered_map
 from . import quantize
 

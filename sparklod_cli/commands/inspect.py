@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import click
 
-from ..system.defaults import MAX_SH_DEGREE, PLOT_BY
+from ..images.defaults import PLOT_BY
+from ..model import MAX_SH_DEGREE
 from ..system.errors import OutOfMemoryError, SparklodError, StdoutError
 from ..system.printable import MOST, printable, shortened
 from ..system.setting_fields import Quantity, Range, whole

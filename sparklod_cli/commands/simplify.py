@@ -15,9 +15,9 @@ from ..codecs.formats import WRITABLE, ending_of
 from ..codecs.options import SogOptions, WriteOptions
 from ..fitting.settings import STEPS, FitSettings
 from ..lod.budget import Budget, parse_budget
+from ..lod.builders import DETAIL_GROWTH
 from ..system import interrupts
 from ..system.addresses import Place
-from ..system.defaults import DETAIL_GROWTH
 from ..system.errors import FormatError
 from ..system.setting_fields import Quantity, Range, setting_of, whole
 from ..system.stdio import DASH, name_of

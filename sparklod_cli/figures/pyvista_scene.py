@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from ..images.pixels import FAINT, INK, LINE, font, write_scale, write_title
+from ..lod.builders import DEFAULT_BASE
 from ..model.gaussian import rotation_matrix
 from ..model.splats import FloatArray, Splats
 from ..render.color_scales import Coloring, ticks
-from ..system.defaults import DEFAULT_BASE
 from ..system.errors import SparklodError
 from ..system.optional import optional_import
 from ..system.python_process import program_command

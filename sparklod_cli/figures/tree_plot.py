@@ -8,7 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras.frame import direction_of
+from ..images.defaults import PLOT_BY
 from ..images.pixels import BACKGROUND
+from ..lod.builders import DEFAULT_BASE
 from ..lod.kernels.tree_links import find_depths
 from ..model.gaussian import lod_opacity, spark_size
 from ..model.lod_tree import CHUNK_NODES
@@ -30,7 +32,6 @@ from ..render.color_scales import (
     whole_numbers,
     with_ends,
 )
-from ..system.defaults import DEFAULT_BASE, PLOT_BY
 from ..system.errors import SparklodError
 from ..system.units import count_of
 from .pyvista_scene import (

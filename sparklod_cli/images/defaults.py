@@ -1,5 +1,9 @@
 """Formats and defaults of pictures. Imports nothing, so that `--help` stays fast."""
 
+#: Quantities by which `inspect` can colour a picture.
+PLOT_BY = ("level", "opacity", "size", "chunk")
+
+
 #: Formats of single pictures, of animations, and of contact sheets.
 STILL = ("png", "jpg", "webp", "npy")
 MOVING = ("webp", "gif", "mp4", "webm")

@@ -8,6 +8,15 @@ from typing import Any, NamedTuple
 
 from ..model.sh import COEFFICIENTS
 
+#: Ratio of the voxel sizes of successive levels in the quick builder.
+MIN_BASE, MAX_BASE, DEFAULT_BASE = 1.1, 2.0, 1.5
+
+#: Maximum ratio of nodes to leaves in the quality builder; 2 keeps every node of its binary tree.
+MIN_GROWTH, MAX_GROWTH, DEFAULT_GROWTH = 1.05, 2.0, 1.4
+
+#: Growth of the tree that the detail levels of a Streamed SOG are cut from: as it is not written, it keeps all nodes.
+DETAIL_GROWTH = MAX_GROWTH
+
 
 class SplatBytes(NamedTuple):
     """Bytes that a splat takes at the peak of a bake: without spherical harmonics, and for each of their coefficients.

@@ -26,9 +26,9 @@ from numpy.typing import NDArray
 from ..model.gaussian import spark_size
 from ..model.lod_tree import LodTree
 from ..model.splats import FloatArray, Splats
-from ..system.defaults import DEFAULT_GROWTH, MAX_GROWTH, MIN_GROWTH
 from ..system.progress import Progress, silent
 from ..system.threads import threads_for
+from .builders import DEFAULT_GROWTH, MAX_GROWTH, MIN_GROWTH
 from .check import Bounds, check, check_setting
 from .final_tree import FinalTree, PruningGoal, in_final_order
 from .kernels import pair_cost

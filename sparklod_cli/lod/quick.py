@@ -29,9 +29,9 @@ from numpy.typing import NDArray
 from ..model.gaussian import spark_size
 from ..model.lod_tree import LodTree
 from ..model.splats import COLUMNS, FloatArray, Splats
-from ..system.defaults import DEFAULT_BASE, MAX_BASE, MIN_BASE
 from ..system.progress import Progress, silent
 from ..system.threads import threads_for
+from .builders import DEFAULT_BASE, MAX_BASE, MIN_BASE
 from .check import Bounds, check, check_setting
 from .kernels.pair_cost import WIDTH
 from .kernels.sort import PART_BITS, Keys, Nodes, cell_words, sort_by_cell, sort_by_key

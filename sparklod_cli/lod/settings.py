@@ -6,9 +6,26 @@ import math
 from dataclasses import dataclass, field
 
 from ..model.foveation import SPARK, Foveation
-from ..system.defaults import PRESETS
 from ..system.setting_fields import CheckedSettings, Range, setting
 from .detail_rule import DetailRule
+
+#: Default splat budgets by device: those of Spark 2, then those of Spark's LoD design.
+PRESETS = {
+    "desktop": 2_500_000,
+    "ios": 1_500_000,
+    "android": 1_000_000,
+    "vision-pro": 750_000,
+    "quest": 500_000,
+    "preview-desktop": 1_500_000,
+    "mobile": 500_000,
+}
+
+#: Number of chunks that Spark fetches concurrently.
+FETCHERS = 3
+
+#: Width of the blending range of continuous cuts, as a ratio of pixel scales.
+BLEND = 1.25
+
 
 #: Factors that the traversal multiplies in float32.
 FACTOR = Range(0, 10**12)

@@ -10,6 +10,9 @@ from ..model.georeference import IDENTITY, Matrix16, placed
 from ..system.setting_fields import CheckedSettings, Quantity, Range, setting, whole
 from ..system.units import parse_count
 
+#: Requests under way at a time: CesiumJS's, to one server.
+FETCHERS = 18
+
 #: Least determinant of the axes of a transform, as a share of the product of their lengths: less is flat. Chosen.
 LEAST_VOLUME = 1e-6
 

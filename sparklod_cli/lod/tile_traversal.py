@@ -20,9 +20,6 @@ from ..model.tile_scene import TileScene
 from .tiles import PIXEL_ERROR
 from .traversal import CutView, SplatForest, TreeCut, TreeInstance, views_of
 
-#: Requests under way at a time: CesiumJS's, to one server.
-FETCHERS = 18
-
 #: Corners of a box, as shares of its extent.
 CORNERS = np.stack(np.meshgrid(*[(0.0, 1.0)] * 3, indexing="ij"), axis=-1).reshape(8, 3)
 

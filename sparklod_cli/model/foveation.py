@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ..system.defaults import BEHIND_FOVEATE, CONE_FOV, CONE_FOV0, CONE_FOVEATE
+#: Spark 2's foveation: full angles of its cones in degrees, weights at the outer one and behind the camera.
+CONE_FOV0, CONE_FOV, CONE_FOVEATE, BEHIND_FOVEATE = 90.0, 120.0, 0.4, 0.2
 
 
 @dataclass(frozen=True)

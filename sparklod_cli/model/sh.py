@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from ..system.defaults import MAX_SH_DEGREE
 from ..system.errors import FormatError
+from . import MAX_SH_DEGREE
 
 #: Y_00, the constant term of the real spherical harmonics: 1 / (2 * sqrt(pi)).
 SH_C0 = 0.28209479177387814

@@ -26,8 +26,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..system.defaults import UP_AXES
 from ..system.threads import blocks_of
+from . import UP_AXES
 from .gaussian import quat_of_rotation, rotation_matrices
 from .sh import COEFFICIENTS, SH_C1, SH_C2, SH_C3
 from .splats import FloatArray, Splats

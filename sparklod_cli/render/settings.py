@@ -7,13 +7,16 @@ from dataclasses import dataclass, field
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, cast
 
-from ..system.defaults import FARTHEST, MAX_SH_DEGREE, MAX_SUPERSAMPLE
+from ..model import FARTHEST, MAX_SH_DEGREE
 from ..system.setting_fields import CheckedSettings, Range, setting, whole
 from .devices import device_setting
 
 if TYPE_CHECKING:
     from ..cameras.camera import Camera
     from .rasterizer import Image, ShadedSplats
+
+#: Largest supersampling factor: samples per pixel along each axis.
+MAX_SUPERSAMPLE = 4
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..codecs.gpu import loaded_nodes, lod_tree
 from ..io.details import LevelFiles
-from ..lod import detail_rule, tile_traversal
+from ..lod import detail_rule, tile_settings
 from ..lod.detail_traversal import DetailFiles
 from ..model.lod_tree import CHUNK_NODES, LodTree, Nodes
 from ..model.scene import DetailScene, FileCoding, Scene, facts_of
@@ -214,7 +214,7 @@ class LoadedTiles(LoadedRuns):
         tiles: their boxes, errors and links.
     """
 
-    fetchers = tile_traversal.FETCHERS
+    fetchers = tile_settings.FETCHERS
 
     tiles: TileScene = field(kw_only=True)
 

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..system.defaults import FETCHERS
+from ..lod.settings import FETCHERS
 
 #: How many bytes Spark's pager asks for at first, then if they do not hold the whole header of a file.
 HEADER_REQUESTS = (64 << 10, 256 << 10, 1 << 20)

@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass, field
 from typing import ClassVar
 
-from ..lod import detail_rule
-from ..system.defaults import FETCHERS
+from ..lod import detail_rule, tile_settings
+from ..lod.settings import FETCHERS
 from ..system.setting_fields import CheckedSettings, Quantity, Range, setting, whole
 from ..system.units import parse_bandwidth, parse_time
 
@@ -35,7 +35,8 @@ class Network(CheckedSettings):
     )
     fetchers: int | None = setting(
         None,
-        f"Number of chunks that are fetched at a time.  [default: {FETCHERS}; {detail_rule.FETCHERS} of Streamed SOG]",
+        f"Number of chunks that are fetched at a time.  [default: {FETCHERS}; {detail_rule.FETCHERS} of Streamed SOG,"
+        f" {tile_settings.FETCHERS} of 3D Tiles]",
         whole(1, 1000),
         needs="bandwidth",
     )

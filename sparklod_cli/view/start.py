@@ -11,7 +11,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cameras import framing
+from ..cameras import DEFAULT_SIZE, ELEVATION, framing
 from ..cameras.camera import Camera, Matrix
 from ..cameras.frame import DEFAULT_FOV_Y, Settings
 from ..cameras.sources import SingleViews, WholeScene
@@ -24,16 +24,12 @@ from ..model.balls import Balls, balls_of
 from ..model.scene import DetailScene
 from ..model.splats import Splats
 from ..model.tile_scene import TileScene
-from ..system.defaults import ELEVATION
 from ..system.errors import InvalidSplatsError, SparklodError, UnreadableError, reason_of
 from ..system.progress import Progress, silent
 from .files import ShownFile
 
 #: x, y and z in world units.
 Point = tuple[float, float, float]
-
-#: Width and height of the picture that the first look is framed for; the page steps back where its window is narrower.
-FRAME = (1280, 720)
 
 #: Vertical field of view where none is given, degrees.
 FOV = round(math.degrees(DEFAULT_FOV_Y), 9)
@@ -187,7 +183,7 @@ def start_of(extents: Sequence[Extent], view: tuple[Point, Point] | None, up: Po
         CameraPathError: the camera makes no sense.
     """
     balls = Balls.concat(extent.balls for extent in extents)
-    settings = Settings(size=FRAME, fov_y=math.radians(fov), up=up)
+    settings = Settings(size=DEFAULT_SIZE, fov_y=math.radians(fov), up=up)
     try:
         middle, radius = framing.framing(balls.center)
     except InvalidSplatsError:  # nothing that could be framed

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 
 from sparklod_cli.bake import estimate
 from sparklod_cli.lod.builders import METHODS
+from sparklod_cli.model import MAX_SH_DEGREE
 from sparklod_cli.system import machine
-from sparklod_cli.system.defaults import MAX_SH_DEGREE
 from sparklod_cli.system.errors import OutOfMemoryError
 
 CASES = (st.sampled_from(METHODS), st.integers(1, 10**9), st.integers(0, MAX_SH_DEGREE))

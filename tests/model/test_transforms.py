@@ -13,12 +13,12 @@ from hypothesis import strategies as st
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.cameras.pose import look_at
 from sparklod_cli.images.metrics import psnr
+from sparklod_cli.model import UP_AXES
 from sparklod_cli.model.gaussian import covariance
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.model.transforms import LARGEST, ROWS, Transform, sh_basis, sh_rotations
 from sparklod_cli.render.rasterizer import Image, draw, shade
 from sparklod_cli.render.settings import RasterSettings
-from sparklod_cli.system.defaults import UP_AXES
 from tests.references.gaussians import covariance as reference_covariance
 from tests.references.gaussians import rotation_matrix
 from tests.references.spark_pictures import spherical_harmonics

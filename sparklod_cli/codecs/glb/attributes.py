@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from ...model import MAX_SH_DEGREE
 from ...model.gaussian import normalized_quat
 from ...model.sh import COEFFICIENTS, notes_on_degree
 from ...model.splats import FloatArray, Splats
-from ...system.defaults import MAX_SH_DEGREE
 from ...system.errors import FormatError
 from .. import quantize
 from ..left_out import left_out

@@ -11,11 +11,11 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from ...model import MAX_SH_DEGREE
 from ...model.lod_tree import LodTree
 from ...model.scene import FileCoding, ScaleCoding
 from ...model.sh import COEFFICIENTS, width_of
 from ...model.splats import COLUMNS, FloatArray, Splats
-from ...system.defaults import MAX_SH_DEGREE
 from ...system.errors import FormatError, TruncatedError
 from ...system.progress import Progress
 from ...system.threads import ordered_map

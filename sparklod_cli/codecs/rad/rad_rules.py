@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
 
+from ...model import MAX_SH_DEGREE
 from ...model.lod_tree import CHUNK_NODES
-from ...system.defaults import MAX_SH_DEGREE
 from ...system.untrusted import quoted_value
 from ..quantize import LARGEST
 from ..validation import RuleViolation

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from ...model import morton
 from ...model.scene import Scene
 from ...model.splats import FloatArray, Splats
-from ...system.defaults import MAX_SH_CODES
 from ...system.errors import FormatError
 from ...system.progress import Progress, silent
 from ...system.threads import blocks_of, ordered_map
@@ -25,7 +24,7 @@ from .. import quantize, sh_palette
 from ..clamps import CodeRange
 from ..file_names import META, SOG_IMAGES
 from ..file_notes import note_of
-from ..options import DEFAULTS, WriteOptions
+from ..options import DEFAULTS, MAX_SH_CODES, WriteOptions
 from . import texel_codings as codings
 from .sog_container import MAX_SIDE, Texels, encode_webp, image_of, size_for, zipped
 from .texel_codings import codebook, even_codebook, nearest

@@ -10,11 +10,21 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import click
 
-from ...codecs.options import SH_CODES
+from ...codecs.options import MAX_SH_CODES, SH_CODES
 from ...fitting.settings import STEPS, FitSettings
-from ...lod.builders import BUILDERS, METHODS
+from ...lod.builders import (
+    BUILDERS,
+    DEFAULT_BASE,
+    DEFAULT_GROWTH,
+    DETAIL_GROWTH,
+    MAX_BASE,
+    MAX_GROWTH,
+    METHODS,
+    MIN_BASE,
+    MIN_GROWTH,
+)
 from ...lod.detail_rule import DetailSettings
-from ...system import defaults
+from ...model import MAX_SH_DEGREE, UP_AXES
 from ...system.addresses import Place
 from ...system.setting_fields import Quantity, Range, setting_of, whole
 from ...system.units import parse_size
@@ -49,21 +59,21 @@ class TreeOptions:
     )
     max_sh: int = option(
         "Highest degree of spherical harmonics to keep.",
-        whole(0, defaults.MAX_SH_DEGREE),
-        defaults.MAX_SH_DEGREE,
+        whole(0, MAX_SH_DEGREE),
+        MAX_SH_DEGREE,
         heading=COMMON,
     )
     base: float = option(
         "Growth of the voxel grid from level to level, with --method quick. Smaller values give smoother transitions"
         " and more nodes.",
-        Range(defaults.MIN_BASE, defaults.MAX_BASE, unit="N"),
-        defaults.DEFAULT_BASE,
+        Range(MIN_BASE, MAX_BASE, unit="N"),
+        DEFAULT_BASE,
     )
     growth: float | None = option(
         "Largest number of nodes for each leaf, with --method quality."
-        f"  [default: {defaults.DEFAULT_GROWTH:g}; {defaults.DETAIL_GROWTH:g} with --format {STREAMED_SOG} or"
+        f"  [default: {DEFAULT_GROWTH:g}; {DETAIL_GROWTH:g} with --format {STREAMED_SOG} or"
         f" {TILES_3D}]",
-        Range(defaults.MIN_GROWTH, defaults.MAX_GROWTH, unit="N"),
+        Range(MIN_GROWTH, MAX_GROWTH, unit="N"),
     )
 
     def settings(self, *, only_cuts: bool) -> dict[str, Any]:
@@ -72,7 +82,7 @@ class TreeOptions:
         Args:
             only_cuts: the output has cuts of the tree, and not the tree.
         """
-        growth = defaults.DETAIL_GROWTH if only_cuts else defaults.DEFAULT_GROWTH
+        growth = DETAIL_GROWTH if only_cuts else DEFAULT_GROWTH
         return {
             "method": self.method or (METHOD_OF_DETAIL if only_cuts else METHOD),
             "base": self.base,
@@ -139,7 +149,7 @@ class TransformOptions:
     up: str | None = option(
         "Axis that is up in the input: turn it to +y, and note that in the output for render, traverse and view."
         " y turns nothing; scenes as trained are mostly -y.  [default: note what the file says, and turn nothing]",
-        defaults.UP_AXES,
+        UP_AXES,
         heading=COMMON,
     )
     rotate: tuple[float, ...] = option(
@@ -154,7 +164,7 @@ class TransformOptions:
         from ...model.transforms import Transform
 
         try:
-            up = self.up or defaults.UP_AXES[0]
+            up = self.up or UP_AXES[0]
             return Transform.from_parts(up=up, rotate=self.rotate, scale=self.scale, translate=self.translate)
         except ValueError as error:
             raise click.UsageError(str(error)) from None
@@ -170,9 +180,9 @@ class PaletteOptions:
         "Write spherical harmonics to RAD as a palette of at most N entries, 2 to 65,536, and a label for each splat:"
         " the file gets smaller, and reflections less exact. N is 65,536 if it is left out. SOG always has a palette;"
         " this chooses its size, which otherwise suits the number of splats.",
-        OptionalNumber(SH_CODES, example=defaults.MAX_SH_CODES),
+        OptionalNumber(SH_CODES, example=MAX_SH_CODES),
         is_flag=False,
-        flag_value=str(defaults.MAX_SH_CODES),
+        flag_value=str(MAX_SH_CODES),
     )
 
 

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import click
 
+from ...cameras import DEFAULT_SIZE, ELEVATION, ORBIT
 from ...cameras.formats.table import FORMATS, Axes
-from ...system.defaults import ELEVATION, ORBIT
 from ...system.errors import CameraPathError, TooManyCamerasError
 from ...system.setting_fields import Range, whole
 from ..command import COMMON, POINT, SIZE, VIEW, VIEWS, flag, flag_of, is_set, option, refuse
@@ -70,7 +70,7 @@ class Cameras:
     look_at: Any = option("Place one camera at EYE that looks at TARGET, each x,y,z.", VIEW, heading=COMMON)
     size: tuple[int, int] | None = option(
         "Width and height of the images, in pixels; the vertical field of view is kept."
-        "  [default: the file's, or 1280x720]",
+        f"  [default: the file's, or {DEFAULT_SIZE[0]}x{DEFAULT_SIZE[1]}]",
         SIZE,
         heading=COMMON,
     )

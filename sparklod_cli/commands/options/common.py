@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ...system.defaults import MAX_THREADS
 from ...system.setting_fields import whole
 from ..command import COMMON, DIRECTION, flag, option
 from ..console import Console, Verbosity
@@ -20,6 +19,9 @@ from ..paths import OutputPath, require_suffix
 if TYPE_CHECKING:
     from ...lod.budget import Budget
     from ...tables.assertions import Outcome
+
+#: Largest accepted number of threads.
+MAX_THREADS = 256
 
 
 def _note_verbosity(ctx: click.Context, param: click.Parameter, value: bool) -> bool:

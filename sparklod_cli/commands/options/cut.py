@@ -10,10 +10,9 @@ import click
 
 from ...codecs.formats import PRECISIONS
 from ...lod import detail_rule
-from ...lod.settings import FACTOR, LodSettings
-from ...model.foveation import Cones, Foveation, Frustum
+from ...lod.settings import BLEND, FACTOR, PRESETS, LodSettings
+from ...model.foveation import BEHIND_FOVEATE, CONE_FOV, CONE_FOV0, CONE_FOVEATE, Cones, Foveation, Frustum
 from ...simulation.streaming_settings import Network, StreamingSettings
-from ...system import defaults
 from ...system.printable import printable
 from ...system.setting_fields import Quantity, Range
 from ...system.units import check_grouping, parse_time
@@ -29,7 +28,7 @@ if TYPE_CHECKING:
     from ..render import RenderOptions
     from ..traverse import TraverseOptions
 
-#: A key of `defaults.PRESETS`.
+#: A key of `PRESETS`.
 DEFAULT_PRESET = "desktop"
 
 #: Options of the size on the screen, pixels, which 3D Tiles have, too.
@@ -112,26 +111,26 @@ class CutOptions:
     preset: str | None = option(
         "Budget of a device: Spark 2's, or that of Spark's LoD design with preview-desktop and mobile."
         f"  [default: {DEFAULT_PRESET}; for Streamed SOG PlayCanvas's, {detail_rule.BUDGET:,} splats]",
-        tuple(defaults.PRESETS),
+        tuple(PRESETS),
     )
     lod_splat_scale: float = option("Factor by which the budget is multiplied.", Range(above=0), 1.0)
     lod: LodSettings = field(default_factory=LodSettings)
     cone_fov0: float = option(
-        "Full angle of the inner foveation cone, in degrees: full priority inside it.", DEGREES, defaults.CONE_FOV0
+        "Full angle of the inner foveation cone, in degrees: full priority inside it.", DEGREES, CONE_FOV0
     )
     cone_fov: float = option(
         "Full angle of the outer cone, in degrees, where priority has fallen to --cone-foveate.",
         DEGREES,
-        defaults.CONE_FOV,
+        CONE_FOV,
     )
-    cone_foveate: float = option(f"Priority of nodes at the outer cone, {PRIORITY}.", FACTOR, defaults.CONE_FOVEATE)
+    cone_foveate: float = option(f"Priority of nodes at the outer cone, {PRIORITY}.", FACTOR, CONE_FOVEATE)
     outside_foveate: float | None = option(
         "Priority of nodes outside the frustum, in place of the cones, as in Spark's LoD design.",
         FACTOR,
         excludes=CONES,
     )
     behind_foveate: float | None = option(
-        f"Priority of nodes behind the camera.  [default: {defaults.BEHIND_FOVEATE:g}; 1 with --outside-foveate]",
+        f"Priority of nodes behind the camera.  [default: {BEHIND_FOVEATE:g}; 1 with --outside-foveate]",
         FACTOR,
     )
     precision: str = option(
@@ -156,7 +155,7 @@ class CutOptions:
         if self.budget:
             budget = self.budget[0]
         else:
-            count = defaults.PRESETS[self.preset or DEFAULT_PRESET]
+            count = PRESETS[self.preset or DEFAULT_PRESET]
             budget = replace(Budget.of_count(count), by_default=self.preset is None)
         scaled = budget.scaled(self.lod_splat_scale)
         if scaled.count is not None and not scaled.count * scaled.scale <= LARGEST:
@@ -172,7 +171,7 @@ class CutOptions:
         behind = self.behind_foveate
         if self.outside_foveate is not None:
             return Frustum(self.outside_foveate, 1.0 if behind is None else behind)
-        behind = defaults.BEHIND_FOVEATE if behind is None else behind
+        behind = BEHIND_FOVEATE if behind is None else behind
         return Cones(self.cone_fov0, self.cone_fov, self.cone_foveate, behind)
 
 
@@ -189,13 +188,13 @@ class PictureCut(CutOptions):
         " splats than the budget."
     )
     blend: float | None = option(
-        f"With --continuous: ratio of the pixel scales between which nodes blend.  [default: {defaults.BLEND:g}]",
+        f"With --continuous: ratio of the pixel scales between which nodes blend.  [default: {BLEND:g}]",
         Range(above=1),
         needs="continuous",
     )
 
     def settings(self) -> LodSettings:
-        width = (self.blend or defaults.BLEND) if self.continuous else None
+        width = (self.blend or BLEND) if self.continuous else None
         return replace(super().settings(), continuous=width)
 
 

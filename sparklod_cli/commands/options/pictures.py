@@ -12,9 +12,9 @@ import click
 
 from ...codecs.rounding import ROUND_TRIPS
 from ...images.defaults import JPEG_QUALITY, MOVING, STILL, THUMBNAIL_SIZE, THUMBNAIL_SUPERSAMPLE
+from ...model import MAX_SH_DEGREE
 from ...render.devices import uses_card
 from ...render.settings import SORTINGS, RenderSettings
-from ...system import defaults
 from ...system.setting_fields import Range, whole
 from ..command import COLOR, COMMON, flag, is_set, option, refuse
 from ..paths import Folder, InputPath, require_suffix, stem_of
@@ -150,8 +150,8 @@ class ComparisonOptions:
     plot: Path | None = plot_option("With --compare: draw charts of the table as a .png.", needs="compare")
     max_sh: int = option(
         "With --compare: highest degree of spherical harmonics to draw.",
-        whole(0, defaults.MAX_SH_DEGREE),
-        defaults.MAX_SH_DEGREE,
+        whole(0, MAX_SH_DEGREE),
+        MAX_SH_DEGREE,
         needs="compare",
     )
     diff: Path | None = option("Draw the difference from the picture of another file, and print its PSNR.", InputPath())
