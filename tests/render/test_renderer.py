@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from sparklod_cli.render.rasterizer import shade
-from sparklod_cli.render.renderer import DrawnPicture, Renderer
+from sparklod_cli.render.renderer import BILLBOARD_ALPHA, DrawnPicture, Renderer
 from sparklod_cli.render.settings import BACKENDS, COLOR_BY, STYLES, RasterSettings, RenderSettings
-from sparklod_cli.render.styles import BILLBOARD_ALPHA
 from sparklod_cli.scenes.finder import CutFinder
 from sparklod_cli.system.errors import SparklodError
 from tests.render.drawables import balls, camera, plain

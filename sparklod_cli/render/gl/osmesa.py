@@ -23,8 +23,7 @@ from ...system.optional import optional_import
 from ..rasterizer import Image, ShadedSplats, world_to_camera
 from ..settings import CLIP, RasterSettings
 from . import context as contexts
-from .shaders import sources
-from .texture import data_texture_of
+from .texture import data_texture_of, sources
 
 Indices = NDArray[np.uint32]
 
