@@ -1,4 +1,4 @@
-"""Reader's notes that name the data of a file that the reader leaves out."""
+"""Reader's notes on a scene, such as those that name the data of a file that the reader leaves out."""
 
 from __future__ import annotations
 
@@ -18,6 +18,25 @@ FAMILY = 3
 
 #: A name with a number at its end, of few enough digits to count with.
 _COUNTED = re.compile(r"(.*?)(0|[1-9][0-9]{0,8})", re.DOTALL)
+
+
+class Note(str):
+    """A note on a scene, with the code of the finding that `inspect` makes of it; None for no finding.
+
+    A plain text is a note on data that the reader leaves out.
+    """
+
+    code: str | None
+
+    def __new__(cls, text: str, code: str | None = None) -> Note:
+        note = super().__new__(cls, text)
+        note.code = code
+        return note
+
+
+def code_of(note: str) -> str | None:
+    """Return the code of the finding that a note is; None for no finding."""
+    return note.code if isinstance(note, Note) else "container.left-out"
 
 
 def left_out(noun: str, plural: str, names: Iterable[str]) -> tuple[str, ...]:

@@ -28,7 +28,7 @@ from ..system.untrusted import quoted
 from . import quantize
 from .clamps import CodeRange
 from .file_notes import comment_of, read_comment
-from .left_out import HARMLESS, left_out
+from .left_out import HARMLESS, Note, left_out
 from .options import DEFAULTS, WriteOptions
 from .ply_header import PlyHeader, first_value, offset_of, read_header
 from .reader import OpenFile, Positioned, Reader, Rows, Scratch, Target, decode_rows, encode_rows, rows_of, size_of
@@ -53,7 +53,7 @@ PLAIN_RGB = ("red", "green", "blue")
 #: Standard deviation, in world units, of the filter with which Mip-Splatting smooths each splat when it draws it, and
 #: which is in the scales and opacities of its "fused" files already. Facts: its scene/gaussian_model.py.
 FILTER = "filter_3D"
-FILTERED = f"the 3D filter of Mip-Splatting ({FILTER}) is applied to its scales and opacities"
+FILTERED = Note(f"the 3D filter of Mip-Splatting ({FILTER}) is applied to its scales and opacities")
 
 #: The element of Apple's SHARP whose value is 1 where colours are linear and 0 where they are sRGB.
 COLOR_SPACE = "color_space"

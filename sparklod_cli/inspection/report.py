@@ -8,10 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..codecs.ply import FILTERED
-from ..codecs.sog.codec import code_of
+from ..codecs.left_out import code_of
 from ..codecs.spz_streams import KNOWN_FLAGS
-from ..codecs.tiles_3d.codec import NOT_PLACED
 from ..io import opened, read_arrays, read_scene, size_of_input
 from ..io.rad_file import FORMAT as RAD
 from ..io.rad_file import RadFile
@@ -277,7 +275,7 @@ def _report(path: Path, head: Head | None, surveyed: HeaderScan | None) -> Repor
 
 def _container_findings(scene: Scene) -> list[Finding]:
     header = scene.header
-    findings = [Finding(code_of(note), note) for note in scene.notes if note not in (FILTERED, NOT_PLACED)]
+    findings = [Finding(code, note) for note in scene.notes if (code := code_of(note)) is not None]
     unknown = header.get("flags", 0) & ~KNOWN_FLAGS
     if unknown:
         findings.append(Finding("container.flags", f"the header sets flags {unknown:#04x}, which have no meaning"))

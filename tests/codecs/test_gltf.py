@@ -200,7 +200,7 @@ def test_a_glb_may_have_buffers_in_files() -> None:
         (gltf(uri="data:7"), FormatError, "holds 0"),
         (gltf().replace(b'"version": "2.0"', b'"version": "1.0"'), VersionError, "glTF version '1.0' is unknown"),
         (b"[" + gltf() + b"]", FormatError, "its JSON is no object"),
-        (gltf()[:-1], FormatError, "its JSON is broken"),
+        (gltf()[:-1], FormatError, "its content is not JSON"),
         (b'{"asset": {"version": "2.0"}, "meshes": []}', NotSplatsError, "a glTF without splats"),
     ],
 )

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from ...model.splats import FloatArray
 from ...system.errors import FormatError, TruncatedError, UnsupportedError, VersionError
-from ...system.untrusted import parse_json, quoted, quoted_value
+from ...system.untrusted import Json, Origin, quoted_value
 from ..json_trees import leads_away
 from ..reader import OpenFile, Positioned, size_of
 
@@ -198,10 +198,7 @@ class GltfFile:
         short = _DATA.sub(number_of, text)
         if len(short) > MAX_JSON:
             raise UnsupportedError(f"its JSON of {len(short):,} bytes is larger than the {MAX_JSON:,} that are read")
-        try:
-            return parse_json(short)
-        except ValueError as error:
-            raise FormatError(f"its JSON is broken: {quoted(error)}") from None
+        return Json.parse(short, Origin("its content", FormatError)).value
 
     @property
     def size(self) -> int:
@@ -221,12 +218,12 @@ class GltfFile:
             self._arrays[name] = found
         return self._arrays[name]
 
-    def item(self, name: str, index: Any) -> dict[str, Any]:
+    def item(self, name: str, index: Any) -> Json:
         """Return an object of an array of the JSON by its number."""
         found = self._array(name)
         if isinstance(index, bool) or not isinstance(index, int) or not 0 <= index < len(found):
             raise FormatError(f"there is no {quoted_value(index)} among the {len(found):,} {name} of its JSON")
-        return found[index]
+        return Json(found[index], Origin(f"{name}[{index}]", FormatError))
 
     def names(self) -> Iterator[str]:
         """Yield the paths of the files with its buffers, relative to its folder."""
@@ -243,18 +240,18 @@ class GltfFile:
         """
         record = self.item("buffers", index)
         if index not in self._buffers:
-            found = self._found(index, record.get("uri"))
-            if found.length < whole(record, "byteLength"):
+            found = self._found(index, record.value.get("uri"))
+            if found.length < record.whole("byteLength", most=LARGEST):
                 where = "the file" if found.name is None else quoted_value(found.name)
                 raise TruncatedError(
-                    f"buffer {index} has {record['byteLength']:,} bytes, of which {where} holds {found.length:,}"
+                    f"buffer {index} has {record.value['byteLength']:,} bytes, of which {where} holds {found.length:,}"
                 )
             self._buffers[index] = found
         return self._buffers[index]
 
     def _found(self, index: int, uri: Any) -> Buffer:
         if uri is None:
-            extensions = self.item("buffers", index).get("extensions")
+            extensions = self.item("buffers", index).value.get("extensions")
             if isinstance(extensions, dict) and extensions:
                 name = quoted_value(next(iter(extensions)))
                 raise UnsupportedError(
@@ -298,13 +295,12 @@ class GltfFile:
     def view(self, index: Any) -> tuple[int, int, int, int | None]:
         """Return buffer, offset in its file, bytes and stride of a buffer view, which lies within its buffer."""
         view = self.item("bufferViews", index)
-        number = whole(view, "buffer")
+        number = view.whole("buffer", most=LARGEST)
         buffer = self.buffer(number)
-        offset, length = whole(view, "byteOffset", 0), whole(view, "byteLength")
-        if offset + length > whole(self.item("buffers", number), "byteLength"):
+        offset, length = view.optional("byteOffset", _bytes, 0), _bytes(view.get("byteLength"))
+        if offset + length > self.item("buffers", number).whole("byteLength", most=LARGEST):
             raise FormatError(f"buffer view {index} ends beyond its buffer")
-        stride = whole(view, "byteStride") if "byteStride" in view else None
-        return number, buffer.start + offset, length, stride
+        return number, buffer.start + offset, length, view.optional("byteStride", _bytes)
 
     def accessor(self, index: Any, kind: str, components: tuple[int, ...]) -> Accessor:
         """Return an accessor, all of whose values lie within its buffer view.
@@ -317,7 +313,8 @@ class GltfFile:
         Raises:
             FormatError: it is of another type, or reaches beyond its buffer view.
         """
-        accessor = self.item("accessors", index)
+        record = self.item("accessors", index)
+        accessor = record.value
         component, normalized = accessor.get("componentType"), accessor.get("normalized", False)
         if accessor.get("type") != kind or component not in components:
             raise FormatError(
@@ -330,7 +327,7 @@ class GltfFile:
             )
         dtype = np.dtype(COMPONENTS[component])
         buffer, offset, length, stride = self.view(accessor["bufferView"])
-        count, inside = whole(accessor, "count"), whole(accessor, "byteOffset", 0)
+        count, inside = record.whole("count", most=LARGEST), record.optional("byteOffset", _bytes, 0)
         size = TYPES[kind] * dtype.itemsize
         step = size if stride is None else stride
         if not size <= step <= max(MAX_STRIDE, size):
@@ -362,16 +359,8 @@ def _unpacked(uri: bytes, index: int) -> bytes:
         raise FormatError(f"the data of buffer {index} are no base64: {error}") from None
 
 
-def whole(record: Mapping[str, Any], name: str, default: int | None = None) -> int:
-    """Return a whole number of at least 0 of a JSON object.
-
-    Raises:
-        FormatError: there is none.
-    """
-    value = record.get(name, default)
-    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= LARGEST:
-        raise FormatError(f"{name} is {quoted_value(value)}, not a whole number up to {LARGEST:,}")
-    return value
+def _bytes(value: Json) -> int:
+    return value.whole(most=LARGEST)
 
 
 def head_of(root: Mapping[str, Any], length: int) -> bytes:

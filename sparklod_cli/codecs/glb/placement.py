@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ...model.gaussian import rotation_matrices
 from ...model.transforms import LARGEST, Transform, scale_of
 from ...system.errors import FormatError, UnsupportedError
-from ...system.untrusted import quoted_value
+from ...system.untrusted import Json, Origin
 from .glb_container import GltfFile
 
 Matrix = NDArray[np.float64]
@@ -131,11 +131,9 @@ def _matrix(node: dict[str, Any]) -> Matrix:
 
 
 def _numbers(node: dict[str, Any], name: str, count: int, default: tuple[float, ...]) -> Matrix:
-    values = node.get(name, default)
-    numbers = isinstance(values, (list, tuple)) and all(type(value) in (int, float) for value in values)
-    if not numbers or len(values) != count or not all(abs(value) <= LARGEST for value in values):
-        raise FormatError(f"{name} of a node is {quoted_value(values)}, not {count} numbers up to {LARGEST:g}")
-    return np.array(values, np.float64)
+    if name not in node:
+        return np.array(default, np.float64)
+    return np.array(Json(node, Origin("a node", FormatError)).get(name).numbers(count, most=LARGEST))
 
 
 def transform_of(matrix: Matrix) -> Transform:

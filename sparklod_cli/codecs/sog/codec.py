@@ -24,6 +24,7 @@ from .. import quantize
 from ..compression import check_promise
 from ..file_notes import read_note
 from ..kernels import texels
+from ..left_out import Note
 from ..reader import OpenFile, Positioned, Reader, Target
 from . import texel_codings as codings
 from .sog_container import LARGEST, Pixels, SogFiles, has
@@ -37,9 +38,6 @@ MAX_PALETTE = 1 << 16
 
 #: Most splats: a WebP image has at most this many texels.
 MAX_SPLATS = 1 << 28
-
-#: How the note on lossy images begins, which is a finding of its own.
-LOSSY = "its images are lossy WebP"
 
 #: Where the channels stand in a pixel.
 RED_GREEN_BLUE, ALPHA = np.array([16, 8, 0], np.uint32), np.array([24], np.uint32)
@@ -57,11 +55,6 @@ class Step:
     texture: str
     index: int
     fill: Callable[[Splats, Pixels], str | None]
-
-
-def code_of(note: str) -> str:
-    """Return the kind of the finding that a note on a scene is."""
-    return "container.lossy" if note.startswith(LOSSY) else "container.left-out"
 
 
 def open_content(source: OpenFile) -> Reader:
@@ -85,7 +78,8 @@ def open_content(source: OpenFile) -> Reader:
     check_promise(count * 4 * width_of(degree), files.size)
     steps = _steps(meta, version, palette)
     lossy = ", ".join(map(quoted_value, files.lossy()))
-    losses = (f"{LOSSY} ({lossy}), so that values are not those written; encode them without losses",) if lossy else ()
+    text = f"its images are lossy WebP ({lossy}), so that values are not those written; encode them without losses"
+    losses = (Note(text, "container.lossy"),) if lossy else ()
     center_tables = codings.center_table(*_ends(meta, "means", 3))
 
     def in_order() -> list[Step]:

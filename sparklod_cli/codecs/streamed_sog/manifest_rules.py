@@ -19,6 +19,7 @@ from ...system.units import count_of
 from ...system.untrusted import quoted_value
 from ..file_names import MANIFEST
 from ..json_trees import leads_away
+from ..left_out import code_of
 from ..reader import OpenCompanion
 from ..scene_files import Chunk, SceneFiles
 from ..sog import codec as sog
@@ -114,7 +115,8 @@ def file_violations(manifest: Manifest, files: Mapping[str, Chunk | str]) -> Ite
 def _about(file: Chunk) -> Iterator[RuleViolation]:
     """Yield the notes on a chunk file as violations."""
     for note in file.notes:
-        yield RuleViolation(sog.code_of(note), f"{quoted_value(file.name)}: {note}", fatal=False)
+        if (code := code_of(note)) is not None:
+            yield RuleViolation(code, f"{quoted_value(file.name)}: {note}", fatal=False)
 
 
 def _kind_of(file: Chunk) -> str:

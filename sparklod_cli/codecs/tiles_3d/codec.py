@@ -25,6 +25,7 @@ from ..compression import check_promise
 from ..file_names import TILESET
 from ..glb import codec as glb
 from ..glb.placement import transform_of
+from ..left_out import Note
 from ..reader import OpenCompanion, OpenFile, Reader
 from ..scene_files import Chunk, SceneFiles
 from ..validation import check_rules, error_of
@@ -34,7 +35,7 @@ from .tileset_rules import matrices_of, matrix_of, read_violations, violations, 
 from .volumes import Volume, to_tileset, turned
 
 #: Note of scenes whose splats have the coordinates of their tileset.
-NOT_PLACED = "the transform of the tileset, its place on the Earth, is not applied"
+NOT_PLACED = Note("the transform of the tileset, its place on the Earth, is not applied")
 
 Matrix = NDArray[np.float64]
 

@@ -18,7 +18,7 @@ from ..glb.attributes import COMPRESSION, EXTENSION
 from ..glb.placement import product
 from ..json_trees import leads_away
 from ..scene_files import Chunk, SceneFiles
-from ..validation import LOOSE_BOUND, RuleViolation, count_outside
+from ..validation import LOOSE_BOUND, RuleViolation, count_outside, error_of
 from .tileset import CONTENT_GLTF, OLD_VERSION, REPLACE, SPLATS, UNREAD, VERSION, TileRecord, Tileset
 from .volumes import Volume, to_tileset, volume_of
 
@@ -73,7 +73,10 @@ def read_violations(tileset: Tileset) -> Iterator[RuleViolation]:
             yield broken("unread", f"{where} the extension {quoted_value(others[0])}, which is not read")
     for number, tile in enumerate(tileset.tiles):
         yield from _unread(tileset, number, tile)
-    yield from _product_violations(tileset)
+    try:
+        matrices_of(tileset, of_root=True)
+    except FormatError as error:
+        yield RuleViolation(error.code, str(error))
 
 
 def _unread(tileset: Tileset, number: int, tile: TileRecord) -> Iterator[RuleViolation]:
@@ -112,29 +115,27 @@ def _numbers(record: Mapping[str, object]) -> list[float] | None:
     return numbers if numbers[3::4] == [0, 0, 0, 1] else None
 
 
-def _product_violations(tileset: Tileset) -> Iterator[RuleViolation]:
-    """Yield the tiles whose transforms, with those above them, are out of range."""
-    matrices = list[NDArray[np.float64]]()
-    for number, tile in enumerate(tileset.tiles):
-        own = matrix_of(tile.record)
-        try:
-            matrices.append(product(matrices[tile.parent] if tile.parent >= 0 else np.eye(4), own))
-        except FormatError as error:
-            yield broken("transform", f"{tileset.place(number)}: {error}")
-            return
-
-
 def matrix_of(record: Mapping[str, object]) -> NDArray[np.float64]:
     """Return the (4, 4) transform of a tile, the identity unless it has one, for column vectors."""
     numbers = _numbers(record)
     return np.eye(4) if numbers is None else np.array(numbers, np.float64).reshape(4, 4).T
 
 
-def matrices_of(tileset: Tileset) -> list[NDArray[np.float64]]:
-    """Return the (4, 4) transform of each tile to the axes of the tileset, without that of the root."""
+def matrices_of(tileset: Tileset, *, of_root: bool = False) -> list[NDArray[np.float64]]:
+    """Return the (4, 4) transform of each tile to the axes of the tileset, with that of the root if `of_root`.
+
+    Raises:
+        FormatError: transforms multiply to numbers that are too large.
+    """
     matrices = list[NDArray[np.float64]]()
-    for tile in tileset.tiles:
-        matrices.append(np.eye(4) if tile.parent < 0 else matrices[tile.parent] @ matrix_of(tile.record))
+    for number, tile in enumerate(tileset.tiles):
+        matrix = matrices[tile.parent] if tile.parent >= 0 else np.eye(4)
+        if "transform" in tile.record and (tile.parent >= 0 or of_root):
+            try:
+                matrix = product(matrix, matrix_of(tile.record))
+            except FormatError as error:
+                raise error_of("tiles.transform", f"{tileset.place(number)}: {error}") from None
+        matrices.append(matrix)
     return matrices
 
 
