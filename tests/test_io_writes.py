@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import stat
 import subprocess
 import sys
+import uuid
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -14,8 +16,9 @@ import pytest
 
 from sparklod_cli.io import parts_output
 from sparklod_cli.system import atomic
+from sparklod_cli.system.addresses import Address
 from sparklod_cli.system.errors import FormatError, OutputError
-from sparklod_cli.system.output import check_writable, write_file
+from sparklod_cli.system.output import Output, check_writable, write_file
 from sparklod_cli.system.stdio import write_stdout
 from tests.conftest import FIXTURES, IS_ROOT
 from tests.outputs import write_files
@@ -308,3 +311,27 @@ def test_a_replaced_file_keeps_its_permissions(tmp_path: Path) -> None:
     write_file(target, [b"new"], overwrite=True)
     assert target.stat().st_mode & 0o777 == 0o600
     assert target.stat().st_ino != before  # renamed to, not written into
+
+
+@pytest.mark.parametrize("kind", ["path", "address"])
+def test_a_file_grows_by_each_call_and_appears_at_the_end(kind: str, tmp_path: Path) -> None:
+    place: Path | Address = tmp_path / "out.spz"
+    if kind == "address":
+        pytest.importorskip("fsspec")
+        place = Address(f"memory://{uuid.uuid4().hex}") / "out.spz"
+    for content, error in ((b"whole", None), (b"other", KeyboardInterrupt()), (b"other", FormatError("too large"))):
+        out = Output(place, overwrite=error is not None)
+        with contextlib.suppress(KeyboardInterrupt, FormatError), out:
+            assert [out.write("out.spz", [content[:2]]), out.write("out.spz", [content[2:4], content[4:]])] == [2, 3]
+            assert place.exists() == (error is not None)
+            if error is not None:
+                raise error
+        with place.open("rb") as file:
+            assert file.read() == b"whole"
+    assert names(tmp_path) == ([] if kind == "address" else ["out.spz"])
+
+
+def test_an_output_that_nothing_is_written_to_is_no_file(tmp_path: Path) -> None:
+    with Output(tmp_path / "new" / "out.spz", overwrite=False), output(tmp_path / "new" / "x.rad", overwrite=False):
+        pass
+    assert names(tmp_path) == []

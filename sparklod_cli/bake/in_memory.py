@@ -30,8 +30,8 @@ class InMemory:
 
     Attributes:
         source, settings, threads, progress: as for `flow.bake`.
-        reader: of the source; None once it was read.
-        opened: closes it.
+        reader: of the source; None after it was read.
+        opened: closes the reader.
     """
 
     source: Source
@@ -77,7 +77,7 @@ class InMemory:
         self.clock.end("read")
         if self.output.form is not None:
             self._leaves = Statistics.of_blocks(splats, np.ones(len(splats), np.bool_), self.output.needed, threads)
-            self.output.check(self._leaves)  # before building, so that what does not fit is said at once
+            self.output.check(self._leaves)  # before building, so that an impossible output is reported at once
         tree.splats, tree.dropped, tree.method = len(splats), tally.dropped, settings.method
         leaves = [splats]
         del scene, splats, far  # the builder frees its input as it goes, if nobody else holds it: a third of the peak

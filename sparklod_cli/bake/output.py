@@ -1,4 +1,4 @@
-"""Output of a bake: what is settled of it before the tree is built, and how the tree is written."""
+"""Output of a bake: its files and options, which are known before the tree is built, and writing the tree."""
 
 from __future__ import annotations
 
@@ -36,17 +36,17 @@ Encode = Callable[[BuiltTree, Encoder], Windows]
 
 @dataclass(frozen=True)
 class BakeOutput:
-    """Destination of a tree, and what is settled of it.
+    """Destination of a tree.
 
     Attributes:
-        out: its files, which were tried.
+        out: its files.
         options: of its format.
-        form: of an SPZ or RAD file, which is written in windows; None for what is made of all nodes at once, in memory,
-            and takes any tree.
+        form: format of an SPZ or RAD file, which is written in windows; None for an output that is made of all nodes at
+            once, in memory, and takes any tree.
         simplifier: of a simplified scene, else None.
-        stored: codes that nodes keep which still have the values of `before`; None without.
+        stored: codes of unchanged nodes, which keep them; None for none.
         before: (N,) nodes with these codes.
-        repacked: RAD file whose chunks are copied; None without.
+        repacked: RAD file whose chunks are copied; None for none.
     """
 
     out: Output
@@ -60,7 +60,7 @@ class BakeOutput:
 
     @property
     def in_chunks(self) -> bool:
-        """Whether it is read in chunks, so that nodes are put in an order for that first."""
+        """Whether viewers read it in chunks, for which nodes are ordered first."""
         return self.form is not None and self.form is WRITABLE[RAD]
 
     @property
@@ -77,7 +77,7 @@ class BakeOutput:
 def output_of(
     target: Place, settings: BakeSettings, *, overwrite: bool, say: Callable[[str], None] = lambda text: None
 ) -> BakeOutput:
-    """Return the output that settings ask for; fail now if it cannot be written later.
+    """Return the output of a bake; raise now if it cannot be written later.
 
     Raises:
         OutputError: see `system.output.Output`.
@@ -100,18 +100,18 @@ def output_of(
 def output_of_existing_tree(
     output: BakeOutput, source: Source, scene: Scene, settings: BakeSettings
 ) -> tuple[BakeOutput, bool]:
-    """Return the output of an input that has a tree, which is kept, and whether its nodes are in order already.
+    """Return the output of an input whose tree is kept, and whether its nodes are in order already.
 
-    Nodes keep their opacities. In the same format, what was not chosen of how to write is that of the file, and nodes
-    that have the values of the file are written bit for bit as they stand there; chunks of a RAD that goes into its
-    other container are copied, unless an option tells how.
+    Nodes keep their opacities. In the same format, options that were not given are those of the file, and the codes of
+    unchanged nodes are copied. Chunks of a RAD file that gets its other container are copied unless an option changes
+    the encoding.
 
     Args:
         output: of an input without a tree.
 
     Raises:
-        FormatError: nobody asked for another format than that of the scene, or for merged splats to be fitted; or for
-            something that only splats without a tree can be given.
+        FormatError: the settings neither change the format or container of the tree nor fit its merged splats; or they
+            have options that only splats without a tree take.
     """
     held = scene.format.split()[0]
     others = settings.detail, settings.tiles, settings.encoding, settings.simplify
@@ -145,7 +145,7 @@ def output_of_existing_tree(
 
 
 def write_tree(tree: BuiltTree, encode: Encode, clock: Clock, threads: int, progress: Progress) -> WrittenTree:
-    """Write a tree whose nodes are in order to its output; in memory, unless it is written in windows."""
+    """Write a tree whose nodes are in order to its output; all but SPZ and RAD files need its nodes in memory."""
     output = tree.output
     settings, options = output.settings, output.options
     if output.form is not None:

@@ -1,4 +1,4 @@
-"""Writing a tree as parts that viewers choose: a Streamed SOG of regions at several levels, and 3D Tiles."""
+"""Outputs in parts that viewers load as needed: a Streamed SOG of regions at several levels, and 3D Tiles."""
 
 from __future__ import annotations
 

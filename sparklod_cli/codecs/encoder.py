@@ -1,7 +1,7 @@
 """Interfaces and helpers for writing a file in windows, whether its splats are in memory or not.
 
-A window is encoded by itself, on any thread or machine, and its result kept, in memory, in a file, or in a store that
-machines share; then the pieces of the file are made of the results.
+Each window is encoded alone, on any thread or machine, and its result stays in memory or in a store that machines
+share. The pieces of the file are then made of the results.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class Encoder(ABC):
         tree: whether there is one.
         antialiased, up: as in `Scene`.
         options: with nothing left open.
-        ranges: beyond which values are counted, see `clamps.tally`; none unless somebody wants to know.
+        ranges: values beyond them are counted, see `clamps.tally`; empty for no count.
     """
 
     count: int

@@ -37,7 +37,7 @@ FORMER = "former"
 
 
 def unique(name: str) -> str:
-    """Return `PARTS` or `STAGES` with a number that nobody else has."""
+    """Return `PARTS` or `STAGES` with a random number."""
     return name.format(secrets.token_hex(8))
 
 
@@ -49,7 +49,7 @@ def lock(descriptor: int) -> None:
 
 
 def try_lock(descriptor: int) -> bool:
-    """Lock a file as `lock` does, without waiting; return False if somebody else has locked it."""
+    """Lock a file as `lock` does, without waiting; return False if another process has locked it."""
     if fcntl is None:
         return True
     try:
@@ -63,7 +63,7 @@ def try_lock(descriptor: int) -> bool:
 
 @functools.lru_cache(256)
 def sweep(folder: Path) -> None:
-    """Remove what killed writers have left in a folder; once, as it may get thousands of files."""
+    """Remove the remains of killed writers from a folder; once, as thousands of files may be written there."""
     with contextlib.suppress(OSError):
         for path in [*folder.glob(PARTS.format("*")), *folder.glob(STAGES.format("*"))]:
             with contextlib.suppress(OSError):
@@ -74,7 +74,7 @@ def sweep(folder: Path) -> None:
 
 
 def _remove_unlocked(path: Path) -> None:
-    """Remove a file or folder of this user that no process has locked; raise `OSError` if one has."""
+    """Remove a file or folder of this user; raise `OSError` if a process has locked it."""
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)  # it may be read-only
     try:
         status = os.fstat(descriptor)
@@ -217,7 +217,7 @@ def _replaced_mode(target: Path, overwrite: bool) -> int | None:
 
 
 def _first_mode(target: Path, overwrite: bool) -> int:
-    """Return permissions to create a file with, before the umask: never more than the complete file will have."""
+    """Return permissions for creating a file, before the umask: never more than those of the complete file."""
     mode = _replaced_mode(target, overwrite)
     return 0o666 if mode is None else mode & 0o600
 
@@ -246,7 +246,7 @@ def _name(file: BinaryIO, target: Path, overwrite: bool) -> None:
     if mode is not None:
         os.fchmod(number, mode)
     lock(number)
-    temporary = _part_of(target)
+    temporary = target.with_name(unique(PARTS))
     try:
         _link(number, temporary)  # link() cannot replace a file, so it has two names for a moment
         temporary.replace(target)
@@ -259,15 +259,10 @@ def _link(number: int, path: Path) -> None:
     os.link(OPEN_FILES / str(number), path, src_dir_fd=number, follow_symlinks=True)
 
 
-def _part_of(target: Path) -> Path:
-    """Return a unique temporary name in the folder of a file."""
-    return target.with_name(unique(PARTS))
-
-
 def _open_part(target: Path, overwrite: bool) -> tuple[Path, int]:
     """Create a locked temporary file in the folder of `target`; return its path and descriptor."""
     while True:
-        temporary = _part_of(target)
+        temporary = target.with_name(unique(PARTS))
         descriptor = os.open(temporary, _FLAGS | os.O_CREAT | os.O_EXCL, _first_mode(target, overwrite))
         lock(descriptor)
         with contextlib.suppress(FileNotFoundError):  # another process removed it before it was locked
@@ -277,7 +272,7 @@ def _open_part(target: Path, overwrite: bool) -> tuple[Path, int]:
 
 
 def rename(temporary: Path, target: Path, overwrite: bool) -> None:
-    """Give a complete file its name; `FileExistsError` if that is taken, and `overwrite` is not set."""
+    """Give a complete file its name; raise `FileExistsError` if that is taken and `overwrite` is not set."""
     if overwrite:
         temporary.replace(target)
         return
@@ -293,13 +288,13 @@ def rename(temporary: Path, target: Path, overwrite: bool) -> None:
 
 @contextlib.contextmanager
 def created(folder: Path) -> Iterator[None]:
-    """Create a folder for the time of a context, which removes those that it created if they are empty at its end."""
+    """Create a folder and its parents for a context; new ones that are empty at its end are removed."""
     new = [each for each in (folder, *folder.parents) if not each.exists()]
     folder.mkdir(parents=True, exist_ok=True)
     try:
         yield
     finally:
-        with contextlib.suppress(OSError):  # the first that has something in it ends this
+        with contextlib.suppress(OSError):  # the first that is not empty ends this
             for each in new:
                 each.rmdir()
 
