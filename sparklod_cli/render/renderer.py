@@ -20,7 +20,7 @@ from ..system.progress import Progress, silent
 from . import color_by, rasterizer
 from .color_by import Scale
 from .devices import uses_card
-from .kernels import bands
+from .kernels.raster import count_fragments, draw_discs
 from .rasterizer import Image, ShadedSplats, shade
 from .settings import BACKENDS, CLIP, ON_CARD, RasterSettings, RenderSettings
 
@@ -205,7 +205,7 @@ def draw_styled(
     width = splats.scale[index].mean(axis=1) * size_factor(splats.lod_opacity[index])
     radius = np.clip(width * np.float32(camera.focal[1]) / depth, 0.5, settings.max_radius)
     rgb = np.minimum(splats.rgb[index], 1)
-    bands.draw_discs(
+    draw_discs(
         camera.height,
         np.ascontiguousarray(x[order]),
         np.ascontiguousarray(y[order]),
@@ -248,5 +248,5 @@ def count_overdraw(splats: ShadedSplats, camera: Camera, settings: RasterSetting
     if len(splats.center):
         seen = rasterizer.project_splats(splats, camera, settings)
         is_design = settings.profile == "shifted"
-        bands.count_fragments(len(counts), seen.screen, seen.keys, is_design, np.float32(MIN_ALPHA), counts)
+        count_fragments(len(counts), seen.screen, seen.keys, is_design, np.float32(MIN_ALPHA), counts)
     return counts.astype(np.float32)

@@ -1,4 +1,4 @@
-"""Kernels of the backward pass on a card, with the formulas of `kernels.backward`.
+"""The backward pass on a card, with the formulas of `kernels.backward`.
 
 No two threads write to the same place, and all sums have a fixed order, so that gradients are the same every time: each
 tile writes a row of sums for each of its splats, which are added in the order of the splat's tiles.
@@ -9,10 +9,11 @@ from __future__ import annotations
 import numpy as np
 from numba import cuda
 
-from ...model.falloff import merged_slopes, plain_slopes
+from ...model.falloff import MIN_ALPHA, merged_slopes, plain_slopes
 from ...system.jit import kernel
 from ...system.jit_cuda import SIMULATED, cuda_kernel
 from ...system.jit_types import f4, f8, i2, i4, i8, out, u8
+from .. import rasterizer
 from ..kernels.backward import (
     BY_BLUE,
     BY_GREEN,
@@ -48,7 +49,9 @@ from ..kernels.project import (
     index_of,
 )
 from ..kernels.raster import OPAQUE
+from .card import CardArray
 from .forward import PIXELS, lens_of, limits_of, pixel_of
+from .rasterizer import CardPicture, CardSplats, CardView
 
 f32, f64 = np.float32, np.float64
 
@@ -231,3 +234,25 @@ def carry_back(center, scale, quat, lod_opacity, colors, index, matrix, view, sc
     lens, limits = lens_of(view), limits_of(view)
     splats = ShadedColumns(center, scale, quat, lod_opacity, colors)
     carry_splat_back(splats, index[i], matrix, lens, limits, screen[i], totals[i], gradients[i])
+
+
+def gradients_on_card(splats: CardSplats, picture: CardPicture, view: CardView, by_image: CardArray) -> CardArray:
+    """Return (M, GRADIENT_COLUMNS) derivatives of a loss by each of the splats that a picture was drawn of.
+
+    They are the same every time; see `gradients.SplatGradients`. The splats are as they were when the picture was
+    drawn, with the profile spark; `by_image` (height, width, 4) are the derivatives of the loss by the picture.
+    """
+    across, down = rasterizer.tiles_across(view.camera)
+    seen, number, new = picture, picture.index.shape[0], splats.memory.array
+    sums = new("sums", (seen.pairs.shape[0], SUMS))
+    totals = new("totals", (number, SUMS), np.float64)
+    gradients = new("gradients", (number, GRADIENT_COLUMNS))
+    tiles = seen.boxes, seen.ends, seen.start, seen.pairs, across, np.float32(MIN_ALPHA)
+    drawn = seen.screen, seen.keys, *tiles, seen.image, by_image, sums
+    weigh_tiles.launch(across * down, PIXELS, *drawn)
+    blocks = -(-number * WARP // ADDERS)
+    add_rows.launch(blocks, ADDERS, seen.keys, seen.count, seen.ends, sums, totals)
+    columns = splats.center, splats.scale, splats.quat_xyzw, splats.lod_opacity, splats.colors, seen.index
+    results = view.matrix, view.view, seen.screen, seen.count, totals, gradients
+    carry_back.for_each(number, *columns, *results)
+    return gradients

@@ -85,11 +85,7 @@ def print_card() -> None:
 
 
 class _TooLargeError(Exception):
-    """An array does not fit into the memory of the card.
-
-    Attributes:
-        share: memory of the card over what is in use with that array.
-    """
+    """An array does not fit into the memory of the card; `share` is that memory over what is in use with the array."""
 
     def __init__(self, share: float) -> None:
         super().__init__(share)

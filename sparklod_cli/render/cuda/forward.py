@@ -81,16 +81,13 @@ def project(
     boxes,
     count,
 ):
-    """Shade splats and project them onto the screen.
+    """Shade splats and project them onto the screen; `screen`, `keys` and `boxes` are as in `kernels.project.project`.
 
     Args:
-        center, scale, quat, lod_opacity, rgb, sh: columns of N splats.
-        degree: of the spherical harmonics, 0 for none.
-        index: (M,) which splats to draw.
+        center, scale, quat, lod_opacity, rgb, sh: columns of N splats, of which the M of `index` are drawn.
         eye: (3,) position of the camera. matrix: (3, 4) world to camera. view: numbers of `Lens` and `Limits`.
         radial: splats are sorted by distance from the camera, not by depth.
         colors: (N, 3) filled for the M splats: what the camera sees.
-        screen, keys, boxes: of `kernels.project.project`, filled for the M splats.
         count: (M,) tiles that each overlaps, 0 if it is not drawn.
     """
     i = cuda.grid(1)

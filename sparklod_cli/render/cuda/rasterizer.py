@@ -39,7 +39,6 @@ class CardSplats:
 
     @property
     def degree(self) -> int:
-        """Degree of the spherical harmonics."""
         return COEFFICIENTS.index(self.sh.shape[1])
 
 
@@ -55,7 +54,6 @@ class CardView:
 
     @classmethod
     def of(cls, camera: Camera, settings: RasterSettings) -> CardView:
-        """Copy a camera to the card."""
         nothing = ShadedSplats(*(np.empty((0, 3), np.float32),) * 5)
         _, matrix, lens, limits = rasterizer.arguments(nothing, camera, settings)
         eye = camera.position.astype(np.float32)

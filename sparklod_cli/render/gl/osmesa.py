@@ -157,7 +157,6 @@ class OpenGLRenderer:
     """Draws a sequence of frames; compiles once, and uploads only what has changed."""
 
     def __init__(self, *, precision: str = "float", sorting: str = "exact", throttle: float = 0.0) -> None:
-        """Prepare OpenGL; see `draw` for the arguments."""
         self._data, self._order = data_texture_of(precision), Order(sorting, throttle)
         self.uploads = self.sorts = 0
         self._count, self._capacity, self._size = 0, 0, (0, 0)

@@ -1,10 +1,12 @@
-"""Lists the splats of each tile of a picture, and draws the tiles."""
+"""Lists the splats of each tile of a picture, and draws the tiles; draws discs and counts fragments."""
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
-from ...model.falloff import merged, plain, shifted
+from ...model.falloff import alpha_at, merged, plain, shifted
 from ...system.jit import kernel, prefetch
 from ...system.jit_types import b1, f4, i2, i4, i8, out, u8
 from .project import (
@@ -26,6 +28,7 @@ from .project import (
     TILE,
     X,
     Y,
+    exponent,
     index_of,
 )
 
@@ -70,7 +73,6 @@ def count_in_tiles(begin, end, keys, boxes, across, sorted_boxes, counts):
         begin, end: blocks of splats, of `len(counts)` of about one size.
         keys: (M,) of `project`, sorted, without NOT_DRAWN.
         across: number of tiles in a row of them.
-        sorted_boxes: (M, 4) filled.
         counts: (blocks, tiles) added to: for each block, the splats of each tile.
     """
     words = boxes.reshape(-1)
@@ -277,11 +279,9 @@ def draw_tile(screen, start, splats, tile, across, design, least, image):
 
 @kernel(i8, f4[:, :], i8[:], i4[:], i8, b1, f4, out(f4[:, :, :]), out(i8[:]), ranges=True, contract=True)
 def draw_tiles(begin, end, screen, start, splats, across, design, least, image, stop):
-    """Blend the splats of each tile, from near to far.
+    """Blend the splats of each tile, from near to far; `start` and `splats` are those of `rasterizer.sort_into_tiles`.
 
     Args:
-        screen: (N, COLUMNS) of `project`.
-        start, splats: of `rasterizer.sort_into_tiles`.
         across: number of tiles in a row of them.
         design: merged splats have the falloff `shifted`, that of Spark's LoD design.
         least: least alpha that is drawn.
@@ -290,3 +290,54 @@ def draw_tiles(begin, end, screen, start, splats, across, design, least, image, 
     """
     for tile in range(begin, end):
         stop[tile] = draw_tile(screen, start, splats, tile, across, design, least, image)
+
+
+@kernel(i8, f4[:], f4[:], f4[:], f4[:, :], f4, out(f4[:, :, :]), ranges=True)
+def draw_discs(top, bottom, x, y, radius, rgb, alpha, image):
+    """Blend discs on a picture in their order, each over those before it; centres and radii in pixels."""
+    width = image.shape[1]
+    for i in range(len(x)):
+        r = radius[i]
+        if y[i] + r < top or y[i] - r > bottom:
+            continue
+        for line in range(top, bottom):
+            dy = f32(line) + f32(0.5) - y[i]
+            square = r * r - dy * dy
+            if square < 0:
+                continue
+            half = np.sqrt(square)
+            first = max(0, math.ceil(x[i] - half - f32(0.5)))
+            last = min(width - 1, math.floor(x[i] + half - f32(0.5)))
+            for column in range(first, last + 1):
+                for c in range(3):
+                    image[line, column, c] += alpha * (rgb[i, c] - image[line, column, c])
+                image[line, column, 3] += alpha * (f32(1) - image[line, column, 3])
+
+
+@kernel(i8, f4[:, :], u8[:], b1, f4, out(i4[:, :]), ranges=True)
+def count_fragments(top, bottom, screen, keys, design, least, counts):
+    """Add the number of splats that cover each pixel, hidden ones included, to (height, width) counts.
+
+    Args:
+        screen, keys: of `project`; the (M,) keys are those of splats that are drawn, in any order.
+        design, least: of `raster.draw_tiles`.
+    """
+    width = counts.shape[1]
+    for key in keys:
+        row = screen[index_of(key)]
+        first_line = max(top, math.ceil(row[Y] - row[HALF_HEIGHT] - f32(0.5)))
+        last_line = min(bottom - 1, math.floor(row[Y] + row[HALF_HEIGHT] - f32(0.5)))
+        if first_line > last_line:
+            continue
+        first = max(0, math.ceil(row[X] - row[HALF_WIDTH] - f32(0.5)))
+        last = min(width - 1, math.floor(row[X] + row[HALF_WIDTH] - f32(0.5)))
+        d = row[OPACITY]
+        for line in range(first_line, last_line + 1):
+            dy = f32(line) + f32(0.5) - row[Y]
+            for column in range(first, last + 1):
+                dx = f32(column) + f32(0.5) - row[X]
+                t = exponent(row, dx, dy)
+                if t < row[LEAST]:
+                    continue
+                if alpha_at(t, d, row[POWER], design) >= least:
+                    counts[line, column] += 1

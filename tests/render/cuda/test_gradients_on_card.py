@@ -27,9 +27,8 @@ MOST = 1e-3
 
 
 def test_gradients_are_those_of_the_processor() -> None:
-    from sparklod_cli.render.cuda.backward import BATCH
+    from sparklod_cli.render.cuda.backward import BATCH, gradients_on_card
     from sparklod_cli.render.cuda.card import to_card
-    from sparklod_cli.render.cuda.gradients import gradients_on_card
     from sparklod_cli.render.cuda.rasterizer import CardSplats, CardView, draw_on_card
 
     splats, camera, settings = splats_of(40), camera_at(size=(18, 10)), RasterSettings(max_radius=25.0)
