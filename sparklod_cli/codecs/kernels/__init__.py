@@ -1,1 +1,1 @@
-"""Compiled inner loops of the codecs."""
+"""Compiled inner loops of the codecs; `lod.kernels` explains their docstrings."""

@@ -31,7 +31,7 @@ def look_up_words(words, tables, out):
 
 @kernel(u4[:], u4[:], f4[:, :], out(f4[:, :]), nogil=True)
 def look_up(pixels, shifts, tables, out):
-    """Fill (N, C) float32 by (C, 256) tables and the bytes that stand at (C,) uint32 `shifts` of (N,) pixels."""
+    """Fill (N, C) float32 by (C, 256) tables and the bytes of (N,) pixels at (C,) bit `shifts`."""
     for i in range(len(pixels)):
         for k in range(len(shifts)):
             out[i, k] = tables[k, pixels[i] >> shifts[k] & _BYTE]

@@ -168,8 +168,8 @@ def choose_split(nodes, greatest, size, chunks):
 def mark_first_part(families, members, root, weight, axis, room):
     """Mark the families of the first part of a split, which has room for `room` nodes, by a weight of -1.
 
-    Families are taken in order as long as there is room; larger ones are passed over, so that the room is used up but
-    for very few nodes. In a split by size each family becomes its own root. Returns whether any was marked.
+    Families are taken in order as long as there is room; families that do not fit are passed over, so that the room is
+    used up but for very few nodes. In a split by size each family becomes its own root. Returns whether any was marked.
     """
     marked = False
     if axis == SIZE:
@@ -203,7 +203,7 @@ def mark_first_part(families, members, root, weight, axis, room):
 
 @kernel()
 def move_first_part(members, root, weight, spare):
-    """Move the marked families to the beginning, both parts in their order; return how many there are."""
+    """Move the marked families to the beginning; both parts keep their order. Return how many are marked."""
     length, rest = 0, 0
     for i in range(len(members)):
         family = members[i]

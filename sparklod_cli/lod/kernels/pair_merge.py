@@ -141,7 +141,7 @@ def merge_pair(a, b, planes, merged):
 
 @kernel(inline=True)
 def closing(overlap, large, middle, small):
-    """Return the share of the pair's coverage, of its overlap's, that a merged node keeps to close a layer.
+    """Return the part of an overlap, as a share of the pair's coverage, that a merged node keeps to close a layer.
 
     `large`, `middle` and `small` are the merged node's semi-axes; needles are in no layer.
     """

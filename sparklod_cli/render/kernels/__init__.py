@@ -1,1 +1,1 @@
-"""Compiled inner loops of the rasterizer."""
+"""Compiled inner loops of the rasterizer; `lod.kernels` explains their docstrings."""

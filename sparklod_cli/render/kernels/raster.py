@@ -294,7 +294,7 @@ def draw_tiles(begin, end, screen, start, splats, across, design, least, image, 
 
 @kernel(i8, f4[:], f4[:], f4[:], f4[:, :], f4, out(f4[:, :, :]), ranges=True)
 def draw_discs(top, bottom, x, y, radius, rgb, alpha, image):
-    """Blend discs on a picture in their order, each over those before it; centres and radii in pixels."""
+    """Blend discs in order, each over those before it, on a (height, width, 4) picture; centres and radii in pixels."""
     width = image.shape[1]
     for i in range(len(x)):
         r = radius[i]
