@@ -266,7 +266,7 @@ def broken(monkeypatch: pytest.MonkeyPatch) -> Break:
         def fail(*args: object, **kwargs: object) -> None:
             raise error
 
-        monkeypatch.setattr(reading, "opened", fail)
+        monkeypatch.setattr(reading, "open_splats", fail)
 
     return end_in
 

@@ -60,7 +60,7 @@ from sparklod_cli import cli
 from sparklod_cli.io import reading
 from sparklod_cli.system import interrupts, jit
 {work}
-reading.opened = work
+reading.open_splats = work
 interrupts.handle()
 sys.exit(cli.run(["inspect", "fixtures/one.ply"]))
 """
