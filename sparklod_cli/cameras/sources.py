@@ -18,7 +18,7 @@ from ..system.errors import CameraPathError, SparklodError
 from ..system.untrusted import Origin, parse_json
 from . import ELEVATION, framing, generators
 from .camera import Matrix
-from .formats.source import Files, Json, Parsed, finite
+from .formats.source import CameraJson, Files, Parsed, finite
 from .formats.table import NAMES, Axes, PathFormat
 from .frame import DEFAULT_FPS, Frame, Settings, camera_of
 from .path import CameraPath, cameras_of, read
@@ -238,7 +238,7 @@ def similarity(text: str) -> Matrix:
     words = re.split(r"[\s,;]+", text.strip())
     try:
         if text.lstrip().startswith("["):
-            numbers = Json(parse_json(text), Origin("matrix", CameraPathError)).matrix(4)
+            numbers = CameraJson(parse_json(text), Origin("matrix", CameraPathError)).matrix(4)
         else:
             numbers = [finite(word, "matrix") for word in words]
     except ValueError:

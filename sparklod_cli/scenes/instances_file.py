@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -17,10 +15,15 @@ from ..model.foveation import Cones, Foveation, Frustum
 from ..model.instances import TOTAL, Instance, Matrix, names_of
 from ..model.transforms import LARGEST, scale_of
 from ..system.errors import SparklodError
-from ..system.untrusted import parse_json, quoted_value, well_formed
+from ..system.untrusted import Json, Origin, quoted_value, well_formed
 
-#: What an instance may say, and how many numbers that is; 0 for something else.
-KEYS = {"file": 0, "name": 0, "matrix": 16, "translation": 3, "rotation": 4, "scale": 1, "lod_scale": 1, "foveation": 0}
+#: What an instance may say.
+PARTS = ("translation", "rotation", "scale")
+KEYS = ("file", "name", "matrix", *PARTS, "lod_scale", "foveation")
+
+#: The kinds of foveation: their keys, and the fields that these fill.
+FRUSTUM = {"outside_foveate": "outside", "behind_foveate": "behind"}
+CONES = {"cone_fov0": "fov0", "cone_fov": "fov", "cone_foveate": "foveate", "behind_foveate": "behind"}
 
 #: How far the axes of a matrix may be from right angles and one length.
 SKEW = 1e-3
@@ -41,97 +44,85 @@ def read_instances(path: Path | str) -> list[Instance]:
         FormatError: it cannot be read.
     """
     path = Path(path)
-    try:
-        data = parse_json(read_text(path), keep_surrogates=True)  # files may be called so
-    except ValueError as error:
-        raise InstancesFileError(f"{path} is not JSON: {error}") from None
-    instances = data.get("instances") if isinstance(data, dict) else None
-    if not isinstance(instances, list) or not instances:
-        raise InstancesFileError(f'{path} has no list of instances: {{"instances": [{{"file": ...}}, ...]}}')
-    found: list[Instance] = []
-    try:
-        found.extend(_instance(instance, path.parent) for instance in instances)
-    except ValueError as error:
-        raise InstancesFileError(f"{path}: instance {len(found)} {error}") from None
+
+    def error(problem: str) -> InstancesFileError:
+        return InstancesFileError(f"{path}: {problem}")
+
+    root = Json.parse(read_text(path), Origin("", error), keep_surrogates=True)  # files may be called so
+    listed = root.value.get("instances") if isinstance(root.value, dict) else None
+    if not isinstance(listed, list) or not listed:
+        raise error('it has no list of instances: {"instances": [{"file": ...}, ...]}')
+    found = [_instance(item, path.parent) for item in root.items("instances")]
     given = Counter(each.name for each in found if each.name)
     twice = next((name for name, count in given.items() if count > 1), None)
     if twice is not None:
-        raise InstancesFileError(f"{path}: two instances are called {twice!r}")
+        raise error(f"two instances are called {twice!r}")
     automatic = iter(names_of([each.file for each in found if each.file and not each.name], given))
     return [each if each.name else replace(each, name=next(automatic)) for each in found]
 
 
-def _instance(data: Any, folder: Path) -> Instance:
-    """Return one instance, its name empty where it has none; `ValueError` where it is none."""
-    if not isinstance(data, dict):
-        raise ValueError(f"is {quoted_value(data)}, not an object")
-    for key in data:
-        if key not in KEYS:
-            raise ValueError(f"has {quoted_value(key)}, which is not one of {', '.join(KEYS)}")
-    file, name = data.get("file"), data.get("name", "")
-    if not isinstance(file, str) or not file:
-        raise ValueError("names no file")
-    if not is_file_name(file):
-        raise ValueError(f"names the file {quoted_value(file)}, which no file can be called")
-    if not isinstance(name, str) or name == TOTAL:
-        raise ValueError(f"cannot be called {quoted_value(name)}")
-    lod_scale = _numbers(data, "lod_scale", [1.0])[0]
-    if lod_scale < 0:
-        raise ValueError(f"has a lod_scale of {lod_scale:g}")
-    return Instance(folder / file, well_formed(name), _matrix(data), lod_scale, _foveation(data.get("foveation")))
+def _instance(item: Json, folder: Path) -> Instance:
+    """Return one instance, its name empty where it has none."""
+    _check_keys(item, KEYS)
+    file, name = item.text("file"), item.optional("name", Json.text, "")
+    if not file or not is_file_name(file):
+        raise item.get("file").unexpected("the name of a file")
+    if name == TOTAL:
+        raise item.get("name").unexpected("another name")
+    lod_scale = item.optional("lod_scale", _at_least_0, 1.0)
+    return Instance(folder / file, well_formed(name), _matrix(item), lod_scale, item.optional("foveation", _foveation))
 
 
-def _matrix(data: Mapping[str, Any]) -> Matrix:
+def _check_keys(item: Json, known: Collection[str]) -> None:
+    """Check that an object has known keys only, and that none but "foveation" is null."""
+    if not isinstance(item.value, dict):
+        raise item.unexpected("an object")
+    for key, value in item.value.items():
+        if key not in known:
+            raise item.error(f"{quoted_value(key)} is not one of {', '.join(known)}")
+        if value is None and key != "foveation":
+            raise item.get(key).error("null is no value; leave it out")
+
+
+def _matrix(item: Json) -> Matrix:
     """Return the (4, 4) matrix of a matrix, or of scale, rotation and translation."""
-    if "matrix" not in data:
-        x, y, z, w = _numbers(data, "rotation", [0, 0, 0, 1])
-        scale = _numbers(data, "scale", [1.0])[0]
-        if not scale >= 1 / LARGEST:
-            raise ValueError(f"has a scale of {scale:g}, which is {'too little' if scale > 0 else 'not more than 0'}")
-        matrix = np.eye(4)
-        matrix[:3, :3] = scale * rotation_of([w, x, y, z])
-        matrix[:3, 3] = _numbers(data, "translation", [0, 0, 0])
+    if item.has("matrix"):
+        if any(map(item.has, PARTS)):
+            raise item.error("it has a matrix, and parts of one too")
+        matrix = np.array(item.get("matrix").matrix(4, most=LARGEST)).reshape(4, 4)
+        found = scale_of(matrix, SKEW)
+        if found is None or found < 1 / LARGEST:
+            raise item.get("matrix").error("it is no rotation, uniform scale and translation, row by row")
         return matrix
-    if data.keys() & {"translation", "rotation", "scale"}:
-        raise ValueError("has a matrix, and parts of one too")
-    matrix = np.array(_numbers(data, "matrix", [])).reshape(4, 4)
-    found = scale_of(matrix, SKEW)
-    if found is None or found < 1 / LARGEST:
-        raise ValueError("has a matrix that is no rotation, uniform scale and translation, row by row")
+    x, y, z, w = item.optional("rotation", lambda each: each.numbers(4, most=LARGEST), [0.0, 0.0, 0.0, 1.0])
+    scale = item.optional("scale", _number, 1.0)
+    if not scale >= 1 / LARGEST:
+        raise item.get("scale").unexpected(f"a number from {1 / LARGEST:g} on")
+    matrix = np.eye(4)
+    try:
+        matrix[:3, :3] = scale * rotation_of([w, x, y, z])
+    except ValueError as error:
+        raise item.error(f"it {error}") from None
+    matrix[:3, 3] = item.optional("translation", lambda each: each.numbers(3, most=LARGEST), [0.0, 0.0, 0.0])
     return matrix
 
 
-def _foveation(data: Any) -> Foveation | None:
-    if data is None:
-        return None
-    if not isinstance(data, dict):
-        raise ValueError(f"has a foveation of {quoted_value(data)}")
-    kinds: dict[type[Cones | Frustum], dict[str, str]] = {
-        Frustum: {"outside_foveate": "outside", "behind_foveate": "behind"},
-        Cones: {"cone_fov0": "fov0", "cone_fov": "fov", "cone_foveate": "foveate", "behind_foveate": "behind"},
-    }
-    kind = Frustum if "outside_foveate" in data else Cones
-    for key in data:
-        if key not in kinds[kind]:
-            raise ValueError(f"has {quoted_value(key)} in its foveation, which is not one of {', '.join(kinds[kind])}")
-    values = {field: _numbers(data, key, [0.0])[0] for key, field in kinds[kind].items() if key in data}
-    if any(value < 0 for value in values.values()):
-        raise ValueError("has a negative foveation")
+def _foveation(item: Json) -> Foveation:
+    is_frustum = item.has("outside_foveate")
+    fields = FRUSTUM if is_frustum else CONES
+    _check_keys(item, fields)
+    values = {fields[key]: _at_least_0(value) for key, value in item.entries()}
     if max(values.get("fov0", 0), values.get("fov", 0)) > WIDEST:
-        raise ValueError(f"has a cone of more than {WIDEST} degrees in its foveation")
-    return kind(**values)
+        raise item.error(f"it has a cone of more than {WIDEST} degrees")
+    return Frustum(**values) if is_frustum else Cones(**values)
 
 
-def _numbers(data: Mapping[str, Any], key: str, default: list[float]) -> list[float]:
-    """Return the finite numbers of a key, as many as it has."""
-    value = data.get(key, default)
-    flat = value if isinstance(value, list) else [value]
-    if key == "matrix" and len(flat) == 4 and all(isinstance(row, list) for row in flat):
-        flat = [number for row in flat for number in row]
-    count = KEYS.get(key, 1)
-    plain = all(isinstance(number, (int, float)) and not isinstance(number, bool) for number in flat)
-    if len(flat) != count or not plain or not all(-math.inf < number < math.inf for number in flat):
-        raise ValueError(f"has {key} {quoted_value(value)}, which is not {count} finite number{'s' * (count > 1)}")
-    if any(abs(number) > LARGEST for number in flat):
-        raise ValueError(f"has {key} {quoted_value(value)}, which is beyond {LARGEST:g}")
-    return [float(number) for number in flat]
+def _number(item: Json) -> float:
+    """Return a number, which may be the only item of a list."""
+    return item.numbers(1, most=LARGEST)[0] if isinstance(item.value, list) else item.number(most=LARGEST)
+
+
+def _at_least_0(item: Json) -> float:
+    if (number := _number(item)) < 0:
+        raise item.unexpected("a number of 0 or more")
+    return number

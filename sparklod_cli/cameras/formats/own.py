@@ -14,7 +14,7 @@ from ...system.untrusted import quoted_value
 from ..camera import Matrix
 from ..frame import NO_LENS, Frame, Intrinsics, Settings
 from ..generators import Key, between, frame_looking
-from .source import Files, Json, Parsed, finite, posed, side
+from .source import CameraJson, Files, Parsed, finite, posed, side
 from .table import Axes
 
 FORMAT, VERSION = "sparklod-camera-path", 1
@@ -35,7 +35,7 @@ def parse_sparklod(files: Files, settings: Settings) -> Parsed:
     if root.has("version") and root.value["version"] != VERSION:
         raise CameraPathError(f"version {quoted_value(root.value['version'])} is unknown, only {VERSION} is read")
     lens = _lens(root, NO_LENS)
-    fps = root.optional("fps", Json.positive)
+    fps = root.optional("fps", CameraJson.positive)
     if root.has("keyframes", "frames"):
         raise CameraPathError("it has frames and keyframes; give one of them")
     if root.has("keyframes"):
@@ -47,8 +47,8 @@ def parse_sparklod(files: Files, settings: Settings) -> Parsed:
     return Parsed([_frame(item, lens, axes, settings) for item in items], fps=fps, turned=turned)
 
 
-def _axes(root: Json) -> Axes:
-    name = root.optional("axes", Json.text, Axes.OPENGL_C2W.value)
+def _axes(root: CameraJson) -> Axes:
+    name = root.optional("axes", CameraJson.text, Axes.OPENGL_C2W.value)
     try:
         return Axes(name)
     except ValueError:
@@ -56,33 +56,33 @@ def _axes(root: Json) -> Axes:
         raise CameraPathError(f"axes {name[:20]!r} are unknown; use one of {known}") from None
 
 
-def _frame(item: Json, default: Intrinsics, axes: Axes, settings: Settings) -> Frame:
+def _frame(item: CameraJson, default: Intrinsics, axes: Axes, settings: Settings) -> Frame:
     lens = _lens(item, default)
-    time, name = item.optional("time", Json.number), item.label("name")
+    time, name = item.optional("time", CameraJson.number), item.label("name")
     if item.has("eye"):
         up = item.get("up").numbers(3) if item.has("up") else settings.up_axis
         return frame_looking(item.get("eye").numbers(3), item.get("target").numbers(3), up, lens, time, name)
     return Frame(_matrix(item), lens, time, name, None if settings.axes else axes)
 
 
-def _matrix(item: Json) -> Matrix:
+def _matrix(item: CameraJson) -> Matrix:
     if item.has("matrix"):
         return np.array(item.get("matrix").matrix(4)).reshape(4, 4)
     x, y, z, w = item.get("quat_xyzw").numbers(4)
     return posed([w, x, y, z], item.get("position").numbers(3), item.place or "it")
 
 
-def _key(item: Json) -> Key:
+def _key(item: CameraJson) -> Key:
     return Key(
         tuple(item.get("eye").numbers(3)),
         tuple(item.get("target").numbers(3)),
         item.optional("up", lambda up: tuple(up.numbers(3))),
         item.optional("fov", lambda fov: math.radians(fov.number())),
-        item.optional("time", Json.number),
+        item.optional("time", CameraJson.number),
     )
 
 
-def _lens(item: Json, default: Intrinsics) -> Intrinsics:
+def _lens(item: CameraJson, default: Intrinsics) -> Intrinsics:
     """Return the lens of an object, whose fields override those of the whole file."""
     if item.has("size"):
         width, height = (each.side() for each in item.get("size").items())

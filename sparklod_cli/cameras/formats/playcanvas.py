@@ -18,7 +18,7 @@ from ...system.untrusted import quoted_value
 from ..camera import Matrix
 from ..frame import Frame, Intrinsics, Settings, sampled
 from ..generators import along, cardinal_tangents, frame_looking, hermite
-from .source import Files, Json, Parsed
+from .source import CameraJson, Files, Parsed
 
 UP = (0.0, 1.0, 0.0)
 FRAME_RATE = 30.0
@@ -60,9 +60,9 @@ def parse_supersplat(files: Files, settings: Settings) -> Parsed:
     return Parsed([_looking(_values(view, FOV_VIEW), None, settings) for view in views])
 
 
-def _of_track(track: Json, fov: float, first_version: bool, settings: Settings) -> Parsed:
+def _of_track(track: CameraJson, fov: float, first_version: bool, settings: Settings) -> Parsed:
     """Return an item of animTracks. Version 1 has one field of view for all keys, and at first counted in seconds."""
-    rate = track.optional("frameRate", Json.positive, FRAME_RATE)
+    rate = track.optional("frameRate", CameraJson.positive, FRAME_RATE)
     times = np.array(track.get("keyframes", "times").numbers())
     if not track.has("frameRate"):
         times = times * FRAME_RATE
@@ -72,7 +72,7 @@ def _of_track(track: Json, fov: float, first_version: bool, settings: Settings) 
         points[:, column : column + 3] = np.reshape(values.get(key).numbers(3 * len(times)), (-1, 3))
     points[:, 6] = values.get("fov").numbers(len(times)) if values.has("fov") else fov
     duration = track.get("duration").positive()
-    smoothness = track.optional("smoothness", Json.number, float(not first_version))
+    smoothness = track.optional("smoothness", CameraJson.number, float(not first_version))
     length = None
     if len(times) and track.has("loopMode") and track.value["loopMode"] == "repeat":
         length = (duration + (duration == times[-1] / rate)) * rate
@@ -81,15 +81,15 @@ def _of_track(track: Json, fov: float, first_version: bool, settings: Settings) 
     return _sampled(at, _whole(duration * rate), rate, settings)
 
 
-def _of_document(root: Json, settings: Settings) -> Parsed:
+def _of_document(root: CameraJson, settings: Settings) -> Parsed:
     """Return the frames of a project; poses beyond the end of its time line are ignored, with a note."""
     line = root.get("timeline")
-    count, rate = line.number("frames"), line.optional("frameRate", Json.positive, FRAME_RATE)
+    count, rate = line.number("frames"), line.optional("frameRate", CameraJson.positive, FRAME_RATE)
     keys = {}
     late = 0
     sets = list(root.items("poseSets"))  # SuperSplat writes one set or none
     for index, pose in enumerate(pose for one in sets[:1] for pose in one.items("poses")):
-        frame = pose.optional("frame", Json.number, index * rate)
+        frame = pose.optional("frame", CameraJson.number, index * rate)
         if frame < count:
             keys[frame] = _values(pose, _fov(root))
         else:
@@ -97,7 +97,7 @@ def _of_document(root: Json, settings: Settings) -> Parsed:
     notes = [f"Only the first of its {len(sets):,} pose sets was read."] if len(sets) > 1 else []
     if late:
         notes.append(f"Poses beyond the end of its time line were ignored ({late:,}).")
-    smoothness = line.optional("smoothness", Json.number, 1.0)
+    smoothness = line.optional("smoothness", CameraJson.number, 1.0)
     looping = not line.has("loop") or line.value["loop"] is True
     times = np.array(sorted(keys))
     points = np.array([keys[time] for time in times]).reshape(-1, 7)
@@ -110,13 +110,13 @@ def _whole(frames: float) -> float:
     return float(round(frames)) if math.isfinite(frames) else frames
 
 
-def _values(view: Json, fov: float) -> list[float]:
+def _values(view: CameraJson, fov: float) -> list[float]:
     """Return position, target and field of view in degrees."""
-    degrees = view.optional("fov", Json.number, fov)
+    degrees = view.optional("fov", CameraJson.number, fov)
     return [*view.get("position").numbers(3), *view.get("target").numbers(3), degrees]
 
 
-def _fov(root: Json) -> float:
+def _fov(root: CameraJson) -> float:
     camera = root.get("camera")
     return camera.number("fov") if camera.has("fov") else FOV_TRACK
 
@@ -173,9 +173,9 @@ def recognises_camera_track(files: Files) -> bool:
 def parse_camera_track(files: Files, settings: Settings) -> Parsed:
     """Parse the plain camera track of splat-transform: `{frameRate, frames: [{position, target, fov, up}]}`."""
     root = files.object()
-    fps, items = root.optional("frameRate", Json.positive), list(root.items("frames"))
+    fps, items = root.optional("frameRate", CameraJson.positive), list(root.items("frames"))
 
-    def frame(item: Json) -> Frame:
+    def frame(item: CameraJson) -> Frame:
         lens = Intrinsics(fov=item.optional("fov", lambda fov: math.radians(fov.number())))  # vertical
         up = item.optional("up", lambda up: up.numbers(3)) or settings.up or UP
         return frame_looking(item.get("position").numbers(3), item.get("target").numbers(3), up, lens)

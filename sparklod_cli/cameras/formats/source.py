@@ -1,4 +1,4 @@
-"""Input and output of parsers: `Files`, `Json`, which checks values where they are used, and `Parsed`."""
+"""Input and output of parsers: `Files`, `CameraJson`, which checks values where they are used, and `Parsed`."""
 
 from __future__ import annotations
 
@@ -45,10 +45,10 @@ class Files:
         return decoded(self.data)
 
     @cached_property
-    def json(self) -> Json | None:
+    def json(self) -> CameraJson | None:
         """The first file as JSON; None if it is not JSON."""
         try:
-            return Json.parse(self.text or "", ORIGIN)
+            return CameraJson.parse(self.text or "", ORIGIN)
         except CameraPathError:
             return None
 
@@ -58,7 +58,7 @@ class Files:
             raise CameraPathError("it is not a text file")
         return self.text.splitlines()
 
-    def object(self) -> Json:
+    def object(self) -> CameraJson:
         """Return the first file as JSON; `CameraPathError` if it is not JSON."""
         if self.json is None:
             raise CameraPathError("it is not JSON, or cut short")
@@ -82,7 +82,7 @@ class Parsed:
     turned: bool = False
 
 
-class Json(untrusted.Json):
+class CameraJson(untrusted.Json):
     """A value of a camera file, whose numbers may be written as texts; its errors are `CameraPathError`."""
 
     __slots__ = ()

@@ -9,7 +9,7 @@ import numpy as np
 from ...system.errors import CameraPathError
 from ..frame import Frame, Intrinsics, Settings
 from ..pose import pose
-from .source import Files, Json, Parsed
+from .source import CameraJson, Files, Parsed
 
 #: The camera types of nerfstudio's paths that are read as pinhole cameras.
 PINHOLES = ("perspective", "fisheye")
@@ -31,20 +31,20 @@ def recognises_nerfstudio(files: Files) -> bool:
 def parse_nerfstudio(files: Files, settings: Settings) -> Parsed:
     """Parse a path that nerfstudio's viewer saved. Keyframes are ignored: the frames are interpolated from them."""
     root = files.object()
-    kind = root.optional("camera_type", Json.text, PINHOLES[0])
+    kind = root.optional("camera_type", CameraJson.text, PINHOLES[0])
     if kind not in PINHOLES:
         raise CameraPathError(f"its camera_type {kind[:20]!r} is not that of a pinhole camera")
     size = None
     if root.has("render_width", "render_height"):
         size = root.get("render_width").side(), root.get("render_height").side()
 
-    def frame(item: Json) -> Frame:
-        degrees = item.optional("fov", Json.number)  # vertical, as in three.js; the aspect is that of the size
+    def frame(item: CameraJson) -> Frame:
+        degrees = item.optional("fov", CameraJson.number)  # vertical, as in three.js; the aspect is that of the size
         matrix = np.array(item.get("camera_to_world").matrix(4)).reshape(4, 4)
         return Frame(matrix, Intrinsics(size, fov=None if degrees is None else math.radians(degrees)))
 
     frames = list(map(frame, root.items("camera_path")))
-    fps = root.optional("fps", Json.number, 0.0)
+    fps = root.optional("fps", CameraJson.number, 0.0)
     notes = ("Its fisheye cameras are read as pinhole cameras.",) if kind == "fisheye" else ()
     return Parsed(frames, notes, fps if fps > 0 else None)
 
@@ -74,14 +74,14 @@ def parse_transforms(files: Files, settings: Settings) -> Parsed:
     return Parsed(frames, tuple(notes))
 
 
-def _lens(item: Json, root: Json) -> Intrinsics:
+def _lens(item: CameraJson, root: CameraJson) -> Intrinsics:
     """Return the lens of a frame: each value is that of the frame, or else of the whole file."""
 
     def number(key: str) -> float | None:
-        return (item if item.has(key) else root).optional(key, Json.number)
+        return (item if item.has(key) else root).optional(key, CameraJson.number)
 
     def side(key: str) -> int | None:
-        return (item if item.has(key) else root).optional(key, Json.side)
+        return (item if item.has(key) else root).optional(key, CameraJson.side)
 
     width, height = side("w"), side("h")
     angle_x, angle_y = number("camera_angle_x"), number("camera_angle_y")

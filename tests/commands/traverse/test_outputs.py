@@ -138,7 +138,10 @@ def test_a_scene_names_what_is_missing_beside_it(tmp_path: Path, capsys: Capture
     assert traverse("--scene", scene_file(tmp_path, {"file": "gone.spz"})) == 1
     assert capsys.readouterr().err == f"error: {tmp_path / 'gone.spz'}: cannot be read: no such file or directory\n"
     assert traverse("--scene", scene_file(tmp_path, {"file": "a"}, {"file": "b", "scale": "big"})) == 1
-    assert f"error: {tmp_path / 'scene.json'}: instance 1 has scale 'big'" in capsys.readouterr().err
+    assert (
+        f"error: {tmp_path / 'scene.json'}: instances[1].scale: expected a number up to 1e+12, not 'big'"
+        in capsys.readouterr().err
+    )
 
 
 def test_a_walk_through_a_city_has_a_row_for_every_instance_and_frame(
