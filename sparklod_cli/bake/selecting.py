@@ -54,19 +54,21 @@ def check_transformed(beyond: int) -> None:
 
 def transformed(splats: Splats, settings: Transform, threads: int = 1) -> Splats:
     """Turn, scale and move splats; fail where one leaves the range of float32."""
+    if settings.is_identity:
+        return splats
     turned, beyond = transform(splats, settings, threads)
     check_transformed(beyond)
     return turned
 
 
 def split_environment(splats: Splats, distance: float) -> tuple[Splats, Splats | None]:
-    """Return the splats of a scene, and those far outside, which become its environment; None without any.
+    """Separate splats far outside of a scene, which become its environment; None without any.
 
     Args:
         distance: see `lod.regions.beyond`.
 
     Raises:
-        InvalidSplatsError: all of them would.
+        InvalidSplatsError: all splats are far outside.
     """
     from ..lod.regions import beyond
 

@@ -31,9 +31,9 @@ class SimplifyGoal:
     """Size or fidelity of a simplified scene. One of the three is not None.
 
     Attributes:
-        to: so many, or a share of all.
-        max_bytes: the most that fit into a file of this size.
-        psnr: the fewest whose pictures are this close to full detail, dB.
+        to: number of splats, or a share of all.
+        max_bytes: size of a file that as many splats as possible shall fill.
+        psnr: least PSNR against full detail, dB, of as few splats as possible.
 
     Raises:
         ValueError: not exactly one is given, or it is out of its range.
@@ -82,7 +82,7 @@ class BakeSettings:
         camera_path: a file of training cameras, or of those by which a PSNR is measured, in the coordinates of the
             output; None for cameras that are placed around and inside the scene.
         converts: an input that has a tree keeps it, if its format is another one; otherwise it is refused.
-        unused: flags of options that were given and mean nothing to an input that has a tree, which is refused then.
+        unused: flags of given options that have no effect on a tree; such an input is refused.
     """
 
     method: str = METHODS[0]
@@ -118,7 +118,7 @@ class BakeSettings:
         return rotated(self.up or found, self.transform.rotation)
 
     def notes_on(self, source: Scene | Reader) -> tuple[str, ...]:
-        """Return what a user should know of an input: its notes, and its axis if a specification names it."""
+        """Return notes on an input for the user: its own, and on its up axis if a specification names that."""
         return source.notes + (line(source.up, source.up_by) if self.up is None else ())
 
 

@@ -1,4 +1,4 @@
-"""Validation: of splats and trees that were read or will be written, and of the rules of formats with many."""
+"""Validation of splats and trees where they are read or passed to the API, and of the rules of formats."""
 
 from __future__ import annotations
 
@@ -60,7 +60,10 @@ def with_valid_tree(scene: Scene) -> Scene:
         scene.tree.validate()
     except TreeError as error:
         raise FormatError(f"its Level-of-Detail tree is broken: {error}") from error
-    return dataclasses.replace(scene, tree=LodTree(scene.tree.child_count, scene.tree.first_child()))
+    start = scene.tree.first_child()
+    if np.array_equal(start, scene.tree.child_start):
+        return scene  # whose tree knows that it is valid
+    return dataclasses.replace(scene, tree=LodTree(scene.tree.child_count, start))
 
 
 def is_valid_and_visible(splats: Splats, threads: int) -> tuple[bool, bool]:

@@ -45,9 +45,9 @@ class LodTree:
         return len(self.child_count)
 
     def frozen(self) -> LodTree:
-        """Return this tree with columns that nobody can write to: copies unless they are such columns already.
+        """Return this tree with immutable columns, copied unless they are so already.
 
-        Kernels follow the links without looking where they lead: a tree must not change after `validate`.
+        Kernels follow links without bounds checks: a tree must not change after `validate`.
         """
         if self._is_frozen:
             return self

@@ -27,7 +27,7 @@ EXAMINED = 1 << 15
 
 @dataclass(frozen=True)
 class SelectionTally:
-    """Counts of the splats of a scene, or of a part of it, that a selection keeps and drops.
+    """Counts of splats of a scene, or of a part of it, that a selection keeps and drops.
 
     Attributes:
         count: N splats.
@@ -45,7 +45,7 @@ class SelectionTally:
         return self.count - sum(self.dropped.values())
 
     def then(self, after: SelectionTally) -> SelectionTally:
-        """Return the result for these splats and those that come after them."""
+        """Return the tally of these splats and those after them."""
         first = self.first_invalid
         if first is None and after.first_invalid is not None:
             first = self.count + after.first_invalid
@@ -83,9 +83,9 @@ class Selection:
         return (splats if keep.all() else splats.take(keep)), tally.dropped
 
     def examine(self, splats: Splats, *, threads: int = 1) -> tuple[NDArray[np.bool_], SelectionTally]:
-        """Return which splats of a scene, or of a part of it, are kept, (N,), and what becomes of the others.
+        """Return the (N,) mask of the splats of a scene, or of a part of it, that are kept, and a tally of the others.
 
-        Invalid ones are not kept in any case.
+        Invalid splats are never kept.
         """
         keep, tally = np.ones(len(splats), np.bool_), SelectionTally()
         parts = blocks_of(len(splats), EXAMINED)
@@ -95,7 +95,6 @@ class Selection:
         return keep, tally
 
     def _examine(self, splats: Splats) -> tuple[NDArray[np.bool_], SelectionTally]:
-        """`examine` for a few splats."""
         invalid = splats.invalid()
         keeps = {kind: ~mask for kind, mask in invalid.items()} | {
             "zero_opacity": splats.opacity > 0,
@@ -113,7 +112,7 @@ class Selection:
         return keep, SelectionTally(len(splats), {reason: count for reason, count in dropped.items() if count}, first)
 
     def check(self, tally: SelectionTally) -> None:
-        """Check that a tree can be made of what is kept of a whole scene; raises `InvalidSplatsError`, see `apply`."""
+        """Check the tally of a whole scene: raise `InvalidSplatsError` if no tree can be built, see `apply`."""
         if tally.count == 0:
             raise InvalidSplatsError("it has no splats")
         if tally.first_invalid is not None and not self.drop_invalid:
