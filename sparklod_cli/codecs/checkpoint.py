@@ -24,10 +24,11 @@ from ..system.progress import Progress
 from ..system.threads import blocks_of, ordered_map
 from ..system.untrusted import quoted, quoted_value
 from . import quantize
+from .formats import ZIP
 from .left_out import HARMLESS, left_out
 from .reader import OpenFile, Positioned, Reader, Target, size_of
 from .tensor_pickle import Tensor, unpickled
-from .zip_folder import ZIP, ZIP_ERRORS
+from .zip_folder import ZIP_ERRORS
 
 #: Bytes of data.pkl at most. That of nerfstudio, with the state of its optimisers, has some 50,000. Chosen.
 MOST_PICKLE = 1 << 24

@@ -21,6 +21,10 @@ from ..system.untrusted import keys_of_object
 HEAD, JSON_HEAD = 1 << 16, 1 << 22
 
 
+#: Beginning of a zip that is not empty.
+ZIP = b"PK\x03\x04"
+
+
 @dataclass(frozen=True)
 class Format:
     """A file format.

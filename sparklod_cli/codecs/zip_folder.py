@@ -18,9 +18,6 @@ from .compression import check_promise
 from .file_names import MANIFEST, META, TILESET
 from .reader import size_of
 
-#: Beginning of a zip that is not empty.
-ZIP = b"PK\x03\x04"
-
 #: What `zipfile` raises on archives that are damaged, encrypted or of a kind that it does not read.
 ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, ValueError, struct.error)
 

@@ -15,9 +15,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 from ..codecs.encoder import Stored
-from ..codecs.formats import FORMATS, NPZ, RAW_SUFFIXES, Format, head_of, lookalike_of, sniff
+from ..codecs.formats import FORMATS, NPZ, RAW_SUFFIXES, ZIP, Format, head_of, lookalike_of, sniff
 from ..codecs.reader import OpenCompanion, OpenFile, Reader, Target
-from ..codecs.zip_folder import ZIP, ZipFolder
 from ..model.instances import Instance
 from ..model.scene import DetailScene, Scene
 from ..model.splats import COLUMNS
@@ -179,6 +178,8 @@ def open_splats(path: Place, closing: contextlib.ExitStack) -> tuple[BinaryIO, F
     form = recognised(head, path)
     open_companion: OpenCompanion = functools.partial(open_named, path, folders=form.folders)
     if head.startswith(ZIP) and form.companions:
+        from ..codecs.zip_folder import ZipFolder  # what most files do without
+
         folder = ZipFolder(file)
         file.seek(0)
         if folder.first != form.unbundled:  # a folder of another format in a zip

@@ -14,7 +14,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from ..codecs.file_names import META
-from ..codecs.formats import head_of
+from ..codecs.formats import ZIP, head_of
 from ..codecs.glb.codec import open_content as open_glb
 from ..codecs.glb.glb_container import MAGIC as GLB_MAGIC
 from ..codecs.rad.rad_header import CHUNK_MAGIC, MAGIC, RadHeader, read_header
@@ -23,7 +23,7 @@ from ..codecs.streamed_sog.manifest import MAX_MANIFEST, parse
 from ..codecs.streamed_sog.manifest_rules import files_of_chunk
 from ..codecs.tiles_3d.codec import names_of
 from ..codecs.tiles_3d.tileset import MAX_TILESET
-from ..codecs.zip_folder import ZIP, ZipFolder
+from ..codecs.zip_folder import ZipFolder
 from ..io.local_files import companion_path, in_folder, open_named, open_plain, reason_unreadable
 from ..io.reading import recognised
 from ..model.lod_tree import CHUNK_NODES

@@ -18,6 +18,7 @@ from ...system.progress import Progress, silent
 from ...system.units import count_of
 from ...system.untrusted import quoted_value
 from ..file_names import MANIFEST
+from ..formats import ZIP
 from ..json_trees import leads_away
 from ..left_out import code_of
 from ..reader import OpenCompanion
@@ -26,7 +27,6 @@ from ..sog import codec as sog
 from ..sog import texel_codings
 from ..sog.sog_container import MAX_META, image_names, parse_meta
 from ..validation import RuleViolation, count_outside
-from ..zip_folder import ZIP
 from .manifest import MAX_MANIFEST, Bound, Manifest, ManifestNode, Run, parse
 
 #: Meaning of each code; the text of a violation has the values. Values of the wrong kind, which
