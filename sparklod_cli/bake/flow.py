@@ -20,9 +20,9 @@ from ..system.progress import Progress, silent
 from ..system.stdio import DASH
 from . import estimate
 from .in_memory import InMemory
-from .output import output_of, write_tree
 from .records import Baked, Clock
 from .settings import BakeSettings, Resources
+from .tree_output import output_of, write_tree
 
 if TYPE_CHECKING:
     from .out_of_core.job import Engine

@@ -18,10 +18,10 @@ from ..model.scene import Scene
 from ..model.splats import Splats
 from ..system.progress import Progress
 from ..system.threads import on_threads
-from .output import BakeOutput, output_of_existing_tree
 from .records import BuiltTree, Clock
 from .selecting import read_environment, select, split_environment, transformed
 from .settings import BakeSettings
+from .tree_output import BakeOutput, output_of_existing_tree
 
 
 @dataclass

@@ -12,10 +12,10 @@ from ..model.scene import NodeStream, Scene
 from ..model.splats import Splats
 
 if TYPE_CHECKING:
-    from .output import BakeOutput
     from .parts_output import WrittenDetail, WrittenTiles
     from .refining import Refined
     from .simplifying import WrittenSet
+    from .tree_output import BakeOutput
 
 
 class Clock:

@@ -28,7 +28,7 @@ from .records import BuiltTree, Clock, WrittenTree
 from .refining import Refined, fit_settings, refined
 from .settings import BakeSettings, SimplifyGoal
 
-#: Cameras that a PSNR is measured with where nobody names any, and their seed: as many as judge a fitted tree.
+#: Number of cameras for a PSNR unless cameras are given, and their seed; a fitted tree is judged by as many.
 CAMERAS, SEED = 16, 0
 
 #: How far a file may be below the size that was asked for, and how far the splats that hold a PSNR may be above the
@@ -45,7 +45,7 @@ Measure = Callable[[int], float]
 def count_for(
     goal: SimplifyGoal, leaves: int, *, bytes_of: Measure, psnr_of: Measure, progress: Progress
 ) -> tuple[int, float | None]:
-    """Return how many splats a goal asks for, and their PSNR where it asks for one.
+    """Return the number of splats that meets a goal, and their PSNR if the goal is a PSNR.
 
     Args:
         leaves: of full detail.
@@ -63,7 +63,7 @@ def count_for(
 
 
 def _largest(most: int, leaves: int, bytes_of: Measure, progress: Progress) -> int:
-    """Return the most splats whose file has at most `most` bytes, or little less, see `CLOSE_BYTES`."""
+    """Return the largest number of splats whose file has at most `most` bytes, within `CLOSE_BYTES`."""
     low, high, below, above = 1, leaves, bytes_of(1), bytes_of(leaves)
     if above <= most:
         return leaves
@@ -85,7 +85,7 @@ def _largest(most: int, leaves: int, bytes_of: Measure, progress: Progress) -> i
 
 
 def _smallest(least: float, leaves: int, psnr_of: Measure, progress: Progress) -> tuple[int, float]:
-    """Return the fewest splats, or little more, whose PSNR is at least `least`, and that."""
+    """Return the smallest number of splats whose PSNR is at least `least`, within `CLOSE_COUNT`, and the PSNR."""
     low, high, best = 0, leaves, psnr_of(leaves)
     trials = math.ceil(math.log2(max(math.log(max(leaves, 2)) / math.log1p(CLOSE_COUNT), 1)))
     for trial in range(trials):
@@ -158,7 +158,7 @@ class Chosen:
 
 @dataclass(frozen=True)
 class Simplifier:
-    """Cuts trees as a goal asks for.
+    """Simplification of trees to a goal.
 
     Attributes:
         refine: how the cut is fitted to pictures of full detail, for all cameras; None for not at all.
@@ -173,7 +173,7 @@ class Simplifier:
 
     @classmethod
     def of(cls, settings: BakeSettings, say: Callable[[str], None]) -> Simplifier:
-        """Return the one of settings.
+        """Return the simplifier for the settings of a bake.
 
         Raises:
             CameraPathError: the cameras that they name cannot be read.
@@ -189,7 +189,7 @@ class Simplifier:
         return cls(settings.simplify, refine, cameras, say)
 
     def choose(self, tree: Scene, *, bytes_of: Callable[[Scene], float], threads: int, progress: Progress) -> Chosen:
-        """Return the cut of a tree that the goal asks for, fitted if need be, as a scene without a tree.
+        """Find the cut of a tree that meets the goal, and fit it if requested; return it as a scene without a tree.
 
         Args:
             bytes_of: size of the file of a scene.

@@ -1,4 +1,4 @@
-"""The only package that opens paths: tells formats, reads scenes, and writes files whole or not at all.
+"""Opens inputs, recognises their formats and reads them; decides which files a scene becomes.
 
 What most jobs need is imported here; `rad_file` and `details` are imported by those who need them.
 """

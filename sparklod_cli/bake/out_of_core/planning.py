@@ -19,9 +19,9 @@ from ...system.stdio import name_of
 from ...system.units import count_of, format_size
 from .. import estimate
 from ..identity import BakeIdentity
-from ..output import BakeOutput
 from ..records import Clock
 from ..settings import BakeSettings, Resources
+from ..tree_output import BakeOutput
 from .in_blocks import InBlocks
 from .job import Engine, Job, LocalEngine
 from .scratch_folder import at_work
