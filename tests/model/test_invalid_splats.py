@@ -10,11 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import sparklod_cli as sparklod
 from fixtures import by_hand_ksplat, by_hand_splat
 from sparklod_cli.cli import run
 from sparklod_cli.codecs.formats import ENCODINGS
-from sparklod_cli.lod import quality, quick
 from sparklod_cli.lod.builders import METHODS
+from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.selection import REASONS, Selection
 from sparklod_cli.model.splats import INVALID, Splats
 from sparklod_cli.system.errors import InvalidSplatsError
@@ -118,14 +119,14 @@ def test_every_kind_has_a_spoiler_and_is_a_reason() -> None:
     assert list(SPOILERS) == list(INVALID) == list(REASONS)[: len(INVALID)]
 
 
-@pytest.mark.parametrize("builder", [quick, quality])
+@pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("kind", INVALID)
-def test_every_kind_is_refused_by_builders_and_dropped_by_a_selection(kind: str, builder: object) -> None:
+def test_every_kind_is_refused_by_builders_and_dropped_by_a_selection(kind: str, method: str) -> None:
     good = random_splats(20, sh_degree=1)
     splats = spoiled(kind, 4, good)
     assert {each: mask.tolist() for each, mask in splats.invalid().items()} == {kind: [at == 4 for at in range(20)]}
     with pytest.raises(InvalidSplatsError, match=r"1 of 20 splats is .*the first is splat 4"):
-        builder.build(splats)  # type: ignore[attr-defined]
+        sparklod.build_lod(Scene(splats), method=method)
     with pytest.raises(InvalidSplatsError, match=r"1 of 20 splats is .*the first is splat 4"):
         Selection().apply(splats)
     kept, dropped = Selection(drop_invalid=True).apply(splats)
