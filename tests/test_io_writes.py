@@ -313,7 +313,7 @@ def test_a_replaced_file_keeps_its_permissions(tmp_path: Path) -> None:
     assert target.stat().st_ino != before  # renamed to, not written into
 
 
-@pytest.mark.parametrize("kind", ["path", "address"])
+@pytest.mark.parametrize("kind", ["path", pytest.param("address", marks=pytest.mark.slow)])
 def test_a_file_grows_by_each_call_and_appears_at_the_end(kind: str, tmp_path: Path) -> None:
     place: Path | Address = tmp_path / "out.spz"
     if kind == "address":
