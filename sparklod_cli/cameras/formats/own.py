@@ -85,7 +85,8 @@ def _key(item: CameraJson) -> Key:
 def _lens(item: CameraJson, default: Intrinsics) -> Intrinsics:
     """Return the lens of an object, whose fields override those of the whole file."""
     if item.has("size"):
-        width, height = (each.side() for each in item.get("size").items())
+        item.get("size").pair()
+        width, height = (each.side() for each in item.items("size"))
         default = dataclasses.replace(default, size=(width, height))
     if item.has("fov"):
         default = dataclasses.replace(default, fov=math.radians(item.number("fov")), focal=None)

@@ -75,6 +75,7 @@ FAULTS: dict[str, tuple[str | bytes, str]] = {
         own('"size": [9, 9], "focal": [9, 1e200], "frames": [{"eye": [1, 0, 0], "target": [0, 0, 0]}]'),
         "frame 0 has a focal length .* not positive or too large",
     ),
+    "a size of one side": (own('"size": [9], "frames": []'), "size: expected a list of 2 numbers"),
     "half a pixel": (own('"size": [9.5, 9], "frames": []'), "size.0.: expected a number of pixels, not 9.5"),
     "a fov of 180": (
         own('"fov": 180, "frames": [{"eye": [1, 0, 0], "target": [0, 0, 0]}]'),
