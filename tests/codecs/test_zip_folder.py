@@ -141,7 +141,10 @@ def test_a_zip_of_a_folder_of_scans_is_said_to_be_unzipped(tmp_path: Path) -> No
 
 
 def test_a_manifest_in_a_zip_is_held_to_its_format(tmp_path: Path) -> None:
-    for data, reason in ((b"{}", "not a splat file"), (b'{"lodLevels": 1}', "lod-meta.json has no filenames")):
+    for data, reason in (
+        (b"{}", "not a splat file"),
+        (b'{"lodLevels": 1}', "filenames of lod-meta.json: expected a list, but it is missing"),
+    ):
         with pytest.raises(FormatError, match=reason):
             read_scene(zipped(tmp_path / "scene.zip", {"lod-meta.json": data}))
     missing = {name: data for name, data in STREAMED.items() if not name.startswith("0_0/")}

@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 import sparklod_cli as sparklod
-from sparklod_cli.codecs.spz_streams import SYSTEM_OF_UP, SYSTEMS, is_right_handed, up_of
+from sparklod_cli.codecs.spz_streams import SYSTEM_OF_UP, SYSTEMS
 from sparklod_cli.model.gaussian import normalized_quat, rotation_matrices
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.sh import SH_C0
@@ -108,6 +108,10 @@ def test_the_library_turns_upright_what_sparklod_notes(library: Library, tmp_pat
     same(library.read(path, "RUB").splats, Transform.from_up(up).apply(scene.splats))
 
 
+#: Directions by the letters of coordinate systems: right, left, up, down, back and front.
+DIRECTIONS = {"R": (1, 0, 0), "L": (-1, 0, 0), "U": (0, 1, 0), "D": (0, -1, 0), "B": (0, 0, 1), "F": (0, 0, -1)}
+
+
 @pytest.mark.parametrize("version", [2, 3, 4])
 @pytest.mark.parametrize("system", SYSTEMS)
 def test_a_coordinate_system_says_what_is_up_and_nothing_is_turned(
@@ -118,8 +122,9 @@ def test_a_coordinate_system_says_what_is_up_and_nothing_is_turned(
     files = {"source": str(source), "path": str(path)}
     library.ask({"do": "write", **files, "from": "RUB", "version": version, "system": system})
     scene = sparklod.read(path)
-    assert scene.up == up_of(system)
-    assert any("left-handed" in note for note in scene.notes) is not is_right_handed(system)
+    axes = np.array([DIRECTIONS[letter] for letter in system])  # where x, y and z point, as right, up and back
+    assert scene.up == {1: "", -1: "-"}[axes[:, 1].sum()] + "xyz"[np.flatnonzero(axes[:, 1])[0]]
+    assert any("left-handed" in note for note in scene.notes) is bool(np.linalg.det(axes) < 0)
     # It writes the records of older versions, but does not find them when it reads.
     same(library.read(path, system if version == 4 else "UNSPECIFIED").splats, scene.splats)
     if system == SYSTEM_OF_UP[scene.up]:
