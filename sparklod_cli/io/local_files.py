@@ -113,7 +113,7 @@ def _named_in(path: Path) -> list[Path]:
     """Return the files that a splat file names: images of a SOG, chunks of a RAD, all of the other formats."""
     with path.open("rb") as file:
         head = head_of(file)
-        form = sniff(head, "")
+        form = sniff(head, path.suffix)
         if form is not None and not form.companions:
             return []
         from ..codecs.glb.glb_container import GltfFile

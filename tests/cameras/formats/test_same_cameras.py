@@ -76,7 +76,7 @@ def test_every_format_has_a_fixture() -> None:
 def test_each_format_recognises_its_own_files_only() -> None:
     for name, (form, *_) in CASES.items():
         files = files_at(FOLDER / name)
-        assert [row.name for row in FORMATS if row.parser().recognises(files)] == [form]
+        assert [row.name for row in FORMATS if row.recognises(files)] == [form]
 
 
 def test_a_format_that_may_have_another_world_says_so() -> None:
