@@ -60,25 +60,23 @@ class Siblings:
                         found += [f"{each.name}/{file.name}" for file in each.iterdir()]
         return sorted(filter(self.is_member, found), key=lambda name: (len(name), name))
 
-    def former(self, target: Place) -> list[str]:
-        """Return the files of a former output, which an overwrite removes or replaces; `OutputError` as `existing`."""
-        existing = self.existing(target)
+    def former(self, target: Place, existing: list[str]) -> list[str]:
+        """Return the `existing` files that belong to a former output, which an overwrite removes or replaces."""
         if self.named is None:
             return existing
-        names = dict[str, None]()
+        names, known = dict[str, None](), set(existing)
         with contextlib.suppress(OSError, FormatError):
             for name in self.named(target):
                 names[name] = None
-        return [name for name in names if name in set(existing)]
+        return [name for name in names if name in known]
 
 
 class Output:
     """An output, tried when it is made, before any work; its files appear at the end of the context, all or none.
 
-    With `overwrite`, existing files are replaced, and those of a former
-    output that have no successor are removed. An error or an interrupt leaves the former files. See `atomic.publish`
-    for a kill. At an address, files are sent one by one: the former first file is removed first, the new one must be
-    written last, and an error removes what was sent.
+    With `overwrite`, existing files are replaced, and those of a former output that have no successor are removed. An
+    error or an interrupt leaves the former files. See `atomic.publish` for a kill. At an address, files are sent one by
+    one: the former first file is removed first, the new one must be written last, and an error removes what was sent.
 
     Args:
         place: of the file, or of the first file; files go to where a symbolic link leads. - is standard output. A pipe
@@ -203,8 +201,7 @@ class Output:
             raise OutputError(f"{self.place} is a pipe or a device, which cannot take several files; name a file")
         if is_remote and self._overwrite and siblings.is_folder is None:
             return
-        self._find_former(siblings)
-        existing = siblings.existing(self.target)
+        existing = self._find_former(siblings)
         if siblings.is_folder is not None:
             self._check_folder(siblings.first_folder)
             for name in existing if is_remote else ():
@@ -215,9 +212,12 @@ class Output:
                 if not self._overwrite or (isinstance(place, Path) and _is_no_file(place)):
                     raise _taken(place)
 
-    def _find_former(self, siblings: Siblings) -> None:
-        self._former = siblings.former(self.target)
+    def _find_former(self, siblings: Siblings) -> list[str]:
+        """Find the files of a former output, and return all files there that have names of siblings."""
+        existing = siblings.existing(self.target)
+        self._former = siblings.former(self.target, existing)
         self._ours = {"", *(name.rpartition("/")[0] for name in self._former)}
+        return existing
 
     def _check_folder(self, folder: str) -> None:
         """Raise `OutputError` where a folder is not empty, and not one of the former output."""
