@@ -12,7 +12,7 @@ from . import __version__
 from .commands.command import Group
 from .commands.console import Verbosity, say, say_error, say_usage_error
 from .system import interrupts, stdio
-from .system.errors import SparklodError, out_of_memory
+from .system.errors import SparklodError, out_of_memory, reason_of
 from .system.printable import printable
 
 #: Most characters of an unexpected error in its message.
@@ -111,7 +111,7 @@ def _run(arguments: list[str] | None) -> int:
         if out_of_memory(error):
             return _failed(error, verbosity)
         where = f"{os.fsdecode(error.filename)}: " if isinstance(error.filename, (str, bytes, os.PathLike)) else ""
-        say_error(f"cannot go on: {where}{(error.strerror or str(error)).lower()}")
+        say_error(f"cannot go on: {where}{reason_of(error)}")
         return 1
     except Exception as error:
         return _failed(error.__cause__ if isinstance(error, _EndOfFileError) and error.__cause__ else error, verbosity)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,7 +12,7 @@ import numpy as np
 from ..io import rad_file, read_scene
 from ..model.scene import Scene, Tree
 from ..model.splats import COLUMNS, FloatArray
-from ..system.errors import FormatError, InvalidSplatsError, TreeError, memory_errors_translated
+from ..system.errors import FormatError, InvalidSplatsError, TreeError, memory_errors_translated, naming
 from ..system.threads import thread_count
 from .arguments import ProgressLike, progress_callback, scene_like
 
@@ -24,6 +23,9 @@ if TYPE_CHECKING:
     from ..codecs.rad.codec import RadChunk
     from ..codecs.rad.rad_header import RadHeader
     from ..inspection.report import Report
+
+#: Errors of public functions that begin with the name of the file.
+OF_FILES = (FormatError, InvalidSplatsError, TreeError)
 
 
 def read(
@@ -47,7 +49,7 @@ def read(
         OutOfMemoryError: it does not fit into memory.
     """
     path = Path(path)
-    with progress_callback(progress) as callback, memory_errors_translated(), naming(path):
+    with progress_callback(progress) as callback, memory_errors_translated(), naming(path, OF_FILES):
         count = thread_count(threads)
         if columns is None:
             scene = read_scene(path, threads=count, progress=callback)
@@ -59,15 +61,6 @@ def read(
         if scene.tree is not None:
             scene.tree.validate()
     return as_tree(scene)
-
-
-@contextlib.contextmanager
-def naming(path: Path) -> Iterator[None]:
-    """Prefix errors with the file, as commands do."""
-    try:
-        yield
-    except (FormatError, InvalidSplatsError, TreeError) as error:
-        raise type(error)(f"{path}: {error}") from None
 
 
 def as_tree(scene: Scene) -> Scene:
@@ -169,7 +162,7 @@ def read_rad_header(path: Path | str) -> RadHeader:
         FormatError: it cannot be read, is no such header, or promises what cannot be.
     """
     path = Path(path)
-    with naming(path):
+    with naming(path, OF_FILES):
         return rad_file.read_rad_header(path)
 
 
@@ -190,5 +183,5 @@ def read_rad_chunk(path: Path | str, number: int, *, palette: FloatArray | None 
     path = Path(path)
     if isinstance(number, bool) or not isinstance(number, (int, np.integer)):
         raise TypeError(f"number is {number!r}; give a whole number, which counts chunks from 0")
-    with naming(path), memory_errors_translated():
+    with naming(path, OF_FILES), memory_errors_translated():
         return rad_file.read_rad_chunk(path, number, palette=palette)

@@ -12,11 +12,11 @@ from ..codecs.file_names import MANIFEST
 from ..codecs.options import DEFAULT_COMPRESSION
 from ..io import parts_output, scene_output, write_scene
 from ..model.scene import Scene
-from ..system.errors import FormatError, InvalidSplatsError, memory_errors_translated
+from ..system.errors import FormatError, InvalidSplatsError, memory_errors_translated, naming
 from ..system.output import Output
 from ..system.threads import thread_count
 from .arguments import ProgressLike, file_path, progress_callback, scene_like
-from .files import naming, pack
+from .files import OF_FILES, pack
 
 if TYPE_CHECKING:
     from ..codecs.options import RadOptions, SogOptions, WriteOptions
@@ -125,7 +125,7 @@ def write(
     with progress_callback(progress) as callback, memory_errors_translated():
         if encoding is not None:
             return _write_arrays(path, scene, encoding, overwrite=overwrite, threads=count)
-        with naming(path):
+        with naming(path, OF_FILES):
             check_valid(scene.splats, count)
             if environment is not None:
                 check_valid(scene_like(environment).splats, count)
@@ -174,7 +174,7 @@ def _write_arrays(path: Path, scene: Scene, encoding: str, *, overwrite: bool, t
         known = ", ".join((NPZ, *RAW_SUFFIXES))
         raise FormatError(f"{path}: arrays are written as {known}, which the name does not end in")
     out = Output(path, overwrite=overwrite)
-    with naming(path):
+    with naming(path, OF_FILES):
         arrays = pack(scene, encoding, threads=threads)
     pieces = dump.encode_raw(arrays) if path.suffix.lower() in RAW_SUFFIXES else dump.encode_npz(arrays)
     with out:

@@ -11,7 +11,7 @@ from ..io import read_rgba, read_scene
 from ..model.selection import Selection, SelectionTally
 from ..model.splats import Splats
 from ..model.transforms import Transform
-from ..system.errors import FormatError, InvalidSplatsError
+from ..system.errors import FormatError, InvalidSplatsError, naming
 from ..system.progress import Progress
 from .settings import BakeSettings
 
@@ -84,7 +84,7 @@ def read_environment(settings: BakeSettings, threads: int, progress: Progress) -
     """
     path = settings.environment
     assert path is not None
-    try:
+    with naming(f"the environment {path}", (FormatError, InvalidSplatsError)):
         scene = read_scene(path, threads=threads, progress=progress)
         if scene.tree is not None:
             raise FormatError("it is a Level-of-Detail file; give the splats that its tree was built from")
@@ -92,5 +92,3 @@ def read_environment(settings: BakeSettings, threads: int, progress: Progress) -
         splats, tally = select(scene.splats, dataclasses.replace(settings, rgba=None, selection=selection))
         selection.check(tally)
         return transformed(splats, settings.transform, threads)
-    except (FormatError, InvalidSplatsError) as error:
-        raise type(error)(f"the environment {path}: {error}") from None

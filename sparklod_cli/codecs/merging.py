@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import bisect
-import contextlib
 import dataclasses
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -15,20 +14,11 @@ from ..model.axes import common, differing, rotated
 from ..model.sh import COEFFICIENTS
 from ..model.splats import Splats
 from ..model.transforms import Transform
-from ..system.errors import SparklodError
+from ..system.errors import naming
 from ..system.progress import Progress
 from ..system.units import count_of
 from .reader import Reader, Target
 from .scene_files import copy_rows
-
-
-@contextlib.contextmanager
-def naming(name: str) -> Iterator[None]:
-    """Put a name before the errors of the body."""
-    try:
-        yield
-    except SparklodError as error:
-        raise type(error)(f"{name}: {error}") from None
 
 
 @dataclass(frozen=True, eq=False)

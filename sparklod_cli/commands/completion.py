@@ -12,7 +12,7 @@ from pathlib import Path
 import click
 from click.shell_completion import get_completion_class
 
-from ..system.errors import SparklodError
+from ..system.errors import SparklodError, reason_of
 from .command import Command
 from .console import say
 
@@ -100,5 +100,5 @@ def _install(shell: str) -> None:
         with path.open("a", encoding="utf-8") as file:
             file.write("\n" * bool(before and not before.endswith("\n")) + line + "\n")
     except OSError as error:
-        raise SparklodError(f"{path}: cannot be changed: {(error.strerror or str(error)).lower()}") from None
+        raise SparklodError(f"{path}: cannot be changed: {reason_of(error)}") from None
     say(f"{path} loads the completion from the next shell on")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,7 +17,7 @@ from ..lod.budget import Budget, parse_budget
 from ..lod.builders import DETAIL_GROWTH
 from ..system import interrupts
 from ..system.addresses import Place
-from ..system.errors import FormatError
+from ..system.errors import FormatError, naming
 from ..system.setting_fields import Quantity, Range, setting_of, whole
 from ..system.stdio import DASH, name_of
 from ..system.units import parse_size
@@ -215,7 +214,9 @@ def simplify(ctx: click.Context, /, **_: Any) -> None:
         settings = options.settings(ctx)
         question_budgets(console, files.to)
         console.announce_compiling(settings)
-        with console.job(stage_shares(settings)), _naming_input(files):
+        # Errors about one of several inputs name it already.
+        named = naming(name_of(files.source), FormatError) if len(files.inputs) == 1 else contextlib.nullcontext()
+        with console.job(stage_shares(settings)), named:
             baked = bake(
                 files.source,
                 files.output,
@@ -233,17 +234,6 @@ def simplify(ctx: click.Context, /, **_: Any) -> None:
             console.clear()
             say("interrupted")
             ctx.exit(interrupts.INTERRUPTED)
-
-
-@contextlib.contextmanager
-def _naming_input(files: SimplifiedFiles) -> Iterator[None]:
-    """Name a single input in errors of the body about it; those about several name theirs."""
-    try:
-        yield
-    except FormatError as error:
-        if len(files.inputs) > 1:
-            raise
-        raise type(error)(f"{name_of(files.source)}: {error}") from None
 
 
 def _check(ctx: click.Context, files: SimplifiedFiles, *, as_json: bool) -> None:

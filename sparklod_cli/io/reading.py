@@ -24,7 +24,7 @@ from ..model.tile_scene import TileScene
 from ..model.transforms import Transform
 from ..system import atomic
 from ..system.addresses import Address, Place, absolute
-from ..system.errors import FormatError, OutputError, UnknownFormatError, UnreadableError, reason_of
+from ..system.errors import FormatError, OutputError, UnknownFormatError, UnreadableError, naming, reason_of
 from ..system.progress import Progress, silent
 from ..system.stdio import DASH, name_of, spooled
 from ..system.units import count_of
@@ -388,7 +388,7 @@ def _opened_again(path: Place, version: tuple[Any, ...], scratch: Path | None, t
 
 def _merged(source: Merged, scratch: Path | None, threads: int, closing: contextlib.ExitStack) -> Reader:
     """Open several files; the header of one that is named twice is read once."""
-    from ..codecs.merging import Placed, merged, naming  # what a single file does without
+    from ..codecs.merging import Placed, merged  # what a single file does without
 
     closing.callback(_opened_again.cache_clear)
     readers = dict[Place, Reader]()

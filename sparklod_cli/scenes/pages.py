@@ -21,7 +21,7 @@ from ..model.instances import Instance
 from ..model.lod_tree import CHUNK_BITS, CHUNK_NODES, LodTree, Nodes
 from ..model.scene import FileCoding
 from ..model.splats import COLUMNS, Splats
-from ..system.errors import SparklodError, TreeError
+from ..system.errors import TreeError, naming
 from ..system.machine import available_memory
 from ..system.threads import ordered_map
 from .loaded_scene import Index, LoadedScene, bytes_of
@@ -162,12 +162,10 @@ class Pages:
         Raises:
             FormatError: a chunk is damaged; names the file.
         """
-        try:
+        with naming(self._name):
             for _, splats, tree in self.file.chunks(columns, thorough=False, threads=self._threads):
                 assert tree is not None
                 yield splats, tree
-        except SparklodError as error:
-            raise type(error)(f"{self._name}: {error}") from None
 
     def leaf_count(self) -> int:
         """Return the number of leaves; reads the children of all nodes."""
@@ -179,10 +177,8 @@ class Pages:
         return np.concatenate([number * CHUNK_NODES + leaves for number, leaves in enumerate(found)])
 
     def _decoded(self, number: int, columns: Collection[str]) -> tuple[Splats, LodTree | None, FileCoding]:
-        try:
+        with naming(self._name):
             return self.file.chunk(number, columns)
-        except SparklodError as error:
-            raise type(error)(f"{self._name}: {error}") from None
 
 
 class PagedForest(Forest):

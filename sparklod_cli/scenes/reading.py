@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ..codecs.formats import PRECISIONS
-from ..codecs.reader import OpenFile
+from ..codecs.reader import decode_file
 from ..codecs.rounding import after
 from ..io import opened, size_of_input
 from ..io.details import read_level_files
@@ -23,7 +23,7 @@ from ..model.scene import DetailScene, Scene
 from ..model.selection import Selection, describe
 from ..model.splats import COLUMNS
 from ..model.tile_scene import TileScene
-from ..system.errors import FormatError, InvalidSplatsError, SparklodError, TreeError, memory_errors_translated
+from ..system.errors import FormatError, InvalidSplatsError, TreeError, memory_errors_translated, naming
 from ..system.progress import Progress, silent
 from ..system.stdio import DASH
 from .loaded import Scenes
@@ -136,24 +136,19 @@ def _read(
     Args:
         paged: precision of the pages that a file too large to be read whole becomes; None to read it nevertheless.
     """
-    try:
-        with memory_errors_translated(), opened(path) as (file, form, more):
-            if paged is not None and form.name == RAD and path != DASH:
-                with contextlib.suppress(FormatError):  # which is raised below
-                    rad = RadFile.of(path, file, more["open_companion"])
-                    if not rad.fits and rad.header.lod_tree and rad.header.chunk_size == CHUNK_NODES:
-                        nodes = functools.partial(nodes_of, precision=paged, threads=1)
-                        return Pages(rad, str(path), nodes, threads)
-            if form.parts is not None and path != DASH:
-                parts: DetailScene | TileScene = form.codec().decode_parts(
-                    file, threads=threads, progress=progress, **more
-                )
-                return parts
-            reader = replace(form.codec().open_content(OpenFile(file, threads=threads, **more)), threads=threads)
-            scene: Scene = reader.scene(columns=columns, progress=progress, validate=False)
-            return scene
-    except SparklodError as error:
-        raise type(error)(f"{path}: {error}") from None
+    with naming(path), memory_errors_translated(), opened(path) as (file, form, more):
+        if paged is not None and form.name == RAD and path != DASH:
+            with contextlib.suppress(FormatError):  # which is raised below
+                rad = RadFile.of(path, file, more["open_companion"])
+                if not rad.fits and rad.header.lod_tree and rad.header.chunk_size == CHUNK_NODES:
+                    nodes = functools.partial(nodes_of, precision=paged, threads=1)
+                    return Pages(rad, str(path), nodes, threads)
+        if form.parts is not None and path != DASH:
+            parts: DetailScene | TileScene = form.codec().decode_parts(file, threads=threads, progress=progress, **more)
+            return parts
+        return decode_file(
+            form.codec(), file, threads=threads, progress=progress, columns=columns, validate=False, **more
+        )
 
 
 def _check_tree(name: Path | str, scene: Scene) -> None:
@@ -165,10 +160,8 @@ def _check_tree(name: Path | str, scene: Scene) -> None:
 
 def _drawable(name: str, scene: Scene, notes: list[str]) -> Scene:
     """Return a scene without the splats that cannot be drawn."""
-    try:
+    with naming(name, InvalidSplatsError):
         splats, dropped = Selection(drop_invalid=True).apply(scene.splats)
-    except InvalidSplatsError as error:
-        raise InvalidSplatsError(f"{name}: {error}") from None
     if dropped:
         notes.append(f"{name}: left out {describe(dropped)}")
     return replace(scene, splats=splats)

@@ -125,6 +125,17 @@ def reason_of(error: OSError) -> str:
 
 
 @contextlib.contextmanager
+def naming(
+    name: object, kinds: type[SparklodError] | tuple[type[SparklodError], ...] = SparklodError
+) -> Iterator[None]:
+    """Put a name, such as that of a file, before the messages of errors of these kinds."""
+    try:
+        yield
+    except kinds as error:
+        raise type(error)(f"{name}: {error}") from None
+
+
+@contextlib.contextmanager
 def memory_errors_translated() -> Iterator[None]:
     """Translate every error of the body that means memory ran out into an `OutOfMemoryError` that names the array."""
     try:

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from .errors import StdoutError, UnreadableError
+from .errors import StdoutError, UnreadableError, reason_of
 
 
 class ReaderGoneError(StdoutError):
@@ -76,7 +76,7 @@ class _GuardedStream:
             yield
         except OSError as error:
             silence(self._stream)
-            reason = (error.strerror or str(error)).lower()
+            reason = reason_of(error)
             if isinstance(error, BrokenPipeError):
                 raise ReaderGoneError(f"cannot write standard output: {reason}") from None
             raise StdoutError(f"cannot write standard output: {reason}") from None

@@ -27,7 +27,7 @@ from ..codecs.zip_folder import ZipFolder
 from ..io.local_files import companion_path, in_folder, open_named, open_plain, reason_unreadable
 from ..io.reading import recognised
 from ..model.lod_tree import CHUNK_NODES
-from ..system.errors import FormatError, NotSplatsError, UnreadableError
+from ..system.errors import FormatError, NotSplatsError, UnreadableError, naming
 from ..system.printable import printable
 from ..system.untrusted import quoted_value
 
@@ -132,9 +132,8 @@ def shown_files(paths: Sequence[Path]) -> list[ShownFile]:
 
 def _named(path: Path, folder: str) -> ShownFile:
     try:
-        return _shown(path, folder)
-    except FormatError as error:
-        raise type(error)(f"{path}: {error}") from None
+        with naming(path, FormatError):
+            return _shown(path, folder)
     except OSError as error:
         raise UnreadableError(f"{path}: cannot be read: {reason_unreadable(error)}") from None
 

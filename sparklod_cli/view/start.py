@@ -24,7 +24,7 @@ from ..model.balls import Balls, balls_of
 from ..model.scene import DetailScene
 from ..model.splats import Splats
 from ..model.tile_scene import TileScene
-from ..system.errors import InvalidSplatsError, SparklodError, UnreadableError, reason_of
+from ..system.errors import InvalidSplatsError, UnreadableError, naming, reason_of
 from ..system.progress import Progress, silent
 from .files import ShownFile
 
@@ -95,14 +95,13 @@ def extent_of(shown: ShownFile, *, threads: int = 1, progress: Progress = silent
         SparklodError: it is broken; the text names it.
     """
     try:
-        if shown.header is not None and shown.header.lod_tree and len(shown.header.chunks) > 1:
-            return _coarse_extent(shown, shown.header)
-        parts = read_parts(shown.path, threads=threads, progress=progress)
-        if parts is not None:
-            return _parts_extent(parts)
-        scene = read_scene(shown.path, threads=threads, progress=progress)
-    except SparklodError as error:
-        raise type(error)(f"{shown.path}: {error}") from None
+        with naming(shown.path):
+            if shown.header is not None and shown.header.lod_tree and len(shown.header.chunks) > 1:
+                return _coarse_extent(shown, shown.header)
+            parts = read_parts(shown.path, threads=threads, progress=progress)
+            if parts is not None:
+                return _parts_extent(parts)
+            scene = read_scene(shown.path, threads=threads, progress=progress)
     except OSError as error:
         raise UnreadableError(f"{shown.path}: cannot be read: {reason_of(error)}") from None
     leaves = None if scene.tree is None else np.flatnonzero(scene.tree.is_leaf)

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from ...system import atomic
-from ...system.errors import FormatError, InvalidSplatsError, ScratchError, UnreadableError
+from ...system.errors import FormatError, InvalidSplatsError, ScratchError, UnreadableError, reason_of
 from ...system.threads import ordered_map
 from ...system.units import count_of
 from ...system.untrusted import parse_json
@@ -150,7 +150,7 @@ def locked(folder: Path) -> Iterator[None]:
             descriptor = _opened_lock(path)
         except OSError as error:
             raise ScratchError(
-                f"cannot write in the scratch folder {folder}: {(error.strerror or str(error)).lower()}; choose another"
+                f"cannot write in the scratch folder {folder}: {reason_of(error)}; choose another"
                 " one with --scratch-dir"
             ) from None
         try:

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from ...system import atomic
 from ...system.addresses import Address, Place
-from ...system.errors import ScratchError
+from ...system.errors import ScratchError, reason_of
 
 #: Arrays of a result by name, empty or of any shape.
 Arrays = Mapping[str, NDArray[Any]]
@@ -326,7 +326,7 @@ class Store:
         try:
             yield
         except OSError as error:
-            reason = (error.strerror or str(error)).lower()
+            reason = reason_of(error)
             if error.errno in FULL:
                 raise ScratchError(
                     f"there is no room left in the scratch folder {self.folder}: {reason}; free some and run the"
