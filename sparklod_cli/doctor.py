@@ -50,7 +50,7 @@ LITTLE_MEMORY = 1 << 30
 #: Program of the child process that calls `_print_kernels`.
 KERNELS = f"import {__name__} as doctor; doctor._print_kernels()"
 
-#: Prints the card, its driver and the versions of its compilers, or exits with the reason why there is none.
+#: Prints the card, its driver and the versions of its compilers, or exits with the reason why no card can be used.
 CARD = "from sparklod_cli.render.cuda.card import print_card; print_card()"
 
 #: Prints the encoder of videos.

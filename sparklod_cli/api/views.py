@@ -403,7 +403,7 @@ def read_cameras(
         size: width and height of the images, pixels; those of the file unless given.
         fov_y: vertical field of view, degrees; that of the file unless given.
         fps: frames a second; times are then counted anew.
-        every: keep only every so many frames.
+        every: n, to keep every n-th frame.
         up: x, y, z that points up, for cameras of which the file has only eye and target.
 
     Raises:

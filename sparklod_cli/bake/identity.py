@@ -126,7 +126,7 @@ class BakeIdentity:
 
     @classmethod
     def from_record(cls, record: Any) -> BakeIdentity:
-        """Return the identity whose `dataclasses.asdict` is `record`; raise `ValueError` if it is none."""
+        """Read an identity from its record, `dataclasses.asdict`; raise `ValueError` for any other value."""
         try:
             return cls(tuple(FileState(**each) for each in record["inputs"]), dict(record["settings"]))
         except (KeyError, TypeError) as error:

@@ -187,8 +187,7 @@ class Reader:
         header: as in `Scene`; reading all splats may add to it.
         has_tree: whether the splats are the nodes of a tree.
         coding: called when all splats have been read, returns `Scene.coding`; None for `scene.PLAIN`.
-        block: splats that are read together at least; blocks are whole ones.
-        up_by: as in `Scene`.
+        block: smallest number of splats that are read together; ranges are read in multiples of it.
         concurrent: several threads may call `fill` at a time.
         threads: that decode rows.
     """

@@ -47,7 +47,7 @@ class Distribution:
 
     @classmethod
     def of(cls, values: FloatArray) -> Distribution:
-        """Count all values of (N, ...) float32; those that are no numbers come last."""
+        """Count all values of an (N, ...) float32 array; NaN is in the last bin."""
         rows = max(1, _VALUES * len(values) // max(values.size, 1))
         parts = []
         for start in range(0, max(len(values), 1), rows):

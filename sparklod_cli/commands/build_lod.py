@@ -247,7 +247,7 @@ class BakedFiles:
 
     @property
     def named_manifest(self) -> str | None:
-        """The format whose manifest is called as the named output; None if there is none."""
+        """The format whose manifest has the name of the output; None if no format's manifest has it."""
         name = self.output.name if self.output is not None and self.output != DASH else ""
         return next((form for form, (manifest, *_) in MANIFESTS.items() if manifest == name), None)
 

@@ -108,7 +108,7 @@ class Numbers:
         self.count = 0
 
     def add(self, values: FloatArray) -> None:
-        """Add (n,) numbers; those that are not finite are left out."""
+        """Add the finite numbers of an (n,) array."""
         values = values[np.isfinite(values)]
         self.count += len(values)
         self._sum += float(values.sum(dtype=np.float64))

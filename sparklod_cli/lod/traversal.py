@@ -164,7 +164,7 @@ class TreeCut:
         least: the least limit of a refined node; infinite if none was refined.
         stop: (pixel scale, instance, index) of the node that would have exceeded the budget, or None.
         demand: (chunks,) float32, for each chunk of all trees the largest limit of the nodes that are, or should be,
-            refined and have children in it; 0 if there is none.
+            refined and have children in it; 0 without such nodes.
         seconds: that it took to find, once its chunks were in memory.
     """
 

@@ -56,7 +56,7 @@ def find_cut(trees, stop, guess, slots, demand, cut):
     Args:
         guess: the first threshold, such as the last cut's, or 0; the cut does not depend on it.
         demand: (chunks,) of all trees, filled: the largest limit of the nodes that are, or should be, refined and have
-            children in the chunk; 0 if there is none.
+            children in the chunk; 0 without such nodes.
         cut: room for more than `stop.budget` nodes, filled.
 
     Returns:

@@ -30,8 +30,8 @@ def find_depths(child_count, child_start, size):
     Takes linear time for any links: at most MAX_LINKS per node are followed.
 
     Returns:
-        depth: int32, edges from the root on the first path found; -1 if there is none.
-        limit: float32, the least size on that path, the node's included; 0 if there is none.
+        depth: int32, edges from the root on the first path found; -1 for nodes that no path reaches.
+        limit: float32, the least size on that path, the node's included; 0 for nodes that no path reaches.
     """
     count = len(child_count)
     depth = np.full(count, -1, np.int32)
