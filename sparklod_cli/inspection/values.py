@@ -134,7 +134,7 @@ class Numbers:
         if self._distribution is not None:
             found = {name: self._origin + self._distribution.quantile(level / 100) for name, level in LEVELS.items()}
         else:
-            at = np.sort(np.concatenate(self._kept)).item
+            at = (np.sort(np.concatenate(self._kept)) + 0).item  # -0 becomes 0, as in a `Distribution`
             found = {name: interpolated(at, self.count, level / 100) for name, level in LEVELS.items()}
         return {name: _number(value) for name, value in found.items()} | {"mean": _number(self._sum / self.count)}
 
