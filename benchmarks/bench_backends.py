@@ -15,9 +15,8 @@ import numpy as np
 from performance.machine import machine
 from scenes import load
 
-from sparklod_cli.cameras.camera import Camera
+from sparklod_cli.cameras.camera import Camera, look_at
 from sparklod_cli.cameras.framing import framing
-from sparklod_cli.cameras.pose import look_at
 from sparklod_cli.images.metrics import psnr
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.render.rasterizer import Image, ShadedSplats, shade

@@ -15,9 +15,8 @@ import numpy as np
 from scenes import load, tiled
 
 import sparklod_cli as sparklod
-from sparklod_cli.cameras.camera import Camera
+from sparklod_cli.cameras.camera import Camera, look_at
 from sparklod_cli.cameras.framing import framing
-from sparklod_cli.cameras.pose import look_at
 from sparklod_cli.codecs.options import DEFAULTS
 from sparklod_cli.codecs.rad import codec as rad
 from sparklod_cli.lod.chunk_order import arrange

@@ -21,8 +21,8 @@ from performance.rows import Column, Label, Row, Table, figure, label, ratio
 from scenes import load, tiled
 
 import sparklod_cli as sparklod
+from sparklod_cli.cameras.camera import look_at
 from sparklod_cli.cameras.framing import framing
-from sparklod_cli.cameras.pose import look_at
 from sparklod_cli.codecs.gpu import lod_tree
 from sparklod_cli.lod.continuous import ContinuousCuts
 from sparklod_cli.lod.cut_statistics import Changes, measure

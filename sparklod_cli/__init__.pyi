@@ -32,7 +32,7 @@ if TYPE_CHECKING:  # mypy then resolves the modules first, which import this one
     from .api.writing import write as write
     from .bake.refining import Refined as Refined
     from .cameras.camera import Camera as Camera
-    from .cameras.path import CameraPath as CameraPath
+    from .cameras.sources import CameraPath as CameraPath
     from .codecs.options import RadOptions as RadOptions
     from .codecs.options import SogOptions as SogOptions
     from .codecs.rad.codec import RadChunk as RadChunk

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
-from .cameras.path import CameraPath
+from .cameras.sources import CameraPath
 from .images.metrics import (
     BACKGROUNDS,
     Mask,

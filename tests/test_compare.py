@@ -17,9 +17,8 @@ from PIL import Image
 import sparklod_cli as sparklod
 from sparklod_cli.bake.flow import bake
 from sparklod_cli.bake.settings import BakeSettings
-from sparklod_cli.cameras.camera import Camera
-from sparklod_cli.cameras.path import CameraPath
-from sparklod_cli.cameras.pose import look_at
+from sparklod_cli.cameras.camera import Camera, look_at
+from sparklod_cli.cameras.sources import CameraPath
 from sparklod_cli.cli import run as program
 from sparklod_cli.compare import Comparison, measured
 from sparklod_cli.images.metrics import MOST_PSNR, on_background

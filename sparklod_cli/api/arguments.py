@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..cameras.camera import Camera
-from ..cameras.path import CameraPath
+from ..cameras.sources import CameraPath
 from ..lod.budget import LARGEST, Budget, parse_budget
 from ..model.scene import Scene
 from ..system.errors import OutputError

@@ -27,8 +27,7 @@ from ..system.threads import on_threads
 
 if TYPE_CHECKING:
     from ..cameras.frame import Settings
-    from ..cameras.path import CameraPath
-    from ..cameras.sources import CameraSource
+    from ..cameras.sources import CameraPath, CameraSource
     from ..images.output import PictureOutput
     from ..images.sequence import PictureSettings, WrittenPictures
     from ..lod.budget import Budget

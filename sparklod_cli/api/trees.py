@@ -11,7 +11,7 @@ from ..bake.selecting import select
 from ..bake.settings import BakeSettings, SimplifyGoal
 from ..bake.simplifying import Simplifier
 from ..cameras.camera import Camera
-from ..cameras.path import CameraPath
+from ..cameras.sources import CameraPath
 from ..codecs.validation import check_valid
 from ..fitting.settings import STEPS, FitSettings
 from ..lod.builders import (

@@ -15,8 +15,7 @@ from ..cameras import DEFAULT_SIZE, ELEVATION
 from ..cameras.camera import Camera
 from ..cameras.formats.table import FORMATS, Axes
 from ..cameras.frame import MAX_FRAMES, Settings, direction_of
-from ..cameras.path import CameraPath
-from ..cameras.sources import Orbit, read_path, similarity
+from ..cameras.sources import CameraPath, Orbit, read_path, similarity
 from ..codecs.formats import PRECISIONS
 from ..images import metrics
 from ..lod import detail_rule

@@ -13,7 +13,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cameras.pose import FARTHEST, rotation_of
+from ..cameras.camera import FARTHEST, rotation_of
 from ..model.falloff import MAX_STD_DEV, MIN_ALPHA, STD_DEV_PER_D
 from ..model.gaussian import lod_opacity
 from ..model.scene import DetailScene

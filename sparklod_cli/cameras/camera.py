@@ -1,4 +1,4 @@
-"""`Camera`, a pinhole camera somewhere in the world."""
+"""`Camera`, a pinhole camera somewhere in the world, and poses as (4, 4) matrices."""
 
 from __future__ import annotations
 
@@ -7,10 +7,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from ..model.gaussian import rotation_matrix
 from ..system.errors import CameraPathError
 from . import DEFAULT_SIZE
+from .formats.table import Axes
 
 Matrix = NDArray[np.float64]
 
@@ -61,8 +63,6 @@ class Camera:
         Raises:
             CameraPathError: eye and target are the same point, or a number is out of its range.
         """
-        from .pose import look_at  # which needs this module
-
         for what, vector in (("eye", eye), ("target", target), ("up", up)):
             if np.shape(vector) != (3,):
                 raise CameraPathError(f"{what} is {vector!r}; give x, y, z")
@@ -101,3 +101,120 @@ class Camera:
     def fov_y(self) -> float:
         """Vertical field of view in radians, as if the principal point were the image's centre."""
         return 2 * math.atan(self.height / (2 * self.focal[1]))
+
+
+#: Largest deviation of an element of R^T R from a multiple of the identity. Files that round to three decimals stay
+#: well below it.
+SKEW = 0.02
+
+#: From OpenCV's axes to OpenGL's and back: y and z change their sign.
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+
+#: Largest coordinate, world units: that of a float32, the type of centres.
+FARTHEST = float(np.finfo(np.float32).max)
+
+
+def to_opengl(matrix: Matrix, axes: Axes) -> Matrix:
+    """Return a pose as camera-to-world in OpenGL's axes.
+
+    Args:
+        matrix: (4, 4), with 0 0 0 1 as its last row; may have a uniform scale.
+
+    Raises:
+        ValueError: it cannot be inverted; the text continues a sentence about it.
+    """
+    if axes.from_world:
+        try:
+            with np.errstate(all="ignore"):
+                matrix = np.asarray(np.linalg.inv(matrix), np.float64)
+        except np.linalg.LinAlgError:
+            raise ValueError("has a matrix that cannot be inverted") from None
+    return matrix @ FLIP if axes.opencv else matrix
+
+
+def rigid(matrix: Matrix) -> Matrix:
+    """Return a camera-to-world matrix without its scale, and with the nearest exact rotation.
+
+    Args:
+        matrix: (4, 4).
+
+    Raises:
+        ValueError: it is not a rotation, a uniform scale and a position; the text continues a sentence about it.
+    """
+    with np.errstate(all="ignore"):
+        if not np.isfinite(matrix).all() or np.abs(matrix[:3, 3]).max() > FARTHEST:
+            raise ValueError("has numbers that are not finite, or too large")
+        if np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-4:
+            raise ValueError("has a matrix whose last row is not 0 0 0 1")
+        rotation = matrix[:3, :3]
+        volume = np.linalg.det(rotation)
+        if not np.isfinite(volume) or volume == 0:
+            raise ValueError("has a matrix of determinant 0")
+        if volume < 0:
+            raise ValueError("has a matrix that mirrors")
+        rotation = rotation / np.cbrt(volume)
+        if not np.abs(rotation.T @ rotation - np.eye(3)).max() <= SKEW:
+            raise ValueError("has axes that are not at right angles, or not of the same length")
+    left, _, right = np.linalg.svd(rotation)
+    result = np.eye(4)
+    result[:3, :3] = left @ right  # the nearest rotation in the sense of least squares
+    result[:3, 3] = matrix[:3, 3]
+    return result
+
+
+def pose(rotation: ArrayLike, position: ArrayLike) -> Matrix:
+    """Return the (4, 4) matrix of a (3, 3) rotation and a (3,) position."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation
+    matrix[:3, 3] = position
+    return matrix
+
+
+def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike) -> Matrix:
+    """Return the (4, 4) camera-to-world matrix, in OpenGL's axes, of a camera at `eye` that looks at `target`.
+
+    Args:
+        eye, target: (3,) world units.
+        up: (3,) up axis; another direction replaces it if it is along the line of sight.
+
+    Raises:
+        ValueError: eye and target are the same point, or too far apart; the text continues a sentence about the camera.
+    """
+    eye, target = np.asarray(eye, np.float64), np.asarray(target, np.float64)
+    with np.errstate(over="ignore", invalid="ignore"):
+        back = eye - target
+    if not np.isfinite(back).all():
+        raise ValueError("looks at a point that is too far away")
+    back = normalized(back)
+    if not np.isfinite(back).all():
+        raise ValueError("looks at its own position")
+    right = _cross(normalized(up), back)
+    if not np.linalg.norm(right) > 1e-6:
+        right = _cross(np.eye(3)[np.argmin(np.abs(back))], back)
+    right = normalized(right)
+    return pose(np.stack([right, _cross(back, right), back], axis=1), eye)
+
+
+def _cross(a: Matrix, b: Matrix) -> Matrix:
+    """Return the cross product of two (3,) vectors; `np.cross` takes ten times as long for a single pair."""
+    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
+def normalized(vector: ArrayLike) -> Matrix:
+    """Return a (K,) vector scaled to length 1; NaN if its length is 0 or not finite."""
+    array = np.asarray(vector, np.float64)
+    with np.errstate(all="ignore"):
+        array = array / np.abs(array).max()  # so that squares neither overflow nor vanish
+        return array / float(np.linalg.norm(array))
+
+
+def rotation_of(quat_wxyz: ArrayLike) -> Matrix:
+    """Return the (3, 3) rotation of a quaternion w x y z of any length but 0.
+
+    Raises:
+        ValueError: its length is 0 or not finite; the text continues a sentence about it.
+    """
+    w, x, y, z = unit = normalized(quat_wxyz)
+    if not np.isfinite(unit).all():
+        raise ValueError("has a quaternion of length 0")
+    return np.array(rotation_matrix(x, y, z, w)).reshape(3, 3)

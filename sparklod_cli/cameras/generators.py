@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..system.errors import CameraPathError
-from .camera import Matrix
+from .camera import Matrix, look_at, normalized
 from .formats.table import Axes
 from .frame import DEFAULT_FOV_Y, DEFAULT_FPS, NO_LENS, NUMBERED, Frame, Intrinsics, Sampled, sampled
-from .pose import look_at, normalized
 
 #: Mean seconds from one key to the next, if the keys have no times.
 SECONDS = 2.0

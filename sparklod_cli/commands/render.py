@@ -25,7 +25,7 @@ from .paths import Folder, claim_stdout, keep_apart, name_outputs
 
 if TYPE_CHECKING:
     from ..api.jobs import Compared, DrawnPath
-    from ..cameras.path import CameraPath
+    from ..cameras.sources import CameraPath
     from ..images.output import PictureOutput
     from ..images.sequence import PictureSettings, WrittenPictures
     from ..lod.settings import LodSettings

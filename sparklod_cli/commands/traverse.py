@@ -36,7 +36,7 @@ from .paths import OutputPath, claim_stdout, keep_apart, name_outputs
 
 if TYPE_CHECKING:
     from ..api.jobs import Traversed
-    from ..cameras.path import CameraPath
+    from ..cameras.sources import CameraPath
     from ..scenes.loaded import Scenes
     from ..simulation.outputs import FrameOutputs
     from ..simulation.summary import FrameStatistics, Moment, Summary

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..cameras.camera import Camera
 from ..cameras.framing import framing
-from ..cameras.path import CameraPath
+from ..cameras.sources import CameraPath
 
 Vector = NDArray[np.float64]
 

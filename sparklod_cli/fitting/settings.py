@@ -10,7 +10,7 @@ from ..render.devices import device_setting
 from ..system.setting_fields import CheckedSettings, setting, whole
 
 if TYPE_CHECKING:
-    from ..cameras.path import CameraPath
+    from ..cameras.sources import CameraPath
 
 #: Numbers of steps, up to far more than pay, and hours of work; and seeds.
 STEPS, SEED = whole(1, 1_000_000), whole(0, (1 << 32) - 1)

@@ -25,7 +25,7 @@ from .pixels import sheet
 
 if TYPE_CHECKING:
     from ..cameras.camera import Camera
-    from ..cameras.path import CameraPath
+    from ..cameras.sources import CameraPath
     from ..render.color_scales import Coloring
     from ..render.renderer import DrawnPicture
     from ..render.settings import RenderSettings

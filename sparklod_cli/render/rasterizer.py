@@ -9,8 +9,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cameras.camera import Camera, Matrix
-from ..cameras.pose import FARTHEST, FLIP
+from ..cameras.camera import FARTHEST, FLIP, Camera, Matrix
 from ..model.falloff import MAX_STD_DEV, MIN_ALPHA, STD_DEV_PER_D
 from ..model.gaussian import lod_opacity, placed
 from ..model.sh import COEFFICIENTS

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..cameras.pose import rotation_of
+from ..cameras.camera import rotation_of
 from ..io import is_file_name, read_text
 from ..model.foveation import Cones, Foveation, Frustum
 from ..model.instances import TOTAL, Instance, Matrix, names_of

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras.camera import Camera
-from ..cameras.path import CameraPath
+from ..cameras.sources import CameraPath
 from ..lod.cut_statistics import Changes, CutStatistics, measure
 from ..lod.settings import LodSettings
 from ..lod.traversal import TreeCut

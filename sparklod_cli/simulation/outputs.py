@@ -16,7 +16,7 @@ from ..tables.columns import Filter, TableOutput
 from .summary import Lookout
 
 if TYPE_CHECKING:
-    from ..cameras.path import CameraPath
+    from ..cameras.sources import CameraPath
     from ..tables.columns import Row
     from .frames import SimulatedFrame, Simulation
 

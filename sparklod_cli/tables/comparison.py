@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from ..cameras.path import MOST_TURN
+from ..cameras.sources import MOST_TURN
 from .assertions import numbers, statistic
 from .columns import FRAME, Column, Row
 

@@ -20,10 +20,10 @@ from pathlib import Path
 from typing import Any
 
 from .. import __version__
-from ..cameras.formats.source import Files
 from ..cameras.formats.table import NAMES
+from ..cameras.frame import Files
 from ..cameras.frame import Settings as CameraSettings
-from ..cameras.path import CameraPath, read
+from ..cameras.sources import CameraPath, read
 from ..io import read_text
 from ..io.local_files import leads_away
 from ..model.axes import lines_of

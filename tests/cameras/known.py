@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sparklod_cli.cameras.camera import Camera
-from sparklod_cli.cameras.formats.source import Files
 from sparklod_cli.cameras.formats.table import NAMES
-from sparklod_cli.cameras.frame import Settings
-from sparklod_cli.cameras.path import CameraPath, read
+from sparklod_cli.cameras.frame import Files, Settings
+from sparklod_cli.cameras.sources import CameraPath, read
 from sparklod_cli.io import read_together
 from tests.conftest import FIXTURES
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sparklod_cli.cameras.formats.source import Parsed
+from sparklod_cli.cameras.camera import look_at
 from sparklod_cli.cameras.formats.table import Axes, PathFormat
-from sparklod_cli.cameras.frame import Frame, Intrinsics, Settings
+from sparklod_cli.cameras.frame import Frame, Intrinsics, Parsed, Settings
 from sparklod_cli.cameras.generators import (
     Key,
     between,
@@ -21,8 +21,7 @@ from sparklod_cli.cameras.generators import (
     hermite,
     orbit,
 )
-from sparklod_cli.cameras.path import cameras_of
-from sparklod_cli.cameras.pose import look_at
+from sparklod_cli.cameras.sources import cameras_of
 from sparklod_cli.system.errors import CameraPathError
 
 DOWN_Y = (0.0, -1.0, 0.0)

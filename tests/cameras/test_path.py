@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.cameras.formats.table import Axes
 from sparklod_cli.cameras.frame import Settings
-from sparklod_cli.cameras.path import CameraPath, read
+from sparklod_cli.cameras.sources import CameraPath, read
 from sparklod_cli.system.errors import CameraPathError
 from tests.cameras.known import KNOWN, LANDMARK, check_pose, pixel, read_fixture, text_file
 

@@ -14,7 +14,7 @@ from click.testing import CliRunner, Result
 
 from sparklod_cli.cameras import generators
 from sparklod_cli.cameras.framing import FILLED
-from sparklod_cli.cameras.path import CameraPath
+from sparklod_cli.cameras.sources import CameraPath
 from sparklod_cli.commands.command import argument, command, values_of
 from sparklod_cli.commands.options.cameras import Cameras
 from sparklod_cli.model.balls import Balls

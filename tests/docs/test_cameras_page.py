@@ -9,7 +9,7 @@ import pytest
 
 from sparklod_cli.cameras.formats.colmap import MODELS
 from sparklod_cli.cameras.formats.table import FORMATS, PLAYCANVAS
-from sparklod_cli.cameras.path import read
+from sparklod_cli.cameras.sources import read
 from tests.cameras.known import text_file
 from tests.conftest import ROOT
 

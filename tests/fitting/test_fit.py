@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli.cameras.camera import Camera
-from sparklod_cli.cameras.path import CameraPath
+from sparklod_cli.cameras.sources import CameraPath
 from sparklod_cli.codecs import ply
 from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.fitting import cameras, optimiser

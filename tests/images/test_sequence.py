@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from sparklod_cli.cameras.frame import Settings
-from sparklod_cli.cameras.path import CameraPath
-from sparklod_cli.cameras.sources import SingleViews
+from sparklod_cli.cameras.sources import CameraPath, SingleViews
 from sparklod_cli.images import sequence
 from sparklod_cli.images.output import output_for
 from sparklod_cli.images.sequence import PictureSettings, WrittenPictures, write_pictures

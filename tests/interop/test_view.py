@@ -25,8 +25,7 @@ import pytest
 from PIL import Image
 
 from sparklod_cli import read, write
-from sparklod_cli.cameras.camera import Camera
-from sparklod_cli.cameras.pose import look_at
+from sparklod_cli.cameras.camera import Camera, look_at
 from sparklod_cli.cli import run
 from sparklod_cli.lod import quick
 from sparklod_cli.lod.tile_settings import TileSettings

@@ -13,12 +13,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sparklod_cli.cameras.camera import Camera
-from sparklod_cli.cameras.formats.source import Parsed
 from sparklod_cli.cameras.formats.table import Axes, PathFormat
-from sparklod_cli.cameras.frame import DEFAULT_UP, Settings
+from sparklod_cli.cameras.frame import DEFAULT_UP, Parsed, Settings
 from sparklod_cli.cameras.framing import framing
 from sparklod_cli.cameras.generators import orbit
-from sparklod_cli.cameras.path import cameras_of
+from sparklod_cli.cameras.sources import cameras_of
 from sparklod_cli.codecs.gpu import lod_tree
 from sparklod_cli.images.metrics import on_background, psnr
 from sparklod_cli.io import read_scene

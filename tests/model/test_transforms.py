@@ -10,8 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sparklod_cli.cameras.camera import Camera
-from sparklod_cli.cameras.pose import look_at
+from sparklod_cli.cameras.camera import Camera, look_at
 from sparklod_cli.images.metrics import psnr
 from sparklod_cli.model import UP_AXES
 from sparklod_cli.model.gaussian import covariance

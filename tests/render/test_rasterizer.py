@@ -10,8 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sparklod_cli.cameras.camera import Camera
-from sparklod_cli.cameras.pose import look_at
+from sparklod_cli.cameras.camera import Camera, look_at
 from sparklod_cli.model.gaussian import normalized_quat
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.render.rasterizer import Image, ShadedSplats, draw, shade

@@ -7,9 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sparklod_cli.cameras.camera import Camera
-from sparklod_cli.cameras.path import CameraPath
-from sparklod_cli.cameras.pose import look_at
+from sparklod_cli.cameras.camera import Camera, look_at
+from sparklod_cli.cameras.sources import CameraPath
 from sparklod_cli.lod.settings import LodSettings
 from sparklod_cli.model.foveation import Cones, Frustum
 from sparklod_cli.scenes.loaded import Scenes

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli.cameras.camera import Camera
-from sparklod_cli.cameras.path import CameraPath
+from sparklod_cli.cameras.sources import CameraPath
 from sparklod_cli.lod.detail_rule import DetailRule
 from sparklod_cli.lod.settings import LodSettings
 from sparklod_cli.model.instances import Instance

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sparklod_cli.cameras.path import CameraPath
+from sparklod_cli.cameras.sources import CameraPath
 from sparklod_cli.lod.settings import LodSettings
 from sparklod_cli.model.instances import TOTAL
 from sparklod_cli.scenes.loaded import Scenes

@@ -12,9 +12,8 @@ import numpy as np
 from ...system.errors import CameraPathError
 from ...system.untrusted import quoted_value
 from ..camera import Matrix
-from ..frame import NO_LENS, Frame, Intrinsics, Settings
+from ..frame import NO_LENS, CameraJson, Files, Frame, Intrinsics, Parsed, Settings, finite, posed, side
 from ..generators import Key, between, frame_looking
-from .source import CameraJson, Files, Parsed, finite, posed, side
 from .table import Axes
 
 FORMAT, VERSION = "sparklod-camera-path", 1

@@ -11,8 +11,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, cast
 
 if TYPE_CHECKING:
-    from ..frame import Settings
-    from .source import Files, Parsed
+    from ..frame import Files, Parsed, Settings
 
 
 class Axes(Enum):
@@ -95,7 +94,7 @@ FORMATS = (
     PathFormat("inria", "Inria's cameras.json", "trainers", Axes.OPENCV_C2W, names=(("cameras.json",),)),
     PathFormat("supersplat", "SuperSplat", "playcanvas", None, looking=True, world=PLAYCANVAS),
     PathFormat("camera-track", "splat-transform's camera track", "playcanvas", None, looking=True, world=PLAYCANVAS),
-    PathFormat("open3d", "Open3D's camera trajectory", "trajectories", Axes.OPENCV_W2C),
+    PathFormat("open3d", "Open3D's camera trajectory", "trainers", Axes.OPENCV_W2C),
     PathFormat(
         "colmap",
         "COLMAP",
@@ -103,7 +102,7 @@ FORMATS = (
         Axes.OPENCV_W2C,
         names=(("images.bin", "cameras.bin"), ("images.txt", "cameras.txt")),
     ),
-    PathFormat("tum", "TUM trajectory", "trajectories", Axes.OPENCV_C2W),
+    PathFormat("tum", "TUM trajectory", "trainers", Axes.OPENCV_C2W),
 )
 
 #: Sets of files that are searched for in a folder, and beside a file of one of them: COLMAP's first.

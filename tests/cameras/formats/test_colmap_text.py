@@ -6,9 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from sparklod_cli.cameras.formats.source import Files
-from sparklod_cli.cameras.path import read
-from sparklod_cli.cameras.sources import read_path
+from sparklod_cli.cameras.frame import Files
+from sparklod_cli.cameras.sources import read, read_path
 from sparklod_cli.system.errors import CameraPathError
 from tests.cameras.known import FOLDER, KNOWN, check_pose, files_at, text_file
 

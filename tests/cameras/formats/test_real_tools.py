@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 from sparklod_cli.cameras.frame import Settings
-from sparklod_cli.cameras.path import read
+from sparklod_cli.cameras.sources import read
 from tests.cameras.known import FOLDER, KNOWN, LANDMARK, files_at, pixel
 from tests.interop import npm
 

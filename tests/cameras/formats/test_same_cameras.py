@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sparklod_cli.cameras.formats.source import Files
 from sparklod_cli.cameras.formats.table import FORMATS
-from sparklod_cli.cameras.frame import Settings
-from sparklod_cli.cameras.path import read
+from sparklod_cli.cameras.frame import Files, Settings
+from sparklod_cli.cameras.sources import read
 from tests.cameras.known import (
     FOCAL,
     FOLDER,

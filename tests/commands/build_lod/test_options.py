@@ -151,7 +151,7 @@ print(*sorted(sys.modules))
 """
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
     assert "sparklod_cli.codecs.ply" in loaded
-    others = ("cameras.pose", "codecs.sog.sog_container", "codecs.streamed_sog.manifest", "codecs.rad.codec")
+    others = ("cameras.camera", "codecs.sog.sog_container", "codecs.streamed_sog.manifest", "codecs.rad.codec")
     others += (
         "codecs.gpu.dump",
         "bake.out_of_core.cluster",

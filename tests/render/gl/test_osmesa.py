@@ -8,8 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from sparklod_cli.cameras.camera import Camera
-from sparklod_cli.cameras.pose import look_at
+from sparklod_cli.cameras.camera import Camera, look_at
 from sparklod_cli.codecs.gpu import data_texture
 from sparklod_cli.io import read_scene
 from sparklod_cli.model.falloff import MIN_ALPHA
