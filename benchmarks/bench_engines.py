@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from sparklod_cli.codecs.file_names import TILESET
-from sparklod_cli.codecs.tiles_3d.volumes import to_tileset
+from sparklod_cli.codecs.tiles_3d.tileset import to_tileset
 from sparklod_cli.io import read_scene
 from tests.interop.engines.browser import Browser, Shown
 from tests.interop.engines.likeness import like_cesium, likeness, our_picture

@@ -85,7 +85,7 @@ class SogOptions:
 
     Attributes:
         sh_codes: the most entries of the palette of spherical harmonics, which a label for each splat points into; None
-            for as many as suit the number of splats, see `sog_writer`.
+            for as many as suit the number of splats, see `sog.codec.codes_for`.
     """
 
     sh_codes: int | None = None

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..codecs import quantize
+from ..codecs.rad.codec import rounded
 from ..codecs.rad.property_codings import CODINGS
-from ..codecs.rad.rad_encoder import rounded
 from ..codecs.rad.rad_layout import PROPERTIES, Row
 from ..codecs.spark_codings import STEPS_8_8_8, encode_axis_angle, encode_lod_alpha
 from ..codecs.spz import to_code

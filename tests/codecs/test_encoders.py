@@ -12,7 +12,7 @@ import pytest
 from sparklod_cli.codecs import clamps, encoder, sh_palette, spz
 from sparklod_cli.codecs.options import DEFAULTS, RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import codec as rad
-from sparklod_cli.codecs.rad import rad_encoder, rad_options
+from sparklod_cli.codecs.rad import rad_options
 from sparklod_cli.codecs.sh_palette import cluster
 from sparklod_cli.lod import quality, quick
 from sparklod_cli.model.scene import Scene
@@ -81,14 +81,14 @@ def test_chunk_files_are_made_of_the_results_of_windows(options: WriteOptions, m
 def test_a_palette_of_a_sample_is_nearly_as_good_as_one_of_all(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = Scene(*quick.build(random_splats(8_000, sh_degree=1), 1.5))
     nodes = node_stream(scene)
-    whole = rad_encoder.Palette.of(scene, 40, 1, silent)
-    assert rad_encoder.Palette.of(nodes, 40, 1, silent).labels is not None  # of all nodes
-    monkeypatch.setattr(rad_encoder, "SAMPLE", 2_048)
+    whole = rad.Palette.of(scene, 40, 1, silent)
+    assert rad.Palette.of(nodes, 40, 1, silent).labels is not None  # of all nodes
+    monkeypatch.setattr(rad, "SAMPLE", 2_048)
     monkeypatch.setattr(encoder, "CHUNK_NODES", 3_000)
-    sampled = rad_encoder.Palette.of(nodes, 40, 1, silent)
+    sampled = rad.Palette.of(nodes, 40, 1, silent)
     assert sampled.labels is None
 
-    def error(found: rad_encoder.Palette) -> float:
+    def error(found: rad.Palette) -> float:
         return float(np.square(found.codes[found.labels_of(scene.splats, 0)] - scene.splats.sh).mean())
 
     assert error(sampled) < 1.1 * error(whole)

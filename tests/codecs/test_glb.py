@@ -16,7 +16,7 @@ import pytest
 
 from fixtures import by_hand_glb
 from sparklod_cli.codecs.glb import codec as glb
-from sparklod_cli.codecs.glb.placement import TURNS
+from sparklod_cli.codecs.glb.glb_container import TURNS
 from sparklod_cli.codecs.options import PROFILES, WriteOptions
 from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.io import read_scene

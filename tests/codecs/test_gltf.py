@@ -13,7 +13,8 @@ import pytest
 
 from fixtures import by_hand_glb
 from sparklod_cli.codecs.glb import codec as glb
-from sparklod_cli.codecs.glb import glb_container, log_scales
+from sparklod_cli.codecs.glb import glb_container
+from sparklod_cli.codecs.glb.attributes import READ_AS_LOGS
 from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.codecs.reader import OpenFile, decode_file
 from sparklod_cli.inspection.report import ReportSettings, inspect
@@ -362,7 +363,7 @@ def test_logarithms_are_read_as_such(factor: float) -> None:
     logs = np.log(splats.scale.astype(np.float64) * factor)
     assert (logs < 0).any(axis=1).mean() > 0.3
     back = read(with_scales(splats, logs))
-    assert back.notes == (log_scales.READ,)
+    assert back.notes == (READ_AS_LOGS,)
     np.testing.assert_allclose(back.splats.scale, splats.scale * factor, rtol=1e-5)
 
 
@@ -381,7 +382,7 @@ def test_the_writer_tells_where_no_logarithm_is_below_0(generator: str, are_logs
     splats = random_splats(2_000)
     scales = np.exp(np.abs(np.log(splats.scale.astype(np.float64))))
     back = read(with_scales(splats, np.log(scales), generator))
-    assert (back.notes == (log_scales.READ,)) == are_logs
+    assert (back.notes == (READ_AS_LOGS,)) == are_logs
     np.testing.assert_allclose(back.splats.scale, scales if are_logs else np.log(scales), rtol=1e-5)
 
 

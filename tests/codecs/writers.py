@@ -27,7 +27,7 @@ from sparklod_cli.codecs.glb import codec as glb
 from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.codecs.sog import codec as sog
 from sparklod_cli.codecs.sog import texel_codings as codings
-from sparklod_cli.codecs.sog.sog_writer import LARGE, SEEN
+from sparklod_cli.codecs.sog.codec import LARGE, SEEN
 from sparklod_cli.codecs.sog.texel_codings import codebook
 from sparklod_cli.model import morton
 from sparklod_cli.model.scene import Scene

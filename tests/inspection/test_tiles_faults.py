@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from fixtures import by_hand_glb, by_hand_tiles
-from sparklod_cli.codecs.glb.placement import TURNS
+from sparklod_cli.codecs.glb.glb_container import TURNS
 from sparklod_cli.codecs.options import PROFILES, WriteOptions
-from sparklod_cli.codecs.tiles_3d import tile_writer, tileset_rules
+from sparklod_cli.codecs.tiles_3d import codec, tileset_rules
 from sparklod_cli.codecs.tiles_3d.tileset_rules import ERRORS, WARNINGS
 from sparklod_cli.inspection.report import Report, ReportSettings, inspect
 from sparklod_cli.io import parts_output
@@ -208,7 +208,7 @@ def test_what_we_write_has_no_findings(up: str | None, profile: str, tmp_path: P
     made = make(*quality.build(random_splats(2_000, sh_degree=1), 2.0), TileSettings(tile_splats=60, lat=-33, lon=151))
     made = dataclasses.replace(made, up=up)
     path = tmp_path / "tileset.json"
-    files = tile_writer.encode_files(made, WriteOptions(glb_profile=profile), most_tiles=40)
+    files = codec.encode_files(made, WriteOptions(glb_profile=profile), most_tiles=40)
     size = write_files(parts_output(path, overwrite=False), files)
     report = checked(path)
     assert report.findings == []

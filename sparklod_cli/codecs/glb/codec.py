@@ -12,12 +12,13 @@ from __future__ import annotations
 import dataclasses
 import io
 from collections import ChainMap
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
 
+from ...model.scene import Scene
 from ...model.sh import width_of
 from ...model.splats import FloatArray, Splats
 from ...model.transforms import Transform
@@ -27,29 +28,43 @@ from ...system.threads import blocks_of, ordered_map
 from ...system.units import count_of
 from ...system.untrusted import quoted_value
 from .. import spz
+from ..clamps import SPZ, CodeRange
 from ..compression import check_promise
-from ..file_notes import FileNote, read_note
+from ..file_notes import FileNote, note_of, read_note
 from ..left_out import left_out
-from ..reader import OpenFile, Reader, Target
+from ..options import CESIUM, DEFAULTS, KHRONOS, WriteOptions
+from ..reader import OpenFile, Reader, Target, encode_rows
 from ..scene_files import copy_rows
-from . import log_scales
 from .attributes import (
+    ATTRIBUTES,
     COMPRESSION,
     EXTENSION,
     OLD_COMPRESSION,
+    POINT_COLOR,
     POSITION,
+    READ_AS_LOGS,
     SCALE,
+    UNSIGNED,
     Attribute,
+    are_logs,
     attributes_of,
+    doubt_about,
     notes_on,
+    sh_attributes,
 )
-from .glb_container import FLOAT, Accessor, GltfFile
-from .glb_writer import POINTS, PROPERTIES
-from .glb_writer import encode as encode
-from .glb_writer import extensions_of as extensions_of
-from .glb_writer import held as held
-from .glb_writer import settled as settled
-from .placement import GltfNodes, is_turn_of, transform_of
+from .glb_container import (
+    FLOAT,
+    TURNS,
+    TYPES,
+    Accessor,
+    GltfFile,
+    GltfNodes,
+    check_length,
+    head_of,
+    is_turn_of,
+    rotation_of_up,
+    transform_of,
+)
 
 #: Extensions that a file may require, and how those begin that change no splats: materials and lights are ignored.
 READ = (EXTENSION, COMPRESSION, OLD_COMPRESSION, "KHR_mesh_quantization")
@@ -233,13 +248,13 @@ def _plain_content(file: GltfFile, primitive: dict[str, Any], generator: object)
         for each, accessor in accessors
         if each.column == wanted.column
     )
-    if log_scales.are_logs(scales, generator):
-        notes.append(log_scales.READ)
+    if are_logs(scales, generator):
+        notes.append(READ_AS_LOGS)
         accessors = [
-            (log_scales.decoded(each) if each.column == SCALE.column else each, accessor)
+            (dataclasses.replace(each, decode=np.exp) if each.column == SCALE.column else each, accessor)
             for each, accessor in accessors
         ]
-    elif doubt := log_scales.doubt_about(scales, centers, count):
+    elif doubt := doubt_about(scales, centers, count):
         notes.append(doubt)
 
     def fill(target: Target, threads: int, progress: Progress) -> None:
@@ -323,3 +338,159 @@ def placed(content: Reader, transform: Transform) -> Reader:
                 column[...] = getattr(turned, name)
 
     return dataclasses.replace(content, fill=fill)
+
+
+#: glTF's number for primitives of points, and the target of vertex attributes.
+POINTS, ARRAY_BUFFER = 0, 34962
+
+#: What the values of the extension mean, as they are written.
+PROPERTIES = {
+    "kernel": "ellipse",
+    "colorSpace": "srgb_rec709_display",
+    "sortingMethod": "cameraDistance",
+    "projection": "perspective",
+}
+
+
+def profile_of(options: WriteOptions) -> str:
+    """Return the profile that is written, `KHRONOS` unless an option names another."""
+    return options.glb_profile or KHRONOS
+
+
+def extensions_of(profile: str) -> list[str]:
+    """Return the extensions of glTF that the files of a profile use."""
+    return [EXTENSION, COMPRESSION] if profile == CESIUM else [EXTENSION]
+
+
+def settled(scene: Scene, options: WriteOptions) -> WriteOptions:
+    """Return the options with nothing left open, those of SPZ, too, which the profile "cesium" has inside.
+
+    Raises:
+        FormatError: the scene is a tree, has an opacity above 1, which glTF forbids, or does not fit.
+    """
+    if scene.tree is not None:
+        raise FormatError("GLB holds no Level-of-Detail tree")
+    splats = scene.splats
+    most = float(splats.opacity.max(initial=0))
+    if most > 1:
+        raise FormatError(f"GLB holds no opacity above 1, and a splat has {most:g}; extract the leaves, or simplify")
+    if profile_of(options) == CESIUM:
+        return spz.settled(scene, options)
+    check_length(4 * len(splats) * (14 + 3 * splats.sh.shape[1]) + (1 << 16))
+    return options
+
+
+def held(options: WriteOptions, sh_degree: int) -> Sequence[CodeRange]:
+    """Return the values that the profile holds without clamping them: all, or those of SPZ."""
+    return SPZ if profile_of(options) == CESIUM else ()
+
+
+def encode(
+    scene: Scene, options: WriteOptions = DEFAULTS, *, threads: int = 1, progress: Progress = silent
+) -> Iterator[bytes]:
+    """Return the bytes of a GLB, piece by piece; its root node turns the axis that points up, where known, to y.
+
+    The same scene and options give the same bytes for any number of threads.
+
+    Raises:
+        FormatError: see `settled`.
+    """
+    options = settled(scene, options)
+    yield from (_encode_spz if profile_of(options) == CESIUM else _encode_plain)(scene, options, threads, progress)
+
+
+def _encode_plain(scene: Scene, options: WriteOptions, threads: int, progress: Progress) -> Iterator[bytes]:
+    splats, count = scene.splats, len(scene.splats)
+    attributes = [*ATTRIBUTES, *sh_attributes(splats.sh_degree)]
+    views, accessors, offset = [], [], 0
+    for number, each in enumerate(attributes):
+        size = TYPES[each.type]
+        views.append({"buffer": 0, "byteOffset": offset, "byteLength": 4 * size * count, "target": ARRAY_BUFFER})
+        accessors.append({"bufferView": number, **_accessor(each.type, count), **_bounds(each, splats)})
+        offset += 4 * size * count
+    root = _root(scene, attributes, accessors, views, offset, PROPERTIES, required=False)
+    yield head_of(root, offset)
+    for each in attributes:
+        column = each.part_of(splats)
+
+        def rows(part: slice, each: Attribute = each, column: FloatArray = column) -> bytes:
+            return np.ascontiguousarray(each.encode(column[part]), "<f4").tobytes()
+
+        yield from encode_rows(rows, count, threads, progress)
+
+
+def _encode_spz(scene: Scene, options: WriteOptions, threads: int, progress: Progress) -> Iterator[bytes]:
+    # The axis that points up is noted in `asset`.
+    plain = dataclasses.replace(scene, up=None)
+    data = b"".join(spz.encode(plain, options, threads=threads, progress=progress))
+    splats, count = scene.splats, len(scene.splats)
+    position, rotation, scale, *_ = ATTRIBUTES
+    color = Attribute(POINT_COLOR, "VEC4", UNSIGNED, "rgb")
+    attributes = [position, color, scale, rotation, *sh_attributes(splats.sh_degree)]
+    accessors = [{**_accessor(each.type, count), **_bounds(each, splats)} for each in attributes]
+    accessors[1] |= {"componentType": UNSIGNED[0], "normalized": True}  # as CesiumJS unpacks colours and opacities
+    views = [{"buffer": 0, "byteOffset": 0, "byteLength": len(data)}]
+    properties = {**PROPERTIES, "extensions": {COMPRESSION: {"bufferView": 0}}}
+    padding = bytes(-len(data) % 4)
+    root = _root(scene, attributes, accessors, views, len(data) + len(padding), properties, required=True)
+    yield head_of(root, len(data) + len(padding))
+    yield data + padding
+
+
+def _accessor(kind: str, count: int) -> dict[str, Any]:
+    return {"componentType": FLOAT, "count": count, "type": kind}
+
+
+def _bounds(attribute: Attribute, splats: Splats) -> dict[str, Any]:
+    """Return the bounds of positions, which glTF demands; JSON has their float32 values to the last bit."""
+    if attribute.column != "center" or not len(splats):
+        return {}
+    return {"min": splats.center.min(axis=0).tolist(), "max": splats.center.max(axis=0).tolist()}
+
+
+def _root(
+    scene: Scene,
+    attributes: Sequence[Attribute],
+    accessors: list[dict[str, Any]],
+    views: list[dict[str, Any]],
+    length: int,
+    properties: dict[str, Any],
+    *,
+    required: bool,
+) -> dict[str, Any]:
+    """Return the JSON of a file with one mesh of one primitive, in one node."""
+    note = note_of(antialiased=scene.antialiased, up=scene.up)
+    asset = {"version": "2.0", "generator": note.pop("generator")} | ({"extras": note} if note else {})
+    extensions = extensions_of(CESIUM if required else KHRONOS)
+    return {
+        "asset": asset,
+        "extensionsUsed": extensions,
+        **({"extensionsRequired": extensions} if required else {}),
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0} | _turn(scene.up, as_matrix=required)],
+        "meshes": [
+            {
+                "primitives": [
+                    {
+                        "attributes": {each.semantic: number for number, each in enumerate(attributes)},
+                        "mode": POINTS,
+                        "extensions": {EXTENSION: properties},
+                    }
+                ]
+            }
+        ],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": length}],
+    }
+
+
+def _turn(up: str | None, *, as_matrix: bool) -> dict[str, Any]:
+    """Return the turn of a node that makes an axis y. As content of a tile, CesiumJS reads nothing but a matrix."""
+    if as_matrix:
+        matrix = np.eye(4)
+        matrix[:3, :3] = rotation_of_up(up)
+        return {"matrix": matrix.T.ravel().tolist()}
+    turn = TURNS[up or "y"]
+    return {} if turn == TURNS["y"] else {"rotation": turn}

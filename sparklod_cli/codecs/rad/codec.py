@@ -6,29 +6,44 @@ A file is a header and its chunks, or a header that names a file for each chunk;
 from __future__ import annotations
 
 import dataclasses
+import math
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from zlib_ng import zlib_ng
 
-from ...model.lod_tree import LodTree
-from ...model.scene import Scene
-from ...model.splats import COLUMNS, Splats
+from ...model.lod_tree import CHUNK_NODES, LodTree
+from ...model.scene import NodeStream, Scene
+from ...model.sh import COEFFICIENTS
+from ...model.splats import COLUMNS, FloatArray, Splats
 from ...system.progress import Progress, silent
-from ..encoder import results
+from ...system.threads import blocks_of
+from .. import quantize, sh_palette, spark_codings
+from ..clamps import CodeRange
+from ..encoder import Encoded, Encoder, Named, Windows, results, windows_of
+from ..file_notes import comment_of
 from ..options import DEFAULTS, WriteOptions
 from ..quantize import Bytes
 from ..reader import OpenCompanion
 from ..splat_encoding import SplatEncoding
-from .property_codings import CODINGS
-from .rad_encoder import CHUNK, CodedProperty, RadEncoder
-from .rad_encoder import encoder as encoder
-from .rad_header import Files, Property, RadHeader
-from .rad_layout import AUTO, OPTIONS, PROPERTIES, RANGES, SIZES, Row, encodings_of
-from .rad_options import AUTOMATIC
+from .property_codings import BLOCK, CODINGS
+from .rad_header import (
+    GZ,
+    Files,
+    Property,
+    RadChunkHeader,
+    RadHeader,
+    in_files,
+    in_one_file,
+    pack_chunk_header,
+    padding,
+)
+from .rad_layout import AUTO, BY_NAME, OPTIONS, PROPERTIES, RANGES, SIZES, Row, encodings_of
+from .rad_options import AUTOMATIC, code_range
 from .rad_options import held as held
 from .rad_options import needed as needed
 from .rad_options import settled as settled
@@ -39,6 +54,238 @@ from .rad_reader import read_chunk as read_chunk
 
 #: Bytes of chunks that wait in memory for their header; beyond, they wait on disk.
 SPOOLED = 1 << 26
+
+#: Names of the arrays of a window's result: the bytes of a chunk, and their number.
+CHUNK, SIZE = "chunk", "size"
+
+_RAW = -zlib_ng.MAX_WBITS
+
+#: The largest float32 below 1.
+_BELOW_1 = np.nextafter(np.float32(1), np.float32(0))
+
+
+#: Nodes that the palette of a tree is made of which is not in memory, evenly spread; a tree of fewer gives all. Of 16
+#: times as many as codes. Chosen.
+SAMPLE = 1 << 20
+
+#: Consecutive nodes of a sample, so that reading it takes few reads. Chosen.
+RUN = 1 << 8
+
+
+class CodedProperty(NamedTuple):
+    """Property of a chunk: encoding, codes of any shape that are not compressed, and ends of their range, if any."""
+
+    encoding: str
+    codes: NDArray[Any]
+    min: float | None
+    max: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class Palette:
+    """Spherical harmonics that splats share.
+
+    Attributes:
+        codes: (codes, K, 3) coefficients, as many codes as the first chunk has splats: Spark reads no other number.
+        used: how many of them are codes; the others, behind them, are 0.
+        labels: (N,) the code of each splat; None where it is searched for in each chunk.
+    """
+
+    codes: FloatArray
+    used: int
+    labels: NDArray[np.uint32] | None
+
+    @classmethod
+    def of(cls, scene: Scene | NodeStream, most: int, threads: int, progress: Progress) -> Palette:
+        """Cluster the SH of a scene to at most `most` codes; zeros follow, up to as many as Spark reads."""
+        if isinstance(scene, NodeStream):
+            splats, count = _sample(scene), scene.count
+        else:
+            splats, count = scene.splats, len(scene)
+        room = min(count, CHUNK_NODES)
+        weight = sh_palette.visible_weight(splats)
+        found = sh_palette.cluster(splats.sh, min(most, room), weight=weight, threads=threads, progress=progress)
+        padded = np.zeros((room, *found.codes.shape[1:]), np.float32)
+        padded[: len(found.codes)] = found.codes
+        return cls(padded, len(found.codes), found.labels if len(splats) == count else None)
+
+    def labels_of(self, splats: Splats, start: int) -> NDArray[np.uint32]:
+        """Return (n,) the codes of the splats of the file from number `start` on."""
+        if self.labels is not None:
+            return self.labels[start : start + len(splats)]
+        return sh_palette.labels_of(splats.sh, self.codes[: self.used])
+
+
+def _sample(nodes: NodeStream) -> Splats:
+    """Read runs of nodes, evenly spread over all."""
+    if nodes.count <= SAMPLE:
+        return nodes.read(0, nodes.count)[0]
+    starts = np.linspace(0, nodes.count - RUN, SAMPLE // RUN).astype(np.int64)
+    return Splats.concat([nodes.read(start, start + RUN)[0] for start in starts.tolist()])
+
+
+@dataclass(frozen=True, eq=False)
+class RadEncoder(Encoder):
+    """Encoder of a file: the result of a window is a chunk; `palette` is that of SH, or None."""
+
+    palette: Palette | None = None
+
+    @property
+    def _codes(self) -> SplatEncoding:
+        """The ranges of the codes."""
+        assert self.options.rad.ranges is not None
+        return self.options.rad.ranges
+
+    def codes(self, splats: Splats, tree: LodTree | None, start: int) -> Encoded:
+        """Encode a chunk: its bytes, and how many they are."""
+        chunk = np.frombuffer(self._chunk(splats, tree, start), np.uint8)
+        return {CHUNK: chunk, SIZE: np.array([len(chunk)])}
+
+    def pieces(self, windows: Windows, *, threads: int, progress: Progress) -> Iterator[bytes]:
+        """Return the bytes of one file, piece by piece."""
+        numbers = range(len(windows_of(self.count)))
+        sizes = [int(windows[number][SIZE][0]) for number in numbers]
+        yield from self.one_file(sizes, (windows[number][CHUNK].tobytes() for number in numbers), progress)
+
+    def one_file(self, sizes: Sequence[int], chunks: Iterable[bytes], progress: Progress) -> Iterator[bytes]:
+        """Return the bytes of one file, piece by piece, of the sizes and the bytes of its chunks."""
+        return in_one_file(self._header, sizes, self._counted(chunks, progress))
+
+    def files(self, windows: Iterable[Named], stem: str, *, progress: Progress = silent) -> Files:
+        """Return the name and the bytes of each file of a scene with a file a chunk; see `rad_header.in_files`."""
+        chunks = (window[CHUNK].tobytes() for window in windows)
+        return in_files(self._header, self._counted(chunks, progress), stem)
+
+    def _counted(self, chunks: Iterable[bytes], progress: Progress) -> Iterator[bytes]:
+        for part, chunk in zip(windows_of(self.count), chunks, strict=True):
+            yield chunk
+            progress("writing", part.stop, self.count, "splat")
+
+    @property
+    def _header(self) -> RadHeader:
+        """The header of the file, without its chunks."""
+        codes = None if self.palette is None else len(self.palette.codes)
+        comment = comment_of(antialiased=self.antialiased, up=self.up)
+        return RadHeader(self.count, self.sh_degree, self.tree, CHUNK_NODES, 0, (), self._codes, codes, comment)
+
+    def _chunk(self, splats: Splats, tree: LodTree | None, start: int) -> bytes:
+        payload, properties, at = [], [], 0
+        labels = None if self.palette is None else self.palette.labels_of(splats, start)
+        for row in self._rows(first=start == 0):
+            made = self.coded(row, splats, tree, labels, start)
+            data = self._deflated(made.codes, made.encoding)
+            properties.append(Property(at, len(data), row.name, made.encoding, GZ, made.min, made.max))
+            payload += [data, bytes(padding(len(data)))]
+            at += len(data) + padding(len(data))
+        header = RadChunkHeader(start, len(splats), at, self.sh_degree, self.tree, tuple(properties), self._codes)
+        return b"".join([pack_chunk_header(header), *payload])
+
+    def coded(
+        self, row: Row, splats: Splats, tree: LodTree | None, labels: NDArray[np.uint32] | None, start: int
+    ) -> CodedProperty:
+        """Encode a property of the chunk that begins with node `start`."""
+        encoding = getattr(self.options.rad, row.option) if row.option else row.encodings[0]
+        low, high = code_range(row, self._codes)
+        codes = CODINGS[encoding].encode(self.values(row, encoding, splats, tree, labels), low, high)
+        return CodedProperty(encoding, codes, *((low, high) if RANGES.get(encoding) else (None, None)))
+
+    def _rows(self, *, first: bool) -> Iterator[Row]:
+        """Yield the properties of a chunk."""
+        for row in PROPERTIES:
+            if row.degree:
+                own = row.codes and first if self.palette is not None else not row.codes
+                present = row.degree <= self.sh_degree and own
+            elif row.column == "labels":
+                present = self.palette is not None
+            else:
+                present = row.column in COLUMNS or self.tree
+            if present:
+                yield row
+
+    def values(
+        self, row: Row, encoding: str, splats: Splats, tree: LodTree | None, labels: NDArray[np.uint32] | None
+    ) -> NDArray[Any]:
+        """Return (n, numbers) values of a property, as its encoding takes them."""
+        if row.degree:
+            source = splats.sh if self.palette is None else self.palette.codes
+            flat = source.reshape(len(source), 3 * source.shape[1])
+            return flat[:, 3 * COEFFICIENTS[row.degree - 1] : 3 * COEFFICIENTS[row.degree]]
+        if row.column == "labels":
+            assert labels is not None
+            return labels[:, None]
+        column: NDArray[Any] = getattr(splats if row.column in COLUMNS else tree, row.column)
+        if row.column == "opacity":
+            return _alpha(self._opacity(splats), encoding, self._codes)[:, None]
+        if row.column == "quat_xyzw" and encoding != "oct88r8":
+            return column[:, :3] * np.where(column[:, 3:] < 0, np.float32(-1), np.float32(1))
+        if row.column == "center" and self.options.rad.center_bits is not None:
+            return rounded(column, self.options.rad.center_bits)
+        return column if column.ndim == 2 else column[:, None]
+
+    def _opacity(self, splats: Splats) -> FloatArray:
+        """Return (n,) opacities that make up for the rounding of scales."""
+        if not self.options.covering:
+            return splats.opacity
+        ends = code_range(BY_NAME["scales"], self._codes)
+        bits = self.options.rad.center_bits
+        blur, kept = 0.0 if bits is None else 2.0**-bits, np.empty_like(splats.opacity)
+        for part in blocks_of(len(splats), BLOCK):
+            scale = splats.scale[part]
+            rounded = CODINGS[self.options.rad.scales].rounded(scale, *ends)
+            kept[part] = quantize.compensated(splats.opacity[part], scale, rounded, blur)
+        return kept
+
+    def _deflated(self, codes: NDArray[Any], encoding: str) -> bytes:
+        """Compress codes to a raw deflate stream.
+
+        Of codes of a byte, only runs are looked for: longer matches are chance, which makes them longer and slower.
+        """
+        strategy = zlib_ng.Z_RLE if SIZES[encoding] == 1 else zlib_ng.Z_DEFAULT_STRATEGY
+        packer = zlib_ng.compressobj(
+            self.options.compression_level, zlib_ng.DEFLATED, _RAW, zlib_ng.DEF_MEM_LEVEL, strategy
+        )
+        return packer.compress(codes.data.cast("B")) + packer.flush()
+
+
+def encoder(
+    scene: Scene | NodeStream,
+    options: WriteOptions,
+    ranges: tuple[CodeRange, ...] = (),
+    *,
+    threads: int = 1,
+    progress: Progress = silent,
+) -> RadEncoder:
+    """Return the encoder of a scene; finds its palette, if there is to be one.
+
+    Args:
+        scene: of which nothing is read but what the palette is made of.
+
+    Raises:
+        ValueError: the options are not settled.
+    """
+    if options.rad.ranges is None:
+        raise ValueError("the options leave choices open; `settled` makes them")
+    bare, codes = RadEncoder.of(scene, options, ranges), options.rad.sh_codes
+    if codes is None or not bare.sh_degree or not bare.count:
+        return bare
+    return dataclasses.replace(bare, palette=Palette.of(scene, codes, threads, progress))
+
+
+def rounded(center: FloatArray, bits: int) -> FloatArray:
+    """Round centres to multiples of 2 ** -bits that float32 holds."""
+    # A float, as numpy 1 makes objects of large integers.
+    most = float(math.floor(math.ldexp(float(np.finfo(np.float32).max), bits)))
+    multiples = np.rint(np.ldexp(center.astype(np.float64), bits)).clip(-most, most)
+    return np.ldexp(multiples, -bits).astype(np.float32)
+
+
+def _alpha(opacity: FloatArray, encoding: str, ranges: SplatEncoding) -> FloatArray:
+    """Return the alpha of linear opacities.
+
+    As a code, 1 of 0..2 lies between two of them; it must not become the upper one, which is that of a merged splat.
+    """
+    alpha = spark_codings.encode_lod_alpha(opacity)
+    return np.where(alpha == 1, _BELOW_1, alpha) if encoding == "r8" and ranges.lod_opacity else alpha
 
 
 def encode(

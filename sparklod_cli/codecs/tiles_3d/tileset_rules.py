@@ -15,12 +15,23 @@ from ...system.progress import Progress, silent
 from ...system.units import count_of
 from ...system.untrusted import quoted_value
 from ..glb.attributes import COMPRESSION, EXTENSION
-from ..glb.placement import product
+from ..glb.glb_container import product
 from ..json_trees import leads_away
 from ..scene_files import Chunk, SceneFiles
 from ..validation import LOOSE_BOUND, RuleViolation, count_outside, error_of
-from .tileset import CONTENT_GLTF, OLD_VERSION, REPLACE, SPLATS, UNREAD, VERSION, TileRecord, Tileset
-from .volumes import Volume, to_tileset, volume_of
+from .tileset import (
+    CONTENT_GLTF,
+    OLD_VERSION,
+    REPLACE,
+    SPLATS,
+    UNREAD,
+    VERSION,
+    TileRecord,
+    Tileset,
+    Volume,
+    to_tileset,
+    volume_of,
+)
 
 #: Meaning of each code; the text of a violation has the values. Values of the wrong kind, which the parser refuses,
 #: have the codes "container.corrupt" and "container.version", as in other formats.

@@ -17,7 +17,7 @@ import sparklod_cli
 from sparklod_cli.codecs.options import SogOptions, WriteOptions
 from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.codecs.sog import codec as sog
-from sparklod_cli.codecs.sog import sog_container, sog_writer
+from sparklod_cli.codecs.sog import sog_container
 from sparklod_cli.io import read_scene
 from sparklod_cli.model.gaussian import normalized_quat
 from sparklod_cli.model.scene import Scene
@@ -192,7 +192,7 @@ def test_a_palette_has_as_many_codes_as_suit_or_as_are_asked_for(codes: int | No
 
 def test_palettes_are_as_large_as_those_of_splat_transform() -> None:
     expected = {1: 1024, 1024: 1024, 2047: 1024, 2048: 2048, 5000: 4096, 65_535: 32_768, 65_536: 65_536, 10**8: 65_536}
-    assert {count: sog_writer.codes_for(count) for count in expected} == expected
+    assert {count: sog.codes_for(count) for count in expected} == expected
 
 
 @pytest.mark.parametrize("count", [1, 15, 16, 17, 4096, 4097, 500_000, 16_380**2])
@@ -229,7 +229,7 @@ def test_what_sog_cannot_hold_is_refused_before_a_byte_is_written(what: str) -> 
 
 
 def test_more_splats_than_an_image_has_texels_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sog_writer, "MAX_SIDE", 7)
+    monkeypatch.setattr(sog, "MAX_SIDE", 7)
     sog.settled(Scene(random_splats(16)), WriteOptions())
     with pytest.raises(FormatError, match="17 splats; a SOG holds at most 16"):
         sog.settled(Scene(random_splats(17)), WriteOptions())

@@ -16,8 +16,8 @@ import pytest
 from fixtures import by_hand_glb, by_hand_tiles
 from sparklod_cli.codecs.options import PROFILES, WriteOptions
 from sparklod_cli.codecs.reader import decode_file
-from sparklod_cli.codecs.tiles_3d import codec, tile_writer
-from sparklod_cli.codecs.tiles_3d.volumes import LARGEST
+from sparklod_cli.codecs.tiles_3d import codec
+from sparklod_cli.codecs.tiles_3d.tileset import LARGEST
 from sparklod_cli.io import open_reader, read_parts, read_scene
 from sparklod_cli.lod import quality
 from sparklod_cli.lod.tile_settings import TileSettings
@@ -45,7 +45,7 @@ def tiles(up: str | None = None) -> TileScene:
 
 
 def files_of(scene: TileScene, profile: str | None = None, **more: Any) -> Files:
-    files = tile_writer.encode_files(scene, WriteOptions(glb_profile=profile), **more)
+    files = codec.encode_files(scene, WriteOptions(glb_profile=profile), **more)
     return {name: b"".join(pieces) for name, pieces in files}
 
 
