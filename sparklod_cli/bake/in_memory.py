@@ -76,7 +76,7 @@ class InMemory:
             tree.environment = transformed(far, settings.transform, threads)
         self.clock.end("read")
         if self.output.form is not None:
-            self._leaves = Statistics.of_blocks(splats, np.ones(len(splats), np.bool_), self.output.needed, threads)
+            self._leaves = Statistics.of(splats, np.ones(len(splats), np.bool_), self.output.needed, threads)
             self.output.check(self._leaves)  # before building, so that an impossible output is reported at once
         tree.splats, tree.dropped, tree.method = len(splats), tally.dropped, settings.method
         leaves = [splats]
@@ -106,7 +106,7 @@ class InMemory:
         if output.form is not None and self._leaves is not None:
             assert scene.tree is not None
             inner = scene.splats.take(~scene.tree.is_leaf)
-            merged = Statistics.of_blocks(inner, np.zeros(len(inner), np.bool_), output.needed, self.threads)
+            merged = Statistics.of(inner, np.zeros(len(inner), np.bool_), output.needed, self.threads)
             tree.statistics = Statistics.merged([self._leaves, merged])
         elif output.form is not None:
             tree.statistics = Statistics.of_scene(scene, output.needed, threads=self.threads)

@@ -99,7 +99,7 @@ def settled(scene: Scene | Statistics, options: WriteOptions) -> WriteOptions:
         raise FormatError(f"a coordinate does not fit {bits} fractional bits; use at most {most}")
     sh_bits = options.sh_bits
     if sh_bits is None:
-        sh_bits = quantize.LEAST_SH_BITS if found.leaf_sh is None else enough(found.leaf_sh)
+        sh_bits = quantize.LEAST_SH_BITS if found.leaf_sh is None else enough(found.leaf_sh, found.sh_between)
     if not quantize.LEAST_SH_BITS <= sh_bits <= ALL_BITS:
         raise ValueError(f"sh_bits is {sh_bits}, not {quantize.LEAST_SH_BITS} to {ALL_BITS}")
     return dataclasses.replace(options, spz_version=version, fractional_bits=bits, sh_bits=sh_bits)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -25,9 +25,6 @@ from . import quantize
 #: A bin holds the float32 values with the same upper 16 bits: sign, exponent and 7 bits of the mantissa. Its ends
 #: are at most 0.8 % apart.
 _SHIFT, _BINS = 16, 1 << 16
-
-#: Values that are sorted at a time: they stay in the processor's cache.
-_VALUES = 1 << 17
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,19 +44,15 @@ class Distribution:
 
     @classmethod
     def of(cls, values: FloatArray) -> Distribution:
-        """Count all values of an (N, ...) float32 array; NaN is in the last bin."""
-        rows = max(1, _VALUES * len(values) // max(values.size, 1))
-        parts = []
-        for start in range(0, max(len(values), 1), rows):
-            ordered = np.sort(values[start : start + rows], axis=None) + np.float32(0)  # -0 becomes 0
-            ordered[np.isnan(ordered)] = np.nan  # without a sign
-            bits = ordered.view(np.uint32) >> np.uint32(_SHIFT)
-            first = _starts(bits)
-            ends = np.append(first, len(bits))[1:]
-            bins = bits[first].astype(np.int64)
-            bins = np.where(bins < _BINS // 2, bins + _BINS // 2, _BINS - 1 - bins)
-            parts.append(cls(bins, ends - first, ordered[first], ordered[ends - 1]))
-        return cls.merged(parts)
+        """Count all values of a float32 array of any shape; NaN is in the last bin."""
+        ordered = np.sort(values, axis=None) + np.float32(0)  # -0 becomes 0
+        ordered[np.isnan(ordered)] = np.nan  # without a sign
+        bits = ordered.view(np.uint32) >> np.uint32(_SHIFT)
+        first = _starts(bits)
+        ends = np.append(first, len(bits))[1:]
+        bins = bits[first].astype(np.int64)
+        bins = np.where(bins < _BINS // 2, bins + _BINS // 2, _BINS - 1 - bins)
+        return cls(bins, ends - first, ordered[first], ordered[ends - 1])
 
     @classmethod
     def merged(cls, parts: Sequence[Distribution]) -> Distribution:
@@ -107,14 +100,16 @@ class Distribution:
         if math.isnan(self.most[-1]):
             return math.inf
         until = np.cumsum(self.counts)
-
-        def at(rank: int) -> float:
-            place = int(np.searchsorted(until, rank, side="right"))
-            count, least, most = int(self.counts[place]), float(self.least[place]), float(self.most[place])
-            after = rank - (int(until[place]) - count)
-            return least if least == most else least + (most - least) * after / (count - 1)
-
-        return interpolated(at, int(until[-1]), share)
+        place, ends = share * (int(until[-1]) - 1), list[float]()
+        for rank in (math.floor(place), math.ceil(place)):
+            row = int(np.searchsorted(until, rank, side="right"))
+            count, least, most = int(self.counts[row]), float(self.least[row]), float(self.most[row])
+            after = rank - (int(until[row]) - count)
+            ends.append(least if least == most else least + (most - least) * after / (count - 1))
+        (low, high), part = ends, place - math.floor(place)
+        if low == high:
+            return low
+        return high - (high - low) * (1 - part) if part >= 0.5 else low + (high - low) * part
 
 
 #: The columns of a `Distribution` beside its bins.
@@ -124,21 +119,6 @@ _COLUMNS = ("counts", "least", "most")
 def _starts(rows: NDArray[Any]) -> NDArray[np.intp]:
     """Return where runs of equal values begin."""
     return np.flatnonzero(np.concatenate([[True], rows[1:] != rows[:-1]])[: len(rows)])
-
-
-def interpolated(at: Callable[[int], float], count: int, share: float) -> float:
-    """Return a quantile, linearly interpolated from the nearer end as numpy does.
-
-    Args:
-        at: returns the value of a rank, 0 to count - 1.
-        share: 0..1.
-    """
-    place = share * (count - 1)
-    rank = int(place)
-    low, high, part = at(rank), at(min(rank + 1, count - 1)), place - rank
-    if part == 0 or low == high:
-        return low
-    return high - (high - low) * (1 - part) if part >= 0.5 else low + (high - low) * part
 
 
 #: Ends of the bins of magnitudes, 32,768 from 0 up. The last ones are of infinity and of what is not a number.
@@ -165,61 +145,50 @@ LARGEST_ERROR = 0.009
 _SH_ROWS = 1 << 13
 
 
-@dataclass(frozen=True, eq=False)
-class ShBytes:
-    """Counts of SH coefficients as bytes of SPZ.
+def sh_code_counts(sh: FloatArray) -> tuple[NDArray[np.int64], int]:
+    """Count (N, K, 3) SH coefficients as bytes of SPZ.
 
-    Attributes:
-        counts: (degrees, 256) int64 coefficients of each degree by their code.
-        between: how many coefficients lie between two codes.
+    Returns:
+        (degrees, 256) int64 coefficients of each degree by their code, and how many lie between two codes.
     """
-
-    counts: NDArray[np.int64]
-    between: int
-
-    @classmethod
-    def of(cls, sh: FloatArray) -> ShBytes:
-        """Count (N, K, 3) coefficients."""
-        counts, between = np.zeros((MAX_SH_DEGREE, 256), np.int64), 0
-        for start in range(0, len(sh), _SH_ROWS):
-            part = sh[start : start + _SH_ROWS]
-            codes = quantize.encode_sh(part, ALL_BITS)
-            between += int(np.count_nonzero(quantize.decode_sh(codes) != part))
-            for degree in range(MAX_SH_DEGREE):
-                own = codes[:, COEFFICIENTS[degree] : COEFFICIENTS[degree + 1]]
-                counts[degree] += np.bincount(own.reshape(-1), minlength=256)
-        return cls(counts, between)
-
-    @classmethod
-    def merged(cls, parts: Sequence[ShBytes]) -> ShBytes:
-        """Merge the counts of one part or more, in any order."""
-        return cls(np.sum([part.counts for part in parts], axis=0), sum(part.between for part in parts))
-
-    def error(self, bits: int) -> float:
-        """Return the root mean square change of a colour, over splats and directions, if this many bits are kept.
-
-        The mean square of a basis function over all directions is 1 / (4 * pi).
-        """
-        codes = np.broadcast_to(np.arange(256, dtype=np.uint8)[:, None, None], (256, COEFFICIENTS[MAX_SH_DEGREE], 3))
-        whole = quantize.decode_sh(np.ascontiguousarray(codes))
-        square = np.square(quantize.decode_sh(quantize.encode_sh(whole, bits)) - whole, dtype=np.float64)[:, :, 0]
-        total = 0.0
-        for degree, counts in enumerate(self.counts):
-            if counts.any():
-                coefficients = 2 * degree + 3
-                total += coefficients * float(counts @ square[:, COEFFICIENTS[degree]]) / float(counts.sum())
-        return math.sqrt(total / (4 * math.pi))
+    counts, between = np.zeros((MAX_SH_DEGREE, 256), np.int64), 0
+    for start in range(0, len(sh), _SH_ROWS):
+        part = sh[start : start + _SH_ROWS]
+        codes = quantize.encode_sh(part, ALL_BITS)
+        between += int(np.count_nonzero(quantize.decode_sh(codes) != part))
+        for degree in range(MAX_SH_DEGREE):
+            own = codes[:, COEFFICIENTS[degree] : COEFFICIENTS[degree + 1]]
+            counts[degree] += np.bincount(own.reshape(-1), minlength=256)
+    return counts, between
 
 
-def enough(found: ShBytes) -> int:
-    """Return the fewest bits of the SH of full detail that keep to `LARGEST_ERROR`.
+def sh_error(counts: NDArray[np.int64], bits: int) -> float:
+    """Return the root mean square change of a colour, over splats and directions, if this many bits are kept.
+
+    The mean square of a basis function over all directions is 1 / (4 * pi).
+
+    Args:
+        counts: of `sh_code_counts`.
+    """
+    codes = np.broadcast_to(np.arange(256, dtype=np.uint8)[:, None, None], (256, COEFFICIENTS[MAX_SH_DEGREE], 3))
+    whole = quantize.decode_sh(np.ascontiguousarray(codes))
+    square = np.square(quantize.decode_sh(quantize.encode_sh(whole, bits)) - whole, dtype=np.float64)[:, :, 0]
+    total = 0.0
+    for degree, row in enumerate(counts):
+        if row.any():
+            total += (2 * degree + 3) * float(row @ square[:, COEFFICIENTS[degree]]) / float(row.sum())
+    return math.sqrt(total / (4 * math.pi))
+
+
+def enough(counts: NDArray[np.int64], between: int) -> int:
+    """Return the fewest bits of the SH of full detail, see `sh_code_counts`, that keep to `LARGEST_ERROR`.
 
     Where all coefficients are codes, as those from an SPZ file, none may change: they stay the same however often they
     are written.
     """
-    most = LARGEST_ERROR if found.between else 0.0
+    most = LARGEST_ERROR if between else 0.0
     every = range(quantize.LEAST_SH_BITS, ALL_BITS)
-    return next((bits for bits in every if found.error(bits) <= most), ALL_BITS)
+    return next((bits for bits in every if sh_error(counts, bits) <= most), ALL_BITS)
 
 
 #: A step of the positions is at most a 16th of the standard deviation of a small splat, so that rounding shifts it by
@@ -257,7 +226,7 @@ class Statistics:
         tree: whether they are nodes of a tree.
         reach: the largest magnitude of a coordinate.
         values: distributions of "leaf_scale", "leaf_length", "rgb", "scale", "sh1", "sh2" and "sh3", see `ALL`.
-        leaf_sh: SH of leaves, or of splats where there is no tree; None without SH.
+        leaf_sh, sh_between: `sh_code_counts` of leaves, or of splats where there is no tree; None without SH.
     """
 
     count: int
@@ -265,49 +234,45 @@ class Statistics:
     tree: bool
     reach: float | None = None
     values: Mapping[str, Distribution] = field(default_factory=dict)
-    leaf_sh: ShBytes | None = None
+    leaf_sh: NDArray[np.int64] | None = None
+    sh_between: int = 0
 
     @classmethod
-    def of(cls, splats: Splats, leaf: NDArray[np.bool_] | None = None, needed: Collection[str] = ALL) -> Statistics:
+    def of(
+        cls, splats: Splats, leaf: NDArray[np.bool_] | None = None, needed: Collection[str] = ALL, threads: int = 1
+    ) -> Statistics:
         """Count N splats or nodes.
 
         Args:
             leaf: (N,) which nodes are leaves; None for splats that are no nodes.
             needed: what to count, of `ALL`.
         """
-        reach, leaf_sh = None, None
-        leaves = slice(None) if leaf is None or leaf.all() else leaf
-        if "reach" in needed:
-            reach = float(np.maximum(splats.center.max(initial=0), -splats.center.min(initial=0)))  # NaN stays
-        columns = {name: getattr(splats, name) for name in ("rgb", "scale") if name in needed}
-        if "leaf_scale" in needed:
-            columns["leaf_scale"] = np.maximum.reduce(splats.scale[leaves].T)
-        if "leaf_length" in needed:
-            columns["leaf_length"] = lengths(splats.scale[leaves])
-        if "leaf_sh" in needed and splats.sh_degree:
-            leaf_sh = ShBytes.of(splats.sh[leaves])
-        if "sh" in needed:
-            for degree in range(1, splats.sh_degree + 1):
-                columns[f"sh{degree}"] = splats.sh[:, COEFFICIENTS[degree - 1] : COEFFICIENTS[degree]]
-        values = {name: Distribution.of(column) for name, column in columns.items()}
-        return cls(len(splats), splats.sh_degree, leaf is not None, reach, values, leaf_sh)
+
+        def count(part: slice) -> Statistics:
+            block, leaves = splats.rows(part), slice(None) if leaf is None or leaf[part].all() else leaf[part]
+            reach, leaf_sh, between = None, None, 0
+            if "reach" in needed:
+                reach = float(np.maximum(block.center.max(initial=0), -block.center.min(initial=0)))  # NaN stays
+            columns = {name: getattr(block, name) for name in ("rgb", "scale") if name in needed}
+            if "leaf_scale" in needed:
+                columns["leaf_scale"] = np.maximum.reduce(block.scale[leaves].T)
+            if "leaf_length" in needed:
+                columns["leaf_length"] = lengths(block.scale[leaves])
+            if "leaf_sh" in needed and block.sh_degree:
+                leaf_sh, between = sh_code_counts(block.sh[leaves])
+            if "sh" in needed:
+                for degree in range(1, block.sh_degree + 1):
+                    columns[f"sh{degree}"] = block.sh[:, COEFFICIENTS[degree - 1] : COEFFICIENTS[degree]]
+            values = {name: Distribution.of(column) for name, column in columns.items()}
+            return cls(len(block), block.sh_degree, leaf is not None, reach, values, leaf_sh, between)
+
+        blocks = blocks_of(len(splats), _BLOCK) or [slice(0)]
+        return cls.merged(list(ordered_map(count, blocks, threads)))
 
     @classmethod
     def of_scene(cls, scene: Scene, needed: Collection[str] = ALL, *, threads: int = 1) -> Statistics:
         """Count the splats of a scene."""
-        return cls.of_blocks(scene.splats, None if scene.tree is None else scene.tree.is_leaf, needed, threads)
-
-    @classmethod
-    def of_blocks(
-        cls, splats: Splats, leaf: NDArray[np.bool_] | None, needed: Collection[str], threads: int
-    ) -> Statistics:
-        """Count as `of`, on several threads."""
-
-        def count(part: slice) -> Statistics:
-            return cls.of(splats.take(part), None if leaf is None else leaf[part], needed)
-
-        parts = list(ordered_map(count, blocks_of(len(splats), _BLOCK), threads))
-        return cls.merged(parts) if parts else cls.of(splats, leaf, needed)
+        return cls.of(scene.splats, None if scene.tree is None else scene.tree.is_leaf, needed, threads)
 
     @classmethod
     def merged(cls, parts: Sequence[Statistics]) -> Statistics:
@@ -326,15 +291,14 @@ class Statistics:
             first.tree,
             None if first.reach is None else float(np.max([part.reach for part in parts])),
             {name: Distribution.merged([part.values[name] for part in parts]) for name in first.values},
-            ShBytes.merged(leaf_sh) if leaf_sh else None,
+            np.sum(leaf_sh, axis=0) if leaf_sh else None,
+            sum(part.sh_between for part in parts),
         )
 
     def array(self) -> NDArray[np.uint8]:
         """Return the bytes of these statistics, tens of KB, from which `from_array` makes them again."""
-        columns: dict[str, Any] = {"count": self.count, "sh_degree": self.sh_degree, "tree": self.tree}
-        columns |= {} if self.reach is None else {"reach": self.reach}
-        parts = {**self.values, **({} if self.leaf_sh is None else {"leaf_sh": self.leaf_sh})}
-        columns |= {f"{name}.{key}": value for name, part in parts.items() for key, value in vars(part).items()}
+        columns = {name: value for name, value in vars(self).items() if name != "values" and value is not None}
+        columns |= {f"{name}.{key}": value for name, part in self.values.items() for key, value in vars(part).items()}
         file = io.BytesIO()
         np.savez_compressed(file, **columns)
         return np.frombuffer(file.getvalue(), np.uint8)
@@ -349,9 +313,7 @@ class Statistics:
                 name, _, column = key.partition(".")
                 place = parts.setdefault(name, {}) if column else facts
                 place[column or name] = value if value.ndim else value.item()
-        sh = parts.pop("leaf_sh", None)
-        values = {name: Distribution(**columns) for name, columns in parts.items()}
-        return cls(**facts, values=values, leaf_sh=None if sh is None else ShBytes(**sh))
+        return cls(**facts, values={name: Distribution(**columns) for name, columns in parts.items()})
 
 
 def lengths(scale: FloatArray) -> FloatArray:

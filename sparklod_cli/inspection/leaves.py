@@ -17,7 +17,7 @@ from ..codecs.rad.rad_layout import PROPERTIES, Row
 from ..codecs.spark_codings import STEPS_8_8_8, encode_axis_angle, encode_lod_alpha
 from ..codecs.spz import to_code
 from ..codecs.spz_streams import LOD, Layout
-from ..codecs.statistics import ALL_BITS, Distribution, ShBytes, enough, fine_bits
+from ..codecs.statistics import ALL_BITS, Distribution, enough, fine_bits, sh_code_counts
 from ..model.scene import Scene
 from ..model.selection import Selection
 from ..model.sh import COEFFICIENTS
@@ -104,7 +104,7 @@ def of_spz(scene: Scene, leaves: Splats, *, covering: bool) -> LeafCoding:
     degree = scene.splats.sh_degree
     steps = np.full(3 + 1 + 3 + 3 + 3 * COEFFICIENTS[degree], STEPS)
     steps[10:] = SH_STEPS
-    sh_bits = enough(ShBytes.of(leaves.sh)) if degree else ALL_BITS
+    sh_bits = enough(*sh_code_counts(leaves.sh)) if degree else ALL_BITS
 
     def encode(splats: Splats) -> CodedSplats:
         parts, numbers = [], {}

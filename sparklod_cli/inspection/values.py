@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..codecs.statistics import Distribution, interpolated
+from ..codecs.statistics import Distribution
 from ..model.gaussian import spark_size
 from ..model.scene import Scene
 from ..model.sh import COEFFICIENTS
@@ -134,8 +134,9 @@ class Numbers:
         if self._distribution is not None:
             found = {name: self._origin + self._distribution.quantile(level / 100) for name, level in LEVELS.items()}
         else:
-            at = (np.sort(np.concatenate(self._kept)) + 0).item  # -0 becomes 0, as in a `Distribution`
-            found = {name: interpolated(at, self.count, level / 100) for name, level in LEVELS.items()}
+            numbers = np.concatenate(self._kept).astype(np.float64) + 0  # -0 becomes 0, as in a `Distribution`
+            shares = np.array(list(LEVELS.values())) / 100
+            found = dict(zip(LEVELS, np.quantile(numbers, shares).tolist(), strict=True))
         return {name: _number(value) for name, value in found.items()} | {"mean": _number(self._sum / self.count)}
 
 
