@@ -81,7 +81,7 @@ class Meter:
 def bake(arguments: list[str]) -> None:
     """Bake in this process and print what its stages and compiled loops took, as JSON."""
     meter = Meter()
-    from sparklod_cli.bake.records import Clock
+    from sparklod_cli.bake.settings import Clock
     from sparklod_cli.cli import main
     from sparklod_cli.system.jit import Kernel
 

@@ -30,7 +30,7 @@ if TYPE_CHECKING:  # mypy then resolves the modules first, which import this one
     from .api.views import traverse as traverse
     from .api.writing import Written as Written
     from .api.writing import write as write
-    from .bake.refining import Refined as Refined
+    from .bake.simplifying import Refined as Refined
     from .cameras.camera import Camera as Camera
     from .cameras.sources import CameraPath as CameraPath
     from .codecs.options import RadOptions as RadOptions

@@ -5,11 +5,9 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterable
 
-from ..bake.in_memory import build_tree
-from ..bake.refining import Refined, refined
-from ..bake.selecting import select
+from ..bake.in_memory import build_tree, select
 from ..bake.settings import BakeSettings, SimplifyGoal
-from ..bake.simplifying import Simplifier
+from ..bake.simplifying import Refined, Simplifier, refined
 from ..cameras.camera import Camera
 from ..cameras.sources import CameraPath
 from ..codecs.validation import check_valid
@@ -241,6 +239,6 @@ def extract_leaves(tree: Scene) -> Scene:
         FormatError: the scene has no tree.
         TreeError: the tree is broken.
     """
-    from ..extract_leaves import leaves_of
+    from ..bake.simplifying import leaves_of
 
     return leaves_of(scene_like(tree))

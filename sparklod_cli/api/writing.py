@@ -151,7 +151,7 @@ def _write_levels(
     progress: Progress,
 ) -> Written:
     from ..bake.parts_output import write_levels
-    from ..bake.records import Clock
+    from ..bake.settings import Clock
 
     path = out.place
     assert isinstance(path, Path)

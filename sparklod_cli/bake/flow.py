@@ -20,8 +20,7 @@ from ..system.progress import Progress, silent
 from ..system.stdio import DASH
 from . import estimate
 from .in_memory import InMemory
-from .records import Baked, Clock
-from .settings import BakeSettings, Resources
+from .settings import Baked, BakeSettings, Clock, Resources
 from .tree_output import output_of, write_tree
 
 if TYPE_CHECKING:
@@ -69,7 +68,7 @@ def bake(
     with memory_errors_translated(), contextlib.ExitStack() as stack:
         resources, fitting = resources or Resources(), None
         if settings.refine is not None:
-            from .refining import fit_settings, refined
+            from .simplifying import fit_settings, refined
 
             fitting = fit_settings(settings)
         overwrite = overwrite or (resources.resume and has_published(source, target, settings, resources))

@@ -17,7 +17,7 @@ from ..model.tile_scene import TileScene
 from ..system.output import Output
 from ..system.progress import Progress
 from ..system.threads import on_threads
-from .records import Clock, WrittenTree
+from .settings import Clock, WrittenTree
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,8 @@ from ..system.addresses import Place, absolute
 from ..system.errors import SparklodError
 from ..system.progress import Progress, silent
 from .flow import bake, fits_in_memory
-from .out_of_core.cluster_engine import ClusterEngine
-from .records import Baked
-from .settings import BakeSettings, Resources
+from .out_of_core.cluster import ClusterEngine
+from .settings import Baked, BakeSettings, Resources
 
 
 def bake_side_by_side(

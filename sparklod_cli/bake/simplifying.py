@@ -1,10 +1,11 @@
-"""Simplified scenes: one cut of a tree for all cameras, written without a tree."""
+"""Scenes made of a tree, its leaves or a simplified cut, and fitting of trees and cuts to pictures: `--refine`."""
 
 from __future__ import annotations
 
 import dataclasses
 import itertools
 import math
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -14,19 +15,23 @@ from numpy.typing import NDArray
 from ..cameras.camera import Camera
 from ..codecs.clamps import Losses, settled_with_losses
 from ..codecs.formats import WRITABLE
-from ..fitting.settings import FitSettings
-from ..io.writing import encoded, write_scene
+from ..codecs.options import WriteOptions
+from ..codecs.spz import like
+from ..codecs.validation import check_valid
+from ..fitting.settings import FitReport, FitSettings
+from ..io import read_scene
+from ..io.writing import encoded, scene_output, write_scene
 from ..lod.detail_levels import RefinementOrder, with_plain_opacity
 from ..model.falloff import MIN_ALPHA
 from ..model.scene import Scene
 from ..model.splats import Splats
-from ..system.errors import FormatError, SparklodError
-from ..system.progress import Progress
+from ..system import interrupts
+from ..system.addresses import Place
+from ..system.errors import FormatError, SparklodError, memory_errors_translated
+from ..system.progress import Progress, silent
 from ..system.threads import on_threads
 from ..system.units import count_of
-from .records import BuiltTree, Clock, WrittenTree
-from .refining import Refined, fit_settings, refined
-from .settings import BakeSettings, SimplifyGoal
+from .settings import BakeSettings, BuiltTree, Clock, SimplifyGoal, WrittenTree
 
 #: Number of cameras for a PSNR unless cameras are given, and their seed; a fitted tree is judged by as many.
 CAMERAS, SEED = 16, 0
@@ -272,3 +277,165 @@ def write_simplified(
         **vars(losses), splats=count, share=share, faint=chosen.faint, psnr=chosen.psnr, refine=chosen.refine
     )
     return WrittenTree(output_format=form.name, bytes=size, simplified=made)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Refined(FitReport):
+    """Result of fitting merged splats, as reported by `--json`.
+
+    Attributes:
+        seed: of the random cameras and budgets.
+        seconds: duration.
+    """
+
+    seed: int
+    seconds: float
+
+
+def fit_settings(settings: BakeSettings) -> FitSettings | None:
+    """Return the settings of fitting, with the cameras of the file they name; None without `--refine`.
+
+    Raises:
+        CameraPathError: the file cannot be read, or has no cameras; names it.
+    """
+    if settings.refine is None or settings.camera_path is None:
+        return settings.refine
+    from ..cameras.sources import read_path  # most bakes read no cameras
+
+    return dataclasses.replace(settings.refine, path=read_path(settings.camera_path))
+
+
+def refined(
+    scene: Scene,
+    settings: FitSettings,
+    *,
+    fixed: NDArray[np.int64] | None = None,
+    threads: int,
+    progress: Progress,
+    say: Callable[[str], None],
+) -> tuple[Scene, Refined]:
+    """Fit the merged splats of a tree; return the tree and the result.
+
+    A first Ctrl-C ends the fitting early, with the improvements of finished stages.
+
+    Args:
+        fixed: see `fitting.fit.fit`.
+        say: receives one-line messages for the user.
+
+    Raises:
+        KeyboardInterrupt: the fitting was interrupted before it improved anything.
+    """
+    from ..fitting.fit import fit
+
+    assert scene.tree is not None
+    start = time.perf_counter()
+    with interrupts.deferred() as interrupted:
+        nodes, report = fit(
+            scene.splats,
+            scene.tree,
+            settings,
+            fixed=fixed,
+            antialiased=scene.antialiased,
+            threads=threads,
+            progress=progress,
+            say=say,
+            interrupted=interrupted,
+        )
+    if not report.is_complete:
+        if not report.kept:
+            say("Stopped before --refine improved anything; no file written.")
+            raise KeyboardInterrupt
+        say("Interrupted: writing the improvements of the finished stages; another Ctrl-C ends without an output.")
+    seconds = round(time.perf_counter() - start, 4)
+    return dataclasses.replace(scene, splats=_within(nodes, scene)), Refined(
+        **vars(report), seed=settings.seed, seconds=seconds
+    )
+
+
+def _within(nodes: Splats, scene: Scene) -> Splats:
+    """Return nodes whose centres stay in their former box, so that a format needs no other number of bits for them.
+
+    With another number, leaves would move.
+    """
+    before = scene.splats.center
+    return dataclasses.replace(nodes, center=nodes.center.clip(before.min(axis=0), before.max(axis=0)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Extracted(Losses):
+    """Result of extracting the leaves of a tree.
+
+    Attributes:
+        format: of the input, for display.
+        nodes, splats: of its tree, and those of them that are leaves, which were written.
+        seconds: by stage (read, write).
+    """
+
+    format: str
+    nodes: int
+    splats: int
+    sh_degree: int
+    bytes: int
+    seconds: dict[str, float]
+    output_format: str
+
+
+def leaves_of(scene: Scene) -> Scene:
+    """Return the splats that the tree of a scene was built of, as a scene without a tree.
+
+    Raises:
+        FormatError: it has no tree.
+    """
+    if scene.tree is None:
+        raise FormatError("it has no Level-of-Detail tree whose leaves could be written")
+    leaves = scene.splats.take(scene.tree.is_leaf)
+    # A leaf is an input splat. One whose opacity is above 1 comes from a writer that rounds up.
+    leaves = dataclasses.replace(leaves, opacity=np.minimum(leaves.opacity, np.float32(1)))
+    return Scene(leaves, antialiased=scene.antialiased, format=scene.format, header=scene.header, up=scene.up)
+
+
+def extract_leaves(
+    source: Place,
+    target: Place,
+    options: WriteOptions,
+    *,
+    suffix: str,
+    overwrite: bool = False,
+    threads: int = 1,
+    progress: Progress = silent,
+) -> Extracted:
+    """Read the tree of a Level-of-Detail file and writes its leaves, in their order, as a file of plain splats.
+
+    Args:
+        source: a Level-of-Detail file; - is standard input.
+        options: how to write; what is None is taken from the input, which keeps its values as they are.
+        suffix: of the format, one of `WRITABLE`.
+
+    Raises:
+        FormatError, OutputError: see `io.read_scene` and `io.scene_output`; the file has no tree.
+        InvalidSplatsError: a leaf is invalid.
+        OutOfMemoryError: it does not fit into memory.
+    """
+    with memory_errors_translated():
+        form = WRITABLE[suffix]
+        out = scene_output(target, form, chunked=options.rad.chunked, overwrite=overwrite)
+        start = time.perf_counter()
+        scene = read_scene(source, threads=threads, progress=progress)
+        leaves = leaves_of(scene)
+        check_valid(leaves.splats, threads)
+        read_done = time.perf_counter()
+        # As they are: their opacities make up for nothing.
+        chosen = dataclasses.replace(like(scene.header, options), covering=False)
+        chosen, losses = settled_with_losses(leaves, form, chosen, threads)
+        size = write_scene(out, form, leaves, chosen, threads=threads, progress=progress)
+        seconds = {"read": read_done - start, "write": time.perf_counter() - read_done}
+    return Extracted(
+        format=scene.format,
+        nodes=len(scene.splats),
+        splats=len(leaves.splats),
+        sh_degree=leaves.splats.sh_degree,
+        bytes=size,
+        seconds={stage: round(value, 4) for stage, value in seconds.items()},
+        output_format=form.name,
+        **vars(losses),
+    )

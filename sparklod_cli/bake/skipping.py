@@ -18,8 +18,7 @@ from ..system.output import Output, check_writable
 from ..system.untrusted import parse_json
 from .flow import bake, has_published
 from .identity import BakeIdentity, content_of, files_of
-from .records import Baked
-from .settings import BakeSettings, Resources
+from .settings import Baked, BakeSettings, Resources
 
 #: Suffix of the file beside an output, and the largest size that is read.
 SUFFIX, MAX_BYTES = ".sparklod.json", 1 << 24

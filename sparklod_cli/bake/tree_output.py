@@ -24,8 +24,7 @@ from ..system.addresses import Place
 from ..system.errors import FormatError
 from ..system.output import Output
 from ..system.progress import Progress
-from .records import BuiltTree, Clock, WrittenTree
-from .settings import SPZ, BakeSettings
+from .settings import SPZ, BakeSettings, BuiltTree, Clock, WrittenTree
 
 if TYPE_CHECKING:
     from .simplifying import Simplifier

@@ -67,10 +67,9 @@ from .paths import (
 )
 
 if TYPE_CHECKING:
-    from ..bake.out_of_core.cluster_engine import ClusterEngine
-    from ..bake.records import Baked
-    from ..bake.settings import BakeSettings, Source
-    from ..extract_leaves import Extracted
+    from ..bake.out_of_core.cluster import ClusterEngine
+    from ..bake.settings import Baked, BakeSettings, Source
+    from ..bake.simplifying import Extracted
     from ..model.instances import Instance
 
     #: Result for an input; None where the output exists already.
@@ -569,7 +568,7 @@ def _outcomes(
 
     if files.unlod:
         console.announce_compiling()
-        from ..extract_leaves import extract_leaves
+        from ..bake.simplifying import extract_leaves
 
         written: dict[str, Any] = {"suffix": files.suffix, "options": options.write_options()}
         make = functools.partial(extract_leaves, **written, threads=threads, **shared)

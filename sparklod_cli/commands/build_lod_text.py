@@ -11,12 +11,9 @@ from .console import Console, count_of
 
 if TYPE_CHECKING:
     from ..bake.parts_output import WrittenDetail
-    from ..bake.records import Baked
-    from ..bake.refining import Refined
-    from ..bake.settings import Source
-    from ..bake.simplifying import WrittenSet
+    from ..bake.settings import Baked, Source
+    from ..bake.simplifying import Extracted, Refined, WrittenSet
     from ..codecs.clamps import Clamp
-    from ..extract_leaves import Extracted
 
 #: What clamping does to a scene and what to do about it, by column of `Splats` and whether the upper end clamps.
 CLAMPED_BY_SPZ = {

@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sparklod_cli.bake.records import BuiltTree, Clock, WrittenTree
-from sparklod_cli.bake.settings import BakeSettings
+from sparklod_cli.bake.settings import BakeSettings, BuiltTree, Clock, WrittenTree
 from sparklod_cli.bake.tree_output import BakeOutput, output_of, write_tree
 from sparklod_cli.codecs import encoder
 from sparklod_cli.codecs.options import RadOptions, WriteOptions

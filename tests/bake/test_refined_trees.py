@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli.bake.flow import bake
-from sparklod_cli.bake.records import Baked
-from sparklod_cli.bake.settings import BakeSettings
+from sparklod_cli.bake.settings import Baked, BakeSettings
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.cli import run
 from sparklod_cli.codecs.formats import WRITABLE

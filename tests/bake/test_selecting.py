@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sparklod_cli.bake.selecting import select
+from sparklod_cli.bake.in_memory import select
 from sparklod_cli.bake.settings import BakeSettings
 from sparklod_cli.model.selection import Selection, SelectionTally
 from sparklod_cli.system.errors import InvalidSplatsError

@@ -16,7 +16,7 @@ import pytest
 
 from sparklod_cli.bake.flow import SCRATCH as SUFFIX
 from sparklod_cli.bake.flow import bake
-from sparklod_cli.bake.out_of_core import scratch_folder
+from sparklod_cli.bake.out_of_core import planning
 from sparklod_cli.bake.out_of_core.job import PUBLISHED
 from sparklod_cli.bake.out_of_core.store import Store
 from sparklod_cli.bake.settings import BakeSettings, Resources
@@ -150,14 +150,14 @@ def test_an_interrupted_bake_says_what_is_left_and_is_refused_or_begun_anew(
 
 def stop_at_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
     """Interrupts bakes when their output is in place, and nothing of their scratch is removed."""
-    clear = scratch_folder._clear
+    clear = planning._clear
 
     def interrupted(store: Store) -> None:
         if store.has(PUBLISHED):
             raise KeyboardInterrupt
         clear(store)
 
-    monkeypatch.setattr(scratch_folder, "_clear", interrupted)
+    monkeypatch.setattr(planning, "_clear", interrupted)
 
 
 @pytest.mark.parametrize("bakes", [bake, bake_unless_there], ids=lambda bakes: bakes.__name__)

@@ -1,25 +1,470 @@
-"""Dask clusters: a running one, or processes on this machine that are started and ended with a bake."""
+"""Dask clusters: an engine that runs tasks on them, with retries and reports of lost workers, and the code of workers.
+
+A cluster is a running one, or processes on this machine that are started and ended with a bake.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import errno
+import functools
 import logging
+import os
+import pickle
+import queue
+import shutil
+import signal
+import socket
 import tempfile
+import time
+import uuid
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import CancelledError
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from ... import __version__
 from ...system import machine
-from ...system.errors import SparklodError
+from ...system.addresses import Place
+from ...system.errors import OutOfMemoryError, SparklodError, memory_errors_translated
 from ...system.optional import optional_import
+from ...system.progress import Progress, silent
 from ...system.python_process import check_current_folder, safe_path
 from ...system.threads import thread_count
 from ..estimate import default_memory
-from .cluster_engine import ClusterEngine, Connection
+from .job import Task
+from .store import Store
+
+_INSTALL = f"install sparklod {__version__} with its extra cluster there, and start it again"
+
+#: Seconds to wait before a failed call is repeated: networks recover, and shared folders show files late.
+PAUSES = (1.0, 5.0)
+
+#: Seconds between checks of the cluster while no call ends.
+TICK = 1.0
+
+#: Seconds after which a cluster without workers is reported.
+ALONE_SECONDS = 10.0
+
+#: Error numbers that repeating a call does not help: no room, no permission.
+LASTING = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EFBIG, errno.ENAMETOOLONG}
+
+#: Seconds to wait for the message of a nanny that ended a worker for its memory; it may come after the loss.
+NANNY_DELAY = 3.0
+
+#: Topics of the scheduler's messages about workers, and of the nannies' about memory.
+TOPICS = ("all", "worker-restart-memory")
+
+#: States of a future that has ended. Others are "pending", and "lost" with the worker that held its result.
+ENDED = {"finished", "error", "cancelled"}
+
+#: Most task names in a message.
+LISTED = 3
+
+LESS_MEMORY = (
+    "give a smaller --memory, which makes smaller blocks, or let fewer workers share a machine; finished work is"
+    " kept, and --resume continues"
+)
+
+
+class Connection:
+    """Client of a cluster that reports lost workers. A context manager."""
+
+    def __init__(self, client: Any, say: Callable[[str], None]) -> None:
+        """Take a `distributed.Client`; `say` receives one-line messages for the user."""
+        self.client, self.say = client, say
+        self._losses: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
+        self._starved = set[str]()
+        self._alone_since: float | None = None
+
+    def __enter__(self) -> Connection:
+        for topic in TOPICS:
+            self.client.subscribe_topic(topic, self._keep)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.alive:
+            for topic in TOPICS:
+                self.client.unsubscribe_topic(topic)
+
+    @property
+    def alive(self) -> bool:
+        """Whether the scheduler answers."""
+        return bool(self.client.status == "running")
+
+    def workers(self) -> dict[str, Any]:
+        """Return the scheduler's information on each worker, by address."""
+        with self.guarded():
+            known: dict[str, Any] = dict(self.client.scheduler_info()["workers"])
+        return known
+
+    @contextlib.contextmanager
+    def guarded(self) -> Iterator[None]:
+        """Translate errors of the connection."""
+        try:
+            yield
+        except (OSError, CancelledError, RuntimeError, AttributeError):
+            raise self.gone() from None
+
+    def gone(self) -> SparklodError:
+        """Return the error for a scheduler that no longer answers."""
+        return SparklodError(
+            "the scheduler of the cluster no longer answers; finished work is kept: start the cluster again, and add"
+            " --resume"
+        )
+
+    def look(self) -> None:
+        """Report lost workers, and a cluster without workers; raise a `SparklodError` without a scheduler."""
+        self.tell_losses()
+        if not self.alive:
+            raise self.gone()
+        if self.workers():
+            self._alone_since = None
+        elif self._alone_since is None:
+            self._alone_since = time.monotonic()
+        elif self._alone_since + ALONE_SECONDS < time.monotonic():
+            self.say("the cluster has no workers at the moment; waiting for some (Ctrl-C ends this)")
+            self._alone_since = float("inf")
+
+    def tell_losses(self) -> None:
+        """Report lost workers and the tasks that are repeated."""
+        with contextlib.suppress(queue.Empty):
+            while True:
+                lost = self._losses.get_nowait()
+                names = sorted(_name_of(key) for key in lost.get("processing-tasks") or ())
+                again = f"; to be done again: {', '.join(names[:LISTED])}" if names else ""
+                again += f" and {len(names) - LISTED} more" if len(names) > LISTED else ""
+                why = "ran out of memory" if lost["worker"] in self._starved else "was lost"
+                self.say(f"worker {lost['worker']} {why}{again}")
+
+    def failure(self, name: str, future: Any) -> Exception:
+        """Return the error of a failed call."""
+        if future.status == "cancelled":
+            return self.gone()
+        with self.guarded():
+            error: Exception = future.exception()
+        if type(error).__name__ == "KilledWorker":
+            worker = str(error.last_worker.address)  # type: ignore[attr-defined]
+            if self._was_starved(worker):
+                return OutOfMemoryError(f"{name} does not fit into the memory of a worker; {LESS_MEMORY}")
+            return SparklodError(
+                f"each worker that did {name} was lost, the last one {worker}. Its log may tell why; if the system"
+                f" ended them for want of memory, {LESS_MEMORY}"
+            )
+        if isinstance(error, OutOfMemoryError):
+            return OutOfMemoryError(f"{name}: {error}; {LESS_MEMORY}")
+        return error
+
+    def _was_starved(self, worker: str) -> bool:
+        deadline = time.monotonic() + NANNY_DELAY
+        while worker not in self._starved and time.monotonic() < deadline:
+            time.sleep(TICK / 20)
+        return worker in self._starved
+
+    def _keep(self, event: tuple[float, Any]) -> None:
+        """Record a message of the scheduler; called on the client's thread."""
+        message = event[1]
+        if not isinstance(message, dict):
+            return
+        if "rss" in message:
+            self._starved.add(str(message.get("worker")))
+        elif message.get("action") == "remove-worker" and not message.get("expected"):
+            self._losses.put(message)
+
+
+def _name_of(key: Any) -> str:
+    return str(key[-1] if isinstance(key, tuple) else key)
+
+
+class Pool:
+    """Calls on a cluster that have not ended. A context manager, which cancels unfinished calls."""
+
+    def __init__(self, connection: Connection, stage: str) -> None:
+        self._connection = connection
+        self._prefix = f"{stage}-{uuid.uuid4().hex[:8]}"
+        self._calls = dict[str, tuple[int, tuple[Any, ...]]]()
+        self._futures = dict[str, Any]()
+        self._tries = dict[str, int]()
+        self._paused: list[tuple[float, str]] = []
+        self._ended: queue.SimpleQueue[str] = queue.SimpleQueue()
+
+    def __enter__(self) -> Pool:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._connection.tell_losses()
+        if self._futures and self._connection.alive:
+            with contextlib.suppress(Exception):  # the scheduler is gone by now
+                self._connection.client.cancel(list(self._futures.values()), force=True)
+
+    def __bool__(self) -> bool:
+        return bool(self._calls)
+
+    def submit(self, name: str, place: int, *call: Any) -> None:
+        """Submit a call.
+
+        Args:
+            name: unique in this pool.
+            place: calls with lower places come first.
+            call: function and arguments.
+        """
+        self._calls[name] = place, call
+        key = (f"{self._prefix}-{self._tries.get(name, 0)}", name)
+        with self._connection.guarded():
+            future = self._connection.client.submit(*call, key=key, pure=False, priority=-place)
+        self._futures[name] = future
+        future.add_done_callback(lambda _: self._ended.put(name))
+
+    def next(self) -> tuple[str, Any, Exception | None]:
+        """Wait for a call that ends; return its name, its result and its error, if it failed."""
+        while True:
+            self._submit_paused()
+            try:
+                name = self._ended.get(timeout=TICK)
+            except queue.Empty:
+                self._connection.look()
+                continue
+            status = self._futures[name].status
+            if status not in ENDED:  # its worker was lost since; the scheduler repeats it
+                self._ask_again(name)
+                continue
+            future = self._futures.pop(name)
+            if status == "finished":
+                with self._connection.guarded():
+                    result = future.result()
+                del self._calls[name]
+                return name, result, None
+            error = self._connection.failure(name, future)
+            if not self._is_worth_another(name, error):
+                del self._calls[name]
+                return name, None, error
+
+    def _ask_again(self, name: str) -> None:
+        """Check a call again after a while."""
+        self._connection.look()
+        loop = self._connection.client.loop
+        loop.add_callback(loop.call_later, TICK, self._ended.put, name)
+
+    def _is_worth_another(self, name: str, error: Exception) -> bool:
+        """Return whether a failed call is repeated; it is, after a pause."""
+        tried = self._tries.get(name, 0)
+        if not isinstance(error, OSError) or error.errno in LASTING or tried >= len(PAUSES):
+            return False
+        self._tries[name] = tried + 1
+        self._paused.append((time.monotonic() + PAUSES[tried], name))
+        return True
+
+    def _submit_paused(self) -> None:
+        due = [name for when, name in self._paused if when <= time.monotonic()]
+        self._paused = [each for each in self._paused if each[1] not in due]
+        for name in due:
+            place, call = self._calls[name]
+            self.submit(name, place, *call)
+
+
+class ClusterEngine:
+    """Engine on a Dask cluster.
+
+    The client holds the graph: a task is submitted when all its needs are done. Workers return two numbers only, so a
+    lost worker takes no result with it: results are in the store.
+
+    Attributes:
+        memory: bytes that a task may take; None if unknown.
+    """
+
+    def __init__(self, connection: Connection, *, threads: int, memory: int | None = None) -> None:
+        """Take the connection to a cluster, the threads of a task, and `memory`."""
+        self._connection, self.threads, self.memory = connection, threads, memory
+        self._checked: tuple[str, frozenset[str]] | None = None
+
+    def run(self, stage: str, tasks: Sequence[Task], job: Any, progress: Progress) -> None:
+        """Run tasks as `Engine.run`."""
+        store: Store = job.store
+        left = {task.name: (place, task) for place, task in enumerate(tasks) if not store.has(task.name)}
+        total = sum(task.weight for task in tasks)
+        done = total - sum(task.weight for _, task in left.values())
+        progress(stage, done, total, "splat")
+        if not left:
+            return
+        here = str(store), frozenset(self._connection.workers())
+        if here != self._checked:  # new workers may have joined
+            self.check(store)
+            self._checked = here
+        packed = pickle.dumps(job)
+        needs = {name: {need for need in task.needs if need in left} for name, (_, task) in left.items()}
+        heirs: dict[str, list[str]] = {}
+        for name, names in needs.items():
+            for need in names:
+                heirs.setdefault(need, []).append(name)
+        with Pool(self._connection, stage) as pool:
+
+            def submit(name: str) -> None:
+                place, task = left[name]
+                pool.submit(name, place, run_task, packed, task, self.threads)
+
+            for name in [name for name, names in needs.items() if not names]:
+                submit(name)
+            while pool:
+                name, result, error = pool.next()
+                if error is None:
+                    written, read = result
+                    store.traffic.add(written=written, read=read)
+                elif not store.has(name):
+                    raise error
+                done += left[name][1].weight
+                progress(stage, done, total, "splat")
+                for heir in heirs.get(name, ()):
+                    needs[heir].discard(name)
+                    if not needs[heir]:
+                        submit(heir)
+
+    @contextlib.contextmanager
+    def map_calls(
+        self, stage: str, call: Callable[..., Any], arguments: Sequence[tuple[Any, ...]], progress: Progress, unit: str
+    ) -> Iterator[Iterator[Any]]:
+        """Call a function with each tuple of arguments in parallel until the context ends.
+
+        Args:
+            call: function of a module that also takes `threads`, and returns something small.
+            arguments: small, and can be pickled.
+            unit: word for a call in the progress.
+
+        Yields:
+            the result of each call, in their order, or the `SparklodError` that it failed with.
+        """
+        with Pool(self._connection, stage) as pool:
+            for place, each in enumerate(arguments):
+                pool.submit(str(place), place, functools.partial(call, threads=self.threads), *each)
+            yield self._outcomes(pool, stage, len(arguments), progress, unit)
+
+    def _outcomes(self, pool: Pool, stage: str, count: int, progress: Progress, unit: str) -> Iterator[Any]:
+        outcomes = dict[str, Any]()
+        for place in range(count):
+            while str(place) not in outcomes:
+                progress(stage, place + len(outcomes), count, unit)
+                name, result, error = pool.next()
+                if error is not None and not isinstance(error, SparklodError):
+                    raise error
+                outcomes[name] = result if error is None else error
+            yield outcomes.pop(str(place))
+
+    def check(self, store: Store | None, files: Sequence[Place] = ()) -> None:
+        """Raise a `SparklodError` if a worker has another sparklod, or does not see the store or the files.
+
+        Args:
+            files: that tasks read; tasks report those missing on this machine.
+        """
+        here = [file for file in files if isinstance(file, Path) and file.exists()]
+        name = f"{PROBE}/{uuid.uuid4().hex}"
+        if store is not None:
+            store.put(name, {PROBE: np.arange(2)})
+        try:
+            with self._connection.guarded():
+                answers = self._connection.client.run(probe, store, name, here, on_error="return")
+        finally:
+            if store is not None:
+                store.remove(name)
+        for worker, answer in answers.items():
+            _check_answer(worker, answer, store)
+
+    def remove(self, folder: Path) -> None:
+        """Remove a folder on the machines of all workers, and on this one."""
+        shutil.rmtree(folder, ignore_errors=True)
+        if self._connection.alive:
+            with contextlib.suppress(SparklodError), self._connection.guarded():
+                self._connection.client.run(shutil.rmtree, folder, ignore_errors=True)
+
+
+def _check_answer(worker: str, answer: Any, store: Store | None) -> None:
+    """Raise a `SparklodError` for a worker that cannot run tasks."""
+    if not isinstance(answer, Probed):  # an error: it has no sparklod, or one without `probe`
+        raise SparklodError(f"worker {worker} does not run sparklod {__version__} ({answer}): {_INSTALL}")
+    place = f"worker {worker} on {answer.host}"
+    if answer.version != __version__:
+        raise SparklodError(f"{place} has sparklod {answer.version}, not {__version__} as here: {_INSTALL}")
+    if not answer.reads:
+        raise SparklodError(
+            f"{place} does not see what was written to {store}: give --scratch-dir a folder that all machines share, or"
+            " a URL such as s3://bucket/scratch"
+        )
+    if answer.writes:
+        raise SparklodError(f"{place} cannot write to {store}: {answer.writes}")
+    if answer.missing:
+        raise SparklodError(
+            f"{place} does not see {', '.join(answer.missing)}: put inputs into a folder that all machines share, or at"
+            " a URL"
+        )
+
+
+#: Result of a probe, and its array.
+PROBE = "probe"
+
+
+@dataclass(frozen=True)
+class Probed:
+    """Result of probing a worker.
+
+    Attributes:
+        reads: it can read the result that the client wrote.
+        writes: why it cannot write a result; empty if it can.
+        missing: files that it does not see.
+    """
+
+    version: str
+    host: str
+    reads: bool
+    writes: str
+    missing: tuple[str, ...]
+
+
+def probe(store: Store | None, name: str, files: Sequence[Path]) -> Probed:
+    """Try on a worker to read the result that the client wrote, to write one, and to see files."""
+    reads, writes = True, ""
+    if store is not None:
+        mine = f"{name}-{uuid.uuid4().hex}"
+        try:
+            store.put(mine, {PROBE: np.arange(2)})
+            store.remove(mine)
+        except Exception as error:
+            writes = f"{type(error).__name__}: {error}"
+        try:
+            reads = store.has(name) and len(store.get(name)[PROBE]) > 0
+        except Exception:
+            reads = False
+    missing = tuple(str(path) for path in files if not path.exists())
+    return Probed(__version__, socket.gethostname(), reads, writes, missing)
+
+
+def run_task(packed: bytes, task: Task, threads: int) -> tuple[int, int]:
+    """Run a task on a worker, unless its result exists: another worker may have been lost after putting the result.
+
+    Args:
+        packed: pickled job; each task unpickles its own, so that it counts its own bytes.
+
+    Returns:
+        bytes that the task wrote to the store, and read from it.
+    """
+    job = pickle.loads(packed)
+    if not job.store.has(task.name):
+        with memory_errors_translated():
+            task.run(job, *task.arguments, threads=threads, progress=silent)
+        machine.release_memory()
+    return job.store.traffic.written, job.store.traffic.read
+
+
+def dask_setup(worker: Any) -> None:
+    """Prepare a worker process started here: it has no dashboard, and the client ends it, not Ctrl-C."""
+    worker.http_server.stop()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.environ.setdefault("NUMBA_NUM_THREADS", "1")
+
 
 #: Seconds to wait for a scheduler, or for workers.
-PATIENCE = 30
+ANSWER_SECONDS = 30
 
 #: How often a task is repeated on another worker after one was lost with it.
 LOSSES = 2
@@ -121,14 +566,14 @@ def _connected(address: str) -> Iterator[Any]:
 
     whole = address if "://" in address else f"tcp://{address}"
     try:
-        client = Client(whole, timeout=PATIENCE, security=_credentials(whole), set_as_default=False)
+        client = Client(whole, timeout=ANSWER_SECONDS, security=_credentials(whole), set_as_default=False)
     except (OSError, ValueError) as error:
         raise SparklodError(
             f"no scheduler answers at {whole} ({error}); start one with dask scheduler, and dask worker {whole}"
         ) from None
     try:
         try:
-            client.wait_for_workers(1, timeout=PATIENCE)
+            client.wait_for_workers(1, timeout=ANSWER_SECONDS)
         except TimeoutError:
             raise SparklodError(
                 f"the cluster at {whole} has no workers; start some with dask worker {whole} --nthreads 1"
@@ -179,7 +624,7 @@ def _started(workers: int, threads: int, memory: int | None) -> Iterator[Any]:
                 dashboard_address=None,
                 memory_limit=_memory_limit(workers, memory),
                 env={"NUMBA_NUM_THREADS": str(threads)},
-                preload=["sparklod_cli.bake.out_of_core.cluster_engine"],
+                preload=["sparklod_cli.bake.out_of_core.cluster"],
                 scheduler_kwargs={"allowed_failures": LOSSES},
                 silence_logs=SILENT,
             )
@@ -187,7 +632,7 @@ def _started(workers: int, threads: int, memory: int | None) -> Iterator[Any]:
             raise SparklodError(f"no cluster can be started on this machine: {error}") from None
         stack.callback(_end, own)
         own.loop.add_callback(own.scheduler.http_server.stop)
-        client = stack.enter_context(contextlib.closing(Client(own, timeout=PATIENCE, set_as_default=False)))
+        client = stack.enter_context(contextlib.closing(Client(own, timeout=ANSWER_SECONDS, set_as_default=False)))
         yield client
 
 

@@ -23,12 +23,24 @@ from ...model.sh import width_of
 from ...model.splats import FloatArray, Splats
 from ...system.progress import Progress
 from ...system.threads import blocks_of, on_threads
-from ..records import BuiltTree, Clock
-from ..selecting import check_transformed, select, transform
-from ..settings import BakeSettings
+from ..in_memory import check_transformed, select, transform
+from ..settings import BakeSettings, BuiltTree, Clock
 from ..tree_output import BakeOutput
-from .blocks import BuildStage, cut_into_blocks
-from .job import ORDER, PUBLISHED, ROOT, Engine, Job, Task, clean_of, encoded_of, families_of, pending_of, stage_of
+from .job import (
+    ORDER,
+    PUBLISHED,
+    ROOT,
+    BuildStage,
+    Engine,
+    Job,
+    Task,
+    clean_of,
+    cut_into_blocks,
+    encoded_of,
+    families_of,
+    pending_of,
+    stage_of,
+)
 from .order import WINDOW_NODES, EncodedChunks, Rows, encode, fill_rows, node_stream, put_order, rows_of, splats_of
 from .store import Arrays
 

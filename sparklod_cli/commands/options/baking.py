@@ -33,7 +33,7 @@ from ..paths import InputPath, OutputPath
 from .common import General
 
 if TYPE_CHECKING:
-    from ...bake.out_of_core.cluster_engine import ClusterEngine
+    from ...bake.out_of_core.cluster import ClusterEngine
     from ...model.selection import Selection
     from ...model.transforms import Transform
     from ..console import Console

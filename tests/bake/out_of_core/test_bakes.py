@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli.bake.flow import bake
-from sparklod_cli.bake.records import Baked
-from sparklod_cli.bake.settings import BakeSettings, Resources
+from sparklod_cli.bake.settings import Baked, BakeSettings, Resources
 from sparklod_cli.codecs import ply
 from sparklod_cli.io import read_scene
 from sparklod_cli.model.scene import Scene

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sparklod_cli.bake.out_of_core.blocks import cut_into_blocks
+from sparklod_cli.bake.out_of_core.job import cut_into_blocks
 
 
 @pytest.mark.parametrize(

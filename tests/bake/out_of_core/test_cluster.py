@@ -16,9 +16,8 @@ import pytest
 pytest.importorskip("cryptography")
 pytest.importorskip("distributed")
 
-from sparklod_cli.bake.out_of_core import cluster_engine
-from sparklod_cli.bake.out_of_core.cluster import ClusterSettings, cluster
-from sparklod_cli.bake.out_of_core.cluster_engine import ClusterEngine
+from sparklod_cli.bake.out_of_core import cluster as module
+from sparklod_cli.bake.out_of_core.cluster import ClusterEngine, ClusterSettings, cluster
 from sparklod_cli.bake.out_of_core.job import Task
 from sparklod_cli.bake.out_of_core.store import Store
 from sparklod_cli.system.errors import OutOfMemoryError, ScratchError, SparklodError
@@ -51,8 +50,8 @@ def job(tmp_path: Path) -> Job:
 
 @pytest.fixture(autouse=True)
 def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cluster_engine, "PAUSES", (0.0, 0.0))
-    monkeypatch.setattr(cluster_engine, "TICK", 0.05)
+    monkeypatch.setattr(module, "PAUSES", (0.0, 0.0))
+    monkeypatch.setattr(module, "TICK", 0.05)
 
 
 def test_tasks_run_after_what_they_need_on_all_workers(engine: ClusterEngine, job: Job) -> None:
@@ -116,7 +115,7 @@ def test_calls_side_by_side_give_results_and_failures_in_order(engine: ClusterEn
 
 
 def test_a_result_that_is_lost_with_its_worker_is_waited_for(engine: ClusterEngine) -> None:
-    with cluster_engine.Pool(engine._connection, "baking") as pool:
+    with module.Pool(engine._connection, "baking") as pool:
         pool.submit("twice", 0, functools.partial(made_up.twice, threads=1), 21)
         future = pool._futures["twice"]
         future.result(timeout=60)
@@ -144,7 +143,7 @@ def test_workers_that_do_not_fit_are_refused(
         with pytest.raises(SparklodError, match=r"does not see /proc/self/task/.*: put inputs into a folder that all"):
             engine.check(None, [here_alone])
     with monkeypatch.context() as patch:
-        patch.setattr(cluster_engine, "__version__", "9.9")
+        patch.setattr(module, "__version__", "9.9")
         with pytest.raises(SparklodError, match=r"has sparklod .*, not 9\.9 as here: install sparklod"):
             engine.check(job.store)
     with pytest.raises(SparklodError, match=r"does not see what was written to .*--scratch-dir a folder that all"):
@@ -162,12 +161,12 @@ class _Elsewhere(Store):
 def test_a_worker_without_sparklod_is_told_what_to_do(engine: ClusterEngine, job: Job) -> None:
     client = engine._connection.client
     client.wait_for_workers(2, timeout=60)  # one that another test killed may only now be replaced
-    client.run(_hide, cluster_engine.__name__)
+    client.run(_hide, module.__name__)
     try:
         with pytest.raises(SparklodError, match=r"does not run sparklod .*: install sparklod .* extra cluster there"):
             engine.check(job.store)
     finally:
-        client.run(_show, cluster_engine.__name__)
+        client.run(_show, module.__name__)
 
 
 def _hide(module: str) -> None:

@@ -19,8 +19,7 @@ import distributed
 import psutil
 
 from sparklod_cli.bake.out_of_core import cluster as module
-from sparklod_cli.bake.out_of_core.cluster import ClusterSettings, cluster
-from sparklod_cli.bake.out_of_core.cluster_engine import ClusterEngine
+from sparklod_cli.bake.out_of_core.cluster import ClusterEngine, ClusterSettings, cluster
 from sparklod_cli.bake.out_of_core.store import Store
 from sparklod_cli.system.progress import silent
 

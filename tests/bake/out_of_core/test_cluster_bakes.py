@@ -21,11 +21,9 @@ import distributed
 
 from sparklod_cli.bake.flow import bake
 from sparklod_cli.bake.out_of_core import cluster as module
-from sparklod_cli.bake.out_of_core.cluster import ClusterSettings, cluster
-from sparklod_cli.bake.out_of_core.cluster_engine import ClusterEngine
+from sparklod_cli.bake.out_of_core.cluster import ClusterEngine, ClusterSettings, cluster
 from sparklod_cli.bake.out_of_core.job import Engine
-from sparklod_cli.bake.records import Baked
-from sparklod_cli.bake.settings import BakeSettings, Resources
+from sparklod_cli.bake.settings import Baked, BakeSettings, Resources
 from sparklod_cli.codecs.file_names import RAD_SUFFIX as RAD
 from sparklod_cli.system.addresses import Address, Place
 from sparklod_cli.system.errors import SparklodError

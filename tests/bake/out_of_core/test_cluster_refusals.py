@@ -109,7 +109,7 @@ def test_a_cluster_without_workers_is_refused(scheduler: Any, monkeypatch: pytes
 
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "127.0.0.1:9", "nonsense://x:1"])
 def test_an_address_without_a_scheduler_is_refused(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "PATIENCE", 0.2)
+    monkeypatch.setattr(module, "ANSWER_SECONDS", 0.2)
     with (
         pytest.raises(SparklodError, match=r"no scheduler answers at .*; start one with dask scheduler"),
         cluster(ClusterSettings(scheduler=address)),

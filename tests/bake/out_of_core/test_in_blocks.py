@@ -15,8 +15,7 @@ from sparklod_cli.bake.out_of_core import order, store
 from sparklod_cli.bake.out_of_core.in_blocks import InBlocks
 from sparklod_cli.bake.out_of_core.job import Job
 from sparklod_cli.bake.out_of_core.store import Store
-from sparklod_cli.bake.records import BuiltTree, Clock
-from sparklod_cli.bake.settings import BakeSettings
+from sparklod_cli.bake.settings import BakeSettings, BuiltTree, Clock
 from sparklod_cli.bake.tree_output import BakeOutput
 from sparklod_cli.codecs.statistics import ALL
 from sparklod_cli.lod import families, quick

@@ -13,7 +13,7 @@ import pytest
 
 from sparklod_cli.bake.flow import SCRATCH, scratch_folder
 from sparklod_cli.bake.identity import BakeIdentity, FileState
-from sparklod_cli.bake.out_of_core.scratch_folder import LOCK, MANIFEST, at_work
+from sparklod_cli.bake.out_of_core.planning import LOCK, MANIFEST, at_work
 from sparklod_cli.bake.out_of_core.store import Store
 from sparklod_cli.bake.settings import BakeSettings
 from sparklod_cli.system.errors import FormatError, ScratchError, UnreadableError
@@ -176,7 +176,7 @@ def test_a_folder_of_somebody_else_is_refused(store: Store) -> None:
 HOLDER = """
 import sys
 from pathlib import Path
-from sparklod_cli.bake.out_of_core.scratch_folder import locked
+from sparklod_cli.bake.out_of_core.planning import locked
 with locked(Path(sys.argv[1])):
     print("at work", flush=True)
     sys.stdin.read()
