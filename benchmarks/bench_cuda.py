@@ -22,13 +22,11 @@ from numba import cuda
 from performance.machine import machine
 
 import sparklod_cli as sparklod
-from sparklod_cli.fitting import cameras
-from sparklod_cli.fitting.cameras import TRAINING, Place, placed
+from sparklod_cli.fitting import pictures as training
 from sparklod_cli.fitting.cuda.optimiser import CardOptimiser
-from sparklod_cli.fitting.fit import AHEAD, MOST_SHARE, raster_for
+from sparklod_cli.fitting.fit import AHEAD, MOST_SHARE, RATES, Optimiser, raster_for
 from sparklod_cli.fitting.nodes import FittedNodes
-from sparklod_cli.fitting.optimiser import RATES, Optimiser
-from sparklod_cli.fitting.pictures import FullDetailPicture, pictures
+from sparklod_cli.fitting.pictures import TRAINING, FullDetailPicture, Place, pictures, placed
 from sparklod_cli.model.gaussian import lod_opacity
 from sparklod_cli.render.cuda.card import find_card, to_card
 from sparklod_cli.render.cuda.rasterizer import CardSplats, CardView, draw_on_card
@@ -80,11 +78,11 @@ class Bench:
     @contextlib.contextmanager
     def training_size(self, width: int, height: int) -> Iterator[None]:
         """Have training cameras of this size, times the root of the scale."""
-        before, cameras.SIZE = cameras.SIZE, self.size(width, height)
+        before, training.SIZE = training.SIZE, self.size(width, height)
         try:
             yield
         finally:
-            cameras.SIZE = before
+            training.SIZE = before
 
     def steps(self, count: int) -> int:
         """Return a number of steps, times the scale."""
@@ -149,14 +147,14 @@ class Bench:
 
     def _refine(self, device: str, steps: int) -> tuple[str, list[float]]:
         tree, start = self.tree(150_000), time.perf_counter()
-        with self.training_size(*cameras.SIZE):
+        with self.training_size(*training.SIZE):
             _, report = sparklod.refine(tree, steps=self.steps(steps), device=device, threads=self.threads)
         gains = [report.psnr_after[share] - before for share, before in report.psnr_before.items()]
         return f"{time.perf_counter() - start:.1f} s, {report.steps:,} steps", gains
 
     def memory(self) -> tuple[str, str]:
         """Memory of `--refine` of 5 million splats: of its largest cut, and of all pictures."""
-        with self.training_size(*cameras.SIZE):
+        with self.training_size(*training.SIZE):
             nodes, picture = self.nodes(5_000_000)
         free, _ = cuda.current_context().get_memory_info()
         optimiser = CardOptimiser(nodes)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from sparklod_cli.simulation.columns import COLUMNS
+from sparklod_cli.simulation.results import COLUMNS
 from sparklod_cli.tables.assertions import parse
 
 from ..case import Case, Rng

@@ -35,9 +35,8 @@ if TYPE_CHECKING:
     from ..model.instances import Instance
     from ..render.settings import RenderSettings
     from ..scenes.loaded import Scenes
-    from ..simulation.outputs import FrameOutputs, WrittenFrames
+    from ..simulation.results import FrameOutputs, Summary, WrittenFrames
     from ..simulation.streaming_settings import StreamingSettings
-    from ..simulation.summary import Summary
     from ..tables.assertions import Assertion, Outcome
     from ..tables.columns import Filter, Row, TableOutput
     from ..tables.comparison import BudgetSummary
@@ -286,11 +285,9 @@ def traverse_files(
         UnfitError: the budget, or the chunk cache, is too small for the roots.
         SparklodError: a file cannot be read or written, or is no tree.
     """
-    from ..simulation.columns import EMPTY, LOADING
     from ..simulation.frames import Simulation
     from ..simulation.loading import Loader
-    from ..simulation.outputs import write_frames
-    from ..simulation.summary import summarize
+    from ..simulation.results import EMPTY, LOADING, summarize, write_frames
     from ..tables.assertions import check
 
     outputs.check()

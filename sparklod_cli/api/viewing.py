@@ -11,12 +11,12 @@ from ..cameras.sources import read_path
 from ..model.axes import common
 from ..system.errors import NotSplatsError, SparklodError, memory_errors_translated
 from ..system.progress import Progress, silent
-from ..view.export import check_folder as check_folder
-from ..view.export import export as export
 from ..view.files import shown_files
 from ..view.server import LOOPBACK as LOOPBACK
 from ..view.server import Server as Server
 from ..view.site import Site as Site
+from ..view.site import check_folder as check_folder
+from ..view.site import export as export
 from ..view.site import from_cdn, from_folder, site_of
 from ..view.start import FOV, Point, extent_of, start_of
 

@@ -47,8 +47,8 @@ from .arguments import (
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from ..simulation.results import Summary
     from ..simulation.streaming_settings import StreamingSettings
-    from ..simulation.summary import Summary
     from ..tables.comparison import BudgetSummary
 
 
@@ -158,8 +158,8 @@ def traverse(
         FormatError: a scene has no tree.
         ValueError: the budget, or the cache, is too small for the roots.
     """
-    from ..simulation.columns import COLUMNS
     from ..simulation.frames import Simulation
+    from ..simulation.results import COLUMNS
 
     with on_threads(threads) as count, progress_callback(progress) as callback, memory_errors_translated():
         scenes = _trees(viewed, count, precision)
@@ -304,7 +304,7 @@ class Frames(Table):
 
     def summary(self) -> Summary:
         """Return statistics of the frames, totals, and notable frames."""
-        from ..simulation.summary import summarize
+        from ..simulation.results import summarize
 
         return summarize(self.rows)
 

@@ -118,10 +118,9 @@ class Fidelity:
     """
 
     def __init__(self, tree: Scene, cameras: Sequence[Camera] | None, threads: int) -> None:
-        from ..fitting.cameras import Place, placed
         from ..fitting.fit import raster_for
         from ..fitting.nodes import FittedNodes
-        from ..fitting.pictures import pictures
+        from ..fitting.pictures import Place, pictures, placed
 
         assert tree.tree is not None
         place = Place.of(tree.splats.center[tree.tree.is_leaf])

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import click
 
-from ..images.defaults import PLOT_BY
+from ..images.output import PLOT_BY
 from ..model import MAX_SH_DEGREE
 from ..system.errors import OutOfMemoryError, SparklodError, StdoutError
 from ..system.printable import MOST, printable, shortened

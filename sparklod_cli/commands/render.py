@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..images.defaults import THUMBNAIL_SIZE, THUMBNAIL_SUPERSAMPLE
+from ..images.output import THUMBNAIL_SIZE, THUMBNAIL_SUPERSAMPLE
 from ..render.settings import OF_PIXELS
 from ..system.stdio import DASH
 from ..system.units import format_size

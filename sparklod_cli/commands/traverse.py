@@ -38,8 +38,7 @@ if TYPE_CHECKING:
     from ..api.jobs import Traversed
     from ..cameras.sources import CameraPath
     from ..scenes.loaded import Scenes
-    from ..simulation.outputs import FrameOutputs
-    from ..simulation.summary import FrameStatistics, Moment, Summary
+    from ..simulation.results import FrameOutputs, FrameStatistics, Moment, Summary
     from ..tables.assertions import Assertion
     from ..tables.columns import Row
 
@@ -109,21 +108,20 @@ class FrameTable:
         return self.output is None and not as_json and is_terminal(sys.stdout)
 
     def outputs(self, *, as_json: bool) -> FrameOutputs:
-        from ..simulation import columns
-        from ..simulation.outputs import FrameOutputs
+        from ..simulation.results import COLUMNS, TIMING, FrameOutputs
         from ..tables.columns import TableOutput
 
         nowhere = self.output is None and (as_json or self.summary_on_stdout(as_json=as_json))
         table = TableOutput(
             path=None if self.output == DASH else self.output,
             form=None if nowhere else table_form("--output", self.output, self.form),
-            columns=[each for each in columns.COLUMNS if each.name not in columns.TIMING or not self.no_timing],
+            columns=[each for each in COLUMNS if each.name not in TIMING or not self.no_timing],
             overwrite=self.overwrite,
         )
         return FrameOutputs(table, self.indices_out, self.padded, self.plot, self.overwrite)
 
     def assertions(self) -> list[Assertion]:
-        from ..simulation.columns import COLUMNS, LOADING
+        from ..simulation.results import COLUMNS, LOADING
         from ..tables import assertions
 
         with assert_errors():

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras.frame import direction_of
-from ..images.defaults import PLOT_BY
+from ..images.output import PLOT_BY
 from ..images.pixels import BACKGROUND
 from ..lod.builders import DEFAULT_BASE
 from ..lod.kernels.tree_links import find_depths

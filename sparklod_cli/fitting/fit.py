@@ -1,27 +1,138 @@
-"""Fitting of the merged splats of a finished tree to pictures of full detail."""
+"""Fitting of the merged splats of a finished tree to pictures of full detail: the optimiser and its schedule."""
 
 from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..model.lod_tree import LodTree
 from ..model.splats import Splats
+from ..render import gradients
 from ..render.devices import uses_card
 from ..render.settings import RasterSettings
 from ..system.errors import BackendError
 from ..system.progress import Progress, silent
 from ..system.threads import on_threads
 from ..system.units import percent_of
-from .cameras import HELD_OUT, TRAINING, Place, placed, split_path
+from .kernels import adam
+from .kernels.adam import Rates
 from .nodes import FittedNodes, FittedSet, Index
-from .optimiser import Optimiser, Schedule, default_steps
-from .pictures import FullDetailPicture, Scores, gain, keep_gains, keep_sizes, pictures, scores_of
+from .pictures import (
+    HELD_OUT,
+    TRAINING,
+    FullDetailPicture,
+    Place,
+    Scores,
+    gain,
+    keep_gains,
+    keep_sizes,
+    pictures,
+    placed,
+    scores_of,
+    split_path,
+)
 from .settings import FitReport, FitSettings, FitStage
+
+#: Stages, after each of which held-out cameras decide.
+STAGES = 12
+
+#: Rates of the first steps, and those of the last ones over these. Measured (benchmarks/notes/refining.md).
+RATES, LAST = Rates(0.006, 0.012, 0.003, 0.006, 0.006, 0.0012), 0.02
+
+#: Steps unless given: the most, the least, and their number times that of the leaves. Chosen.
+MOST_BY_DEFAULT, LEAST_BY_DEFAULT, WORK = 12_000, 1000, 3_000_000_000
+
+
+class Optimiser:
+    """Adam for the merged splats of a tree, each with its own count of steps."""
+
+    def __init__(self, nodes: FittedNodes) -> None:
+        self.nodes = nodes
+        self._moved: list[Any] = []
+        count, terms = len(nodes.fitted), nodes.columns.sh.shape[1]
+        self._slots = slots_of(nodes)
+        self._moments = adam.Moments(
+            np.zeros((count, adam.FIRST), np.float32),
+            np.zeros((count, terms, 3), np.float32),
+            np.zeros((count, adam.SECOND), np.float32),
+            np.zeros(count, np.int32),
+        )
+
+    def step(self, picture: FullDetailPicture, index: Index, rates: adam.Rates) -> None:
+        """Take one step for a picture of a cut."""
+        nodes, camera = self.nodes, picture.camera
+        seen, shaded = nodes.visible(index, camera)
+        drawing = gradients.draw(shaded, camera, nodes.raster)
+        found = drawing.gradients(picture.gradient(drawing.image))
+        terms = nodes.columns.sh.shape[1]
+        rgb, sh = gradients.by_sh(shaded.center, camera.position, terms, shaded.rgb, found.rgb)
+        derivatives = found.center, found.log_scale, found.turn, found.lod_opacity, rgb, sh
+        columns = adam.Gradients(*map(np.ascontiguousarray, derivatives))
+        rates = adam.Rates(*map(np.float32, rates))
+        adam.step(len(seen), nodes.columns, nodes.old, seen, self._slots, columns, rates, self._moments, nodes.bounds)
+        self._moved.append(seen)
+
+    def place(self) -> None:
+        """Update the nodes that cuts are found with, by the steps since the last call."""
+        for seen in self._moved:
+            self.nodes.renew(seen)
+        self._moved.clear()
+
+    def synchronize(self) -> None:
+        """Bring the columns of the nodes up to date; here they always are."""
+
+
+def slots_of(nodes: FittedNodes) -> NDArray[np.int32]:
+    """Return the row of each node in `Moments`, -1 for those that do not change."""
+    slots = np.full(len(nodes.tree), -1, np.int32)
+    slots[nodes.fitted] = np.arange(len(nodes.fitted), dtype=np.int32)
+    return slots
+
+
+class Schedule:
+    """Steps that remain, and their rates: half a wave of a cosine, from `RATES` to `LAST` of them.
+
+    Attributes:
+        done, remaining: numbers of steps.
+    """
+
+    def __init__(self, steps: int) -> None:
+        self.done, self.remaining = 0, steps
+        self._stage = -(-steps // STAGES)
+        self._progress = 0.0
+
+    @property
+    def stage_steps(self) -> int:
+        """Steps of the next stage."""
+        return min(self._stage, self.remaining)
+
+    def rates(self) -> Rates:
+        """Return the rates of the next step."""
+        factor = LAST + (1 - LAST) * 0.5 * (1 + math.cos(math.pi * self._progress))
+        return Rates(*(rate * factor for rate in RATES))
+
+    def advance(self) -> None:
+        """Count a step."""
+        self._progress += (1 - self._progress) / self.remaining
+        self.done += 1
+        self.remaining -= 1
+
+    def shorten(self) -> None:
+        """Leave out half of the steps that remain, and all if less than a stage remains."""
+        self.remaining = self.remaining // 2 if self.remaining > self._stage else 0
+
+
+def default_steps(leaves: int) -> int:
+    """Return the default number of steps for a tree of so many leaves."""
+    return max(LEAST_BY_DEFAULT, min(MOST_BY_DEFAULT, WORK // leaves))
+
 
 #: Near plane at most and far plane at least, in radii of the scene, for scenes of tiny or huge units.
 NEAR, FAR = 0.01, 100.0

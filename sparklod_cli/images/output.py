@@ -1,4 +1,4 @@
-"""The destination and format of pictures: one file, one file per frame, an animation or a contact sheet."""
+"""Formats and defaults of pictures; their destination: a file, a file per frame, an animation or a contact sheet."""
 
 from __future__ import annotations
 
@@ -8,7 +8,25 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..system.output import check_free, check_writable
-from .defaults import MOVING, SHEETS, STILL, SUFFIXES
+
+#: Quantities by which `inspect` can colour a picture.
+PLOT_BY = ("level", "opacity", "size", "chunk")
+
+
+#: Formats of single pictures, of animations, and of contact sheets.
+STILL = ("png", "jpg", "webp", "npy")
+MOVING = ("webp", "gif", "mp4", "webm")
+SHEETS = ("png", "jpg", "webp")
+
+#: Formats by suffix, where the two differ.
+SUFFIXES = {"jpeg": "jpg"}
+
+#: Quality of JPEG, 1 to 100: losses are hardly visible.
+JPEG_QUALITY = 92
+
+#: Width and height of a thumbnail, pixels, and the pixels along each side that each of them is the mean of.
+THUMBNAIL_SIZE, THUMBNAIL_SUPERSAMPLE = (512, 512), 2
+
 
 #: Formats with an alpha channel.
 WITH_ALPHA = ("png", "webp", "npy")

@@ -15,7 +15,7 @@ from PIL import ImageDraw, ImageFont
 
 from ..render.color_scales import Coloring, smooth
 from ..system.printable import printable
-from .defaults import JPEG_QUALITY
+from .output import JPEG_QUALITY
 
 if TYPE_CHECKING:
     from ..render.rasterizer import Image

@@ -19,8 +19,8 @@ from ..system.stdio import DASH
 from ..system.threads import on_threads, ordered_map
 from . import pixels as codes
 from .animation import animate
-from .defaults import JPEG_QUALITY
 from .metrics import check_covered, psnr
+from .output import JPEG_QUALITY
 from .pixels import sheet
 
 if TYPE_CHECKING:

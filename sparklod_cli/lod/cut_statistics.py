@@ -17,7 +17,7 @@ from .traversal import CutView, Forest, TreeCut, TreeInstance
 
 @dataclass(frozen=True)
 class CutStatistics:
-    """Statistics of a cut, or of one instance's nodes in it; names are those of `simulation.columns`.
+    """Statistics of a cut, or of one instance's nodes in it; names are those of `simulation.results`.
 
     Attributes:
         selected, leaves: numbers of nodes, and of those without children.

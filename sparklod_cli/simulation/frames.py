@@ -19,8 +19,8 @@ from ..scenes.loaded import Scenes
 from ..system.progress import Progress, silent
 from ..system.threads import ordered_map
 from ..tables.columns import Row
-from .columns import COLUMNS, OF_BUDGETS, OF_TREES
 from .loading import Viewer
+from .results import COLUMNS, OF_BUDGETS, OF_TREES
 from .streaming import ChunkStream
 from .streaming_settings import StreamingSettings
 

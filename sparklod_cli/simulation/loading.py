@@ -14,9 +14,8 @@ from ..lod.traversal import TreeCut
 from ..scenes.finder import CutFinder, view_of
 from ..scenes.loaded import Cut, Scenes
 from ..tables.columns import Row
-from .chunk_cache import Chunks, header_answers
-from .columns import LOADING
-from .streaming import ChunkStream
+from .results import LOADING
+from .streaming import Chunks, ChunkStream, header_answers
 from .streaming_settings import StreamingSettings
 
 #: The share of a cut that makes a picture almost what it will be; chosen.

@@ -17,7 +17,7 @@ from sparklod_cli.cli import run
 from sparklod_cli.codecs.formats import WRITABLE
 from sparklod_cli.codecs.gpu import lod_tree
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
-from sparklod_cli.fitting import cameras, fit
+from sparklod_cli.fitting import fit, pictures
 from sparklod_cli.fitting.settings import SHARES, FitSettings
 from sparklod_cli.io import read_parts, read_scene
 from sparklod_cli.lod.detail_rule import DetailSettings
@@ -41,7 +41,7 @@ COUNT = 2_000
 @pytest.fixture(scope="module", autouse=True)
 def small_pictures() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cameras, "SIZE", (160, 90))
+        patch.setattr(pictures, "SIZE", (160, 90))
         patch.setattr(fit, "HELD_OUT", 4)
         yield
 

@@ -8,8 +8,7 @@ import re
 import numpy as np
 import pytest
 
-from sparklod_cli.simulation.columns import COLUMNS, LOADING
-from sparklod_cli.simulation.summary import MOMENTS, QUANTITIES
+from sparklod_cli.simulation.results import COLUMNS, LOADING, MOMENTS, QUANTITIES
 from sparklod_cli.tables.assertions import check, parse
 from tests.conftest import ROOT
 from tests.docs.traverse_picture import example

@@ -9,8 +9,8 @@ import numpy as np
 from PIL import Image
 
 from sparklod_cli.cameras.camera import Camera
-from sparklod_cli.figures.traversal_chart import PathScene, Plot, plot
-from sparklod_cli.simulation.summary import Lookout
+from sparklod_cli.figures.charts import PathScene, Plot, plot
+from sparklod_cli.simulation.results import Lookout
 from sparklod_cli.tables.assertions import totals
 from sparklod_cli.tables.columns import Row
 from tests.scenes import random_splats

@@ -9,7 +9,7 @@ import sys
 import numpy as np
 import pytest
 
-from sparklod_cli.figures import charts, traversal_chart
+from sparklod_cli.figures import charts
 from sparklod_cli.system.errors import SparklodError
 from sparklod_cli.system.optional import install_hint
 from sparklod_cli.tables.columns import Row
@@ -49,7 +49,7 @@ def test_ticks_of_counts_are_integers(most: int, charting: None) -> None:
     matplotlib.backends.backend_agg.FigureCanvasAgg(figure)
     axes = figure.subplots()
     axes.set_ylim(0, 1.22 * most or 1)
-    traversal_chart._counted(axes, matplotlib)
+    charts._counted(axes, matplotlib)
     figure.canvas.draw()
     texts = [text.get_text() for text in axes.get_yticklabels()]
     assert len(texts) >= 2
@@ -63,7 +63,7 @@ class TestCharts:
         assert plotted(flight(60)) == made
         image = pixels(made.png)
         assert image.shape[1] == charts.WIDTH
-        assert image.shape[0] > traversal_chart.ROW * len(traversal_chart.PANELS) / 2
+        assert image.shape[0] > charts.ROW * len(charts.PANELS) / 2
 
     def test_frames_to_look_at_are_marked(self) -> None:
         quiet = flight(60)
@@ -75,21 +75,19 @@ class TestCharts:
 
     def test_empty_columns_leave_their_panel_out(self) -> None:
         rows = flight(60)
-        every = traversal_chart.draw_charts(rows, marked(rows)).shape[0]
-        assert every == traversal_chart.ROW * 5
-        fewer = traversal_chart.draw_charts(
-            [each | dict.fromkeys(("traverse_ms", "complete_in_s"), None) for each in rows], {}
-        )
-        assert fewer.shape[0] == traversal_chart.ROW * 4
+        every = charts.draw_charts(rows, marked(rows)).shape[0]
+        assert every == charts.ROW * 5
+        fewer = charts.draw_charts([each | dict.fromkeys(("traverse_ms", "complete_in_s"), None) for each in rows], {})
+        assert fewer.shape[0] == charts.ROW * 4
 
-    @pytest.mark.parametrize("panel", traversal_chart.PANELS, ids=lambda panel: panel.title)
-    def test_each_panel_shows_its_columns(self, panel: traversal_chart.Panel, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(traversal_chart, "PANELS", (panel,))
+    @pytest.mark.parametrize("panel", charts.PANELS, ids=lambda panel: panel.title)
+    def test_each_panel_shows_its_columns(self, panel: charts.Panel, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(charts, "PANELS", (panel,))
         rows = flight(60)
-        before = traversal_chart.draw_charts(rows, marked(rows))
+        before = charts.draw_charts(rows, marked(rows))
         for name in panel.columns:
             other = [each | {name: (each[name] or 0) * (1.1 + at % 7)} for at, each in enumerate(rows)]  # type: ignore[operator]
-            assert not np.array_equal(traversal_chart.draw_charts(other, marked(other)), before), name
+            assert not np.array_equal(charts.draw_charts(other, marked(other)), before), name
 
     def test_a_path_of_one_frame_has_a_chart_of_full_width(self) -> None:
         assert pixels(plotted(flight(1)).png).shape[1] == charts.WIDTH
@@ -116,7 +114,7 @@ class TestCharts:
     @pytest.mark.parametrize(("limit", "said"), [(0.001, "edges from the root"), (None, "level")])
     def test_levels_without_pixel_scales_are_detail_levels(self, limit: float | None, said: str) -> None:
         matplotlib = charts.load_matplotlib()
-        (panel,) = (each for each in traversal_chart.PANELS if "level_mean" in each.columns)
+        (panel,) = (each for each in charts.PANELS if "level_mean" in each.columns)
         axes = matplotlib.figure.Figure().subplots()
         panel.draw(axes, charts.FrameColumns([each | {"pixel_scale_limit": limit} for each in flight(4)]), matplotlib)
         assert axes.get_ylabel() == said
@@ -128,14 +126,14 @@ class TestCharts:
     def test_a_matplotlibrc_changes_nothing(self) -> None:
         import matplotlib
 
-        before = traversal_chart.draw_charts(flight(5), {})
+        before = charts.draw_charts(flight(5), {})
         with matplotlib.rc_context({"lines.linewidth": 9, "font.size": 30, "axes.grid": False}):
-            assert np.array_equal(traversal_chart.draw_charts(flight(5), {}), before)
+            assert np.array_equal(charts.draw_charts(flight(5), {}), before)
 
     def test_pyplot_is_left_alone(self) -> None:
         """It would keep every figure, and ask for a display."""
         program = (
-            "import sys; from tests.tables.rows import flight; from sparklod_cli.figures import traversal_chart\n"
-            "traversal_chart.draw_charts(flight(3), {}); assert 'matplotlib.pyplot' not in sys.modules"
+            "import sys; from tests.tables.rows import flight; from sparklod_cli.figures import charts\n"
+            "charts.draw_charts(flight(3), {}); assert 'matplotlib.pyplot' not in sys.modules"
         )
         subprocess.run([sys.executable, "-c", program], check=True)

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sparklod_cli.figures import charts, pyvista_scene
+from sparklod_cli.figures.charts import FRAME, PathScene, _above, frustum_lines, picture_of_path
 from sparklod_cli.figures.pyvista_scene import viewpoint
-from sparklod_cli.figures.traversal_chart import FRAME, PathScene, _above, frustum_lines, picture_of_path
 from sparklod_cli.model.gaussian import covariance
 from sparklod_cli.system.errors import SparklodError
 from tests.figures.flights import SIZE, circle, count_of, looking, path_scene, pixels, plotted

@@ -9,7 +9,7 @@ import pytest
 
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.cameras.sources import CameraPath
-from sparklod_cli.fitting.cameras import DISTANCES, LONGEST, TRAINING, Place, placed, smaller, split_path
+from sparklod_cli.fitting.pictures import DISTANCES, LONGEST, TRAINING, Place, placed, smaller, split_path
 
 UNITS = (1e-4, 1.0, 1e6)
 

@@ -8,11 +8,9 @@ from typing import Any
 import pytest
 
 from sparklod_cli.cameras.camera import Camera
-from sparklod_cli.fitting import cameras, optimiser
 from sparklod_cli.fitting import fit as fit_module
-from sparklod_cli.fitting.fit import AHEAD, fit
+from sparklod_cli.fitting.fit import AHEAD, Optimiser, fit
 from sparklod_cli.fitting.nodes import FittedNodes, Index
-from sparklod_cli.fitting.optimiser import Optimiser
 from sparklod_cli.fitting.settings import FitSettings
 from sparklod_cli.lod import quality
 from tests.scenes import random_splats
@@ -56,8 +54,8 @@ def test_cuts_are_found_before_the_steps_of_the_group_before(threads: int, monke
         made.append(nodes)
         return nodes.optimiser
 
-    monkeypatch.setattr(cameras, "SIZE", (64, 36))
-    monkeypatch.setattr(optimiser, "STAGES", STAGES)
+    monkeypatch.setattr("sparklod_cli.fitting.pictures.SIZE", (64, 36))
+    monkeypatch.setattr(fit_module, "STAGES", STAGES)
     monkeypatch.setattr(fit_module, "TRAINING", 4)
     monkeypatch.setattr(fit_module, "HELD_OUT", 2)
     monkeypatch.setattr(fit_module, "FittedNodes", RecordedNodes)

@@ -7,12 +7,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from sparklod_cli.fitting import cameras
 from sparklod_cli.fitting import fit as fit_module
-from sparklod_cli.fitting.fit import fit
+from sparklod_cli.fitting.fit import Optimiser, fit
 from sparklod_cli.fitting.kernels.adam import Rates
 from sparklod_cli.fitting.nodes import FittedNodes, Index
-from sparklod_cli.fitting.optimiser import Optimiser
 from sparklod_cli.fitting.pictures import FullDetailPicture
 from sparklod_cli.fitting.settings import FitReport, FitSettings
 from sparklod_cli.lod import quality
@@ -48,7 +46,7 @@ def fitted(device: str, said: list[str]) -> tuple[Splats, FitReport]:
 
 @pytest.fixture(autouse=True)
 def failing_card(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cameras, "SIZE", (64, 36))
+    monkeypatch.setattr("sparklod_cli.fitting.pictures.SIZE", (64, 36))
     monkeypatch.setattr(fit_module, "TRAINING", 4)
     monkeypatch.setattr(fit_module, "HELD_OUT", 2)
     monkeypatch.setattr(fit_module, "_optimiser_on", optimiser_on)

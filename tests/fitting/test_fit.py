@@ -13,11 +13,10 @@ from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.cameras.sources import CameraPath
 from sparklod_cli.codecs import ply
 from sparklod_cli.codecs.reader import decode_file
-from sparklod_cli.fitting import cameras, optimiser
 from sparklod_cli.fitting import fit as fit_module
 from sparklod_cli.fitting.fit import fit
 from sparklod_cli.fitting.nodes import FittedNodes
-from sparklod_cli.fitting.pictures import pictures, scores_of
+from sparklod_cli.fitting.pictures import Place, pictures, scores_of
 from sparklod_cli.fitting.settings import SHARES, FitReport, FitSettings
 from sparklod_cli.inspection.tree import examine
 from sparklod_cli.lod import quality, quick
@@ -49,7 +48,7 @@ def fitted(seed: int = 0, threads: int = 1, steps: int = STEPS) -> tuple[Splats,
 
 @pytest.fixture(autouse=True)
 def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cameras, "SIZE", (160, 90))
+    monkeypatch.setattr("sparklod_cli.fitting.pictures.SIZE", (160, 90))
     monkeypatch.setattr(fit_module, "HELD_OUT", 6)
 
 
@@ -91,7 +90,7 @@ def test_no_budget_loses_on_the_held_out_cameras_and_cuts_gain_on_cameras_that_n
     assert all(report.psnr_after[share] >= report.psnr_before[share] for share in SHARES)
     assert 0 < report.kept <= 1
     before, after = (FittedNodes(splats, tree, RasterSettings(), 1) for splats in (nodes, result))
-    place = cameras.Place.of(nodes.center[tree.is_leaf])
+    place = Place.of(nodes.center[tree.is_leaf])
     views = [
         Camera.look_at(
             (place.middle + 2 * place.radius * np.array(way)).tolist(), place.middle.tolist(), size=(160, 90)
@@ -120,7 +119,7 @@ def test_an_interruption_keeps_what_the_finished_stages_gained() -> None:
     )
     assert not report.is_complete
     assert report.steps == len(steps) == STEPS // 2 + 1
-    assert len(report.stages) == len(stages) == optimiser.STAGES // 2 - 1  # of 14 steps each
+    assert len(report.stages) == len(stages) == fit_module.STAGES // 2 - 1  # of 14 steps each
     assert report.kept > 0
     assert not same(result, demo()[0])
 

@@ -5,12 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sparklod_cli.fitting import cameras
-from sparklod_cli.fitting.cameras import Place, placed
+from sparklod_cli.fitting.fit import LAST, RATES, STAGES, Optimiser, Schedule, default_steps
 from sparklod_cli.fitting.kernels.adam import MOST_D, Rates
 from sparklod_cli.fitting.nodes import FittedNodes
-from sparklod_cli.fitting.optimiser import LAST, RATES, STAGES, Optimiser, Schedule, default_steps
-from sparklod_cli.fitting.pictures import FullDetailPicture, pictures
+from sparklod_cli.fitting.pictures import FullDetailPicture, Place, pictures, placed
 from sparklod_cli.lod import quality
 from sparklod_cli.render.rasterizer import draw
 from sparklod_cli.render.settings import RasterSettings
@@ -22,7 +20,7 @@ SHARE = 0.05
 
 @pytest.fixture
 def nodes(monkeypatch: pytest.MonkeyPatch) -> FittedNodes:
-    monkeypatch.setattr(cameras, "SIZE", (160, 90))
+    monkeypatch.setattr("sparklod_cli.fitting.pictures.SIZE", (160, 90))
     return FittedNodes(*quality.build(random_splats(COUNT, sh_degree=1)), RasterSettings(), 1)
 
 

@@ -7,7 +7,7 @@ import math
 from dataclasses import dataclass, field
 from fractions import Fraction
 
-from sparklod_cli.simulation.chunk_cache import Chunks
+from sparklod_cli.simulation.streaming import Chunks
 from sparklod_cli.simulation.streaming_settings import Network
 
 #: Seconds; of two events nearer than this, rounding decides which comes first.

@@ -10,8 +10,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from sparklod_cli.simulation.chunk_cache import Chunks
-from sparklod_cli.simulation.streaming import ChunkStream
+from sparklod_cli.simulation.streaming import Chunks, ChunkStream
 from sparklod_cli.simulation.streaming_settings import Network
 from tests.references.streaming import NaiveCache, Twin, roots_first
 

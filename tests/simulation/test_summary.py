@@ -9,8 +9,7 @@ import pytest
 
 from sparklod_cli.commands.console import WIDTH
 from sparklod_cli.commands.traverse import lines
-from sparklod_cli.simulation.columns import COLUMNS
-from sparklod_cli.simulation.summary import IN_FRUSTUM, MOMENTS, QUANTITIES, summarize
+from sparklod_cli.simulation.results import COLUMNS, IN_FRUSTUM, MOMENTS, QUANTITIES, summarize
 from sparklod_cli.tables.assertions import check, parse
 from tests.tables.rows import flight, row
 

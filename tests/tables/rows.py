@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from sparklod_cli.simulation.columns import COLUMNS
+from sparklod_cli.simulation.results import COLUMNS
 from sparklod_cli.tables.columns import Cell, Row
 
 

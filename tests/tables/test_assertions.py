@@ -9,7 +9,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from sparklod_cli.simulation.columns import COLUMNS, EMPTY
+from sparklod_cli.simulation.results import COLUMNS, EMPTY
 from sparklod_cli.tables.assertions import SIGNS, STATISTICS, BadAssertionError, Outcome, check, parse
 from sparklod_cli.tables.columns import Row
 from tests.tables.rows import flight, row

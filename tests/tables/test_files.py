@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sparklod_cli.simulation.columns import COLUMNS
+from sparklod_cli.simulation.results import COLUMNS
 from sparklod_cli.system.errors import SparklodError
 from sparklod_cli.system.optional import install_hint
 from sparklod_cli.tables.columns import FORMS, TYPES, Cell, Column, Row, encode

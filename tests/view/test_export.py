@@ -9,9 +9,8 @@ import pytest
 
 from sparklod_cli.cli import run
 from sparklod_cli.system.errors import OutputError
-from sparklod_cli.view import export as exporting
-from sparklod_cli.view.export import check_folder, export
-from sparklod_cli.view.site import Site
+from sparklod_cli.view import site as exporting
+from sparklod_cli.view.site import Site, check_folder, export
 from tests.conftest import FIXTURES
 from tests.view.conftest import TREE, prepared
 

@@ -100,7 +100,7 @@ def plot_option(help: str, **attributes: Any) -> Any:
 def table_form(flag: str, output: Path | None, form: str | None = None) -> str:
     """Return the format of a table, by its option or by the name of the output; CSV on standard output."""
     from ...codecs.formats import FORMATS
-    from ...images.defaults import MOVING, STILL, SUFFIXES
+    from ...images.output import MOVING, STILL, SUFFIXES
     from ...tables.columns import FORMS
 
     suffix = output.suffix.lower() if output is not None else ""

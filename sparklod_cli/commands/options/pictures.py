@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, ClassVar
 import click
 
 from ...codecs.rounding import ROUND_TRIPS
-from ...images.defaults import JPEG_QUALITY, MOVING, STILL, THUMBNAIL_SIZE, THUMBNAIL_SUPERSAMPLE
+from ...images.output import JPEG_QUALITY, MOVING, STILL, THUMBNAIL_SIZE, THUMBNAIL_SUPERSAMPLE
 from ...model import MAX_SH_DEGREE
 from ...render.devices import uses_card
 from ...render.settings import SORTINGS, RenderSettings

@@ -8,7 +8,7 @@ import json
 from pathlib import Path
 
 from sparklod_cli.cli import run
-from sparklod_cli.simulation.columns import COLUMNS
+from sparklod_cli.simulation.results import COLUMNS
 from tests.conftest import FIXTURES
 
 TOWN, TREE = FIXTURES / "traverse" / "town.spz", FIXTURES / "golden" / "hand-tree-v3.spz"

@@ -11,7 +11,7 @@ import pytest
 from sparklod_cli.cli import run
 from sparklod_cli.codecs import spz
 from sparklod_cli.commands.traverse import traverse as command
-from sparklod_cli.figures import traversal_chart
+from sparklod_cli.figures import charts
 from sparklod_cli.lod import quick
 from sparklod_cli.lod.tile_settings import TileSettings
 from sparklod_cli.model.scene import Scene
@@ -106,7 +106,7 @@ def test_every_option_of_traverse_is_used_or_refused(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(
-        traversal_chart, "plot", lambda *arguments: traversal_chart.Plot(b"a plot", None)
+        charts, "plot", lambda *arguments: charts.Plot(b"a plot", None)
     )  # takes seconds, and has its tests
     for name, data in trees.items():
         (tmp_path / name).write_bytes(data)

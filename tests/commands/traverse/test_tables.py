@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from sparklod_cli.simulation.columns import COLUMNS
+from sparklod_cli.simulation.results import COLUMNS
 from tests.commands.traverse.runs import CAMERAS, NAMES, ORBIT, TOWN, TREE, table, traverse
 from tests.conftest import ROOT, Capture
 
@@ -161,15 +161,15 @@ def test_a_plot_is_a_picture(tmp_path: Path, capsys: Capture) -> None:
 def test_a_plot_shows_what_the_frame_had(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Over a slow network few chunks are there; the picture is of what was drawn with these."""
     pytest.importorskip("matplotlib", reason="charts need the extra `render`")
-    from sparklod_cli.figures import traversal_chart
+    from sparklod_cli.figures import charts
 
-    shown: list[traversal_chart.PathScene] = []
+    shown: list[charts.PathScene] = []
 
-    def drawn(rows: object, marked: object, title: str, scene: traversal_chart.PathScene) -> traversal_chart.Plot:
+    def drawn(rows: object, marked: object, title: str, scene: charts.PathScene) -> charts.Plot:
         shown.append(scene)
-        return traversal_chart.Plot(b"a plot", None)
+        return charts.Plot(b"a plot", None)
 
-    monkeypatch.setattr(traversal_chart, "plot", drawn)
+    monkeypatch.setattr(charts, "plot", drawn)
     slow = ("--bandwidth", "0.1Mbit", "--latency", "50ms")
     for number, network in enumerate(((), slow)):
         table = tmp_path / f"{number}.csv"

@@ -5,12 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sparklod_cli.fitting import cameras
-from sparklod_cli.fitting.cameras import Place, placed
-from sparklod_cli.fitting.fit import fit
+from sparklod_cli.fitting.fit import RATES, Optimiser, fit
 from sparklod_cli.fitting.nodes import FittedNodes, FittedSet
-from sparklod_cli.fitting.optimiser import RATES, Optimiser
-from sparklod_cli.fitting.pictures import pictures
+from sparklod_cli.fitting.pictures import Place, pictures, placed
 from sparklod_cli.fitting.settings import FitSettings
 from sparklod_cli.lod import quality
 from sparklod_cli.render.settings import RasterSettings
@@ -28,7 +25,7 @@ MOST = 0.02
 
 @pytest.fixture(autouse=True)
 def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cameras, "SIZE", (16, 10))
+    monkeypatch.setattr("sparklod_cli.fitting.pictures.SIZE", (16, 10))
 
 
 def nodes_of(kind: str) -> FittedNodes:

@@ -15,7 +15,7 @@ from sparklod_cli.model.falloff import MIN_ALPHA
 from sparklod_cli.model.gaussian import normalized_quat
 from sparklod_cli.model.splats import FloatArray
 from sparklod_cli.render import rasterizer, settings
-from sparklod_cli.render.gl import osmesa, texture
+from sparklod_cli.render.gl import osmesa
 from sparklod_cli.render.rasterizer import Image, ShadedSplats, shade
 from sparklod_cli.render.settings import BACKENDS, PROFILES, SORTS, RasterSettings
 from sparklod_cli.system.errors import BackendError
@@ -137,7 +137,7 @@ def test_clipping_is_that_of_the_reference() -> None:
 
 @needs_opengl
 @pytest.mark.parametrize("size", [(1, 1), (17, 300), (300, 17)])
-@pytest.mark.parametrize("precision", texture.PRECISIONS)
+@pytest.mark.parametrize("precision", osmesa.PRECISIONS)
 def test_pictures_of_any_size_are_those_of_the_reference(size: tuple[int, int], precision: str) -> None:
     seen = camera((0, 0, 3), size=size)
     reference = rasterizer.draw(SPLATS["large"], seen, RasterSettings())
@@ -160,7 +160,7 @@ def one(**columns: list[float]) -> ShadedSplats:
 
 
 @needs_opengl
-@pytest.mark.parametrize("precision", texture.PRECISIONS)
+@pytest.mark.parametrize("precision", osmesa.PRECISIONS)
 def test_one_splat_is_the_gaussian_of_the_textbook(precision: str) -> None:
     """By the textbook: 20 pixels of standard deviation, in the middle; the first row is the uppermost."""
     straight = np.eye(4)
@@ -179,7 +179,7 @@ def test_one_splat_is_the_gaussian_of_the_textbook(precision: str) -> None:
 
 
 @needs_opengl
-@pytest.mark.parametrize("precision", texture.PRECISIONS)
+@pytest.mark.parametrize("precision", osmesa.PRECISIONS)
 @pytest.mark.parametrize("sorting", settings.SORTINGS)
 @pytest.mark.parametrize("throttle", [0.0, 0.01])
 def test_a_picture_of_no_splats_is_empty(precision: str, sorting: str, throttle: float) -> None:
@@ -300,7 +300,7 @@ def test_keys_are_sorted_upwards_and_equal_ones_backwards() -> None:
 def test_half_precision_has_the_texture_of_the_viewer() -> None:
     splats = random_splats(1500)
     shown = shade([(splats, np.eye(4))], CAMERAS["front"])
-    words = texture.data_texture_of("half")
+    words = osmesa.data_texture_of("half")
     assert words.update(shown) == (True, True)
     theirs = data_texture.pack(splats)["texture"]
     assert words.texture.shape == theirs.shape == (2, 2048, 4)
@@ -320,7 +320,7 @@ def test_sizes_beyond_opengls_limits_are_refused() -> None:
 
 
 @needs_opengl
-@pytest.mark.parametrize("precision", texture.PRECISIONS)
+@pytest.mark.parametrize("precision", osmesa.PRECISIONS)
 def test_the_order_of_the_input_does_not_matter(precision: str) -> None:
     shown = SPLATS["plausible"]
     shuffle = np.random.default_rng(1).permutation(len(shown))

@@ -1,0 +1,491 @@
+"""Results of a traversal: the columns of its table, which has a row for each frame, its summary, and its outputs."""
+
+from __future__ import annotations
+
+import io
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+
+from ..system.output import check_free, check_writable, write_file
+from ..system.progress import Progress, silent
+from ..tables.assertions import Number, numbers, statistic, totals
+from ..tables.columns import FRAME, Column, Filter, Row, TableOutput
+
+COLUMNS = (
+    *FRAME,
+    Column("instance", str, "", "", "name of the instance, or `total` for all together"),
+    *(Column(f"position_{axis}", float, ".6f", "world units", "position of the camera") for axis in "xyz"),
+    *(Column(f"forward_{axis}", float, ".6f", "", "unit vector along the optical axis") for axis in "xyz"),
+    Column("fov_y_deg", float, ".4f", "degrees", "vertical field of view"),
+    Column("width", int, "", "px", "width of the image"),
+    Column("height", int, "", "px", "height of the image"),
+    Column("budget", int, "", "splats", "largest number of splats that may be drawn, all instances together"),
+    Column(
+        "pixel_scale_limit",
+        float,
+        ".6g",
+        "",
+        "nodes at or below this pixel scale are not refined; by default the angular size of a pixel",
+    ),
+    Column("selected", int, "", "splats", "splats drawn: the nodes of the cut"),
+    Column("leaves", int, "", "splats", "leaves among them: splats of full detail"),
+    Column("interior", int, "", "splats", "merged splats among them"),
+    Column("budget_used", float, ".4f", "share", "selected over budget"),
+    Column(
+        "stop_reason",
+        str,
+        "",
+        "",
+        "why the cut is not finer: `budget`: refining one more node would exceed it; `pixel`: no node above the "
+        "pixel-scale limit is left to refine; `missing`: the children of the nodes to be refined are not resident; "
+        "`exhausted`: only leaves are left; of Streamed SOG"
+        " and 3D Tiles `distance`: no region or tile is near enough to be finer",
+    ),
+    Column("pixel_scale_min", float, ".6g", "", "pixel scale down to which all nodes have been refined"),
+    Column("frontier", int, "", "splats", "of the cut, nodes still waiting to be refined when the search stops"),
+    Column(
+        "level_min",
+        int,
+        "",
+        "",
+        "smallest depth of a node of the cut, edges from the root; of Streamed SOG the finest detail level",
+    ),
+    Column("level_mean", float, ".3f", "", "mean depth of the nodes of the cut, or detail level of its splats"),
+    Column("level_max", int, "", "", "largest depth of a node of the cut, or detail level"),
+    Column("in_frustum", int, "", "splats", "of the cut, splats inside the frustum: their centre is in the image"),
+    Column("outside", int, "", "splats", "of the cut, splats in front of the camera but outside the frustum"),
+    Column("behind", int, "", "splats", "of the cut, splats behind the camera"),
+    Column("projected_px_p50", float, ".3f", "px", "median projected size of the splats inside the frustum"),
+    Column("projected_px_p95", float, ".3f", "px", "95th percentile of the projected sizes"),
+    Column(
+        "overdraw_estimate",
+        float,
+        ".3f",
+        "",
+        "mean number of splats on a pixel: their areas out to sqrt(8) standard deviations, over that of the image",
+    ),
+    Column(
+        "chunks_touched",
+        int,
+        "",
+        "chunks",
+        "chunks of 65,536 nodes that the search for the cut reads, or would read if they were resident; of Streamed SOG"
+        " and 3D Tiles files that are drawn from or asked for",
+    ),
+    Column("chunks_new", int, "", "chunks", "chunks that arrived since the previous frame"),
+    Column(
+        "bytes_new",
+        int,
+        "",
+        "bytes",
+        "bytes that arrived since the previous frame: chunks and header of RAD, chunk files and manifest of Streamed "
+        "SOG; of SPZ, which has no chunks, as if the file were cut evenly",
+    ),
+    Column("chunks_resident", int, "", "chunks", "chunks in the cache after this frame"),
+    Column(
+        "missing",
+        int,
+        "",
+        "splats",
+        "nodes drawn although they should be refined, because their children are not resident; of Streamed SOG splats "
+        "that should be drawn, but whose chunk files are not resident",
+    ),
+    Column(
+        "complete_in_s",
+        float,
+        ".4f",
+        "s",
+        "with `--bandwidth`: time until the whole cut is resident, if the camera stays and the chunks are known",
+    ),
+    Column("added", int, "", "splats", "nodes of the cut that the previous frame did not draw"),
+    Column("removed", int, "", "splats", "nodes that only the previous frame drew"),
+    Column(
+        "churn",
+        float,
+        ".4f",
+        "share",
+        "(added + removed) over the splats of both frames: 0 if nothing changes, 1 if everything does",
+    ),
+    Column("traverse_ms", float, ".3f", "ms", "time to find the cut, on one thread; left out with `--no-timing`"),
+)
+
+#: Figures of a visitor who opens a page in front of the first camera and waits there, with `--bandwidth`. No table has
+#: them, but the summary, and assertions can be about them.
+LOADING = (
+    Column("first_picture_s", float, ".4f", "s", "time until anything is drawn"),
+    Column("resident_90_s", float, ".4f", "s", "time until 90 % of the splats of the cut are resident"),
+    Column("resident_90_bytes", int, "", "bytes", "bytes that have arrived by then"),
+    Column("resident_all_s", float, ".4f", "s", "time until the whole cut is resident"),
+    Column("resident_all_bytes", int, "", "bytes", "bytes that have arrived by then"),
+)
+
+#: Columns that Streamed SOG and 3D Tiles have no values for.
+OF_TREES = ("pixel_scale_limit", "pixel_scale_min", "frontier")
+
+#: Columns of viewers that have a budget, which CesiumJS has not.
+OF_BUDGETS = ("budget", "budget_used")
+
+#: Columns that differ from run to run.
+TIMING = ("traverse_ms",)
+
+#: Why all cells of a column can be empty.
+EMPTY = {
+    "time_s": "the path has no times",
+    "complete_in_s": "it needs --bandwidth",
+    "traverse_ms": "--no-timing leaves it out",
+    **dict.fromkeys(
+        ("added", "removed", "churn"), "it compares a frame with the one before, and there is only one frame"
+    ),
+    **dict.fromkeys(("pixel_scale_limit", "frontier"), "only trees have it, not Streamed SOG or 3D Tiles"),
+    "pixel_scale_min": "no node was refined, or it is Streamed SOG or 3D Tiles",
+    **dict.fromkeys(OF_BUDGETS, "CesiumJS, which draws 3D Tiles, has no budget"),
+    **dict.fromkeys(("projected_px_p50", "projected_px_p95"), "no splat is inside the frustum on any frame"),
+    **dict.fromkeys((column.name for column in LOADING), "it needs --bandwidth, and a --chunk-cache that suffices"),
+}
+
+
+UNITS = {column.name: column.unit for column in COLUMNS}
+
+#: The share of the cut inside the frustum; a quotient of two columns.
+IN_FRUSTUM = "in_frustum_share"
+
+#: Quantities with statistics, in the order of the summary.
+QUANTITIES = (
+    "selected", "budget_used", "pixel_scale_min", "projected_px_p95", "overdraw_estimate", IN_FRUSTUM,
+    "chunks_new", "bytes_new", "missing", "complete_in_s", "churn", "traverse_ms",
+)  # fmt: skip
+
+STATISTICS = ("min", "p50", "p95", "max")
+
+
+@dataclass(frozen=True)
+class FrameStatistics:
+    """Statistics over the frames.
+
+    Attributes:
+        name: name of a column, or `IN_FRUSTUM`.
+        unit: unit of the values; empty for a plain number.
+        frames: number of frames with a value.
+        min, p50, p95, max: statistics over these frames.
+    """
+
+    name: str
+    unit: str
+    frames: int
+    min: Number
+    p50: Number
+    p95: Number
+    max: Number
+
+
+@dataclass(frozen=True)
+class Moment:
+    """The frame with the largest value of one of the criteria `MOMENTS`.
+
+    Attributes:
+        criterion: name of the criterion.
+        frame: its number.
+        time_s: seconds on the path.
+        name: name of the frame; None if it has none.
+        value: the largest value.
+        unit: unit of the value; "limit" is a multiple of the pixel scale limit.
+    """
+
+    criterion: str
+    frame: int
+    time_s: float | None
+    name: str | None
+    value: Number
+    unit: str
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Summary of a simulation.
+
+    Attributes:
+        frames: number of frames.
+        seconds: time from the first frame to the last.
+        chunks, bytes: total number and size of the fetched chunks.
+        chunks_first, bytes_first: those fetched for the first frame.
+        stop_reasons: shares of the frames, 0..1, the most frequent first.
+        quantities: statistics; quantities without a value on any frame are omitted.
+        moments: the most extreme frames; criteria that no frame meets are omitted.
+        loading: times and bytes of `columns.LOADING`, by name; None without a network.
+    """
+
+    frames: int
+    seconds: float
+    chunks: int
+    bytes: int
+    chunks_first: int
+    bytes_first: int
+    stop_reasons: dict[str, float]
+    quantities: tuple[FrameStatistics, ...]
+    moments: tuple[Moment, ...]
+    loading: Row | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """As plain lists, dicts and numbers, for JSON; quantities and moments by their names."""
+        plain = asdict(self)
+        for group, name in (("quantities", "name"), ("moments", "criterion")):
+            plain[group] = {each.pop(name): each for each in plain[group]}
+        return plain
+
+
+def summarize(rows: Iterable[Row], loading: Row | None = None) -> Summary:
+    """Summary of the rows of all frames, in order; rows of single instances are ignored."""
+    frames = totals(rows)
+    times = numbers(frames, "time_s")
+    reasons = Counter(str(row["stop_reason"]) for row in frames if row["stop_reason"] is not None)
+    chunks, size = numbers(frames, "chunks_new"), numbers(frames, "bytes_new")
+    lookout = Lookout()
+    for row in frames:
+        lookout.add(row)
+    return Summary(
+        frames=len(frames),
+        seconds=round(times[-1] - times[0], 6) if times else 0.0,
+        chunks=int(sum(chunks)),
+        bytes=int(sum(size)),
+        chunks_first=int(sum(numbers(frames[:1], "chunks_new"))),
+        bytes_first=int(sum(numbers(frames[:1], "bytes_new"))),
+        stop_reasons={reason: round(count / reasons.total(), 6) for reason, count in reasons.most_common()},
+        quantities=tuple(quantity for name in QUANTITIES if (quantity := _quantity(name, frames)) is not None),
+        moments=tuple(lookout.moments()),
+        loading=loading,
+    )
+
+
+def _quantity(name: str, frames: Sequence[Row]) -> FrameStatistics | None:
+    values = [share for row in frames if (share := _share(row)) is not None]
+    if name != IN_FRUSTUM:
+        values = numbers(frames, name)
+    if not values:
+        return None
+    found = {each: _rounded(statistic(each, values)) for each in STATISTICS}
+    return FrameStatistics(name, UNITS.get(name, "share"), len(values), **found)
+
+
+def _share(row: Row) -> Number | None:
+    seen, selected = row["in_frustum"], row["selected"]
+    return seen / selected if isinstance(seen, int) and isinstance(selected, int) and selected else None
+
+
+def _rounded(value: Number) -> Number:
+    """Round to nine significant digits, which hides rounding errors of floats."""
+    return value if isinstance(value, int) else float(f"{value:.9g}")
+
+
+def coarseness(row: Row) -> Number | None:
+    """Return the smallest pixel scale of a refined node, as a multiple of the limit; None if either is missing."""
+    scale, limit = row["pixel_scale_min"], row["pixel_scale_limit"]
+    return scale / limit if isinstance(scale, (int, float)) and isinstance(limit, (int, float)) and limit else None
+
+
+def _cell(name: str) -> Callable[[Row], Number | None]:
+    return lambda row: next(iter(numbers([row], name)), None)
+
+
+#: Criteria for extreme frames: the value of a row, the threshold that it must exceed, and the unit.
+MOMENTS: dict[str, tuple[Callable[[Row], Number | None], Number, str]] = {
+    "churn": (_cell("churn"), 0, "share"),
+    "bytes": (_cell("bytes_new"), 0, "bytes"),
+    "coarsest": (coarseness, 1, "limit"),
+    "missing": (_cell("missing"), 0, "splats"),
+    "incomplete": (_cell("complete_in_s"), 0, "s"),
+    "overdraw": (_cell("overdraw_estimate"), 0, ""),
+}
+
+
+class Lookout:
+    """Finds the frame with the largest value of each criterion, the first among equals.
+
+    The bytes fetched by the first frame do not count, since it has to fetch everything.
+    """
+
+    def __init__(self) -> None:
+        self._most: dict[str, tuple[Number, Row]] = {}
+        self._frames = 0
+
+    def add(self, row: Row) -> list[str]:
+        """Add the row of the next frame; returns the criteria in which it exceeds all earlier frames."""
+        found = []
+        for criterion, (measure, above, _) in MOMENTS.items():
+            value = None if criterion == "bytes" and not self._frames else measure(row)
+            if value is not None and value > (self._most[criterion][0] if criterion in self._most else above):
+                self._most[criterion] = value, row
+                found.append(criterion)
+        self._frames += 1
+        return found
+
+    def moments(self) -> list[Moment]:
+        """Return the extreme frames so far, in the order of `MOMENTS`."""
+        moments = []
+        for criterion, (_, _, unit) in MOMENTS.items():
+            if criterion in self._most:
+                value, row = self._most[criterion]
+                frame, name = cast("int", row["frame"]), cast("str | None", row["name"])
+                time = cast("float | None", row["time_s"])
+                moments.append(Moment(criterion, frame, time, name or None, _rounded(value), unit))
+        return moments
+
+
+if TYPE_CHECKING:
+    from ..cameras.sources import CameraPath
+    from ..tables.columns import Row
+    from .frames import SimulatedFrame, Simulation
+
+#: Nodes per row of Spark's index texture.
+ROW = 16_384
+
+
+@dataclass(frozen=True)
+class FrameOutputs:
+    """Destinations of the frames of a simulation.
+
+    Attributes:
+        indices: folder for the node indices of each cut; None for none.
+        padded: pad the index files to whole rows of `ROW`.
+        plot: file of the charts; None for none.
+    """
+
+    table: TableOutput
+    indices: Path | None = None
+    padded: bool = False
+    plot: Path | None = None
+    overwrite: bool = False
+
+    def check(self) -> None:
+        """Raise a `SparklodError` if an output cannot be written; called before any work is done."""
+        self.table.check()
+        if self.plot is not None:
+            check_writable(self.plot, overwrite=self.overwrite)
+            from ..figures.charts import load_matplotlib
+
+            load_matplotlib()
+        if self.indices is not None:
+            check_writable(self.indices / "0.npy", overwrite=True)
+
+    def check_frames(self, numbers: Sequence[int], instances: int) -> None:
+        """Raise an `OutputError` if an index file of a frame exists and may not be replaced."""
+        for file in self.index_files(numbers, instances):
+            check_free(file, overwrite=self.overwrite)
+
+    def index_files(self, numbers: Sequence[int], instances: int) -> Iterator[Path]:
+        """Yield the index files that will be written for frames of these numbers."""
+        if self.indices is not None:
+            for number in numbers:
+                yield from index_files(self.indices, number, instances)
+
+
+@dataclass(frozen=True)
+class WrittenFrames:
+    """Results of `write_frames`.
+
+    Attributes:
+        rows: the row of all instances together for each frame.
+        in_front: mean share of the drawn splats in front of the camera.
+        note: why the charts have no picture of the path; None if they have one, or if there are no charts.
+    """
+
+    rows: list[Row]
+    in_front: float
+    note: str | None
+
+
+@dataclass
+class _ChartData:
+    """Data for the charts: rows, and the extreme frames so far."""
+
+    rows: list[Row] = field(default_factory=list)
+    in_front: list[float] = field(default_factory=list)
+    lookout: Lookout = field(default_factory=Lookout)
+    frames: dict[str, SimulatedFrame] = field(default_factory=dict)
+
+    def add(self, frame: SimulatedFrame) -> None:
+        """Store a frame if it exceeds all earlier frames in one of the criteria."""
+        for criterion in self.lookout.add(frame.rows[0]):
+            self.frames[criterion] = frame
+        self.frames.setdefault("first", frame)
+
+    def best(self) -> SimulatedFrame:
+        """Return the first extreme frame that draws anything, as none does before the first chunk has arrived."""
+        criteria = [moment.criterion for moment in self.lookout.moments()]
+        extremes = [self.frames[criterion] for criterion in (*criteria, "first")]
+        return next((each for each in extremes if len(each.cut)), extremes[0])
+
+
+def write_frames(
+    simulation: Simulation,
+    path: CameraPath,
+    outputs: FrameOutputs,
+    *,
+    threads: int = 1,
+    progress: Progress = silent,
+    passed: Filter | None = None,
+) -> WrittenFrames:
+    """Simulate a camera path and writes the outputs: table and index files frame by frame, then the charts.
+
+    Args:
+        passed: a filter for the bytes of a table on standard output.
+
+    Raises:
+        OutputError: a file cannot be written.
+    """
+    data = _ChartData()
+
+    def rows() -> Iterator[Row]:
+        for frame in simulation.run(path, threads=threads, progress=progress):
+            data.in_front.append(frame.in_front)
+            data.rows.append(frame.rows[0])
+            _write_indices(frame, outputs)
+            if outputs.plot is not None:
+                data.add(frame)
+            yield from frame.rows
+
+    outputs.table.write(rows(), passed=passed)
+    note = None if outputs.plot is None else _plot(simulation, path, outputs.plot, data, overwrite=outputs.overwrite)
+    return WrittenFrames(data.rows, float(np.mean(data.in_front)), note)
+
+
+def index_files(folder: Path, frame: int, instances: int) -> list[Path]:
+    """Return the index files of a frame, one per instance."""
+    if instances == 1:
+        return [folder / f"{frame:06d}.npy"]
+    return [folder / f"{frame:06d}.{instance}.npy" for instance in range(instances)]
+
+
+def _write_indices(frame: SimulatedFrame, outputs: FrameOutputs) -> None:
+    if outputs.indices is None:
+        return
+    parts = frame.cut.indices()
+    for nodes, file in zip(parts, index_files(outputs.indices, frame.number, len(parts)), strict=True):
+        if outputs.padded:
+            nodes = np.concatenate([nodes, np.zeros(-len(nodes) % ROW, np.uint32)]).reshape(-1, ROW)
+        out = io.BytesIO()
+        np.save(out, nodes)
+        write_file(file, [out.getvalue()], overwrite=outputs.overwrite)
+
+
+def _plot(simulation: Simulation, path: CameraPath, target: Path, data: _ChartData, *, overwrite: bool) -> str | None:
+    """Write the charts, with the path over the cut of an extreme frame; returns a note if that picture is missing."""
+    from ..figures import charts
+
+    frame = data.best()
+    cut = simulation.scenes.cut_of(frame.cut)
+    scene = charts.PathScene(
+        path.cameras,
+        cut.splats,
+        np.concatenate([part.depth for part in cut.parts]),
+        path.numbers.index(frame.number),
+        "level" if simulation.scenes.in_runs else "tree depth",
+    )
+    marked = {moment.criterion: moment.frame for moment in data.lookout.moments()}
+    drawn = charts.plot(data.rows, marked, simulation.scenes.title, scene)
+    write_file(target, [drawn.png], overwrite=overwrite)
+    return drawn.note
