@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sparklod_cli.codecs.file_names import TILESET
+from sparklod_cli.codecs.formats import TILESET
 from sparklod_cli.codecs.tiles_3d.tileset import to_tileset
 from sparklod_cli.io import read_scene
 from tests.interop.engines.browser import Browser, Shown

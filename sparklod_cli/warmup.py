@@ -14,7 +14,7 @@ from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from .codecs.file_names import RAD_SUFFIX
+from .codecs.formats import RAD_SUFFIX
 from .system import jit
 from .system.errors import SparklodError
 from .system.kernel_cache import PACKAGE, KernelCache, stem_of

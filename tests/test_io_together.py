@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from sparklod_cli.codecs import file_names
+from sparklod_cli.codecs import formats
 from sparklod_cli.codecs.rad import rad_header
 from sparklod_cli.codecs.rad.rad_header import RadChunkEntry, RadHeader
 from sparklod_cli.io import companions, siblings_of
@@ -24,7 +24,7 @@ posix = pytest.mark.skipif(os.name != "posix", reason="POSIX only")
 def files(count: int, stem: str = "x") -> Iterator[tuple[str, Iterable[bytes]]]:
     """What a codec writes: chunks, and their header last."""
     for number in range(count):
-        yield file_names.rad_chunk_name(stem, number), [b"chunk ", str(number).encode()]
+        yield formats.rad_chunk_name(stem, number), [b"chunk ", str(number).encode()]
     yield f"{stem}.rad", [b"header"]
 
 
@@ -52,13 +52,13 @@ def test_chunks_stand_beside_the_header(name: str, tmp_path: Path) -> None:
 
 
 def test_names_that_are_not_of_chunks_are_told_apart() -> None:
-    assert [
-        file_names.rad_chunk_number(file_names.rad_chunk_name("x-lod", number), "x-lod") for number in (0, 7, 12345)
-    ] == [*(0, 7, 12345)]
+    assert [formats.rad_chunk_number(formats.rad_chunk_name("x-lod", number), "x-lod") for number in (0, 7, 12345)] == [
+        *(0, 7, 12345)
+    ]
     for name in ("x-lod.rad", "x-lod-01.radc", "x-lod-.radc", "x-lod--1.radc", "x-lod-1.rad", "x-lod-1-1.radc"):
-        assert file_names.rad_chunk_number(name, "x-lod") is None
+        assert formats.rad_chunk_number(name, "x-lod") is None
     for name in ("y-lod-1.radc", "1.radc", "x-lod1.radc", "x-lod-1.radc.bak", "x-lod-1.RADC", "x-lod-٣.radc"):
-        assert file_names.rad_chunk_number(name, "x-lod") is None
+        assert formats.rad_chunk_number(name, "x-lod") is None
 
 
 def test_chunks_of_a_longer_output_are_removed_and_nothing_else(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
-from sparklod_cli.codecs.file_names import TILESET
+from sparklod_cli.codecs.formats import TILESET
 from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.codecs.tiles_3d.codec import encode_files
 from sparklod_cli.io import parts_output

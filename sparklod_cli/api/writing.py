@@ -8,7 +8,7 @@ from pathlib import Path
 from types import NoneType
 from typing import TYPE_CHECKING
 
-from ..codecs.file_names import MANIFEST
+from ..codecs.formats import MANIFEST
 from ..codecs.options import DEFAULT_COMPRESSION
 from ..io import parts_output, scene_output, write_scene
 from ..model.scene import Scene

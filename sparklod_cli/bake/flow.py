@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..codecs.file_names import META, RAD_SUFFIX
+from ..codecs.formats import META, RAD_SUFFIX
 from ..codecs.reader import Reader
 from ..io.reading import Source, open_reader
 from ..lod.builders import METHODS

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..codecs.file_names import ENVIRONMENT, folders_of
+from ..codecs.formats import ENVIRONMENT, folders_of
 from ..codecs.options import WriteOptions
 from ..lod.detail_rule import DetailSettings
 from ..lod.tile_settings import TileSettings

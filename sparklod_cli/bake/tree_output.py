@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..codecs import clamps
 from ..codecs.encoder import CLAMPED, Encoder, Stored, Windows, windows_of
-from ..codecs.file_names import RAD_SUFFIX as RAD
+from ..codecs.formats import RAD_SUFFIX as RAD
 from ..codecs.formats import WRITABLE, Format
 from ..codecs.options import DEFAULTS, WriteOptions
 from ..codecs.rad.rad_layout import OPTIONS

@@ -15,9 +15,8 @@ from ..system.errors import FormatError
 from ..system.progress import Progress
 from ..system.units import count_of
 from . import quantize
-from .left_out import HARMLESS, left_out
 from .ply_header import PlyHeader, offset_of, read_header
-from .reader import OpenFile, Positioned, Reader, Rows, Target, decode_rows, rows_of, size_of
+from .reader import HARMLESS, OpenFile, Positioned, Reader, Rows, Target, decode_rows, left_out, rows_of, size_of
 
 #: Splats of a chunk, which share bounds.
 CHUNK_SPLATS = 256

@@ -1,24 +1,29 @@
-"""Several scenes as one."""
+"""Several scenes, and the splat files beside a manifest, as one scene."""
 
 from __future__ import annotations
 
 import bisect
+import contextlib
 import dataclasses
 import itertools
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+import posixpath
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import BinaryIO
 
 import numpy as np
 
 from ..model.axes import common, differing, rotated
 from ..model.sh import COEFFICIENTS
-from ..model.splats import Splats
+from ..model.splats import COLUMNS, Splats
 from ..model.transforms import Transform
-from ..system.errors import naming
-from ..system.progress import Progress
+from ..system.errors import FormatError, UnsupportedError, naming
+from ..system.progress import Progress, silent
+from ..system.threads import ordered_map
 from ..system.units import count_of
-from .reader import Reader, Target
-from .scene_files import copy_rows
+from ..system.untrusted import quoted_value
+from .reader import Fill, OpenCompanion, OpenFile, Reader, Target, size_of
+from .validation import error_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,3 +107,192 @@ def _padded(splats: Splats, sh_degree: int) -> Splats:
     sh = np.zeros((len(splats), COEFFICIENTS[sh_degree], 3), np.float32)
     sh[:, : splats.sh.shape[1]] = splats.sh
     return dataclasses.replace(splats, sh=sh)
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Run of splats of a file: the first, how many, and the row that the first of them gets."""
+
+    start: int
+    count: int
+    row: int
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """Splat file, as far as its header tells, and the pieces of it to read.
+
+    Attributes:
+        name: path from the manifest's folder on.
+        count: all its splats.
+        sh_degree, antialiased, up, up_by, format, notes: as of a scene.
+        bytes: of it and the files that it names.
+        pieces: to read.
+    """
+
+    name: str
+    count: int
+    sh_degree: int
+    antialiased: bool
+    bytes: int
+    pieces: tuple[Piece, ...]
+    up: str | None = None
+    format: str = ""
+    notes: tuple[str, ...] = ()
+    up_by: str = ""
+
+    @property
+    def rows(self) -> int:
+        """Number of splats in the pieces."""
+        return sum(piece.count for piece in self.pieces)
+
+
+@dataclass(frozen=True)
+class SceneFiles:
+    """Splat files beside a manifest.
+
+    Attributes:
+        open_companion: opens them; None where there are no other files to open.
+        manifest: what it is called, for messages.
+        code: of the rule that they can be read.
+        open_content: reads the header of one, given its name, too.
+    """
+
+    open_companion: OpenCompanion | None
+    manifest: str
+    code: str
+    open_content: Callable[[str, OpenFile], Reader]
+
+    def open(self, name: str, pieces: Sequence[Piece] | None = None, row: int = 0) -> Chunk:
+        """Read the header of a file.
+
+        Args:
+            pieces: to read later; None for all of it, from `row` on.
+
+        Raises:
+            FormatError: it cannot be read, or is of another format; names it.
+        """
+        with self._opened(name) as source:
+            size = size_of(source.file)
+            content = self.open_content(name, source)
+        return Chunk(
+            name,
+            content.count,
+            content.sh_degree,
+            content.antialiased,
+            content.header.get("bytes", size),
+            (Piece(0, content.count, row),) if pieces is None else tuple(pieces),
+            content.up,
+            content.format,
+            content.notes,
+            content.up_by,
+        )
+
+    def read(
+        self,
+        chunks: Sequence[Chunk],
+        out: Splats,
+        threads: int = 1,
+        progress: Progress = silent,
+        first_row: int = 0,
+    ) -> None:
+        """Fill rows with the pieces of files, several files at a time, on several threads.
+
+        Args:
+            chunks: whose pieces together have every row of `out` once.
+            out: SH coefficients that a file does not have become 0.
+            first_row: that the first row of `out` has in the pieces.
+
+        Raises:
+            FormatError: a file is broken; names it.
+        """
+        together = min(threads, len(chunks))
+
+        def work(chunk: Chunk) -> int:
+            with self._opened(chunk.name) as source:
+                reader = replace(self.open_content(chunk.name, source), threads=max(1, threads // together))
+                splats, _ = reader.read(0, reader.count, once=True)
+            if (reader.count, reader.sh_degree) != (chunk.count, chunk.sh_degree):
+                raise FormatError(f"{quoted_value(chunk.name)} was changed while it was read; start again")
+            for piece in chunk.pieces:
+                _copy(out, piece, piece.row - first_row, splats)
+            return chunk.rows
+
+        done = 0
+        for rows in ordered_map(work, chunks, together):
+            done += rows
+            progress("reading", done, len(out), "splat")
+
+    def fill(self, chunks: Sequence[Chunk], degree: int, threads: int) -> Fill:
+        """Return what fills the rows of files, one after the other; where blocks are read, one file stays in memory.
+
+        Args:
+            chunks: whose pieces have the rows in order where they are read in blocks.
+            degree: SH degree of the rows.
+            threads: to read a file on, for a block.
+        """
+        count = sum(chunk.rows for chunk in chunks)
+        last: dict[int, Splats] = {}
+
+        def decoded(chunk: Chunk, row: int) -> Splats:
+            if row not in last:
+                last.clear()
+                splats = Splats.empty(chunk.rows, degree)
+                self.read([chunk], splats, threads, first_row=row)
+                last[row] = splats
+            return last[row]
+
+        def fill(target: Target, threads: int, progress: Progress) -> None:
+            if len(target.splats) == count:
+                self.read(chunks, target.splats, threads, progress)
+                return
+            end = 0
+            for chunk in chunks:
+                begin, end = end, end + chunk.rows
+                start, stop = max(target.start, begin), min(target.stop, end)
+                if start < stop:
+                    part = decoded(chunk, begin).rows(slice(start - begin, stop - begin))
+                    copy_rows(part, target.rows(slice(start, stop)))
+            if target.stop == count:
+                last.clear()
+
+        return fill
+
+    @contextlib.contextmanager
+    def _opened(self, name: str) -> Iterator[OpenFile]:
+        """Open a file, and what opens the files beside it; errors of the body name it."""
+        if self.open_companion is None:
+            raise FormatError(f"{self.manifest} names {quoted_value(name)}, but other files cannot be opened here")
+        open_companion, folder = self.open_companion, posixpath.dirname(name)
+
+        def beside(other: str) -> BinaryIO:
+            return open_companion(f"{folder}/{other}" if folder else other)
+
+        try:
+            opened = open_companion(name)
+        except FormatError as error:  # which names it
+            raise error_of(self.code, str(error)) from None
+        with opened as file:
+            try:
+                yield OpenFile(file, beside)
+            except UnsupportedError as error:  # the file is sound
+                raise UnsupportedError(f"{quoted_value(name)}: {error}") from None
+            except FormatError as error:
+                raise error_of(self.code, f"{quoted_value(name)}: {error}") from None
+
+
+def _copy(out: Splats, piece: Piece, row: int, splats: Splats) -> None:
+    """Copy a piece of a file to rows."""
+    copy_rows(splats.rows(slice(piece.start, piece.start + piece.count)), out.rows(slice(row, row + piece.count)))
+
+
+def copy_rows(splats: Splats, out: Splats) -> None:
+    """Copy splats to as many rows; SH coefficients that they do not have become 0."""
+    for name in COLUMNS:
+        column = getattr(out, name)
+        if name == "sh":
+            has = splats.sh.shape[1]
+            column[:, has:] = 0
+            column[:, :has] = splats.sh
+        else:
+            column[...] = getattr(splats, name)

@@ -28,10 +28,23 @@ from ..system.untrusted import quoted
 from . import quantize
 from .clamps import CodeRange
 from .file_notes import comment_of, read_comment
-from .left_out import HARMLESS, Note, left_out
 from .options import DEFAULTS, WriteOptions
 from .ply_header import PlyHeader, first_value, offset_of, read_header
-from .reader import OpenFile, Positioned, Reader, Rows, Scratch, Target, decode_rows, encode_rows, rows_of, size_of
+from .reader import (
+    HARMLESS,
+    Note,
+    OpenFile,
+    Positioned,
+    Reader,
+    Rows,
+    Scratch,
+    Target,
+    decode_rows,
+    encode_rows,
+    left_out,
+    rows_of,
+    size_of,
+)
 
 Coding = Callable[[FloatArray], FloatArray]
 

@@ -15,7 +15,7 @@ from typing import IO, BinaryIO
 from ..system.errors import ChecksumError, FormatError, NotSplatsError
 from ..system.untrusted import quoted, quoted_value
 from .compression import check_promise
-from .file_names import MANIFEST, META, TILESET
+from .formats import MANIFEST, META, TILESET
 from .reader import size_of
 
 #: What `zipfile` raises on archives that are damaged, encrypted or of a kind that it does not read.

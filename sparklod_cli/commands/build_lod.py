@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..codecs.file_names import MANIFEST, TILESET
-from ..codecs.file_names import RAD_SUFFIX as RAD
-from ..codecs.formats import ENCODINGS, FORMATS, NPZ, RAW_SUFFIXES, WRITABLE, ending_of
+from ..codecs.formats import ENCODINGS, FORMATS, MANIFEST, NPZ, RAW_SUFFIXES, TILESET, WRITABLE, ending_of
+from ..codecs.formats import RAD_SUFFIX as RAD
 from ..codecs.options import RadOptions, SogOptions, WriteOptions
 from ..fitting.settings import FitSettings
 from ..lod.detail_rule import DetailSettings

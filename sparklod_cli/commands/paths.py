@@ -13,7 +13,7 @@ from typing import Any
 
 import click
 
-from ..codecs.file_names import MANIFEST, META, TILESET
+from ..codecs.formats import MANIFEST, META, TILESET
 from ..system.addresses import Address, Place, place_of
 from ..system.stdio import DASH
 from .command import flag_of

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..codecs.left_out import code_of
+from ..codecs.reader import code_of
 from ..codecs.spz_streams import KNOWN_FLAGS
 from ..io import opened, read_arrays, read_scene, size_of_input
 from ..io.rad_file import FORMAT as RAD

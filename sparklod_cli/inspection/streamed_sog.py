@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import BinaryIO
 
+from ..codecs.merging import Chunk
 from ..codecs.reader import OpenCompanion, size_of
-from ..codecs.scene_files import Chunk
 from ..codecs.streamed_sog.manifest import VERSION, Manifest, ManifestNode
 from ..codecs.streamed_sog.manifest_rules import level_counts, scan_files, scan_splats
 from ..system.printable import MOST, printable

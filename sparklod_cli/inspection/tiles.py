@@ -8,8 +8,8 @@ from typing import BinaryIO
 
 import numpy as np
 
+from ..codecs.merging import Chunk
 from ..codecs.reader import OpenCompanion
-from ..codecs.scene_files import Chunk
 from ..codecs.tiles_3d.codec import tile_files
 from ..codecs.tiles_3d.tileset import MAX_TILESET, Tileset, read_whole
 from ..codecs.tiles_3d.tileset_rules import (

@@ -1,6 +1,6 @@
 """Opens inputs, recognises their formats and reads them; decides which files a scene becomes.
 
-What most jobs need is imported here; `rad_file` and `details` are imported by those who need them.
+What most jobs need is imported here; `rad_file` is imported where it is needed.
 """
 
 from .local_files import (

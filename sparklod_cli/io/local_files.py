@@ -12,8 +12,7 @@ from collections.abc import Collection, Iterable
 from pathlib import Path, PurePath
 from typing import BinaryIO
 
-from ..codecs.file_names import FIRST_FILES, MANIFEST, META, TILESET
-from ..codecs.formats import FORMATS, POINTER, SHORT, head_of, is_pointer, sniff
+from ..codecs.formats import FIRST_FILES, FORMATS, MANIFEST, META, POINTER, SHORT, TILESET, head_of, is_pointer, sniff
 from ..model.splats import FloatArray
 from ..system.addresses import Place, size_of
 from ..system.errors import FormatError, UnreadableError, reason_of

@@ -7,11 +7,12 @@ from collections.abc import Iterator
 from pathlib import Path, PurePath
 from typing import Any
 
-from ..codecs.file_names import (
+from ..codecs.formats import (
     MANIFEST,
     META,
     TILES,
     TILESET,
+    Format,
     chunk_folder,
     is_chunk_folder,
     is_in_manifest,
@@ -20,7 +21,6 @@ from ..codecs.file_names import (
     rad_chunk_number,
     sog_image_number,
 )
-from ..codecs.formats import Format
 from ..codecs.options import WriteOptions
 from ..model.scene import Scene
 from ..system.addresses import Place

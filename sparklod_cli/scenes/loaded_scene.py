@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..codecs.gpu import loaded_nodes, lod_tree
-from ..io.details import LevelFiles
 from ..lod import detail_rule, tile_settings
 from ..lod.detail_traversal import DetailFiles
 from ..model.lod_tree import CHUNK_NODES, LodTree, Nodes
@@ -250,18 +249,6 @@ def whole_scene(parts: DetailScene | TileScene) -> Scene:
         degree = min(splats.sh_degree, parts.environment.sh_degree)
         splats = Splats.concat([part.with_max_sh(degree) for part in (splats, parts.environment)])
     return Scene(splats, **facts_of(parts))
-
-
-def files_of(found: LevelFiles) -> DetailFiles:
-    """Return the chunk files of a manifest; regions are in its order."""
-    manifest = found.manifest
-    of_run = np.full((sum(1 for _ in manifest.regions()), manifest.levels), -1, np.int64)
-    for row, (_, node) in zip(of_run, manifest.regions(), strict=True):
-        for level, run in (node.runs or {}).items():
-            if run.count:
-                row[level] = run.file
-    environment = None if manifest.environment is None else len(manifest.filenames)
-    return DetailFiles(of_run, np.array(found.sizes, np.int64), environment, found.bytes, found.requests)
 
 
 def files_in_memory(detail: DetailScene) -> DetailFiles:

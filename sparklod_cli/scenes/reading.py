@@ -11,12 +11,14 @@ from pathlib import Path
 import numpy as np
 
 from ..codecs.formats import PRECISIONS
-from ..codecs.reader import decode_file
+from ..codecs.reader import OpenCompanion, decode_file, size_of
 from ..codecs.rounding import after
+from ..codecs.streamed_sog.manifest import MAX_MANIFEST, parse
+from ..codecs.streamed_sog.manifest_rules import files_of_chunk
 from ..io import opened, size_of_input
-from ..io.details import read_level_files
 from ..io.rad_file import FORMAT as RAD
 from ..io.rad_file import RadFile
+from ..lod.detail_traversal import DetailFiles
 from ..model.instances import Instance, Source
 from ..model.lod_tree import CHUNK_NODES, LodTree
 from ..model.scene import DetailScene, Scene
@@ -35,7 +37,6 @@ from .loaded_scene import (
     LoadedTiles,
     bytes_of,
     files_in_memory,
-    files_of,
     nodes_of,
     whole_scene,
 )
@@ -124,8 +125,39 @@ def _loaded_runs(
     if isinstance(found, TileScene):
         size = found.header.get("bytes", bytes_of(scene.splats))
         return LoadedTiles(file, size, scene, drawn, chunks, tiles=found)
-    files = files_in_memory(found) if file is None else files_of(read_level_files(file))
+    files = files_in_memory(found) if file is None else read_detail_files(file)
     return LoadedDetail(file, int(files.sizes.sum()) + files.manifest, scene, drawn, chunks, detail=found, files=files)
+
+
+def read_detail_files(path: Path) -> DetailFiles:
+    """Return the files of a lod-meta.json, or of the folder that holds it; regions are in the order of the manifest.
+
+    Raises:
+        FormatError: it cannot be read, or is no such manifest.
+    """
+    with opened(path) as (file, _, more):
+        data = file.read(MAX_MANIFEST + 1)
+        manifest = parse(data)
+        requests = tuple(_bytes_of_files(more["open_companion"], name) for name in manifest.names())
+    of_run = np.full((sum(1 for _ in manifest.regions()), manifest.levels), -1, np.int64)
+    for row, (_, node) in zip(of_run, manifest.regions(), strict=True):
+        for level, run in (node.runs or {}).items():
+            if run.count:
+                row[level] = run.file
+    environment = None if manifest.environment is None else len(manifest.filenames)
+    return DetailFiles(of_run, np.array([*map(sum, requests)], np.int64), environment, len(data), requests)
+
+
+def _bytes_of_files(open_companion: OpenCompanion, name: str) -> tuple[int, ...]:
+    """Return the bytes of the files of a chunk; () where one cannot be read, which reading its splats reports."""
+    sizes = list[int]()
+    try:
+        for each in files_of_chunk(open_companion, name):
+            with open_companion(each) as file:
+                sizes.append(size_of(file))
+    except FormatError:
+        return ()
+    return tuple(sizes)
 
 
 def _read(

@@ -13,8 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import quote
 
-from ..codecs.file_names import META
-from ..codecs.formats import ZIP, head_of
+from ..codecs.formats import META, ZIP, head_of
 from ..codecs.glb.codec import open_content as open_glb
 from ..codecs.glb.glb_container import MAGIC as GLB_MAGIC
 from ..codecs.rad.rad_header import CHUNK_MAGIC, MAGIC, RadHeader, read_header

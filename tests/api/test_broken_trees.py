@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 import sparklod_cli as sparklod
-from sparklod_cli.codecs.file_names import MANIFEST
+from sparklod_cli.codecs.formats import MANIFEST
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene, Tree
 from tests.conftest import ROOT

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 import sparklod_cli as sparklod
 from fuzz.laws import check_passes
-from sparklod_cli.codecs.file_names import MANIFEST
+from sparklod_cli.codecs.formats import MANIFEST
 from sparklod_cli.codecs.options import RadOptions, SogOptions
 from sparklod_cli.codecs.rad.rad_layout import OPTIONS, choices
 from sparklod_cli.lod.builders import METHODS

@@ -13,8 +13,7 @@ import sparklod_cli as sparklod
 from sparklod_cli.bake.flow import bake
 from sparklod_cli.bake.settings import BakeSettings
 from sparklod_cli.bake.simplifying import extract_leaves
-from sparklod_cli.codecs.file_names import MANIFEST
-from sparklod_cli.codecs.formats import ENCODINGS, WRITABLE
+from sparklod_cli.codecs.formats import ENCODINGS, MANIFEST, WRITABLE
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
 from sparklod_cli.codecs.splat_encoding import SplatEncoding
 from sparklod_cli.lod.detail_rule import DetailSettings

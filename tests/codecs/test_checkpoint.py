@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 
 from fixtures import by_hand_checkpoint
-from sparklod_cli.codecs import checkpoint, tensor_pickle
+from sparklod_cli.codecs import checkpoint
+from sparklod_cli.codecs.checkpoint import Tensor, unpickled
 from sparklod_cli.codecs.reader import decode_file
-from sparklod_cli.codecs.tensor_pickle import Tensor, unpickled
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.sh import SH_C0
 from sparklod_cli.model.splats import COLUMNS
@@ -177,7 +177,7 @@ def test_a_small_pickle_takes_little_time_and_memory(before: bytes) -> None:
 
 def test_a_pickle_of_too_many_steps_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     assert unpickled(b"\x80\x02]" + b"N" * 90 + b".") is None
-    monkeypatch.setattr(tensor_pickle, "MOST_STEPS", 90)
+    monkeypatch.setattr(checkpoint, "MOST_STEPS", 90)
     with pytest.raises(FormatError, match="more than 90 steps"):
         unpickled(b"\x80\x02" + b"N" * 90 + b".")
 

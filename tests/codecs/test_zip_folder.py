@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 
 from sparklod_cli.cli import run
+from sparklod_cli.codecs.streamed_sog.manifest import parse
 from sparklod_cli.codecs.zip_folder import ZipFolder
 from sparklod_cli.io import read_parts, read_scene
-from sparklod_cli.io.details import read_level_files
 from sparklod_cli.io.reading import open_reader
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS
+from sparklod_cli.scenes.reading import read_detail_files
 from sparklod_cli.system.errors import FormatError, NotSplatsError
 from tests.conftest import FIXTURES, Capture
 
@@ -69,8 +70,9 @@ def test_a_zip_has_the_levels_and_sizes_of_its_folder(kind: str, tmp_path: Path)
     np.testing.assert_array_equal(found.splats.center, expected.splats.center)
     np.testing.assert_array_equal(found.counts, expected.counts)
     if kind == "sh1-streamed-sog":
-        assert read_level_files(path).sizes == read_level_files(SETS[kind]).sizes
-        assert min(read_level_files(path).sizes) > 0
+        sizes = read_detail_files(path).sizes
+        assert sizes.tolist() == read_detail_files(SETS[kind]).sizes.tolist()
+        assert min(sizes) > 0
 
 
 def test_bundles_in_a_zip_are_read(tmp_path: Path) -> None:
@@ -86,9 +88,9 @@ def test_bundles_in_a_zip_are_read(tmp_path: Path) -> None:
     (tmp_path / "flat" / "lod-meta.json").write_bytes(manifest)
     path = zipped(tmp_path / "scene.ssog", files_in(tmp_path / "flat"))
     assert_same(read_scene(path), read_scene(SETS["sh1-streamed-sog"]))
-    sizes = read_level_files(tmp_path / "flat").sizes
-    assert sizes == read_level_files(path).sizes
-    assert sizes == tuple((tmp_path / "flat" / name).stat().st_size for name in read_level_files(path).manifest.names())
+    sizes = read_detail_files(tmp_path / "flat").sizes.tolist()
+    assert sizes == read_detail_files(path).sizes.tolist()
+    assert sizes == [(tmp_path / "flat" / name).stat().st_size for name in parse(manifest).names()]
 
 
 def test_commands_read_a_zipped_streamed_sog(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:

@@ -15,7 +15,7 @@ from ...model.sh import COEFFICIENTS, notes_on_degree
 from ...model.splats import FloatArray, Splats
 from ...system.errors import FormatError
 from .. import quantize
-from ..left_out import left_out
+from ..reader import left_out
 
 EXTENSION, COMPRESSION = "KHR_gaussian_splatting", "KHR_gaussian_splatting_compression_spz_2"
 

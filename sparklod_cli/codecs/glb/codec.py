@@ -31,10 +31,9 @@ from .. import spz
 from ..clamps import SPZ, CodeRange
 from ..compression import check_promise
 from ..file_notes import FileNote, note_of, read_note
-from ..left_out import left_out
+from ..merging import copy_rows
 from ..options import CESIUM, DEFAULTS, KHRONOS, WriteOptions
-from ..reader import OpenFile, Reader, Target, encode_rows
-from ..scene_files import copy_rows
+from ..reader import OpenFile, Reader, Target, encode_rows, left_out
 from .attributes import (
     ATTRIBUTES,
     COMPRESSION,

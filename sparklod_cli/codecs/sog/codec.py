@@ -30,12 +30,11 @@ from ...system.untrusted import Json, quoted_value
 from .. import quantize, sh_palette
 from ..clamps import CodeRange
 from ..compression import check_promise
-from ..file_names import META, SOG_IMAGES
 from ..file_notes import note_of, read_note
+from ..formats import META, SOG_IMAGES
 from ..kernels import texels
-from ..left_out import Note
 from ..options import DEFAULTS, MAX_SH_CODES, WriteOptions
-from ..reader import OpenFile, Positioned, Reader, Target
+from ..reader import Note, OpenFile, Positioned, Reader, Target
 from . import texel_codings as codings
 from .sog_container import LARGEST, MAX_SIDE, Pixels, SogFiles, Texels, encode_webp, has, image_of, size_for, zipped
 from .texel_codings import codebook, even_codebook, nearest

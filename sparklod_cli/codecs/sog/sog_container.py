@@ -20,7 +20,7 @@ from ...system.errors import FormatError, NotSplatsError
 from ...system.units import count_of
 from ...system.untrusted import Json, Origin, quoted_value
 from ..compression import check_promise
-from ..file_names import META, SOG_IMAGES
+from ..formats import META, SOG_IMAGES
 from ..reader import OpenCompanion, size_of
 from ..zip_folder import PIECE, ZipFolder
 

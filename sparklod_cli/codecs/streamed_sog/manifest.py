@@ -16,8 +16,8 @@ from typing import Any
 from ...system.errors import VersionError
 from ...system.untrusted import Json, quoted_value
 from .. import quantize
-from ..file_names import MANIFEST
 from ..file_notes import FileNote, read_note
+from ..formats import MANIFEST
 from ..json_trees import nodes_of, parse_manifest, place_of
 
 #: The version that is read and written. A manifest from before versions has none.

@@ -17,12 +17,10 @@ from ...system.errors import FormatError
 from ...system.progress import Progress, silent
 from ...system.units import count_of
 from ...system.untrusted import quoted_value
-from ..file_names import MANIFEST
-from ..formats import ZIP
+from ..formats import MANIFEST, ZIP
 from ..json_trees import leads_away
-from ..left_out import code_of
-from ..reader import OpenCompanion
-from ..scene_files import Chunk, SceneFiles
+from ..merging import Chunk, SceneFiles
+from ..reader import OpenCompanion, code_of
 from ..sog import codec as sog
 from ..sog import texel_codings
 from ..sog.sog_container import MAX_META, image_names, parse_meta

@@ -26,14 +26,13 @@ from ...system.progress import Progress, silent
 from ...system.threads import ordered_map
 from ...system.untrusted import quoted_value
 from ..compression import check_promise
-from ..file_names import TILES, TILESET
 from ..file_notes import note_of
+from ..formats import TILES, TILESET
 from ..glb import codec as glb
 from ..glb.glb_container import transform_of
-from ..left_out import Note
+from ..merging import Chunk, SceneFiles
 from ..options import CESIUM, WriteOptions
-from ..reader import OpenCompanion, OpenFile, Reader
-from ..scene_files import Chunk, SceneFiles
+from ..reader import Note, OpenCompanion, OpenFile, Reader
 from ..validation import check_rules, error_of
 from .tileset import (
     CONTENT_GLTF,

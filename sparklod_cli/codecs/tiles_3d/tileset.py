@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from ...model.scene import Bounds
 from ...system.errors import FormatError, VersionError
 from ...system.untrusted import Json, quoted_value
-from ..file_names import TILESET
 from ..file_notes import FileNote, read_note
+from ..formats import TILESET
 from ..glb.glb_container import rotation_of_up
 from ..json_trees import nodes_of, parse_manifest, place_of
 from ..reader import OpenCompanion

@@ -17,7 +17,7 @@ from ...system.untrusted import quoted_value
 from ..glb.attributes import COMPRESSION, EXTENSION
 from ..glb.glb_container import product
 from ..json_trees import leads_away
-from ..scene_files import Chunk, SceneFiles
+from ..merging import Chunk, SceneFiles
 from ..validation import LOOSE_BOUND, RuleViolation, count_outside, error_of
 from .tileset import (
     CONTENT_GLTF,

@@ -24,7 +24,7 @@ from sparklod_cli.bake.out_of_core import cluster as module
 from sparklod_cli.bake.out_of_core.cluster import ClusterEngine, ClusterSettings, cluster
 from sparklod_cli.bake.out_of_core.job import Engine
 from sparklod_cli.bake.settings import Baked, BakeSettings, Resources
-from sparklod_cli.codecs.file_names import RAD_SUFFIX as RAD
+from sparklod_cli.codecs.formats import RAD_SUFFIX as RAD
 from sparklod_cli.system.addresses import Address, Place
 from sparklod_cli.system.errors import SparklodError
 from sparklod_cli.system.progress import Progress, silent

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from fixtures import by_hand_sog, by_hand_streamed_sog
+from sparklod_cli.codecs.merging import SceneFiles
 from sparklod_cli.codecs.reader import decode_file
-from sparklod_cli.codecs.scene_files import SceneFiles
 from sparklod_cli.codecs.streamed_sog import codec
 from sparklod_cli.io import open_reader, read_parts, read_scene
 from sparklod_cli.model.scene import DetailScene, Scene

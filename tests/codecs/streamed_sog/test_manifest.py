@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sparklod_cli.codecs.file_names import is_of_streamed_sog
+from sparklod_cli.codecs.formats import is_of_streamed_sog
 from sparklod_cli.codecs.streamed_sog import manifest as manifests
 from sparklod_cli.codecs.streamed_sog.manifest import LARGEST, Manifest, ManifestNode, Run, parse, serialise
 from sparklod_cli.system.errors import FormatError, VersionError

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli.codecs import ply
-from sparklod_cli.codecs.file_names import ENVIRONMENT_FILE
+from sparklod_cli.codecs.formats import ENVIRONMENT_FILE
 from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.io import read_scene
 from sparklod_cli.model.scene import Scene

@@ -14,7 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 from sparklod_cli.cameras.camera import Camera
-from sparklod_cli.codecs.file_names import TILESET
+from sparklod_cli.codecs.formats import TILESET
 from sparklod_cli.io import read_parts, read_scene
 from sparklod_cli.lod.settings import pixel_limit
 from sparklod_cli.lod.tile_settings import TileSettings
