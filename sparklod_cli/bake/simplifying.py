@@ -18,7 +18,8 @@ from ..codecs.formats import WRITABLE
 from ..codecs.options import WriteOptions
 from ..codecs.spz import like
 from ..codecs.validation import check_valid
-from ..fitting.settings import FitReport, FitSettings
+from ..fitting.report import FitReport
+from ..fitting.settings import FitSettings
 from ..io import read_scene
 from ..io.writing import encoded, scene_output, write_scene
 from ..lod.detail_levels import RefinementOrder, with_plain_opacity

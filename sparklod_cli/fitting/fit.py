@@ -38,7 +38,8 @@ from .pictures import (
     scores_of,
     split_path,
 )
-from .settings import FitReport, FitSettings, FitStage
+from .report import FitReport, FitStage
+from .settings import FitSettings
 
 #: Stages, after each of which held-out cameras decide.
 STAGES = 12

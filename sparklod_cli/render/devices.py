@@ -4,24 +4,17 @@ from __future__ import annotations
 
 import importlib.util
 from collections.abc import Callable
-from typing import Any
 
 from ..system.errors import BackendError
-from ..system.setting_fields import setting
 
 #: Devices that can be requested: a card if there is one; the processor; a card.
 DEVICES = ("auto", "cpu", "cuda")
 
-
-def device_setting(user: str, *, needs: str = "") -> Any:
-    """Return a `setting` for one of `DEVICES`; `user` is what computes on it."""
-    return setting(
-        "cpu",
-        f"What {user} computes with: an NVIDIA card if there is one (auto), the processor, or a card (cuda). Cards are"
-        " tested in a simulator only.",
-        DEVICES,
-        needs=needs,
-    )
+#: Help of a setting of one of them; {} is what computes on it.
+DEVICE_HELP = (
+    "What {} computes with: an NVIDIA card if there is one (auto), the processor, or a card (cuda). Cards are tested in"
+    " a simulator only."
+)
 
 
 def uses_card(device: str, say: Callable[[str], None] = lambda text: None) -> bool:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from ..model import FARTHEST, MAX_SH_DEGREE
 from ..system.setting_fields import CheckedSettings, Range, setting, whole
-from .devices import device_setting
+from .devices import DEVICE_HELP, DEVICES
 
 if TYPE_CHECKING:
     from ..cameras.camera import Camera
@@ -140,7 +140,7 @@ class RenderSettings(CheckedSettings):
         "Renderer: numba is the reference, osmesa is OpenGL in software, open3d is a quick look.",
         tuple(name for name in BACKENDS if name != ON_CARD),
     )
-    device: str = device_setting("the backend numba")
+    device: str = setting("cpu", DEVICE_HELP.format("the backend numba"), DEVICES)
     color_by: str | None = setting(
         None,
         "Colour splats by a quantity, unlit, with a colour bar beside the picture.  [default: their own colours]",

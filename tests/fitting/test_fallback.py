@@ -12,7 +12,8 @@ from sparklod_cli.fitting.fit import Optimiser, fit
 from sparklod_cli.fitting.kernels.adam import Rates
 from sparklod_cli.fitting.nodes import FittedNodes, Index
 from sparklod_cli.fitting.pictures import FullDetailPicture
-from sparklod_cli.fitting.settings import FitReport, FitSettings
+from sparklod_cli.fitting.report import FitReport
+from sparklod_cli.fitting.settings import FitSettings
 from sparklod_cli.lod import quality
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.system.errors import BackendError
