@@ -7,7 +7,7 @@ import json
 import os
 import sys
 import threading
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from time import monotonic, time
 from types import TracebackType
@@ -17,7 +17,6 @@ import click
 
 from ..system import interrupts
 from ..system.printable import MOST, printable
-from ..system.progress import StagedProgress
 from ..system.stdio import silence
 from ..system.units import count_of as count_of
 from ..system.units import format_duration, format_size
@@ -61,14 +60,6 @@ def _wrapped(line: str, width: int, indent: int) -> list[str]:
     joined = re.sub(r"(?<=[\d:]) (?=\S)", "\N{NO-BREAK SPACE}", line)
     broken = textwrap.wrap(joined, width, subsequent_indent=" " * indent, break_on_hyphens=False)
     return [part.replace("\N{NO-BREAK SPACE}", " ") for part in broken]
-
-
-def _columns() -> int | None:
-    """Return the columns of the terminal; None if standard error is not a terminal."""
-    try:
-        return os.get_terminal_size(sys.stderr.fileno()).columns or None
-    except (AttributeError, OSError, ValueError):  # it is closed, redirected, or no file
-        return None
 
 
 def is_terminal(stream: TextIO | None) -> bool:
@@ -149,15 +140,28 @@ class Console:
         self._bars = not quiet and is_terminal(sys.stderr)
         self._bar: Any = None
         self._stage, self._start, self._logged = "", 0.0, 0.0
-        self._job: StagedProgress | None = None
-        self._ended = contextlib.ExitStack()
+        #: Begin and share of each stage of a job, 0 to 1, and how much of the job is done, which never falls.
+        self._job: dict[str, tuple[float, float]] | None = None
+        self._reached = 0.0
+        #: Ends the reports of compilation; duration of each; the process that compiles ahead, and for which work.
+        self._stop_listening: Callable[[], None] | None = None
+        self._compiled: list[float] = []
+        self._ahead: CompileAhead | None = None
+        self._work: str | BakeSettings | None = None
+        self._troubles: set[str] = set()
 
     def __enter__(self) -> Console:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         self.clear()
-        self._ended.close()
+        if self._ahead is not None:
+            self._ahead.close()
+        if self._stop_listening is not None:
+            self._stop_listening()
+        if self._compiled:
+            count = len(self._compiled) + (self._ahead.compiled if self._ahead is not None else 0)
+            self.say(f"compiled {count_of(count, 'kernel')} in {sum(self._compiled):.1f} s")
 
     def clear(self) -> None:
         if self._bar is not None:
@@ -172,8 +176,12 @@ class Console:
         """Print a line; on a terminal, one that is too long is broken between words."""
         if not self._quiet:
             self.clear()
-            line, width = printable(text, MOST), _columns()
-            for part in [line] if width is None else _wrapped(line, max(width, 2 * INDENT), INDENT):
+            try:
+                width = os.get_terminal_size(sys.stderr.fileno()).columns
+            except (AttributeError, OSError, ValueError):  # it is closed, redirected, or no file
+                width = 0
+            line = printable(text, MOST)
+            for part in _wrapped(line, max(width, 2 * INDENT), INDENT) if width else [line]:
                 _echo(part)
 
     def detail(self, text: str) -> None:
@@ -183,10 +191,18 @@ class Console:
 
     @contextlib.contextmanager
     def job(self, shares: Mapping[str, float]) -> Iterator[None]:
-        """Show the stages of the work inside as one bar, with the time left; `shares` as for `StagedProgress`."""
+        """Show the stages of the work inside as one bar, with the time left.
+
+        Args:
+            shares: the relative time of each stage, in order; other stages add nothing.
+        """
         self.clear()
-        self._job, self._start = StagedProgress(shares), monotonic()
-        self._logged = self._start
+        whole, begin = sum(shares.values()), 0.0
+        self._job, self._reached = {}, 0.0
+        for stage, share in shares.items():
+            self._job[stage] = begin, share / whole
+            begin += share / whole
+        self._start = self._logged = monotonic()
         try:
             yield
         finally:
@@ -194,16 +210,39 @@ class Console:
             self._job, self._stage = None, ""
 
     def progress(self, stage: str, done: int, total: int, unit: str) -> None:
+        now = monotonic()
         if self._job is not None:
-            self._show_job(stage, self._job.reach(stage, done, total))
-        elif not self._bars:
-            self._log_progress(stage, done, total, unit)
-        else:
-            bar = self._bar
+            begin, share = self._job.get(stage, (0.0, 0.0))
+            self._reached = min(max(self._reached, begin + share * done / max(total, 1)), 1.0)
+        elif stage != self._stage:
+            self._stage, self._start, self._logged = stage, now, now
+        if self._bars:
+            self._draw(stage, done, total, unit)
+        elif now - self._logged >= LOG_INTERVAL and (self._job is not None or done < total):
+            self._logged, lasted, reached = now, now - self._start, self._reached
+            if self._job is not None:
+                left = f", about {format_duration(lasted * (1 / reached - 1))} left" if reached else ""
+                self.say(f"{stage}: {100 * reached:.0f} % done after {format_duration(lasted)}{left}")
+            else:
+                size = f"{format_size(done)} of {format_size(total)}"
+                amount = size if unit == "B" else f"{done:,} of {total:,} {unit}s"
+                self.say(f"{stage}: {amount} ({100 * done / total:.0f} %), {format_duration(lasted)}")
+
+    def _draw(self, stage: str, done: int, total: int, unit: str) -> None:
+        """Draw the bar of a stage, or of a job with the time left at the rate so far."""
+        bar = self._bar
+        if self._job is None:
             if bar is None or bar.desc != stage:
                 scaled = {"unit_scale": True, "unit": unit if unit == "B" else f" {unit}s"}
                 bar = self._open_bar(total=total, desc=stage, **scaled)
             bar.update(done - bar.n)
+            return
+        if bar is None:
+            bar = self._open_bar(total=1.0, desc=stage, initial=self._reached, bar_format=JOB_BAR, smoothing=0)
+        bar.initial, bar.start_t = 0, time() - (monotonic() - self._start)  # the rate is that of the whole job
+        bar.update(self._reached - bar.n)
+        if bar.desc != stage:
+            bar.set_description_str(stage)
 
     def _open_bar(self, **how: Any) -> Any:
         from tqdm import tqdm
@@ -212,32 +251,6 @@ class Console:
         tqdm.set_lock(threading.RLock())  # tqdm's own is for several processes, and may start one
         self._bar = tqdm(leave=False, file=sys.stderr, dynamic_ncols=True, **how)
         return self._bar
-
-    def _show_job(self, stage: str, reached: float) -> None:
-        """Show the stage of a job, its progress, and the time left at the rate so far."""
-        now = monotonic()
-        if self._bars:
-            bar = self._bar
-            if bar is None:
-                bar = self._open_bar(total=1.0, desc=stage, initial=reached, bar_format=JOB_BAR, smoothing=0)
-            bar.initial, bar.start_t = 0, time() - (now - self._start)  # the rate is that of the whole job
-            bar.update(reached - bar.n)
-            if bar.desc != stage:
-                bar.set_description_str(stage)
-        elif now - self._logged >= LOG_INTERVAL:
-            self._logged = now
-            left = f", about {format_duration((now - self._start) * (1 / reached - 1))} left" if reached else ""
-            self.say(f"{stage}: {100 * reached:.0f} % done after {format_duration(now - self._start)}{left}")
-
-    def _log_progress(self, stage: str, done: int, total: int, unit: str) -> None:
-        """Print a line about a stage that takes long, every `LOG_INTERVAL` seconds."""
-        now = monotonic()
-        if stage != self._stage:
-            self._stage, self._start, self._logged = stage, now, now
-        if now - self._logged >= LOG_INTERVAL and done < total:
-            self._logged = now
-            amount = f"{format_size(done)} of {format_size(total)}" if unit == "B" else f"{done:,} of {total:,} {unit}s"
-            self.say(f"{stage}: {amount} ({100 * done / total:.0f} %), {format_duration(now - self._start)}")
 
     def announce_compiling(self, work: str | BakeSettings | None = None) -> None:
         """Announce the first kernel that is compiled, show which one it is, and print at the end how long all took.
@@ -249,42 +262,32 @@ class Console:
         """
         from ..system import jit
 
-        ahead: list[CompileAhead] = []
-        seconds: list[float] = []
-        troubles: set[str] = set()
+        self._work = work
+        self._stop_listening = jit.listen(self._begin_compiling, self._end_compiling, self._say_trouble)
 
-        def begin(name: str) -> None:
-            interrupts.leave_if_lost()
-            if not ahead:
-                from ..warmup import CompileAhead, jobs_of, missing
+    def _begin_compiling(self, name: str) -> None:
+        from ..system import jit
+        from ..warmup import CompileAhead, jobs_of, missing
 
-                absent = missing()
-                ahead.append(CompileAhead(absent, [] if work is None else jobs_of(work), name))
-                self._ended.callback(ahead[0].close)
-                advance = f"kept for later runs; sparklod warmup compiles all {len(absent)} in advance"
-                often = advance if jit.CACHE_FOLDER else "in every run: no cache can be written"
-                self.say(f"Compiling kernels for this machine, up to a minute ({often}) ...")
-            if self._bars:
-                # How many a command needs is not known.
-                text = f"compiling: kernel {len(seconds) + 1}, {sum(seconds):.0f} s so far"
-                self._open_bar(desc=text, bar_format="{desc}")
+        interrupts.leave_if_lost()
+        if self._ahead is None:
+            absent = missing()
+            self._ahead = CompileAhead(absent, [] if self._work is None else jobs_of(self._work), name)
+            advance = f"kept for later runs; sparklod warmup compiles all {len(absent)} in advance"
+            often = advance if jit.CACHE_FOLDER else "in every run: no cache can be written"
+            self.say(f"Compiling kernels for this machine, up to a minute ({often}) ...")
+        if self._bars:
+            # How many a command needs is not known.
+            text = f"compiling: kernel {len(self._compiled) + 1}, {sum(self._compiled):.0f} s so far"
+            self._open_bar(desc=text, bar_format="{desc}")
 
-        def end(duration: float) -> None:
-            seconds.append(duration)
-            self._start += duration  # compiling does not count as time of the job
-            self._logged += duration
-            self.clear()
+    def _end_compiling(self, duration: float) -> None:
+        self._compiled.append(duration)
+        self._start += duration  # compiling does not count as time of the job
+        self._logged += duration
+        self.clear()
 
-        def say_once(trouble: str) -> None:
-            if trouble not in troubles:
-                troubles.add(trouble)
-                self.say(trouble)
-
-        def close() -> None:
-            stop()
-            if seconds:
-                count = len(seconds) + sum(each.compiled for each in ahead)
-                self.say(f"compiled {count_of(count, 'kernel')} in {sum(seconds):.1f} s")
-
-        stop = jit.listen(begin, end, say_once)
-        self._ended.callback(close)
+    def _say_trouble(self, trouble: str) -> None:
+        if trouble not in self._troubles:
+            self._troubles.add(trouble)
+            self.say(trouble)

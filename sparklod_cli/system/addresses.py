@@ -18,7 +18,6 @@ from typing import Any, Literal
 from urllib.parse import unquote, urlsplit
 
 from .errors import SparklodError
-from .optional import optional_import
 from .printable import redacted, without_secrets
 
 #: How addresses begin, chained ones too (simplecache::s3://). A letter and a colon alone are a drive of Windows.
@@ -253,6 +252,8 @@ def _cut(url: str) -> tuple[str, str]:
 @functools.lru_cache(maxsize=64)
 def _system(url: str) -> tuple[Any, str]:
     """Return the file system that opens an address, and what the address is called there."""
+    from .optional import optional_import  # which few commands need
+
     with optional_import("addresses need fsspec and the package of their service", "cloud"):
         import fsspec
 

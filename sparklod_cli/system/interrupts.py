@@ -81,7 +81,19 @@ def handle() -> None:
         reader, writer = os.pipe()
         os.set_blocking(writer, False)
         signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
-        _raise_again_where_lost(interrupt, handled[0], writer)
+        otherwise = sys.unraisablehook
+
+        def raise_again(lost: sys.UnraisableHookArgs) -> None:
+            """Raise an interruption again that Python prints only: inside `__del__` or callbacks of weak references."""
+            if lost.exc_type is OSError and RACE in str(lost.exc_value):  # it came together with the first one
+                _leave()
+            if lost.exc_type is not KeyboardInterrupt:
+                otherwise(lost)
+                return
+            signal.signal(handled[0], interrupt)
+            os.write(writer, bytes([LOST]))
+
+        sys.unraisablehook = raise_again
         threading.Thread(target=_watch, args=(reader, handled), daemon=True).start()
 
 
@@ -113,25 +125,6 @@ def ignore() -> None:
     """Ignore the signals; called at the end of the process, when all work is done."""
     for number in ENDING:
         signal.signal(number, signal.SIG_IGN)
-
-
-def _raise_again_where_lost(interrupt: Callable[[int, FrameType | None], None], number: int, writer: int) -> None:
-    """Have an interruption raised again that came inside `__del__` or a callback of a weak reference, as imports use.
-
-    Python prints what is raised there and goes on.
-    """
-    otherwise = sys.unraisablehook
-
-    def hook(lost: sys.UnraisableHookArgs) -> None:
-        if lost.exc_type is OSError and RACE in str(lost.exc_value):  # it came together with the first one
-            _leave()
-        if lost.exc_type is not KeyboardInterrupt:
-            otherwise(lost)
-            return
-        signal.signal(number, interrupt)
-        os.write(writer, bytes([LOST]))
-
-    sys.unraisablehook = hook
 
 
 def _watch(reader: int, handled: list[signal.Signals]) -> None:

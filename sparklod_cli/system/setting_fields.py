@@ -83,11 +83,6 @@ class Quantity:
     parse: Callable[[str], Any]
     range: Range | None = None
 
-    def check(self, name: str, value: Any) -> None:
-        """Check a value as `Range.check` does."""
-        if self.range is not None:
-            self.range.check(name, value)
-
 
 @dataclass(frozen=True)
 class Setting:
@@ -112,8 +107,9 @@ class Setting:
 
     def check(self, name: str, value: Any) -> None:
         """Raise TypeError or ValueError unless the declaration allows a value."""
-        if isinstance(self.kind, (Range, Quantity)):
-            self.kind.check(name, value)
+        numbers = self.kind.range if isinstance(self.kind, Quantity) else self.kind
+        if isinstance(numbers, Range):
+            numbers.check(name, value)
         elif isinstance(self.kind, tuple) and value not in self.kind:
             noun = (self.name or name).replace("_", " ")
             raise ValueError(f"there is no {noun} {value!r}; give one of {', '.join(map(str, self.kind))}")

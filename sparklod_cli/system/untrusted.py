@@ -6,6 +6,7 @@ Imports nothing heavy: `--help` needs the table of formats, which are told by ke
 from __future__ import annotations
 
 import codecs
+import contextlib
 import json
 import math
 import re
@@ -36,6 +37,9 @@ _ESCAPED_SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
 
 #: For a value at a time; `float` takes any number of digits in time proportional to it.
 _DECODER = json.JSONDecoder(parse_int=float)
+
+#: A sign of the syntax, with the blanks around it.
+_MARK = re.compile(r"[ \t\r\n]*([{,:])[ \t\r\n]*")
 
 T = TypeVar("T")
 
@@ -138,25 +142,17 @@ def decoded_text(data: bytes, errors: str = "strict") -> str:
 
 def keys_of_object(beginning: bytes) -> list[str]:
     """Return the keys of a JSON object as far as its beginning shows them; none of any other data."""
-    text, keys, at, mark = decoded_text(beginning, "replace"), list[str](), 0, "{"
-    try:
-        while text[at := _past_blanks(text, at)] == mark:
-            key, at = _DECODER.raw_decode(text, _past_blanks(text, at + 1))
-            if not isinstance(key, str) or text[at := _past_blanks(text, at)] != ":":
+    text, keys, at, sign = decoded_text(beginning, "replace"), list[str](), 0, "{"
+    with contextlib.suppress(ValueError, RecursionError):  # the beginning ends there, or it is not JSON
+        while (mark := _MARK.match(text, at)) and mark[1] == sign:
+            key, at = _DECODER.raw_decode(text, mark.end())
+            colon = _MARK.match(text, at)
+            if not isinstance(key, str) or colon is None or colon[1] != ":":
                 break
             keys.append(key)
-            _, at = _DECODER.raw_decode(text, _past_blanks(text, at + 1))
-            mark = ","
-    except (ValueError, IndexError, RecursionError):
-        pass  # the beginning ends there, or it is not JSON
+            _, at = _DECODER.raw_decode(text, colon.end())
+            sign = ","
     return keys
-
-
-def _past_blanks(text: str, at: int) -> int:
-    """Return the place of the next character that is no blank; `IndexError` at the end."""
-    while text[at] in " \t\r\n":
-        at += 1
-    return at
 
 
 class Origin(NamedTuple):

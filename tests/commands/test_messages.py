@@ -13,6 +13,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from sparklod_cli.cli import run
 from sparklod_cli.codecs import ply
@@ -237,6 +239,37 @@ def test_a_log_gets_how_much_of_a_job_is_done_and_the_time_left(monkeypatch: pyt
             console.progress(stage, done, 2, "splat")
     lines = ["reading: 25 % done after 12 s, about 36 s left", "writing: 62 % done after 1 min, about 36 s left"]
     assert log.getvalue().splitlines() == lines
+
+
+SHARES = {"reading": 1.0, "building": 3.0, "writing": 4.0}
+Calls = list[tuple[str, int, int]]
+
+
+def shares_reported(calls: Calls) -> list[float]:
+    """How much of a job is done by the lines of a log, one for each call, 0 to 100."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sys.stderr", log := io.StringIO())
+        patch.setattr(console_module, "LOG_INTERVAL", -1)
+        with Console(quiet=False, verbose=False) as console, console.job(SHARES):
+            for stage, done, total in calls:
+                console.progress(stage, done, total, "splat")
+    return [float(share) for share in re.findall(r": (\d+) % done", log.getvalue())]
+
+
+def test_the_stages_of_a_job_have_their_shares() -> None:
+    shares = shares_reported([(stage, done, 2) for stage in SHARES for done in (1, 2)])
+    assert shares == pytest.approx([100 / 16, 100 / 8, 500 / 16, 50, 75, 100], abs=0.5)
+
+
+@given(st.lists(st.tuples(st.sampled_from([*SHARES, "compiling"]), st.integers(0, 20), st.integers(0, 10))))
+def test_a_job_never_goes_back_nor_beyond_its_end(calls: Calls) -> None:
+    shares, last = shares_reported(calls), 0.0
+    assert len(shares) == len(calls)
+    for (stage, _, _), share in zip(calls, shares, strict=True):
+        assert last <= share <= 100
+        if stage == "compiling":
+            assert share == last
+        last = share
 
 
 def test_colour_is_for_terminals_that_want_it(monkeypatch: pytest.MonkeyPatch) -> None:
