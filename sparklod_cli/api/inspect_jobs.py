@@ -163,7 +163,7 @@ def _picture(
 def _thumbnail(report: Report, scene: Scene, threads: int) -> DescribedPicture | None:
     """Return the scene as a viewer draws it; None where it is broken, or too large to be drawn at once."""
     from ..figures.tree_plot import DescribedPicture
-    from ..inspection.arrays import NO_CHILDREN
+    from ..inspection.report import NO_CHILDREN
     from .files import as_tree
     from .views import cut, orbit, render, show
 

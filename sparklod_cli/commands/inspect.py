@@ -153,13 +153,13 @@ class InspectOutput:
     plot_by: str = option("What the colours of the picture show.", PLOT_BY, PLOT_BY[0], heading=PICTURES)
 
     def table(self) -> TableOutput | None:
-        from ..inspection.chunks import COLUMNS
+        from ..inspection.blocks import CHUNK_COLUMNS
         from ..tables.columns import TableOutput
 
         if self.chunks_out is None:
             return None
         return TableOutput(
-            self.chunks_out, table_form("--chunks-out", self.chunks_out), COLUMNS, overwrite=self.overwrite
+            self.chunks_out, table_form("--chunks-out", self.chunks_out), CHUNK_COLUMNS, overwrite=self.overwrite
         )
 
 
@@ -334,13 +334,13 @@ class _Job:
         return status
 
     def _print_chunks(self, name: str, report: Report) -> int:
-        from ..inspection.chunks import lines as lines_of_chunks
+        from ..inspection.blocks import chunk_lines
 
         if report.chunks is None:
             self.console.error(f"{name}: its chunks are unknown, since it does not hold all of its splats")
             return 1
         if self.options.output.chunks and not self.options.general.as_json:
-            click.echo("\n".join(lines_of_chunks(report.chunks)))
+            click.echo("\n".join(chunk_lines(report.chunks)))
         if self.settings.chunks is not None:
             self.console.say(f"{self.settings.chunks.path}  table of {count_of(len(report.chunks), 'chunk')}")
         return 0

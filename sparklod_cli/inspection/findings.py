@@ -1,13 +1,9 @@
-"""`Finding`, one fault of a file, the table of all kinds of findings, and `HeaderScan`, findings about headers."""
+"""`Finding`, one fault of a file, and the table of all kinds of findings."""
 
 from __future__ import annotations
 
-import statistics
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
-
-import numpy as np
 
 from ..codecs.rad.rad_rules import ERRORS as RAD_ERRORS
 from ..codecs.rad.rad_rules import WARNINGS as RAD_WARNINGS
@@ -116,86 +112,3 @@ def findings_of(violations: Iterable[RuleViolation]) -> list[Finding]:
         Finding(code, texts[0] + (f" (and {len(texts) - 1:,} more like it)" if len(texts) > 1 else ""))
         for code, texts in by_code.items()
     ]
-
-
-@dataclass(frozen=True)
-class Head:
-    """Head of a report, known from headers before any splat is read.
-
-    Attributes:
-        format: name for display.
-        bytes: of all files together.
-        splats: as reading gives them; nodes of a tree.
-        sh_degree, antialiased, up, up_by: of the splats.
-    """
-
-    format: str
-    bytes: int
-    splats: int
-    sh_degree: int
-    antialiased: bool
-    up: str | None
-    up_by: str = ""
-
-
-@dataclass(frozen=True)
-class ChunkBytes:
-    """Sizes of chunks, bytes."""
-
-    min: int
-    median: int
-    max: int
-
-    @classmethod
-    def of(cls, sizes: Sequence[int]) -> ChunkBytes | None:
-        """Return the least, median and greatest of the sizes of chunks; None without any."""
-        return cls(min(sizes), round(statistics.median(sizes)), max(sizes)) if sizes else None
-
-
-#: Quantiles, by name.
-QUANTILES = {"min": 0.0, "p25": 0.25, "p50": 0.5, "p75": 0.75, "max": 1.0}
-
-
-def quantiles_of(values: Sequence[float], weights: Sequence[float] | None = None) -> dict[str, float]:
-    """Return the quantiles of values, each of them one of these, and their mean.
-
-    Args:
-        values: one or more.
-        weights: of the values, not all 0; without, all count the same.
-    """
-    numbers = np.asarray(values, np.float64)
-    order = np.argsort(numbers, kind="stable")
-    weighed = np.ones(len(numbers)) if weights is None else np.asarray(weights, np.float64)
-    below = np.cumsum(weighed[order])
-    places = np.searchsorted(below, [share * below[-1] for share in QUANTILES.values()])
-    found = numbers[order][places]
-    mean = float(numbers @ (weighed / below[-1]))
-    return {name: float(f"{each:.6g}") for name, each in [*zip(QUANTILES, found, strict=True), ("mean", mean)]}
-
-
-@dataclass(frozen=True)
-class HeaderScan:
-    """Facts and broken rules from the headers of a file and of the files that it names.
-
-    Attributes:
-        field: of the report that has the facts, "rad", "streamed_sog" or "tiles".
-        violations: broken rules.
-        head: what a report begins with; None where `facts` is.
-        facts: `RadFacts`, `StreamedSogFacts` or `TileFacts`; None where a rule is broken without which the rest cannot
-            be trusted.
-    """
-
-    field: str
-    violations: Sequence[RuleViolation]
-    head: Head | None = None
-    facts: Any = None
-
-    @property
-    def findings(self) -> list[Finding]:
-        """Broken rules, one finding for each code."""
-        return findings_of(self.violations)
-
-    @property
-    def fatal(self) -> list[Finding]:
-        """Findings because of which the file cannot be read."""
-        return findings_of(each for each in self.violations if each.fatal)

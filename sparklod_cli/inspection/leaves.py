@@ -25,7 +25,7 @@ from ..model.splats import FloatArray, Splats
 from ..system.errors import InvalidSplatsError
 from ..system.units import count_of
 from .findings import Finding
-from .rad import PropertyFacts, RadFacts
+from .headers import PropertyFacts, RadFacts
 
 #: Largest differences of the codes of one splat: writers round, truncate or go through float16. SPZ's codes of SH keep
 #: upper bits only, so that a step of theirs is a bucket of 16; logarithms of scales as float32 differ in last bits.

@@ -6,25 +6,30 @@ import dataclasses
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from ..codecs.gpu import data_texture, ext_splats, lod_tree, packed_splats
+from ..codecs.gpu.dump import Arrays
 from ..codecs.reader import code_of
+from ..codecs.splat_encoding import SplatEncoding
 from ..codecs.spz_streams import KNOWN_FLAGS
 from ..io import opened, read_arrays, read_scene, size_of_input
 from ..io.rad_file import FORMAT as RAD
 from ..io.rad_file import RadFile
 from ..model.scene import Scene
 from ..model.sh import width_of
-from ..model.splats import COLUMNS
+from ..model.splats import COLUMNS, Splats
 from ..system.errors import FormatError, SparklodError
 from ..system.printable import printable
 from ..system.progress import Progress, silent
 from ..system.untrusted import QUOTED
 from ..tables.columns import Row
-from . import arrays, chunks, rad, streamed_sog, tiles, tree, value_checks, values
-from .blocks import Block, ReportBlocks, merged
-from .findings import Finding, Head, HeaderScan
-from .value_checks import ValueTally
+from . import headers, tree, values
+from .blocks import Block, ReportBlocks, chunk_row, chunk_table, merged
+from .findings import Finding
+from .headers import Head, HeaderScan
 
 #: Version of the report: counts up when a field changes its meaning or is removed. schema.json describes this one.
 SCHEMA_VERSION = 1
@@ -85,7 +90,7 @@ class Report:
         tiles: facts from the tilesets and headers of 3D Tiles; None for other formats.
         tree: facts of the Level-of-Detail tree; None without one.
         values: statistics of the splats; None if not requested.
-        chunks: a row for each chunk, see `chunks.COLUMNS`; None if not requested.
+        chunks: a row for each chunk, see `blocks.CHUNK_COLUMNS`; None if not requested.
         findings: None if not requested, unless the file could not be read.
     """
 
@@ -102,9 +107,9 @@ class Report:
     compression_ratio: float | None = None
     notes: list[str] = dataclasses.field(default_factory=list)
     hints: list[str] = dataclasses.field(default_factory=list)
-    rad: rad.RadFacts | None = None
-    streamed_sog: streamed_sog.StreamedSogFacts | None = None
-    tiles: tiles.TileFacts | None = None
+    rad: headers.RadFacts | None = None
+    streamed_sog: headers.StreamedSogFacts | None = None
+    tiles: headers.TileFacts | None = None
     tree: tree.TreeFacts | None = None
     values: values.ValueFacts | None = None
     chunks: list[Row] | None = None
@@ -156,7 +161,7 @@ def inspect(
     try:
         held = read_arrays(path)
         if held is not None:
-            fields, scene_of_arrays = arrays.examine(held, settings, threads=threads)
+            fields, scene_of_arrays = _of_arrays(held, settings, threads=threads)
             each = round(size / fields["splats"], 3) if size and fields["splats"] else None
             return Report(str(path), size, bytes_per_splat=each, **fields), scene_of_arrays
         surveyed = _surveyed(path, settings.check, threads, progress)
@@ -187,10 +192,10 @@ def _surveyed(path: Path, check: bool, threads: int, progress: Progress) -> Head
     """Return facts and findings from the headers of a file; None for formats with few."""
     with opened(path) as (file, form, more):
         if form.name == RAD:
-            return rad.survey(file, more["open_companion"], check=check)
+            return headers.survey_rad(file, more["open_companion"], check=check)
         if form.parts is None:
             return None
-        survey = {"levels": streamed_sog.survey, "tiles": tiles.survey}[form.parts]
+        survey = {"levels": headers.survey_streamed_sog, "tiles": headers.survey_tiles}[form.parts]
         return survey(file, more["open_companion"], check=check, threads=threads, progress=progress)
 
 
@@ -205,31 +210,31 @@ def _of_blocks(
 ) -> Report:
     about = blocks.about
     degree = about.splats.sh_degree
-    ends, size = value_checks.ends_of(about.header), about.header.get("bytes", size)
+    ends, size = values.ends_of(about.header), about.header.get("bytes", size)
     findings = _container_findings(about)
     if surveyed is not None:
         of_files = {each.code for each in surveyed.findings}  # which say in which file
         findings = [each for each in findings if each.code not in of_files] + surveyed.findings
         size = surveyed.facts.bytes
     if surveyed is not None and surveyed.field == "rad":
-        ends = rad.ends_of(surveyed.facts)
+        ends = headers.ends_of_rad(surveyed.facts)
     nodes = tree.TreeColumns.of(blocks) if blocks.is_tree and blocks.count else None
 
     def examined(block: Block) -> tuple[Any, Any, Any]:
         return (
             None if nodes is None else nodes.add(block),
-            ValueTally.of(block, ends, layouts=settings.check) if settings.values or settings.check else None,
-            chunks.row_of(block) if settings.chunks else None,
+            values.ValueTally.of(block, ends, layouts=settings.check) if settings.values or settings.check else None,
+            chunk_row(block) if settings.chunks else None,
         )
 
     opaque, tallies, rows = zip(*blocks.map(examined, columns, threads), strict=True) if blocks.count else ((), (), ())
     statistics = facts = table = None
     hints: list[str] = []
     if settings.values:
-        total = ValueTally.total(tallies)
+        total = values.ValueTally.total(tallies)
         statistics = values.statistics_of(blocks, total, all_quantities=settings.all_quantities, threads=threads)
     if settings.chunks:
-        table = chunks.table_of(rows, about.chunk_bytes, nodes)
+        table = chunk_table(rows, about.chunk_bytes, None if nodes is None else (nodes.tree, nodes.size))
     if nodes is not None:
         facts, found = tree.examine_blocks(
             blocks,
@@ -242,9 +247,9 @@ def _of_blocks(
         )
         findings += found
     if settings.check:
-        total = ValueTally.total(tallies)
-        findings += value_checks.findings_about(total, ends, is_tree=blocks.is_tree)
-        hints = value_checks.hints_about(total.layouts, degree)
+        total = values.ValueTally.total(tallies)
+        findings += values.findings_about(total, ends, is_tree=blocks.is_tree)
+        hints = values.hints_about(total.layouts, degree)
     head = Head(about.format, size or 0, blocks.count, degree, about.antialiased, about.up, about.up_by)
     report = _report(path, head, surveyed)
     return dataclasses.replace(
@@ -286,3 +291,77 @@ def _container_findings(scene: Scene) -> list[Finding]:
     elif header.get("trailing_bytes"):
         findings.append(Finding("container.trailing", f"{header['trailing_bytes']:,} bytes follow the data"))
     return findings
+
+
+if TYPE_CHECKING:
+    from .report import ReportSettings
+
+#: The note on arrays with the nodes of a tree but without their children.
+NO_CHILDREN = "its splats are the nodes of a tree, but it has no child indices, so leaves cannot be told apart"
+
+
+def _of_arrays(arrays: Arrays, settings: ReportSettings, *, threads: int = 1) -> tuple[dict[str, Any], Scene | None]:
+    """Return the fields of a report on the arrays of one of `codecs.formats.ENCODINGS`, and the splats if complete.
+
+    Args:
+        arrays: by name; the names identify the encoding.
+
+    Raises:
+        FormatError: the arrays match no encoding, or have wrong shapes.
+    """
+    if "packed" in arrays:
+        # build-lod writes trees, for which Spark stores LoD opacities; the file does not record that.
+        splats = packed_splats.unpack(arrays, SplatEncoding(lod_opacity=True), threads=threads)
+        return _of_splats("PackedSplats", splats, settings)
+    if "ext0" in arrays:
+        return _of_splats("ExtSplats", ext_splats.unpack(arrays, threads=threads), settings)
+    if "lod_tree" in arrays:
+        return _of_tree_arrays(arrays, settings), None
+    if "texture" in arrays:
+        return _of_texture(arrays, settings), None
+    raise FormatError(f"its arrays ({', '.join(arrays)}) match no encoding that build-lod writes")
+
+
+def _of_splats(name: str, splats: Splats, settings: ReportSettings) -> tuple[dict[str, Any], Scene]:
+    scene = Scene(splats, format=f"NPZ of {name}")
+    opaque = dataclasses.replace(splats, opacity=np.minimum(splats.opacity, np.float32(1)))  # merged splats exceed 1
+    return _array_fields(
+        scene.format,
+        len(splats),
+        NO_CHILDREN,
+        settings,
+        sh_degree=splats.sh_degree,
+        values=values.examine(splats, all_quantities=settings.all_quantities) if settings.values else None,
+        findings=values.check(Scene(opaque)) if settings.check else [],
+    ), scene
+
+
+def _of_tree_arrays(arrays: Arrays, settings: ReportSettings) -> dict[str, Any]:
+    nodes = lod_tree.unpack(arrays)
+    count = len(nodes.tree)
+    facts: tree.TreeFacts | None = None
+    findings: list[Finding] = []
+    if count:
+        # Opaque balls of the sizes of the nodes, whose scales and opacities are not stored.
+        balls = Splats.zeros(count, 0)
+        balls.scale[:] = nodes.size[:, None] / 2
+        balls.opacity[:] = 1
+        facts, findings = tree.examine(balls, nodes.tree, check=settings.check)
+        facts = dataclasses.replace(facts, more_than_opaque=None)
+    elif settings.check:
+        findings = [Finding("values.empty", "there are no splats")]
+    note = "it has centres, sizes and children of nodes, but no opacities, colours and shapes"
+    return _array_fields("NPZ of LodTree", count, note, settings, tree=facts, findings=findings)
+
+
+def _of_texture(arrays: Arrays, settings: ReportSettings) -> dict[str, Any]:
+    capacity = data_texture.capacity(arrays)
+    used = np.flatnonzero(np.ascontiguousarray(arrays["texture"]).reshape(capacity, 8).any(axis=1))
+    note = "it has centres, covariances and colours of nodes, but no opacities above 1, SH and children"
+    return _array_fields("NPZ of a data texture", int(used[-1]) + 1 if len(used) else 0, note, settings)
+
+
+def _array_fields(form: str, splats: int, note: str, settings: ReportSettings, **more: Any) -> dict[str, Any]:
+    """Return the fields of a report; spherical harmonics and findings are left out unless they are among `more`."""
+    fields = {"format": form, "splats": splats, "sh_degree": 0, "antialiased": False, "notes": [note], "findings": []}
+    return fields | more | ({} if settings.check else {"findings": None})

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from sparklod_cli.cli import run
-from sparklod_cli.inspection import chunks
+from sparklod_cli.inspection import blocks as blocks_of
 from sparklod_cli.inspection.blocks import ReportBlocks, merged
 from sparklod_cli.inspection.report import Report, ReportSettings, inspect
 from sparklod_cli.inspection.tree import TreeColumns
@@ -37,7 +37,9 @@ def rows_of(scene: Scene) -> list[dict[str, Any]]:
     nodes = TreeColumns.of(blocks) if blocks.is_tree and blocks.count else None
     if nodes is not None:
         merged(blocks.map(nodes.add, (), 1))
-    return chunks.table_of(list(blocks.map(chunks.row_of, (), 1)), scene.chunk_bytes, nodes)
+    return blocks_of.chunk_table(
+        list(blocks.map(blocks_of.chunk_row, (), 1)), scene.chunk_bytes, nodes and (nodes.tree, nodes.size)
+    )
 
 
 def parents_of(scene: Scene) -> dict[int, int]:
@@ -98,7 +100,7 @@ def test_the_table_is_printed_and_written(tmp_path: Path, capsys: Capture) -> No
     assert (first[:2], second[:2]) == (["0", "65,536"], ["1", "8"])
     with output.open(newline="") as file:
         rows = list(csv.DictReader(file))
-    assert [column.name for column in chunks.COLUMNS] == list(rows[0])
+    assert [column.name for column in blocks_of.CHUNK_COLUMNS] == list(rows[0])
     assert [row["splats"] for row in rows] == ["65536", "8"]
     assert run(["inspect", str(path), "--chunks", "--json"]) == 0
     plain = json.loads(capsys.readouterr().out)

@@ -15,9 +15,9 @@ import pytest
 from sparklod_cli.cli import run
 from sparklod_cli.codecs.rad import codec as codec
 from sparklod_cli.codecs.rad import rad_reader
-from sparklod_cli.inspection import leaves, rad
+from sparklod_cli.inspection import headers, leaves
+from sparklod_cli.inspection.headers import PropertyFacts
 from sparklod_cli.inspection.html import FileSection, page
-from sparklod_cli.inspection.rad import PropertyFacts
 from sparklod_cli.inspection.report import ReportSettings, inspect
 from sparklod_cli.io import read_scene
 from sparklod_cli.model.scene import Scene
@@ -27,7 +27,7 @@ from tests.inspection.rad_files import CHUNK, RANGES, Rad, tree, with_chunk, wit
 PALETTE = tree(24, max_sh=2, palette=True)
 
 
-def facts_of(path: Path) -> rad.RadFacts:
+def facts_of(path: Path) -> headers.RadFacts:
     facts = inspect(path, ReportSettings(headers_only=True))[0].rad
     assert facts is not None
     return facts
@@ -43,7 +43,7 @@ def test_the_facts_are_those_of_the_headers(chunked: bool, tmp_path: Path) -> No
     assert facts.bytes == len(header) + sum(sizes) == sum(path.stat().st_size for path in tmp_path.iterdir())
     assert (facts.header_bytes, facts.first_bytes) == (len(header), len(header) + len(chunks[0]))
     assert facts.chunk_size == CHUNK
-    assert facts.chunk_bytes == rad.ChunkBytes(sizes[0], round(sum(sizes) / 2), sizes[1])
+    assert facts.chunk_bytes == headers.ChunkBytes(sizes[0], round(sum(sizes) / 2), sizes[1])
     assert (facts.palette, facts.comment, facts.ranges) == (0, None, RANGES)
     assert list(facts.properties) == [column.name for column in written.chunks[0].columns]
     for name, found in facts.properties.items():

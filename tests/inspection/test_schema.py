@@ -19,7 +19,8 @@ from sparklod_cli.cli import run
 from sparklod_cli.codecs import spz
 from sparklod_cli.codecs.formats import FORMATS
 from sparklod_cli.codecs.options import WriteOptions
-from sparklod_cli.inspection import chunks, values
+from sparklod_cli.inspection import values
+from sparklod_cli.inspection.blocks import CHUNK_COLUMNS
 from sparklod_cli.inspection.findings import CODES
 from sparklod_cli.inspection.report import SCHEMA_VERSION, ReportSettings, inspect, value_at
 from sparklod_cli.lod import quick
@@ -335,7 +336,7 @@ def test_the_pages_have_every_field_once(full: Report) -> None:
     assert tops == SCHEMA["properties"].keys()
     for name in ("rad", "streamed_sog", "tiles", "tree", "values"):
         assert {way.split(".")[1] for way in named if way.startswith(f"{name}.")} == full[name].keys()
-    assert {way.split(".")[2] for way in named if way.startswith("chunks.")} == {each.name for each in chunks.COLUMNS}
+    assert {way.split(".")[2] for way in named if way.startswith("chunks.")} == {each.name for each in CHUNK_COLUMNS}
     assert {way.split(".")[2] for way in named if way.startswith("findings.")} == full["findings"][0].keys()
 
 

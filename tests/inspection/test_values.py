@@ -17,11 +17,11 @@ from sparklod_cli.codecs import ply, splat, spz
 from sparklod_cli.codecs.spz_streams import ANTIALIASED, HEADER, LOD, MAGIC, Layout
 from sparklod_cli.inspection import values
 from sparklod_cli.inspection.report import ReportSettings, inspect
-from sparklod_cli.inspection.value_checks import check
 from sparklod_cli.inspection.values import (
     MAIN,
     PERCENTILES,
     QUANTITIES,
+    check,
     examine,
     histogram_of,
     names_of,

@@ -1,0 +1,516 @@
+"""Facts from the headers of files in parts, RAD, Streamed SOG and 3D Tiles, and the rules that those break."""
+
+from __future__ import annotations
+
+import statistics
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from ..codecs.merging import Chunk
+from ..codecs.rad.property_codings import LARGEST_F16
+from ..codecs.rad.rad_header import ENCODING_KEYS, RadChunkHeader, RadHeader
+from ..codecs.rad.rad_layout import BY_NAME, PROPERTIES, SIZES
+from ..codecs.rad.rad_reader import scan_chunks, scan_header
+from ..codecs.reader import OpenCompanion, size_of
+from ..codecs.splat_encoding import log_scale_table
+from ..codecs.streamed_sog.manifest import VERSION as STREAMED_SOG_VERSION
+from ..codecs.streamed_sog.manifest import Manifest, ManifestNode
+from ..codecs.streamed_sog.manifest_rules import level_counts, scan_files, scan_splats
+from ..codecs.tiles_3d.codec import tile_files
+from ..codecs.tiles_3d.tileset import MAX_TILESET, Tileset, read_whole
+from ..codecs.tiles_3d.tileset_rules import (
+    depths_of,
+    matrices_of,
+    matrix_of,
+    read_violations,
+    violations,
+)
+from ..codecs.tiles_3d.tileset_rules import (
+    scan_files as scan_tile_files,
+)
+from ..codecs.tiles_3d.tileset_rules import (
+    scan_splats as scan_tile_splats,
+)
+from ..codecs.validation import RuleViolation
+from ..model.axes import common
+from ..model.georeference import EarthPlace, place_of
+from ..system.printable import MOST, printable
+from ..system.progress import Progress, silent
+from ..system.untrusted import LARGEST
+from .findings import Finding, findings_of
+from .values import Box, Ends
+
+
+@dataclass(frozen=True)
+class Head:
+    """Head of a report, known from headers before any splat is read.
+
+    Attributes:
+        format: name for display.
+        bytes: of all files together.
+        splats: as reading gives them; nodes of a tree.
+        sh_degree, antialiased, up, up_by: of the splats.
+    """
+
+    format: str
+    bytes: int
+    splats: int
+    sh_degree: int
+    antialiased: bool
+    up: str | None
+    up_by: str = ""
+
+
+@dataclass(frozen=True)
+class ChunkBytes:
+    """Sizes of chunks, bytes."""
+
+    min: int
+    median: int
+    max: int
+
+    @classmethod
+    def of(cls, sizes: Sequence[int]) -> ChunkBytes | None:
+        """Return the least, median and greatest of the sizes of chunks; None without any."""
+        return cls(min(sizes), round(statistics.median(sizes)), max(sizes)) if sizes else None
+
+
+#: Quantiles, by name.
+QUANTILES = {"min": 0.0, "p25": 0.25, "p50": 0.5, "p75": 0.75, "max": 1.0}
+
+
+def quantiles_of(values: Sequence[float], weights: Sequence[float] | None = None) -> dict[str, float]:
+    """Return the quantiles of values, each of them one of these, and their mean.
+
+    Args:
+        values: one or more.
+        weights: of the values, not all 0; without, all count the same.
+    """
+    numbers = np.asarray(values, np.float64)
+    order = np.argsort(numbers, kind="stable")
+    weighed = np.ones(len(numbers)) if weights is None else np.asarray(weights, np.float64)
+    below = np.cumsum(weighed[order])
+    places = np.searchsorted(below, [share * below[-1] for share in QUANTILES.values()])
+    found = numbers[order][places]
+    mean = float(numbers @ (weighed / below[-1]))
+    return {name: float(f"{each:.6g}") for name, each in [*zip(QUANTILES, found, strict=True), ("mean", mean)]}
+
+
+@dataclass(frozen=True)
+class HeaderScan:
+    """Facts and broken rules from the headers of a file and of the files that it names.
+
+    Attributes:
+        field: of the report that has the facts, "rad", "streamed_sog" or "tiles".
+        violations: broken rules.
+        head: what a report begins with; None where `facts` is.
+        facts: `RadFacts`, `StreamedSogFacts` or `TileFacts`; None where a rule is broken without which the rest cannot
+            be trusted.
+    """
+
+    field: str
+    violations: Sequence[RuleViolation]
+    head: Head | None = None
+    facts: Any = None
+
+    @property
+    def findings(self) -> list[Finding]:
+        """Broken rules, one finding for each code."""
+        return findings_of(self.violations)
+
+    @property
+    def fatal(self) -> list[Finding]:
+        """Findings because of which the file cannot be read."""
+        return findings_of(each for each in self.violations if each.fatal)
+
+
+@dataclass(frozen=True)
+class PropertyFacts:
+    """A property of all chunks, see `schema.json`."""
+
+    encoding: str
+    bytes: int
+    share: float
+    min: float | None
+    max: float | None
+
+
+@dataclass(frozen=True)
+class RadFacts:
+    """Facts from the headers of a RAD file; `schema.json` describes the fields."""
+
+    chunked: bool
+    bytes: int
+    header_bytes: int
+    first_bytes: int
+    chunk_size: int
+    chunk_bytes: ChunkBytes | None
+    palette: int
+    ranges: dict[str, float | bool] | None
+    comment: str | None
+    properties: dict[str, PropertyFacts]
+
+
+def survey_rad(file: BinaryIO, open_companion: OpenCompanion, *, check: bool) -> HeaderScan:
+    """Read the headers of a RAD file and of its chunks.
+
+    Args:
+        check: look at the padding of properties, too.
+
+    Raises:
+        FormatError: the header of the file cannot be read.
+    """
+    header, violations = scan_header(file, open_companion)
+    gathered = _Gathered()
+    if not any(each.fatal for each in violations):
+        for chunk in scan_chunks(file, open_companion, header, paddings=check):
+            violations += chunk.violations
+            if chunk.header is not None:
+                gathered.add(chunk.header)
+    if any(each.fatal for each in violations):
+        return HeaderScan("rad", violations)
+    facts, noted = _rad_facts(header, gathered), header.noted
+    head = Head(header.format, facts.bytes, header.count, header.max_sh, noted.antialiased, noted.up)
+    return HeaderScan("rad", violations, head, facts)
+
+
+@dataclass
+class _Gathered:
+    """Properties of the chunks so far, by name."""
+
+    encodings: dict[str, dict[str, None]] = field(default_factory=dict)
+    bytes: Counter[str] = field(default_factory=Counter)
+    low: dict[str, float] = field(default_factory=dict)
+    high: dict[str, float] = field(default_factory=dict)
+
+    def add(self, chunk: RadChunkHeader) -> None:
+        for each in chunk.properties:
+            if each.name not in BY_NAME or each.encoding not in SIZES:
+                continue  # a finding says so
+            self.encodings.setdefault(each.name, {})[each.encoding] = None
+            self.bytes[each.name] += each.bytes
+            if each.min is not None:
+                self.low[each.name] = min(each.min, self.low.get(each.name, each.min))
+            if each.max is not None:
+                self.high[each.name] = max(each.max, self.high.get(each.name, each.max))
+
+
+def _rad_facts(header: RadHeader, gathered: _Gathered) -> RadFacts:
+    sizes = [entry.bytes for entry in header.chunks]
+    total = header.bytes + sum(sizes)
+    ranges = None
+    if header.encoding is not None:
+        ranges = {key: getattr(header.encoding, name) for key, name in ENCODING_KEYS.items()}
+    comment = None if header.comment is None else printable(" ".join(header.comment.split()), MOST)
+    names = [row.name for row in PROPERTIES if row.name in gathered.encodings]
+    return RadFacts(
+        chunked=header.chunked,
+        bytes=total,
+        header_bytes=header.bytes,
+        first_bytes=header.bytes + (sizes[0] if sizes else 0),
+        chunk_size=header.chunk_size,
+        chunk_bytes=ChunkBytes.of(sizes),
+        palette=header.sh_code_count or 0,
+        ranges=ranges,
+        comment=comment,
+        properties={
+            name: PropertyFacts(
+                encoding=", ".join(gathered.encodings[name]),
+                bytes=gathered.bytes[name],
+                share=round(gathered.bytes[name] / total, 4),
+                min=gathered.low.get(name),
+                max=gathered.high.get(name),
+            )
+            for name in names
+        },
+    )
+
+
+def ends_of_rad(facts: RadFacts) -> Ends:
+    """Return the ends of the codes of a file; there are none where chunks have several encodings."""
+    center, scales = facts.properties.get("center"), facts.properties.get("scales")
+    ends = Ends()
+    if center is not None and center.encoding in ("f16", "f16_lebytes"):
+        ends = replace(ends, center=float(LARGEST_F16))
+    if scales is not None and scales.encoding == "ln_0r8" and scales.min is not None and scales.max is not None:
+        table = log_scale_table(scales.min, scales.max)
+        ends = replace(ends, scale=(float(table[1]), float(table[-1])))
+    return ends
+
+
+@dataclass(frozen=True)
+class LevelFacts:
+    """A detail level, see `schema.json`."""
+
+    splats: int
+    share: float | None
+    regions: int
+    files: int
+    bytes: int
+    errors: dict[str, float] | None
+
+
+@dataclass(frozen=True)
+class EnvironmentFacts:
+    """The splats that are drawn whatever the detail levels are: how many, and the bytes of their files."""
+
+    splats: int
+    bytes: int
+
+
+@dataclass(frozen=True)
+class StreamedSogFacts:
+    """Facts from the manifest and the headers of the chunk files, see `schema.json`."""
+
+    generator: str | None
+    bytes: int
+    manifest_bytes: int
+    first_bytes: int
+    splats: int
+    levels: list[LevelFacts]
+    regions: int
+    depth: int
+    region_splats: dict[str, float]
+    region_edge: dict[str, float]
+    bound: Box
+    files: int
+    file_bytes: ChunkBytes | None
+    environment: EnvironmentFacts | None
+
+
+def survey_streamed_sog(
+    file: BinaryIO, open_companion: OpenCompanion, *, check: bool, threads: int = 1, progress: Progress = silent
+) -> HeaderScan:
+    """Read a manifest and the headers of its chunk files.
+
+    Args:
+        check: decode the chunk files and look at their splats, too.
+
+    Raises:
+        FormatError: the manifest cannot be parsed.
+    """
+    size = size_of(file)
+    manifest, files, violations = scan_files(file, open_companion)
+    if any(each.fatal for each in violations):
+        return HeaderScan("streamed_sog", violations)
+    if check:
+        violations += scan_splats(open_companion, manifest, files, threads=threads, progress=progress)
+    chunks = {name: chunk for name, chunk in files.items() if isinstance(chunk, Chunk)}
+    facts = _detail_facts(manifest, chunks, size)
+    return HeaderScan("streamed_sog", violations, _detail_head(manifest, chunks, facts), facts)
+
+
+def _detail_head(manifest: Manifest, chunks: Mapping[str, Chunk], facts: StreamedSogFacts) -> Head:
+    """Return what a reader of level 0 and the environment finds."""
+    read = [chunks[name] for name in _names_of(manifest, 0)]
+    count = facts.levels[0].splats
+    if manifest.environment is not None:
+        read.append(chunks[manifest.environment])
+        count += chunks[manifest.environment].count
+    degree = max((chunk.sh_degree for chunk in read), default=0)
+    antialiased = any(chunk.antialiased for chunk in read)
+    return Head(f"Streamed SOG {STREAMED_SOG_VERSION}", facts.bytes, count, degree, antialiased, manifest.noted.up)
+
+
+def _names_of(manifest: Manifest, level: int) -> list[str]:
+    """Return the chunk files with splats of a level."""
+    held = {node.runs[level].file for _, node in manifest.regions() if node.runs and _count(node, level)}
+    return [manifest.filenames[number] for number in sorted(held)]
+
+
+def _detail_facts(manifest: Manifest, chunks: Mapping[str, Chunk], size: int) -> StreamedSogFacts:
+    counts = level_counts(manifest)
+    levels = [_detail_level(manifest, chunks, level, counts) for level in range(manifest.levels)]
+    environment = None
+    if manifest.environment is not None:
+        chunk = chunks[manifest.environment]
+        environment = EnvironmentFacts(chunk.count, chunk.bytes)
+    beyond = 0 if environment is None else environment.bytes
+    sizes = [chunks[name].bytes for name in manifest.filenames]
+    asset = manifest.head.get("asset")
+    generator = asset.get("generator") if isinstance(asset, dict) else None
+    regions = [node for _, node in manifest.regions()]
+    edges = [max(map(_edge, *node.bound)) for node in regions if node.bound is not None]
+    full = [_count(node, 0) for node in regions]
+    bound = manifest.nodes[0].bound
+    assert bound is not None
+    return StreamedSogFacts(
+        generator=printable(" ".join(generator.split()), MOST) if isinstance(generator, str) else None,
+        bytes=size + sum(sizes) + beyond,
+        manifest_bytes=size,
+        first_bytes=size + levels[-1].bytes + beyond,
+        splats=sum(counts),
+        levels=levels,
+        regions=len(regions),
+        depth=_depth(manifest),
+        region_splats=quantiles_of(full),
+        region_edge=quantiles_of(edges),
+        bound=Box(list(bound[0]), list(bound[1])),
+        files=len(sizes),
+        file_bytes=ChunkBytes.of(sizes),
+        environment=environment,
+    )
+
+
+def _detail_level(manifest: Manifest, chunks: Mapping[str, Chunk], level: int, counts: Sequence[int]) -> LevelFacts:
+    names = _names_of(manifest, level)
+    held = [node for _, node in manifest.regions() if _count(node, level)]
+    errors = [node.errors[level] for node in held if node.errors is not None]
+    weights = [_count(node, 0) for node in held]
+    known = bool(errors) and len(errors) == len(held) and any(weights)
+    return LevelFacts(
+        splats=counts[level],
+        share=round(counts[level] / counts[0], 4) if counts[0] else None,
+        regions=len(held),
+        files=len(names),
+        bytes=sum(chunks[name].bytes for name in names),
+        errors=quantiles_of(errors, weights) if known else None,
+    )
+
+
+def _count(node: ManifestNode, level: int) -> int:
+    """Return the splats of a region at a level."""
+    return node.runs[level].count if node.runs and level in node.runs else 0
+
+
+def _depth(manifest: Manifest) -> int:
+    """Edges to the deepest node; each node comes after its parent."""
+    depths = [0] * len(manifest.nodes)
+    for number, node in enumerate(manifest.nodes[1:], 1):
+        depths[number] = depths[node.parent] + 1
+    return max(depths)
+
+
+def _edge(low: float, high: float) -> float:
+    """Return the length between two numbers, which are finite but may be as large as numbers are."""
+    return min(max(high - low, -LARGEST), LARGEST)
+
+
+#: Distance from the centre of the Earth, metres, from which on a transform places a tileset on it. Chosen.
+ON_EARTH = 1e6
+
+
+@dataclass(frozen=True)
+class TileLevelFacts:
+    """The tiles of a depth, see `schema.json`."""
+
+    tiles: int
+    splats: int
+    bytes: int
+    leaves: int
+    errors: dict[str, float] | None
+
+
+@dataclass(frozen=True)
+class TileFacts:
+    """Facts from the tileset files and the headers of the tiles, see `schema.json`."""
+
+    generator: str | None
+    version: str
+    bytes: int
+    tileset_bytes: int
+    first_bytes: int
+    splats: int
+    tiles: int
+    levels: list[TileLevelFacts]
+    tilesets: int
+    geometric_error: float | None
+    tile_splats: dict[str, float]
+    file_bytes: ChunkBytes | None
+    georeference: EarthPlace | None
+
+
+def survey_tiles(
+    file: BinaryIO, open_companion: OpenCompanion, *, check: bool, threads: int = 1, progress: Progress = silent
+) -> HeaderScan:
+    """Read a tileset and the headers of its tiles.
+
+    Args:
+        check: decode the tiles and look at their splats, too.
+
+    Raises:
+        FormatError: a tileset file cannot be parsed.
+    """
+    tileset = read_whole(file.read(MAX_TILESET + 1), open_companion)
+    found = list(read_violations(tileset))
+    if not found:
+        found += violations(tileset)
+    if any(each.fatal for each in found):
+        return HeaderScan("tiles", found)
+    matrices = matrices_of(tileset)
+    named = {name: matrices[at] for at, tile in enumerate(tileset.tiles) if (name := tile.name) is not None}
+    files = tile_files(open_companion, named)
+    chunks, about_files = scan_tile_files(tileset, files)
+    found += about_files
+    if any(each.fatal for each in found):
+        return HeaderScan("tiles", found)
+    if check:
+        found += scan_tile_splats(tileset, files, chunks, threads=threads, progress=progress)
+    return HeaderScan("tiles", found, _tile_head(tileset, chunks), _tile_facts(tileset, chunks))
+
+
+def _tile_head(tileset: Tileset, chunks: Mapping[int, Chunk]) -> Head:
+    """Return what a reader of the tiles without children finds."""
+    read = [chunk for number, chunk in chunks.items() if not tileset.tiles[number].children]
+    return Head(
+        f"3D Tiles {tileset.head['asset']['version']} of {read[0].format}" if read else "3D Tiles",
+        tileset.bytes + sum(chunk.bytes for chunk in chunks.values()),
+        sum(chunk.count for chunk in read),
+        max((chunk.sh_degree for chunk in read), default=0),
+        any(chunk.antialiased for chunk in read),
+        common(chunk.up for chunk in read),
+        common(chunk.up_by for chunk in read) or "",
+    )
+
+
+def _tile_facts(tileset: Tileset, chunks: Mapping[int, Chunk]) -> TileFacts:
+    asset = tileset.head["asset"]
+    extras = asset.get("extras")
+    generator = extras.get("generator") if isinstance(extras, dict) else None
+    depths = depths_of(tileset)
+    sizes = [chunk.bytes for chunk in chunks.values()]
+    by_depth = [[at for at in range(len(depths)) if depths[at] == depth] for depth in range(max(depths) + 1)]
+    total, error = tileset.bytes + sum(sizes), tileset.head.get("geometricError")
+    first = next((chunk.bytes for number, chunk in chunks.items() if depths[number] == 0), 0)
+    return TileFacts(
+        generator=printable(" ".join(generator.split()), MOST) if isinstance(generator, str) else None,
+        version=asset["version"],
+        bytes=total,
+        tileset_bytes=tileset.bytes,
+        first_bytes=tileset.bytes + first,
+        splats=sum(chunk.count for chunk in chunks.values()),
+        tiles=len(chunks),
+        levels=[_tile_level(tileset, chunks, numbers) for numbers in by_depth],
+        tilesets=len(tileset.heads),
+        geometric_error=float(error) if isinstance(error, (int, float)) else None,
+        tile_splats=quantiles_of([chunk.count for chunk in chunks.values()] or [0]),
+        file_bytes=ChunkBytes.of(sizes),
+        georeference=_place(tileset),
+    )
+
+
+def _tile_level(tileset: Tileset, chunks: Mapping[int, Chunk], numbers: Sequence[int]) -> TileLevelFacts:
+    held = [number for number in numbers if number in chunks]
+    inner = [number for number in held if tileset.tiles[number].children]
+    errors = [float(tileset.tiles[number].record["geometricError"]) for number in inner]
+    return TileLevelFacts(
+        tiles=len(held),
+        splats=sum(chunks[number].count for number in held),
+        bytes=sum(chunks[number].bytes for number in held),
+        leaves=len(held) - len(inner),
+        errors=quantiles_of(errors) if errors else None,
+    )
+
+
+def _place(tileset: Tileset) -> EarthPlace | None:
+    """Return where the transform of the root puts the origin of the scene; None where that is not on the Earth."""
+    matrix = matrix_of(tileset.tiles[0].record)
+    if float(np.linalg.norm(matrix[:3, 3])) < ON_EARTH:
+        return None
+    found = place_of(tuple(matrix.T.ravel().tolist()))
+    latitude, longitude = round(found.latitude, 9) + 0.0, round(found.longitude, 9) + 0.0  # no -0
+    return EarthPlace(latitude, longitude, round(found.height, 4) + 0.0, round(found.heading, 6) % 360)
