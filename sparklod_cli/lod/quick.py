@@ -18,10 +18,12 @@ at a level ends where the cells of the level below end that something unknown co
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+import itertools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,31 +32,59 @@ from ..model.gaussian import spark_size
 from ..model.lod_tree import LodTree
 from ..model.splats import COLUMNS, FloatArray, Splats
 from ..system.progress import Progress, silent
-from ..system.threads import threads_for
+from ..system.threads import blocks_of, threads_for
 from .builders import DEFAULT_BASE, MAX_BASE, MIN_BASE
 from .check import Bounds, check, check_setting
-from .kernels.pair_cost import WIDTH
-from .kernels.sort import PART_BITS, Keys, Nodes, cell_words, sort_by_cell, sort_by_key
-from .voxel_grid import Margins, VoxelGrid
-from .voxel_tree import (
-    MERGED,
-    Final,
-    Joining,
-    NodeRows,
-    Offsets,
-    VoxelTree,
-    fill_rows,
-    joining,
-)
+from .kernels.cell_pairs import SPAN, merge_in_cells, split_families
+from .kernels.geometry import SplatColumns
+from .kernels.node_rows import Space, fill_leaf_rows, fill_leaves, fill_merged_splats, merge_colors
+from .kernels.pair_cost import WEIGHT, WIDTH
+from .kernels.sort import PART_BITS, Keys, Nodes, Parts, cell_words, fill_level_keys, sort_by_cell, sort_by_key
 
 if TYPE_CHECKING:  # builds in memory do without
-    from .stage_records import Pending, Region, StageFamilies
+    from .stage_records import Margins, Pending, Region, StageFamilies
 
 #: Level of splats that have not joined the tree yet: they do so at the level of their size.
 NEW = -1
 
 #: More than the levels of any scene: sizes and distances of float32 span 2 ** 278, and the base is at least 1.1.
 LEVELS = 4096
+
+#: Largest coordinate in steps of a level: parts are half a step wide, their coordinates int64, and so must be their
+#: differences. No level is finer than this allows.
+MAX_STEPS = 2.0**59
+
+#: Edge of a cell in steps of its level. Chosen; 8 is no better (benchmarks/notes/quick-builder.md).
+CELL = 4
+
+#: Parts of a cell on an axis.
+PARTS = 1 << PART_BITS
+
+#: The grid is shifted from level to level by these shares of a cell on the three axes: powers of the golden section,
+#: so that seams hardly ever recur.
+SHIFT = (0.38196601, 0.76393202, 0.14589803)
+
+#: The largest size of a merged node, in steps of its level; a node's size is about 2 * sqrt(trace of its covariance /
+#: 3). Chosen; what matters is the number of rounds (`kernels/cell_pairs.py`).
+LIMIT = 0.7
+
+#: Largest coordinate and size, units: float32 holds its square. Chosen.
+FARTHEST = 1e15
+
+#: Bits per axis of the Morton codes that leaves are sorted by: 51 bits, and at most 11 for the level (sizes are
+#: float32, the base is at least 1.1), fit a uint64.
+CURVE_BITS = 17
+
+#: In place of the number of a given node, for a merged one.
+MERGED = np.uint32(0xFFFFFFFF)
+
+#: Rows that are moved at a time: their copies stay in a processor's cache.
+MOVED = 1 << 14
+
+Offsets = NDArray[np.int64]
+
+#: Fills the node rows of splats, given their indices and the (n, WIDTH) rows.
+FillRows = Callable[[Nodes, FloatArray], None]
 
 
 def build(splats: Splats, base: float = DEFAULT_BASE, *, progress: Progress = silent) -> tuple[Splats, LodTree]:
@@ -80,94 +110,358 @@ def build(splats: Splats, base: float = DEFAULT_BASE, *, progress: Progress = si
     bounds = check(splats)
     with threads_for(n) as threads:
         grid = VoxelGrid.of(bounds, base)
-        index, joins = grid.sorted_leaves(splats.center, splats.scale, threads)
-        arrivals = Arrivals(n, joining(index, joins, lambda some, rows: fill_rows(some, splats, grid.space, rows)))
-        tree = VoxelTree(n, n, grid.space)
-        ((_, root),) = grow(tree, grid, arrivals, None, progress)
-        final = tree.finish(root, index, splats)
-    return final.nodes, final.tree
+        index, ends = grid.sorted_leaves(splats.center, splats.scale, threads)
+        tree = VoxelTree(grid, n, index, ends, partial(fill_rows, splats, grid.space))
+        ((_, root),) = tree.grow(None, progress)
+        nodes, links, *_ = tree.finish(root, splats)
+    return nodes, links
 
 
 @dataclass(frozen=True, eq=False)
-class Arrivals:
-    """The nodes that take part, each from some level on. Lists are emptied as they do, so that memory is freed.
+class VoxelGrid:
+    """The cells of all levels, the finest of which is level 0: the same whatever part of the scene is built.
+
+    Nodes of a level are about base ** level large. A cell is wider, so that it holds several of them to choose from,
+    and is divided into parts, along which its nodes are sorted. From level to level the grid is shifted, and its seams
+    with it.
 
     Attributes:
-        splats: number of splats that join at the level of their size.
-        joining: those splats by level, each along the curve.
-        waiting: rows of other nodes by the level that they wait for; all nodes in a cell of the level below come from
-            one stage, in their order.
+        base: growth of the cells from level to level.
+        finest: power of the base that is the edge of the cells of level 0.
+        steps: (L,) edges of the cells of all levels that a splat can belong to, world units.
+        low, high: (3,) float64 corners of the box of all centres, world units.
+        box: (2, 3) float64 the same corners in units, as rows hold them.
+        largest: size of the largest splat, world units.
+        space: coordinates of node rows; the unit is a power of two, so that centres are divided by it exactly.
     """
 
-    splats: int
-    joining: dict[int, Joining]
-    waiting: dict[int, NodeRows] = field(default_factory=dict)
+    base: float
+    finest: int
+    steps: NDArray[np.float64]
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+    box: NDArray[np.float64]
+    largest: float
+    space: Space
+
+    @classmethod
+    def of(cls, bounds: Bounds, base: float) -> VoxelGrid:
+        """Return the grid of a scene with these bounds."""
+        corners = np.array([bounds.low, bounds.high])
+        farthest = float(np.abs(corners).max())
+        finest = math.floor(math.log(max(bounds.smallest, farthest / MAX_STEPS), base))
+        coarsest = max(finest + 1, math.ceil(math.log(bounds.largest, base)) + 1)
+        steps = base ** np.arange(finest, coarsest + 1, dtype=np.float64)
+        middle = math.sqrt(bounds.smallest) * math.sqrt(bounds.largest)
+        unit = 2.0 ** round(math.log2(max(middle, farthest / FARTHEST, bounds.largest / FARTHEST)))
+        box = (corners / unit).astype(np.float32).astype(np.float64)
+        space = Space(np.zeros(3), np.float64(unit))
+        return cls(base, finest, steps, bounds.low, bounds.high, box, bounds.largest, space)
+
+    def parts(self, level: int) -> Parts:
+        """Return the parts of the cells of any level; the scene's box bounds all, as a mean is in the box of its terms.
+
+        `low` is that of a cell.
+        """
+        step = np.float64(self.base) ** (self.finest + level) / self.space.unit
+        edge = np.float64(step) * np.float64(CELL / PARTS)
+        shift = np.floor(np.array(SHIFT) * level % 1 * PARTS).astype(np.int64)
+        low, high = (np.floor(corner / edge).astype(np.int64) for corner in self.box)
+        lowest = (low - shift) // PARTS * PARTS + shift
+        return Parts(edge, lowest, int((high - lowest).max()).bit_length())
+
+    def sorted_leaves(
+        self, center: FloatArray, scale: FloatArray, threads: int, order: Nodes | None = None
+    ) -> tuple[Nodes, Offsets]:
+        """Return the splats by level and then along a curve, and where each level ends.
+
+        Args:
+            center, scale: (n, 3) of the splats.
+            order: (n,) the splats in the order of the scene; by default they are in it.
+        """
+        # One cell to spare at either end.
+        edge = max(float((self.high - self.low).max()) / (2**CURVE_BITS - 2), float(self.steps[0]))
+        low_cell = np.floor(self.low / edge).astype(np.int64)
+        keys, levels = np.empty(len(scale), np.uint64), np.empty(len(scale), np.int32)
+        fill_level_keys(len(scale), center, scale, self.steps, edge, low_cell, 3 * CURVE_BITS, keys, levels)
+        ends = np.cumsum(np.bincount(levels))
+        del levels
+        if order is None:
+            order = np.arange(len(center), dtype=np.uint32)
+        else:
+            keys = keys[order]
+        return sort_by_key(keys, order, 3 * CURVE_BITS + len(self.steps).bit_length(), threads)[1], ends
 
 
-def grow(
-    tree: VoxelTree, grid: VoxelGrid, arrivals: Arrivals, margins: Margins | None, progress: Progress
-) -> list[tuple[int, NodeRows]]:
-    """Merge the nodes of each cell, level by level.
+class NodeRows(NamedTuple):
+    """Columns of n nodes without a parent.
 
-    Args:
-        arrivals: all nodes that are given; it is emptied.
-        margins: of the region that they are in, at level 0; None if they are all that there are, and get one root.
-
-    Returns:
-        the nodes without a parent, by the level that they wait for; only the root if there are no margins.
+    Attributes:
+        node: (n, WIDTH) float32 node rows of `kernels/pair_cost.py`.
+        number: (n,) uint32 place of a given node among these; of a merged node, where its children begin, as a distance
+            from the end of the final order.
+        children: (n,) uint16 number of children that it was given here; 0 for a given node.
     """
-    active, level, joined = np.empty(0, np.uint32), 0, 0
-    last = max(0, int(np.searchsorted(grid.steps, grid.largest)))  # a splat joins at its level at most
-    left: list[tuple[int, NodeRows]] = []
-    while True:
-        if level in arrivals.waiting:
-            active = tree.join(active, arrivals.waiting.pop(level))
-            active = _by_cell(tree, grid, level - 1, active, within=False)[0]
-        if level > last and not arrivals.waiting and len(active) <= 1:
-            break
-        if margins is not None:
-            margins.widen(level)
-            if margins.are_closed:
+
+    node: FloatArray
+    number: NDArray[np.uint32]
+    children: NDArray[np.uint16]
+
+    @classmethod
+    def empty(cls, size: int) -> NodeRows:
+        """Return room for nodes."""
+        return cls(np.empty((size, WIDTH), np.float32), np.empty(size, np.uint32), np.empty(size, np.uint16))
+
+    def take(self, nodes: Nodes | slice) -> NodeRows:
+        """Return some of the nodes."""
+        return NodeRows(self.node[nodes], self.number[nodes], self.children[nodes])
+
+
+class Batch(NamedTuple):
+    """Merges that were done together.
+
+    Attributes:
+        level: of their cells.
+        families: number of merged nodes.
+        members: number of their children.
+        keys: (families, words) Morton codes of their cells, the highest word first; empty in memory.
+    """
+
+    level: int
+    families: int
+    members: int
+    keys: Keys
+
+
+class VoxelTree:
+    """Nodes without a parent, and nodes with one in their final order.
+
+    Only nodes without a parent are worked on. A node that gets one is written to its place in the final order at once,
+    which is filled from its end: the last batch of merges, the coarsest one, comes first there. So a node takes memory
+    in one place at a time.
+
+    Attributes:
+        rows: of the nodes without a parent; views of them do not outlive the next call.
+        batches: in the order of the merges.
+    """
+
+    def __init__(
+        self,
+        grid: VoxelGrid,
+        leaves: int,
+        index: Nodes,
+        ends: Offsets,
+        fill: FillRows,
+        waiting: dict[int, NodeRows] | None = None,
+        keys: Callable[[int, FloatArray], Keys] | None = None,
+    ) -> None:
+        """Make a tree without nodes.
+
+        Args:
+            leaves: given nodes with a number from here on are merged ones.
+            index: (given,) splat of each given node; those that join at the level of their size come first, each level
+                along the curve.
+            ends: where each level ends in `index`.
+            fill: of the splats that join.
+            waiting: rows of all other nodes by the level that they wait for; all nodes in a cell of the level below
+                come from one stage, in their order. It is emptied, so that memory is freed.
+            keys: returns the keys of a batch, by the level and the rows of the merged nodes; None in memory.
+        """
+        self.batches = list[Batch]()
+        self._grid, self._leaves, self._index, self._waiting, self._keys = grid, leaves, index, waiting or {}, keys
+        # Emptied as splats join, so that what `fill` holds is freed.
+        self._joining = {
+            level: (slice(begin, end), fill)
+            for level, (begin, end) in enumerate(itertools.pairwise([0, *ends.tolist()]))
+            if begin < end
+        }
+        # Twice the nodes are the most that there will be; memory that is not written to is not taken. So much room is
+        # enough for the rows, too: half of them for what the others are merged into.
+        size = 2 * len(index)
+        self.rows, self._used, self._awaited, self._total = NodeRows.empty(size), 0, len(index), 0
+        self._center, self._scale = np.empty((size, 3), np.float32), np.empty((size, 3), np.float32)
+        self._quat, self._opacity = np.empty((size, 4), np.float32), np.empty(size, np.float32)
+        self._weight, self._number = np.empty(size, np.float64), np.empty(size, np.uint32)
+        self._count = np.empty(size, np.uint16)
+
+    def grow(self, margins: Margins | None, progress: Progress) -> list[tuple[int, NodeRows]]:
+        """Merge the nodes of each cell, level by level.
+
+        Args:
+            margins: of the region of all nodes, at level 0; None if there are no other nodes, and these get one root.
+
+        Returns:
+            the nodes without a parent, by the level that they wait for; only the root if there are no margins.
+        """
+        grid, active, level = self._grid, np.empty(0, np.uint32), 0
+        splats = max((numbers.stop for numbers, _ in self._joining.values()), default=0)
+        last = max(0, int(np.searchsorted(grid.steps, grid.largest)))  # a splat joins at its level at most
+        left: list[tuple[int, NodeRows]] = []
+        while True:
+            if level in self._waiting:
+                waiting = self._waiting.pop(level)
+                active, part = self._join(active, len(waiting.number))
+                added = self.rows.take(part)
+                added.node[:], added.number[:], added.children[:] = waiting
+                del waiting, added
+                with threads_for(len(active)) as threads:
+                    active, _ = sort_by_cell(self.rows.node, active, grid.parts(level - 1), threads, within=False)
+            if level > last and not self._waiting and len(active) <= 1:
                 break
-        if level in arrivals.joining:
-            new = arrivals.joining.pop(level)
-            joined += len(new)
-            active = tree.join(active, new)
-            progress("building", joined, arrivals.splats, "splat")
-        if margins is not None:
-            active, outside = margins.split(active, tree.rows.node)
-            left.append((level, tree.rows.take(outside)))
-        if len(active) > 1:
-            with threads_for(len(active)):
-                active = tree.tidy(active)
-                active = tree.merge_cells(level, *_by_cell(tree, grid, level, active), grid.largest_trace(level))
-        level += 1
-    left.append((level, tree.rows.take(active)))
-    unjoined = [(level, splats.rows()) for level, splats in arrivals.joining.items()]
-    return left + unjoined + list(arrivals.waiting.items())
+            if margins is not None:
+                margins.widen(grid.parts(level))
+                if margins.are_closed:
+                    break
+            if level in self._joining:
+                numbers, _ = self._joining[level]
+                active, part = self._join(active, numbers.stop - numbers.start)
+                self._fill(level, self.rows.take(part))
+                progress("building", numbers.stop, splats, "splat")
+            if margins is not None:
+                active, outside = margins.split(active, self.rows.node)
+                left.append((level, self.rows.take(outside)))
+            if len(active) > 1:
+                active = self._merge_cells(level, active)
+            level += 1
+        left.append((level, self.rows.take(active)))
+        for unjoined, (numbers, _) in list(self._joining.items()):
+            rows = NodeRows.empty(numbers.stop - numbers.start)
+            self._fill(unjoined, rows)
+            left.append((unjoined, rows))
+        return left + list(self._waiting.items())
+
+    def _join(self, active: Nodes, more: int) -> tuple[Nodes, slice]:
+        """Add nodes, whose rows are to be filled; return where the active ones and they are. Others are forgotten."""
+        active = self._tidy(active, more)
+        part = slice(self._used, self._used + more)
+        self._used, self._awaited = part.stop, self._awaited - more
+        return np.concatenate([active, np.arange(part.start, part.stop, dtype=np.uint32)]), part
+
+    def _fill(self, level: int, rows: NodeRows) -> None:
+        """Fill the rows of the splats that join at a level."""
+        numbers, fill = self._joining.pop(level)
+        fill(self._index[numbers], rows.node)
+        rows.number[:] = np.arange(numbers.start, numbers.stop, dtype=np.uint32)
+        rows.children[:] = 0
+
+    def _tidy(self, active: Nodes, more: int = 0) -> Nodes:
+        """Make room for more nodes, and for what all of them are merged into; return where the active ones are."""
+        need, size = len(active) + 2 * more, len(self.rows.number)
+        if self._used + need <= size and self._used <= 2 * len(active) + more:
+            return active
+        # The active nodes move together, in place.
+        kept = np.zeros(self._used, np.bool_)
+        kept[active] = True
+        order = np.flatnonzero(kept).astype(np.uint32)
+        place = np.empty(self._used, np.uint32)
+        place[order] = np.arange(len(order), dtype=np.uint32)
+        for part in blocks_of(len(order), MOVED):
+            if order[part][-1] >= part.stop:  # else they are there
+                for column in self.rows:
+                    column[part] = column[order[part]]
+        self._used = len(order)
+        enough = 2 * (len(active) + self._awaited)
+        if size > 2 * enough:  # give memory back
+            for column in self.rows:
+                column.resize((enough, *column.shape[1:]), refcheck=False)
+        return place[active]
+
+    def _merge_cells(self, level: int, nodes: Nodes) -> Nodes:
+        """Merge the nodes of each cell, as `kernels.cell_pairs.merge_in_cells`; return the nodes without a parent."""
+        parts = self._grid.parts(level)
+        size = LIMIT * (float(parts.step) * (PARTS / CELL))
+        largest = np.float32(0.75 * size * size if size < FARTHEST**1.2 else math.inf)  # trace of a covariance
+        with threads_for(len(nodes)) as threads:
+            nodes, is_first = sort_by_cell(self.rows.node, self._tidy(nodes), parts, threads)
+            owner, row = np.empty(len(nodes), np.int64), np.empty(len(nodes), np.uint32)
+            merge_in_cells(-(-len(nodes) // SPAN), nodes, is_first, self.rows.node, largest, self._used, owner, row)
+            members, first, merged, survivors = split_families(nodes, owner, row)
+            del owner, row
+            if len(merged):
+                self._write(members)
+                self.rows.number[merged] = self._total - first[:-1]
+                self.rows.children[merged] = np.diff(first)
+                keys = self._keys(level, self.rows.node[merged]) if self._keys else np.empty((0, 0), np.uint64)
+                self.batches.append(Batch(level, len(merged), len(members), keys))
+                self._used += len(nodes) // 2
+        return survivors
+
+    def _write(self, nodes: Nodes) -> None:
+        """Put nodes before all that have been written."""
+        end = len(self._weight) - self._total
+        part = slice(end - len(nodes), end)
+        rows, count = self.rows, len(nodes)
+        self._weight[part] = rows.node[nodes, WEIGHT]
+        self._number[part], self._count[part] = rows.number[nodes], rows.children[nodes]
+        is_merged = (self._count[part] > 0) | (self._number[part] >= self._leaves)
+        at = np.where(is_merged, np.arange(1, count + 1, dtype=np.uint32), np.uint32(0))
+        columns = self._center[part], self._scale[part], self._quat[part], self._opacity[part]
+        fill_merged_splats(count, at, 1, nodes, rows.node, self._grid.space, *columns)
+        self._total += count
+
+    def finish(self, tops: NodeRows, given: Splats) -> tuple[Splats, LodTree, Nodes, Nodes]:
+        """Return the nodes as they are drawn: those without a parent, then children of the batches, the last first.
+
+        Colours are merged here, where those of siblings are adjacent. The tree is of no use afterwards.
+
+        Args:
+            tops: the nodes without a parent.
+            given: splats, as they are drawn.
+
+        Returns:
+            M nodes; the children that they were given here; (M,) uint32 numbers of the given nodes, `MERGED` for
+            others; and (F,) uint32 the nodes with children, in the order of these.
+        """
+        self.rows = tops
+        self._write(np.arange(len(tops.number), dtype=np.uint32))
+        self.rows = tops.take(slice(0))
+        total, part = self._total, slice(len(self._weight) - self._total, None)
+        weight, number, count = self._weight[part], self._number[part], self._count[part]
+        inner = np.flatnonzero(count).astype(np.uint32)
+        start = np.zeros(total, np.uint32)
+        start[inner] = np.uint32(total) - number[inner]
+        number[inner] = MERGED
+        owner = np.zeros(total + 1, np.uint32)  # of a family, by its first child
+        owner[start[inner]] = inner + np.uint32(1)
+        parents = owner[owner > 0] - np.uint32(1)
+        del owner, inner
+        geometry = self._center[part], self._scale[part], self._quat[part], self._opacity[part]
+        sh = given.sh.shape[1:]
+        out = Splats(*geometry, np.empty((total, 3), np.float32), np.empty((total, *sh), np.float32))
+        for name in COLUMNS:
+            column, filled = getattr(given, name), getattr(out, name)
+            width = math.prod(filled.shape[1:])
+            fill_leaves(total, number, self._index, column.reshape(len(column), width), filled.reshape(total, width))
+        del given, column  # frees memory if the caller has no reference
+        same, end = np.arange(total, dtype=np.uint32), len(parents)
+        for batch in self.batches:
+            with threads_for(batch.members):
+                for color in (out.rgb, out.sh.reshape(total, math.prod(sh))):
+                    family = parents[end - batch.families : end]
+                    merge_colors(len(family), family, start, count, same, weight, color)
+            end -= batch.families
+        return out, LodTree(count, start), number, parents
 
 
-def _by_cell(
-    tree: VoxelTree, grid: VoxelGrid, level: int, nodes: Nodes, *, within: bool = True
-) -> tuple[Nodes, NDArray[np.bool_]]:
-    """`sort_by_cell` of the cells of a level."""
-    with threads_for(len(nodes)) as threads:
-        return sort_by_cell(tree.rows.node, nodes, grid.parts(level), threads, within=within)
+def fill_rows(splats: Splats, space: Space, index: Nodes, rows: FloatArray) -> None:
+    """Fill the node rows of some splats."""
+    columns = SplatColumns(splats.center, splats.scale, splats.quat_xyzw, splats.opacity)
+    fill_leaf_rows(len(index), index, columns, splats.rgb, space, rows, np.empty(len(index), np.float32))
 
 
 def plan(bounds: Bounds, sample: Splats, setting: float) -> VoxelGrid:
-    """Return the grid of the scene; the setting is the base, and `ValueError` is raised if it is out of range."""
+    """See `StagedBuilder`; the setting is the base."""
     check_setting("base", setting, MIN_BASE, MAX_BASE)
     return VoxelGrid.of(bounds, setting)
 
 
 def leaves(splats: Splats, index: NDArray[np.int64], plan: VoxelGrid) -> Pending:
-    """Return splats that have not joined the tree."""
+    """See `StagedBuilder`; these splats have not joined the tree."""
     from .stage_records import NO_FAMILY, Pending
 
     n = len(splats)
     rows = np.empty((n, WIDTH), np.float32)
-    fill_rows(np.arange(n, dtype=np.uint32), splats, plan.space, rows)
+    fill_rows(splats, plan.space, np.arange(n, dtype=np.uint32), rows)
     level, family = np.full(n, NEW, np.int32), np.full(n, NO_FAMILY, np.int64)
     return Pending.of(splats, rows=rows, level=level, index=index, family=family)
 
@@ -179,45 +473,54 @@ def advance(
 
     Families with the same batch and key come from one stage: a stable sort keeps them as they are.
     """
-    from .stage_records import NO_FAMILY, STAGE_BITS, Pending
+    from .stage_records import NO_FAMILY, STAGE_BITS, Margins, Pending, StageFamilies
 
     given = dict(pending.columns)
     del pending
     with threads_for(len(given["level"])) as threads:
-        pick, joins, arrivals, leaves = _arrivals(given, plan, threads)
-        del given["rows"]  # the arrivals have them
-        tree = VoxelTree(len(pick), leaves, plan.space, partial(_keys, plan))
-        margins = Margins(plan, region.low, region.high) if region else None
-        left = grow(tree, plan, arrivals, margins, progress)
-        tops = NodeRows.concat([rows for _, rows in left])
-        final = tree.finish(tops, pick, Splats(**{name: given[name] for name in COLUMNS}))
-    waits = np.repeat(np.array([level for level, _ in left], np.int32), [len(rows) for _, rows in left])
-    was_given = tops.count == 0
-    family = np.full(len(final.tree), NO_FAMILY, np.int64)
-    is_given = final.number != MERGED
-    family[is_given] = given["family"][pick[final.number[is_given]]]
-    family[final.parents] = (np.int64(stage) << STAGE_BITS) | np.arange(len(final.parents))
+        tree, pick, ends = _tree(given, plan, threads)
+        margins = Margins(plan.box, float(plan.space.unit), region) if region else None
+        left = tree.grow(margins, progress)
+        tops = NodeRows(*(np.concatenate(columns) for columns in zip(*(rows for _, rows in left), strict=True)))
+        count = len(tops.number)
+        nodes, links, number, parents = tree.finish(tops, Splats(**{name: given[name] for name in COLUMNS}))
+    waits = np.repeat(np.array([level for level, _ in left], np.int32), [len(rows.number) for _, rows in left])
+    family = np.full(len(links), NO_FAMILY, np.int64)
+    is_given = number != MERGED
+    family[is_given] = given["family"][pick[number[is_given]]]
+    family[parents] = (np.int64(stage) << STAGE_BITS) | np.arange(len(parents))
     # A splat that waits for the level of its own size has not joined.
-    is_new = was_given & (tops.number < arrivals.splats)
-    is_new[is_new] = np.searchsorted(joins, tops.number[is_new], "right") == waits[is_new]
-    index = np.full(len(tops), -1, np.int64)
+    is_new = (tops.children == 0) & (tops.number < (ends[-1] if len(ends) else 0))
+    is_new[is_new] = np.searchsorted(ends, tops.number[is_new], "right") == waits[is_new]
+    index = np.full(count, -1, np.int64)
     index[is_new] = given["index"][pick[tops.number[is_new]]]
-    drawn = final.nodes.take(slice(len(tops)))
+    drawn = nodes.take(slice(count))
     handed_on = Pending.of(
         Splats(**{name: column.copy() for name, column in vars(drawn).items()}),
         rows=tops.node,
         level=np.where(is_new, np.int32(NEW), waits),
         index=index,
-        family=family[: len(tops)].copy(),
+        family=family[:count].copy(),
     )
-    return _families(tree, final, family, len(tops), plan.parts(0).words), handed_on
+    batches, with_children = tree.batches[::-1], nodes.take(parents)
+    coarse_first = np.array([LEVELS - batch.level for batch in batches], np.int32)
+    families = StageFamilies(
+        batch=np.repeat(coarse_first, [batch.families for batch in batches]),
+        key=np.concatenate([*(batch.keys for batch in batches), np.empty((0, plan.parts(0).words), np.uint64)]),
+        count=links.child_count[parents],
+        nodes=nodes.take(slice(count, None)),
+        family=family[count:],
+        center=with_children.center,
+        size=spark_size(with_children),
+    )
+    return families, handed_on
 
 
-def _arrivals(given: Mapping[str, NDArray[Any]], grid: VoxelGrid, threads: int) -> tuple[Nodes, Offsets, Arrivals, int]:
-    """Return the pending node of each number, where each level ends among the new splats, and the rows.
+def _tree(given: dict[str, NDArray[Any]], grid: VoxelGrid, threads: int) -> tuple[VoxelTree, Nodes, Offsets]:
+    """Return the tree of a stage, the pending node of each number, and where each level ends among the new splats.
 
     New splats have the first numbers, by level, curve and index, as in memory; then come other splats, then merged
-    ones. The last value is the number of the first of these.
+    ones. The node rows of `given` are removed, so that they are freed when all splats have joined.
     """
     from .stage_records import NO_FAMILY
 
@@ -229,25 +532,26 @@ def _arrivals(given: Mapping[str, NDArray[Any]], grid: VoxelGrid, threads: int) 
         order = sort_by_key(index.astype(np.uint64), order, int(index.max()).bit_length(), threads)[1]
     every = len(old) == 0
     center, scale = (column if every else column[new] for column in (given["center"], given["scale"]))
-    order, joins = grid.sorted_leaves(center, scale, threads, order)
+    order, ends = grid.sorted_leaves(center, scale, threads, order)
     new = new[order]
     is_merged = given["family"][old] != NO_FAMILY
     merged = len(old) - int(np.count_nonzero(is_merged))
     place = old
     old = np.concatenate([old[~is_merged], old[is_merged]])
     numbers = np.arange(len(new), len(new) + len(old), dtype=np.uint32)
-    survivors = NodeRows(given["rows"][old], numbers, np.zeros(len(old), np.uint16))
+    rows: FloatArray = given.pop("rows")
+    survivors = NodeRows(rows[old], numbers, np.zeros(len(old), np.uint16))
     number = np.empty(len(old), np.uint32)  # among the survivors, of each in the order of the stages
     number[np.searchsorted(place, old)] = np.arange(len(old), dtype=np.uint32)
     levels = given["level"][place]
     waiting = {level: survivors.take(number[levels == level]) for level in np.unique(levels).tolist()}
-    rows: FloatArray = given["rows"]
 
     def fill(some: Nodes, out: FloatArray) -> None:
         np.take(rows, some, axis=0, out=out, mode="clip")
 
-    arrivals = Arrivals(len(new), joining(new, joins, fill), waiting)
-    return np.concatenate([new, old]), joins, arrivals, len(new) + merged
+    pick = np.concatenate([new, old])
+    tree = VoxelTree(grid, len(new) + merged, pick, ends, fill, waiting, partial(_keys, grid))
+    return tree, pick, ends
 
 
 def _keys(grid: VoxelGrid, level: int, rows: FloatArray) -> Keys:
@@ -256,21 +560,3 @@ def _keys(grid: VoxelGrid, level: int, rows: FloatArray) -> Keys:
     words = [cell_words(rows, nodes, parts, word) for word in range(grid.parts(0).words)]
     words[0] &= ~np.uint64((1 << 3 * PART_BITS) - 1)
     return np.stack(words[::-1], axis=1)
-
-
-def _families(tree: VoxelTree, final: Final, family: NDArray[np.int64], tops: int, words: int) -> StageFamilies:
-    """Return the families of a stage, from its nodes and their families; the first are without a parent."""
-    from .stage_records import StageFamilies
-
-    batches = tree.batches[::-1]
-    number = np.array([LEVELS - batch.level for batch in batches], np.int32)  # coarse levels first
-    parents = final.nodes.take(final.parents)
-    return StageFamilies(
-        batch=np.repeat(number, [batch.families for batch in batches]),
-        key=np.concatenate([*(batch.keys for batch in batches), np.empty((0, words), np.uint64)]),
-        count=final.tree.child_count[final.parents],
-        nodes=final.nodes.take(slice(tops, None)),
-        family=family[tops:],
-        center=parents.center,
-        size=spark_size(parents),
-    )

@@ -7,6 +7,7 @@ at last for the whole scene.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 
 from ..model.splats import COLUMNS, FloatArray, Splats
 from ..system.progress import Progress
+from .kernels.sort import PART_BITS, Nodes, Parts, split_box
 
 if TYPE_CHECKING:
     from .check import Bounds
@@ -25,6 +27,12 @@ NO_FAMILY = -1
 
 #: A family's number is that of its stage, shifted by this many bits, and its place among the families of the stage.
 STAGE_BITS = 32
+
+#: Parts of a cell on an axis.
+CELL_PARTS = 1 << PART_BITS
+
+FLOAT_MAX = np.float32(np.finfo(np.float32).max)
+INFINITY = np.float32(np.inf)
 
 
 @dataclass(frozen=True)
@@ -137,3 +145,64 @@ class StagedBuilder(Protocol):
             region: of the scene; None for all of it, after which one node is left, the root.
             stage: number of the stage, which is part of the numbers of its families.
         """
+
+
+class Margins:
+    """The centres that unknown nodes can have: on some axis, at most `below` or at least `above`; in units.
+
+    Outside of a region and near its faces, the quick builder does not know all nodes of a stage.
+    """
+
+    def __init__(self, box: NDArray[np.float64], unit: float, region: Region) -> None:
+        """Before the first level: all centres that are not in the region.
+
+        Args:
+            box: (2, 3) corners of the box of all centres of the scene, units.
+            unit: length of a unit, world units.
+        """
+        self._low, self._high = box.tolist()
+        # As centres of rows are rounded, if at all.
+        self._below = [_rounded(value / unit) for value in region.low]
+        self._above = [_rounded(value / unit) for value in region.high]
+
+    def widen(self, parts: Parts) -> None:
+        """Take the whole cells of a level that unknown nodes can be in; called for one level after another."""
+        edge = float(parts.step)
+        for axis, lowest in enumerate(parts.low.tolist()):
+            below, above = self._below[axis], self._above[axis]
+            # No centre lies outside of the box of the scene, known or unknown.
+            has_below, has_above = below >= self._low[axis], above <= self._high[axis]
+            last = _first_part(float(below), edge, lowest) + CELL_PARTS - 1 if has_below else 0
+            first = _first_part(float(above), edge, lowest) if has_above else 0
+            self._below[axis] = _last_of_part(last, edge) if has_below else -INFINITY
+            self._above[axis] = np.nextafter(_last_of_part(first - 1, edge), INFINITY) if has_above else INFINITY
+
+    @property
+    def are_closed(self) -> bool:
+        """Whether no centre in the box of the scene is off the margins."""
+        sides = zip(self._below, self._above, self._low, self._high, strict=True)
+        return any(float(below) >= min(float(above), high) or float(above) <= low for below, above, low, high in sides)
+
+    def split(self, nodes: Nodes, geometry: FloatArray) -> tuple[Nodes, Nodes]:
+        """Separate nodes off the margins, whose cells no unknown node can be in, from the others."""
+        return split_box(nodes, geometry, np.array(self._below), np.array(self._above))
+
+
+def _rounded(value: float) -> np.float32:
+    """Return the nearest float32, which may be infinite."""
+    return np.float32(value if math.isinf(value) else min(max(value, -float(FLOAT_MAX)), float(FLOAT_MAX)))
+
+
+def _first_part(value: float, edge: float, lowest: int) -> int:
+    """Return the first part of the cell that a coordinate is in; `lowest` is the first part of any cell."""
+    return (math.floor(value / edge) - lowest) // CELL_PARTS * CELL_PARTS + lowest
+
+
+def _last_of_part(part: int, edge: float) -> np.float32:
+    """Return the largest float32 in a part of an axis or in one below it."""
+    near = np.float32(min(max((part + 1) * edge, -float(FLOAT_MAX)), float(FLOAT_MAX)))
+    while near > -FLOAT_MAX and math.floor(float(near) / edge) > part:
+        near = np.nextafter(near, -INFINITY)
+    while near < FLOAT_MAX and math.floor(float(after := np.nextafter(near, INFINITY)) / edge) <= part:
+        near = after
+    return near
