@@ -29,7 +29,7 @@ from sparklod_cli.model.splats import Splats
 from sparklod_cli.scenes.finder import view_of
 from sparklod_cli.scenes.loaded import Scenes
 from sparklod_cli.scenes.reading import read_scenes
-from sparklod_cli.simulation.loading import chunks_of
+from sparklod_cli.simulation.frames import chunks_of
 from sparklod_cli.simulation.streaming import ChunkStream
 from sparklod_cli.simulation.streaming_settings import Network
 from sparklod_cli.system.threads import processors

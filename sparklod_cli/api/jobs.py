@@ -171,7 +171,7 @@ def _source(
     try:
         if loading is None or settings is None or not scenes.with_cuts:
             return CutFinder(scenes, settings)
-        from ..simulation.loading import LoadingCuts
+        from ..simulation.frames import LoadingCuts
 
         return LoadingCuts(scenes, settings, *loading)
     except ValueError as error:
@@ -285,8 +285,7 @@ def traverse_files(
         UnfitError: the budget, or the chunk cache, is too small for the roots.
         SparklodError: a file cannot be read or written, or is no tree.
     """
-    from ..simulation.frames import Simulation
-    from ..simulation.loading import Loader
+    from ..simulation.frames import Loader, Simulation
     from ..simulation.results import EMPTY, LOADING, summarize, write_frames
     from ..tables.assertions import check
 

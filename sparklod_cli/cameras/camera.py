@@ -115,13 +115,10 @@ FARTHEST = float(np.finfo(np.float32).max)
 
 
 def to_opengl(matrix: Matrix, axes: Axes) -> Matrix:
-    """Return a pose as camera-to-world in OpenGL's axes.
+    """Return a pose as camera-to-world in OpenGL's axes; `ValueError` if it cannot be inverted.
 
-    Args:
-        matrix: (4, 4), with 0 0 0 1 as its last row; may have a uniform scale.
-
-    Raises:
-        ValueError: it cannot be inverted; the text continues a sentence about it.
+    The (4, 4) matrix has 0 0 0 1 as its last row, and may have a uniform scale. The text of the error, as of all errors
+    of poses here, continues a sentence about the camera.
     """
     if axes.from_world:
         try:
@@ -133,13 +130,9 @@ def to_opengl(matrix: Matrix, axes: Axes) -> Matrix:
 
 
 def rigid(matrix: Matrix) -> Matrix:
-    """Return a camera-to-world matrix without its scale, and with the nearest exact rotation.
+    """Return a (4, 4) camera-to-world matrix without its scale, and with the nearest exact rotation.
 
-    Args:
-        matrix: (4, 4).
-
-    Raises:
-        ValueError: it is not a rotation, a uniform scale and a position; the text continues a sentence about it.
+    A `ValueError` says why a matrix is not a rotation, a uniform scale and a position.
     """
     with np.errstate(all="ignore"):
         if not np.isfinite(matrix).all() or np.abs(matrix[:3, 3]).max() > FARTHEST:
@@ -173,12 +166,8 @@ def pose(rotation: ArrayLike, position: ArrayLike) -> Matrix:
 def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike) -> Matrix:
     """Return the (4, 4) camera-to-world matrix, in OpenGL's axes, of a camera at `eye` that looks at `target`.
 
-    Args:
-        eye, target: (3,) world units.
-        up: (3,) up axis; another direction replaces it if it is along the line of sight.
-
-    Raises:
-        ValueError: eye and target are the same point, or too far apart; the text continues a sentence about the camera.
+    Another direction replaces the up axis if that is along the line of sight. `ValueError` if eye and target, world
+    units, are the same point, or too far apart.
     """
     eye, target = np.asarray(eye, np.float64), np.asarray(target, np.float64)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -209,11 +198,7 @@ def normalized(vector: ArrayLike) -> Matrix:
 
 
 def rotation_of(quat_wxyz: ArrayLike) -> Matrix:
-    """Return the (3, 3) rotation of a quaternion w x y z of any length but 0.
-
-    Raises:
-        ValueError: its length is 0 or not finite; the text continues a sentence about it.
-    """
+    """Return the (3, 3) rotation of a quaternion w x y z of any length; `ValueError` if that is 0 or not finite."""
     w, x, y, z = unit = normalized(quat_wxyz)
     if not np.isfinite(unit).all():
         raise ValueError("has a quaternion of length 0")

@@ -82,7 +82,6 @@ class Frame:
     Attributes:
         matrix: (4, 4), in the axes of its format.
         time: seconds from an arbitrary start; None if the file has no times.
-        name: for display; may be empty.
         axes: of this matrix if they are certain, since it was computed from an eye and a target; otherwise None.
     """
 
@@ -95,10 +94,9 @@ class Frame:
 
 @dataclass(frozen=True)
 class Sampled(Sequence[Frame]):
-    """Frames that are computed when they are asked for, as a few keys can yield any number of them.
+    """Frames that are computed when they are used, as a few keys can yield any number of them.
 
     Attributes:
-        length: number of frames.
         at: computes the frames of (K,) int64 numbers, each below `length`.
     """
 
@@ -125,15 +123,7 @@ class Sampled(Sequence[Frame]):
 
 
 def sampled(count: float, at: Callable[[NDArray[np.int64]], list[Frame]]) -> Sampled:
-    """Return computed frames, `count` rounded up and at least one.
-
-    Args:
-        count: number of frames, the result of a formula.
-        at: see `Sampled`.
-
-    Raises:
-        TooManyCamerasError: the count is `NUMBERED` or more, or not a number.
-    """
+    """Return computed frames, `count` rounded up and at least one; `TooManyCamerasError` from `NUMBERED` on."""
     if not count < NUMBERED:
         raise TooManyCamerasError(f"{count:.3g} frames are more than {MAX_GENERATED:,}")
     return Sampled(max(math.ceil(count), 1), at)
@@ -172,8 +162,7 @@ class Settings:
 def camera_of(pose: Matrix, lens: Intrinsics, time: float, name: str, settings: Settings) -> Camera:
     """Return the camera of a rigid pose in OpenGL's axes, with defaults for what neither file nor user says.
 
-    Raises:
-        ValueError: the lens makes no sense; the text continues a sentence about the camera.
+    The text of a `ValueError` about the lens continues a sentence about the camera.
     """
     size = lens.size or settings.size or DEFAULT_SIZE
     focal = lens.focal if lens.size and lens.focal else _focal_of(lens, size)
@@ -223,7 +212,7 @@ class Files:
     """The file of a camera path and those that belong to it.
 
     Attributes:
-        contents: bytes of each file by name; the one that was asked for comes first.
+        contents: bytes of each file by name; the requested one comes first.
     """
 
     path: Path
@@ -231,7 +220,6 @@ class Files:
 
     @property
     def data(self) -> bytes:
-        """The bytes of the first file."""
         return next(iter(self.contents.values()), b"")
 
     @cached_property
@@ -241,20 +229,18 @@ class Files:
 
     @cached_property
     def json(self) -> CameraJson | None:
-        """The first file as JSON; None if it is not JSON."""
+        """The first file; None if it is not JSON."""
         try:
             return CameraJson.parse(self.text or "", ORIGIN)
         except CameraPathError:
             return None
 
     def lines(self) -> list[str]:
-        """Return the lines of the first file; `CameraPathError` if it is not text."""
         if self.text is None:
             raise CameraPathError("it is not a text file")
         return self.text.splitlines()
 
     def object(self) -> CameraJson:
-        """Return the first file as JSON; `CameraPathError` if it is not JSON."""
         if self.json is None:
             raise CameraPathError("it is not JSON, or cut short")
         return self.json
@@ -265,7 +251,7 @@ class Parsed:
     """The result of a parser.
 
     Attributes:
-        frames: in order; those between keys are computed when they are asked for.
+        frames: in order; those between keys are computed when they are used.
         notes: what was ignored or assumed, one sentence each, for display.
         fps: frames a second in the file; None if it gives none.
         turned: every camera has its own up axis.
@@ -293,18 +279,15 @@ class CameraJson(untrusted.Json):
         return isinstance(self.value, list) and bool(self.value) and self.get(0).has(*keys)
 
     def pair(self) -> tuple[float, float]:
-        """Return two finite numbers."""
         first, second = self.numbers(2)
         return first, second
 
     def positive(self) -> float:
-        """Return a number above 0."""
         if not (number := self.number()) > 0:
             raise self.unexpected("a number above 0")
         return number
 
     def side(self) -> int:
-        """Return pixels along a side of an image."""
         number = self.number()
         if not _is_side(number):
             raise self.unexpected("a number of pixels")

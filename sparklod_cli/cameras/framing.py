@@ -52,13 +52,11 @@ def framing(center: NDArray[np.floating]) -> tuple[NDArray[np.float64], float]:
     """Return the middle of a scene and the radius of a ball around it that most splats are in.
 
     Args:
-        center: (N, 3) of the splats, world units. What is not finite is left out.
+        center: (N, 3) of the splats, world units. What is not finite is left out; `InvalidSplatsError` if nothing is
+            left.
 
     Returns:
         (3,) the median of each coordinate, and a radius above 0.
-
-    Raises:
-        InvalidSplatsError: there are no finite centres.
     """
     sample = np.asarray(center[:: max(len(center) // SAMPLE, 1)], np.float64)
     sample = sample[np.isfinite(sample).all(axis=1)]
@@ -72,8 +70,7 @@ def framing(center: NDArray[np.floating]) -> tuple[NDArray[np.float64], float]:
 def covered(scene: Balls) -> Balls:
     """Return the splats that cameras must have in view: 99.9 % of those that are neither backdrop nor sparse.
 
-    Raises:
-        InvalidSplatsError: there are no splats with finite numbers.
+    `InvalidSplatsError` if there are no splats with finite numbers.
     """
     middle, radius = framing(scene.center)
     every = max(len(scene.center) // SAMPLE, 1)
@@ -92,12 +89,7 @@ def covered(scene: Balls) -> Balls:
 
 
 def _is_dense(scene: Balls, size: float) -> NDArray[np.bool_]:
-    """Return the mask (N,) of the splats in cells that are not sparse.
-
-    Args:
-        scene: without backdrop, around the origin.
-        size: of the scene, see `framing`.
-    """
+    """Return the mask (N,) of the splats in cells that are not sparse, of a scene of this size around the origin."""
     side = size * max(CELL, (FEW / len(scene.center)) ** (1 / 3))
     area = np.clip(scene.radius, SPECK * size, side) ** 2
     dense = np.zeros(len(area), np.bool_)
@@ -152,9 +144,7 @@ def fitted(camera: Camera, scene: Balls) -> Camera:
 def distance(cameras: Sequence[Camera], center: Matrix, scene: Balls) -> float:
     """Return the distance from their target, in world units, at which cameras have a scene in their pictures.
 
-    Args:
-        cameras: at least one, wherever they are; their directions count.
-        center: (3,) in the middle of all pictures.
+    Only the directions of the cameras count. `center`, (3,), is in the middle of all pictures.
     """
     local = Balls(scene.center - center, scene.radius)
     needed = []
@@ -172,10 +162,7 @@ def sampled_cameras(cameras: Sequence[Item]) -> Sequence[Item]:
 def reach(near: float, far: float, cameras: Sequence[Camera], scene: Balls) -> tuple[float, float]:
     """Near and far distances, moved apart where they would leave out a part of a scene that cameras look at.
 
-    Args:
-        near, far: along the axis of a camera, world units.
-        cameras: that look at the scene.
-        scene: all that its splats cover.
+    They are along the axis of a camera, world units; `scene` is all that its splats cover.
     """
     sample = scene.center[:: max(len(scene.center) // SAMPLE, 1)]
     corners = scene.box if scene.box is not None else np.stack([scene.center.min(axis=0), scene.center.max(axis=0)])

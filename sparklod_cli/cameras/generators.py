@@ -54,8 +54,7 @@ def frame_looking(
 ) -> Frame:
     """Return a frame at `eye`, (3,), that looks at `target`, (3,), with `up`, (3,), pointing up in the image.
 
-    Raises:
-        CameraPathError: eye and target are the same point.
+    `CameraPathError` if eye and target are the same point.
     """
     try:
         return Frame(look_at(eye, target, up), lens, time, name, Axes.OPENGL_C2W)
@@ -65,10 +64,9 @@ def frame_looking(
 
 
 def orbit(count: int, center: ArrayLike, distance: float, elevation: float, up: ArrayLike) -> Sampled:
-    """`count` frames once around a point, counter-clockwise seen from above.
+    """Return `count` frames once around a point, counter-clockwise seen from above.
 
     Args:
-        count: number of frames.
         center: (3,) point that all look at.
         distance: from it, world units.
         elevation: angle above it, radians.
@@ -87,10 +85,9 @@ def orbit(count: int, center: ArrayLike, distance: float, elevation: float, up: 
 
 
 def dolly(count: float, center: ArrayLike, far: float, near: float, elevation: float, up: ArrayLike) -> Sampled:
-    """`count` frames straight towards a point; from frame to frame its surroundings grow by the same factor.
+    """Return `count` frames, at least 2, straight towards a point; from frame to frame it grows by the same factor.
 
     Args:
-        count: number of frames, at least 2.
         center: (3,) point that all look at.
         far, near: distances of the first and the last frame from it, world units.
         elevation: angle above it, radians.
@@ -124,14 +121,13 @@ def between(
     of the distances between them (Yuksel, Schaefer and Keyser 2011), which avoids loops and cusps.
 
     Args:
-        keys: at least two.
         fps: frames a second; None for `DEFAULT_FPS`.
         up: (3,) up axis of keys without one.
         lens: of keys without a field of view.
         seconds: mean time from key to key, if keys have no times.
 
     Raises:
-        CameraPathError: there are too few keys, or too many frames; times are missing, or do not increase.
+        CameraPathError: there are fewer than two keys, or too many frames; times are missing, or do not increase.
     """
     rate = fps or DEFAULT_FPS
     if len(keys) < 2:
@@ -160,11 +156,7 @@ def between(
 
 
 def along(curve: Callable[[Matrix], Matrix], at: Matrix) -> Matrix:
-    """(N, K) points of a curve.
-
-    Raises:
-        CameraPathError: some points are not finite: keys are too far apart, or too close in time.
-    """
+    """Return (N, K) points of a curve; `CameraPathError` if keys are too far apart, or too close in time."""
     with np.errstate(all="ignore"):
         points = curve(at)
     if not np.isfinite(points).all():
@@ -173,7 +165,6 @@ def along(curve: Callable[[Matrix], Matrix], at: Matrix) -> Matrix:
 
 
 def _times(keys: Sequence[Key], values: Matrix, seconds: float) -> Matrix:
-    """(keys,) seconds of the keys."""
     times = [key.time for key in keys]
     if all(time is None for time in times):
         knots = centripetal_knots(values[:, :6])
@@ -194,10 +185,9 @@ def _front(up: Matrix) -> Matrix:
 
 
 def centripetal_knots(points: Matrix) -> Matrix:
-    """(n,) knots from 0 on that differ by the square roots of the distances between points.
+    """Return (n,) knots from 0 on that differ by the square roots of the distances between n >= 2 points, (n, D).
 
-    Args:
-        points: (n, D), n at least 2. If all are the same, the steps are 1.
+    If all points are the same, the steps are 1.
     """
     with np.errstate(over="ignore"):
         steps = np.sqrt(np.linalg.norm(np.diff(points, axis=0), axis=1))
@@ -206,13 +196,9 @@ def centripetal_knots(points: Matrix) -> Matrix:
 
 
 def catmull_rom_tangents(knots: Matrix, points: Matrix) -> Matrix:
-    """(n, D) tangents of the Catmull-Rom spline with arbitrary knots (Barry and Goldman 1988).
+    """Return (n, D) tangents of the Catmull-Rom spline with (n,) increasing knots, n >= 2 (Barry and Goldman 1988).
 
     Each is the tangent of the parabola through a point and its neighbours; at the ends, through the last three points.
-
-    Args:
-        knots: (n,) increasing, n at least 2.
-        points: (n, D).
     """
     steps = np.diff(knots)[:, None]
     slopes = np.diff(points, axis=0) / steps
@@ -223,26 +209,14 @@ def catmull_rom_tangents(knots: Matrix, points: Matrix) -> Matrix:
 
 
 def cardinal_tangents(knots: Matrix, points: Matrix) -> Matrix:
-    """(n, D) tangents along the line from the previous to the next point, as SuperSplat has them.
-
-    Args:
-        knots: (n,) increasing, n at least 2.
-        points: (n, D).
-    """
+    """Return (n, D) tangents along the line from the previous to the next point, as SuperSplat has them."""
     slopes = np.diff(points, axis=0) / np.diff(knots)[:, None]
     inner = (points[2:] - points[:-2]) / (knots[2:] - knots[:-2])[:, None]
     return np.concatenate([slopes[:1], inner, slopes[-1:]])
 
 
 def hermite(knots: Matrix, points: Matrix, tangents: Matrix, at: Matrix) -> Matrix:
-    """(m, D) points of the piecewise cubic curve with these points and tangents at the knots.
-
-    Args:
-        knots: (n,) increasing, n at least 2.
-        points: (n, D).
-        tangents: (n, D) derivatives by the parameter.
-        at: (m,) parameters between the first and the last knot.
-    """
+    """Return (m, D) points, at (m,) parameters, of the piecewise cubic curve with points and tangents at `knots`."""
     piece = np.clip(np.searchsorted(knots, at, side="right") - 1, 0, len(knots) - 2)
     step = np.diff(knots)[piece, None]
     t = (at[:, None] - knots[piece, None]) / step

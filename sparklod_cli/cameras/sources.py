@@ -135,9 +135,8 @@ def _known(files: Files) -> PathFormat:
 def cameras_of(parsed: Parsed, form: PathFormat, settings: Settings) -> CameraPath:
     """Return the cameras of frames from a file or a generator.
 
-    Raises:
-        CameraPathError: there are none, or one makes no sense; the text names it.
-        TooManyCamerasError: there are too many.
+    `CameraPathError` if there are none, or one makes no sense, which the text names; `TooManyCamerasError` if there are
+    too many.
     """
     numbers = range(0, len(parsed.frames), settings.every)
     if not numbers:
@@ -178,7 +177,7 @@ class CameraFile:
     """The cameras of a file, or of a folder that COLMAP wrote.
 
     Attributes:
-        format: its name in `formats.table.FORMATS`; None tells it by the content.
+        format: its name in `formats.table.FORMATS`; None recognizes it by the content.
     """
 
     path: Path
@@ -187,12 +186,11 @@ class CameraFile:
     fits_scene = False
 
     def cameras(self, settings: Settings, scene: Scene) -> CameraPath:
-        """Return the cameras of the file; the scene is not looked at."""
         return read_path(self.path, self.format, settings)
 
 
 class _Aimed:
-    """Cameras that look at one point from a distance; either is chosen for the scene where it is None."""
+    """Cameras that look at one point from a distance; both are chosen for the scene where they are None."""
 
     center: Point | None
     distance: float | None
@@ -200,7 +198,6 @@ class _Aimed:
 
     @property
     def fits_scene(self) -> bool:
-        """Whether the distance is chosen for the scene."""
         return self.distance is None
 
     def _aim(
@@ -210,7 +207,7 @@ class _Aimed:
 
         Args:
             frames: makes cameras of their directions; called where something is chosen for the scene.
-            times: the distance, where it is chosen, as a multiple of where the scene just fits the image.
+            times: factor of a chosen distance over that at which the scene just fits the image.
         """
         if self.center is not None and self.distance is not None:
             return self.center, self.distance
@@ -240,7 +237,6 @@ class Orbit(_Aimed):
     elevation: float = ELEVATION
 
     def cameras(self, settings: Settings, scene: Scene) -> CameraPath:
-        """Return the cameras around the scene."""
         up, tilt = settings.up_axis, math.radians(self.elevation)
         around = functools.partial(generators.orbit, self.count, (0.0, 0.0, 0.0), 1, tilt, up)
         center, distance = self._aim(around, settings, scene)
@@ -263,7 +259,6 @@ class Dolly(_Aimed):
     elevation: float = ELEVATION
 
     def cameras(self, settings: Settings, scene: Scene) -> CameraPath:
-        """Return the cameras on the way to the scene."""
         up, tilt = settings.up_axis, math.radians(self.elevation)
         count = max(2, round(self.seconds * (settings.fps or DEFAULT_FPS)))
         ahead = functools.partial(generators.dolly, 2, (0.0, 0.0, 0.0), 1, 1, tilt, up)
@@ -274,14 +269,13 @@ class Dolly(_Aimed):
 
 @dataclass(frozen=True)
 class WholeScene:
-    """One camera, so many degrees above the middle of the scene, that has all of it just inside its picture."""
+    """One camera in front of the middle of the scene, and above it, that has all of it just inside its picture."""
 
     elevation: float = ELEVATION
 
     fits_scene = True
 
     def cameras(self, settings: Settings, scene: Scene) -> CameraPath:
-        """Return the camera, in front of the scene."""
         path = Orbit(1, (0.0, 0.0, 0.0), 1.0, self.elevation).cameras(settings, scene)
         fitted = framing.fitted(path.cameras[0], framing.covered(scene()))
         return dataclasses.replace(path, cameras=(fitted,))
@@ -289,7 +283,7 @@ class WholeScene:
 
 @dataclass(frozen=True)
 class SingleViews:
-    """A camera for each pair of an eye and the target that it looks at.
+    """A camera at time 0 for each pair of an eye and the target that it looks at.
 
     Attributes:
         views: at least one (eye, target).
@@ -302,7 +296,6 @@ class SingleViews:
     fits_scene = False
 
     def cameras(self, settings: Settings, scene: Scene) -> CameraPath:
-        """Return the cameras, all at time 0; the scene is not looked at."""
         up = settings.up_axis
         paths = [_generated("one view", [generators.frame_looking(*view, up)], settings) for view in self.views]
         cameras = [path.cameras[0] for path in paths]
@@ -329,7 +322,6 @@ class Keyframes:
     fits_scene = False
 
     def cameras(self, settings: Settings, scene: Scene) -> CameraPath:
-        """Return the cameras on the way; the scene is not looked at."""
         keys = [generators.Key(eye, target) for eye, target in self.views]
         fps, up = settings.fps or DEFAULT_FPS, settings.up_axis
         return _generated("keyframes", generators.between(keys, fps, up, seconds=self.seconds), settings)
@@ -342,15 +334,9 @@ CameraSource = CameraFile | Orbit | Dolly | WholeScene | SingleViews | Keyframes
 
 
 def read_path(path: Path, format: str | None = None, settings: Settings | None = None) -> CameraPath:
-    """Return the cameras of a file, or of a folder that COLMAP wrote.
+    """Return the cameras of a file, or of a folder that COLMAP wrote; see `read`.
 
-    Args:
-        path: of the file or folder.
-        format: its name in `formats.table.FORMATS`; None tells it by the content.
-        settings: what is said over what the file says.
-
-    Raises:
-        CameraPathError: it cannot be read, is of no known format, or has a camera that makes no sense; names the file.
+    A `CameraPathError`, also where it cannot be read, names the file.
     """
     try:
         contents = io.read_together(path, NAMES, LARGEST)
@@ -365,11 +351,8 @@ def read_path(path: Path, format: str | None = None, settings: Settings | None =
 def similarity(text: str) -> Matrix:
     """Return a (4, 4) matrix of a rotation, a uniform scale and a translation from 16 numbers, row by row.
 
-    Args:
-        text: the numbers, separated by commas or white space, or JSON: a list of them or of rows.
-
-    Raises:
-        CameraPathError: the text is something else; that of the error continues a sentence about it.
+    The numbers are separated by commas or white space, or JSON: a list of them or of rows. The text of a
+    `CameraPathError` continues a sentence about them.
     """
     words = re.split(r"[\s,;]+", text.strip())
     try:
@@ -390,11 +373,7 @@ def similarity(text: str) -> Matrix:
 
 
 def read_world_transform(path: Path) -> Matrix:
-    """(4, 4) the rotation, uniform scale and translation of a file of 16 numbers.
-
-    Raises:
-        CameraPathError: it cannot be read, or has another matrix; names the file.
-    """
+    """Return the `similarity` in a file; a `CameraPathError` names the file."""
     try:
         return similarity(io.read_text(path))
     except CameraPathError as error:

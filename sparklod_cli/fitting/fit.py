@@ -67,7 +67,6 @@ class Optimiser:
         )
 
     def step(self, picture: FullDetailPicture, index: Index, rates: adam.Rates) -> None:
-        """Take one step for a picture of a cut."""
         nodes, camera = self.nodes, picture.camera
         seen, shaded = nodes.visible(index, camera)
         drawing = gradients.draw(shaded, camera, nodes.raster)
@@ -87,7 +86,7 @@ class Optimiser:
         self._moved.clear()
 
     def synchronize(self) -> None:
-        """Bring the columns of the nodes up to date; here they always are."""
+        """Update the columns of the nodes, which are always up to date here."""
 
 
 def slots_of(nodes: FittedNodes) -> NDArray[np.int32]:
@@ -98,11 +97,7 @@ def slots_of(nodes: FittedNodes) -> NDArray[np.int32]:
 
 
 class Schedule:
-    """Steps that remain, and their rates: half a wave of a cosine, from `RATES` to `LAST` of them.
-
-    Attributes:
-        done, remaining: numbers of steps.
-    """
+    """Steps that remain, and their rates: half a wave of a cosine, from `RATES` to `LAST` of them."""
 
     def __init__(self, steps: int) -> None:
         self.done, self.remaining = 0, steps
@@ -111,16 +106,13 @@ class Schedule:
 
     @property
     def stage_steps(self) -> int:
-        """Steps of the next stage."""
         return min(self._stage, self.remaining)
 
     def rates(self) -> Rates:
-        """Return the rates of the next step."""
         factor = LAST + (1 - LAST) * 0.5 * (1 + math.cos(math.pi * self._progress))
         return Rates(*(rate * factor for rate in RATES))
 
     def advance(self) -> None:
-        """Count a step."""
         self._progress += (1 - self._progress) / self.remaining
         self.done += 1
         self.remaining -= 1
@@ -173,13 +165,13 @@ def fit(
             opacity above 1, and none gets one. None for the cuts that Spark draws.
         antialiased: of the scene; splats are drawn the same either way, as Spark draws them.
         say: called with a line of text after each stage.
-        interrupted: asked between steps; when it returns True, what the finished stages gained is returned.
+        interrupted: called between steps; when it returns True, the gain of the finished stages is returned.
 
     Raises:
         BackendError: `settings.device` is "cuda", and there is no card, or it failed, or its memory does not suffice.
 
     Returns:
-        N nodes, and what fitting brought: at none of `settings.SHARES` less than before on the held-out cameras.
+        N nodes, and the report; at none of `settings.SHARES` are held-out cameras farther from full detail than before.
     """
 
     def run(device: str) -> tuple[Splats, FitReport]:
@@ -254,7 +246,6 @@ class _Fitting:
 
     @property
     def has_steps(self) -> bool:
-        """True if there are steps to take."""
         return self._schedule.remaining > 0
 
     def run_stage(self, progress: Progress, interrupted: Callable[[], bool]) -> bool:
@@ -303,14 +294,13 @@ class _Fitting:
         return [(picture, pool.submit(self.nodes.cut, picture.camera, share)) for picture, share in some]
 
     def describe_stage(self) -> str:
-        """Return what the steps so far gained, for display."""
         stage, before = self._stages[-1], self._before
         after = stage.psnr_after
         changes = (f"{percent_of(share)} {before[share]:.2f} -> {after[share]:.2f} dB" for share in after)
         return f"{stage.name}: {', '.join(changes)}"
 
     def finish(self, is_complete: bool) -> tuple[Splats, FitReport]:
-        """Return the best nodes, those that lost with their first values, and the report."""
+        """Return the best nodes, where those that break a law have their first values, and the report."""
         self.nodes.restore(self.nodes.fitted, self._kept)
         after = self._lawful() if self._stages else self._before
         kept = float(self.nodes.changed()[self.nodes.fitted].mean()) if self.nodes.fitted.size else 0.0
@@ -318,7 +308,7 @@ class _Fitting:
         return self.nodes.result(), report
 
     def _lawful(self) -> Scores:
-        """Take back what breaks a law, and return the scores of the nodes."""
+        """Undo changes that break a law, and return the scores of the nodes."""
         for _ in range(TRIES):
             keep_sizes(self.nodes)
             after = keep_gains(self.nodes, self._held_out, self._before)
@@ -329,7 +319,6 @@ class _Fitting:
 
 
 def _optimiser_on(device: str, nodes: FittedNodes, say: Callable[[str], None]) -> Optimiser:
-    """Return the optimiser of a device."""
     if not uses_card(device, say):
         return Optimiser(nodes)
     from .cuda.optimiser import CardOptimiser

@@ -30,9 +30,6 @@ Index = NDArray[np.int64]
 class FittedNodes:
     """The nodes of a tree while they change.
 
-    Args:
-        nodes: N nodes, as they are at first.
-
     Attributes:
         columns: of the nodes, as they are now; changed in place.
         old: the columns as they were at first.
@@ -67,7 +64,7 @@ class FittedNodes:
         return self._traversal.cut(view, budget=budget).indices()[0].astype(np.int64)
 
     def visible(self, index: Index, camera: Camera) -> tuple[Index, ShadedSplats]:
-        """Return those of some nodes that a camera may see, and how it sees them."""
+        """Return the nodes of `index` that a camera may see, and how it sees them."""
         now = self.columns
         whole = ShadedSplats(now.center, now.scale, now.quat_xyzw, now.lod_opacity, now.rgb)
         _, matrix, lens, limits = rasterizer.arguments(whole, camera, self.raster)
@@ -106,7 +103,6 @@ class FittedNodes:
         self.renew(index)
 
     def halve(self, index: Index) -> None:
-        """Halve the changes of some nodes."""
         for now, old in zip(self.columns, self.old, strict=True):
             now[index] = (now[index] + old[index]) / 2
         turned = index[(self.columns.quat_xyzw[index] != self.old.quat_xyzw[index]).any(axis=1)]
@@ -114,11 +110,10 @@ class FittedNodes:
         self.renew(index)
 
     def copy(self) -> Columns:
-        """Return the columns as they are now."""
         return _copied(self.columns)
 
     def changed(self) -> NDArray[np.bool_]:
-        """Return a (N,) mask of the nodes that are not as they were at first."""
+        """Return a (N,) mask of the nodes that differ from their first values."""
         pairs = zip(self.columns, self.old, strict=True)
         return np.logical_or.reduce([(a != b).reshape(len(a), -1).any(axis=1) for a, b in pairs])
 
@@ -132,10 +127,9 @@ class FittedNodes:
 
 
 class FittedSet(FittedNodes):
-    """The nodes of one cut for all cameras while they change, leaves too; none gets an opacity above 1.
+    """The nodes of one cut for all cameras while they change, leaves too; none has, or gets, an opacity above 1.
 
     Args:
-        nodes: of the tree, with opacities of at most 1.
         fixed: indices of the cut, ascending.
     """
 
@@ -149,7 +143,6 @@ class FittedSet(FittedNodes):
         self.shares = (len(fixed) / len(self.leaves),)
 
     def cut(self, camera: Camera, share: float) -> Index:
-        """Return the cut, whatever the camera and the share."""
         return self._fixed
 
 

@@ -69,7 +69,6 @@ class Place:
 
     @classmethod
     def of(cls, center: NDArray[np.floating]) -> Place:
-        """Return the extent of a scene with (N, 3) centres."""
         return cls(center, *framing(center))
 
 
@@ -166,7 +165,6 @@ class FullDetailPicture:
     """Picture of full detail from one camera.
 
     Attributes:
-        camera: that sees it.
         full: (H, W, 4) uint16 of full detail in units of 1 / 65535: colours multiplied by alpha, and alpha.
     """
 

@@ -47,11 +47,7 @@ def check(form: str, fps: float) -> None:
 
 
 def load_imageio(form: str) -> ModuleType:
-    """Import imageio with its ffmpeg, which writes videos of a form.
-
-    Raises:
-        SparklodError: it is not installed.
-    """
+    """Import imageio with its ffmpeg, which writes videos of a form; `SparklodError` if it is not installed."""
     with optional_import(f".{form} needs imageio", "video"):
         import imageio.v2
         import imageio_ffmpeg

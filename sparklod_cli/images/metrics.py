@@ -48,12 +48,7 @@ STRIP = 32
 
 @dataclass(frozen=True)
 class Tile:
-    """One tile of an image.
-
-    Attributes:
-        psnr: dB, of the tile alone.
-        x, y: upper left pixel of the tile.
-    """
+    """One tile of an image: its PSNR in dB, and its upper left pixel."""
 
     psnr: float
     x: int
@@ -85,21 +80,14 @@ def psnr_of(mse: float) -> float:
 
 
 def psnr(a: Image, b: Image) -> float:
-    """Peak signal-to-noise ratio in dB, over all pixels and channels; at most `MOST_PSNR`.
-
-    Args:
-        a, b: (H, W, C) of the same shape, 0..1.
-    """
+    """Peak signal-to-noise ratio in dB, over all pixels and channels of two images of 0..1; at most `MOST_PSNR`."""
     return psnr_of(float(np.mean(_squared_error(a, b))))
 
 
 def edges(image: Image) -> Mask:
-    """(H, W) where a picture with premultiplied alpha has an edge, on black or on white, and the pixels around it.
+    """(H, W) where a picture, (H, W, 4) with premultiplied alpha, has an edge, on black or on white, and around it.
 
     An edge is a pixel whose luminance has a gradient of at least `EDGE`; the pixels around it are its eight neighbours.
-
-    Args:
-        image: (H, W, 4).
     """
     strong = np.zeros(image.shape[:2], bool)
     for gray in BACKGROUNDS.values():
@@ -114,12 +102,7 @@ def edges(image: Image) -> Mask:
 
 
 def edge_psnr(a: Image, b: Image, where: Mask) -> float | None:
-    """PSNR in dB over some pixels alone, at most `MOST_PSNR`; None where there is no such pixel.
-
-    Args:
-        a, b: (H, W, C) of the same shape, 0..1.
-        where: (H, W) of `edges`.
-    """
+    """PSNR in dB over the pixels `where` of `edges` alone, at most `MOST_PSNR`; None where there is no such pixel."""
     return psnr_of(float(np.mean(_squared_error(a[where], b[where])))) if where.any() else None
 
 
@@ -139,11 +122,7 @@ def popping(a: Image, b: Image, a_before: Image, b_before: Image) -> float:
 
 
 def worst_tile(a: Image, b: Image) -> Tile:
-    """Return the tile with the lowest PSNR, the first of several. Tiles at the right and lower edge may be smaller.
-
-    Args:
-        a, b: (H, W, C) of the same shape, 0..1.
-    """
+    """Return the tile with the lowest PSNR, the first of several. Tiles at the right and lower edge may be smaller."""
     error = _squared_error(a, b).mean(axis=2)
     height, width = error.shape
     down, across = np.arange(0, height, TILE), np.arange(0, width, TILE)
@@ -158,9 +137,6 @@ def ssim(a: Image, b: Image) -> float:
     """Structural similarity (Wang et al. 2004), 1 for identical images: the mean over all positions of the window.
 
     Each channel is compared by itself. A window wider than the image is cut to its side.
-
-    Args:
-        a, b: (H, W, C) of the same shape, 0..1.
     """
     taps = [_taps(min(WINDOW, side)) for side in a.shape[:2]]
     rows = a.shape[0] - len(taps[0]) + 1
@@ -213,7 +189,6 @@ def _gradient(luminance: Image) -> Image:
 
 
 def _squared_error(a: Image, b: Image) -> NDArray[np.float64]:
-    """(H, W, C) float64 squared differences."""
     error = np.subtract(a, b, dtype=np.float64)
     error *= error
     return error

@@ -50,7 +50,6 @@ class PictureOutput:
     kind: str
 
     def path(self, number: int = 0) -> Path:
-        """Return the path of the file, or of the file of a frame."""
         assert self.name is not None
         if self.kind != "frames":
             return self.name
@@ -77,8 +76,7 @@ def output_for(name: Path | None, default: Path, cameras: int, *, sheet: bool) -
     """Return the destination of the pictures of a number of cameras.
 
     Args:
-        name: the requested path; "-" for standard output; None for a path derived from `default`.
-        default: a path without suffix.
+        name: the requested path; "-" for standard output; None for a path derived from `default`, which has no suffix.
 
     Raises:
         ValueError: this destination cannot hold that many pictures, or its format is unknown.

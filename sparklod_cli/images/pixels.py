@@ -52,11 +52,7 @@ def write_title(draw: ImageDraw.ImageDraw, unit: float, title: str, lines: Seque
 
 
 def write_scale(image: Pillow.Image, draw: ImageDraw.ImageDraw, unit: float, coloring: Coloring) -> None:
-    """Draws a colour scale at the right of a picture: what the colours mean.
-
-    Args:
-        unit: pixels in a thousandth of the picture's height; 1 for a picture of 1600 x 1000.
-    """
+    """Draw a colour scale at the right of a picture; `unit` is that of `write_title`."""
     left, right = image.width - 170 * unit, image.width - 146 * unit
     top, bottom = 0.26 * image.height, 0.84 * image.height
     draw.text((left, top - 18 * unit), coloring.title, INK, font(unit, 21), anchor="ls")
@@ -154,13 +150,9 @@ def apart(a: Image, b: Image) -> Image:
 
 
 def gain_for(differences: Sequence[Image]) -> float:
-    """Return the amplification with which differences are visible and few of them are clipped.
+    """Return the amplification with which differences, (H, W, 3) each, are visible and few of them are clipped.
 
-    Args:
-        differences: (H, W, 3) each, see `apart`.
-
-    Returns:
-        The largest of `GAINS` with which 99 % of the pixels that differ are not clipped; 1 if no pixel differs.
+    It is the largest of `GAINS` with which 99 % of the pixels that differ are not clipped; 1 if no pixel differs.
     """
     largest = np.concatenate([each.max(axis=2).ravel() for each in differences])
     differing = largest[largest > 0]
@@ -177,12 +169,7 @@ def difference_bar(gain: float) -> Coloring:
 
 
 def encode(pixels: Pixels, form: str, jpeg_quality: int = JPEG_QUALITY) -> bytes:
-    """Return the bytes of a "png", of a "webp" without loss, or of a "jpg".
-
-    Args:
-        pixels: with alpha for "png" and "webp" only.
-        form: one of the three.
-    """
+    """Return the bytes of a "png" or, without loss, of a "webp", which may have alpha, or of a "jpg"."""
     out = io.BytesIO()
     picture = Pillow.fromarray(pixels)
     if form == "jpg":
@@ -222,11 +209,9 @@ def cells(count: int, size: tuple[int, int]) -> list[tuple[int, int]]:
 
 
 def sheet(pictures: Sequence[Pixels], captions: Sequence[str]) -> Pixels:
-    """One picture of several of the same size, which are not scaled.
+    """Return one picture of several of the same size, at least one, which are not scaled.
 
-    Args:
-        pictures: at least one; the sheet has alpha if any of them has.
-        captions: one for each picture; cut to its width.
+    The sheet has alpha if any of them has. Captions are cut to the width of a picture.
     """
     height, width = pictures[0].shape[:2]
     size = (width, height)

@@ -172,7 +172,6 @@ class _Writer:
         return [camera.name or f"frame {number}" for number, camera in cameras]
 
     def _frames(self) -> Iterator[_Frame]:
-        """Yield the pictures, in order."""
         count = len(self._path.cameras)
         for done, frame in enumerate(ordered_map(self._frame, range(count), min(self._settings.jobs, count)), 1):
             self._progress("drawing", done, count, "frame")
@@ -202,14 +201,12 @@ class _Writer:
         return _Frame(facts, pixels, b"", empty)
 
     def _draw(self, at: int) -> tuple[DrawnPicture, DrawnPicture | None]:
-        """Return the picture of a camera, and the picture of the reference."""
         if at in self._drawn:
             return self._drawn.pop(at)
         camera = self._path.cameras[at]
         return self._renderer.draw(camera), None if self._reference is None else self._reference.draw(camera)
 
     def _bar(self) -> Coloring | None:
-        """Return the colour bar; None if the pictures get none."""
         if not self._settings.bar:
             return None
         if self._reference is not None:

@@ -32,19 +32,16 @@ class FixedCut:
     whole: Cut
 
     def cut(self, camera: Camera) -> Cut:
-        """Return the cut, whatever the camera."""
         return self.whole
 
     def candidates(self) -> Cut:
-        """Return the cut."""
         return self.whole
 
 
 class CutFinder:
-    """Finds what a viewer draws of scenes; several threads may ask it.
+    """Finds what a viewer draws of scenes; several threads may use it.
 
     Args:
-        scenes: with trees or detail levels, or without.
         settings: of the viewer; None draws full detail.
 
     Raises:
@@ -61,7 +58,7 @@ class CutFinder:
                 self._continuous = ContinuousCuts(self._traversal)
 
     def with_budget(self, budget: int) -> CutFinder:
-        """Return one with another budget and traversal, for a traversal begins where its last cut ended."""
+        """Return a finder with another budget and its own traversal, as a traversal begins where its last cut ended."""
         twin = copy.copy(self)
         if self.settings is not None and self._traversal is not None:
             twin.settings = replace(self.settings, budget=budget)
@@ -69,7 +66,7 @@ class CutFinder:
         return twin
 
     def cut(self, camera: Camera) -> Cut:
-        """Return what a camera sees: the cut of the trees or detail levels, and all splats of scenes that have none."""
+        """Return the cut of the trees or detail levels, and all splats of scenes that have none."""
         if self._traversal is None or self.settings is None:
             return self.scenes.full()
         view, limit = view_of(camera), self.settings.limit(camera.fov_y, camera.height)

@@ -40,10 +40,9 @@ class Part:
     """Splats of one instance in a cut.
 
     Attributes:
-        scene: that it is of.
-        index: (M,) which of its splats are drawn, ascending.
+        index: (M,) which of the scene's splats are drawn, ascending.
         weight: (M,) float64 by how much, 0..1, in a continuous cut; None for wholly.
-        object_to_world: (4, 4) where they stand.
+        object_to_world: (4, 4) place of the instance.
     """
 
     scene: LoadedScene
@@ -53,7 +52,7 @@ class Part:
 
     @functools.cached_property
     def splats(self) -> Splats:
-        """M splats in the space of the scene, as opaque as they are drawn."""
+        """M splats in the space of the scene, with the opacities that are drawn."""
         if self.index is self.scene.leaves:
             return self.scene.full
         splats = self.scene.rows(self.index)
@@ -127,7 +126,6 @@ class Scenes:
 
     @property
     def title(self) -> str:
-        """The names of the scenes."""
         return ", ".join(dict.fromkeys(loaded.name for loaded in self.loaded))
 
     @property
@@ -173,8 +171,7 @@ class Scenes:
     def with_cuts(self) -> Sequence[LoadedScene]:
         """The scenes of which viewers draw cuts, in the order of `forest`: trees, detail levels or tiles.
 
-        Raises:
-            ValueError: there are two kinds of them, which no viewer draws.
+        `ValueError` for two kinds of them, which no viewer draws.
         """
         kinds: dict[str, Sequence[LoadedScene]] = {
             "a Level-of-Detail tree": self.trees,
@@ -196,7 +193,6 @@ class Scenes:
         return sum(loaded.leaf_count for loaded in self.of_instance if loaded.has_cuts)
 
     def splats_of(self, budget: Budget) -> int:
-        """Return the splats of a budget, of which some are shares of the leaves."""
         if budget.by_default and self.details:
             budget = replace(budget, count=detail_rule.BUDGET)
         if self.tiled:  # CesiumJS has no budget
@@ -205,7 +201,7 @@ class Scenes:
 
     @functools.cached_property
     def forest(self) -> Forest:
-        """The trees, or the scenes at several detail levels, as traversals read them."""
+        """The trees, detail levels or tiles, as traversals read them."""
         if self.details:
             return DetailForest(
                 *zip(*((each.detail, each.scene.splats, each.files) for each in self.details), strict=True)
@@ -223,7 +219,7 @@ class Scenes:
 
     @functools.cached_property
     def depth(self) -> NDArray[np.int32]:
-        """(nodes,) edges from the root to each node of `forest`, as far as it was read, or the detail level of each."""
+        """(nodes,) edges from the root to each node of `forest` that was read, or the detail level of each."""
         if isinstance(self.forest, PagedForest):
             return self.forest.depth
         return np.concatenate([loaded.depth for loaded in self.with_cuts])
@@ -278,7 +274,6 @@ class Scenes:
         return Cut(tuple(map(self._whole, range(len(self.instances)))))
 
     def cut_of(self, found: TreeCut) -> Cut:
-        """Return what a traversal of these scenes found, with its splats."""
         least = found.least if np.isfinite(found.least) else None
         return Cut(self.parts_of([(nodes, None) for nodes in found.indices()]), least, found.reason)
 
@@ -299,7 +294,7 @@ class Scenes:
         return Part(loaded, loaded.leaves, None, self.instances[number].object_to_world)
 
     def balls(self) -> Balls:
-        """Return what the splats cover in the world: full detail of every instance."""
+        """Return what the splats of full detail of every instance cover, in the world."""
         if any(isinstance(loaded, PagedScene) for loaded in self.loaded):
             return sampled_balls(self.instances, self.of_instance)
         return Balls.concat(

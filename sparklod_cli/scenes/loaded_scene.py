@@ -27,12 +27,12 @@ UNNAMED = "scene"
 
 @dataclass(frozen=True, eq=False)
 class LoadedScene:
-    """A scene that instances are of, read once however often it stands.
+    """A scene, read once however many instances it has.
 
     Attributes:
-        file: that it was read from; None for a scene that was in memory.
+        file: None for a scene that was in memory.
         bytes: of the file; of a scene that was in memory, of its columns.
-        scene: as the file has it; columns that were not asked for are 0.
+        scene: as the file has it; columns that were not read are 0.
         splats: N, as they are drawn: those of the scene, or what a coding makes of them.
         first_chunk: number of its first chunk, where the chunks of all scenes are counted.
     """
@@ -45,17 +45,15 @@ class LoadedScene:
 
     @property
     def name(self) -> str:
-        """Name in messages and titles: that of the file."""
         return self.file.name if self.file is not None else UNNAMED
 
     @property
     def is_tree(self) -> bool:
-        """Whether it has a Level-of-Detail tree, so that cuts of it can be drawn."""
         return self.scene.tree is not None
 
     @property
     def has_cuts(self) -> bool:
-        """Whether a viewer draws cuts of it, by what a camera sees: of a tree, or of detail levels."""
+        """Whether a viewer draws cuts of it: of a tree, of detail levels or of tiles."""
         return self.is_tree
 
     @functools.cached_property
@@ -65,7 +63,6 @@ class LoadedScene:
 
     @functools.cached_property
     def every(self) -> Index:
-        """(N,) indices of all splats."""
         return np.arange(self.count)
 
     @functools.cached_property
@@ -188,11 +185,10 @@ class LoadedDetail(LoadedRuns):
 
     @functools.cached_property
     def leaves(self) -> Index:
-        """(M,) indices of full detail: level 0, and the environment."""
+        """(M,) indices of level 0 and of the environment."""
         return np.flatnonzero(self.depth == 0)
 
     def chunk_of(self, index: Index) -> NDArray[np.int64]:
-        """Return the (M,) numbers of the chunk files that some splats are in."""
         return self.first_chunk + self._file[index]
 
     @functools.cached_property
@@ -201,17 +197,12 @@ class LoadedDetail(LoadedRuns):
         return np.concatenate([file, np.full(self.count - len(file), self.files.environment or 0)])
 
     def chunk_bytes(self) -> NDArray[np.int64]:
-        """Return the (chunks,) bytes of each chunk file."""
         return self.files.sizes
 
 
 @dataclass(frozen=True, eq=False)
 class LoadedTiles(LoadedRuns):
-    """A scene of tiles; `scene` and `splats` have those of all tiles.
-
-    Attributes:
-        tiles: their boxes, errors and links.
-    """
+    """A scene of tiles; `scene` and `splats` have those of all tiles."""
 
     fetchers = tile_settings.FETCHERS
 
@@ -228,15 +219,13 @@ class LoadedTiles(LoadedRuns):
 
     @functools.cached_property
     def leaves(self) -> Index:
-        """(M,) indices of full detail: the splats of tiles without children."""
+        """(M,) indices of the splats of tiles without children."""
         return np.flatnonzero(np.repeat(self.tiles.is_leaf, self.tiles.counts))
 
     def chunk_of(self, index: Index) -> NDArray[np.int64]:
-        """Return the (M,) numbers of the tiles that some splats are in."""
         return self.first_chunk + np.searchsorted(np.cumsum(self.tiles.counts), index, side="right")
 
     def chunk_bytes(self) -> NDArray[np.int64]:
-        """Return the (chunks,) bytes of the file of each tile; of a scene in memory, of its columns."""
         if self.tiles.sizes is not None:
             return self.tiles.sizes
         return bytes_of(self.splats) * self.tiles.counts // max(1, self.count)

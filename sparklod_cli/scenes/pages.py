@@ -42,15 +42,14 @@ READ_SHARE = 0.5
 
 
 class Pages:
-    """The nodes and splats of a RAD file, as far as they were needed.
+    """The nodes and splats of a RAD file that were needed so far.
 
-    Nodes of chunks that were read stay in memory, 28 bytes each; of decoded splats, only those of some chunks.
-    Several threads may ask.
+    Nodes of chunks that were read stay in memory, 28 bytes each; of decoded splats, only those of some chunks. Several
+    threads may use it. Where a chunk is damaged, a `FormatError` names the file.
 
     Args:
         file: of a tree in chunks of `CHUNK_NODES`.
         name: of the file, for errors.
-        nodes_of: makes the nodes of a chunk.
         threads: to decode splats with.
 
     Attributes:
@@ -72,16 +71,12 @@ class Pages:
             self._kept = max(LEAST_KEPT, int(KEPT_SHARE * free / size))
 
     def place(self, nodes: NDArray[np.void], depth: NDArray[np.int32]) -> None:
-        """Take arrays of zeros, (N,) `NODE` and (N,) int32, for the nodes that will be read, and reads the root's."""
+        """Set the arrays of zeros, (N,) `NODE` and (N,) int32, that nodes are read into, and read the root's."""
         self.nodes, self.depth = nodes, depth
         self.read([0])
 
     def read(self, numbers: Sequence[int]) -> None:
-        """Read the nodes of chunks that are not present.
-
-        Raises:
-            FormatError, TreeError: a chunk is damaged, or its children are not those of a tree; names the file.
-        """
+        """Read the nodes of chunks that are not present; a `TreeError` if their children are not those of a tree."""
         for number in numbers:
             with self._lock:
                 if not self.present[number]:
@@ -108,7 +103,7 @@ class Pages:
                 raise TreeError(f"{self._name}: its tree is broken: node {node[np.argmax(mask)]} {what}")
 
     def _descend(self, frontier: NDArray[np.int64]) -> None:
-        """Give their depths to the nodes below some whose depth is known, as far as chunks are present."""
+        """Set the depths of the nodes below some whose depth is known, in the chunks that are present."""
         while len(frontier):
             count = self.nodes["child_count"][frontier].astype(np.int64)
             inner, count = frontier[count > 0], count[count > 0]
@@ -122,14 +117,7 @@ class Pages:
             frontier = children[self.present[children >> CHUNK_BITS]]
 
     def splats(self, index: NDArray[np.integer]) -> Splats:
-        """Return some splats, whose chunks are decoded, and kept for the next ones as far as there is room.
-
-        Args:
-            index: (M,) ascending.
-
-        Raises:
-            FormatError: a chunk is damaged; names the file.
-        """
+        """Return some splats by their indices, (M,) ascending; decoded chunks are cached for the next ones."""
         rows = Splats.empty(len(index), self.file.header.max_sh)
         numbers, begins = np.unique(index >> CHUNK_BITS, return_index=True)
         ends = itertools.pairwise([*begins.tolist(), len(index)])
@@ -157,11 +145,7 @@ class Pages:
         return rows
 
     def blocks(self, columns: Collection[str]) -> Iterator[tuple[Splats, LodTree]]:
-        """Yield all chunks in order, with these columns; none of them is kept.
-
-        Raises:
-            FormatError: a chunk is damaged; names the file.
-        """
+        """Yield all chunks in order, with these columns; none of them is cached."""
         with naming(self._name):
             for _, splats, tree in self.file.chunks(columns, thorough=False, threads=self._threads):
                 assert tree is not None
@@ -212,11 +196,7 @@ class PagedForest(Forest):
         return present
 
     def read(self, chunks: NDArray[np.bool_]) -> None:
-        """Read those of these chunks, (chunks,) bool, that are not in memory.
-
-        Raises:
-            FormatError, TreeError: see `Pages.read`.
-        """
+        """Read those of these chunks, (chunks,) bool, that are not in memory; errors are those of `Pages.read`."""
         for number, pages in self._pages.items():
             own = chunks[self.chunk_base[number] : self.chunk_base[number + 1]]
             pages.read(np.flatnonzero(own & ~pages.present).tolist())
@@ -237,11 +217,7 @@ class PagedForest(Forest):
 
 @dataclass(frozen=True, eq=False)
 class PagedScene(LoadedScene):
-    """A tree that may be larger than memory; `scene` and `splats` have no rows.
-
-    Attributes:
-        pages: its nodes and splats.
-    """
+    """A tree that may be larger than memory; `scene` and `splats` have no rows."""
 
     pages: Pages = field(kw_only=True)
 
@@ -252,7 +228,6 @@ class PagedScene(LoadedScene):
 
     @property
     def count(self) -> int:
-        """N."""
         return self.pages.count
 
     @functools.cached_property
@@ -262,16 +237,14 @@ class PagedScene(LoadedScene):
 
     @functools.cached_property
     def leaf_count(self) -> int:
-        """M."""
         return self.pages.leaf_count()
 
     def rows(self, index: Index) -> Splats:
-        """Return some splats, in the space of the scene, by their indices, ascending."""
         return self.pages.splats(index)
 
 
 def sampled_balls(instances: Sequence[Instance], scenes: Sequence[LoadedScene]) -> Balls:
-    """Return what the splats of instances cover, as many as cameras look at: those that they take of all."""
+    """Return the sample of what the splats of instances cover that cameras are framed by."""
     counts = [loaded.leaf_count for loaded in scenes]
     while True:
         every = max(sum(counts) // SAMPLE, 1)
@@ -293,12 +266,7 @@ def sampled_balls(instances: Sequence[Instance], scenes: Sequence[LoadedScene]) 
 
 
 class _Sample:
-    """Evenly spaced balls of an instance, and the ends of all of them.
-
-    Args:
-        start: number of its first ball among those of all instances.
-        every: one is taken of so many.
-    """
+    """Every n-th ball of an instance, and the bounds of all of them; the first one has the number `start` of all."""
 
     def __init__(self, start: int, every: int) -> None:
         self._start, self._every = start, every
@@ -307,7 +275,6 @@ class _Sample:
         self.parts: list[Balls] = [Balls(np.empty((0, 3)), np.empty(0))]
 
     def add(self, balls: Balls) -> None:
-        """Add some in order."""
         first = -(self._start + self.count) % self._every
         self.parts.append(Balls(balls.center[first :: self._every].copy(), balls.radius[first :: self._every].copy()))
         self.count += len(balls.radius)

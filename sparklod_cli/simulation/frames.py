@@ -1,4 +1,4 @@
-"""`Simulation`: the cuts that a viewer draws along a camera path, frame by frame, and the chunks that it fetches."""
+"""`Viewer`: fetches the chunks of scenes, `Loader`: while a page loads, `Simulation`: along a camera path."""
 
 from __future__ import annotations
 
@@ -14,15 +14,157 @@ from ..lod.cut_statistics import Changes, CutStatistics, measure
 from ..lod.settings import LodSettings
 from ..lod.traversal import TreeCut
 from ..model.instances import TOTAL
-from ..scenes.finder import view_of
-from ..scenes.loaded import Scenes
+from ..scenes.finder import CutFinder, view_of
+from ..scenes.loaded import Cut, Scenes
 from ..system.progress import Progress, silent
 from ..system.threads import ordered_map
 from ..tables.columns import Row
-from .loading import Viewer
-from .results import COLUMNS, OF_BUDGETS, OF_TREES
-from .streaming import ChunkStream
+from .results import COLUMNS, LOADING, OF_BUDGETS, OF_TREES
+from .streaming import Chunks, ChunkStream, header_answers
 from .streaming_settings import StreamingSettings
+
+#: The share of a cut that makes a picture almost what it will be; chosen.
+MOST = 0.9
+
+
+@dataclass(frozen=True)
+class Arrival:
+    """State when a chunk has arrived.
+
+    Attributes:
+        seconds: since the page was opened.
+        bytes: that have arrived so far, of headers too.
+        share: 0..1 of the splats of the whole cut that are resident.
+        resident: (chunks,) bool, of all trees.
+    """
+
+    seconds: float
+    bytes: int
+    share: float
+    resident: NDArray[np.bool_]
+
+
+class Viewer:
+    """A viewer that fetches the chunks of scenes, for one camera after another.
+
+    Args:
+        scenes: with trees or detail levels; others are there from the beginning.
+        settings: of the cuts; continuous cuts are not simulated.
+        streaming: network and cache; everything is resident unless given.
+        remembers: cuts are found one after the other, along a path; see `Scenes.traversal`.
+
+    Raises:
+        ValueError: the budget, or the cache, is too small for the roots; or there are too many instances.
+    """
+
+    def __init__(
+        self,
+        scenes: Scenes,
+        settings: LodSettings,
+        streaming: StreamingSettings | None = None,
+        *,
+        remembers: bool = False,
+    ) -> None:
+        self.scenes, self.settings = scenes, settings
+        self._streaming = streaming or StreamingSettings()
+        self._traversal = scenes.traversal(settings, remembers=remembers and not self._streaming.network.instant)
+        self._chunks = chunks_of(scenes)
+        self._stream()  # raises what would fail later
+
+    def _stream(self, start: float = 0.0) -> ChunkStream:
+        return ChunkStream(self._chunks, self._streaming.network, capacity=self._streaming.chunk_cache, start=start)
+
+    def _cut(self, camera: Camera, resident: NDArray[np.bool_] | None = None) -> TreeCut:
+        """Return the cut with the resident chunks, all unless given."""
+        limit = self.settings.limit(camera.fov_y, camera.height)
+        return self._traversal.cut(view_of(camera), budget=self.settings.budget, smallest=limit, resident=resident)
+
+
+class Loader(Viewer):
+    """A visitor who opens a page with scenes and waits in front of a camera; see `Viewer`."""
+
+    def arrivals(self, camera: Camera) -> Iterator[Arrival]:
+        """Yield the state at the beginning and after each arrival of a chunk, as long as any are wanted.
+
+        The camera rests. As soon as a chunk has arrived, the viewer looks for the chunks that the cut needs, as far as
+        it can tell from those that it has; Spark does so with the next picture that it draws.
+        """
+        per_chunk = self._splats_of(self._cut(camera))
+        total = max(1, int(per_chunk.sum()))
+        stream = self._stream()
+        stream.want([])
+        while True:
+            resident = stream.cache.resident()
+            yield Arrival(stream.now, stream.received, float(per_chunk[resident].sum()) / total, resident)
+            stream.want(self._cut(camera, resident).chunks())
+            while not stream.take_arrivals():
+                if not stream.step():
+                    return
+
+    def load(self, camera: Camera) -> Row:
+        """Return the waits, `LOADING`, of a visitor who stays at a camera; None for what never fits into the cache."""
+        figures: Row = dict.fromkeys(column.name for column in LOADING)
+        for arrival in self.arrivals(camera):
+            if figures["first_picture_s"] is None and self._chunks.shows(arrival.resident):
+                figures["first_picture_s"] = arrival.seconds
+            for name, share in (("resident_90", MOST), ("resident_all", 1)):
+                if figures[f"{name}_s"] is None and arrival.share >= share:
+                    figures[f"{name}_s"], figures[f"{name}_bytes"] = arrival.seconds, arrival.bytes
+            if arrival.share == 1:
+                break
+        return {column.name: column.rounded(figures[column.name]) for column in LOADING}
+
+    def cut_after(self, camera: Camera, seconds: float) -> Cut:
+        """Return what is drawn for a camera so many seconds after the page was opened in front of it."""
+        resident = np.zeros(len(self._chunks), np.bool_)
+        for arrival in self.arrivals(camera):
+            if arrival.seconds > seconds:
+                break
+            resident = arrival.resident
+        return self.scenes.cut_of(self._cut(camera, resident))
+
+    def _splats_of(self, cut: TreeCut) -> NDArray[np.int64]:
+        """Return the (chunks,) numbers of splats of a cut in each chunk of all trees."""
+        counts = np.zeros(len(self._chunks), np.int64)
+        scenes = [loaded for loaded in self.scenes.of_instance if loaded.has_cuts]
+        for loaded, view, nodes in zip(scenes, cut.views, cut.indices(), strict=True):
+            chunks, splats = np.unique(loaded.chunk_of(nodes.astype(np.int64)) - loaded.first_chunk, return_counts=True)
+            counts[int(view["chunk_base"]) + chunks] += splats
+        return counts
+
+
+class LoadingCuts(Loader):
+    """Cuts of visitors some time after they opened the page, one visitor for each camera; a `CutSource`.
+
+    Args:
+        seconds: since then.
+
+    Raises:
+        ValueError: as `Loader`.
+    """
+
+    def __init__(self, scenes: Scenes, settings: LodSettings, streaming: StreamingSettings, seconds: float) -> None:
+        super().__init__(scenes, settings, streaming)
+        self._seconds = seconds
+
+    def cut(self, camera: Camera) -> Cut:
+        return self.cut_after(camera, self._seconds)
+
+    def candidates(self) -> Cut:
+        return CutFinder(self.scenes, self.settings).candidates()
+
+
+def chunks_of(scenes: Scenes) -> Chunks:
+    """Return the chunks of scenes with cuts, and what a viewer needs before it can ask for them."""
+    if scenes.in_runs:
+        manifests = [[loaded.manifest_bytes] if loaded.manifest_bytes else [] for loaded in scenes.in_runs]
+        requests = [loaded.requests for loaded in scenes.in_runs]
+        kind = type(scenes.in_runs[0])
+        return Chunks.of_requests(requests, manifests, fetchers=kind.fetchers, connections=kind.connections)
+    return Chunks(
+        [tree.chunk_bytes() for tree in scenes.trees],
+        [header_answers(tree.header_bytes, tree.bytes) for tree in scenes.trees],
+    )
 
 
 @dataclass(frozen=True)
@@ -31,8 +173,7 @@ class SimulatedFrame:
 
     Attributes:
         number: number of the frame on the path.
-        cut: the cut that is drawn.
-        resident: (chunks,) bool, of all trees, the chunks that it was found with.
+        resident: (chunks,) bool, of all trees, the chunks that the cut was found with.
         rows: the row of all instances together, then one per instance, if requested.
         in_front: share of the drawn splats in front of the camera.
     """

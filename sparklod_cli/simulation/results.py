@@ -165,14 +165,7 @@ STATISTICS = ("min", "p50", "p95", "max")
 
 @dataclass(frozen=True)
 class FrameStatistics:
-    """Statistics over the frames.
-
-    Attributes:
-        name: name of a column, or `IN_FRUSTUM`.
-        unit: unit of the values; empty for a plain number.
-        frames: number of frames with a value.
-        min, p50, p95, max: statistics over these frames.
-    """
+    """Statistics over the `frames` that have a value of a column, or of `IN_FRUSTUM`."""
 
     name: str
     unit: str
@@ -188,12 +181,9 @@ class Moment:
     """The frame with the largest value of one of the criteria `MOMENTS`.
 
     Attributes:
-        criterion: name of the criterion.
         frame: its number.
         time_s: seconds on the path.
-        name: name of the frame; None if it has none.
-        value: the largest value.
-        unit: unit of the value; "limit" is a multiple of the pixel scale limit.
+        unit: of the value; "limit" is a multiple of the pixel scale limit.
     """
 
     criterion: str
@@ -209,14 +199,13 @@ class Summary:
     """Summary of a simulation.
 
     Attributes:
-        frames: number of frames.
         seconds: time from the first frame to the last.
         chunks, bytes: total number and size of the fetched chunks.
         chunks_first, bytes_first: those fetched for the first frame.
         stop_reasons: shares of the frames, 0..1, the most frequent first.
         quantities: statistics; quantities without a value on any frame are omitted.
         moments: the most extreme frames; criteria that no frame meets are omitted.
-        loading: times and bytes of `columns.LOADING`, by name; None without a network.
+        loading: times and bytes of `LOADING`, by name; None without a network.
     """
 
     frames: int
@@ -377,7 +366,6 @@ class FrameOutputs:
             check_free(file, overwrite=self.overwrite)
 
     def index_files(self, numbers: Sequence[int], instances: int) -> Iterator[Path]:
-        """Yield the index files that will be written for frames of these numbers."""
         if self.indices is not None:
             for number in numbers:
                 yield from index_files(self.indices, number, instances)
@@ -429,13 +417,9 @@ def write_frames(
     progress: Progress = silent,
     passed: Filter | None = None,
 ) -> WrittenFrames:
-    """Simulate a camera path and writes the outputs: table and index files frame by frame, then the charts.
+    """Simulate a camera path and write the outputs: table and index files frame by frame, then the charts.
 
-    Args:
-        passed: a filter for the bytes of a table on standard output.
-
-    Raises:
-        OutputError: a file cannot be written.
+    `passed` filters the bytes of a table on standard output. `OutputError` if a file cannot be written.
     """
     data = _ChartData()
 
@@ -473,7 +457,7 @@ def _write_indices(frame: SimulatedFrame, outputs: FrameOutputs) -> None:
 
 
 def _plot(simulation: Simulation, path: CameraPath, target: Path, data: _ChartData, *, overwrite: bool) -> str | None:
-    """Write the charts, with the path over the cut of an extreme frame; returns a note if that picture is missing."""
+    """Write the charts, with the path over the cut of an extreme frame; return a note if that picture is missing."""
     from ..figures import charts
 
     frame = data.best()

@@ -37,9 +37,7 @@ def header_answers(header_bytes: int, file_bytes: int) -> tuple[int, ...]:
 
 
 class Chunks:
-    """The chunks of all trees, numbered consecutively, tree by tree.
-
-    The numbers are those of `lod.traversal.Forest.chunk_base`.
+    """The chunks of all trees, numbered consecutively, tree by tree, as in `lod.traversal.Forest.chunk_base`.
 
     Args:
         sizes: for each tree the sizes of its chunks in the file, bytes.
@@ -47,11 +45,10 @@ class Chunks:
             for a chunk, see `header_answers`; none unless given.
         rooted: whether trees are drawn from their first chunks on, which hold their roots; chunk files of Streamed SOG
             are drawn each for itself.
-        fetchers: chunks that a viewer fetches at a time, unless it is told otherwise.
-        connections: requests that are under way at a time; None for any number.
+        fetchers: default number of chunks that a viewer fetches at a time.
+        connections: largest number of concurrent requests; None for any number.
 
     Attributes:
-        sizes: of each chunk, bytes.
         requests: for each chunk, bytes of the answers that it takes: to a first request, and to those that follow it
             together.
         firsts: the first chunk of each tree.
@@ -105,7 +102,6 @@ class Chunks:
         return len(self.sizes)
 
     def tree_of(self, chunk: int) -> int:
-        """Return the tree of a chunk."""
         return bisect_right(self.firsts, chunk) - 1
 
     def shows(self, resident: NDArray[np.bool_]) -> bool:
@@ -113,7 +109,6 @@ class Chunks:
         return bool((resident[self.roots] if self.roots else resident).any())
 
     def bytes_of(self, chunks: Iterable[int]) -> int:
-        """Return the total size of some chunks."""
         return sum(self.sizes[chunk] for chunk in chunks)
 
 
@@ -122,10 +117,7 @@ class ChunkCache:
 
     A chunk is used when it arrives and as long as it is wanted; among wanted chunks the more important one counts as
     more recently used. Wanted chunks beyond the capacity are not fetched, since they would evict more important ones or
-    be evicted by them. Spark's pager works the same way.
-
-    Args:
-        chunks: the chunks of all trees. Chunks with roots are always wanted, and come first.
+    be evicted by them. Spark's pager works the same way. Chunks with roots are always wanted, and come first.
 
     Attributes:
         requested: the wanted chunks, each once, the most important first.
@@ -165,14 +157,9 @@ class ChunkCache:
         return [chunk for chunk in self.admitted if chunk not in self._resident]
 
     def want(self, requested: Iterable[int]) -> None:
-        """Replace the list of wanted chunks.
+        """Replace the list of wanted chunks, the most important first; `ValueError` if there is no such chunk.
 
-        Args:
-            requested: chunks, the most important first. The roots of all trees come before them, in this order,
-                too, whether listed or not.
-
-        Raises:
-            ValueError: there is no such chunk.
+        The roots of all trees come before them, in this order, too, whether listed or not.
         """
         named = [int(chunk) for chunk in requested]
         if named and not 0 <= min(named) <= max(named) < len(self._chunks):
@@ -185,11 +172,10 @@ class ChunkCache:
         self._arrange()
 
     def arrive(self, chunk: int) -> int | None:
-        """Add a chunk that has been fetched.
+        """Add a chunk that has been fetched, and return the one that was evicted; None if none was.
 
-        Returns:
-            the chunk that was evicted: the least recently used of the unwanted chunks, or else the least important. It
-            may be the new chunk itself, if it is no longer wanted. None if nothing was evicted.
+        That is the least recently used of the unwanted chunks, or else the least important. It may be the new chunk
+        itself, if it is no longer wanted.
         """
         self._resident[chunk] = None
         # All admitted chunks fit, so if an admitted one exceeds the capacity, the first in the order of eviction is not
@@ -202,7 +188,6 @@ class ChunkCache:
         return evicted
 
     def copy(self) -> ChunkCache:
-        """Return an independent copy of the cache."""
         twin = copy.copy(self)  # the lists are replaced, never changed
         twin._resident = self._resident.copy()
         return twin
@@ -228,8 +213,8 @@ class ChunkStream:
     `cache.resident()` are then the chunks that can be drawn.
 
     A free fetcher requests the most important admitted chunk that is neither resident nor under way. Requests are not
-    cancelled, as in Spark; a chunk that is no longer wanted when it arrives goes into the cache if there
-    is room, or in place of one that has not been used for longer. Decoding takes no time, and no request fails.
+    cancelled, as in Spark; a chunk that is no longer wanted when it arrives goes into the cache if there is room, or in
+    place of one that has not been used for longer. Decoding takes no time, and no request fails.
 
     A chunk is there when all of its answers are (`Chunks.requests`): that to a first request, and those to the others,
     which are asked for together then. A request waits for a free connection, in the order of the requests.
@@ -240,7 +225,7 @@ class ChunkStream:
     The state changes at events only, so the result does not depend on the steps in which time advances.
 
     Args:
-        network: the network; everything arrives at once unless given.
+        network: everything arrives at once unless given.
 
     Attributes:
         now: the current time, seconds.
@@ -310,11 +295,7 @@ class ChunkStream:
         return going
 
     def complete_in(self, requested: Iterable[int]) -> float | None:
-        """Seconds until all these chunks are resident if no others are requested.
-
-        Returns:
-            0 if they are resident; None if they do not fit into the cache.
-        """
+        """Seconds until all these chunks are resident if no others are requested; None if the cache is too small."""
         future = self._copy()
         future.want(requested)
         if len(future.cache.admitted) < len(future.cache.requested):
@@ -357,7 +338,6 @@ class ChunkStream:
             self._queue.append(request)
 
     def _size(self, request: _Request) -> int:
-        """Return the bytes of the answer."""
         if request.chunk < 0:
             return self._headers[-1 - request.chunk][0]
         return self._chunks.requests[request.chunk][request.part]

@@ -91,7 +91,7 @@ class Condition:
 
     Attributes:
         sign: one of `SIGNS`.
-        bound: what it is compared with: a number, or for == and != anything that JSON has.
+        bound: a number, or for == and != anything that JSON has.
     """
 
     text: str
@@ -101,11 +101,10 @@ class Condition:
 
     @classmethod
     def of(cls, name: str, sign: str, bound: Any) -> Condition:
-        """Return a condition made by the program, with its text."""
         return cls(f"{name}{sign}{json.dumps(bound)}", name, sign, bound)
 
     def holds(self, value: Any) -> bool:
-        """Whether a value is on the right side of the bound. Only numbers are in an order; true is not 1."""
+        """Whether a value satisfies the condition. Only numbers have an order; true is not 1."""
         if self.sign in ("==", "!="):
             same = bool(value == self.bound) and isinstance(value, bool) == isinstance(self.bound, bool)
             return same == (self.sign == "==")

@@ -38,10 +38,7 @@ class Column:
     meaning: str
 
     def rounded(self, value: Cell) -> Cell:
-        """Return a value rounded to the digits of this column.
-
-        A number that is not finite, of splats that are not, is an empty cell.
-        """
+        """Return a value rounded to the digits of this column; a number that is not finite becomes an empty cell."""
         if not self.digits or value is None:
             return value
         if not math.isfinite(float(value)):
@@ -276,25 +273,16 @@ class TableOutput:
 
     @property
     def on_stdout(self) -> bool:
-        """Whether the table goes to standard output."""
         return self.path is None and self.form is not None
 
     def check(self) -> None:
-        """Raise a `SparklodError` where the table cannot be written, before work goes into it."""
         if self.path is not None:
             check_writable(self.path, overwrite=self.overwrite)
         if self.form == "parquet":
             load_pyarrow()
 
     def write(self, rows: Iterable[Row], *, passed: Filter | None = None) -> None:
-        """Compute all rows and write each at once.
-
-        Args:
-            passed: wraps the bytes on their way to standard output; None for none.
-
-        Raises:
-            OutputError: the file cannot be written.
-        """
+        """Compute all rows and write each at once; `passed` filters the bytes on their way to standard output."""
         if self.form is None:
             for _ in rows:
                 pass

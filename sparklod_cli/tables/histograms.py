@@ -87,9 +87,7 @@ def _range(values: NDArray[np.float64]) -> tuple[float, float]:
 def as_text(histogram: Histogram, *, width: int = 60, rows: int = 20) -> str:
     """Return a line for each bin, with its lower edge, count and bar, and lines for the numbers outside the bins.
 
-    Args:
-        histogram: whose bins are joined where there are more than `rows`.
-        width: of the longest bar, in characters.
+    Bins are joined where there are more than `rows`; the longest bar has `width` characters.
     """
     lines: list[tuple[str, int, bool]] = []
     if len(histogram.counts):

@@ -19,8 +19,7 @@ from sparklod_cli.scenes.finder import CutFinder
 from sparklod_cli.scenes.loaded import Scenes
 from sparklod_cli.scenes.loaded_scene import LoadedDetail
 from sparklod_cli.scenes.reading import read_scenes
-from sparklod_cli.simulation.frames import Simulation
-from sparklod_cli.simulation.loading import Loader
+from sparklod_cli.simulation.frames import Loader, Simulation
 from sparklod_cli.simulation.results import OF_TREES
 from sparklod_cli.simulation.streaming_settings import Network, StreamingSettings
 from tests.lod.details import row_of_regions

@@ -11,7 +11,7 @@ import pytest
 from sparklod_cli.lod.settings import LodSettings
 from sparklod_cli.scenes.finder import CutFinder, view_of
 from sparklod_cli.scenes.loaded import Scenes
-from sparklod_cli.simulation.loading import Loader
+from sparklod_cli.simulation.frames import Loader
 from sparklod_cli.simulation.results import LOADING
 from sparklod_cli.simulation.streaming_settings import Network, StreamingSettings
 from tests.simulation.paths import SPARK, resting, rows_of

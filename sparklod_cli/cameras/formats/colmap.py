@@ -294,11 +294,7 @@ class _Reader:
 
 
 def lens_of(model: Model, width: float, height: float, numbers: list[float], way: str) -> Intrinsics:
-    """Return the lens of a camera, without its distortion.
-
-    Raises:
-        CameraPathError: the number of parameters or the size is wrong, or it is not a pinhole camera.
-    """
+    """Return the lens of a camera, without its distortion; `CameraPathError` if its model has none or other numbers."""
     if not model.focals:
         raise CameraPathError(f"{way} is {model.name}, which is not a pinhole camera")
     if len(numbers) != model.count:

@@ -105,7 +105,6 @@ def _of_document(root: CameraJson, settings: Settings) -> Parsed:
 
 
 def _whole(frames: float) -> float:
-    """Return a number rounded; infinity stays infinite."""
     return float(round(frames)) if math.isfinite(frames) else frames
 
 

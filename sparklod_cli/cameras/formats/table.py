@@ -29,12 +29,10 @@ class Axes(Enum):
 
     @property
     def opencv(self) -> bool:
-        """Whether y points down and the camera looks along +z."""
         return self in (Axes.OPENCV_C2W, Axes.OPENCV_W2C)
 
     @property
     def from_world(self) -> bool:
-        """Whether the matrix transforms from world to camera."""
         return self in (Axes.OPENGL_W2C, Axes.OPENCV_W2C)
 
 
@@ -67,11 +65,9 @@ class PathFormat:
     names: tuple[tuple[str, ...], ...] = ()
 
     def recognises(self, files: Files) -> bool:
-        """Return whether files are of this format."""
         return bool(self._function("recognises")(files))
 
     def parse(self, files: Files, settings: Settings) -> Parsed:
-        """Parse files; raises `CameraPathError` if they are not of this format."""
         return cast("Parsed", self._function("parse")(files, settings))
 
     def _function(self, verb: str) -> Any:

@@ -48,7 +48,6 @@ class CardOptimiser(Optimiser):
         self._examples: dict[int, _CardExample] = {}
 
     def step(self, picture: FullDetailPicture, index: Index, rates: adam.Rates) -> None:
-        """Take one step for a picture of a cut."""
         with self._errors():
             example = self._example(picture)
             drawn = self._index(index)
@@ -58,7 +57,6 @@ class CardOptimiser(Optimiser):
         self._moved.append((index, moved))
 
     def place(self) -> None:
-        """Update the nodes that cuts are found with, by the steps since the last call."""
         for index, moved in self._moved:
             self.nodes.place(index, moved[:, :3], moved[:, 3])
         self._moved.clear()
