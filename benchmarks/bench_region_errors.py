@@ -22,7 +22,7 @@ from sparklod_cli.lod import quality
 from sparklod_cli.lod.detail_levels import detail_cuts, make
 from sparklod_cli.lod.detail_rule import DetailSettings
 from sparklod_cli.model.gaussian import covariance
-from sparklod_cli.model.scene import DetailScene
+from sparklod_cli.model.traversed import DetailScene
 from sparklod_cli.render import rasterizer
 from sparklod_cli.render.rasterizer import shade
 from sparklod_cli.render.settings import RasterSettings

@@ -27,9 +27,9 @@ from sparklod_cli.codecs.gpu import lod_tree
 from sparklod_cli.lod.continuous import ContinuousCuts
 from sparklod_cli.lod.cut_statistics import Changes, measure
 from sparklod_cli.lod.traversal import CutView, Forest, Traversal, TreeInstance
-from sparklod_cli.model.lod_tree import Nodes
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
+from sparklod_cli.model.traversed import Nodes
 from sparklod_cli.scenes.finder import view_of
 from sparklod_cli.system.threads import on_threads, ordered_map, processors
 

@@ -15,8 +15,9 @@ from sparklod_cli.lod.detail_rule import BUDGET, DetailRule
 from sparklod_cli.lod.settings import LodSettings
 from sparklod_cli.model.foveation import Cones
 from sparklod_cli.model.instances import Instance
-from sparklod_cli.model.scene import DetailScene, Scene
+from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
+from sparklod_cli.model.traversed import DetailScene
 from sparklod_cli.render.color_by import numbers_of, scale_of_splats
 from sparklod_cli.scenes.finder import CutFinder
 from sparklod_cli.scenes.loaded import Scenes

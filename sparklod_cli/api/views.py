@@ -21,7 +21,8 @@ from ..images import metrics
 from ..lod import detail_rule
 from ..lod.settings import BLEND, LodSettings
 from ..model.instances import Instance, names_of
-from ..model.scene import DetailScene, Scene
+from ..model.scene import Scene
+from ..model.traversed import DetailScene
 from ..render.rasterizer import Image
 from ..render.renderer import Renderer
 from ..render.settings import RenderSettings

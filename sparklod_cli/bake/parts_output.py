@@ -11,9 +11,9 @@ from ..codecs.formats import ENVIRONMENT, folders_of
 from ..codecs.options import WriteOptions
 from ..lod.detail_rule import DetailSettings
 from ..lod.tile_settings import TileSettings
-from ..model.scene import DetailScene, Scene
+from ..model.scene import Scene
 from ..model.splats import Splats
-from ..model.tile_scene import TileScene
+from ..model.traversed import DetailScene, TileScene
 from ..system.output import Output
 from ..system.progress import Progress
 from ..system.threads import on_threads

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from ..cameras.camera import FARTHEST, rotation_of
 from ..model.falloff import MAX_STD_DEV, MIN_ALPHA, STD_DEV_PER_D
 from ..model.gaussian import lod_opacity
-from ..model.scene import DetailScene
 from ..model.sh import degree_of
+from ..model.traversed import DetailScene
 from ..render.kernels.ellipse import Limits
 from ..render.kernels.project import TILE, ShadedColumns
 from ..render.kernels.region_errors import compare_levels

@@ -17,10 +17,8 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 from ..codecs.encoder import Stored
 from ..codecs.formats import FORMATS, NPZ, RAW_SUFFIXES, ZIP, Format, head_of, lookalike_of, sniff
 from ..codecs.reader import OpenCompanion, OpenFile, Reader, Target
-from ..model.instances import Instance
-from ..model.scene import DetailScene, Scene
+from ..model.scene import Scene
 from ..model.splats import COLUMNS
-from ..model.tile_scene import TileScene
 from ..model.transforms import Transform
 from ..system import atomic
 from ..system.addresses import Address, Place, absolute
@@ -32,6 +30,8 @@ from .local_files import in_folder, open_named, reason_unreadable
 
 if TYPE_CHECKING:
     from ..codecs.gpu import dump
+    from ..model.instances import Instance
+    from ..model.traversed import DetailScene, TileScene
 
 #: Files that stay open together, of one scene, and of those that were closed or that another process opened: each has
 #: a palette of up to 12 MB. Chosen.

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from ..model.falloff import harmonic
 from ..model.gaussian import covariance, spark_size
 from ..model.lod_tree import LodTree
-from ..model.scene import DetailScene
 from ..model.splats import Splats
+from ..model.traversed import DetailScene
 from ..system.progress import Progress, silent
 from .detail_rule import DetailSettings
 from .kernels.tree_links import find_parents

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..model.scene import DetailScene
 from ..model.splats import Splats
+from ..model.traversed import DetailScene
 from .detail_choice import Chains, Distances, Distant, Levels, RegionBounds, choose
 from .detail_rule import LEAST_BASE_DISTANCE, DetailRule
 from .traversal import CutView, SplatForest, TreeCut, TreeInstance, views_of

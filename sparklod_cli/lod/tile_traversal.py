@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..model.splats import Splats
-from ..model.tile_scene import TileScene
+from ..model.traversed import TileScene
 from .tiles import PIXEL_ERROR
 from .traversal import CutView, SplatForest, TreeCut, TreeInstance, views_of
 

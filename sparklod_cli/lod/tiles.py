@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ..model.gaussian import spark_size
 from ..model.lod_tree import LodTree
 from ..model.splats import FloatArray, Splats
-from ..model.tile_scene import TileScene
+from ..model.traversed import TileScene
 from ..system.progress import Progress, silent
 from .detail_levels import STEP, Nodes, RefinementOrder, owners_of, with_plain_opacity
 from .regions import extents, united

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from ..model.foveation import Cones, Foveation, Frustum
 from ..model.gaussian import spark_size
-from ..model.lod_tree import CHUNK_BITS, CHUNK_NODES, Nodes
+from ..model.lod_tree import CHUNK_BITS, CHUNK_NODES
 from ..model.splats import Splats
+from ..model.traversed import Nodes
 from .kernels import cut_arrays, pixel_scale
 from .kernels.cut import find_cut
 

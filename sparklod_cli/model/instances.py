@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .foveation import Foveation
-from .scene import DetailScene, Scene
-from .tile_scene import TileScene
+from .scene import Scene
 from .transforms import LARGEST, SKEW, Transform, scale_of
+from .traversed import DetailScene, TileScene
 
 Matrix = NDArray[np.float64]
 

@@ -1,4 +1,4 @@
-"""`LodTree`: the child columns of a Level-of-Detail tree and their invariants; `Nodes`: what a traversal reads."""
+"""`LodTree`: the child columns of a Level-of-Detail tree and their invariants."""
 
 from __future__ import annotations
 
@@ -9,13 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..system.errors import TreeError
-from .gaussian import spark_size
-from .splats import FloatArray, Splats
 
 #: The most children of a node: child counts are uint16 in Spark's nodes and in SPZ files.
 MAX_CHILDREN = 65535
 
-#: Attribute of a tree that is valid and cannot change.
+#: Attribute of a tree of `frozen`: whether it was validated.
 _VALID = "_valid"
 
 
@@ -49,15 +47,13 @@ class LodTree:
 
         Kernels follow links without bounds checks: a tree must not change after `validate`.
         """
-        if self._is_frozen:
+        if _VALID in self.__dict__:
             return self
-        count, start = self.child_count, self.child_start
-        return LodTree(np.frombuffer(count.tobytes(), np.uint16), np.frombuffer(start.tobytes(), np.uint32))
-
-    @property
-    def _is_frozen(self) -> bool:
-        """Whether both columns are in immutable memory: the owner of a read-only array can make it writable again."""
-        return all(isinstance(column.base, bytes) for column in (self.child_count, self.child_start))
+        # Of bytes, as the owner of a read-only array can make it writable again.
+        count, start = self.child_count.tobytes(), self.child_start.tobytes()
+        tree = LodTree(np.frombuffer(count, np.uint16), np.frombuffer(start, np.uint32))
+        tree.__dict__[_VALID] = False
+        return tree
 
     def __reduce__(self) -> tuple[type[LodTree], tuple[Any, ...]]:
         return LodTree, (self.child_count, self.child_start)  # a copy can be written to, and is validated again
@@ -103,7 +99,7 @@ class LodTree:
         Raises:
             TreeError: an invariant is violated; names the first node that violates it.
         """
-        if _VALID in self.__dict__:
+        if self.__dict__.get(_VALID):
             return
         if len(self.child_count) != len(self.child_start):
             raise TreeError(f"{len(self.child_count)} child counts but {len(self.child_start)} child starts")
@@ -112,45 +108,22 @@ class LodTree:
         node = np.flatnonzero(self.child_count)
         start = self.child_start[node].astype(np.int64)
         end = start + self.child_count[node]
-        self._fail_at(node[start <= node], "comes after one of its children")
-        self._fail_at(node[end > len(self)], "has children past the last node")
         # Ranges of children, sorted by their start, cover 1..M exactly once if each begins where the last one ended.
         by_start = np.argsort(start, kind="stable")
         expected = np.concatenate([[1], end[by_start]])
-        self._fail_at(
-            node[by_start[start[by_start] != expected[:-1]]], "shares children with another node or skips some"
-        )
+        for wrong, what in (
+            (node[start <= node], "comes after one of its children"),
+            (node[end > len(self)], "has children past the last node"),
+            (node[by_start[start[by_start] != expected[:-1]]], "shares children with another node or skips some"),
+        ):
+            if wrong.size:
+                raise TreeError(f"node {wrong[0]} {what}")
         if expected[-1] != len(self):
             raise TreeError(f"node {expected[-1]} has no parent")
-        if self._is_frozen:
+        if _VALID in self.__dict__:
             self.__dict__[_VALID] = True
-
-    @staticmethod
-    def _fail_at(nodes: NDArray[np.int64], what: str) -> None:
-        if nodes.size:
-            raise TreeError(f"node {nodes[0]} {what}")
 
 
 #: Nodes of a chunk, the unit in which Spark streams trees; as a power of 2.
 CHUNK_BITS = 16
 CHUNK_NODES = 1 << CHUNK_BITS
-
-
-@dataclass(frozen=True)
-class Nodes:
-    """Node data that the traversal reads, N nodes.
-
-    Attributes:
-        center: (N, 3) float32 world units.
-        size: (N,) float32 feature sizes, world units.
-        tree: (N,) children; not validated.
-    """
-
-    center: FloatArray
-    size: FloatArray
-    tree: LodTree
-
-    @classmethod
-    def of(cls, splats: Splats, tree: LodTree) -> Nodes:
-        """Return the nodes of a tree in full precision, with Spark's feature sizes."""
-        return cls(splats.center, spark_size(splats), tree)

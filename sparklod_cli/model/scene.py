@@ -1,7 +1,6 @@
 """Contents of one splat file: `Scene`, splats with their tree if they have one, and metadata of the file.
 
-`DetailScene` is one whose regions each exist at several detail levels, as Streamed SOG holds it. `FileCoding` tells how
-a file holds its scales: what it takes to know the numbers that another reader has of them.
+`FileCoding` describes how the file holds its scales, from which the numbers that another reader decodes follow.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..system.errors import InvalidSplatsError, TreeError
 from .axes import AXES
@@ -209,87 +208,6 @@ def _column(name: str, values: ArrayLike, shape: tuple[int, ...]) -> np.ndarray[
         raise ValueError(f"{name} has the shape {array.shape}; give {shape}, a row for each splat")
     with np.errstate(over="ignore"):
         return np.ascontiguousarray(array, np.float32)
-
-
-Bounds = NDArray[np.float64]
-Counts = NDArray[np.int64]
-
-
-@dataclass(frozen=True, eq=False)
-class DetailScene:
-    """Splats of all detail levels, and the regions whose level a viewer chooses one by one.
-
-    Level 0 is full detail; the levels of a region stand for the same splats. The splats of a region at a level are its
-    run. Runs lie level after level, and in a level region after region.
-
-    Attributes:
-        splats: N splats, those of all levels.
-        counts: (R, L) int64 splats of each region at each level; 0 where a region has no such level.
-        bounds: (R, 2, 3) float64 lowest and highest corner of each region, in world units.
-        children: (R - 1, 2) int64 the binary tree over the regions: its inner nodes, root first and before their
-            children. A number from 0 on is an inner node, -1 - r is region r.
-        errors: (R, L) float64 how far each level of a region is from its level 0, 0 there and not decreasing from level
-            to level; None where nobody measured it.
-        environment: splats far outside, which are drawn whatever the levels are; None without.
-        antialiased: trained with the opacity compensation of Mip-Splatting.
-        format, notes, header, up, up_by: as of `Scene`.
-    """
-
-    splats: Splats
-    counts: Counts
-    bounds: Bounds
-    children: NDArray[np.int64]
-    errors: NDArray[np.float64] | None = None
-    environment: Splats | None = None
-    antialiased: bool = False
-    format: str = ""
-    notes: tuple[str, ...] = ()
-    header: Mapping[str, int] = field(default_factory=dict)
-    up: str | None = None
-    up_by: str = ""
-
-    def __post_init__(self) -> None:
-        regions, levels = self.counts.shape
-        shapes = {"bounds": (regions, 2, 3), "children": (regions - 1, 2)}
-        shapes |= {} if self.errors is None else {"errors": (regions, levels)}
-        for name, shape in shapes.items():
-            if getattr(self, name).shape != shape:
-                raise ValueError(f"{name} has the shape {getattr(self, name).shape}; expected {shape}")
-        if self.counts.sum() != len(self.splats):
-            raise ValueError(f"counts are of {self.counts.sum():,} splats, but there are {len(self.splats):,}")
-
-    @property
-    def regions(self) -> int:
-        """Number of regions."""
-        return len(self.counts)
-
-    @property
-    def levels(self) -> int:
-        """Number of detail levels."""
-        return self.counts.shape[1]
-
-    @functools.cached_property
-    def starts(self) -> Counts:
-        """(R, L) the first splat of each run."""
-        flat = self.counts.T.ravel()
-        return np.ascontiguousarray((np.cumsum(flat) - flat).reshape(self.levels, self.regions).T)
-
-    def run(self, region: int, level: int) -> slice:
-        """Return the splats of a region at a level."""
-        start = int(self.starts[region, level])
-        return slice(start, start + int(self.counts[region, level]))
-
-    def level(self, level: int) -> slice:
-        """Return the splats of a level, of all regions."""
-        before = int(self.counts[:, :level].sum())
-        return slice(before, before + int(self.counts[:, level].sum()))
-
-    def scene(self) -> Scene:
-        """Return full detail as a plain scene: level 0, then the environment."""
-        splats = self.splats.take(self.level(0))
-        if self.environment is not None:
-            splats = Splats.concat([splats, self.environment])
-        return Scene(splats, **facts_of(self))
 
 
 def facts_of(source: Any) -> dict[str, Any]:

@@ -105,7 +105,11 @@ class Transform:
             raise ValueError(f"the angles {x:g},{y:g},{z:g} are not all finite; give three in degrees")
         rotation = np.eye(3)
         for axis, angle in enumerate((x, y, z)):
-            cosine, sine = _cosine_and_sine(angle)
+            quarters, rest = divmod(math.fmod(angle, 360), 90)
+            if rest == 0:
+                cosine, sine = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))[int(quarters) % 4]
+            else:
+                cosine, sine = math.cos(math.radians(angle)), math.sin(math.radians(angle))
             turn = np.eye(3)
             first, second = (axis + 1) % 3, (axis + 2) % 3
             turn[first, first] = turn[second, second] = cosine
@@ -161,17 +165,13 @@ class Transform:
         Raises:
             ValueError: one of them is out of range; its text says which and what to give.
         """
-        turned = cls.from_up(up).then(cls.from_euler(*rotate))
-        return cls(turned.rotation, scale, np.asarray(translate, np.float64))
+        rotation = cls.from_euler(*rotate).rotation @ cls.from_up(up).rotation
+        return cls(rotation, scale, np.asarray(translate, np.float64))
 
     @property
     def is_identity(self) -> bool:
         """Whether it leaves everything exactly where and as it is."""
-        return self._keeps_axes and self.scale == 1 and not self.translation.any()
-
-    @property
-    def _keeps_axes(self) -> bool:
-        return np.array_equal(self.rotation, np.eye(3))
+        return np.array_equal(self.rotation, np.eye(3)) and self.scale == 1 and not self.translation.any()
 
     @property
     def matrix(self) -> Matrix:
@@ -202,7 +202,7 @@ class Transform:
         if self.is_identity:
             return splats
         columns = {"center": np.empty_like(splats.center)}
-        if not self._keeps_axes:
+        if not np.array_equal(self.rotation, np.eye(3)):
             columns["quat_xyzw"] = np.empty_like(splats.quat_xyzw)
             if splats.sh.shape[1]:
                 columns["sh"] = np.empty_like(splats.sh)
@@ -250,7 +250,12 @@ def sh_rotations(rotation: Matrix, degree: int) -> list[Matrix]:
     Returns:
         (3, 3), (5, 5) and (7, 7) orthogonal float64, as far as `degree` goes.
     """
-    directions = _directions()
+    # Spread evenly: a spiral from pole to pole by the golden angle.
+    index = np.arange(SAMPLES)
+    z = 1 - (2 * index + 1) / SAMPLES
+    angle = index * (math.pi * (3 - math.sqrt(5)))
+    radius = np.sqrt(1 - z * z)
+    directions = np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
     before, after = sh_basis(directions, degree), sh_basis(directions @ rotation, degree)
     found = []
     for l in range(1, degree + 1):  # noqa: E741 - as books call the degree
@@ -270,42 +275,20 @@ def sh_basis(directions: Matrix, degree: int) -> Matrix:
     x, y, z = directions.T
     columns = [SH_C1 * -y, SH_C1 * z, SH_C1 * -x] if degree else []
     if degree > 1:
-        columns += [c * p for c, p in zip(SH_C2, _second(x, y, z), strict=True)]
+        second = x * y, y * z, 2 * z * z - x * x - y * y, x * z, x * x - y * y
+        columns += [c * p for c, p in zip(SH_C2, second, strict=True)]
     if degree > 2:
-        columns += [c * p for c, p in zip(SH_C3, _third(x, y, z), strict=True)]
+        third = (
+            y * (3 * x * x - y * y),
+            x * y * z,
+            y * (4 * z * z - x * x - y * y),
+            z * (2 * z * z - 3 * x * x - 3 * y * y),
+            x * (4 * z * z - x * x - y * y),
+            z * (x * x - y * y),
+            x * (x * x - 3 * y * y),
+        )
+        columns += [c * p for c, p in zip(SH_C3, third, strict=True)]
     return np.stack(columns, axis=1) if columns else np.empty((len(directions), 0))
-
-
-def _second(x: Matrix, y: Matrix, z: Matrix) -> list[Matrix]:
-    return [x * y, y * z, 2 * z * z - x * x - y * y, x * z, x * x - y * y]
-
-
-def _third(x: Matrix, y: Matrix, z: Matrix) -> list[Matrix]:
-    return [
-        y * (3 * x * x - y * y),
-        x * y * z,
-        y * (4 * z * z - x * x - y * y),
-        z * (2 * z * z - 3 * x * x - 3 * y * y),
-        x * (4 * z * z - x * x - y * y),
-        z * (x * x - y * y),
-        x * (x * x - 3 * y * y),
-    ]
-
-
-def _directions() -> Matrix:
-    """Return (SAMPLES, 3) unit vectors, spread evenly: a spiral from pole to pole by the golden angle."""
-    index = np.arange(SAMPLES)
-    z = 1 - (2 * index + 1) / SAMPLES
-    angle = index * (math.pi * (3 - math.sqrt(5)))
-    radius = np.sqrt(1 - z * z)
-    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
-
-
-def _cosine_and_sine(degrees: float) -> tuple[float, float]:
-    quarters, rest = divmod(math.fmod(degrees, 360), 90)
-    if rest == 0:
-        return ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))[int(quarters) % 4]
-    return math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
 
 
 def _quat_product(rotation: Matrix) -> Matrix:

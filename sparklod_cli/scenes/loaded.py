@@ -22,9 +22,9 @@ from ..model.balls import Balls, balls_of
 from ..model.foveation import Foveation
 from ..model.gaussian import placed
 from ..model.instances import Instance, Matrix
-from ..model.lod_tree import Nodes
 from ..model.scene import Scene
 from ..model.splats import Splats
+from ..model.traversed import Nodes
 from ..system.units import count_of
 from .loaded_scene import Index, LoadedDetail, LoadedRuns, LoadedScene, LoadedTiles, nodes_of
 from .pages import PagedForest, PagedScene, sampled_balls

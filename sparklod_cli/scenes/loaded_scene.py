@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from ..codecs.gpu import loaded_nodes, lod_tree
 from ..lod import detail_rule, tile_settings
 from ..lod.detail_traversal import DetailFiles
-from ..model.lod_tree import CHUNK_NODES, LodTree, Nodes
-from ..model.scene import DetailScene, FileCoding, Scene, facts_of
+from ..model.lod_tree import CHUNK_NODES, LodTree
+from ..model.scene import FileCoding, Scene, facts_of
 from ..model.splats import COLUMNS, Splats
-from ..model.tile_scene import TileScene
+from ..model.traversed import DetailScene, Nodes, TileScene
 
 Index = NDArray[np.signedinteger]
 

@@ -18,9 +18,10 @@ from ..lod.kernels.pixel_scale import NODE
 from ..lod.traversal import Forest, fill_nodes
 from ..model.balls import USED, Balls, balls_of
 from ..model.instances import Instance
-from ..model.lod_tree import CHUNK_BITS, CHUNK_NODES, LodTree, Nodes
+from ..model.lod_tree import CHUNK_BITS, CHUNK_NODES, LodTree
 from ..model.scene import FileCoding
 from ..model.splats import COLUMNS, Splats
+from ..model.traversed import Nodes
 from ..system.errors import TreeError, naming
 from ..system.machine import available_memory
 from ..system.threads import ordered_map

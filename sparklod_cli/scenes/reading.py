@@ -21,10 +21,10 @@ from ..io.rad_file import RadFile
 from ..lod.detail_traversal import DetailFiles
 from ..model.instances import Instance, Source
 from ..model.lod_tree import CHUNK_NODES, LodTree
-from ..model.scene import DetailScene, Scene
+from ..model.scene import Scene
 from ..model.selection import Selection, describe
 from ..model.splats import COLUMNS
-from ..model.tile_scene import TileScene
+from ..model.traversed import DetailScene, TileScene
 from ..system.errors import FormatError, InvalidSplatsError, TreeError, memory_errors_translated, naming
 from ..system.progress import Progress, silent
 from ..system.stdio import DASH

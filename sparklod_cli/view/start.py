@@ -21,9 +21,8 @@ from ..codecs.rad.rad_reader import count_leaves, file_of, read_chunk
 from ..io import read_parts, read_scene
 from ..io.local_files import open_plain
 from ..model.balls import Balls, balls_of
-from ..model.scene import DetailScene
 from ..model.splats import Splats
-from ..model.tile_scene import TileScene
+from ..model.traversed import DetailScene, TileScene
 from ..system.errors import InvalidSplatsError, UnreadableError, naming, reason_of
 from ..system.progress import Progress, silent
 from .files import ShownFile

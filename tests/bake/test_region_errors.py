@@ -13,8 +13,8 @@ from sparklod_cli.bake import region_errors
 from sparklod_cli.bake.region_errors import measured
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.model.gaussian import covariance
-from sparklod_cli.model.scene import DetailScene
 from sparklod_cli.model.splats import Splats
+from sparklod_cli.model.traversed import DetailScene
 from sparklod_cli.render import rasterizer
 from sparklod_cli.render.rasterizer import shade
 from sparklod_cli.render.settings import RasterSettings

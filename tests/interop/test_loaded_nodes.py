@@ -21,9 +21,10 @@ from sparklod_cli.lod import quick
 from sparklod_cli.lod.traversal import CutView, Traversal, TreeInstance
 from sparklod_cli.model.gaussian import linear_opacity
 from sparklod_cli.model.instances import Instance
-from sparklod_cli.model.lod_tree import CHUNK_NODES, Nodes
+from sparklod_cli.model.lod_tree import CHUNK_NODES
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import FloatArray
+from sparklod_cli.model.traversed import Nodes
 from sparklod_cli.scenes.loaded_scene import nodes_of
 from sparklod_cli.scenes.reading import read_scenes
 from tests.conftest import FIXTURES, real_scene

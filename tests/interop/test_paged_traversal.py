@@ -17,8 +17,9 @@ from sparklod_cli.lod.settings import LodSettings
 from sparklod_cli.lod.traversal import CutView, Forest, Traversal, TreeCut, TreeInstance
 from sparklod_cli.model.foveation import Cones
 from sparklod_cli.model.instances import Instance
-from sparklod_cli.model.lod_tree import CHUNK_NODES, Nodes
+from sparklod_cli.model.lod_tree import CHUNK_NODES
 from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.traversed import Nodes
 from sparklod_cli.scenes.reading import read_scenes
 from sparklod_cli.simulation.frames import Simulation
 from sparklod_cli.simulation.streaming_settings import Network, StreamingSettings

@@ -18,7 +18,8 @@ from sparklod_cli.lod.builders import BUILDERS
 from sparklod_cli.lod.settings import pixel_limit
 from sparklod_cli.lod.traversal import CutView, Forest, Traversal, TreeCut, TreeInstance, views_of
 from sparklod_cli.model.foveation import Cones
-from sparklod_cli.model.lod_tree import CHUNK_NODES, Nodes
+from sparklod_cli.model.lod_tree import CHUNK_NODES
+from sparklod_cli.model.traversed import Nodes
 from tests.conftest import FIXTURES, real_scene
 from tests.interop.spark import NODE, Spark
 from tests.lod.forests import rotation, transform

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sparklod_cli.lod.traversal import CutView
-from sparklod_cli.model.scene import DetailScene
+from sparklod_cli.model.traversed import DetailScene
 from tests.scenes import random_splats
 
 

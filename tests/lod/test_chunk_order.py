@@ -21,8 +21,9 @@ from sparklod_cli.lod.kernels.tree_links import find_limits, find_parents
 from sparklod_cli.lod.settings import LodSettings
 from sparklod_cli.lod.traversal import CutView, Forest, Traversal, TreeCut, TreeInstance
 from sparklod_cli.model.gaussian import spark_size
-from sparklod_cli.model.lod_tree import CHUNK_NODES, LodTree, Nodes
+from sparklod_cli.model.lod_tree import CHUNK_NODES, LodTree
 from sparklod_cli.model.splats import Splats
+from sparklod_cli.model.traversed import Nodes
 from sparklod_cli.system.threads import on_threads
 from tests.lod.forests import links
 from tests.lod.trees import check_threads

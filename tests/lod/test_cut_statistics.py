@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from sparklod_cli.lod.cut_statistics import Changes, CutStatistics, measure
 from sparklod_cli.lod.settings import pixel_limit
 from sparklod_cli.lod.traversal import CutView, Traversal, TreeCut, TreeInstance
-from sparklod_cli.model.lod_tree import Nodes
+from sparklod_cli.model.traversed import Nodes
 from tests.lod.forests import Case, cases, drawn, expected_cut, links, views
 
 SIZE = (640, 480)

@@ -26,8 +26,8 @@ from sparklod_cli.lod.detail_rule import DetailSettings
 from sparklod_cli.lod.kernels.tree_links import find_parents
 from sparklod_cli.model.gaussian import covariance, spark_size
 from sparklod_cli.model.lod_tree import LodTree
-from sparklod_cli.model.scene import DetailScene
 from sparklod_cli.model.splats import COLUMNS, Splats
+from sparklod_cli.model.traversed import DetailScene
 from tests.lod.trees import children, hard_cases, sorted_rows
 from tests.scenes import random_splats
 

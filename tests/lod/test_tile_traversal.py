@@ -18,7 +18,7 @@ from sparklod_cli.lod.settings import pixel_limit
 from sparklod_cli.lod.tile_settings import TileSettings
 from sparklod_cli.lod.tile_traversal import TileForest, TileTraversal, choose
 from sparklod_cli.lod.traversal import CutView, TreeInstance
-from sparklod_cli.model.tile_scene import TileScene
+from sparklod_cli.model.traversed import TileScene
 from sparklod_cli.scenes.finder import view_of
 from tests.conftest import FIXTURES
 

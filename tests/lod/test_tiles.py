@@ -18,7 +18,7 @@ from sparklod_cli.lod.tiles import PIXEL_ERROR, make, tile_cuts
 from sparklod_cli.model.gaussian import spark_size
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.splats import COLUMNS, Splats
-from sparklod_cli.model.tile_scene import TileScene
+from sparklod_cli.model.traversed import TileScene
 from sparklod_cli.system.threads import on_threads
 from tests.lod.test_detail_levels import leaves_under
 from tests.lod.trees import hard_cases, sorted_rows

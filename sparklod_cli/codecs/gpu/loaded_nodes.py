@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...model.gaussian import size_factor
-from ...model.lod_tree import LodTree, Nodes
+from ...model.lod_tree import LodTree
 from ...model.scene import PLAIN, FileCoding, ScaleCoding
 from ...model.splats import FloatArray, Splats
+from ...model.traversed import Nodes
 from ...system.threads import for_blocks
 from .. import quantize, spark_codings, splat_encoding
 from ..splat_encoding import SplatEncoding

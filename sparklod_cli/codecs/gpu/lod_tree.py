@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...model.gaussian import spark_size
-from ...model.lod_tree import MAX_CHILDREN, LodTree, Nodes
+from ...model.lod_tree import MAX_CHILDREN, LodTree
 from ...model.scene import Scene
 from ...model.splats import Splats
+from ...model.traversed import Nodes
 from ...system.errors import FormatError
 from ...system.threads import for_blocks
 from ..spark_codings import Words, checked_words

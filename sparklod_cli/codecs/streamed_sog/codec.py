@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...model import morton
-from ...model.scene import Bounds, Counts, DetailScene, Scene, facts_of
+from ...model.scene import Scene, facts_of
 from ...model.sh import width_of
 from ...model.splats import Splats
+from ...model.traversed import Bounds, Counts, DetailScene
 from ...system.errors import FormatError
 from ...system.progress import Progress, silent
 from ...system.threads import ordered_map

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ...model.axes import common
 from ...model.scene import Scene, facts_of
 from ...model.sh import width_of
-from ...model.tile_scene import TileScene
+from ...model.traversed import TileScene
 from ...system.errors import FormatError
 from ...system.progress import Progress, silent
 from ...system.threads import ordered_map

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...model.scene import Bounds
+from ...model.traversed import Bounds
 from ...system.errors import FormatError, VersionError
 from ...system.untrusted import Json, quoted_value
 from ..file_notes import FileNote, read_note

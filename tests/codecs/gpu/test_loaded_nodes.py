@@ -15,9 +15,10 @@ from sparklod_cli.codecs.formats import LOADED
 from sparklod_cli.codecs.gpu import ext_splats, loaded_nodes, lod_tree, packed_splats
 from sparklod_cli.codecs.splat_encoding import SplatEncoding, log_scale_table
 from sparklod_cli.lod import quick
-from sparklod_cli.model.lod_tree import LodTree, Nodes
+from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import PLAIN, FileCoding, ScaleCoding, Scene
 from sparklod_cli.model.splats import Splats
+from sparklod_cli.model.traversed import Nodes
 from tests.scenes import random_splats
 
 SPZ = FileCoding((ScaleCoding("spz"),), 1)

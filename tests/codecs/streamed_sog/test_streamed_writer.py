@@ -16,8 +16,9 @@ from sparklod_cli.codecs.streamed_sog import codec
 from sparklod_cli.codecs.streamed_sog.manifest import parse
 from sparklod_cli.io import parts_output, read_parts, read_scene
 from sparklod_cli.model import morton
-from sparklod_cli.model.scene import DetailScene, Scene
+from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
+from sparklod_cli.model.traversed import DetailScene
 from sparklod_cli.system.errors import FormatError
 from tests.outputs import write_files
 

@@ -25,8 +25,8 @@ from sparklod_cli.lod.tiles import make
 from sparklod_cli.model.axes import AXES
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
-from sparklod_cli.model.tile_scene import TileScene
 from sparklod_cli.model.transforms import Transform
+from sparklod_cli.model.traversed import TileScene
 from sparklod_cli.system.errors import FormatError, VersionError
 from tests.codecs.cases import linear
 from tests.codecs.streamed_sog.scenes import open_companion
