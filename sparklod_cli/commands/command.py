@@ -482,13 +482,19 @@ class Text(click.ParamType):
 
 
 class OptionalNumber(click.IntRange):
-    """A number that may be left out; the error for an input taken for it says what to do."""
+    """A number that may be left out; the error for an input taken for it says what to do.
 
-    def __init__(self, range: Range, *, placeholder: str = "N", example: int) -> None:
+    Args:
+        zero: a text for 0, which may be out of the range.
+    """
+
+    def __init__(self, range: Range, *, placeholder: str = "N", example: int, zero: str = "") -> None:
         super().__init__(range.least, range.most)  # type: ignore[arg-type]  # whole numbers
-        self.placeholder, self.example = placeholder, example
+        self.placeholder, self.example, self.zero = placeholder, example, zero
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        if self.zero and value == self.zero:
+            return 0
         if isinstance(value, str) and not value.lstrip("-").isdigit() and param is not None:
             flag = param.opts[0]
             example = f"{flag}={self.example}"

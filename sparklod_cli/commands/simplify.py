@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ..codecs.formats import WRITABLE, ending_of
-from ..codecs.options import SogOptions, WriteOptions
+from ..codecs.options import WriteOptions
 from ..fitting.settings import STEPS, FitSettings
 from ..lod.budget import Budget, parse_budget
 from ..lod.builders import DETAIL_GROWTH
@@ -21,30 +20,34 @@ from ..system.errors import FormatError, naming
 from ..system.setting_fields import Quantity, Range, setting_of, whole
 from ..system.stdio import DASH, name_of
 from ..system.units import parse_size
-from .build_lod import SPZ, record_of, refuse_others
-from .build_lod_text import report_simplified
+from .build_lod import record_of, report_simplified
 from .command import (
     COMMON,
+    OptionalNumber,
     argument,
     check_declared,
     command,
     flags_set,
     is_set,
     option,
-    parameters_of,
     values_of,
 )
 from .console import Console, print_json, say
 from .options.baking import (
     BY_SIZE,
     EXAMPLE_STEPS,
+    FILE_FORMAT,
     METHOD_OF_DETAIL,
-    PaletteOptions,
-    SelectionOptions,
-    Steps,
-    TransformOptions,
-    TreeOptions,
+    OF_SCENES,
+    POSITION,
+    SELECTION,
+    SPZ,
+    BuildLodOptions,
+    SceneOptions,
     memory_size,
+    palette_option,
+    refuse_others,
+    write_options,
 )
 from .options.common import General, overwrite_flag, question_budgets
 from .paths import (
@@ -60,7 +63,7 @@ from .paths import (
 )
 
 if TYPE_CHECKING:
-    from ..bake.settings import BakeSettings, SimplifyGoal, Source
+    from ..bake.settings import BakeSettings
 
 EXAMPLES = """\
   sparklod simplify scene.ply --to 10% -o small.ply
@@ -80,8 +83,8 @@ GOALS = ("to", "max_bytes", "psnr")
 
 
 @dataclass(frozen=True)
-class SimplifiedFiles:
-    """Inputs, the output, and how many splats it has."""
+class SimplifyOptions:
+    """Options of simplify."""
 
     inputs: tuple[Place, ...] = argument(InputPath(stdin=True, addresses=True), metavar="INPUT...", required=True)
     to: Budget | None = option(
@@ -108,7 +111,7 @@ class SimplifiedFiles:
     refine: int | None = option(
         "Fit the splats to pictures of the INPUT, in STEPS pictures: a minute or more, for some dB."
         "  [default, without STEPS: by the size of the scene]",
-        Steps(STEPS, placeholder="STEPS", example=EXAMPLE_STEPS),
+        OptionalNumber(STEPS, placeholder="STEPS", example=EXAMPLE_STEPS, zero=BY_SIZE),
         is_flag=False,
         flag_value=BY_SIZE,
         heading=COMMON,
@@ -125,70 +128,43 @@ class SimplifiedFiles:
         required=True,
     )
     overwrite: bool = overwrite_flag()
-    max_sh: int = setting_of(TreeOptions, "max_sh")
+    max_sh: int = setting_of(BuildLodOptions, "max_sh")
     memory: int | None = option(
         "Memory that the tree may take, such as 4G; a scene that needs more is refused."
         "  [default: 75 % of what is available]",
         Quantity("SIZE", memory_size),
     )
 
+    scene: SceneOptions = field(default_factory=SceneOptions)
+    written: WriteOptions = field(default_factory=WriteOptions)
+    cluster_sh: int | None = palette_option()
+    general: General = field(default_factory=General)
+
     @property
     def suffix(self) -> str:
         """Ending of the output's name, see `WRITABLE`."""
         return SPZ if self.output == DASH else ending_of(self.output.name)
 
-    @property
-    def source(self) -> Source:
-        from ..bake.settings import Merged
-
-        return self.inputs[0] if len(self.inputs) == 1 else Merged.of(self.inputs)
-
-    @property
-    def goal(self) -> SimplifyGoal:
-        """Size or fidelity of the output."""
-        from ..bake.settings import SimplifyGoal
-
-        return SimplifyGoal(self.to, self.max_bytes, self.psnr)
-
-
-@dataclass(frozen=True)
-class SimplifyOptions:
-    """Options of the command, group by group."""
-
-    files: SimplifiedFiles = field(default_factory=SimplifiedFiles)
-    selection: SelectionOptions = field(default_factory=SelectionOptions)
-    transform: TransformOptions = field(default_factory=TransformOptions)
-    written: WriteOptions = field(default_factory=WriteOptions)
-    palette: PaletteOptions = field(default_factory=PaletteOptions)
-    general: General = field(default_factory=General)
-
     def settings(self, ctx: click.Context) -> BakeSettings:
         """Return the settings of the bake whose tree is cut; loads numpy."""
-        from ..bake.settings import BakeSettings
+        from ..bake.settings import BakeSettings, SimplifyGoal
 
-        files, codes = self.files, self.palette.cluster_sh
-        rad = dataclasses.replace(self.written.rad, sh_codes=codes)
         return BakeSettings(
             method=METHOD_OF_DETAIL,
             growth=DETAIL_GROWTH,
-            max_sh=files.max_sh,
-            selection=self.selection.selection(),
-            transform=self.transform.transform(),
-            up=self.transform.up,
-            rgba=self.selection.rgba,
-            suffix=files.suffix,
-            options=dataclasses.replace(self.written, rad=rad, sog=SogOptions(codes)),
-            simplify=files.goal,
-            refine=None
-            if files.refine is None
-            else FitSettings(steps=files.refine or None, seed=files.seed, device=files.device),
-            camera_path=files.camera_path,
+            max_sh=self.max_sh,
+            **self.scene.settings(),
+            suffix=self.suffix,
+            options=write_options(self.written, self.cluster_sh),
+            simplify=SimplifyGoal(self.to, self.max_bytes, self.psnr),
+            refine=None if self.refine is None else FitSettings(self.refine or None, self.seed, device=self.device),
+            camera_path=self.camera_path,
             converts=True,
-            unused=tuple(flags_set(ctx, ("max_sh", *parameters_of(SelectionOptions, TransformOptions)))),
+            unused=tuple(flags_set(ctx, ("max_sh", *OF_SCENES))),
         )
 
 
-HEADINGS = (COMMON, "Selection", "Rotation, scale and position", "File format", "RAD")
+HEADINGS = (COMMON, SELECTION, POSITION, FILE_FORMAT, "RAD")
 
 
 @command("simplify", SimplifyOptions, examples=EXAMPLES, headings=HEADINGS)
@@ -205,54 +181,55 @@ def simplify(ctx: click.Context, /, **_: Any) -> None:
             raise click.UsageError(f"--output {output.path}: {NAMELESS}")
         ctx.params["output"] = output.path / f"{stem_of(ctx.params['inputs'][0])}-small{SPZ}"
     options = values_of(ctx, SimplifyOptions)
-    files, general = options.files, options.general
-    _check(ctx, files, as_json=general.as_json)
+    general, inputs = options.general, options.inputs
+    _check(ctx, options)
     with Console(quiet=general.quiet, verbose=general.verbose) as console:
         from ..bake.flow import bake, stage_shares
-        from ..bake.settings import Resources
+        from ..bake.settings import Merged, Resources, Source
 
         settings = options.settings(ctx)
-        question_budgets(console, files.to)
+        question_budgets(console, options.to)
         console.announce_compiling(settings)
+        source: Source = inputs[0] if len(inputs) == 1 else Merged.of(inputs)
         # Errors about one of several inputs name it already.
-        named = naming(name_of(files.source), FormatError) if len(files.inputs) == 1 else contextlib.nullcontext()
+        named = naming(name_of(source), FormatError) if len(inputs) == 1 else contextlib.nullcontext()
         with console.job(stage_shares(settings)), named:
             baked = bake(
-                files.source,
-                files.output,
+                source,
+                options.output,
                 settings,
-                overwrite=files.overwrite,
+                overwrite=options.overwrite,
                 threads=general.threads,
                 progress=console.progress,
-                resources=Resources(memory=files.memory),
+                resources=Resources(memory=options.memory),
                 say=console.say,
             )
-        report_simplified(console, files.source, files.output, baked)
+        report_simplified(console, source, options.output, baked)
         if general.as_json:
-            print_json(record_of(files.source, files.output, baked))
+            print_json(record_of(source, options.output, baked))
         if interrupts.came():  # during fitting, which then ends early
             console.clear()
             say("interrupted")
             ctx.exit(interrupts.INTERRUPTED)
 
 
-def _check(ctx: click.Context, files: SimplifiedFiles, *, as_json: bool) -> None:
-    """Raise a `click.UsageError` where options contradict each other, or the names of files."""
+def _check(ctx: click.Context, options: SimplifyOptions) -> None:
+    """Raise a `click.UsageError` where options contradict each other, or the names of options."""
     given = flags_set(ctx, GOALS)
     if len(given) != 1:
         what = f"{' and '.join(given)} cannot be used together; give" if given else "say how many splats to keep: give"
         raise click.UsageError(f"{what} one of --to, --max-bytes and --psnr")
-    require_suffix("--output", files.output, WRITABLE)
-    if files.suffix not in WRITABLE:
-        raise click.UsageError(f"--output writes {', '.join(WRITABLE)}, not {files.suffix}")
+    require_suffix("--output", options.output, WRITABLE)
+    if options.suffix not in WRITABLE:
+        raise click.UsageError(f"--output writes {', '.join(WRITABLE)}, not {options.suffix}")
     check_declared(ctx)
-    if files.camera_path is not None and files.psnr is None and files.refine is None:
+    if options.camera_path is not None and options.psnr is None and options.refine is None:
         raise click.UsageError("--camera-path can only be used with --psnr or --refine")
-    form = WRITABLE[files.suffix]
-    keep_apart(ctx, {"output": with_chunks([files.output]) if form.unbundled == files.suffix else [files.output]})
-    claim_stdout(ctx, "output", as_json=as_json, binary=True)
-    if DASH in files.inputs and len(files.inputs) > 1:
+    form = WRITABLE[options.suffix]
+    keep_apart(ctx, {"output": with_chunks([options.output]) if form.unbundled == options.suffix else [options.output]})
+    claim_stdout(ctx, "output", as_json=options.general.as_json, binary=True)
+    if DASH in options.inputs and len(options.inputs) > 1:
         raise click.UsageError("standard input cannot be merged with files; save it to a file first")
-    if is_set(ctx, "rgba") and len(files.inputs) > 1:
-        raise click.UsageError(f"--rgba takes one input, not {len(files.inputs)}")
+    if is_set(ctx, "rgba") and len(options.inputs) > 1:
+        raise click.UsageError(f"--rgba takes one input, not {len(options.inputs)}")
     refuse_others(ctx, form.name, hints=False)

@@ -130,10 +130,12 @@ def setting(
     return field(default=default, metadata={SETTING: declared})
 
 
-def setting_of(kind: type[Any], name: str) -> Any:
-    """Return a field with the declaration of a field of another dataclass."""
+def setting_of(kind: type[Any], name: str, **attributes: Any) -> Any:
+    """Return a field with the declaration of a field of another dataclass, and further attributes of the option."""
     declared = next(each for each in dataclasses.fields(kind) if each.name == name)
-    return field(default=declared.default, metadata=declared.metadata)
+    own: Setting = declared.metadata[SETTING]
+    changed = dataclasses.replace(own, attributes={**own.attributes, **attributes})
+    return field(default=declared.default, metadata={SETTING: changed})
 
 
 def settings_in(kind: type[Any]) -> Iterator[tuple[dataclasses.Field[Any], Setting | None]]:

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from sparklod_cli.cli import run
 from sparklod_cli.codecs import ply
 from sparklod_cli.commands import console as console_module
-from sparklod_cli.commands.build_lod_text import CLAMPED_BY_SPZ
+from sparklod_cli.commands.build_lod import CLAMPED_BY_SPZ
 from sparklod_cli.commands.console import Console, count_of, say_error
 from sparklod_cli.figures.pyvista_scene import load_pyvista
 from sparklod_cli.io import read_scene, reading

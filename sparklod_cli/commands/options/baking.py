@@ -1,16 +1,18 @@
-"""Options of `sparklod build-lod`: which splats, how they are merged, where they stand, and what a bake may use."""
+"""Options of `sparklod build-lod`, in part shared with `simplify`, and the formats that names of outputs choose."""
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator
+import dataclasses
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
-from ...codecs.options import MAX_SH_CODES, SH_CODES
+from ...codecs.formats import ENCODINGS, MANIFEST, NPZ, RAW_SUFFIXES, TILESET, WRITABLE, ending_of
+from ...codecs.formats import RAD_SUFFIX as RAD
+from ...codecs.options import MAX_SH_CODES, SH_CODES, RadOptions, SogOptions, WriteOptions
 from ...fitting.settings import STEPS, FitSettings
 from ...lod.builders import (
     BUILDERS,
@@ -24,19 +26,27 @@ from ...lod.builders import (
     MIN_GROWTH,
 )
 from ...lod.detail_rule import DetailSettings
+from ...lod.tile_settings import TileSettings
 from ...model import MAX_SH_DEGREE, UP_AXES
 from ...system.addresses import Place
 from ...system.setting_fields import Quantity, Range, setting_of, whole
+from ...system.stdio import DASH
 from ...system.units import parse_size
-from ..command import BALL, COMMON, POINT, OptionalNumber, flag, is_set, option, parameters_of, refuse
-from ..paths import InputPath, OutputPath
-from .common import General
+from ..command import BALL, COMMON, POINT, OptionalNumber, argument, flag, flags_set, option, parameters_of, refuse
+from ..paths import InputPath, OutputPath, stem_of
+from .common import General, output_option, overwrite_flag
 
 if TYPE_CHECKING:
-    from ...bake.out_of_core.cluster import ClusterEngine
-    from ...model.selection import Selection
-    from ...model.transforms import Transform
-    from ..console import Console
+    from ...bake.settings import BakeSettings
+
+#: Headings of `--help`.
+TREE, SELECTION, POSITION, FILE_FORMAT = "Tree", "Selection", "Rotation, scale and position", "File format"
+DETAIL, TILED, REFINING = DetailSettings.HEADING, TileSettings.HEADING, "Refining"
+LARGE, CLUSTER = "Large scenes", "Cluster"
+
+#: Suffixes of the formats in which a tree can be written, and what they are called; the first one is the default.
+TREES = {suffix: form.name for suffix, form in WRITABLE.items() if form.trees}
+SPZ = next(iter(TREES))
 
 #: The values of --format for regions at several detail levels, and for tiles.
 STREAMED_SOG, TILES_3D = "streamed-sog", "3d-tiles"
@@ -44,65 +54,47 @@ STREAMED_SOG, TILES_3D = "streamed-sog", "3d-tiles"
 #: Default builders of trees, and of trees that detail levels or tiles are cut from.
 METHOD, METHOD_OF_DETAIL = METHODS[0], "quality"
 
+#: Value of --refine without a number, and an example of a useful number.
+BY_SIZE, EXAMPLE_STEPS = "default", 2000
 
-@dataclass(frozen=True)
-class TreeOptions:
-    """Options of the tree."""
+#: Values of --skip-existing: read only files whose size or date changed, or all.
+BY_DATE, VERIFY = "date", "verify"
 
-    HEADING: ClassVar[str] = "Tree"
 
-    method: str | None = option(
-        "How splats are merged: quick takes seconds; quality takes longer, and its cuts come closer to full detail."
-        f"  [default: {METHOD}; {METHOD_OF_DETAIL} with --format {STREAMED_SOG} or {TILES_3D}]",
-        METHODS,
-        heading=COMMON,
-    )
-    max_sh: int = option(
-        "Highest degree of spherical harmonics to keep.",
-        whole(0, MAX_SH_DEGREE),
-        MAX_SH_DEGREE,
-        heading=COMMON,
-    )
-    base: float = option(
-        "Growth of the voxel grid from level to level, with --method quick. Smaller values give smoother transitions"
-        " and more nodes.",
-        Range(MIN_BASE, MAX_BASE, unit="N"),
-        DEFAULT_BASE,
-    )
-    growth: float | None = option(
-        "Largest number of nodes for each leaf, with --method quality."
-        f"  [default: {DEFAULT_GROWTH:g}; {DETAIL_GROWTH:g} with --format {STREAMED_SOG} or"
-        f" {TILES_3D}]",
-        Range(MIN_GROWTH, MAX_GROWTH, unit="N"),
-    )
+class OutputForm(NamedTuple):
+    """What build-lod writes.
 
-    def settings(self, *, only_cuts: bool) -> dict[str, Any]:
-        """Return the fields of `BakeSettings` for the tree; the defaults suit the output.
+    Attributes:
+        suffix: of the file.
+        chunked: each chunk of a RAD gets a file of its own.
+        cuts: name of the format, if it has cuts of a tree and not the tree; otherwise empty.
+        manifest: name of the file of such a format.
+        beside: the files beside the manifest, for display.
+    """
 
-        Args:
-            only_cuts: the output has cuts of the tree, and not the tree.
-        """
-        growth = DETAIL_GROWTH if only_cuts else DEFAULT_GROWTH
-        return {
-            "method": self.method or (METHOD_OF_DETAIL if only_cuts else METHOD),
-            "base": self.base,
-            "growth": growth if self.growth is None else self.growth,
-            "max_sh": self.max_sh,
-        }
+    suffix: str
+    chunked: bool = False
+    cuts: str = ""
+    manifest: str = ""
+    beside: str = ""
 
-    def check(self, ctx: click.Context, *, only_cuts: bool) -> None:
-        """Raise a `click.UsageError` where the number of one method is given with another."""
-        chosen = self.settings(only_cuts=only_cuts)["method"]
-        for method, row in BUILDERS.items():
-            if method != chosen:
-                refuse(ctx, [row.setting], f"is an option of --method {method}, not of {chosen}")
+
+#: Values of --format.
+FORMS = {
+    "spz": OutputForm(".spz"),
+    "rad": OutputForm(".rad"),
+    "rad-chunked": OutputForm(".rad", chunked=True),
+    STREAMED_SOG: OutputForm(".json", cuts=DETAIL, manifest=MANIFEST, beside="folders"),
+    TILES_3D: OutputForm(".json", cuts=TILED, manifest=TILESET, beside="a folder"),
+}
+
+#: Values of --format whose manifest has a name of its own, by that name.
+MANIFESTS = {form.manifest: name for name, form in FORMS.items() if form.manifest}
 
 
 @dataclass(frozen=True)
-class SelectionOptions:
-    """Options of which splats of the input are kept."""
-
-    HEADING: ClassVar[str] = "Selection"
+class SceneOptions:
+    """Options of which splats of the input are kept, and how the scene is turned, scaled and moved."""
 
     min_opacity: float = option(
         "Leave out splats whose opacity is lower than this.", Range(0, 1, unit="N"), 0.0, heading=COMMON
@@ -111,41 +103,23 @@ class SelectionOptions:
         "Leave out splats whose centre is outside this ball, in the input's coordinates.", BALL, heading=COMMON
     )
     min_box: tuple[float, ...] | None = option(
-        "Leave out splats whose centre is below this on any axis, in the input's coordinates.", POINT
+        "Leave out splats whose centre is below this on any axis, in the input's coordinates.", POINT, heading=SELECTION
     )
     max_box: tuple[float, ...] | None = option(
-        "Leave out splats whose centre is above this on any axis, in the input's coordinates.", POINT
+        "Leave out splats whose centre is above this on any axis, in the input's coordinates.", POINT, heading=SELECTION
     )
     on_invalid: str = option(
         "Whether to fail on invalid splats or leave them out: numbers that are not finite, negative scales.",
         ("error", "drop"),
         "error",
+        heading=SELECTION,
     )
     rgba: Path | None = option(
         "Replace colours and opacities by those of a .npy or raw file of (N, 4) bytes or floats 0..1; splats of alpha 0"
         " are left out.",
         InputPath(),
+        heading=SELECTION,
     )
-
-    def selection(self) -> Selection:
-        """Return the selection, but for `rgba`."""
-        from ...model.selection import Selection
-
-        return Selection(
-            drop_invalid=self.on_invalid == "drop",
-            min_opacity=self.min_opacity,
-            min_box=self.min_box,  # type: ignore[arg-type]
-            max_box=self.max_box,  # type: ignore[arg-type]
-            within=self.within,
-        )
-
-
-@dataclass(frozen=True)
-class TransformOptions:
-    """Options of how the scene is turned, scaled and moved."""
-
-    HEADING: ClassVar[str] = "Rotation, scale and position"
-
     up: str | None = option(
         "Axis that is up in the input: turn it to +y, and note that in the output for render, traverse and view."
         " y turns nothing; scenes as trained are mostly -y.  [default: note what the file says, and turn nothing]",
@@ -153,91 +127,67 @@ class TransformOptions:
         heading=COMMON,
     )
     rotate: tuple[float, ...] = option(
-        "Turn the scene by these angles in degrees, about x, then y, then z, after --up.", POINT, "0,0,0"
+        "Turn the scene by these angles in degrees, about x, then y, then z, after --up.",
+        POINT,
+        "0,0,0",
+        heading=POSITION,
     )
     scale: float = option(
-        "Multiply the size of the scene by this, about its origin, after --rotate.", Range(above=0), 1.0
+        "Multiply the size of the scene by this, about its origin, after --rotate.",
+        Range(above=0),
+        1.0,
+        heading=POSITION,
     )
-    translate: tuple[float, ...] = option("Move the scene by this, in world units, after --scale.", POINT, "0,0,0")
+    translate: tuple[float, ...] = option(
+        "Move the scene by this, in world units, after --scale.", POINT, "0,0,0", heading=POSITION
+    )
 
-    def transform(self) -> Transform:
+    def settings(self) -> dict[str, Any]:
+        """Return the fields of `BakeSettings` for the scene; loads numpy."""
+        from ...model.selection import Selection
         from ...model.transforms import Transform
 
         try:
-            up = self.up or UP_AXES[0]
-            return Transform.from_parts(up=up, rotate=self.rotate, scale=self.scale, translate=self.translate)
+            transform = Transform.from_parts(
+                up=self.up or UP_AXES[0], rotate=self.rotate, scale=self.scale, translate=self.translate
+            )
         except ValueError as error:
             raise click.UsageError(str(error)) from None
+        selection = Selection(
+            drop_invalid=self.on_invalid == "drop",
+            min_opacity=self.min_opacity,
+            min_box=self.min_box,  # type: ignore[arg-type]
+            max_box=self.max_box,  # type: ignore[arg-type]
+            within=self.within,
+        )
+        return {"selection": selection, "transform": transform, "up": self.up, "rgba": self.rgba}
 
 
-@dataclass(frozen=True)
-class PaletteOptions:
-    """Option of palettes of spherical harmonics, which RAD and SOG have."""
+#: Parameters without an effect on the leaves of a tree.
+OF_SCENES = parameters_of(SceneOptions)
+OF_TREES = ("method", "max_sh", *(builder.setting for builder in BUILDERS.values()), *OF_SCENES)
 
-    HEADING: ClassVar[str] = "File format"
+#: Parameters of bakes out of core, and of bakes on several processes.
+OF_SCRATCH, OF_CLUSTERS = ("memory", "scratch_dir", "resume"), ("workers", "scheduler")
 
-    cluster_sh: int | None = option(
+
+def palette_option() -> Any:
+    """Return the field of `--cluster-sh`, the palettes of spherical harmonics that RAD and SOG have."""
+    return option(
         "Write spherical harmonics to RAD as a palette of at most N entries, 2 to 65,536, and a label for each splat:"
         " the file gets smaller, and reflections less exact. N is 65,536 if it is left out. SOG always has a palette;"
         " this chooses its size, which otherwise suits the number of splats.",
         OptionalNumber(SH_CODES, example=MAX_SH_CODES),
         is_flag=False,
         flag_value=str(MAX_SH_CODES),
+        heading=FILE_FORMAT,
     )
 
 
-@dataclass(frozen=True)
-class DetailOptions:
-    """Options of Streamed SOG."""
-
-    HEADING: ClassVar[str] = "Streamed SOG"
-
-    settings: DetailSettings = field(default_factory=DetailSettings)
-    environment: Path | None = option(
-        "Splats that are always drawn, such as a sky, from a file of any format without a tree; turned and moved as the"
-        " scene.",
-        InputPath(),
-    )
-    environment_beyond: float | None = option(
-        "Make splats whose centre is farther than this from the median of all centres the environment, in the input's"
-        " units.",
-        Range(above=0, unit="RADIUS"),
-    )
-
-
-#: Value of --refine without a number, and an example of a useful number.
-BY_SIZE, EXAMPLE_STEPS = "default", 2000
-
-
-class Steps(OptionalNumber):
-    """A number of steps, or `BY_SIZE`, which becomes 0."""
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
-        return 0 if value == BY_SIZE else super().convert(value, param, ctx)
-
-
-@dataclass(frozen=True)
-class RefineOptions:
-    """Options of merged splats that are fitted to pictures of full detail."""
-
-    HEADING: ClassVar[str] = "Refining"
-
-    refine: int | None = option(
-        "Fit merged splats to pictures of full detail, in STEPS pictures of cuts: minutes, for cuts that come closer to"
-        " it. The leaves stay as they are, and so does the tree of a Level-of-Detail file. Ctrl-C ends it early and"
-        " keeps what was gained.  [default, without STEPS: by the size of the tree]",
-        Steps(STEPS, placeholder="STEPS", example=EXAMPLE_STEPS),
-        is_flag=False,
-        flag_value=BY_SIZE,
-    )
-    camera_path: Path | None = option(
-        "Cameras that --refine fits for, in the coordinates of the output, in any format that render reads: those of"
-        " visitors whose paths are known.  [default: cameras around and inside the scene]",
-        InputPath(),
-        needs="refine",
-    )
-    seed: int = setting_of(FitSettings, "seed")
-    device: str = setting_of(FitSettings, "device")
+def write_options(options: WriteOptions, sh_codes: int | None, *, chunked: bool = False) -> WriteOptions:
+    """Return write options with those of the command; defaults are left to the library, which knows the input."""
+    rad = dataclasses.replace(options.rad, chunked=chunked, sh_codes=sh_codes)
+    return dataclasses.replace(options, rad=rad, sog=SogOptions(sh_codes))
 
 
 def memory_size(text: str) -> int:
@@ -251,51 +201,236 @@ def memory_size(text: str) -> int:
 
 
 @dataclass(frozen=True)
-class ResourceOptions:
-    """Options of scenes that do not fit into memory, and of interrupted bakes."""
+class BuildLodOptions:
+    """Options of build-lod."""
 
-    HEADING: ClassVar[str] = "Large scenes"
-
+    inputs: tuple[Place, ...] = argument(InputPath(stdin=True, addresses=True), metavar="INPUT...")
+    merge: bool = flag(
+        "Bake all INPUTs as one scene, into the file that --output names: tiles of a city, each where its own"
+        " coordinates put it.",
+        heading=COMMON,
+    )
+    scene: Path | None = option(
+        "Merge the files of an instances file, each where it stands there, in place of INPUTs (see docs/build-lod.md).",
+        InputPath(),
+        heading=COMMON,
+    )
+    output: Place | None = output_option(
+        "Output of a single input, or a folder for all outputs; - is standard output.  [default: NAME-lod.spz beside"
+        f" the input; NAME-lod.rad with --format rad, NAME-lod/{MANIFEST} with --format {STREAMED_SOG},"
+        f" NAME-lod/{TILESET} with --format {TILES_3D}, NAME-lod.npz with --encoding, NAME-unlod.spz with --unlod,"
+        " NAME-lod-refined.spz of a NAME-lod.spz with --refine]",
+        addresses=True,
+    )
+    output_dir: Place | None = option(
+        "Folder for the outputs; created if it does not exist.",
+        OutputPath(folder=True, addresses=True),
+        heading=COMMON,
+    )
+    overwrite: bool = overwrite_flag()
+    skip_existing: str | None = option(
+        "Skip inputs whose output exists already, made from the same inputs and settings, as a small file beside it,"
+        " NAME.sparklod.json, records. Files whose size and date are unchanged are not read;"
+        " --skip-existing=verify reads all, and so finds damage that left both as they were.",
+        (BY_DATE, VERIFY),
+        heading=LARGE,
+        metavar="[=verify]",
+        bare=BY_DATE,
+    )
+    unlod: bool = flag(
+        "Write the leaves of Level-of-Detail files instead: the original splats as the file holds them, rounded, with"
+        " opacities that make up for it. As SPZ or, by the name of FILE, .rad, .ply, .sog, DIR/meta.json (an unpacked"
+        " SOG), .glb or .splat, which has no SH.",
+        heading=COMMON,
+    )
+    form: str | None = option(
+        "Format of the output. rad is what Spark streams; rad-chunked writes each chunk to a file of its own,"
+        " NAME-lod-0.radc and so on, beside NAME-lod.rad; streamed-sog is what PlayCanvas, SuperSplat and Babylon.js"
+        f" stream, {MANIFEST} and folders beside it; 3d-tiles is what CesiumJS streams, {TILESET} and a folder beside"
+        " it. A Level-of-Detail file of another format keeps its tree. "
+        " [default: by the name of FILE, or spz]",
+        tuple(FORMS),
+        flags=("--format",),
+        heading=COMMON,
+    )
+    refine: int | None = option(
+        "Fit merged splats to pictures of full detail, in STEPS pictures of cuts: minutes, for cuts that come closer to"
+        " it. The leaves stay as they are, and so does the tree of a Level-of-Detail file. Ctrl-C ends it early and"
+        " keeps what was gained.  [default, without STEPS: by the size of the tree]",
+        OptionalNumber(STEPS, placeholder="STEPS", example=EXAMPLE_STEPS, zero=BY_SIZE),
+        is_flag=False,
+        flag_value=BY_SIZE,
+        heading=REFINING,
+    )
+    camera_path: Path | None = option(
+        "Cameras that --refine fits for, in the coordinates of the output, in any format that render reads: those of"
+        " visitors whose paths are known.  [default: cameras around and inside the scene]",
+        InputPath(),
+        needs="refine",
+        heading=REFINING,
+    )
+    seed: int = setting_of(FitSettings, "seed", heading=REFINING)
+    device: str = setting_of(FitSettings, "device", heading=REFINING)
+    encoding: str | None = option(
+        f"Write arrays in a viewer's memory layout instead: a {NPZ} file, or the words alone if FILE ends in"
+        f" {' or '.join(RAW_SUFFIXES)}.",
+        tuple(ENCODINGS),
+        heading=FILE_FORMAT,
+    )
+    method: str | None = option(
+        "How splats are merged: quick takes seconds; quality takes longer, and its cuts come closer to full detail."
+        f"  [default: {METHOD}; {METHOD_OF_DETAIL} with --format {STREAMED_SOG} or {TILES_3D}]",
+        METHODS,
+        heading=COMMON,
+    )
+    max_sh: int = option(
+        "Highest degree of spherical harmonics to keep.", whole(0, MAX_SH_DEGREE), MAX_SH_DEGREE, heading=COMMON
+    )
+    base: float = option(
+        "Growth of the voxel grid from level to level, with --method quick. Smaller values give smoother transitions"
+        " and more nodes.",
+        Range(MIN_BASE, MAX_BASE, unit="N"),
+        DEFAULT_BASE,
+        heading=TREE,
+    )
+    growth: float | None = option(
+        "Largest number of nodes for each leaf, with --method quality."
+        f"  [default: {DEFAULT_GROWTH:g}; {DETAIL_GROWTH:g} with --format {STREAMED_SOG} or"
+        f" {TILES_3D}]",
+        Range(MIN_GROWTH, MAX_GROWTH, unit="N"),
+        heading=TREE,
+    )
+    input_scene: SceneOptions = field(default_factory=SceneOptions)
+    written: WriteOptions = field(default_factory=WriteOptions)
+    cluster_sh: int | None = palette_option()
+    detail: DetailSettings = field(default_factory=DetailSettings)
+    environment: Path | None = option(
+        "Splats that are always drawn, such as a sky, from a file of any format without a tree; turned and moved as the"
+        " scene.",
+        InputPath(),
+        heading=DETAIL,
+    )
+    environment_beyond: float | None = option(
+        "Make splats whose centre is farther than this from the median of all centres the environment, in the input's"
+        " units.",
+        Range(above=0, unit="RADIUS"),
+        heading=DETAIL,
+    )
+    tiles: TileSettings = field(default_factory=TileSettings)
     memory: int | None = option(
         "Memory that a bake may take, such as 4G or '600 MB'. A scene that needs more is baked out of core: block by"
         " block, with a scratch folder.  [default: 75 % of what is available]",
         Quantity("SIZE", memory_size),
+        heading=LARGE,
     )
     scratch_dir: Place | None = option(
         "Where a bake out of core makes its scratch folder, which is removed at the end.  [default: beside the output]",
         OutputPath(folder=True, addresses=True),
+        heading=LARGE,
     )
     resume: bool = flag(
-        "Go on with a bake out of core that was interrupted; it must be the same bake. Without one, begin."
+        "Go on with a bake out of core that was interrupted; it must be the same bake. Without one, begin.",
+        heading=LARGE,
     )
-
-
-@dataclass(frozen=True)
-class ClusterOptions:
-    """Options of bakes on several processes or machines."""
-
-    HEADING: ClassVar[str] = "Cluster"
-
     workers: int | None = option(
-        "Bake on this many processes of this machine, which share --threads and --memory.", whole(1, 256)
+        "Bake on this many processes of this machine, which share --threads and --memory.",
+        whole(1, 256),
+        heading=CLUSTER,
     )
     scheduler: str | None = option(
-        "Bake on the Dask cluster whose scheduler has this address, as tcp://host:8786.", metavar="ADDRESS"
+        "Bake on the Dask cluster whose scheduler has this address, as tcp://host:8786.",
+        metavar="ADDRESS",
+        heading=CLUSTER,
     )
+    general: General = field(default_factory=General)
 
-    @contextlib.contextmanager
-    def engine(
-        self, ctx: click.Context, general: General, memory: int | None, console: Console
-    ) -> Iterator[ClusterEngine]:
-        """Yield the cluster for the duration of the context."""
-        from ...bake.out_of_core.cluster import ClusterSettings, cluster
+    @property
+    def is_merged(self) -> bool:
+        return self.merge or self.scene is not None
 
-        threads = general.threads if self.scheduler is None or is_set(ctx, "threads") else None
-        with cluster(
-            ClusterSettings(self.scheduler, self.workers or 1, threads), memory=memory, say=console.say
-        ) as engine:
-            yield engine
+    @property
+    def name(self) -> str:
+        """Name of the output; empty if none is given, and for standard output."""
+        return self.output.name if self.output is not None and self.output != DASH else ""
+
+    @property
+    def output_form(self) -> OutputForm:
+        """What is written, by --format, or else by the name of the output."""
+        form = self.form
+        if form is None and not (self.encoding or self.unlod):
+            form = MANIFESTS.get(self.name)
+        if form is not None:
+            return FORMS[form]
+        refines_rad = self.refine is not None and {each.suffix.lower() for each in self.inputs} == {RAD}
+        return OutputForm(NPZ if self.encoding else ending_of(self.name) or (RAD if refines_rad else SPZ))
+
+    @property
+    def builder(self) -> str:
+        """Name of the tree builder."""
+        return self.method or (METHOD_OF_DETAIL if self.output_form.cuts else METHOD)
+
+    def target(self, source: Place) -> Place:
+        """Return the output for an input."""
+        if self.output is not None:
+            return self.output
+        form, stem = self.output_form, stem_of(source)
+        known = self.form is not None or self.refine is not None
+        if form.cuts or self.unlod or (known and source.suffix.lower() in TREES):
+            stem = stem.removesuffix("-lod")  # a tree in another format has its name
+        name = f"{stem}-lod{form.suffix}"
+        if form.cuts:
+            name = f"{stem}-lod/{form.manifest}"
+        elif self.unlod:
+            name = f"{stem}-unlod{form.suffix}"
+        elif self.refine is not None and name == source.name:
+            name = f"{stem}-lod-refined{form.suffix}"
+        return (self.output_dir or source.parent) / name
+
+    def bake_settings(self, ctx: click.Context) -> BakeSettings:
+        """Return the settings of bakes; loads numpy."""
+        from ...bake.settings import BakeSettings
+
+        form = self.output_form
+        growth = DETAIL_GROWTH if form.cuts else DEFAULT_GROWTH
+        return BakeSettings(
+            method=self.builder,
+            base=self.base,
+            growth=growth if self.growth is None else self.growth,
+            max_sh=self.max_sh,
+            **self.input_scene.settings(),
+            suffix=form.suffix,
+            options=write_options(self.written, self.cluster_sh, chunked=form.chunked),
+            encoding=self.encoding,
+            raw=self.output is not None and ending_of(self.name) != NPZ,
+            detail=self.detail if form.cuts == DETAIL else None,
+            tiles=self.tiles if form.cuts == TILED else None,
+            environment=self.environment,
+            environment_beyond=self.environment_beyond,
+            refine=None if self.refine is None else FitSettings(self.refine or None, self.seed, device=self.device),
+            camera_path=self.camera_path,
+            converts=self.form is not None or ending_of(self.name) in TREES or bool(form.cuts),
+            unused=tuple(flags_set(ctx, (*OF_TREES, "environment_beyond"))),
+        )
 
 
-#: Parameters of trees, without an effect where leaves are extracted.
-OF_TREES = parameters_of(TreeOptions, SelectionOptions, TransformOptions)
+#: Parameters of formats, the names of these, and how to get one of them.
+OF_FORMATS: tuple[tuple[Iterable[str], tuple[str, ...], str], ...] = (
+    (("spz_version", "fractional_bits"), ("SPZ",), ""),
+    (parameters_of(RadOptions), ("RAD",), "; name the output .rad, or add --format rad"),
+    (("compression_level",), ("SPZ", "RAD"), ""),
+    (("glb_profile",), ("GLB", TILED), "; GLB is written by --unlod and simplify"),
+    (("cluster_sh",), ("RAD", "SOG"), "; name the output .rad, or add --format rad"),
+    (
+        (*parameters_of(DetailSettings), "environment", "environment_beyond"),
+        (DETAIL,),
+        f"; name the output {MANIFEST}, or add --format {STREAMED_SOG}",
+    ),
+    (parameters_of(TileSettings), (TILED,), f"; name the output {TILESET}, or add --format {TILES_3D}"),
+)
+
+
+def refuse_others(ctx: click.Context, written: str, *, hints: bool = True) -> None:
+    """Raise a `click.UsageError` where an option of another format than the one that is written was given."""
+    for names, formats, hint in OF_FORMATS:
+        if written not in formats and not (written == DETAIL and "SOG" in formats):
+            refuse(ctx, names, f"is an option of {' and '.join(formats)}, not of {written}{hint if hints else ''}")
