@@ -15,7 +15,7 @@ from scenes import load
 
 import sparklod_cli as sparklod
 from sparklod_cli.codecs import compression, spz
-from sparklod_cli.codecs.compression import MIXED, DataRun
+from sparklod_cli.codecs.compression import MIXED
 from sparklod_cli.codecs.options import DEFAULTS, WriteOptions
 from sparklod_cli.codecs.rad import codec as rad
 from sparklod_cli.codecs.spz import WAYS
@@ -51,7 +51,7 @@ def of_streams(scene: Scene, options: WriteOptions) -> dict[str, int]:
         name: sum(
             map(
                 len,
-                compression.gzip_member([column], [DataRun(column.nbytes, WAYS.get(name, MIXED))], level, 1, silent),
+                compression.gzip_member([column], [(column.nbytes, WAYS.get(name, MIXED))], level, 1, silent),
             )
         )
         for name, column in codes.items()

@@ -1,26 +1,29 @@
-"""Compression: writes one gzip member on several threads, and zstd frames, which it reads in small pieces.
+"""Compression: writes one gzip member on several threads, and zstd frames.
 
-benchmarks/notes/file-sizes.md explains why the library's own threaded gzip is not used. `inflate` reads gzip.
+benchmarks/notes/file-sizes.md explains why the library's own threaded gzip is not used. `inflate` reads both.
 """
 
 from __future__ import annotations
 
 import struct
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, NamedTuple
 
-import zstandard
 from zlib_ng import zlib_ng
 
-from ..system.errors import ChecksumError, FormatError, PromiseError, TooLongError
+from ..system.errors import PromiseError
 from ..system.progress import Progress
 from ..system.threads import ordered_map
-from .inflate import COMMENTED_HEAD, PLAIN_HEAD
 from .options import DEFAULT_COMPRESSION
 
-#: Bytes of a block that one thread deflates by itself, and bytes that are read at a time. That blocks of
-#: this size refer to none before them costs 0.05 to 0.2 % of a file (docs/decisions/05-spz.md).
-BLOCK, PIECE = 1 << 19, 1 << 17
+GZIP_MAGIC = b"\x1f\x8b"
+#: How a member of deflate begins that has no fields but the ten bytes of its head, and one with a comment behind these,
+#: which ends with a zero byte (RFC 1952).
+PLAIN_HEAD, COMMENTED_HEAD = GZIP_MAGIC + b"\x08\0", GZIP_MAGIC + b"\x08\x10"
+
+#: Bytes of a block that one thread deflates by itself. That blocks of this size refer to none before them costs 0.05 to
+#: 0.2 % of a file (docs/decisions/05-spz.md).
+BLOCK = 1 << 19
 
 #: Bytes at the beginning of a block on which the ways to deflate it are compared.
 TRIED = 1 << 16
@@ -49,16 +52,9 @@ TRUSTED_SIZE, MAX_RATIO = 1 << 26, 200
 _RAW = -zlib_ng.MAX_WBITS
 
 
-class DataRun(NamedTuple):
-    """Bytes of data of one kind, and the ways to deflate them."""
-
-    size: int
-    ways: tuple[Way, ...] = MIXED
-
-
 def gzip_member(
     pieces: Iterable[Any],
-    runs: Sequence[DataRun],
+    runs: Sequence[tuple[int, tuple[Way, ...]]],
     level: int,
     threads: int,
     progress: Progress,
@@ -72,41 +68,29 @@ def gzip_member(
 
     Args:
         pieces: bytes, or contiguous arrays, asked for a few blocks ahead.
-        runs: what they hold, in order. A block holds data of one, unless all fit into a block.
+        runs: bytes of data of one kind, in order, and the ways to deflate them. A block holds data of one run, unless
+            all fit into a block.
         level: of compression. Below the default, which means haste, no other is used, and above it no lower one.
         comment: of the header, without a zero byte; empty for none.
     """
-    check = 0
-    total = sum(run.size for run in runs)
-
-    def blocks() -> Iterator[tuple[memoryview, bool, tuple[Way, ...]]]:
-        nonlocal check
-        at, parts = 0, list(_parts_of(runs, level))
-        for (_, ways), block in zip(parts, blocks_of_pieces(pieces, [size for size, _ in parts]), strict=True):
-            check, at = zlib_ng.crc32(block, check), at + len(block)
-            yield block, at >= total, ways
-
+    total = sum(size for size, _ in runs)
+    parts: list[tuple[int, tuple[Way, ...]]] = [(total, (Way(level),))]
+    if total > BLOCK:
+        parts = []
+        for size, ways in runs:
+            chosen = tuple(dict.fromkeys(_at_level(way, level) for way in ways))
+            parts += [(min(BLOCK, size - start), chosen) for start in range(0, size, BLOCK)]
+    blocks = blocks_of_pieces(pieces, [size for size, _ in parts])
+    items = zip(blocks, (ways for _, ways in parts), [False] * (len(parts) - 1) + [True], strict=True)
     # No name, no time, no system: the same scene gives the same bytes.
     head, rest = (COMMENTED_HEAD, comment + b"\0") if comment else (PLAIN_HEAD, b"")
     yield head + b"\0\0\0\0\0\xff" + rest
-    done = 0
-    for size, packed in ordered_map(lambda each: _deflated(*each), blocks(), threads):
+    check = done = 0
+    for block, packed in ordered_map(lambda each: _deflated(*each), items, threads):
         yield packed
-        done += size
+        check, done = zlib_ng.crc32(block, check), done + len(block)
         progress("writing", done, total, "B")
     yield struct.pack("<II", check, total & 0xFFFFFFFF)
-
-
-def _parts_of(runs: Sequence[DataRun], level: int) -> Iterator[DataRun]:
-    """Return the blocks of a member, one at least, and the ways to deflate each at a level."""
-    total = sum(run.size for run in runs)
-    if total <= BLOCK:
-        yield DataRun(total, (Way(level),))
-        return
-    for run in runs:
-        ways = tuple(dict.fromkeys(_at_level(way, level) for way in run.ways))
-        for start in range(0, run.size, BLOCK):
-            yield DataRun(min(BLOCK, run.size - start), ways)
 
 
 def _at_level(way: Way, level: int) -> Way:
@@ -116,10 +100,10 @@ def _at_level(way: Way, level: int) -> Way:
     return Way(level if way.level is None or level < DEFAULT_COMPRESSION else max(level, way.level))
 
 
-def _deflated(block: memoryview, last: bool, ways: tuple[Way, ...]) -> tuple[int, bytes]:
-    """Deflate a block, and return its size and its part of a deflate stream."""
+def _deflated(block: memoryview, ways: tuple[Way, ...], last: bool) -> tuple[memoryview, bytes]:
+    """Return a block and its part of a deflate stream."""
     way = min(ways, key=lambda way: len(_packed(block[:TRIED], way, last=True))) if len(ways) > 1 else ways[0]
-    return len(block), _packed(block, way, last=last)
+    return block, _packed(block, way, last=last)
 
 
 def _packed(block: memoryview, way: Way, *, last: bool) -> bytes:
@@ -164,40 +148,7 @@ def zstd_frame(pieces: Iterable[Any], size: int, level: int) -> bytes:
         pieces: bytes, or contiguous arrays, of `size` bytes together.
         level: of deflate, 1 to 9, for which zstd's from 3 to 19 stand.
     """
+    import zstandard
+
     packer = zstandard.ZstdCompressor(level=2 * level + 1, write_checksum=True).compressobj(size=size)
     return b"".join([*(packer.compress(memoryview(piece).cast("B")) for piece in pieces), packer.flush()])
-
-
-class _Window:
-    """The next `size` bytes of a file."""
-
-    def __init__(self, file: BinaryIO, size: int) -> None:
-        self._file, self._left = file, size
-
-    def read(self, size: int) -> bytes:
-        data = self._file.read(min(size, self._left))
-        self._left -= len(data)
-        return data
-
-
-class Unzstd:
-    """Reader of a zstd frame, the next `packed` bytes of a file, that buffers little more than requested."""
-
-    def __init__(self, file: BinaryIO, packed: int, name: str) -> None:
-        self._name = name
-        window: Any = _Window(file, packed)
-        self._reader = zstandard.ZstdDecompressor().stream_reader(window, read_size=PIECE)
-
-    def read(self, size: int) -> bytes:
-        """Return the next `size` bytes, or fewer where the data ends; raises `FormatError` where they are corrupt."""
-        try:
-            piece: bytes = self._reader.read(size)
-        except zstandard.ZstdError as error:
-            kind = ChecksumError if "checksum" in str(error) else FormatError
-            raise kind(f"corrupt zstd data in stream {self._name}: {error}") from None
-        return piece
-
-    def finish(self) -> None:
-        """Raise `FormatError` unless the stream ends here."""
-        if self.read(1):
-            raise TooLongError(f"stream {self._name} is longer than its table announces")

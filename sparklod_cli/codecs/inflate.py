@@ -1,7 +1,7 @@
-"""Inflating: gzip members on one thread, without buffering more than a piece of a file and of its data.
+"""Inflating: gzip members and zstd frames on one thread, without buffering more than a piece of a file and its data.
 
-The one place that chooses the library: ISA-L (package isal) where it is installed, zlib-ng elsewhere. What they inflate
-is the same; docs/decisions/05-spz.md has their speeds.
+The one place that chooses the library for gzip: ISA-L (package isal) where it is installed, zlib-ng elsewhere. What
+they inflate is the same; docs/decisions/05-spz.md has their speeds.
 """
 
 from __future__ import annotations
@@ -9,9 +9,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any, BinaryIO
 
+import zstandard
 from zlib_ng import zlib_ng
 
 from ..system.errors import ChecksumError, FormatError, TooLongError, TruncatedError
+from .compression import COMMENTED_HEAD, PLAIN_HEAD
 
 try:
     from isal import isal_zlib as _library
@@ -21,15 +23,13 @@ except ImportError:
 #: What unpackers raise on data that are no deflate stream.
 ERRORS: tuple[Any, ...] = (zlib_ng.error, _library.error)  # the stubs take the classes for instances
 
-GZIP_MAGIC = b"\x1f\x8b"
-#: How a member of deflate begins that has no fields but the ten bytes of its head, and one with a comment behind these,
-#: which ends with a zero byte (RFC 1952).
-PLAIN_HEAD, COMMENTED_HEAD, _HEAD_SIZE = GZIP_MAGIC + b"\x08\0", GZIP_MAGIC + b"\x08\x10", 10
+#: Bytes of the head of a member without fields.
+_HEAD_SIZE = 10
 #: Bytes up to which a comment is read; sparklod's have some fifty.
 MOST_COMMENT = 1 << 12
 
 #: Bytes of a file that are read at a time, and to which they are inflated at most.
-_PIECE, _STEP = 1 << 17, 1 << 18
+PIECE, _STEP = 1 << 17, 1 << 18
 
 
 def raw_unpacker() -> Any:
@@ -107,7 +107,7 @@ class Inflate:
         unpacker, packed = library.decompressobj(zlib_ng.MAX_WBITS + 16), b""
         self._file.seek(self._start)
         while not unpacker.eof:
-            packed = unpacker.unconsumed_tail or self._file.read(_PIECE)
+            packed = unpacker.unconsumed_tail or self._file.read(PIECE)
             try:
                 piece: bytes = unpacker.decompress(packed, _STEP)
             except ERRORS as error:
@@ -120,3 +120,38 @@ class Inflate:
             elif not packed and not unpacker.eof:
                 return
         self._end = self._file.tell() - len(unpacker.unused_data)
+
+
+class _Window:
+    """The next `size` bytes of a file."""
+
+    def __init__(self, file: BinaryIO, size: int) -> None:
+        self._file, self._left = file, size
+
+    def read(self, size: int) -> bytes:
+        data = self._file.read(min(size, self._left))
+        self._left -= len(data)
+        return data
+
+
+class Unzstd:
+    """Reader of a zstd frame, the next `packed` bytes of a file, that buffers little more than requested."""
+
+    def __init__(self, file: BinaryIO, packed: int, name: str) -> None:
+        self._name = name
+        window: Any = _Window(file, packed)
+        self._reader = zstandard.ZstdDecompressor().stream_reader(window, read_size=PIECE)
+
+    def read(self, size: int) -> bytes:
+        """Return the next `size` bytes, or fewer where the data ends; raises `FormatError` where they are corrupt."""
+        try:
+            piece: bytes = self._reader.read(size)
+        except zstandard.ZstdError as error:
+            kind = ChecksumError if "checksum" in str(error) else FormatError
+            raise kind(f"corrupt zstd data in stream {self._name}: {error}") from None
+        return piece
+
+    def finish(self) -> None:
+        """Raise `FormatError` unless the stream ends here."""
+        if self.read(1):
+            raise TooLongError(f"stream {self._name} is longer than its table announces")

@@ -1,50 +1,173 @@
-"""SPZ, Niantic's compressed splats, and Spark's extension of it for Level-of-Detail trees.
+"""SPZ, Niantic's compressed splats, and Spark's extension of it for Level-of-Detail trees: streams, options, writer.
 
-Reads versions 1 to 4, see `spz_streams`; writes versions 2 and 3, and 4 without a tree, for which Spark's extension is
-not defined. `docs/formats/spz.md` lays the extension out byte by byte.
+Versions 1 to 3 are a header and streams in a gzip member, version 4 a plain header and a zstd frame for each stream.
+Extension records, of which the coordinate system is read and written, follow the streams, in version 4 the header. A
+record has its type, the bytes of its payload, and the payload.
+
+Versions 2 and 3 are written, and 4 without a tree, for which Spark's extension is not defined; `spz_reader` reads all.
+`docs/formats/spz.md` lays the extension out byte by byte.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+import itertools
+import struct
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..model import MAX_SH_DEGREE
+from ..model.gaussian import linear_opacity, lod_opacity
 from ..model.lod_tree import LodTree
 from ..model.scene import NodeStream, Scene
-from ..model.splats import COLUMNS, FloatArray, Splats
+from ..model.sh import COEFFICIENTS
+from ..model.splats import FloatArray, Splats
 from ..system.errors import FormatError
 from ..system.progress import Progress, silent
 from ..system.threads import blocks_of, ordered_map
 from . import clamps, compression, quantize
 from .clamps import CodeRange
-from .compression import DataRun
 from .encoder import Encoded, Encoder, Windows, results, windows_of
 from .file_notes import comment_of
 from .options import DEFAULT_SPZ_VERSION, DEFAULTS, MAX_FRACTIONAL_BITS, TREE_SPZ_VERSIONS, WriteOptions
 from .quantize import Bytes
-from .reader import OpenFile
-from .spz_streams import (
-    ANTIALIASED,
-    EXTENSIONS,
-    HEADER,
-    HEADER_V4,
-    LOD,
-    MAGIC,
-    STREAM_SIZES,
-    SYSTEM_OF_UP,
-    Layout,
-    SpzStream,
-    column_of,
-    extensions_of,
-    read_codes,
-)
-from .spz_streams import open_content as open_content
 from .statistics import ALL_BITS, Statistics, enough, fine_bits
+
+if TYPE_CHECKING:
+    from .reader import OpenFile, Reader
+    from .spz_reader import StoredSpz
+
+MAGIC = 0x5053474E  # "NGSP"
+HEADER = struct.Struct("<IIIBBBB")  # magic, version, splats, SH degree, fractional bits, flags, reserved
+
+#: Of version 4: ..., streams, offset of the table of streams, reserved.
+HEADER_V4 = struct.Struct("<IIIBBBBI12s")
+STREAM_SIZES = struct.Struct("<QQ")  # of a version 4 stream: compressed, uncompressed
+
+#: Flags of the header.
+ANTIALIASED, EXTENSIONS, LOD = 0x01, 0x02, 0x80
+KNOWN_FLAGS = ANTIALIASED | EXTENSIONS | LOD
+
+
+#: Type of an extension record, and bytes of its payload.
+RECORD = struct.Struct("<II")
+
+#: Record of the coordinate system in which the coordinates stand: a uint32, an index of `SYSTEMS` from 1 on.
+COORDINATE_SYSTEM = 0xADBE0003
+
+#: The coordinate systems: where x, y and z point, of left or right, down or up, back or front.
+SYSTEMS = (
+    *("LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF"),
+    *("LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU"),
+)
+
+#: By the axis that points up, the right-handed system whose x points right. None has x pointing up.
+SYSTEM_OF_UP = {"y": "RUB", "-y": "RDF", "z": "RFU", "-z": "RBD"}
+
+
+def extensions_of(up: str | None) -> bytes:
+    """Return the extension records of a file in which this axis points up, one of `SYSTEM_OF_UP`; b"" for None."""
+    if up is None:
+        return b""
+    number = SYSTEMS.index(SYSTEM_OF_UP[up]) + 1
+    return RECORD.pack(COORDINATE_SYSTEM, 4) + number.to_bytes(4, "little")
+
+
+class SpzStream(NamedTuple):
+    """One stream of a file: one column of all splats in order.
+
+    Attributes:
+        name: for messages.
+        size: bytes per splat.
+        column: of `Splats` or `LodTree`.
+        decode: (n, size) bytes to n rows of the column, of any shape.
+        encode: n rows of the column to bytes.
+    """
+
+    name: str
+    size: int
+    column: str
+    decode: Callable[[quantize.Bytes], NDArray[Any]]
+    encode: Callable[[NDArray[Any]], NDArray[Any]]
+
+    @property
+    def row_type(self) -> np.dtype[Any]:
+        """(size,) bytes."""
+        return np.dtype((np.uint8, (self.size,)))
+
+
+def column_of(splats: Splats, tree: LodTree | None, stream: SpzStream) -> NDArray[Any]:
+    """Return the column that a stream holds."""
+    column: NDArray[Any] = getattr(splats if hasattr(splats, stream.column) else tree, stream.column)
+    return column
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The fields of a header on which its streams depend."""
+
+    version: int
+    count: int
+    sh_degree: int
+    fractional_bits: int
+    flags: int
+
+    def streams(self) -> list[SpzStream]:
+        """Return the streams in file order."""
+        q, bits, coefficients = quantize, self.fractional_bits, COEFFICIENTS[self.sh_degree]
+        table = [
+            SpzStream("positions", 6, "center", lambda codes: codes.view("<f2"), lambda center: center.astype("<f2"))
+            if self.version == 1
+            else SpzStream(
+                "positions",
+                9,
+                "center",
+                lambda codes: q.decode_fixed24(codes.reshape(-1, 3, 3), bits),
+                lambda center: q.encode_fixed24(center, bits),
+            ),
+            SpzStream(
+                "alphas",
+                1,
+                "opacity",
+                lambda codes: linear_opacity(q.decode_lod_opacity(codes)),  # D = 0..5
+                lambda opacity: q.encode_lod_opacity(lod_opacity(opacity)),
+            )
+            if self.flags & LOD
+            else SpzStream("alphas", 1, "opacity", q.decode_unorm8, q.encode_unorm8),
+            SpzStream("colors", 3, "rgb", q.decode_color, q.encode_color),
+            SpzStream("scales", 3, "scale", q.decode_log_scale, q.encode_log_scale),
+            SpzStream("rotations", 4, "quat_xyzw", q.decode_quat_smallest_three, q.encode_quat_smallest_three)
+            if self.version >= 3
+            else SpzStream("rotations", 3, "quat_xyzw", q.decode_quat_first_three, q.encode_quat_first_three),
+            SpzStream(
+                "sh",
+                3 * coefficients,  # coefficient-major, r g b innermost
+                "sh",
+                lambda codes: q.decode_sh(codes.reshape(-1, coefficients, 3)[:, : COEFFICIENTS[MAX_SH_DEGREE]]),
+                lambda sh: q.encode_sh(sh, ALL_BITS),  # what is dropped of them is by now, see `sh_codes`
+            ),
+        ]
+        if self.flags & LOD:
+            table += [
+                SpzStream("child_counts", 2, "child_count", lambda codes: codes.view("<u2"), lambda n: n.astype("<u2")),
+                SpzStream("child_starts", 4, "child_start", lambda codes: codes.view("<u4"), lambda n: n.astype("<u4")),
+            ]
+        return [stream for stream in table if stream.size]
+
+    @property
+    def has_tree(self) -> bool:
+        """Whether the splats are the nodes of a tree."""
+        return bool(self.flags & LOD)
+
+    @property
+    def total(self) -> int:
+        """Bytes of all streams."""
+        return self.count * sum(stream.size for stream in self.streams())
+
 
 #: The largest code that a coordinate is given, 2 ** 23 - 2. Writers clamp what does not fit to the code after it, of
 #: either sign, so `inspect` takes a coordinate that has that one for clamped.
@@ -184,26 +307,25 @@ class SpzEncoder(Encoder):
 
     def pieces(self, windows: Windows, *, threads: int, progress: Progress) -> Iterator[bytes]:
         """Return the header and all streams, piece by piece: as one gzip member, or those of version 4."""
-        layout = self.layout
+        layout, streams, count = self.layout, self.layout.streams(), self.count
         if layout.version not in TREE_SPZ_VERSIONS:
             yield from self._pieces_v4(windows, threads, progress)
             return
-        fields = layout.version, layout.count, layout.sh_degree, layout.fractional_bits, layout.flags, 0
-
-        def data() -> Iterator[bytes | NDArray[Any]]:
-            yield HEADER.pack(MAGIC, *fields)
-            for stream in layout.streams():
-                for number in range(len(windows_of(layout.count))):
-                    yield windows[number][stream.name]
-
-        runs = [
-            DataRun(stream.size * layout.count, WAYS.get(stream.name, compression.MIXED)) for stream in layout.streams()
-        ]
-        runs[0] = runs[0]._replace(size=runs[0].size + HEADER.size)
+        fields = layout.version, count, layout.sh_degree, layout.fractional_bits, layout.flags, 0
+        numbers = range(len(windows_of(count)))
+        data = (windows[number][stream.name] for stream in streams for number in numbers)
+        runs = [(stream.size * count, WAYS.get(stream.name, compression.MIXED)) for stream in streams]
+        runs[0] = runs[0][0] + HEADER.size, runs[0][1]
         # A plain file without it would be one of another program, whose y is up.
         comment = "" if self.up is None and self.tree else comment_of(up=self.up)
-        level = self.options.compression_level
-        yield from compression.gzip_member(data(), runs, level, threads, progress, comment=comment.encode())
+        yield from compression.gzip_member(
+            itertools.chain([HEADER.pack(MAGIC, *fields)], data),
+            runs,
+            self.options.compression_level,
+            threads,
+            progress,
+            comment=comment.encode(),
+        )
 
     def _pieces_v4(self, windows: Windows, threads: int, progress: Progress) -> Iterator[bytes]:
         """Return the header, the extensions, the table of streams, and the streams, which are compressed before."""
@@ -297,42 +419,15 @@ def encode(
     yield from of_scene.pieces(windows, threads=threads, progress=progress)
 
 
-@dataclass(frozen=True, eq=False)
-class StoredSpz:
-    """Codes of a file, see `encoder.Stored`.
+def open_content(source: OpenFile) -> Reader:
+    """Open a file, see `spz_reader.open_spz`, which a bake to SPZ does not load."""
+    from .spz_reader import open_spz
 
-    Decoding and encoding again would nearly do: but a rotation whose two largest components are equal, but for
-    rounding, may get another code.
-    """
-
-    layout: Layout
-    codes: Mapping[str, Bytes]
-
-    def like(self, options: WriteOptions) -> WriteOptions:
-        """Return the options, and where they leave a choice open, that of the file."""
-        layout = self.layout
-        if layout.version == 1 or layout.fractional_bits > MAX_FRACTIONAL_BITS:
-            return options  # its positions are in no coding that is written
-        return like({"version": layout.version, "fractional_bits": layout.fractional_bits}, options)
-
-    def keeping(self, encoder: SpzEncoder, unchanged: NDArray[np.bool_]) -> SpzEncoder:
-        """Return an encoder of as many nodes that gives some the codes of the file, where its coding is the same."""
-        streams = encoder.layout.streams()
-        codes = {each.name: self.codes[each.name] for each in streams if self._is_alike(each, encoder.layout)}
-        return dataclasses.replace(encoder, stored=codes, unchanged=unchanged)
-
-    def _is_alike(self, stream: SpzStream, other: Layout) -> bool:
-        """Return True if a layout has a stream of splats in the coding of the file."""
-        own = self.layout
-        if stream.column not in COLUMNS:
-            return False
-        if stream.name == "positions":
-            return own.version > 1 and own.fractional_bits == other.fractional_bits
-        if stream.name == "rotations":
-            return (own.version >= 3) == (other.version >= 3)
-        return stream.name != "alphas" or own.has_tree == other.has_tree
+    return open_spz(source)[0]
 
 
 def stored(file: BinaryIO) -> StoredSpz:
     """Read the codes of a file; raises `FormatError` as `open_content`."""
-    return StoredSpz(*read_codes(OpenFile(file)))
+    from .spz_reader import StoredSpz
+
+    return StoredSpz.of(file)

@@ -14,7 +14,7 @@ from ..codecs.gpu import data_texture, ext_splats, lod_tree, packed_splats
 from ..codecs.gpu.dump import Arrays
 from ..codecs.reader import code_of
 from ..codecs.splat_encoding import SplatEncoding
-from ..codecs.spz_streams import KNOWN_FLAGS
+from ..codecs.spz import KNOWN_FLAGS
 from ..io import opened, read_arrays, read_scene, size_of_input
 from ..io.rad_file import FORMAT as RAD
 from ..io.rad_file import RadFile

@@ -14,7 +14,8 @@ import pytest
 import zstandard
 
 from sparklod_cli.codecs import compression
-from sparklod_cli.codecs.compression import DataRun, Way
+from sparklod_cli.codecs.compression import MIXED, Way
+from sparklod_cli.codecs.inflate import Unzstd
 from sparklod_cli.system.errors import FormatError
 from sparklod_cli.system.progress import silent
 
@@ -35,7 +36,7 @@ def sample(size: int, kind: str = "mixed") -> np.ndarray:
 
 
 def packed(data: np.ndarray, *, level: int = 5, threads: int = 1) -> bytes:
-    return b"".join(compression.gzip_member([data], [DataRun(data.size)], level, threads, silent))
+    return b"".join(compression.gzip_member([data], [(data.size, MIXED)], level, threads, silent))
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -84,11 +85,11 @@ def test_blocks_end_where_a_run_does_unless_all_fit_into_one() -> None:
     data = sample(BLOCK + 30)
     sizes = {BLOCK + 30: [BLOCK, 30], 20: [20, BLOCK, 10], 0: [BLOCK, 30]}
     for first, expected in sizes.items():
-        runs = [DataRun(first, compression.NOISE), DataRun(len(data) - first)]
+        runs = [(first, compression.NOISE), (len(data) - first, MIXED)]
         made = b"".join(compression.gzip_member([data[:7], data[7:]], runs, 5, 2, silent))
         assert [len(block) for block in blocks_of(made)] == expected
         assert gzip.decompress(made) == data.tobytes()
-    small = [DataRun(20, compression.NOISE), DataRun(30)]
+    small = [(20, compression.NOISE), (30, MIXED)]
     assert len(blocks_of(b"".join(compression.gzip_member([data[:50]], small, 5, 1, silent)))) == 1
 
 
@@ -96,7 +97,7 @@ def test_blocks_end_where_a_run_does_unless_all_fit_into_one() -> None:
 def test_pieces_hold_what_the_runs_say(missing: int) -> None:
     data = sample(BLOCK + 30)
     with pytest.raises(ValueError, match="of a block are missing" if missing > 0 else "more data than blocks"):
-        list(compression.gzip_member([data], [DataRun(data.size + missing)], 5, 1, silent))
+        list(compression.gzip_member([data], [(data.size + missing, MIXED)], 5, 1, silent))
 
 
 def patterns() -> dict[str, np.ndarray]:
@@ -119,7 +120,7 @@ def test_of_several_ways_the_smallest_is_taken(kind: str, ways: tuple[Way, ...])
     data = patterns()[kind]
 
     def size_of(*some: Way) -> int:
-        made = b"".join(compression.gzip_member([data], [DataRun(data.size, some)], 5, 1, silent))
+        made = b"".join(compression.gzip_member([data], [(data.size, some)], 5, 1, silent))
         assert gzip.decompress(made) == data.tobytes()
         return len(made)
 
@@ -139,21 +140,21 @@ def test_each_way_is_the_smallest_for_some_data() -> None:
 
 
 def packed_by(way: Way, data: np.ndarray) -> bytes:
-    return b"".join(compression.gzip_member([data], [DataRun(data.size, (way,))], 5, 1, silent))
+    return b"".join(compression.gzip_member([data], [(data.size, (way,))], 5, 1, silent))
 
 
 @pytest.mark.parametrize("level", [1, 4])
 def test_a_low_level_means_haste_whatever_the_data_are(level: int) -> None:
     data = patterns()["triples"]
     for ways in (compression.TRIPLES, compression.LINKS):
-        run = DataRun(data.size, ways)
+        run = (data.size, ways)
         assert b"".join(compression.gzip_member([data], [run], level, 1, silent)) == packed(data, level=level)
 
 
 def test_progress_ends_at_the_end() -> None:
     said: list[tuple[str, int, int, str]] = []
     data = sample(3 * BLOCK + 7)
-    list(compression.gzip_member([data], [DataRun(data.size)], 1, 2, lambda *args: said.append(args)))
+    list(compression.gzip_member([data], [(data.size, MIXED)], 1, 2, lambda *args: said.append(args)))
     assert said == [("writing", min(BLOCK * (i + 1), len(data)), len(data), "B") for i in range(4)]
 
 
@@ -181,8 +182,8 @@ def frame(data: bytes, *, with_size: bool = True) -> bytes:
     return zstandard.ZstdCompressor(write_content_size=with_size).compress(data)
 
 
-def unzstd(data: bytes, packed: int | None = None) -> compression.Unzstd:
-    return compression.Unzstd(io.BytesIO(data), len(data) if packed is None else packed, "sh")
+def unzstd(data: bytes, packed: int | None = None) -> Unzstd:
+    return Unzstd(io.BytesIO(data), len(data) if packed is None else packed, "sh")
 
 
 @pytest.mark.parametrize("with_size", [True, False])
@@ -206,7 +207,7 @@ def test_a_zstd_frame_ends_where_its_bytes_do() -> None:
     first, second = (frame(bytes([value]) * 1000) for value in (1, 2))
     file = io.BytesIO(first + second)
     for value, packed in ((1, first), (2, second)):
-        reader = compression.Unzstd(file, len(packed), "sh")
+        reader = Unzstd(file, len(packed), "sh")
         assert reader.read(1000) == bytes([value]) * 1000
         reader.finish()
     assert len(unzstd(first + second, len(first)).read(2000)) == 1000

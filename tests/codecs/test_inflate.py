@@ -15,7 +15,7 @@ import pytest
 from zlib_ng import zlib_ng
 
 from sparklod_cli.codecs import compression, inflate, spz
-from sparklod_cli.codecs.compression import BLOCK, DataRun
+from sparklod_cli.codecs.compression import BLOCK, MIXED
 from sparklod_cli.codecs.inflate import Inflate
 from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.codecs.reader import decode_file
@@ -85,7 +85,7 @@ def mixed(data: bytes) -> bytes:
 
 
 def ours(data: bytes, comment: bytes = b"") -> bytes:
-    return b"".join(compression.gzip_member([data], [DataRun(len(data))], 5, 1, silent, comment=comment))
+    return b"".join(compression.gzip_member([data], [(len(data), MIXED)], 5, 1, silent, comment=comment))
 
 
 @functools.cache

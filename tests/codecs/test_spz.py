@@ -18,7 +18,7 @@ from fixtures import by_hand
 from sparklod_cli.codecs import clamps, quantize, spz
 from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.codecs.reader import decode_file
-from sparklod_cli.codecs.spz_streams import MOST_EXTENSION_BYTES
+from sparklod_cli.codecs.spz_reader import MOST_EXTENSION_BYTES
 from sparklod_cli.codecs.statistics import Statistics
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene

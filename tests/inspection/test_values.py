@@ -14,7 +14,7 @@ import pytest
 
 from sparklod_cli.cli import run
 from sparklod_cli.codecs import ply, splat, spz
-from sparklod_cli.codecs.spz_streams import ANTIALIASED, HEADER, LOD, MAGIC, Layout
+from sparklod_cli.codecs.spz import ANTIALIASED, HEADER, LOD, MAGIC, Layout
 from sparklod_cli.inspection import values
 from sparklod_cli.inspection.report import ReportSettings, inspect
 from sparklod_cli.inspection.values import (

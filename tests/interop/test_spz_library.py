@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 import sparklod_cli as sparklod
-from sparklod_cli.codecs.spz_streams import SYSTEM_OF_UP, SYSTEMS
+from sparklod_cli.codecs.spz import SYSTEM_OF_UP, SYSTEMS
 from sparklod_cli.model.gaussian import normalized_quat, rotation_matrices
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.sh import SH_C0

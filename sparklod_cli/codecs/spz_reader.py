@@ -1,149 +1,48 @@
-"""The streams of SPZ files: their codings, one table for reading and writing, and the reader.
-
-Versions 1 to 3 are a header and streams in a gzip member, version 4 a plain header and a zstd frame for each stream.
-Extension records, of which the coordinate system is read and written, follow the streams, in version 4 the header. A
-record has its type, the bytes of its payload, and the payload.
-"""
+"""SPZ: reads versions 1 to 4, plain and with Spark's trees, see `spz`."""
 
 from __future__ import annotations
 
 import dataclasses
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, BinaryIO, NamedTuple
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..model import MAX_SH_DEGREE
-from ..model.gaussian import linear_opacity, lod_opacity
-from ..model.lod_tree import LodTree
 from ..model.scene import FileCoding, ScaleCoding
-from ..model.sh import COEFFICIENTS, notes_on_degree
-from ..model.splats import Splats
+from ..model.sh import notes_on_degree
+from ..model.splats import COLUMNS
 from ..system.errors import FormatError, MembersError, NotSplatsError, TruncatedError, VersionError
 from ..system.progress import Progress
 from ..system.threads import ordered_map
-from . import compression, quantize
+from .compression import GZIP_MAGIC, check_promise
 from .file_notes import FileNote, read_comment
-from .inflate import GZIP_MAGIC, Inflate
+from .inflate import PIECE, Inflate, Unzstd
+from .options import MAX_FRACTIONAL_BITS, WriteOptions
 from .quantize import Bytes
 from .reader import OpenFile, Positioned, Read, Reader, Target, rows_of, size_of
-from .statistics import ALL_BITS
-
-MAGIC = 0x5053474E  # "NGSP"
-HEADER = struct.Struct("<IIIBBBB")  # magic, version, splats, SH degree, fractional bits, flags, reserved
-
-#: Flags of the header.
-ANTIALIASED, EXTENSIONS, LOD = 0x01, 0x02, 0x80
-KNOWN_FLAGS = ANTIALIASED | EXTENSIONS | LOD
-
-
-#: The last streams of a file with a tree: column and type, by name.
-LINKS = {"child_counts": ("child_count", "<u2"), "child_starts": ("child_start", "<u4")}
-
-
-class SpzStream(NamedTuple):
-    """One stream of a file: one column of all splats in order.
-
-    Attributes:
-        name: for messages.
-        size: bytes per splat.
-        column: of `Splats` or `LodTree`.
-        decode: (n, size) bytes to n rows of the column, of any shape.
-        encode: n rows of the column to bytes.
-    """
-
-    name: str
-    size: int
-    column: str
-    decode: Callable[[quantize.Bytes], NDArray[Any]]
-    encode: Callable[[NDArray[Any]], NDArray[Any]]
-
-    @property
-    def row_type(self) -> np.dtype[Any]:
-        """(size,) bytes."""
-        return np.dtype((np.uint8, (self.size,)))
-
+from .spz import (
+    ANTIALIASED,
+    COORDINATE_SYSTEM,
+    EXTENSIONS,
+    HEADER,
+    HEADER_V4,
+    MAGIC,
+    RECORD,
+    STREAM_SIZES,
+    SYSTEMS,
+    Layout,
+    SpzEncoder,
+    SpzStream,
+    column_of,
+    like,
+)
 
 #: Some rows of a stream: the stream, which rows, and (n, size) bytes.
-StreamRows = tuple[SpzStream, slice, quantize.Bytes]
-
-
-def column_of(splats: Splats, tree: LodTree | None, stream: SpzStream) -> NDArray[Any]:
-    """Return the column that a stream holds."""
-    column: NDArray[Any] = getattr(splats if hasattr(splats, stream.column) else tree, stream.column)
-    return column
-
-
-@dataclass(frozen=True)
-class Layout:
-    """The fields of a header on which its streams depend."""
-
-    version: int
-    count: int
-    sh_degree: int
-    fractional_bits: int
-    flags: int
-
-    def streams(self) -> list[SpzStream]:
-        """Return the streams in file order."""
-        q, bits, coefficients = quantize, self.fractional_bits, COEFFICIENTS[self.sh_degree]
-        table = [
-            SpzStream("positions", 6, "center", lambda codes: codes.view("<f2"), lambda center: center.astype("<f2"))
-            if self.version == 1
-            else SpzStream(
-                "positions",
-                9,
-                "center",
-                lambda codes: q.decode_fixed24(codes.reshape(-1, 3, 3), bits),
-                lambda center: q.encode_fixed24(center, bits),
-            ),
-            SpzStream(
-                "alphas",
-                1,
-                "opacity",
-                lambda codes: linear_opacity(q.decode_lod_opacity(codes)),  # D = 0..5
-                lambda opacity: q.encode_lod_opacity(lod_opacity(opacity)),
-            )
-            if self.flags & LOD
-            else SpzStream("alphas", 1, "opacity", q.decode_unorm8, q.encode_unorm8),
-            SpzStream("colors", 3, "rgb", q.decode_color, q.encode_color),
-            SpzStream("scales", 3, "scale", q.decode_log_scale, q.encode_log_scale),
-            SpzStream("rotations", 4, "quat_xyzw", q.decode_quat_smallest_three, q.encode_quat_smallest_three)
-            if self.version >= 3
-            else SpzStream("rotations", 3, "quat_xyzw", q.decode_quat_first_three, q.encode_quat_first_three),
-            SpzStream(
-                "sh",
-                3 * coefficients,  # coefficient-major, r g b innermost
-                "sh",
-                lambda codes: q.decode_sh(codes.reshape(-1, coefficients, 3)[:, : COEFFICIENTS[MAX_SH_DEGREE]]),
-                lambda sh: q.encode_sh(sh, ALL_BITS),  # what is dropped of them is by now, see `spz.sh_codes`
-            ),
-        ]
-        if self.flags & LOD:
-            table += [_integers(name, *of_link) for name, of_link in LINKS.items()]
-        return [stream for stream in table if stream.size]
-
-    @property
-    def has_tree(self) -> bool:
-        """Whether the splats are the nodes of a tree."""
-        return bool(self.flags & LOD)
-
-    @property
-    def total(self) -> int:
-        """Bytes of all streams."""
-        return self.count * sum(stream.size for stream in self.streams())
-
-
-def _integers(name: str, column: str, code: str) -> SpzStream:
-    size = np.dtype(code).itemsize
-    return SpzStream(name, size, column, lambda codes: codes.view(code), lambda values: values.astype(code))
-
-
-HEADER_V4 = struct.Struct("<IIIBBBBI12s")  # ..., streams, offset of the table of streams, reserved
-STREAM_SIZES = struct.Struct("<QQ")  # of a version 4 stream: compressed, uncompressed
+StreamRows = tuple[SpzStream, slice, Bytes]
 
 #: Versions that are read.
 READABLE = (1, 2, 3, 4)
@@ -152,29 +51,16 @@ READABLE = (1, 2, 3, 4)
 CODING = FileCoding((ScaleCoding("spz"),), 1)
 
 
-def open_content(source: OpenFile) -> Reader:
-    """Open any SPZ file, plain or LoD. With `scratch`, its streams are unpacked to that.
+def open_spz(source: OpenFile) -> tuple[Reader, Layout, Iterator[StreamRows]]:
+    """Open any SPZ file, plain or LoD: its content, its layout, and the rows of its streams, which can be read once.
 
-    The header of its scene has the flags, the reserved byte and, once all is read, the number of bytes after the data.
+    With `scratch`, its streams are unpacked to that. The header of its scene has the flags, the reserved byte and, once
+    all is read, the number of bytes after the data.
 
     Raises:
         FormatError: the file is not SPZ, of an unknown version or SH degree, cut short or corrupt, or announces far
             more splats than its size can hold.
     """
-    return _open(source)[0]
-
-
-def read_codes(source: OpenFile) -> tuple[Layout, dict[str, Bytes]]:
-    """Read the layout of a file, and (N, bytes) codes of each of its streams, by name; raises as `open_content`."""
-    _, layout, rows = _open(source)
-    codes = {each.name: np.empty((layout.count, each.size), np.uint8) for each in layout.streams()}
-    for each, part, some in rows:
-        codes[each.name][part] = some
-    return layout, codes
-
-
-def _open(source: OpenFile) -> tuple[Reader, Layout, Iterator[StreamRows]]:
-    """Open a file: its content, its layout, and the rows of its streams, which can be read once."""
     file, note, extensions, header = source.file, FileNote(), Extensions(), dict[str, int]()
     size = size_of(file)
     plain = file.read(4) == struct.pack("<I", MAGIC)
@@ -210,7 +96,7 @@ def _open(source: OpenFile) -> tuple[Reader, Layout, Iterator[StreamRows]]:
     def fill(target: Target, threads: int, progress: Progress) -> None:
         def decode(item: StreamRows) -> int:
             stream, part, codes = item
-            if stream.column in target.columns or stream.name in LINKS:
+            if stream.column in target.columns or stream.column not in COLUMNS:
                 column = column_of(target.splats, target.tree, stream)
                 out = column[part.start - target.start : part.stop - target.start]
                 out[...] = stream.decode(codes).reshape(out.shape)
@@ -251,7 +137,7 @@ def _checked(layout: Layout, file_size: int, header: dict[str, int]) -> Layout:
         raise VersionError(f"SPZ version {layout.version} has no SH degree {layout.sh_degree}")
     if layout.fractional_bits > 31:
         raise FormatError(f"{layout.fractional_bits} fractional bits; at most 31 can be read")
-    compression.check_promise(layout.total, file_size)
+    check_promise(layout.total, file_size)
     header |= {"version": layout.version, "fractional_bits": layout.fractional_bits, "flags": layout.flags}
     return layout
 
@@ -296,7 +182,7 @@ def _extensions_behind(inflate: Inflate, layout: Layout) -> Extensions:
     """Return the extensions behind the streams; none where the streams are cut short, which reading these reports."""
     left = layout.total
     while left:
-        piece = inflate.read(min(left, compression.PIECE))
+        piece = inflate.read(min(left, PIECE))
         if not piece:
             return Extensions()
         left -= len(piece)
@@ -339,7 +225,7 @@ def _read_v4(file: BinaryIO, size: int, header: dict[str, int]) -> tuple[Layout,
     def rows() -> Iterator[StreamRows]:
         for stream, (packed, _) in zip(expected, sizes, strict=False):
             end = file.tell() + packed
-            unzstd = compression.Unzstd(file, packed, stream.name)
+            unzstd = Unzstd(file, packed, stream.name)
             yield from _rows(layout, unzstd.read, stream)
             unzstd.finish()
             file.seek(end)
@@ -348,20 +234,8 @@ def _read_v4(file: BinaryIO, size: int, header: dict[str, int]) -> tuple[Layout,
     return layout, rows(), extensions
 
 
-#: Type of an extension record, and bytes of its payload.
-RECORD = struct.Struct("<II")
-
-#: Record of the coordinate system in which the coordinates stand: a uint32, an index of `SYSTEMS` from 1 on.
-COORDINATE_SYSTEM = 0xADBE0003
-
 #: Names of the other types that are published.
 TYPES = {0xADBE0002: "SPZ_ADOBE_safe_orbit_camera"}
-
-#: The coordinate systems: where x, y and z point, of left or right, down or up, back or front.
-SYSTEMS = (
-    *("LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF"),
-    *("LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU"),
-)
 
 _DIRECTIONS = {"R": (1, 0, 0), "L": (-1, 0, 0), "U": (0, 1, 0), "D": (0, -1, 0), "B": (0, 0, 1), "F": (0, 0, -1)}
 
@@ -370,10 +244,6 @@ MOST_EXTENSION_BYTES = 1 << 20
 
 #: Kinds of unknown records that are named.
 MOST_NAMED = 8
-
-
-#: By the axis that points up, the right-handed system whose x points right. None has x pointing up.
-SYSTEM_OF_UP = {"y": "RUB", "-y": "RDF", "z": "RFU", "-z": "RBD"}
 
 
 @dataclass(frozen=True)
@@ -428,9 +298,46 @@ def read_extensions(data: bytes, size: int) -> Extensions:
     return Extensions(up, tuple(notes), has_system)
 
 
-def extensions_of(up: str | None) -> bytes:
-    """Return the extension records of a file in which this axis points up, one of `SYSTEM_OF_UP`; b"" for None."""
-    if up is None:
-        return b""
-    number = SYSTEMS.index(SYSTEM_OF_UP[up]) + 1
-    return RECORD.pack(COORDINATE_SYSTEM, 4) + number.to_bytes(4, "little")
+@dataclass(frozen=True, eq=False)
+class StoredSpz:
+    """Codes of a file, see `encoder.Stored`.
+
+    Decoding and encoding again would nearly do: but a rotation whose two largest components are equal, but for
+    rounding, may get another code.
+    """
+
+    layout: Layout
+    codes: Mapping[str, Bytes]
+
+    @classmethod
+    def of(cls, file: BinaryIO) -> StoredSpz:
+        """Read the codes of a file: (N, bytes) of each of its streams, by name."""
+        _, layout, rows = open_spz(OpenFile(file))
+        codes = {each.name: np.empty((layout.count, each.size), np.uint8) for each in layout.streams()}
+        for each, part, some in rows:
+            codes[each.name][part] = some
+        return cls(layout, codes)
+
+    def like(self, options: WriteOptions) -> WriteOptions:
+        """Return the options, and where they leave a choice open, that of the file."""
+        layout = self.layout
+        if layout.version == 1 or layout.fractional_bits > MAX_FRACTIONAL_BITS:
+            return options  # its positions are in no coding that is written
+        return like({"version": layout.version, "fractional_bits": layout.fractional_bits}, options)
+
+    def keeping(self, encoder: SpzEncoder, unchanged: NDArray[np.bool_]) -> SpzEncoder:
+        """Return an encoder of as many nodes that gives some the codes of the file, where its coding is the same."""
+        streams = encoder.layout.streams()
+        codes = {each.name: self.codes[each.name] for each in streams if self._is_alike(each, encoder.layout)}
+        return dataclasses.replace(encoder, stored=codes, unchanged=unchanged)
+
+    def _is_alike(self, stream: SpzStream, other: Layout) -> bool:
+        """Return True if a layout has a stream of splats in the coding of the file."""
+        own = self.layout
+        if stream.column not in COLUMNS:
+            return False
+        if stream.name == "positions":
+            return own.version > 1 and own.fractional_bits == other.fractional_bits
+        if stream.name == "rotations":
+            return (own.version >= 3) == (other.version >= 3)
+        return stream.name != "alphas" or own.has_tree == other.has_tree
