@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sparklod_cli.codecs.rad.rad_layout import OPTIONS, choices
+from sparklod_cli.codecs.options import RAD_ENCODINGS
 from sparklod_cli.lod.builders import METHODS
 
 from .. import scenes
@@ -35,8 +35,8 @@ def make(rng: Rng) -> Case:
     if output.startswith("chunks"):
         options += ["--format", "rad-chunked"]
     if output.endswith(".rad"):
-        for name in OPTIONS:
-            options += [f"--rad-{name}", pick(rng, ("auto", *choices(name)))]
+        for name in RAD_ENCODINGS:
+            options += [f"--rad-{name}", pick(rng, ("auto", *RAD_ENCODINGS[name]))]
         if rng.integers(4) == 0:
             options += ["--cluster-sh", pick(rng, ("2", "64"))]
     if output.startswith("levels"):

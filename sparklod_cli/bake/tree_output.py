@@ -12,8 +12,7 @@ from ..codecs import clamps
 from ..codecs.encoder import CLAMPED, Encoder, Stored, Windows, windows_of
 from ..codecs.formats import RAD_SUFFIX as RAD
 from ..codecs.formats import WRITABLE, Format
-from ..codecs.options import DEFAULTS, WriteOptions
-from ..codecs.rad.rad_layout import OPTIONS
+from ..codecs.options import DEFAULTS, RAD_ENCODINGS, WriteOptions
 from ..codecs.statistics import Statistics
 from ..io.reading import Merged, Source, opened, read_stored
 from ..io.writing import parts_output, scene_output
@@ -207,7 +206,7 @@ def _write_windows(
         output_format="rad-chunked" if options.rad.chunked else "rad",
         bytes=size,
         chunks=-(-count // CHUNK_NODES),
-        encodings={name: getattr(options.rad, name) for name in OPTIONS if encoder.sh_degree or name != "sh"},
+        encodings={name: getattr(options.rad, name) for name in RAD_ENCODINGS if encoder.sh_degree or name != "sh"},
         sh_codes=min(options.rad.sh_codes, count) if options.rad.sh_codes and encoder.sh_degree else None,
         clamped=beyond.splats,
         clamps=beyond.ends,

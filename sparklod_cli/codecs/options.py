@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from ..system.setting_fields import CheckedSettings, Quantity, setting, whole
-from .rad.rad_layout import AUTO, choices
 
 if TYPE_CHECKING:
     from .splat_encoding import SplatEncoding
@@ -41,8 +40,23 @@ def _bits(text: str) -> int | None:
     return None if text == "auto" else int(text)
 
 
+#: The encodings that each property of RAD may be in, as Spark reads them; the first is the one that Spark writes.
+RAD_ENCODINGS = {
+    "center": ("f32_lebytes", "f32", "f16_lebytes", "f16"),
+    "alpha": ("f16", "r8", "f32"),
+    "rgb": ("r8_delta", "r8", "f16", "f32"),
+    "scales": ("ln_0r8", "ln_f16", "f32"),
+    "orientation": ("oct88r8", "f16", "f32"),
+    "sh": ("s8", "s8_delta", "r8", "r8_delta", "f16", "f32"),
+}
+
+#: Leaves the choice of an encoding to the writer, which goes by the scene.
+AUTO = "auto"
+
+
 def _encoding(option: str, plural: str) -> Any:
-    return setting(AUTO, f"Encoding of {plural}; auto suits the scene.", choices(option), name=f"rad_{option}")
+    encodings = (AUTO, *RAD_ENCODINGS[option])
+    return setting(AUTO, f"Encoding of {plural}; auto suits the scene.", encodings, name=f"rad_{option}")
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,8 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from ..codecs.merging import Chunk
-from ..codecs.rad.property_codings import LARGEST_F16
+from ..codecs.rad.property_codings import BY_NAME, CODINGS, LARGEST_F16, PROPERTIES
 from ..codecs.rad.rad_header import ENCODING_KEYS, RadChunkHeader, RadHeader
-from ..codecs.rad.rad_layout import BY_NAME, PROPERTIES, SIZES
 from ..codecs.rad.rad_reader import scan_chunks, scan_header
 from ..codecs.reader import OpenCompanion, size_of
 from ..codecs.splat_encoding import log_scale_table
@@ -189,7 +188,7 @@ class _Gathered:
 
     def add(self, chunk: RadChunkHeader) -> None:
         for each in chunk.properties:
-            if each.name not in BY_NAME or each.encoding not in SIZES:
+            if each.name not in BY_NAME or each.encoding not in CODINGS:
                 continue  # a finding says so
             self.encodings.setdefault(each.name, {})[each.encoding] = None
             self.bytes[each.name] += each.bytes

@@ -15,8 +15,7 @@ from hypothesis import strategies as st
 import sparklod_cli as sparklod
 from fuzz.laws import check_passes
 from sparklod_cli.codecs.formats import MANIFEST
-from sparklod_cli.codecs.options import RadOptions, SogOptions
-from sparklod_cli.codecs.rad.rad_layout import OPTIONS, choices
+from sparklod_cli.codecs.options import RAD_ENCODINGS, RadOptions, SogOptions
 from sparklod_cli.lod.builders import METHODS
 from sparklod_cli.lod.detail_rule import DetailSettings
 from sparklod_cli.model.gaussian import normalized_quat
@@ -71,7 +70,7 @@ def passes(path: Path, scene: Scene, **options: object) -> None:
 @given(scenes(), st.data())
 @settings(max_examples=25, phases=[Phase.explicit, Phase.generate])  # shrinking takes minutes, and any scene will do
 def test_what_is_written_passes_the_check(scene: Scene, data: st.DataObject) -> None:
-    rad = RadOptions(**{name: data.draw(st.sampled_from(["auto", *choices(name)])) for name in OPTIONS})
+    rad = RadOptions(**{name: data.draw(st.sampled_from(["auto", *RAD_ENCODINGS[name]])) for name in RAD_ENCODINGS})
     shares = data.draw(st.sampled_from([(0.5,), (0.9, 0.5, 0.01), (0.3, 0.1)]))
     detail = DetailSettings(
         shares, data.draw(st.sampled_from([20, 40, 9999])), data.draw(st.sampled_from([1e-3, 16])), 1

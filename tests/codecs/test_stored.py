@@ -11,9 +11,8 @@ import pytest
 
 from sparklod_cli.codecs import spz
 from sparklod_cli.codecs.encoder import results
-from sparklod_cli.codecs.options import RadOptions, WriteOptions
+from sparklod_cli.codecs.options import RAD_ENCODINGS, RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import codec as rad
-from sparklod_cli.codecs.rad.rad_layout import OPTIONS, choices
 from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.codecs.spz import like
 from sparklod_cli.lod import quick
@@ -24,8 +23,10 @@ from tests.scenes import random_splats
 
 #: Of each property the encodings that a file may have, side by side: the last ones are repeated.
 ENCODINGS = [
-    RadOptions(**{name: choices(name)[min(number, len(choices(name)) - 1)] for name in OPTIONS})
-    for number in range(max(len(choices(name)) for name in OPTIONS))
+    RadOptions(
+        **{name: ("auto", *RAD_ENCODINGS[name])[min(number, len(RAD_ENCODINGS[name]))] for name in RAD_ENCODINGS}
+    )
+    for number in range(1 + max(map(len, RAD_ENCODINGS.values())))
 ]
 
 
@@ -111,7 +112,9 @@ def test_a_choice_of_another_coding_is_heeded() -> None:
     assert {*encoder.stored} == {"alphas", "colors", "scales", "sh"}
 
 
-@pytest.mark.parametrize("given", ENCODINGS, ids=lambda options: "-".join(getattr(options, name) for name in OPTIONS))
+@pytest.mark.parametrize(
+    "given", ENCODINGS, ids=lambda options: "-".join(getattr(options, name) for name in RAD_ENCODINGS)
+)
 def test_a_rad_of_any_encodings_keeps_its_codes(given: RadOptions) -> None:
     scene = tree_of()
     options = rad.settled(scene, WriteOptions(rad=given))
@@ -119,7 +122,7 @@ def test_a_rad_of_any_encodings_keeps_its_codes(given: RadOptions) -> None:
     stored = rad.stored(io.BytesIO(data))
     after = check(rad, data)
     found = rad.settled(after, stored.like(WriteOptions())).rad
-    assert [getattr(found, name) for name in OPTIONS] == [getattr(options.rad, name) for name in OPTIONS]
+    assert [getattr(found, name) for name in RAD_ENCODINGS] == [getattr(options.rad, name) for name in RAD_ENCODINGS]
     assert found.ranges == options.rad.ranges
 
 

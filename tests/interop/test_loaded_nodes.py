@@ -11,9 +11,8 @@ import pytest
 
 from sparklod_cli.cli import run
 from sparklod_cli.codecs import spz
-from sparklod_cli.codecs.options import RadOptions, WriteOptions
+from sparklod_cli.codecs.options import RAD_ENCODINGS, RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import codec as rad
-from sparklod_cli.codecs.rad.rad_layout import choices
 from sparklod_cli.codecs.rad.rad_options import HALF
 from sparklod_cli.codecs.splat_encoding import SplatEncoding
 from sparklod_cli.io import read_scene
@@ -281,7 +280,7 @@ WAYS = [
 
 def test_the_ways_have_every_encoding() -> None:
     for field in ("scales", "alpha", "center"):
-        assert {getattr(way, field) for way in WAYS} == set(choices(field)[1:])
+        assert {getattr(way, field) for way in WAYS} == set(RAD_ENCODINGS[field])
 
 
 @pytest.mark.parametrize("way", WAYS, ids=lambda way: f"{way.scales}-{way.alpha}")

@@ -18,10 +18,9 @@ import pytest
 from sparklod_cli.cli import run
 from sparklod_cli.codecs import quantize
 from sparklod_cli.codecs.gpu import packed_splats
-from sparklod_cli.codecs.options import RadOptions, WriteOptions
+from sparklod_cli.codecs.options import RAD_ENCODINGS, RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import codec as rad
 from sparklod_cli.codecs.rad.rad_header import RadHeader, read_chunk_header, read_header
-from sparklod_cli.codecs.rad.rad_layout import choices
 from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.codecs.spark_codings import encode_lod_alpha
 from sparklod_cli.codecs.splat_encoding import SplatEncoding
@@ -167,7 +166,7 @@ def test_both_read_the_same_out_of_files_written_by_hand(spark: Spark, tmp_path:
 
 def ways() -> Iterator[RadOptions]:
     """Options that have every encoding of every property at least once, and what is written where nobody chooses."""
-    names = {field: choices(field)[1:] for field in ("center", "alpha", "rgb", "scales", "orientation", "sh")}
+    names = {field: RAD_ENCODINGS[field] for field in ("center", "alpha", "rgb", "scales", "orientation", "sh")}
     for number in range(max(map(len, names.values()))):
         yield RadOptions(**{field: each[number % len(each)] for field, each in names.items()})
     yield RadOptions()

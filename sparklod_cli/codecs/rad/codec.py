@@ -26,11 +26,11 @@ from .. import quantize, sh_palette, spark_codings
 from ..clamps import CodeRange
 from ..encoder import Encoded, Encoder, Named, Windows, results, windows_of
 from ..file_notes import comment_of
-from ..options import DEFAULTS, WriteOptions
+from ..options import AUTO, DEFAULTS, RAD_ENCODINGS, WriteOptions
 from ..quantize import Bytes
 from ..reader import OpenCompanion
 from ..splat_encoding import SplatEncoding
-from .property_codings import BLOCK, CODINGS
+from .property_codings import BLOCK, BY_NAME, CODINGS, PROPERTIES, Row, encodings_of
 from .rad_header import (
     GZ,
     Files,
@@ -42,7 +42,6 @@ from .rad_header import (
     pack_chunk_header,
     padding,
 )
-from .rad_layout import AUTO, BY_NAME, OPTIONS, PROPERTIES, RANGES, SIZES, Row, encodings_of
 from .rad_options import AUTOMATIC, code_range
 from .rad_options import held as held
 from .rad_options import needed as needed
@@ -187,7 +186,7 @@ class RadEncoder(Encoder):
         encoding = getattr(self.options.rad, row.option) if row.option else row.encodings[0]
         low, high = code_range(row, self._codes)
         codes = CODINGS[encoding].encode(self.values(row, encoding, splats, tree, labels), low, high)
-        return CodedProperty(encoding, codes, *((low, high) if RANGES.get(encoding) else (None, None)))
+        return CodedProperty(encoding, codes, *((low, high) if CODINGS[encoding].ends else (None, None)))
 
     def _rows(self, *, first: bool) -> Iterator[Row]:
         """Yield the properties of a chunk."""
@@ -240,7 +239,7 @@ class RadEncoder(Encoder):
 
         Of codes of a byte, only runs are looked for: longer matches are chance, which makes them longer and slower.
         """
-        strategy = zlib_ng.Z_RLE if SIZES[encoding] == 1 else zlib_ng.Z_DEFAULT_STRATEGY
+        strategy = zlib_ng.Z_RLE if CODINGS[encoding].size == 1 else zlib_ng.Z_DEFAULT_STRATEGY
         packer = zlib_ng.compressobj(
             self.options.compression_level, zlib_ng.DEFLATED, _RAW, zlib_ng.DEF_MEM_LEVEL, strategy
         )
@@ -350,7 +349,7 @@ class StoredRad:
         found = encodings_of(self.chunks[0].properties.values())
         if found.get("center") == AUTOMATIC.center:
             found["center"] = AUTO
-        chosen: dict[str, Any] = {name: found.get(name, AUTO) for name in OPTIONS if getattr(rad, name) == AUTO}
+        chosen: dict[str, Any] = {name: found.get(name, AUTO) for name in RAD_ENCODINGS if getattr(rad, name) == AUTO}
         ranges = rad.ranges or self._ranges()
         return dataclasses.replace(options, rad=dataclasses.replace(rad, **chosen, ranges=ranges))
 
@@ -359,7 +358,7 @@ class StoredRad:
         ranges, properties = self.header.encoding or SplatEncoding(lod_opacity=True), self.chunks[0].properties
         for name, low, high in (("rgb", "rgb_min", "rgb_max"), ("scales", "ln_scale_min", "ln_scale_max")):
             each = properties.get(name)
-            if each is not None and each.encoding in RANGES and each.min is not None and each.max is not None:
+            if each is not None and CODINGS[each.encoding].ends and each.min is not None and each.max is not None:
                 ends: dict[str, Any] = {low: each.min, high: each.max}
                 ranges = dataclasses.replace(ranges, **ends)
         return ranges
@@ -443,7 +442,7 @@ def _differs(encoding: str) -> bool:
 
 def _by_splat(flat: Bytes, row: Row, encoding: str) -> Bytes:
     """Return an (N, ...) view of the bytes of a property, splat by splat."""
-    size, numbers = SIZES[encoding], row.numbers
+    size, numbers = CODINGS[encoding].size, row.numbers
     if encoding == "oct88r8":
         return flat.reshape(-1, numbers)
     if encoding.endswith("_lebytes"):

@@ -1,4 +1,4 @@
-"""The encodings of RAD's properties, as pairs of encode and decode over a whole column of a chunk.
+"""The properties of RAD's chunks, and their encodings: pairs of encode and decode over a whole column of a chunk.
 
 A column is stored number by number: all x, then all y, then all z. The formulas are those of Spark 2.2.0's `rad.rs`.
 """
@@ -6,8 +6,8 @@ A column is stored number by number: all x, then all y, then all z. The formulas
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +15,12 @@ from numpy.typing import NDArray
 from ...model.splats import FloatArray
 from ...system.threads import blocks_of
 from .. import spark_codings, splat_encoding
+from ..options import RAD_ENCODINGS
 from ..quantize import Bytes
 from ..spark_codings import STEPS_8_8_8
+
+if TYPE_CHECKING:
+    from .rad_header import Property
 
 #: Largest finite float16. Larger values are clamped to it: rounded they would be infinite.
 LARGEST_F16 = np.float32(65504)
@@ -32,15 +36,19 @@ _ALL = np.arange(256, dtype=np.uint8)
 
 
 class PropertyCoding(NamedTuple):
-    """Pair of functions.
+    """Encoding of a property.
 
     Attributes:
         encode: (N, numbers) values, and the ends of the range of their codes, to bytes of any shape.
         decode: the bytes, N, the numbers of a splat, and the ends of the range to (N, numbers) values.
+        size: bytes of a number.
+        ends: keys of a property that it needs, for the range of its codes.
     """
 
     encode: Callable[[NDArray[Any], float, float], NDArray[Any]]
     decode: Callable[[Bytes, int, int, float, float], NDArray[Any]]
+    size: int
+    ends: tuple[str, ...] = ()
 
     def rounded(self, values: NDArray[Any], low: float, high: float) -> NDArray[Any]:
         """Return (N, numbers) values as they are decoded."""
@@ -58,11 +66,12 @@ def _plain(code: str, most: np.float32 | None = None) -> PropertyCoding:
     def decode(codes: Bytes, count: int, numbers: int, low: float, high: float) -> NDArray[Any]:
         return codes.view(code).reshape(numbers, count).T
 
-    return PropertyCoding(encode, decode)
+    return PropertyCoding(encode, decode, np.dtype(code).itemsize)
 
 
-def _by_bytes(coding: PropertyCoding, size: int) -> PropertyCoding:
+def _by_bytes(coding: PropertyCoding) -> PropertyCoding:
     """Return the coding of numbers of another coding with their lowest bytes first, then their next ones."""
+    size = coding.size
 
     def encode(values: NDArray[Any], low: float, high: float) -> NDArray[Any]:
         planes = coding.encode(values, low, high).view(np.uint8)
@@ -72,7 +81,7 @@ def _by_bytes(coding: PropertyCoding, size: int) -> PropertyCoding:
         whole = np.ascontiguousarray(codes.reshape(size, -1).T).reshape(-1)
         return coding.decode(whole, count, numbers, low, high)
 
-    return PropertyCoding(encode, decode)
+    return coding._replace(encode=encode, decode=decode)
 
 
 def _by_differences(coding: PropertyCoding) -> PropertyCoding:
@@ -86,11 +95,13 @@ def _by_differences(coding: PropertyCoding) -> PropertyCoding:
         whole = np.cumsum(codes.reshape(numbers, count), axis=1, dtype=np.uint8)
         return coding.decode(whole.reshape(-1), count, numbers, low, high)
 
-    return PropertyCoding(encode, decode)
+    return coding._replace(encode=encode, decode=decode)
 
 
 def _by_table(
-    encode: Callable[[FloatArray, float, float], NDArray[Any]], table: Callable[[float, float], FloatArray]
+    encode: Callable[[FloatArray, float, float], NDArray[Any]],
+    table: Callable[[float, float], FloatArray],
+    ends: tuple[str, ...] = ("min", "max"),
 ) -> PropertyCoding:
     """Return the coding of a byte a number; the table has the values of all 256."""
 
@@ -105,7 +116,7 @@ def _by_table(
             values = table(low, high)
         return values[codes.reshape(numbers, count).T]
 
-    return PropertyCoding(encode_planes, decode)
+    return PropertyCoding(encode_planes, decode, 1, ends)
 
 
 @np.errstate(over="ignore")  # values may be any number of times the end of the range
@@ -142,7 +153,7 @@ def _decode_octahedral(codes: Bytes, count: int, numbers: int, low: float, high:
 
 _F32, _F16 = _plain("<f4"), _plain("<f2", LARGEST_F16)
 _R8 = _by_table(splat_encoding.encode_linear, functools.partial(splat_encoding.decode_linear, _ALL))
-_S8 = _by_table(_encode_signed, lambda low, high: _ALL.view(np.int8) / np.float32(127) * np.float32(high))
+_S8 = _by_table(_encode_signed, lambda low, high: _ALL.view(np.int8) / np.float32(127) * np.float32(high), ("max",))
 
 #: By name. Largest errors inside the range of the codes, apart from that of float32:
 #: f16, f16_lebytes: 2 ** -11 of a number, or 2 ** -25 if that is more. r8, r8_delta: (max - min) / 510.
@@ -151,17 +162,65 @@ _S8 = _by_table(_encode_signed, lambda low, high: _ALL.view(np.int8) / np.float3
 CODINGS = {
     "f32": _F32,
     "f16": _F16,
-    "f32_lebytes": _by_bytes(_F32, 4),
-    "f16_lebytes": _by_bytes(_F16, 2),
+    "f32_lebytes": _by_bytes(_F32),
+    "f16_lebytes": _by_bytes(_F16),
     "r8": _R8,
     "r8_delta": _by_differences(_R8),
     "s8": _S8,
     "s8_delta": _by_differences(_S8),
     "ln_0r8": _by_table(splat_encoding.encode_log_scale, splat_encoding.log_scale_table),
     "ln_f16": PropertyCoding(
-        lambda values, low, high: _plain("<f2").encode(_encode_log(values, low, high), low, high), _decode_log_f16
+        lambda values, low, high: _plain("<f2").encode(_encode_log(values, low, high), low, high), _decode_log_f16, 2
     ),
-    "oct88r8": PropertyCoding(_encode_octahedral, _decode_octahedral),
+    "oct88r8": PropertyCoding(_encode_octahedral, _decode_octahedral, 1),
     "u16": _plain("<u2"),
     "u32": _plain("<u4"),
 }
+
+
+class Row(NamedTuple):
+    """A property.
+
+    Attributes:
+        name: in the file.
+        option: the field of `RadOptions` that chooses its encoding; empty where there is no choice.
+        column: of `Splats` or `LodTree`; "labels" for those of the palette.
+        numbers: of a splat.
+        encodings: that it may be in; the first is the one that Spark writes.
+        degree: of spherical harmonics; 0 for what is none of them.
+        codes: whether it is a part of the palette of spherical harmonics, of which only the first chunk has one.
+    """
+
+    name: str
+    option: str
+    column: str
+    numbers: int
+    encodings: tuple[str, ...]
+    degree: int = 0
+    codes: bool = False
+
+
+#: In the order of a chunk.
+PROPERTIES = (
+    Row("center", "center", "center", 3, RAD_ENCODINGS["center"]),
+    Row("alpha", "alpha", "opacity", 1, RAD_ENCODINGS["alpha"]),
+    Row("rgb", "rgb", "rgb", 3, RAD_ENCODINGS["rgb"]),
+    Row("scales", "scales", "scale", 3, RAD_ENCODINGS["scales"]),
+    Row("orientation", "orientation", "quat_xyzw", 3, RAD_ENCODINGS["orientation"]),
+    Row("sh1", "sh", "sh", 9, RAD_ENCODINGS["sh"], 1),
+    Row("sh2", "sh", "sh", 15, RAD_ENCODINGS["sh"], 2),
+    Row("sh3", "sh", "sh", 21, RAD_ENCODINGS["sh"], 3),
+    Row("sh1_code", "sh", "sh", 9, RAD_ENCODINGS["sh"], 1, True),
+    Row("sh2_code", "sh", "sh", 15, RAD_ENCODINGS["sh"], 2, True),
+    Row("sh3_code", "sh", "sh", 21, RAD_ENCODINGS["sh"], 3, True),
+    Row("sh_label", "", "labels", 1, ("u16", "u32")),
+    Row("child_count", "", "child_count", 1, ("u16",)),
+    Row("child_start", "", "child_start", 1, ("u32",)),
+)
+
+BY_NAME = {row.name: row for row in PROPERTIES}
+
+
+def encodings_of(properties: Iterable[Property]) -> dict[str, str]:
+    """Return the encodings of a chunk's properties, by the field of `RadOptions`."""
+    return {BY_NAME[each.name].option: each.encoding for each in properties if BY_NAME[each.name].option}

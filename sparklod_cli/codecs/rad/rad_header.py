@@ -125,8 +125,8 @@ class Property:
     Attributes:
         offset: from the beginning of the payload.
         bytes: as stored.
-        name: one of `rad_layout.PROPERTIES`, as far as it is known.
-        encoding: one of `rad_layout.SIZES`, as far as it is known.
+        name: one of `property_codings.PROPERTIES`, as far as it is known.
+        encoding: one of `property_codings.CODINGS`, as far as it is known.
         compression: "gz" for a raw deflate stream, None for none.
         min, max: ends of the range of the codes; None where there is none.
     """

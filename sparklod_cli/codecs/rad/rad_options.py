@@ -13,11 +13,10 @@ from ...model.scene import Scene
 from ...model.sh import COEFFICIENTS
 from ...system.errors import FormatError
 from ..clamps import CodeRange
-from ..options import RadOptions, WriteOptions
+from ..options import AUTO, RAD_ENCODINGS, RadOptions, WriteOptions
 from ..splat_encoding import LARGEST_END, SCALE_ZERO, SplatEncoding
 from ..statistics import EXACT_BITS, LOWER, SMALL_QUANTILE, UPPER, Distribution, Statistics, fine_bits, tops
-from .property_codings import LARGEST_F16
-from .rad_layout import AUTO, OPTIONS, PROPERTIES, RANGES, Row
+from .property_codings import CODINGS, LARGEST_F16, PROPERTIES, Row
 
 #: What "auto" stands for, where the scene does not decide.
 AUTOMATIC = RadOptions("f32_lebytes", "r8", "r8", "ln_0r8", "oct88r8", "s8")
@@ -90,7 +89,7 @@ def settled(scene: Scene | Statistics, options: WriteOptions) -> WriteOptions:
             " choose another encoding of centres, such as f32"
         )
     ranges = rad.ranges or fitted(statistics)
-    encodings = {name: getattr(rad, name) for name in OPTIONS}
+    encodings = {name: getattr(rad, name) for name in RAD_ENCODINGS}
     chosen = {name: getattr(AUTOMATIC, name) if value == AUTO else value for name, value in encodings.items()}
     if rad.scales == AUTO and ranges.ln_scale_max - ranges.ln_scale_min > WIDE_LOG_RANGE:
         chosen["scales"] = "ln_f16"
@@ -131,7 +130,7 @@ def held(options: WriteOptions, sh_degree: int) -> list[CodeRange]:
             half = (high - low) / 508
             ends = math.exp(low - half), math.exp(min(high + half, 88.0))
             ranges.append(CodeRange(row.column, *ends, zero=float(SCALE_ZERO)))
-        elif encoding in RANGES:
+        elif encoding and CODINGS[encoding].ends:
             half = (high - low) / (508 if encoding.startswith("s8") else 510)
             ranges.append(CodeRange(row.column, low - half, high + half, numbers, degree=row.degree))
         elif encoding in ("f16", "f16_lebytes"):

@@ -26,7 +26,7 @@ from ..quantize import Bytes, quat_of_xyz
 from ..reader import OpenCompanion, OpenFile, Reader, Target, size_of
 from ..validation import RuleViolation, check_rules, error_of
 from . import rad_rules
-from .property_codings import CODINGS
+from .property_codings import BY_NAME, CODINGS, Row, encodings_of
 from .rad_header import (
     Files,
     Property,
@@ -39,7 +39,6 @@ from .rad_header import (
     read_chunk_header,
     read_header,
 )
-from .rad_layout import BY_NAME, SIZES, Row, encodings_of
 from .rad_rules import broken
 
 
@@ -435,7 +434,7 @@ class PackedChunk:
 
     def unpacked(self, each: Property, row: Row, count: int) -> Bytes:
         """Return the bytes of a property; raises `FormatError` as `values`."""
-        expected = count * row.numbers * SIZES[each.encoding]
+        expected = count * row.numbers * CODINGS[each.encoding].size
         data = self.payload[each.offset : each.offset + each.bytes]
         subject = f"{each.name} of chunk {self.number:,}"
         if each.compression is not None:

@@ -10,8 +10,8 @@ from ...model.lod_tree import CHUNK_NODES
 from ...system.untrusted import quoted_value
 from ..quantize import LARGEST
 from ..validation import RuleViolation
+from .property_codings import BY_NAME, CODINGS, PROPERTIES, Row
 from .rad_header import ALIGNMENT, GZ, Property, RadChunkEntry, RadChunkHeader, RadHeader, padding
-from .rad_layout import BY_NAME, PROPERTIES, RANGES, Row
 
 #: Meaning of each code; the text of a violation has the values. Other formats break some of
 #: these rules, too: their codes are "container.cut-short", "container.trailing" and "container.version".
@@ -243,13 +243,13 @@ def _encodings(each: Property, subject: str) -> Iterator[RuleViolation]:
     if each.encoding not in row.encodings:
         known = ", ".join(row.encodings)
         yield broken("encoding", f"{subject} is in {quoted_value(each.encoding)}; it may be in {known}")
-    ends = {"min": each.min, "max": each.max}
-    for key in RANGES.get(each.encoding, ()):
-        value = ends[key]
+    ends = CODINGS[each.encoding].ends if each.encoding in CODINGS else ()
+    for key in ends:
+        value = getattr(each, key)
         if value is None or abs(value) > float(LARGEST):
             yield broken("encoding", f"{subject} is in {each.encoding}, but its {key} is {quoted_value(value)}")
             return
-    low = each.min if "min" in RANGES.get(each.encoding, ()) else 0.0
-    if each.encoding in RANGES and low is not None and each.max is not None and not low < each.max:
+    low = each.min if "min" in ends else 0.0
+    if ends and low is not None and each.max is not None and not low < each.max:
         text = f"{subject} is in {each.encoding}, but its max, {each.max:g}, is not above {low:g}"
         yield broken("encoding", text, fatal=False)

@@ -15,8 +15,8 @@ import pytest
 
 from fixtures import by_hand_rad
 from sparklod_cli.codecs.rad import codec as rad
+from sparklod_cli.codecs.rad.property_codings import CODINGS
 from sparklod_cli.codecs.rad.rad_header import read_header
-from sparklod_cli.codecs.rad.rad_layout import RANGES
 from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.system.errors import FormatError, PromiseError
 from tests.codecs.sog.test_damaged import VALUES, places_of, replaced
@@ -166,7 +166,7 @@ def test_a_label_beyond_the_palette_is_named() -> None:
 
 def test_a_range_that_float32_cannot_hold_is_refused_without_a_warning() -> None:
     fields = json.loads(PARTS["0.json"])
-    ranged = next(number for number, each in enumerate(fields["properties"]) if each["encoding"] in RANGES)
+    ranged = next(number for number, each in enumerate(fields["properties"]) if CODINGS[each["encoding"]].ends)
     text = json.dumps(replaced(fields, ("properties", ranged, "max"), 1e39)).encode()
     with pytest.raises(FormatError, match=r"its max is 1e\+39$"):
         decode_file(rad, io.BytesIO(by_hand_rad.joined(PARTS | {"0.json": text}, PARTS)))

@@ -10,9 +10,8 @@ import pytest
 from numpy.typing import NDArray
 
 from fixtures import by_hand_rad
-from sparklod_cli.codecs.options import RadOptions
-from sparklod_cli.codecs.rad.property_codings import CODINGS, LARGEST_F16
-from sparklod_cli.codecs.rad.rad_layout import PROPERTIES, RANGES, SIZES, choices
+from sparklod_cli.codecs.options import AUTO, RAD_ENCODINGS, RadOptions
+from sparklod_cli.codecs.rad.property_codings import CODINGS, LARGEST_F16, PROPERTIES
 from tests.codecs.test_quantize import rotation_degrees
 from tests.scenes import random_splats
 
@@ -59,13 +58,13 @@ def test_an_encoding_has_the_bytes_that_spark_reads(
     assert encoded(name, values, low, high) == expected
 
 
-@pytest.mark.parametrize("name", [name for name in SIZES if name not in ("oct88r8", "u16", "u32")])
+@pytest.mark.parametrize("name", [name for name in CODINGS if name not in ("oct88r8", "u16", "u32")])
 @pytest.mark.parametrize("numbers", [1, 3, 15])
 def test_bytes_are_those_of_the_writer_by_hand_and_come_back(name: str, numbers: int) -> None:
     rng = np.random.default_rng(4)
     values = np.exp(rng.normal(-2, 0.5, (700, numbers))).astype(np.float32)
     data = encoded(name, values, -1.5, 1.5)
-    assert len(data) == values.size * SIZES[name]
+    assert len(data) == values.size * CODINGS[name].size
     ours, theirs = (np.frombuffer(each, np.uint8) for each in (data, by_hand_rad.encoded(values, name, -1.5, 1.5)))
     # Logarithms and quotients in float64 decide some ties in another way.
     assert np.count_nonzero(ours != theirs) <= (0 if name[0] == "f" else 0.002 * ours.size)
@@ -102,23 +101,22 @@ def test_what_float16_cannot_hold_becomes_its_largest_number(name: str) -> None:
     assert decoded(name, encoded(name, values), 1, 3).tolist() == [[LARGEST_F16, LARGEST_F16, -LARGEST_F16]]
 
 
-@pytest.mark.parametrize("name", [name for name in SIZES if name not in ("u16", "u32")])
+@pytest.mark.parametrize("name", [name for name in CODINGS if name not in ("u16", "u32")])
 def test_any_bytes_and_any_range_are_decoded_without_a_warning(name: str) -> None:
     rng = np.random.default_rng(6)
     numbers = 3
     for low, high in ((0, 0), (1, -1), (-3e38, 3e38), (1e-45, 2e-45)):
-        data = rng.bytes(1000 * numbers * SIZES[name])
+        data = rng.bytes(1000 * numbers * CODINGS[name].size)
         with np.errstate(all="raise", under="ignore"):
             assert decoded(name, data, 1000, numbers, low, high).shape[0] == 1000
 
 
 @pytest.mark.parametrize("option", ["center", "alpha", "rgb", "scales", "orientation", "sh"])
 def test_every_choice_of_an_option_has_a_coding(option: str) -> None:
-    assert choices(option)[0] == "auto" == getattr(RadOptions(), option)
-    assert set(choices(option)[1:]) <= CODINGS.keys() == SIZES.keys()
+    assert AUTO == "auto" == getattr(RadOptions(), option)
+    assert set(RAD_ENCODINGS[option]) <= CODINGS.keys()
 
 
 def test_every_property_can_be_in_an_encoding() -> None:
     assert all(row.encodings and set(row.encodings) <= CODINGS.keys() for row in PROPERTIES)
-    assert RANGES.keys() <= CODINGS.keys()
     assert len({row.name for row in PROPERTIES}) == len(PROPERTIES)

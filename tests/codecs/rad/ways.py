@@ -12,11 +12,10 @@ from fixtures import (
     by_hand_rad,
 )
 from sparklod_cli.codecs import spark_codings
-from sparklod_cli.codecs.options import RadOptions, WriteOptions
+from sparklod_cli.codecs.options import RAD_ENCODINGS, RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import codec as rad
 from sparklod_cli.codecs.rad.property_codings import LARGEST_F16
 from sparklod_cli.codecs.rad.rad_header import ENCODING_KEYS
-from sparklod_cli.codecs.rad.rad_layout import choices
 from sparklod_cli.codecs.rad.rad_options import HALF
 from sparklod_cli.codecs.splat_encoding import SplatEncoding
 from sparklod_cli.model.scene import Scene
@@ -132,13 +131,13 @@ def written_rad_precision(source: Scene, options: RadOptions) -> Precision:
 
 def rad_encodings(number: int) -> RadOptions:
     """The n-th encoding of each property; where it has fewer, they are repeated."""
-    return RadOptions(**{name: known[number % len(known)] for name in SMALL_RAD for known in [choices(name)[1:]]})
+    return RadOptions(**{name: known[number % len(known)] for name in SMALL_RAD for known in [RAD_ENCODINGS[name]]})
 
 
 RAD_OPTIONS = {
     "auto": RadOptions(),
     "chunked": RadOptions(chunked=True),
-    **{f"encodings {number}": rad_encodings(number) for number in range(len(choices("sh")) - 1)},
+    **{f"encodings {number}": rad_encodings(number) for number in range(len(RAD_ENCODINGS["sh"]))},
 }
 
 RAD = BY_HAND_RAD | {

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from sparklod_cli.codecs import spz
-from sparklod_cli.codecs.options import RadOptions, WriteOptions
+from sparklod_cli.codecs.options import RAD_ENCODINGS, RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import codec as rad
-from sparklod_cli.codecs.rad import rad_layout
 from sparklod_cli.codecs.rad.rad_header import read_chunk_header, read_header
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quick
@@ -194,9 +193,9 @@ def test_a_tree_is_refused_where_nothing_is_to_be_converted(tmp_path: Path, caps
     assert names(tmp_path) == ["many-0.radc", "many.rad", "tree.rad"]
 
 
-@pytest.mark.parametrize("name", rad_layout.OPTIONS)
+@pytest.mark.parametrize("name", RAD_ENCODINGS)
 def test_every_encoding_reaches_the_file_and_the_report(name: str, tmp_path: Path, capsys: Capture) -> None:
-    for encoding in rad_layout.choices(name)[1:]:
+    for encoding in RAD_ENCODINGS[name]:
         output = tmp_path / f"{encoding}.rad"
         assert build(SMALL, "-o", output, f"--rad-{name}", encoding, "--json") == 0
         assert json.loads(capsys.readouterr().out)["encodings"][name] == encoding
