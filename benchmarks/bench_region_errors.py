@@ -20,7 +20,7 @@ from sparklod_cli.bake import region_errors
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.lod import quality
 from sparklod_cli.lod.detail_levels import detail_cuts, make
-from sparklod_cli.lod.detail_rule import DetailSettings
+from sparklod_cli.lod.part_settings import DetailSettings
 from sparklod_cli.model.gaussian import covariance
 from sparklod_cli.model.traversed import DetailScene
 from sparklod_cli.render import rasterizer

@@ -42,8 +42,8 @@ if TYPE_CHECKING:  # mypy then resolves the modules first, which import this one
     from .codecs.splat_encoding import SplatEncoding as SplatEncoding
     from .fitting.settings import FitSettings as FitSettings
     from .inspection.report import Report as Report
-    from .lod.detail_rule import DetailRule as DetailRule
-    from .lod.detail_rule import DetailSettings as DetailSettings
+    from .lod.part_settings import DetailSettings as DetailSettings
+    from .lod.settings import DetailRule as DetailRule
     from .lod.settings import LodSettings as LodSettings
     from .model.foveation import Cones as Cones
     from .model.foveation import Frustum as Frustum

@@ -11,8 +11,7 @@ import pytest
 
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.lod.budget import Budget, parse_budget
-from sparklod_cli.lod.detail_rule import BUDGET, DetailRule
-from sparklod_cli.lod.settings import LodSettings
+from sparklod_cli.lod.settings import PLAYCANVAS_BUDGET, DetailRule, LodSettings
 from sparklod_cli.model.foveation import Cones
 from sparklod_cli.model.instances import Instance
 from sparklod_cli.model.scene import Scene
@@ -80,8 +79,8 @@ def test_budgets_are_shares_of_full_detail_or_the_default_of_playcanvas(row: Det
     scenes = scenes_of(row)
     assert scenes.splats_of(parse_budget("50%")) == (6 * 64 + 5) // 2
     default = replace(Budget.of_count(7), by_default=True)
-    assert scenes.splats_of(default) == BUDGET
-    assert scenes.splats_of(default.scaled(0.5)) == BUDGET // 2
+    assert scenes.splats_of(default) == PLAYCANVAS_BUDGET
+    assert scenes.splats_of(default.scaled(0.5)) == PLAYCANVAS_BUDGET // 2
     assert scenes_of(Scene(row.splats)).splats_of(default) == 7
 
 

@@ -18,8 +18,7 @@ from ..cameras.frame import MAX_FRAMES, Settings, direction_of
 from ..cameras.sources import CameraPath, Orbit, read_path, similarity
 from ..codecs.formats import PRECISIONS
 from ..images import metrics
-from ..lod import detail_rule
-from ..lod.settings import BLEND, LodSettings
+from ..lod.settings import BLEND, PLAYCANVAS_BUDGET, LodSettings
 from ..model.instances import Instance, names_of
 from ..model.scene import Scene
 from ..model.traversed import DetailScene
@@ -288,7 +287,7 @@ def _lod(
     scenes: Scenes, budget: BudgetLike | None, settings: LodSettings | None, continuous: bool | float
 ) -> LodSettings:
     if settings is None:
-        settings = LodSettings(detail_rule.BUDGET) if scenes.details else LodSettings()
+        settings = LodSettings(PLAYCANVAS_BUDGET) if scenes.details else LodSettings()
     if budget is not None:
         if scenes.tiled:
             raise ValueError(f"{scenes.tiled[0].name} is 3D Tiles, which CesiumJS draws without a budget; leave it out")

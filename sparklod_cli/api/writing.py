@@ -20,7 +20,7 @@ from .files import OF_FILES, pack
 
 if TYPE_CHECKING:
     from ..codecs.options import RadOptions, SogOptions, WriteOptions
-    from ..lod.detail_rule import DetailSettings
+    from ..lod.part_settings import DetailSettings
     from ..system.progress import Progress
 
 
@@ -92,7 +92,7 @@ def write(
     from ..codecs.options import RadOptions, SogOptions, WriteOptions
     from ..codecs.splat_encoding import SplatEncoding
     from ..codecs.validation import check_valid
-    from ..lod.detail_rule import DetailSettings
+    from ..lod.part_settings import DetailSettings
 
     path, count = file_path(path), thread_count(threads)
     form = None if encoding is not None else WRITABLE.get(ending_of(path.name))

@@ -9,8 +9,7 @@ import numpy as np
 
 from ..codecs.formats import ENVIRONMENT, folders_of
 from ..codecs.options import WriteOptions
-from ..lod.detail_rule import DetailSettings
-from ..lod.tile_settings import TileSettings
+from ..lod.part_settings import DetailSettings, TileSettings
 from ..model.scene import Scene
 from ..model.splats import Splats
 from ..model.traversed import DetailScene, TileScene

@@ -16,8 +16,7 @@ from ..io.reading import Merged as Merged
 from ..io.reading import Source as Source
 from ..lod.budget import Budget
 from ..lod.builders import DEFAULT_BASE, DEFAULT_GROWTH, METHODS
-from ..lod.detail_rule import DetailSettings
-from ..lod.tile_settings import TileSettings
+from ..lod.part_settings import DetailSettings, TileSettings
 from ..model import MAX_SH_DEGREE
 from ..model.axes import line, rotated
 from ..model.scene import NodeStream, Scene
@@ -119,11 +118,12 @@ class BakeSettings:
 
     def up_of(self, found: str | None) -> str | None:
         """Return the axis of the output that points up, for that of the input."""
-        return rotated(self.up or found, self.transform.rotation)
+        up = self.up or found
+        return rotated(up, self.transform.rotation) if up else None
 
     def notes_on(self, source: Scene | Reader) -> tuple[str, ...]:
         """Return notes on an input for the user: its own, and on its up axis if a specification names that."""
-        return source.notes + (line(source.up, source.up_by) if self.up is None else ())
+        return source.notes + (line(source.up, source.up_by) if source.up and self.up is None else ())
 
 
 @dataclass(frozen=True)

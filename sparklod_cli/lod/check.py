@@ -12,6 +12,9 @@ from ..system.errors import InvalidSplatsError
 from ..system.threads import BLOCK_ROWS, threads_for
 from .kernels.geometry import find_bounds
 
+#: Message on splats without an opacity or a size, whose selection keeps them by mistake.
+INVISIBLE = "a splat is without opacity or scale: see Selection.apply"
+
 
 @dataclass(frozen=True)
 class Bounds:
@@ -48,11 +51,6 @@ def check(splats: Splats) -> Bounds:
         raise InvalidSplatsError("no splat is left to build a tree of")
     with threads_for(len(splats)):
         bounds = Bounds.of(splats)
-    check_visible(bounds.smallest, float(splats.opacity.min()))
+    if not (bounds.smallest > 0 and splats.opacity.min() > 0):
+        raise InvalidSplatsError(INVISIBLE)
     return bounds
-
-
-def check_visible(smallest: float, faintest: float = 1.0) -> None:
-    """Raise `InvalidSplatsError` where the least size, or the least opacity, of splats is 0."""
-    if not (smallest > 0 and faintest > 0):
-        raise InvalidSplatsError("a splat is without opacity or scale: see Selection.apply")

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from .detail_rule import DetailRule
+from .settings import DetailRule
 
 if TYPE_CHECKING:
     from .traversal import CutView

@@ -22,8 +22,8 @@ from ..model.lod_tree import LodTree
 from ..model.splats import Splats
 from ..model.traversed import DetailScene
 from ..system.progress import Progress, silent
-from .detail_rule import DetailSettings
 from .kernels.tree_links import find_parents
+from .part_settings import DetailSettings
 from .regions import divide, extents, united
 
 #: Without given shares, each level has this share of the splats of the level before. A viewer goes one level coarser

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..model.splats import Splats
 from ..model.traversed import DetailScene
 from .detail_choice import Chains, Distances, Distant, Levels, RegionBounds, choose
-from .detail_rule import LEAST_BASE_DISTANCE, DetailRule
+from .settings import LEAST_BASE_DISTANCE, DetailRule
 from .traversal import CutView, SplatForest, TreeCut, TreeInstance, views_of
 
 #: Priorities of files, whole numbers: for regions of which nothing is drawn, for those at another level, and for what

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..model.gaussian import rotation_matrices
 from ..model.splats import FloatArray, Splats
 from ..system.errors import InvalidSplatsError
-from .detail_rule import DetailSettings
+from .part_settings import DetailSettings
 
 #: Half a bound's side for one splat, in standard deviations. Tools bound a splat by the box of one standard deviation
 #: along its own axes, rotated; no multiple of the ellipsoid's box below sqrt(3) encloses that box however it is turned.

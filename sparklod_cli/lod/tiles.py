@@ -17,8 +17,8 @@ from ..model.splats import FloatArray, Splats
 from ..model.traversed import TileScene
 from ..system.progress import Progress, silent
 from .detail_levels import STEP, Nodes, RefinementOrder, owners_of, with_plain_opacity
+from .part_settings import TileSettings
 from .regions import extents, united
-from .tile_settings import TileSettings
 
 #: Geometric error of a splat in its feature sizes: pixels of error that CesiumJS allows unless told otherwise
 #: (`maximumScreenSpaceError`), so that a splat is refined where it is larger than a pixel.

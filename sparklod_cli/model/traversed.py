@@ -1,4 +1,4 @@
-"""What viewers traverse: the nodes of trees, regions at several detail levels, and hierarchies of tiles."""
+"""Scenes as viewers traverse them: the nodes of trees, regions at several detail levels, and hierarchies of tiles."""
 
 from __future__ import annotations
 

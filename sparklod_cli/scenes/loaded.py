@@ -10,11 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..codecs.formats import PRECISIONS
-from ..lod import detail_rule
 from ..lod.budget import Budget
 from ..lod.continuous import faded
 from ..lod.detail_traversal import DetailForest, DetailTraversal
-from ..lod.settings import LodSettings
+from ..lod.settings import PLAYCANVAS_BUDGET, LodSettings
 from ..lod.tile_traversal import TileForest, TileTraversal
 from ..lod.traversal import Forest, Traversal, TreeCut, TreeInstance
 from ..model.axes import common, lines_of, rotated
@@ -194,7 +193,7 @@ class Scenes:
 
     def splats_of(self, budget: Budget) -> int:
         if budget.by_default and self.details:
-            budget = replace(budget, count=detail_rule.BUDGET)
+            budget = replace(budget, count=PLAYCANVAS_BUDGET)
         if self.tiled:  # CesiumJS has no budget
             return max(1, self.leaves)
         return budget.of(self.leaves if budget.share is not None else 0)

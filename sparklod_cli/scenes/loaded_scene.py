@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..codecs.gpu import loaded_nodes, lod_tree
-from ..lod import detail_rule, tile_settings
 from ..lod.detail_traversal import DetailFiles
+from ..lod.settings import CESIUM_FETCHERS, CONNECTIONS, PLAYCANVAS_FETCHERS
 from ..model.lod_tree import CHUNK_NODES, LodTree
 from ..model.scene import FileCoding, Scene, facts_of
 from ..model.splats import COLUMNS, Splats
@@ -163,8 +163,8 @@ class LoadedDetail(LoadedRuns):
         files: where its splats are.
     """
 
-    fetchers = detail_rule.FETCHERS
-    connections = detail_rule.CONNECTIONS
+    fetchers = PLAYCANVAS_FETCHERS
+    connections = CONNECTIONS
 
     detail: DetailScene = field(kw_only=True)
     files: DetailFiles = field(kw_only=True)
@@ -204,7 +204,7 @@ class LoadedDetail(LoadedRuns):
 class LoadedTiles(LoadedRuns):
     """A scene of tiles; `scene` and `splats` have those of all tiles."""
 
-    fetchers = tile_settings.FETCHERS
+    fetchers = CESIUM_FETCHERS
 
     tiles: TileScene = field(kw_only=True)
 

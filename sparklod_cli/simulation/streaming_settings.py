@@ -6,8 +6,7 @@ import math
 from dataclasses import dataclass, field
 from typing import ClassVar
 
-from ..lod import detail_rule, tile_settings
-from ..lod.settings import FETCHERS
+from ..lod.settings import CESIUM_FETCHERS, FETCHERS, PLAYCANVAS_FETCHERS
 from ..system.setting_fields import CheckedSettings, Quantity, Range, setting, whole
 from ..system.units import parse_bandwidth, parse_time
 
@@ -35,8 +34,8 @@ class Network(CheckedSettings):
     )
     fetchers: int | None = setting(
         None,
-        f"Number of chunks that are fetched at a time.  [default: {FETCHERS}; {detail_rule.FETCHERS} of Streamed SOG,"
-        f" {tile_settings.FETCHERS} of 3D Tiles]",
+        f"Number of chunks that are fetched at a time.  [default: {FETCHERS}; {PLAYCANVAS_FETCHERS} of Streamed SOG,"
+        f" {CESIUM_FETCHERS} of 3D Tiles]",
         whole(1, 1000),
         needs="bandwidth",
     )

@@ -12,8 +12,7 @@ from sparklod_cli.bake.settings import BakeSettings, Resources, SimplifyGoal
 from sparklod_cli.codecs.options import RadOptions, SogOptions, WriteOptions
 from sparklod_cli.fitting.settings import FitSettings
 from sparklod_cli.lod.budget import parse_budget
-from sparklod_cli.lod.detail_rule import DetailSettings
-from sparklod_cli.lod.tile_settings import TileSettings
+from sparklod_cli.lod.part_settings import DetailSettings, TileSettings
 from tests.conftest import FIXTURES
 
 CODES = WriteOptions(rad=RadOptions(sh_codes=64), sog=SogOptions(64))

@@ -22,7 +22,7 @@ from sparklod_cli.codecs.streamed_sog.manifest_rules import ERRORS, WARNINGS
 from sparklod_cli.inspection.report import Report, ReportSettings, inspect
 from sparklod_cli.io import parts_output, read_parts
 from sparklod_cli.lod import detail_levels, quick
-from sparklod_cli.lod.detail_rule import DetailSettings
+from sparklod_cli.lod.part_settings import DetailSettings
 from sparklod_cli.system.errors import FormatError
 from tests.inspection.streamed_sog_files import COUNTS, Folder, Node, folder, regions, splats
 from tests.inspection.test_schema import faults as schema_faults

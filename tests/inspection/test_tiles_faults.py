@@ -20,7 +20,7 @@ from sparklod_cli.codecs.tiles_3d.tileset_rules import ERRORS, WARNINGS
 from sparklod_cli.inspection.report import Report, ReportSettings, inspect
 from sparklod_cli.io import parts_output
 from sparklod_cli.lod import quality
-from sparklod_cli.lod.tile_settings import TileSettings
+from sparklod_cli.lod.part_settings import TileSettings
 from sparklod_cli.lod.tiles import make
 from sparklod_cli.model.scene import Scene
 from tests.codecs.cases import linear

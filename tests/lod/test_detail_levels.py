@@ -22,8 +22,8 @@ from sparklod_cli.lod.detail_levels import (
     shares_of,
     with_plain_opacity,
 )
-from sparklod_cli.lod.detail_rule import DetailSettings
 from sparklod_cli.lod.kernels.tree_links import find_parents
+from sparklod_cli.lod.part_settings import DetailSettings
 from sparklod_cli.model.gaussian import covariance, spark_size
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.splats import COLUMNS, Splats

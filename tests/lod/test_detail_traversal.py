@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from sparklod_cli.lod.detail_choice import Chains
-from sparklod_cli.lod.detail_rule import DetailRule
 from sparklod_cli.lod.detail_traversal import (
     ANOTHER_LEVEL,
     ENVIRONMENT,
@@ -14,6 +13,7 @@ from sparklod_cli.lod.detail_traversal import (
     DetailFiles,
     loading,
 )
+from sparklod_cli.lod.settings import DetailRule
 
 #: Three regions at three levels; the last has no level 1. Each level is a file, and the environment the fourth.
 COUNTS = np.array([[40, 20, 10], [40, 20, 10], [40, 0, 10]])

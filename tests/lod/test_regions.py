@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from sparklod_cli.lod.detail_rule import DetailSettings
+from sparklod_cli.lod.part_settings import DetailSettings
 from sparklod_cli.lod.regions import EXTENT, beyond, divide, extents, middle_of, united
 from sparklod_cli.model.gaussian import covariance, rotation_matrices
 from sparklod_cli.model.splats import Splats

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quality, tiles
+from sparklod_cli.lod.part_settings import TileSettings
 from sparklod_cli.lod.settings import pixel_limit
-from sparklod_cli.lod.tile_settings import TileSettings
 from sparklod_cli.lod.tile_traversal import TileForest, TileTraversal, choose
 from sparklod_cli.lod.traversal import CutView, TreeInstance
 from sparklod_cli.model.traversed import TileScene

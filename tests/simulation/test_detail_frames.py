@@ -12,8 +12,7 @@ import pytest
 
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.cameras.sources import CameraPath
-from sparklod_cli.lod.detail_rule import DetailRule
-from sparklod_cli.lod.settings import LodSettings
+from sparklod_cli.lod.settings import DetailRule, LodSettings
 from sparklod_cli.model.instances import Instance
 from sparklod_cli.scenes.finder import CutFinder
 from sparklod_cli.scenes.loaded import Scenes

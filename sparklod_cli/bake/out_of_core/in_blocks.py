@@ -16,11 +16,12 @@ from ...codecs.encoder import Encoder, Windows
 from ...codecs.reader import Reader
 from ...codecs.statistics import Statistics
 from ...lod.builders import BUILDERS
-from ...lod.check import Bounds, check_visible
+from ...lod.check import INVISIBLE, Bounds
 from ...lod.stage_records import NO_FAMILY, Pending
 from ...model.selection import REASONS, SelectionTally
 from ...model.sh import width_of
 from ...model.splats import FloatArray, Splats
+from ...system.errors import InvalidSplatsError
 from ...system.progress import Progress
 from ...system.threads import blocks_of, on_threads
 from ..in_memory import check_transformed, select, transform
@@ -161,7 +162,8 @@ class InBlocks:
             summary = InputSummary.merged(parts)
             job.settings.selection.check(summary.tally)
             check_transformed(summary.beyond)
-            check_visible(summary.bounds.smallest)
+            if not summary.bounds.smallest > 0:
+                raise InvalidSplatsError(INVISIBLE)
             selected = tuple(itertools.accumulate((part.tally.selected for part in parts), initial=0))
             self.job = job = dataclasses.replace(job, selected=selected)
             largest = int(np.sum([np.diff(each["first"]) for each in arrays], axis=0).max())

@@ -173,7 +173,7 @@ TOGETHER = 2
 
 
 class Divided(Protocol):
-    """Division of a scene into regions, for the manifest; `lod.detail_rule.DetailSettings` is one."""
+    """Division of a scene into regions, for the manifest; `lod.part_settings.DetailSettings` is one."""
 
     @property
     def chunk_splats(self) -> int:

@@ -25,8 +25,7 @@ from ...lod.builders import (
     MIN_BASE,
     MIN_GROWTH,
 )
-from ...lod.detail_rule import DetailSettings
-from ...lod.tile_settings import TileSettings
+from ...lod.part_settings import DetailSettings, TileSettings
 from ...model import MAX_SH_DEGREE, UP_AXES
 from ...system.addresses import Place
 from ...system.setting_fields import Quantity, Range, setting_of, whole

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import click
 
 from ...codecs.formats import PRECISIONS
-from ...lod import detail_rule
-from ...lod.settings import BLEND, FACTOR, PRESETS, LodSettings
+from ...lod.settings import BLEND, FACTOR, PLAYCANVAS_BUDGET, PRESETS, DetailRule, LodSettings
 from ...model.foveation import BEHIND_FOVEATE, CONE_FOV, CONE_FOV0, CONE_FOVEATE, Cones, Foveation, Frustum
 from ...simulation.streaming_settings import Network, StreamingSettings
 from ...system.printable import printable
@@ -45,7 +44,7 @@ NODES = (
 CUTS = ("budget", "preset", "lod_splat_scale", *NODES)
 
 #: Options for Streamed SOG alone, and options of loading, without which all chunks are resident.
-DETAIL = parameters_of(detail_rule.DetailRule)
+DETAIL = parameters_of(DetailRule)
 LOADING = ("after", "bandwidth", "latency", "fetchers", "chunk_cache")
 
 #: Angles of cones, and weights of nodes where 1 is that of nodes in the middle.
@@ -110,7 +109,7 @@ class CutOptions:
     budget: tuple[Budget, ...] | None = _budget_option("N|P%")
     preset: str | None = option(
         "Budget of a device: Spark 2's, or that of Spark's LoD design with preview-desktop and mobile."
-        f"  [default: {DEFAULT_PRESET}; for Streamed SOG PlayCanvas's, {detail_rule.BUDGET:,} splats]",
+        f"  [default: {DEFAULT_PRESET}; for Streamed SOG PlayCanvas's, {PLAYCANVAS_BUDGET:,} splats]",
         tuple(PRESETS),
     )
     lod_splat_scale: float = option("Factor by which the budget is multiplied.", Range(above=0), 1.0)

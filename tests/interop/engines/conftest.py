@@ -20,7 +20,7 @@ from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.codecs.streamed_sog import codec
 from sparklod_cli.io import parts_output, read_scene
 from sparklod_cli.lod import detail_levels, quality
-from sparklod_cli.lod.detail_rule import DetailSettings
+from sparklod_cli.lod.part_settings import DetailSettings
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.model.traversed import DetailScene
 from tests.conftest import FIXTURES

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli.lod.detail_choice import Chains, Distant, RegionBounds, choose
-from sparklod_cli.lod.detail_rule import DetailRule
+from sparklod_cli.lod.settings import DetailRule
 from sparklod_cli.lod.traversal import CutView
 from tests.interop.node import Node
 from tests.lod.details import Regions, random_regions, random_view
