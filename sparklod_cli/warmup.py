@@ -242,7 +242,7 @@ class CompileAhead:
         if self._left and jit.CACHE_FOLDER is not None:
             self._process = CompilingProcess(self._taken(), jit.CACHE_FOLDER.parent.resolve())
             self._thread = threading.Thread(target=self._run, args=(self._process,), daemon=True)
-            jit.claim_by(self.claim)
+            jit.before_first_call = self.claim
             self._thread.start()
 
     @property
@@ -257,7 +257,7 @@ class CompileAhead:
 
     def close(self) -> None:
         if self._process is not None:
-            jit.claim_by(None)
+            jit.before_first_call = None
             self._process.stop()
             self._thread.join()
 

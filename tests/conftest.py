@@ -76,7 +76,7 @@ def _refuse_undeclared_types() -> None:
     import numba
 
     from sparklod_cli.system import jit
-    from sparklod_cli.system.jit_types import as_declared
+    from sparklod_cli.system.jit import as_declared
 
     call = jit.Kernel.__call__
     allowed = set()

@@ -54,16 +54,16 @@ def test_kernels_that_are_not_claimed_are_compiled_by_another_process(several_pr
     mine = several_processors[0]
     ahead = CompileAhead(several_processors, ["few"], "drawable.count_doubtful")
     try:
-        jit.claim(mine.kernel)  # as Python calls it, before the other process has come to it, or after
+        ahead.claim(mine.kernel)  # as Python calls it, before the other process has come to it, or after
         others = {unit.name for unit in several_processors} - {mine.name, "drawable.count_doubtful"}
         for unit in several_processors:
             if unit.name in others:
-                jit.claim(unit.kernel)
+                ahead.claim(unit.kernel)
         left = {unit.name for unit in warmup.missing()}
         assert "drawable.count_doubtful" in left
     finally:
         ahead.close()
-    assert jit._claim is None
+    assert jit.before_first_call is None
     assert ahead.compiled == len(several_processors) - len(warmup.missing())
 
 
@@ -73,7 +73,7 @@ def test_a_kernel_that_is_being_compiled_is_waited_for(several_processors: list[
         ahead._changed.wait_for(lambda: ahead._current is not None)
         unit = ahead._current
     assert unit is not None
-    jit.claim(unit.kernel)
+    ahead.claim(unit.kernel)
     assert unit.is_cached
     ahead.close()
 

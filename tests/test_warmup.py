@@ -142,7 +142,7 @@ def test_a_command_that_compiles_says_how_many_kernels_a_warmup_would(
     kernel = few[0].kernel
     with Console(quiet=False, verbose=False) as console:
         console.announce_compiling()
-        again = jit.Kernel(kernel.py_func, kernel.options, kernel.declared)
+        again = jit.Kernel(kernel.py_func, kernel.declared, ranges=kernel.ranges, options=kernel.options)
         again.dispatcher.compile(again.signatures[0])
     first, last = capsys.readouterr().err.splitlines()
     assert first.startswith("Compiling kernels for this machine")

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import functools
 import os
+import re
 import sys
 import warnings
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from .jit_types import as_declared, example
+import numpy as np
+
 from .kernel_cache import Trouble, cache_folders
 from .threads import MOST_THREADS, run_ranges
 
@@ -23,6 +25,9 @@ Done = Callable[[float], None]
 #: The folder for compiled code, None if none can be written; folders of compiled code that is only read; and messages
 #: on folders that are not used.
 CACHE_FOLDER, READ_FOLDERS, DISTRUSTED = cache_folders(Path(__file__))
+
+#: Whether the environment asks numba to compile nothing.
+DISABLED = bool(re.fullmatch("[+-]?0*[1-9][0-9]*", os.environ.get("NUMBA_DISABLE_JIT", "").strip()))
 
 #: File of settings that numba reads in the current folder.
 SETTINGS = Path(".numba_config.yaml")
@@ -37,14 +42,67 @@ def prefetch(array: Any, index: int) -> None:
 
 
 @dataclass(frozen=True)
-class Options:
-    """Compilation options of a kernel; see `kernel`."""
+class Type:
+    """Declared type of an argument: `f4` is a number, `f4[:]` and `f4[:, :]` are C-contiguous arrays, only read.
 
-    ranges: bool
-    nogil: bool
-    inline: bool
-    inline_late: bool
-    contract: bool
+    Attributes:
+        dtype: numpy's.
+        axes: number of axes of an array; 0 for a number.
+    """
+
+    dtype: np.dtype[Any]
+    axes: int = 0
+
+    def __getitem__(self, axes: slice | tuple[slice, ...]) -> Type:
+        return replace(self, axes=len(axes) if isinstance(axes, tuple) else 1)
+
+
+@dataclass(frozen=True)
+class out:  # noqa: N801 - it stands in signatures, as f4 does
+    """Declared type of an argument whose arrays a kernel writes to: `out(f4[:])`, or `out` of a NamedTuple."""
+
+    declared: Any
+
+
+b1, u1, u2, u4, u8 = (Type(np.dtype(code)) for code in ("?", "u1", "u2", "u4", "u8"))
+i2, i4, i8, f4, f8 = (Type(np.dtype(code)) for code in ("i2", "i4", "i8", "f4", "f8"))
+
+
+def fields(*types: Any) -> Callable[[Any], Any]:
+    """Decorate a NamedTuple with the types of its fields, so that its name can stand in signatures."""
+
+    def declare(kind: Any) -> Any:
+        kind.kernel_types = types
+        return kind
+
+    return declare
+
+
+def example(declared: Any, *, writeable: bool = False) -> Any:
+    """Return an argument of a declared type, with empty arrays: what numba takes the types of a signature from."""
+    if isinstance(declared, out):
+        return example(declared.declared, writeable=True)
+    if not isinstance(declared, Type):
+        return declared(*(example(each, writeable=writeable) for each in declared.kernel_types))
+    if not declared.axes:
+        return declared.dtype.type(0)
+    array = np.empty((0,) * declared.axes, declared.dtype)
+    array.flags.writeable = writeable
+    return array
+
+
+def as_declared(declared: Any, argument: Any) -> Any:
+    """Return an argument with arrays that are only read as read-only views, so that numba compiles for one type."""
+    if isinstance(declared, out):
+        return argument
+    if not isinstance(declared, Type):
+        if not isinstance(argument, declared):
+            return argument
+        return declared(*map(as_declared, declared.kernel_types, argument))
+    if declared.axes and isinstance(argument, np.ndarray) and argument.flags.writeable:
+        argument = argument.view(np.ndarray)
+        argument.flags.writeable = False
+    return argument
 
 
 class Kernel:
@@ -52,19 +110,28 @@ class Kernel:
 
     Args:
         function: the Python function.
-        options: how to compile it.
         declared: the types that Python calls it with, for each signature, see `kernel`.
+        ranges: Python calls it for ranges of rows, see `kernel`.
+        options: keyword arguments of `numba.njit`.
 
     Attributes:
-        py_func: the Python function.
-        options: how to compile it.
-        declared: the types that Python calls it with.
+        py_func, declared, ranges, options: as above.
+        has_wrapper: numba's dispatcher that other kernels call also has the code that makes it callable from Python.
+            That takes as long to compile as many a kernel, so kernels that Python does not call have none.
         inner, built: numba's dispatchers that kernels and Python call, see `jit_numba`; None until they are needed.
     """
 
-    def __init__(self, function: Callable[..., Any], options: Options, declared: Sequence[Sequence[Any]] = ()) -> None:
+    def __init__(
+        self,
+        function: Callable[..., Any],
+        declared: Sequence[Sequence[Any]] = (),
+        *,
+        ranges: bool = False,
+        options: Mapping[str, Any] | None = None,
+    ) -> None:
         functools.update_wrapper(self, function)
-        self.py_func, self.options, self.declared = function, options, declared
+        self.py_func, self.declared, self.ranges, self.options = function, declared, ranges, options or {}
+        self.has_wrapper = bool(declared) and not ranges
         self.inner: Any = None
         self.built: Any = None
 
@@ -74,7 +141,7 @@ class Kernel:
             if len(arguments) != len(types):
                 raise TypeError(f"{self.py_func.__name__} takes {len(types)} arguments but {len(arguments)} were given")
             arguments = tuple(map(as_declared, types, arguments))
-        if self.options.ranges:
+        if self.ranges:
             return run_ranges(self.dispatcher, *arguments)
         return self.dispatcher(*arguments)
 
@@ -92,7 +159,7 @@ class Kernel:
         load_numba()
         import numba
 
-        first = (numba.int64,) if self.options.ranges else ()  # a range has two ends, its number of rows is declared
+        first = (numba.int64,) if self.ranges else ()  # a range has two ends, its number of rows is declared
         return [(*first, *(numba.typeof(example(each)) for each in types)) for types in self.declared]
 
 
@@ -109,8 +176,8 @@ def kernel(
     Without fastmath, because results must not depend on the number of threads. Machine code is cached in the
     package, or in the user's cache directory if the package is read-only; if neither is writable, every run compiles.
 
-    A kernel that Python calls declares the types of its arguments, see `jit_types`: numbers `i8`, arrays `f4[:, :]`
-    that it reads, arrays `out(f4[:])` that it writes to, and NamedTuples of them with `jit_types.fields`. It is
+    A kernel that Python calls declares the types of its arguments, see `Type`: numbers `i8`, arrays `f4[:, :]`
+    that it reads, arrays `out(f4[:])` that it writes to, and NamedTuples of them with `fields`. It is
     compiled for these, by `sparklod warmup` or when it is first called. Where it only reads, arrays may be read-only.
 
     Args:
@@ -125,27 +192,18 @@ def kernel(
             them, rather than a function apart that was optimized without knowing them.
         contract: allows fused multiply-add, which rounds once instead of twice, on processors that have it.
     """
-    options = Options(ranges, nogil or ranges, inline, inline_late, contract)
     signatures = types if not types or isinstance(types[0], tuple) else (types,)
-
-    def decorate(function: Callable[..., Any]) -> Any:
-        if not _is_disabled():
-            return Kernel(function, options, signatures)
-        if not signatures:  # only kernels call it
-            return function
+    if DISABLED:
         from .interpreted import interpreted
 
-        return interpreted(function, ranges)
-
-    return decorate
-
-
-def _is_disabled() -> bool:
-    """Return True if the environment asks numba to compile nothing."""
-    try:
-        return bool(int(os.environ.get("NUMBA_DISABLE_JIT") or 0))
-    except ValueError:
-        return False
+        return functools.partial(interpreted, ranges=ranges) if signatures else lambda function: function
+    options = {
+        "nogil": nogil or ranges,
+        "inline": "always" if inline else "never",
+        "forceinline": inline_late or ranges,
+        "fastmath": {"contract"} if contract else False,
+    }
+    return functools.partial(Kernel, declared=signatures, ranges=ranges, options=options)
 
 
 def check_numba_settings() -> None:
@@ -207,22 +265,9 @@ def load_numba() -> ModuleType:
     return jit_numba
 
 
-# Another process that compiles kernels, and who is told of compilations and of a cache that does not work
-
-_claim: Callable[[Kernel], None] | None = None
-
-
-def claim_by(claim: Callable[[Kernel], None] | None) -> None:
-    """Call a function before each kernel is loaded or compiled that Python calls for the first time; None for none."""
-    global _claim
-    _claim = claim
-
-
-def claim(kernel: Kernel) -> None:
-    """Have no other process compile a kernel."""
-    if _claim is not None:
-        _claim(kernel)
-
+#: Called with each kernel that Python calls for the first time, before it is loaded or compiled, so that no other
+#: process compiles it, too; None for nothing.
+before_first_call: Callable[[Kernel], None] | None = None
 
 _listeners: list[tuple[Begun, Done, Trouble]] = []
 

@@ -15,8 +15,7 @@ import numba
 import numpy as np
 from numba import cuda
 
-from .jit import Kernel
-from .jit_types import Type, out
+from .jit import Kernel, Type, out
 
 #: True if numba simulates a card: NUMBA_ENABLE_CUDASIM=1.
 SIMULATED = bool(numba.config.ENABLE_CUDASIM)
@@ -37,7 +36,7 @@ class CudaKernel:
 
     Attributes:
         py_func: the Python function.
-        declared: the types of its arguments, see `jit_types`.
+        declared: the types of its arguments, see `jit.Type`.
     """
 
     def __init__(self, function: Callable[..., Any], declared: Sequence[Any]) -> None:

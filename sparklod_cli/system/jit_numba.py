@@ -41,10 +41,11 @@ def dispatcher_of(kernel: jit.Kernel) -> Any:
     with _lock:
         if kernel.built is None:
             inner = _inner_of(kernel)
-            kernel.built = inner if _has_wrapper(kernel) else _calling(inner, kernel.py_func)
+            kernel.built = inner if kernel.has_wrapper else _calling(inner, kernel.py_func)
             if kernel.declared:
                 _keep(kernel.built, kernel.py_func)
-                jit.claim(kernel)
+                if jit.before_first_call is not None:
+                    jit.before_first_call(kernel)
         return kernel.built
 
 
@@ -55,32 +56,25 @@ def _inner_of(kernel: jit.Kernel) -> Any:
     Nothing is replaced in the modules themselves, since other threads may be calling their functions.
     """
     if kernel.inner is None:
-        options, function = kernel.options, kernel.py_func
+        function: Any = kernel.py_func
         namespace = function.__globals__.setdefault(_NAMESPACE, {})
+        cells = tuple(CellType(_known(cell.cell_contents)) for cell in function.__closure__ or ())
+        copy = FunctionType(function.__code__, namespace, function.__name__, function.__defaults__, cells)
+        copy.__module__, copy.__qualname__ = function.__module__, function.__qualname__
+        copy.__kwdefaults__ = function.__kwdefaults__
         decorate: Any = numba.njit(
             error_model="numpy",
-            nogil=options.nogil,
-            inline="always" if options.inline else "never",
-            forceinline=options.inline_late or options.ranges,
-            fastmath={"contract"} if options.contract else False,
             no_cfunc_wrapper=True,
-            no_cpython_wrapper=not _has_wrapper(kernel),
-            pipeline_class=_ApartCompiler if options.ranges else Compiler,
+            no_cpython_wrapper=not kernel.has_wrapper,
+            pipeline_class=_ApartCompiler if kernel.ranges else Compiler,
+            **kernel.options,
         )
-        kernel.inner = decorate(_copy(function, namespace))
+        kernel.inner = decorate(copy)
         if not kernel.declared:
             _keep(kernel.inner, function)
         for name, value in list(function.__globals__.items()):
             namespace[name] = _known(value)
     return kernel.inner
-
-
-def _has_wrapper(kernel: jit.Kernel) -> bool:
-    """Return whether the dispatcher that other kernels call has code that makes it callable from Python.
-
-    That code takes as long to compile as many a kernel, so those have none that Python does not call.
-    """
-    return bool(kernel.declared) and not kernel.options.ranges
 
 
 def _keep(dispatcher: Any, function: Callable[..., Any]) -> None:
@@ -96,16 +90,6 @@ class _ApartCompiler(Compiler):
         """Return numba's pipelines."""
         self.state.flags.noalias = True
         return super().define_pipelines()
-
-
-def _copy(function: Callable[..., Any], namespace: dict[str, Any]) -> FunctionType:
-    """Return a copy of a function with other globals, and with what numba knows in its closure."""
-    assert isinstance(function, FunctionType)
-    cells = tuple(CellType(_known(cell.cell_contents)) for cell in function.__closure__ or ())
-    copy = FunctionType(function.__code__, namespace, function.__name__, function.__defaults__, cells)
-    copy.__module__, copy.__qualname__ = function.__module__, function.__qualname__
-    copy.__kwdefaults__ = function.__kwdefaults__
-    return copy
 
 
 def _calling(compiled: Any, function: Callable[..., Any]) -> Any:
@@ -156,8 +140,7 @@ class _OnCompile(event.Listener):
     Python looks for garbage only afterwards: a compiler's millions of live objects make that a tenth of the time.
     """
 
-    def __init__(self) -> None:
-        self._depth, self._since, self._collects = 0, 0.0, False
+    _depth, _since, _collects = 0, 0.0, False
 
     def on_start(self, event: event.Event) -> None:
         self._depth += 1  # numba compiles on one thread at a time

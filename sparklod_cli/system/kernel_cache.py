@@ -13,9 +13,9 @@ import pickle
 import re
 import stat
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 PACKAGE = Path(__file__).parents[1]
 
@@ -49,61 +49,39 @@ _IMPORT = re.compile(rb"^from (\.+)([\w.]*) import (\([^)]*\)|[^\n#]*)", re.MULT
 
 
 @functools.cache
-def sources_of(path: Path) -> frozenset[Path]:
+def sources_of(path: Path) -> Mapping[Path, bytes]:
     """Return the sources that the kernels of a module depend on: its own, and those of all that it imports."""
-    sources: set[Path] = set()
-    left = {path}
-    while left:
-        sources |= left
-        left = {imported for each in left for imported in _imports(each)} - sources
-    return frozenset(sources)
-
-
-@functools.cache
-def _imports(path: Path) -> frozenset[Path]:
-    """Return the sources of what a module of the package imports from it."""
-    sources = set()
-    for dots, module, names in _IMPORT.findall(_content(path)):
+    content = path.read_bytes() if path.is_file() else b""
+    sources = {path: content}
+    for dots, module, names in _IMPORT.findall(content):
         base = path.parents[len(dots) - 1].joinpath(*module.decode().split(".") if module else ())
-        sources.add(base.with_suffix(".py"))
-        sources |= {base / f"{name.decode()}.py" for name in re.findall(rb"\w+", names)}
-    return frozenset(path for path in sources if path.is_file())
+        modules = base.with_suffix(".py"), *(base / f"{name.decode()}.py" for name in re.findall(rb"\w+", names))
+        for imported in modules:
+            if imported.is_file():
+                sources |= sources_of(imported)
+    return sources
 
 
-@functools.cache
-def _content(path: Path) -> bytes:
-    return path.read_bytes() if path.is_file() else b""
-
-
-def digest_of(paths: Iterable[Path]) -> str:
+def digest_of(sources: Mapping[Path, bytes]) -> str:
     """Return a digest of the content of some sources."""
-    return hashlib.sha256(b"".join(_content(path) for path in sorted(paths))).hexdigest()[:16]
+    return hashlib.sha256(b"".join(content for _, content in sorted(sources.items()))).hexdigest()[:16]
 
 
-class CacheFolders(NamedTuple):
-    """Folders for compiled code.
-
-    Attributes:
-        written: where new code is stored, and read first; None if no folder can be written.
-        read: folders that can be read only, such as those of a read-only image.
-        distrusted: a message for each folder that other users can write, which is not used.
-    """
-
-    written: Path | None
-    read: tuple[Path, ...] = ()
-    distrusted: tuple[str, ...] = ()
-
-
-def cache_folders(source: Path) -> CacheFolders:
+def cache_folders(source: Path) -> tuple[Path | None, tuple[Path, ...], tuple[str, ...]]:
     """Return the folders for compiled code, and create the one for new code.
 
     They are in NUMBA_CACHE_DIR or, where that is not set, in the package and in the user's cache directory.
 
     Args:
         source: module that compiles. The name of the folders is a digest of it and of all that it imports.
+
+    Returns:
+        the folder where new code is stored, which is read first; None if no folder can be written;
+        folders that can be read only, such as those of a read-only image;
+        a message for each folder that other users can write, which is not used.
     """
     if not source.is_file():
-        return CacheFolders(None)  # in a zip: there is no source to make a digest of
+        return None, (), ()  # in a zip: there is no source to make a digest of
     given = os.environ.get("NUMBA_CACHE_DIR")
     places = [Path(given)] if given else [PACKAGE / "__pycache__"]
     if not given:
@@ -114,15 +92,16 @@ def cache_folders(source: Path) -> CacheFolders:
         folder = place / f"kernels-{digest_of(sources_of(source))}"
         with contextlib.suppress(OSError):
             place.mkdir(parents=True, exist_ok=True)
-            folder.mkdir(SHARED if _user() == 0 else OWN, exist_ok=True)
+            is_superuser = hasattr(os, "geteuid") and os.geteuid() == 0
+            folder.mkdir(SHARED if is_superuser else OWN, exist_ok=True)
         with contextlib.suppress(OSError):
             if not is_trusted(folder.stat()):
                 distrusted.append(_distrusting(folder))
             elif os.access(folder, os.W_OK):
-                return CacheFolders(folder, tuple(read), tuple(distrusted))
+                return folder, tuple(read), tuple(distrusted)
             else:
                 read.append(folder)
-    return CacheFolders(None, tuple(read), tuple(distrusted))
+    return None, tuple(read), tuple(distrusted)
 
 
 def _distrusting(folder: Path) -> str:
@@ -132,18 +111,14 @@ def _distrusting(folder: Path) -> str:
     )
 
 
-def _user() -> int | None:
-    """Return the number of the user; None on systems where files have no owners."""
-    return os.geteuid() if hasattr(os, "geteuid") else None
-
-
 def is_trusted(status: os.stat_result) -> bool:
     """Return True if only this user, the superuser or the owner of the package can have written a file or folder.
 
     The owner of the package need not be distrusted, as its code runs anyway.
     """
-    user = _user()
-    return user is None or (status.st_uid in (0, user, PACKAGE.stat().st_uid) and not status.st_mode & OTHERS)
+    if not hasattr(os, "geteuid"):  # a system where files have no owners
+        return True
+    return status.st_uid in (0, os.geteuid(), PACKAGE.stat().st_uid) and not status.st_mode & OTHERS
 
 
 def stem_of(function: Callable[..., Any]) -> str:
@@ -174,20 +149,13 @@ def _machine() -> str:
             features = ""
     variables = {key: value for key, value in os.environ.items() if key.startswith("NUMBA_") and key not in NEUTRAL}
     host = binding.get_process_triple(), name, features
-    return _digest(host, sorted(variables.items()), numba.__version__, sys.version)
-
-
-def _digest(*values: Any) -> str:
-    return hashlib.blake2b(repr(values).encode(), digest_size=8).hexdigest()
+    described = repr((host, sorted(variables.items()), numba.__version__, sys.version))
+    return hashlib.blake2b(described.encode(), digest_size=8).hexdigest()
 
 
 def is_whole(content: bytes) -> bool:
     """Return True if the content of a file matches its checksum."""
-    return content[:CHECKSUM] == _checksum(content[CHECKSUM:])
-
-
-def _checksum(content: bytes) -> bytes:
-    return hashlib.blake2b(content, digest_size=CHECKSUM).digest()
+    return content[:CHECKSUM] == hashlib.blake2b(content[CHECKSUM:], digest_size=CHECKSUM).digest()
 
 
 class KernelCache:
@@ -215,7 +183,8 @@ class KernelCache:
 
     def name(self, signature: Any) -> str:
         """Return the name of the file for a signature, which is a tuple of numba's types."""
-        return f"{start_of(self._function)}-{_digest(str(signature))}{SUFFIX}"
+        digest = hashlib.blake2b(repr((str(signature),)).encode(), digest_size=8).hexdigest()
+        return f"{start_of(self._function)}-{digest}{SUFFIX}"
 
     def _found(self, signature: Any) -> tuple[Path, bytes] | None:
         """Return the first file for a signature that can be read and trusted, and its content."""
@@ -265,7 +234,8 @@ class KernelCache:
         path, content = self._folder / self.name(signature), dumps(compiled._reduce())
         try:
             path.parent.mkdir(OWN, parents=True, exist_ok=True)  # another process may have removed it
-            atomic.write(path, [_checksum(content), content], overwrite=True)
+            checksum = hashlib.blake2b(content, digest_size=CHECKSUM).digest()
+            atomic.write(path, [checksum, content], overwrite=True)
         except OSError as error:
             reason = (error.strerror or str(error)).lower()
             self._trouble(f"cannot cache compiled code in {path.parent} ({reason}); it is compiled in every run")

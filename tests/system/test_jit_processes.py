@@ -22,7 +22,7 @@ import os, signal, sys, threading, time, warnings
 import numpy as np
 from sparklod_cli.system import jit
 from sparklod_cli.system.jit import kernel
-from sparklod_cli.system.jit_types import f8, i8, out
+from sparklod_cli.system.jit import f8, i8, out
 from sparklod_cli.system.threads import on_threads, threads_in_use
 
 @kernel(i8, f8[:], out(f8[:]), ranges=True)

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from sparklod_cli.system import atomic, jit, kernel_cache
-from sparklod_cli.system.jit_types import f8
+from sparklod_cli.system.jit import f8
 from sparklod_cli.system.kernel_cache import SUFFIX, cache_folders, is_trusted, is_whole, start_of
 from sparklod_cli.warmup import units
 from tests.conftest import ROOT
@@ -102,7 +102,7 @@ posix = pytest.mark.skipif(os.name != "posix", reason="POSIX only")
 @pytest.mark.parametrize("mode", [0o777, 0o775, 0o707])
 def test_a_folder_that_others_can_write_is_not_used(mode: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    folder = cache_folders(Path(jit.__file__)).written
+    folder = cache_folders(Path(jit.__file__))[0]
     assert folder is not None
     folder.chmod(mode)
     written, read, (message,) = cache_folders(Path(jit.__file__))
@@ -168,7 +168,7 @@ def test_a_cache_that_can_only_be_read_is_read(cache: Cache, monkeypatch: pytest
 @posix
 def test_a_folder_that_cannot_be_written_is_read_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    folder = cache_folders(Path(jit.__file__)).written
+    folder = cache_folders(Path(jit.__file__))[0]
     assert folder is not None
     monkeypatch.setattr(os, "access", lambda path, mode: False)
     assert cache_folders(Path(jit.__file__)) == (None, (folder,), ())

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...system.jit import kernel
-from ...system.jit_types import f4
+from ...system.jit import f4, kernel
 
 #: The largest finite float32.
 LARGEST = np.finfo(np.float32).max

@@ -13,8 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...system.jit import kernel
-from ...system.jit_types import f4, f8, i4, i8, out, u4, u8
+from ...system.jit import f4, f8, i4, i8, kernel, out, u4, u8
 
 #: Rows that a cell's direction is found from, spaced evenly over its members. Measured: 8,192 gain nothing.
 SAMPLE = 2048

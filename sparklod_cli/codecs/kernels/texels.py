@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...system.jit import kernel
-from ...system.jit_types import f4, i8, out, u1, u4
+from ...system.jit import f4, i8, kernel, out, u1, u4
 
 _BYTE = np.uint32(255)
 _8, _16, _24 = np.uint32(8), np.uint32(16), np.uint32(24)

@@ -7,8 +7,8 @@ from numba import cuda
 
 from ...render.kernels.backward import CENTER, LOD_OPACITY, LOG_SCALE, RGB, TURN
 from ...render.kernels.shade import sh_gradient_of
+from ...system.jit import f4, f8, i4, out, u2
 from ...system.jit_cuda import cuda_kernel
-from ...system.jit_types import f4, f8, i4, out, u2
 from ..kernels.adam import Columns, FitBounds, Gradients, Moments, Rates, size_of, step_of
 from ..kernels.view import by_pixel, differences
 

@@ -7,8 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...model import gaussian
-from ...system.jit import kernel
-from ...system.jit_types import f4, fields, i4, i8, out
+from ...system.jit import f4, fields, i4, i8, kernel, out
 
 f32 = np.float32
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...render.kernels.ellipse import Lens, Limits
-from ...system.jit import kernel
-from ...system.jit_types import b1, f4, f8, i8, out, u2
+from ...system.jit import b1, f4, f8, i8, kernel, out, u2
 
 f32 = np.float32
 

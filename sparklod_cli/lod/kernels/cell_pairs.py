@@ -16,8 +16,7 @@ import math
 import numpy as np
 
 from ...system.fast_math import exp2
-from ...system.jit import kernel
-from ...system.jit_types import b1, f4, i8, out, u4
+from ...system.jit import b1, f4, i8, kernel, out, u4
 from .geometry import ellipsoid_area
 from .pair_cost import COVARIANCE, COVERED, DENSITY, LOG_DET, NEVER, WEIGHT, WIDTH, log_det, pair_costs
 from .pair_merge import semi_axes

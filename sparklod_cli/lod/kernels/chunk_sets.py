@@ -16,8 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...system.jit import kernel
-from ...system.jit_types import f8, fields, i4, i8, out, u1
+from ...system.jit import f8, fields, i4, i8, kernel, out, u1
 from .pixel_scale import NODES, VIEWS, ZERO, pixel_scale
 from .sort import AXIS_BITS, interleave
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...system.jit import kernel, prefetch
-from ...system.jit_types import f4, out
+from ...system.jit import f4, kernel, out, prefetch
 from .cut_arrays import (
     BASE,
     BUCKET_BITS,

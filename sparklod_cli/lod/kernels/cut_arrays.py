@@ -6,8 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...system.jit import kernel
-from ...system.jit_types import b1, fields, i4, i8, u2, u4
+from ...system.jit import b1, fields, i4, i8, kernel, u2, u4
 from .pixel_scale import INFINITE, NODES, VIEWS, pixel_scale
 
 #: Buckets of pixel scales: the upper half of a float32's bits. A bucket is at most 0.8 % wide, and any number has one.

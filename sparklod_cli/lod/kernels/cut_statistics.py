@@ -7,8 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...model.falloff import DRAWN_AREA
-from ...system.jit import kernel, prefetch
-from ...system.jit_types import f4, f8, fields, i4, i8, out, u2, u4
+from ...system.jit import f4, f8, fields, i4, i8, kernel, out, prefetch, u2, u4
 from .cut_arrays import BUCKET_BITS, BUCKETS, LEAF, CutNodes
 from .pixel_scale import NEAREST, NODES, ONE, VIEWS, ZERO
 

@@ -15,8 +15,7 @@ import numpy as np
 
 from ...model import gaussian
 from ...model.gaussian import THOMSEN_P
-from ...system.jit import kernel
-from ...system.jit_types import f4, f8, fields, i8, out
+from ...system.jit import f4, f8, fields, i8, kernel, out
 
 #: The largest float32, world units: centres and scales of merged splats are clamped to it.
 LARGEST = float(np.finfo(np.float32).max)

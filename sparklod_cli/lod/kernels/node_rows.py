@@ -12,8 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...system.jit import kernel, prefetch
-from ...system.jit_types import f4, f8, fields, i8, out, u2, u4, u8
+from ...system.jit import f4, f8, fields, i8, kernel, out, prefetch, u2, u4, u8
 from .geometry import LARGEST, ROWS, SCALE_FLOOR, SplatColumns, covariance, decompose, ellipsoid_area
 from .pair_cost import CENTER, COLOR, COVARIANCE, COVERED, DENSITY, LOG_DET, WEIGHT, log_det
 from .profile import is_needle, profile_of

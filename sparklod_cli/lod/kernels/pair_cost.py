@@ -12,8 +12,7 @@ import math
 import numpy as np
 
 from ...system.fast_math import log2
-from ...system.jit import kernel
-from ...system.jit_types import f4, i4, i8, out, u4
+from ...system.jit import f4, i4, i8, kernel, out, u4
 
 f32 = np.float32
 

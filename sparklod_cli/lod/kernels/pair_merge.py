@@ -14,8 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...system.jit import kernel
-from ...system.jit_types import f4, i8, out, u4
+from ...system.jit import f4, i8, kernel, out, u4
 from .geometry import ellipsoid_area
 from .pair_cost import CENTER, COLOR, COVARIANCE, COVERED, DENSITY, LOG_DET, WEIGHT, WIDTH, log_det
 from .profile import NEEDLE, is_needle, profile_of, size_factor

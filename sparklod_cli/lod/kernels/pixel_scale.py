@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...system.jit import kernel
-from ...system.jit_types import Type, f4, i8, out
+from ...system.jit import Type, f4, i8, kernel, out
 
 #: A node as the traversal reads it; child indices are relative to its own tree. Siblings are adjacent, so that
 #: a node's children share a few cache lines.

@@ -14,8 +14,7 @@ import math
 
 import numpy as np
 
-from ...system.jit import kernel
-from ...system.jit_types import f4, f8, i4, i8, out, u2, u4
+from ...system.jit import f4, f8, i4, i8, kernel, out, u2, u4
 
 #: Size steps per octave, and octaves: all of float32's, 2^-128 to 2^128. Steps chosen.
 STEPS, OCTAVES = 4, 256

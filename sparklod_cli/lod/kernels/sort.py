@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...model.splats import FloatArray
-from ...system.jit import kernel
-from ...system.jit_types import f4, f8, i4, i8, out, u4, u8
+from ...system.jit import f4, f8, i4, i8, kernel, out, u4, u8
 from .pair_cost import CENTER
 
 Keys = NDArray[np.uint64]

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...system.jit import kernel
-from ...system.jit_types import b1, f4, f8, i4, i8, out, u2, u4
+from ...system.jit import b1, f4, f8, i4, i8, kernel, out, u2, u4
 from .geometry import ellipsoid_area
 
 #: Links followed per node at most. A tree has fewer than one; in a broken tree nodes may share children, so that links

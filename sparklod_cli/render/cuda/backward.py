@@ -10,9 +10,8 @@ import numpy as np
 from numba import cuda
 
 from ...model.falloff import MIN_ALPHA, merged_slopes, plain_slopes
-from ...system.jit import kernel
+from ...system.jit import f4, f8, i2, i4, i8, kernel, out, u8
 from ...system.jit_cuda import SIMULATED, cuda_kernel
-from ...system.jit_types import f4, f8, i2, i4, i8, out, u8
 from .. import rasterizer
 from ..kernels.backward import (
     BY_BLUE,

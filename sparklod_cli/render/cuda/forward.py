@@ -9,9 +9,8 @@ import numpy as np
 from numba import cuda
 
 from ...model.falloff import merged, plain, shifted
-from ...system.jit import kernel
+from ...system.jit import b1, f4, i2, i4, i8, kernel, out, u8
 from ...system.jit_cuda import cuda_kernel
-from ...system.jit_types import b1, f4, i2, i4, i8, out, u8
 from ..kernels.ellipse import Lens, Limits
 from ..kernels.project import (
     BLUE,

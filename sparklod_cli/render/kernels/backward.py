@@ -16,8 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...model.falloff import HALF_LOG2E, deviations_of, merged_slopes, plain_slopes
-from ...system.jit import kernel
-from ...system.jit_types import f4, fields, i2, i4, i8, out
+from ...system.jit import f4, fields, i2, i4, i8, kernel, out
 from .ellipse import MAX_D, Lens, Limits, in_camera, jacobian, per_world_unit, rotation_matrix, turned
 from .project import (
     ACROSS,

@@ -12,8 +12,7 @@ import numpy as np
 from ...model import gaussian
 from ...model.falloff import HALF_LOG2E, deviations_of, end_of
 from ...system.fast_math import log2
-from ...system.jit import kernel
-from ...system.jit_types import f4, fields
+from ...system.jit import f4, fields, kernel
 
 f32, f64 = np.float32, np.float64
 

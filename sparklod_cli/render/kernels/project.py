@@ -8,8 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...model import gaussian
-from ...system.jit import kernel
-from ...system.jit_types import b1, f4, fields, i2, i8, out, u8
+from ...system.jit import b1, f4, fields, i2, i8, kernel, out, u8
 from .ellipse import Lens, Limits, ellipse, on_screen, shortened
 
 f32 = np.float32

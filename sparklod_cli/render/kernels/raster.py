@@ -7,8 +7,7 @@ import math
 import numpy as np
 
 from ...model.falloff import alpha_at, merged, plain, shifted
-from ...system.jit import kernel, prefetch
-from ...system.jit_types import b1, f4, i2, i4, i8, out, u8
+from ...system.jit import b1, f4, i2, i4, i8, kernel, out, prefetch, u8
 from .project import (
     ACROSS,
     ALONG,

@@ -9,8 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...system.jit import kernel
-from ...system.jit_types import f4, f8, i8, out
+from ...system.jit import f4, f8, i8, kernel, out
 from .ellipse import Lens, Limits
 from .project import COLUMNS, TILE, ShadedColumns, project_splat, tiles_of
 from .raster import LANES, draw_tile

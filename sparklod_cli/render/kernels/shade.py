@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...model.sh import SH_C1, SH_C2, SH_C3
-from ...system.jit import kernel
-from ...system.jit_types import f4, i8, out
+from ...system.jit import f4, i8, kernel, out
 
 f32 = np.float32
 
