@@ -13,7 +13,7 @@ import zipfile
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
@@ -27,7 +27,7 @@ from ..system.threads import blocks_of, ordered_map
 from ..system.untrusted import quoted, quoted_value
 from . import quantize
 from .formats import ZIP
-from .reader import HARMLESS, OpenFile, Positioned, Reader, Target, left_out, size_of
+from .reader import HARMLESS, OpenFile, Reader, Target, left_out
 from .zip_folder import ZIP_ERRORS
 
 #: Bytes of data.pkl at most. That of nerfstudio, with the state of its optimisers, has some 50,000. Chosen.
@@ -85,12 +85,12 @@ class _StoredColumn:
     offset: int
     pitch: int
 
-    def read(self, file: Positioned, start: int, stop: int) -> FloatArray:
+    def read(self, source: OpenFile, start: int, stop: int) -> FloatArray:
         """Return the values of some splats, as float32."""
         if not self.type.itemsize or start == stop:
             return np.empty((stop - start, self.type.shape[0]), np.float32)
         size = (stop - start - 1) * self.pitch + self.type.itemsize
-        data = file.read(self.offset + start * self.pitch, size)
+        data = source.read_at(self.offset + start * self.pitch, size)
         if len(data) < size:
             raise TruncatedError(f"cut short inside its tensor {self.of.names[0]}")
         rows = np.ndarray(
@@ -105,7 +105,7 @@ def open_content(source: OpenFile) -> Reader:
     Raises:
         FormatError: the file is cut short or corrupt, has no splats, or tensors of other shapes or types.
     """
-    archive = _TensorArchive(source.file)
+    archive = _TensorArchive(source)
     root = archive.root()
     tensors, program = _tensors_of(root)
     missing = [each.names[program] for each in COLUMNS if each.names[program] not in tensors]
@@ -125,7 +125,6 @@ def open_content(source: OpenFile) -> Reader:
         stored.append(_StoredColumn(each, np.dtype((tensor.type, (values,))), offset, pitch))
     degree, known = COEFFICIENTS.index(values // 3), {each.names[program] for each in COLUMNS} | HARMLESS
     notes = notes_on_degree(degree) + left_out("tensor", "tensors", _others(root, known))
-    positioned = Positioned(source.file)
     # Without SH nerfstudio trains logits of colours.
     decode_plain = quantize.decode_logit if program and not degree else None
 
@@ -135,7 +134,7 @@ def open_content(source: OpenFile) -> Reader:
             for each in stored:
                 out = getattr(target.splats, each.of.column)[part]
                 decode = decode_plain if decode_plain and each.of.column == "rgb" else each.of.decode
-                values = each.read(positioned, target.start + part.start, target.start + part.stop)
+                values = each.read(source, target.start + part.start, target.start + part.stop)
                 out[...] = decode(values[:, : math.prod(out.shape[1:])]).reshape(out.shape)  # no SH above degree 3
             return part
 
@@ -185,10 +184,10 @@ class _TensorArchive:
         FormatError: it is no zip, or has several pickles or members of one name.
     """
 
-    def __init__(self, file: BinaryIO) -> None:
-        self._file, self._size = file, size_of(file)
+    def __init__(self, source: OpenFile) -> None:
+        self._file, self._size = source.file, source.size
         try:
-            self._zip = zipfile.ZipFile(file)
+            self._zip = zipfile.ZipFile(source.file)
             names = Counter(self._zip.namelist())
         except ZIP_ERRORS as error:
             raise FormatError(f"not a complete zip archive: {quoted(error)}") from None

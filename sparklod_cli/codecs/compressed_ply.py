@@ -16,7 +16,7 @@ from ..system.progress import Progress
 from ..system.units import count_of
 from . import quantize
 from .ply_header import PlyHeader, offset_of, read_header
-from .reader import HARMLESS, OpenFile, Positioned, Reader, Rows, Target, decode_rows, left_out, rows_of, size_of
+from .reader import HARMLESS, OpenFile, Reader, Rows, Target, decode_rows, left_out, rows_of
 
 #: Splats of a chunk, which share bounds.
 CHUNK_SPLATS = 256
@@ -38,15 +38,14 @@ def open_content(source: OpenFile) -> Reader:
     Raises:
         FormatError: the file is not compressed PLY, or cut short.
     """
-    size = size_of(source.file)
     header = read_header(source.file)
     count, coefficients = _checked(header)
-    trailing = header.check_size(size)
-    degree, file, elements = degree_of(coefficients), Positioned(source.file), _elements(source.file, header)
+    trailing = header.check_size(source.size)
+    degree, elements = degree_of(coefficients), _elements(source.file, header)
 
     def read(name: str, start: int, stop: int) -> Iterator[Rows]:
         offset, row_type, rows = elements[name]
-        return rows_of(file.read, offset, row_type, start, stop, rows)
+        return rows_of(source.read_at, offset, row_type, start, stop, rows)
 
     bounds = _bounds(read("chunk", 0, -(-count // CHUNK_SPLATS)))
 

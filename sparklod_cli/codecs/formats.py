@@ -11,7 +11,7 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import PurePath
-from typing import Any, BinaryIO, Literal, NamedTuple
+from typing import Any, BinaryIO, Literal
 
 from ..system.printable import printable
 from ..system.untrusted import keys_of_object
@@ -83,11 +83,6 @@ class Format:
     def codec(self) -> Any:
         """Import the module."""
         return import_module(f".{self.module}", __package__)
-
-    def begins(self, head: bytes, keys: Collection[str]) -> bool:
-        """Return True if a file is of this format by its first bytes, or by the `keys` of the object in them."""
-        by_bytes = self.beginning is not None and re.match(self.beginning, head, re.DOTALL) is not None
-        return by_bytes or (bool(self.keys) and set(self.keys) <= set(keys))
 
 
 #: The formats in the order in which they are tried: compressed PLY is PLY too. A .splat file begins with any float, a
@@ -200,9 +195,13 @@ def sniff(head: bytes, suffix: str) -> Format | None:
     else.
     """
     keys = _keys(head)
-    by_content = next((form for form in FORMATS if form.begins(head, keys)), None)
-    if by_content is not None or lookalike_of(head) is not None:
-        return by_content
+    for form in FORMATS:
+        if form.beginning is not None and re.match(form.beginning, head, re.DOTALL):
+            return form
+        if form.keys and set(form.keys) <= set(keys):
+            return form
+    if lookalike_of(head) is not None:
+        return None
     return next((form for form in FORMATS if form.unmarked and suffix.lower() in form.suffixes), None)
 
 
@@ -217,36 +216,25 @@ SHORT = 64
 FEW, QUOTED = 5, 100
 
 
-class Lookalike(NamedTuple):
-    """A kind of file that holds no splats, or none that are read.
-
-    Attributes:
-        text: what it is, and what to do, to stand after "not a splat file, but".
-        beginning: a regular expression that the first bytes match; None if any JSON object with the keys is one.
-        keys: that it has at the top level.
-    """
-
-    text: str
-    beginning: bytes | None = None
-    keys: tuple[str, ...] = ()
-
-
 _CAMERAS = "a file of cameras; give it as --camera-path"
 
-#: In the order in which they are tried.
-LOOKALIKES = (
-    Lookalike(POINTER, POINTED),
-    Lookalike("a web page, perhaps of a download that failed", rb"\s*<(?i:!doctype html|html)"),
-    Lookalike("a glTF without splats", keys=("asset", "nodes")),
-    Lookalike(_CAMERAS, keys=("frames",)),
-    Lookalike(_CAMERAS, keys=("cameras",)),
-    Lookalike(_CAMERAS, keys=("keyframes",)),
-    Lookalike(_CAMERAS, keys=("camera_path",)),
-    Lookalike("the manifest of an LCC scene; convert it to another format", keys=("totalLevel",)),
+#: Kinds of files that hold no splats, or none that are read, in the order in which they are tried: a description and
+#: advice, to follow "not a splat file, but"; a regular expression that the first bytes match, None if any JSON object
+#: with the keys is one; and the keys at the top level.
+LOOKALIKES: tuple[tuple[str, bytes | None, tuple[str, ...]], ...] = (
+    (POINTER, POINTED, ()),
+    ("a web page, perhaps of a download that failed", rb"\s*<(?i:!doctype html|html)", ()),
+    ("a glTF without splats", None, ("asset", "nodes")),
+    (_CAMERAS, None, ("frames",)),
+    (_CAMERAS, None, ("cameras",)),
+    (_CAMERAS, None, ("keyframes",)),
+    (_CAMERAS, None, ("camera_path",)),
+    ("the manifest of an LCC scene; convert it to another format", None, ("totalLevel",)),
     # Longer than two bytes, as a .splat or .hier file may begin with any number.
-    Lookalike(
+    (
         "a JSON list; if it holds cameras, give it as --camera-path",
         rb"(?:\xef\xbb\xbf)?\s*\[\s*\{\s*\"\w+\"\s*:",
+        (),
     ),
 )
 
@@ -254,11 +242,11 @@ LOOKALIKES = (
 def lookalike_of(head: bytes) -> str | None:
     """Return the text of a file of no known format by its first bytes; None if these tell nothing."""
     keys = _keys(head)
-    for each in LOOKALIKES:
-        if each.beginning is not None and re.match(each.beginning, head):
-            return each.text
-        if each.keys and set(each.keys) <= set(keys):
-            return each.text
+    for text, beginning, wanted in LOOKALIKES:
+        if beginning is not None and re.match(beginning, head):
+            return text
+        if wanted and set(wanted) <= set(keys):
+            return text
     if not keys:
         return None
     named = printable(", ".join(keys[:FEW]), QUOTED) + (", ..." if len(keys) > FEW else "")

@@ -21,7 +21,7 @@ from ..system.errors import FormatError, TruncatedError
 from ..system.progress import Progress
 from ..system.threads import BLOCK_ROWS, blocks_of, ordered_map
 from . import quantize
-from .reader import OpenFile, Positioned, Reader, Target, rows_of, size_of
+from .reader import OpenFile, Reader, Target, rows_of
 
 #: Before the columns, the number of splats, negative where numbers are halves; before the nodes, their number.
 COUNT = np.dtype("<i4")
@@ -94,18 +94,17 @@ def open_content(source: OpenFile) -> Reader:
     Raises:
         FormatError: the file is cut short, or its nodes name splats that are not there, or the same ones.
     """
-    size, file = size_of(source.file), Positioned(source.file)
-    count = _count(file, 0, size)
+    count = _count(source, 0)
     is_half, count = count < 0, abs(count)
     number, node = (np.dtype("<f2"), HALF_NODE) if is_half else (np.dtype("<f4"), NODE)
     types = [np.dtype(("<f4" if each.is_float else number, (each.numbers,))) for each in COLUMNS]
     starts = COUNT.itemsize + count * np.cumsum([0, *(each.itemsize for each in types)], dtype=np.int64)
     nodes_at = int(starts[-1])
-    nodes = _count(file, nodes_at, size)
+    nodes = _count(source, nodes_at)
     end = nodes_at + COUNT.itemsize + nodes * (node.itemsize + BOX_NUMBERS * number.itemsize)
-    if nodes < 0 or end > size:
+    if nodes < 0 or end > source.size:
         raise TruncatedError(f"cut short, or no .hier: it announces {count:,} splats in {nodes:,} nodes")
-    leaves = _leaves(file, nodes_at + COUNT.itemsize, node, nodes, count)
+    leaves = _leaves(source, nodes_at + COUNT.itemsize, node, nodes, count)
 
     def fill(target: Target, threads: int, progress: Progress) -> None:
         @np.errstate(over="ignore", invalid="ignore")  # whether numbers are valid is for others to say
@@ -114,7 +113,7 @@ def open_content(source: OpenFile) -> Reader:
             splats = target.splats.rows(slice(first, last))
             some = rows[first:last] - part.start
             for column, row_type, start in zip(COLUMNS, types, starts[:-1], strict=True):
-                between = rows_of(file.read, int(start), row_type, part.start, part.stop, count)
+                between = rows_of(source.read_at, int(start), row_type, part.start, part.stop, count)
                 values = np.concatenate([values for _, values in between])
                 column.put(splats, values[some].astype(np.float32))
             return target.start + int(last)
@@ -126,24 +125,24 @@ def open_content(source: OpenFile) -> Reader:
             for done in ordered_map(read, parts, threads):
                 progress("reading", done, len(leaves), "splat")
 
-    trailing = {"trailing_bytes": size - end}
+    trailing = {"trailing_bytes": source.size - end}
     return Reader(len(leaves), DEGREE, "HIER", fill, header=trailing, block=BLOCK_ROWS, concurrent=True)
 
 
-def _count(file: Positioned, at: int, size: int) -> int:
+def _count(source: OpenFile, at: int) -> int:
     """Return a number of splats or nodes."""
-    if at + COUNT.itemsize > size:
+    if at + COUNT.itemsize > source.size:
         raise TruncatedError("cut short, or no .hier: it has fewer splats than it announces")
-    return int(np.frombuffer(file.read(at, COUNT.itemsize), COUNT)[0])
+    return int(np.frombuffer(source.read_at(at, COUNT.itemsize), COUNT)[0])
 
 
-def _leaves(file: Positioned, at: int, node: np.dtype[Any], nodes: int, count: int) -> NDArray[np.int64]:
+def _leaves(source: OpenFile, at: int, node: np.dtype[Any], nodes: int, count: int) -> NDArray[np.int64]:
     """Return the splats of full detail, ascending: leaves of all nodes, and merged splats of nodes without children.
 
     Hierarchies that were cut to a chunk have nodes that lost their children.
     """
     runs = [np.empty((0, 2), np.int64)]
-    for _, some in rows_of(file.read, at, node, 0, nodes, nodes, "nodes"):
+    for _, some in rows_of(source.read_at, at, node, 0, nodes, nodes, "nodes"):
         start, leaves, merged, depth, children, first_child = (
             some[name].astype(np.int64) for name in ("start", "leaves", "merged", "depth", "children", "first_child")
         )

@@ -20,7 +20,7 @@ from ..system.errors import FormatError, TruncatedError, VersionError
 from ..system.progress import Progress
 from ..system.units import count_of
 from . import quantize
-from .reader import OpenFile, Positioned, Reader, Rows, Target, decode_rows, rows_of, size_of
+from .reader import OpenFile, Reader, Rows, Target, decode_rows, rows_of
 
 HEADER = np.dtype(
     {
@@ -111,14 +111,13 @@ def open_content(source: OpenFile) -> Reader:
         FormatError: the file is not KSPLAT, of an unknown version, level or SH degree, or cut short.
     """
     file = source.file
-    size = size_of(file)
     header = _read(file, HEADER, 1, "the header")[0]
     level, count = int(header["level"]), int(header["splats"])
     if header["major"] != 0 or header["minor"] < 1:
         raise VersionError(f"KSPLAT version {header['major']}.{header['minor']} is unknown, only 0.1 is read")
     if level >= len(LEVELS):
         raise VersionError(f"KSPLAT compression level {level} is unknown, only 0 to {len(LEVELS) - 1} are read")
-    sections = list(_read_sections(file, size, int(header["sections"]), level))
+    sections = list(_read_sections(file, source.size, int(header["sections"]), level))
     end = sections[-1].end if sections else HEADER.itemsize
     sections = [section for section in sections if section.count]
     firsts = [section.first for section in sections]
@@ -128,12 +127,10 @@ def open_content(source: OpenFile) -> Reader:
     degrees = [COEFFICIENTS.index(section.row_type["sh"].shape[0] // 3) for section in sections]
     low, high = header["least_sh"] or np.float32(-DEFAULT_SH), header["most_sh"] or np.float32(DEFAULT_SH)
 
-    positioned = Positioned(file)
-
     def rows(start: int, stop: int) -> Iterator[Rows]:
         for section in sections:
             first, last = max(start - section.first, 0), min(stop - section.first, section.count)
-            for part, some in rows_of(positioned.read, section.offset, section.row_type, first, last, section.count):
+            for part, some in rows_of(source.read_at, section.offset, section.row_type, first, last, section.count):
                 yield slice(section.first + part.start, section.first + part.stop), some
 
     @np.errstate(invalid="ignore", over="ignore")  # absurd numbers overflow
@@ -155,7 +152,7 @@ def open_content(source: OpenFile) -> Reader:
         some = rows(target.start, target.stop)
         decode_rows(some, lambda part, rows: unpack(part, rows, target.rows(part)), count, threads, progress)
 
-    facts = {"level": level, "sections": len(sections), "trailing_bytes": size - end}
+    facts = {"level": level, "sections": len(sections), "trailing_bytes": source.size - end}
     return Reader(count, max(degrees, default=0), "KSPLAT", fill, header=facts, concurrent=True)
 
 

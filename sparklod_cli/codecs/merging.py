@@ -22,7 +22,7 @@ from ..system.progress import Progress, silent
 from ..system.threads import ordered_map
 from ..system.units import count_of
 from ..system.untrusted import quoted_value
-from .reader import Fill, OpenCompanion, OpenFile, Reader, Target, size_of
+from .reader import Fill, OpenCompanion, OpenFile, Reader, Target
 from .validation import error_of
 
 
@@ -173,14 +173,13 @@ class SceneFiles:
             FormatError: it cannot be read, or is of another format; names it.
         """
         with self._opened(name) as source:
-            size = size_of(source.file)
             content = self.open_content(name, source)
         return Chunk(
             name,
             content.count,
             content.sh_degree,
             content.antialiased,
-            content.header.get("bytes", size),
+            content.header.get("bytes", source.size),
             (Piece(0, content.count, row),) if pieces is None else tuple(pieces),
             content.up,
             content.format,

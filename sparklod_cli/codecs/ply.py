@@ -7,11 +7,10 @@ from __future__ import annotations
 
 import functools
 import re
-import threading
 from collections import deque
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from itertools import islice
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,19 +33,19 @@ from .reader import (
     HARMLESS,
     Note,
     OpenFile,
-    Positioned,
     Reader,
     Rows,
-    Scratch,
     Target,
     decode_rows,
     encode_rows,
     left_out,
     rows_of,
-    size_of,
 )
 
 Coding = Callable[[FloatArray], FloatArray]
+
+#: Places of properties in a vertex.
+Places = slice | list[int]
 
 #: Columns of `Splats`, the properties that each consists of, and its decode and encode.
 COLUMNS: tuple[tuple[str, tuple[str, ...], Coding, Coding], ...] = (
@@ -66,7 +65,6 @@ PLAIN_RGB = ("red", "green", "blue")
 #: Standard deviation, in world units, of the filter with which Mip-Splatting smooths each splat when it draws it, and
 #: which is in the scales and opacities of its "fused" files already. Facts: its scene/gaussian_model.py.
 FILTER = "filter_3D"
-FILTERED = Note(f"the 3D filter of Mip-Splatting ({FILTER}) is applied to its scales and opacities")
 
 #: The element of Apple's SHARP whose value is 1 where colours are linear and 0 where they are sRGB.
 COLOR_SPACE = "color_space"
@@ -85,14 +83,6 @@ THIN = np.float32(1e-3)
 WINDOWS_NAN = re.compile(rb"(?<!\S)([+-]?)(?:nan\([^\s()]*\)|1[.,]#(inf)?\w*)(?!\S)", re.IGNORECASE)
 
 
-class _Column(NamedTuple):
-    """A column of `Splats`, the properties of a file that it consists of, and their decode."""
-
-    name: str
-    parts: tuple[str, ...]
-    decode: Coding
-
-
 def open_content(source: OpenFile) -> Reader:
     """Open a PLY file. An ascii file is unpacked to `scratch`, as binary rows.
 
@@ -100,23 +90,34 @@ def open_content(source: OpenFile) -> Reader:
         FormatError: the file is not PLY, cut short, or does not hold splats.
     """
     file = source.file
-    size = size_of(file)
     header = read_header(file)
     row_type = _row_type(header)
     names = row_type.names or ()
     columns = _columns(names, header.mode)
-    coefficients = _checked_coefficients(names)
-    rest = [f"f_rest_{index}" for index in range(3 * coefficients)]
+    numbered = sum(1 for name in names if re.fullmatch(r"f_rest_\d+", name))
+    rest = [f"f_rest_{index}" for index in range(numbered)]
+    if numbered % 3 or not {*rest} <= {*names}:
+        raise FormatError(f"{numbered} f_rest properties; expected f_rest_0, f_rest_1 and so on, a multiple of 3")
     facts = {"properties": len(names), "ascii": int(header.text)}
-    facts |= {"big_endian": int(header.byte_order == ">"), "trailing_bytes": header.check_size(size)}
-    degree, count = degree_of(coefficients), header.count("vertex")
-    unpack = _unpacking(names, columns, rest)
-    needed = {part for column in columns for part in column.parts} | {*rest, FILTER}
-    rows = _rows(file, header, needed, source.scratch)
+    facts |= {"big_endian": int(header.byte_order == ">"), "trailing_bytes": header.check_size(source.size)}
+    degree, count = degree_of(numbered // 3), header.count("vertex")
+    needed = {part for parts, _ in columns.values() for part in parts} | {*rest, FILTER}
+    offset = 0 if header.text else offset_of(file, header, "vertex")
+    places = {name: (_places(names, parts), decode) for name, (parts, decode) in columns.items()}
+    rest_places = _places(names, rest)
+    text_rows = functools.partial(_text_rows, file, header, row_type, needed)
 
     def fill(target: Target, threads: int, progress: Progress) -> None:
-        some = rows(target)
-        decode_rows(some, lambda part, rows: unpack(rows, target.rows(part)), count, threads, progress)
+        span = row_type, target.start, target.stop, count, "vertices"
+        if not header.text:
+            rows = rows_of(source.read_at, offset, *span)
+        elif source.scratch is None or target.once:
+            rows = text_rows()
+        else:
+            rows = rows_of(source.scratch(lambda: (some.tobytes() for _, some in text_rows())).read_at, 0, *span)
+        decode_rows(
+            rows, lambda part, some: _unpack(some, target.rows(part), places, rest_places), count, threads, progress
+        )
 
     noted = read_comment(header.note)
     notes = notes_on_degree(degree) + noted.problems + _notes(file, header, names, needed)
@@ -130,7 +131,8 @@ def _notes(file: BinaryIO, header: PlyHeader, names: Collection[str], needed: Co
     if SCALES[1] in needed and SCALES[2] not in needed:
         notes += ("its disks (2D Gaussian Splatting) are read as splats a thousandth as thick",)
         harmless = HARMLESS | {SCALES[2]}
-    notes += (FILTERED,) if FILTER in names else ()
+    if FILTER in names:
+        notes += (Note(f"the 3D filter of Mip-Splatting ({FILTER}) is applied to its scales and opacities"),)
     elements = [name for name, (_, count) in header.elements.items() if count and name != "vertex"]
     space = first_value(file, header, COLOR_SPACE) if COLOR_SPACE in elements else None
     if space is not None:
@@ -140,27 +142,27 @@ def _notes(file: BinaryIO, header: PlyHeader, names: Collection[str], needed: Co
     return notes + left_out("property", "properties", properties) + left_out("element", "elements", elements)
 
 
-def _columns(names: Collection[str], mode: str) -> list[_Column]:
-    """Return the columns that vertices with these properties fill.
+def _columns(names: Collection[str], mode: str) -> dict[str, tuple[tuple[str, ...], Coding]]:
+    """Return the columns that vertices with these properties fill: the properties of each, and its decode.
 
     Splats with one scale are balls, which need no rotation; those with two are disks, see `THIN`.
 
     Raises:
         NotSplatsError: splats need more properties.
     """
-    have, columns = {*names}, list[_Column]()
+    have, columns = {*names}, dict[str, tuple[tuple[str, ...], Coding]]()
     widths = (2, 1) if mode == "2dgs" else (3, 2, 1)
     scales = SCALES[: next((width for width in widths if have.issuperset(SCALES[:width])), 3)]
     if SCALES[2] in have and len(scales) < 2:
         scales = SCALES  # one is missing
     for name, parts, decode, _ in COLUMNS:
         if name == "rgb" and have.isdisjoint(parts) and have.issuperset(PLAIN_RGB):
-            columns.append(_Column(name, PLAIN_RGB, lambda values: values / np.float32(255)))
+            columns[name] = PLAIN_RGB, lambda values: values / np.float32(255)
         elif name == "scale":
-            columns.append(_Column(name, scales, decode))
+            columns[name] = scales, decode
         elif name != "quat_xyzw" or len(scales) > 1 or not have.isdisjoint(parts):
-            columns.append(_Column(name, parts, decode))
-    missing = [part for column in columns for part in column.parts if part not in have]
+            columns[name] = parts, decode
+    missing = [part for parts, _ in columns.values() for part in parts if part not in have]
     if missing:
         what = "a point cloud or a mesh, not Gaussian splats" if "x" in have else "not Gaussian splats"
         if not have.isdisjoint(REQUIRED[3:]):
@@ -170,36 +172,41 @@ def _columns(names: Collection[str], mode: str) -> list[_Column]:
     return columns
 
 
-def _unpacking(
-    names: Sequence[str], columns: Sequence[_Column], rest: Sequence[str]
-) -> Callable[[NDArray[Any], Splats], None]:
-    """Return the function that fills the columns of splats from rows."""
-    places = {column.name: _run([names.index(part) for part in column.parts]) for column in columns}
-    of_rest = _run([names.index(name) for name in rest])  # all of red's come first
-    scales = next(len(column.parts) for column in columns if column.name == "scale")
-    smoothing = names.index(FILTER) if FILTER in names else None
+# Converters write infinite logits and logarithms for an opacity of 0 or 1 and a scale of 0.
+@np.errstate(over="ignore", invalid="ignore")
+def _unpack(
+    rows: NDArray[Any], splats: Splats, places: Mapping[str, tuple[Places, Coding]], rest_places: Places
+) -> None:
+    """Fill splats from rows.
 
-    # Converters write infinite logits and logarithms for an opacity of 0 or 1 and a scale of 0.
-    @np.errstate(over="ignore", invalid="ignore")
-    def unpack(rows: NDArray[Any], splats: Splats) -> None:
-        matrix = _matrix(rows)
-        for column in columns:
-            out = getattr(splats, column.name)
-            if column.name == "scale":
-                out = out[:, :scales]
-            out[...] = column.decode(matrix[:, places[column.name]]).reshape(out.shape)
-        if scales == 1:
-            splats.scale[:, 1:] = splats.scale[:, :1]
-        if "quat_xyzw" not in places:
-            splats.quat_xyzw[:] = (0, 0, 0, 1)
-        if smoothing is not None:
-            _smooth(splats.scale[:, :2] if scales == 2 else splats.scale, splats.opacity, matrix[:, smoothing])
-        if scales == 2:
-            splats.scale[:, 2] = THIN * splats.scale[:, :2].min(axis=1)
-        sh = matrix[:, of_rest].reshape(len(rows), 3, len(rest) // 3)
-        splats.sh[:] = sh[:, :, : splats.sh.shape[1]].transpose(0, 2, 1)
-
-    return unpack
+    Args:
+        places: of the properties of each column, and its decode.
+        rest_places: of the SH coefficients, those of red first.
+    """
+    names = rows.dtype.names or ()
+    if rows.flags.c_contiguous and all(rows.dtype[name] == np.float32 for name in names):
+        matrix: FloatArray = rows.view(np.float32).reshape(len(rows), len(names))  # not copied
+    else:
+        matrix = np.stack([rows[name].astype(np.float32) for name in names], axis=1)
+    for name, (place, decode) in places.items():
+        values = decode(matrix[:, place])
+        out = getattr(splats, name)
+        if name == "scale":
+            scales = values.shape[1]
+            out = out[:, :scales]
+        out[...] = values.reshape(out.shape)
+    if scales == 1:
+        splats.scale[:, 1:] = splats.scale[:, :1]
+    if "quat_xyzw" not in places:
+        splats.quat_xyzw[:] = (0, 0, 0, 1)
+    if FILTER in names:
+        smoothing = matrix[:, names.index(FILTER)]
+        _smooth(splats.scale[:, :2] if scales == 2 else splats.scale, splats.opacity, smoothing)
+    if scales == 2:
+        splats.scale[:, 2] = THIN * splats.scale[:, :2].min(axis=1)
+    rest = matrix[:, rest_places]
+    sh = rest.reshape(len(rows), 3, rest.shape[1] // 3)
+    splats.sh[:] = sh[:, :, : splats.sh.shape[1]].transpose(0, 2, 1)
 
 
 def _smooth(scale: FloatArray, opacity: FloatArray, size: FloatArray) -> None:
@@ -209,30 +216,12 @@ def _smooth(scale: FloatArray, opacity: FloatArray, size: FloatArray) -> None:
     scale[...] = smooth
 
 
-def _matrix(rows: NDArray[Any]) -> FloatArray:
-    """Return (n, properties) float32 of structured rows, without a copy if all their fields are float32."""
-    names = rows.dtype.names or ()
-    if rows.flags.c_contiguous and all(rows.dtype[name] == np.float32 for name in names):
-        return rows.view(np.float32).reshape(len(rows), len(names))
-    matrix = np.empty((len(rows), len(names)), np.float32)
-    for index, name in enumerate(names):
-        matrix[:, index] = rows[name]
-    return matrix
-
-
-def _run(places: list[int]) -> slice | list[int]:
-    """Return a slice if the places are consecutive, since indexing with it makes no copy; otherwise the list."""
+def _places(names: Sequence[str], parts: Sequence[str]) -> Places:
+    """Return the places of parts among names: a slice if they are consecutive, since indexing with it makes no copy."""
+    places = [names.index(part) for part in parts]
     first = places[0] if places else 0
     run = slice(first, first + len(places))
     return run if places == list(range(run.start, run.stop)) else places
-
-
-def _checked_coefficients(names: Collection[str]) -> int:
-    """Check the names of the SH properties, and return the number of coefficients per channel."""
-    rest = sum(1 for name in names if re.fullmatch(r"f_rest_\d+", name))
-    if rest % 3 or not {f"f_rest_{index}" for index in range(rest)}.issubset(names):
-        raise FormatError(f"{rest} f_rest properties; expected f_rest_0, f_rest_1 and so on, a multiple of 3")
-    return rest // 3
 
 
 def _row_type(header: PlyHeader) -> np.dtype[Any]:
@@ -251,33 +240,9 @@ def _row_type(header: PlyHeader) -> np.dtype[Any]:
     return np.dtype(fields)
 
 
-def _rows(
-    file: BinaryIO, header: PlyHeader, needed: Collection[str], scratch: Scratch | None
-) -> Callable[[Target], Iterator[Rows]]:
-    """Return the function that reads the vertices of a target."""
-    row_type, count, lock = _row_type(header), header.count("vertex"), threading.Lock()
-
-    @functools.lru_cache(1)
-    def opened() -> tuple[Positioned, int]:
-        """Return a file of binary rows, and where they begin."""
-        if not header.text:
-            return Positioned(file), offset_of(file, header, "vertex")
-        assert scratch is not None
-        return Positioned(scratch(lambda: (rows.tobytes() for _, rows in _text_rows(file, header, needed)))), 0
-
-    def read(target: Target) -> Iterator[Rows]:
-        if header.text and (scratch is None or target.once):
-            return _text_rows(file, header, needed)
-        with lock:  # it seeks
-            source, offset = opened()
-        return rows_of(source.read, offset, row_type, target.start, target.stop, count, "vertices")
-
-    return read
-
-
-def _text_rows(file: BinaryIO, header: PlyHeader, needed: Collection[str]) -> Iterator[Rows]:
+def _text_rows(file: BinaryIO, header: PlyHeader, row_type: np.dtype[Any], needed: Collection[str]) -> Iterator[Rows]:
     """Read the vertices of an ascii file in blocks; plyfile's own reader takes value by value in Python."""
-    row_type, vertices = _row_type(header), header.count("vertex")
+    vertices = header.count("vertex")
     file.seek(header.size)
     for name, (_, count) in header.elements.items():
         if name == "vertex":

@@ -35,6 +35,14 @@ Read = Callable[[int], bytes | memoryview]
 ReadAt = Callable[[int, int], bytes | memoryview]
 
 
+#: Opens a file that another one names; raises `FormatError` where it cannot.
+OpenCompanion = Callable[[str], BinaryIO]
+
+#: Opens a file of these bytes, which are made only if they have not been before; for formats whose splats do not lie
+#: one after the other. The file stays open as long as the one that is read.
+Scratch = Callable[[Callable[[], Iterable[bytes]]], "OpenFile"]
+
+
 def size_of(file: BinaryIO) -> int:
     """Return the bytes of a file, which is left at its beginning."""
     size = file.seek(0, io.SEEK_END)
@@ -42,25 +50,37 @@ def size_of(file: BinaryIO) -> int:
     return size
 
 
-class Positioned:
-    """A file that is read by position, by several threads at once, whatever else reads it.
+class OpenFile:
+    """Open file for a codec.
 
-    Args:
-        file: open for reading, until the last read.
+    Attributes:
+        file: open for reading, at its beginning, until the last read.
+        size: bytes of the file.
+        open_companion: opens the files that it names; None if there are none to open.
+        scratch: keeps what has to be unpacked before rows can be read in any order; None to read all rows once.
+        threads: number that read the files which it names.
     """
 
-    def __init__(self, file: BinaryIO) -> None:
-        self._file = file
+    def __init__(
+        self,
+        file: BinaryIO,
+        open_companion: OpenCompanion | None = None,
+        scratch: Scratch | None = None,
+        threads: int = 1,
+    ) -> None:
+        self.file, self.open_companion, self.scratch, self.threads = file, open_companion, scratch, threads
+        self.size = file.seek(0, io.SEEK_END)
+        file.seek(0)
         self._lock = threading.Lock()
         plain = isinstance(getattr(file, "raw", None), io.FileIO) and hasattr(os, "pread")
         self._descriptor = file.fileno() if plain else None
 
-    def read(self, at: int, size: int) -> bytes:
-        """Return the `size` bytes from `at` on, or fewer at the end of the file."""
+    def read_at(self, at: int, size: int) -> bytes:
+        """Return the `size` bytes from `at` on, or fewer at the end of the file; several threads may call this."""
         if self._descriptor is None:
             with self._lock:
-                self._file.seek(at)
-                return self._file.read(size)
+                self.file.seek(at)
+                return self.file.read(size)
         data = os.pread(self._descriptor, size, at)
         while 0 < len(data) < size:  # a read may give less, at most 2 GiB
             more = os.pread(self._descriptor, size - len(data), at + len(data))
@@ -115,30 +135,6 @@ def encode_rows(encode: Callable[[slice], bytes], count: int, threads: int, prog
 
 #: Splats of a block that a scene is read in, unless its format has other ones: some 30 MB with SH of degree 3.
 BLOCK_SPLATS = 1 << 17
-
-#: Opens a file of these bytes, which are made only if they have not been before; for formats whose splats do not lie
-#: one after the other. Whoever passes it closes the file.
-Scratch = Callable[[Callable[[], Iterable[bytes]]], BinaryIO]
-
-#: Opens a file that another one names; raises `FormatError` where it cannot.
-OpenCompanion = Callable[[str], BinaryIO]
-
-
-@dataclass(frozen=True, eq=False)
-class OpenFile:
-    """Open file for a codec.
-
-    Attributes:
-        file: open for reading, at its beginning.
-        open_companion: opens the files that it names; None if there are none to open.
-        scratch: keeps what has to be unpacked before rows can be read in any order; None to read all rows once.
-        threads: number that read the files which it names.
-    """
-
-    file: BinaryIO
-    open_companion: OpenCompanion | None = None
-    scratch: Scratch | None = None
-    threads: int = 1
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,7 @@ from ..system.progress import Progress, silent
 from . import quantize
 from .clamps import CodeRange
 from .options import DEFAULTS, WriteOptions
-from .reader import OpenFile, Positioned, Reader, Target, decode_rows, encode_rows, rows_of, size_of
+from .reader import OpenFile, Reader, Target, decode_rows, encode_rows, rows_of
 
 ROW = np.dtype(
     [
@@ -38,10 +38,10 @@ def open_content(source: OpenFile) -> Reader:
     Raises:
         TruncatedError: the size is not a multiple of 32.
     """
-    size = size_of(source.file)
+    size = source.size
     if size % ROW.itemsize:
         raise TruncatedError(f"cut short, or not .splat: its {size:,} bytes are not a multiple of {ROW.itemsize}")
-    count, file = size // ROW.itemsize, Positioned(source.file)
+    count = size // ROW.itemsize
 
     def fill(target: Target, threads: int, progress: Progress) -> None:
         def decode_part(part: slice, rows: NDArray[Any]) -> None:
@@ -52,7 +52,7 @@ def open_content(source: OpenFile) -> Reader:
             splats.opacity[:] = quantize.decode_unorm8(rows["opacity"])
             splats.quat_xyzw[:] = quantize.decode_quat_bytes(rows["quat_wxyz"])[:, [1, 2, 3, 0]]
 
-        rows = rows_of(file.read, 0, ROW, target.start, target.stop, count)
+        rows = rows_of(source.read_at, 0, ROW, target.start, target.stop, count)
         decode_rows(rows, decode_part, count, threads, progress)
 
     return Reader(count, 0, "SPLAT", fill, concurrent=True)

@@ -23,7 +23,7 @@ from .file_notes import FileNote, read_comment
 from .inflate import PIECE, Inflate, Unzstd
 from .options import MAX_FRACTIONAL_BITS, WriteOptions
 from .quantize import Bytes
-from .reader import OpenFile, Positioned, Read, Reader, Target, rows_of, size_of
+from .reader import OpenFile, Read, Reader, Target, rows_of
 from .spz import (
     ANTIALIASED,
     COORDINATE_SYSTEM,
@@ -62,7 +62,7 @@ def open_spz(source: OpenFile) -> tuple[Reader, Layout, Iterator[StreamRows]]:
             more splats than its size can hold.
     """
     file, note, extensions, header = source.file, FileNote(), Extensions(), dict[str, int]()
-    size = size_of(file)
+    size = source.size
     plain = file.read(4) == struct.pack("<I", MAGIC)
     file.seek(0)
     if plain:
@@ -84,10 +84,10 @@ def open_spz(source: OpenFile) -> tuple[Reader, Layout, Iterator[StreamRows]]:
         if source.scratch is None or target.once:
             yield from rows
             return
-        positioned, offset = Positioned(source.scratch(unpacked)), 0
+        scratch, offset = source.scratch(unpacked), 0
         for each in layout.streams():
             between = rows_of(
-                positioned.read, offset, each.row_type, target.start, target.stop, layout.count, each.name
+                scratch.read_at, offset, each.row_type, target.start, target.stop, layout.count, each.name
             )
             for part, codes in between:
                 yield each, part, codes

@@ -347,7 +347,7 @@ def record_of(source: Source, target: Place, outcome: Outcome) -> dict[str, Any]
 
     record: dict[str, Any] = {"input": str(source)}
     if isinstance(source, Merged):
-        record = {"inputs": [str(each.file) for each in source.files]}
+        record = {"inputs": [str(file) for file, _ in source.files]}
     if isinstance(outcome, SparklodError):
         return {**record, "error": shortened(str(outcome), MOST)}
     more = {"skipped": True} if outcome is None else dataclasses.asdict(outcome)

@@ -14,7 +14,6 @@ from .local_files import (
 )
 from .reading import (
     Merged,
-    PlacedFile,
     open_reader,
     opened,
     read_arrays,

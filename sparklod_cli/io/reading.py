@@ -41,33 +41,25 @@ _LOCK = threading.Lock()
 
 
 @dataclass(frozen=True, eq=False)
-class PlacedFile:
-    """A file and where its splats stand.
+class Merged:
+    """Several files that are one scene.
 
     Attributes:
-        file: of any format that is read, without a tree.
-        transform: turns, scales and moves them.
+        files: of any format that is read, without trees, and the transform of the splats of each; one file may be named
+            more than once.
     """
 
-    file: Place
-    transform: Transform = field(default_factory=Transform)
-
-
-@dataclass(frozen=True, eq=False)
-class Merged:
-    """Several files, with where each stands, that are one scene; one may be named more than once."""
-
-    files: tuple[PlacedFile, ...]
+    files: tuple[tuple[Place, Transform], ...]
 
     @classmethod
     def of(cls, places: Sequence[Place]) -> Merged:
         """Return files where their own coordinates put them."""
-        return cls(tuple(PlacedFile(place) for place in places))
+        return cls(tuple((place, Transform()) for place in places))
 
     @classmethod
     def of_instances(cls, instances: Sequence[Instance]) -> Merged:
         """Return the files of instances, where these stand."""
-        return cls(tuple(PlacedFile(each.file, each.transform) for each in instances if each.file is not None))
+        return cls(tuple((each.file, each.transform) for each in instances if each.file is not None))
 
     def __str__(self) -> str:
         return count_of(len(self.files), "file")
@@ -79,26 +71,23 @@ Source = Place | Merged
 
 def places_of(source: Source) -> list[Place]:
     """Return the files of a source, in order."""
-    return [each.file for each in source.files] if isinstance(source, Merged) else [source]
+    return [file for file, _ in source.files] if isinstance(source, Merged) else [source]
 
 
 def absolute_source(source: Source) -> Source:
     """Return the same source for processes whose working folders are others."""
     if not isinstance(source, Merged):
         return absolute(source)
-    return Merged(tuple(dataclasses.replace(each, file=absolute(each.file)) for each in source.files))
+    return Merged(tuple((absolute(file), transform) for file, transform in source.files))
 
 
 def placement_of(source: Source) -> dict[str, Any]:
     """Return where the files of a source stand, as a recipe has it; nothing for a single file."""
     if not isinstance(source, Merged):
         return {}
-    return {"merged": [_numbers(each.transform) for each in source.files]}
-
-
-def _numbers(transform: Transform) -> list[float]:
-    """Return the rotation row by row, the scale, the translation."""
-    return [float(each) for each in (*transform.rotation.flat, transform.scale, *transform.translation)]
+    # The rotation row by row, the scale, the translation.
+    numbers = ((*each.rotation.flat, each.scale, *each.translation) for _, each in source.files)
+    return {"merged": [[*map(float, each)] for each in numbers]}
 
 
 def read_scene(
@@ -289,14 +278,14 @@ def _opened(
     path: Place, version: tuple[Any, ...], folder: Path | None, threads: int, closing: contextlib.ExitStack
 ) -> Reader:
     """Open a file until `closing` closes it, and what is unpacked of it."""
-    lock, unpacked = threading.Lock(), list[BinaryIO]()
+    lock, unpacked = threading.Lock(), list[OpenFile]()
 
-    def scratch(pieces: Callable[[], Iterable[bytes]]) -> BinaryIO:
+    def scratch(pieces: Callable[[], Iterable[bytes]]) -> OpenFile:
         with lock, _room(folder):
             if not unpacked:
                 place = folder and folder / f"{_digest(path, version)}.unpacked"
                 file = _temporary(pieces) if place is None else _kept(place, pieces)
-                unpacked.append(closing.enter_context(file))
+                unpacked.append(OpenFile(closing.enter_context(file)))
         return unpacked[0]
 
     file, form, more = open_splats(path, closing)
@@ -402,4 +391,4 @@ def _merged(source: Merged, scratch: Path | None, threads: int, closing: context
                 assert isinstance(reader.fill, _FillFromFile)
                 reader = dataclasses.replace(reader, fill=dataclasses.replace(reader.fill, reader=None))
             readers[file] = reader
-    return merged([Placed(readers[each.file], name_of(each.file), each.transform) for each in source.files])
+    return merged([Placed(readers[file], name_of(file), transform) for file, transform in source.files])

@@ -13,7 +13,6 @@ from ..codecs.formats import (
     TILES,
     TILESET,
     Format,
-    chunk_folder,
     is_chunk_folder,
     is_in_manifest,
     is_of_streamed_sog,
@@ -58,17 +57,15 @@ def _content(path: Place, most: int) -> bytes:
         return file.read(most + 1)
 
 
-#: Files beside the manifest of a Streamed SOG, and beside the tileset of 3D Tiles, by the name of the manifest.
-PARTS = {
-    MANIFEST: Siblings(is_of_streamed_sog, is_chunk_folder, chunk_folder(0, 0), _named_by_manifest),
-    TILESET: Siblings(is_of_tileset, lambda name: name == TILES, TILES, _named_by_tileset),
-}
+#: Files beside the manifest of a Streamed SOG, and beside the tileset of 3D Tiles.
+_STREAMED_SOG = Siblings(is_of_streamed_sog, is_chunk_folder, "0_0", _named_by_manifest)
+_TILES_3D = Siblings(is_of_tileset, lambda name: name == TILES, TILES, _named_by_tileset)
 
 
 def siblings_of(path: Place) -> Siblings:
     """Return the names of the files beside a header: of its format's parts, images of a meta.json, or chunks of RAD."""
-    if path.name in PARTS:
-        return PARTS[path.name]
+    if path.name in (MANIFEST, TILESET):
+        return _TILES_3D if path.name == TILESET else _STREAMED_SOG
     name = real_target(path).name
     if META in (path.name.lower(), name.lower()):
         return Siblings(lambda name: sog_image_number(name) is not None)
@@ -81,7 +78,7 @@ def parts_output(path: Place, *, overwrite: bool) -> Output:
     Raises:
         OutputError: see `Output`.
     """
-    return Output(path, overwrite=overwrite, siblings=PARTS.get(path.name, PARTS[MANIFEST]))
+    return Output(path, overwrite=overwrite, siblings=_TILES_3D if path.name == TILESET else _STREAMED_SOG)
 
 
 def scene_output(path: Place, form: Format, *, chunked: bool = False, overwrite: bool) -> Output:

@@ -23,8 +23,8 @@ TRIES = 40
 pytestmark = pytest.mark.filterwarnings("error")
 
 
-def in_memory(pieces: Callable[[], Iterable[bytes]]) -> BinaryIO:
-    return io.BytesIO(b"".join(pieces()))
+def in_memory(pieces: Callable[[], Iterable[bytes]]) -> OpenFile:
+    return OpenFile(io.BytesIO(b"".join(pieces())))
 
 
 def outcome(make: Callable[[], Splats]) -> Splats | str | None:

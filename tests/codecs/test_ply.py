@@ -323,7 +323,8 @@ def test_the_filter_of_mip_splatting_is_applied(scales: int, text: bool) -> None
         scale, opacity = smoothed(log_scale, given["opacity"][row], given["filter_3D"][row])
         np.testing.assert_allclose(splats.scale[row, : len(scale)], scale, rtol=1e-5)
         np.testing.assert_allclose(splats.opacity[row], opacity, rtol=1e-5)
-    assert ply.FILTERED in scene.notes and not any("left out" in note for note in scene.notes)
+    noted = "the 3D filter of Mip-Splatting (filter_3D) is applied to its scales and opacities"
+    assert noted in scene.notes and not any("left out" in note for note in scene.notes)
 
 
 @pytest.mark.filterwarnings("error")

@@ -14,7 +14,7 @@ import pytest
 from sparklod_cli.codecs.merging import Placed, merged
 from sparklod_cli.codecs.reader import Reader
 from sparklod_cli.codecs.sog.sog_container import SogFiles
-from sparklod_cli.io import Merged, PlacedFile, open_reader, read_scene
+from sparklod_cli.io import Merged, open_reader, read_scene
 from sparklod_cli.io.reading import MOST
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
@@ -108,7 +108,7 @@ def test_several_files_are_one_scene_and_one_that_is_named_twice_is_read_twice(t
         paths[form] = put(WRITERS[form][way].write(source), tmp_path / form, form)
         scenes[form] = read_scene(paths[form])
     order = ("PLY", "SPZ", "PLY")
-    files = [PlacedFile(paths[form]) for form in order[:2]] + [PlacedFile(paths["PLY"], turned)]
+    files = [*((paths[form], Transform()) for form in order[:2]), (paths["PLY"], turned)]
     parts = [Placed(reader_of(scenes[form]), form) for form in order[:2]]
     parts += [Placed(reader_of(scenes["PLY"]), "", turned)]
     expected = merged(parts).scene().splats

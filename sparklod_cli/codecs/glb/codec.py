@@ -216,7 +216,7 @@ def _opened(file: GltfFile, primitive: dict[str, Any], source: OpenFile, generat
         def unpacked(*, whole: bool = False) -> Reader:
             data = io.BytesIO(file.bytes_of(view))
             scratch = None if whole else source.scratch
-            found = spz.open_content(dataclasses.replace(source, file=data, open_companion=None, scratch=scratch))
+            found = spz.open_content(OpenFile(data, scratch=scratch, threads=source.threads))
             if found.has_tree:
                 raise UnsupportedError("the SPZ in it has a Level-of-Detail tree, which no glTF has")
             return found

@@ -29,7 +29,7 @@ from ...model.transforms import LARGEST, Transform, scale_of
 from ...system.errors import FormatError, TruncatedError, UnsupportedError, VersionError
 from ...system.untrusted import Json, Origin, quoted_value
 from ..json_trees import leads_away
-from ..reader import OpenFile, Positioned, size_of
+from ..reader import OpenFile, size_of
 
 #: The header of a binary file, magic, version and length, and of a chunk, length and type.
 HEADER, CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
@@ -77,7 +77,7 @@ class Buffer:
 
 
 #: Readers of buffers, by their numbers.
-Readers = Mapping[int, Positioned]
+Readers = Mapping[int, OpenFile]
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ class Accessor:
             TruncatedError: the file has become shorter.
         """
         length = (stop - start - 1) * self.stride + self.size
-        data = readers[self.buffer].read(self.offset + start * self.stride, length)
+        data = readers[self.buffer].read_at(self.offset + start * self.stride, length)
         if len(data) < length:
             raise TruncatedError(f"cut short inside the values of splats {start:,} to {stop:,}")
         strides = self.stride, self.dtype.itemsize
@@ -284,7 +284,7 @@ class GltfFile:
     @contextlib.contextmanager
     def readers(self, indices: Collection[int]) -> Iterator[Readers]:
         """Yield readers of buffers, whose files are open until the end."""
-        found: dict[int, Positioned] = {}
+        found: dict[int, OpenFile] = {}
         with contextlib.ExitStack() as stack:
             for index in indices:
                 buffer, file = self.buffer(index), self._file
@@ -292,7 +292,7 @@ class GltfFile:
                     file = io.BytesIO(buffer.data)
                 elif buffer.name is not None:
                     file = stack.enter_context(self._opened(buffer.name))
-                found[index] = Positioned(file)
+                found[index] = OpenFile(file)
             yield found
 
     def view(self, index: Any) -> tuple[int, int, int, int | None]:
@@ -344,7 +344,7 @@ class GltfFile:
         """Return the content of a buffer view."""
         buffer, offset, length, _ = self.view(index)
         with self.readers([buffer]) as readers:
-            return readers[buffer].read(offset, length)
+            return readers[buffer].read_at(offset, length)
 
 
 def _name_of(uri: str) -> str:

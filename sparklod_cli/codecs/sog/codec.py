@@ -34,7 +34,7 @@ from ..file_notes import note_of, read_note
 from ..formats import META, SOG_IMAGES
 from ..kernels import texels
 from ..options import DEFAULTS, MAX_SH_CODES, WriteOptions
-from ..reader import Note, OpenFile, Positioned, Reader, Target
+from ..reader import Note, OpenFile, Reader, Target
 from . import texel_codings as codings
 from .sog_container import LARGEST, MAX_SIDE, Pixels, SogFiles, Texels, encode_webp, has, image_of, size_for, zipped
 from .texel_codings import codebook, even_codebook, nearest
@@ -99,14 +99,14 @@ def open_content(source: OpenFile) -> Reader:
     def fill(target: Target, threads: int, progress: Progress) -> None:
         if palette is not None:
             palette.values()
-        positioned = None if source.scratch is None or target.once else Positioned(source.scratch(unpacked))
+        scratch = None if source.scratch is None or target.once else source.scratch(unpacked)
 
         def work(item: tuple[int, Step]) -> None:
             number, step = item
-            if positioned is None:
+            if scratch is None:
                 pixels = files.pixels(step.texture, step.index, count)
             else:
-                data = positioned.read(4 * (number * count + target.start), 4 * len(target.splats))
+                data = scratch.read_at(4 * (number * count + target.start), 4 * len(target.splats))
                 pixels = np.frombuffer(data, np.uint32)
             problem = step.fill(target.splats, pixels)
             if problem is not None:
