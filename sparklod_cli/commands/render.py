@@ -177,7 +177,7 @@ def _place(
     Raises:
         SparklodError: a file cannot be written, before work goes into it.
     """
-    from ..images import animation
+    from ..images.pixels import check_animation
     from ..images.sequence import PictureSettings, frame_rate
 
     look, output = options.appearance, _output(ctx, options, len(path.cameras))
@@ -197,7 +197,7 @@ def _place(
     keep_apart(ctx, {**files_read(options, instances), "output": output.paths(path.numbers)})
     output.check(path.numbers, overwrite=options.pictures.overwrite)
     if output.kind == "animation":
-        animation.check(output.form, frame_rate(path))
+        check_animation(output.form, frame_rate(path))
     return output, settings
 
 

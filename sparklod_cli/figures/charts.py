@@ -51,7 +51,6 @@ class FrameColumns:
         return f"frame {value:,.0f}" if value == round(value) else ""
 
     def has(self, *names: str) -> bool:
-        """Whether each of these columns has a number in some row."""
         return all(numbers(self.rows, name) for name in names)
 
     def column(self, name: str) -> Series:
@@ -74,11 +73,7 @@ Axes = Any
 
 
 def load_matplotlib() -> ModuleType:
-    """Import matplotlib without pyplot, whose global state belongs to the calling program.
-
-    Raises:
-        SparklodError: it is not installed.
-    """
+    """Import matplotlib without pyplot, whose global state belongs to the calling program."""
     with optional_import("--plot needs matplotlib", "render", package="matplotlib"):
         import matplotlib
         import matplotlib.backends.backend_agg
@@ -103,11 +98,7 @@ def style() -> dict[str, Any]:
 def draw(lines: int, height: int, fill: Callable[[ModuleType, NDArray[Any]], None]) -> NDArray[np.uint8]:
     """(H, WIDTH, 3) a figure in the style of this package, whatever a matplotlibrc says.
 
-    Args:
-        fill: draws into the axes of the charts, (2 lines,), given matplotlib and these.
-
-    Raises:
-        SparklodError: matplotlib is not installed.
+    `fill` draws into the axes of the charts, (2 lines,), given matplotlib and these.
     """
     matplotlib = load_matplotlib()
     with matplotlib.rc_context():
@@ -149,13 +140,8 @@ BudgetRows = tuple[str, Sequence[Row]]
 def plot_comparison(series: Sequence[BudgetRows], title: str) -> bytes:
     """Return the PNG of charts: PSNR, SSIM and PSNR of edges by budget, PSNR, worst tile and popping along the path.
 
-    A chart of which no frame has a value, such as popping of single views, stays away.
-
-    Args:
-        series: one for each budget, all of the same frames.
-
-    Raises:
-        SparklodError: matplotlib is not installed.
+    A chart of which no frame has a value, such as popping of single views, is left out. All budgets have the same
+    frames.
     """
     groups, frames = [rows for _, rows in series], len(series[0][1])
 
@@ -396,7 +382,7 @@ class Plot:
 
 
 def plot(rows: Iterable[Row], marked: Mapping[str, int], title: str, scene: PathScene | None = None) -> Plot:
-    """Draws charts of all columns that are not empty and, if it can be drawn, the path in the scene.
+    """Draw charts of all columns that are not empty and, if it can be drawn, the path in the scene.
 
     Args:
         rows: of all frames; those of single instances are left out.
@@ -444,14 +430,9 @@ def _one_line(text: str) -> str:
 
 
 def draw_charts(rows: Sequence[Row], marked: Mapping[str, int]) -> NDArray[np.uint8]:
-    """(H, WIDTH, 3) the charts of a path; a column without a number has none.
+    """(H, WIDTH, 3) the charts of a path, of at least one frame; a column without a number has none.
 
-    Args:
-        rows: one for each frame, at least one.
-        marked: numbers of notable frames, by the reason (`Panel.marks`).
-
-    Raises:
-        SparklodError: matplotlib is not installed.
+    `marked` are numbers of notable frames, by the reason (`Panel.marks`).
     """
     frames = FrameColumns(rows)
     panels = [panel for panel in PANELS if frames.has(*panel.columns)]
@@ -533,8 +514,7 @@ class PathScene:
 def picture_of_path(scene: PathScene, *, size: tuple[int, int] = (1600, 1000)) -> bytes:
     """Return the PNG of a path, its frusta and a cut, whose splats are left out where they are not finite.
 
-    Raises:
-        SparklodError: pyvista is not installed or cannot draw here, or there is nothing to draw.
+    `SparklodError` if pyvista is not installed or cannot draw here, or there is nothing to draw.
     """
     cameras, splats, depth, frame = scene.cameras, scene.splats, scene.depth, scene.frame
     index = np.flatnonzero(is_drawable(splats))
@@ -591,8 +571,7 @@ def _path_lines(cameras: Sequence[Camera], way: Points, frame: int | None, exten
 def frustum_lines(camera: Camera, length: float) -> Points:
     """(20, 3) ends of the lines of a frustum, world units: four edges, the far rectangle and a roof on its upper side.
 
-    Args:
-        length: distance of the far rectangle along the optical axis, world units.
+    `length` is the distance of the far rectangle along the optical axis, world units.
     """
     (fx, fy), (cx, cy) = camera.focal, camera.principal
     left, right = -cx / fx, (camera.width - cx) / fx

@@ -196,12 +196,9 @@ def is_drawable(splats: Splats) -> NDArray[np.bool_]:
 
 
 def bounds(splats: Splats) -> tuple[Points, Points]:
-    """Lowest and highest corner, (3,) each, of the box that a picture shows.
+    """Lowest and highest corner, (3,) each, of the box that a picture of drawable splats, at least one, shows.
 
     Along each axis it spans the 1 % to the 99 % quantile of the splats, or all of them if the rest are within `NEAR`.
-
-    Args:
-        splats: at least one; all drawable.
     """
     reach = splats.scale.max(axis=1).astype(np.float64)
     ends = np.empty((4, 3))
@@ -323,11 +320,7 @@ window.Render()
 
 @functools.cache
 def load_pyvista() -> ModuleType:
-    """Import pyvista, after a check that it can draw here.
-
-    Raises:
-        SparklodError: pyvista is not installed, or OpenGL is missing.
-    """
+    """Import pyvista, after a check that it can draw here; `SparklodError` if it is missing, or OpenGL is."""
     if sys.platform == "linux" and not os.environ.get("DISPLAY"):
         # Without this VTK warns, and falls back to EGL only where the libraries of X are installed.
         os.environ.setdefault("VTK_DEFAULT_OPENGL_WINDOW", "vtkEGLRenderWindow")

@@ -121,7 +121,7 @@ class DescribedPicture:
 def plot(
     scene: Scene, *, by: str = "level", depth: int | None = None, size: tuple[int, int] = (1600, 1000)
 ) -> DescribedPicture:
-    """Draws a scene. All depths of a tree are seen from the same viewpoint.
+    """Draw a scene. All depths of a tree are seen from the same viewpoint.
 
     Args:
         scene: N splats; invalid ones are left out. Its tree may be broken.
@@ -129,8 +129,8 @@ def plot(
         depth: edges from the root to the nodes that are drawn; None for all leaves, or all splats.
 
     Raises:
-        SparklodError: pyvista is not installed or cannot draw here, no node has this depth, or there is
-            nothing to draw.
+        SparklodError: pyvista is not installed or cannot draw here, no node has this depth, or there is nothing to
+            draw.
     """
     if by not in PLOT_BY:
         raise ValueError(f"by is {by}, not one of {', '.join(PLOT_BY)}")
@@ -145,7 +145,9 @@ def plot(
     shown = splats.take(index)
     low, high = bounds(splats.take(drawable))
     up = np.array(direction_of(scene.up))
-    eye = viewpoint(box_lines(low[None], high[None]), _direction(up), up, aspect=size[0] / size[1], frame=FRAME)
+    right = np.array([0.0, 1.0, 0.0] if up[0] else [1.0, 0.0, 0.0])
+    direction = np.array(DIRECTION) @ np.stack([right, up, np.cross(right, up)])
+    eye = viewpoint(box_lines(low[None], high[None]), direction, up, aspect=size[0] / size[1], frame=FRAME)
     with PyvistaStage(low, high, size, BACKGROUND) as stage:
         drawn = stage.splats(shown, coloring.rgb, eye)
         if len(index) < len(chosen):
@@ -159,12 +161,6 @@ def plot(
     lines = [line for line in (drawn, voxels, boxes) if line]
     png = write_png(pixels, title, lines, coloring, eye, low, high)
     return DescribedPicture(png, "; ".join([title, f"coloured by {coloring.title}", *lines]))
-
-
-def _direction(up: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(3,) viewing direction `DIRECTION` in a world where `up`, (3,) an axis, is up."""
-    right = np.array([0.0, 1.0, 0.0] if up[0] else [1.0, 0.0, 0.0])
-    return np.array(DIRECTION) @ np.stack([right, up, np.cross(right, up)])
 
 
 def _subject(
@@ -196,7 +192,7 @@ def _subject(
 
 
 def _voxels(stage: PyvistaStage, splats: Splats, low: Points, high: Points, eye: Points) -> str:
-    """Draws the voxel grid in which Quick-LoD would merge splats of this size; returns a description.
+    """Draw the voxel grid in which Quick-LoD would merge splats of this size; return a description.
 
     A file says neither the base of its grids nor to which of them a node belongs, so the grid is the one of the default
     base that the median size belongs to.
@@ -216,7 +212,7 @@ def _voxels(stage: PyvistaStage, splats: Splats, low: Points, high: Points, eye:
 
 
 def _boxes(stage: PyvistaStage, scene: Scene, index: NDArray[np.int64], drawable: NDArray[np.bool_], by: str) -> str:
-    """Draws boxes around the chunks that hold some nodes; returns a description."""
+    """Draw boxes around the chunks that hold some nodes; return a description."""
     count = -(-len(drawable) // CHUNK_NODES)
     chunks = np.unique(index // CHUNK_NODES)
     colors = ramp(VIRIDIS, count)

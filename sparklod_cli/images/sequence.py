@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..cameras.frame import DEFAULT_FPS
 from ..render.renderer import Renderer
@@ -18,10 +17,9 @@ from ..system.progress import Progress, silent
 from ..system.stdio import DASH
 from ..system.threads import on_threads, ordered_map
 from . import pixels as codes
-from .animation import animate
 from .metrics import check_covered, psnr
 from .output import JPEG_QUALITY
-from .pixels import sheet
+from .pixels import animate, sheet
 
 if TYPE_CHECKING:
     from ..cameras.camera import Camera
@@ -147,7 +145,10 @@ class _Writer:
 
         def drawn() -> Iterator[_Frame]:
             nonlocal empty
-            for frame in self._frames():
+            count = len(self._path.cameras)
+            frames = ordered_map(self._frame, range(count), min(self._settings.jobs, count))
+            for done, frame in enumerate(frames, 1):
+                self._progress("drawing", done, count, "frame")
                 facts.append(frame.facts)
                 empty &= frame.empty
                 yield frame
@@ -163,19 +164,10 @@ class _Writer:
             count = len(self._path.cameras)
             self._write(output.name, [animate(pictures, count, output.form, frame_rate(self._path))])
         else:
-            whole = sheet([_pixels(frame) for frame in drawn()], self._captions())
-            self._write(output.name, [self._encode(whole)])
+            cameras = zip(self._path.numbers, self._path.cameras, strict=True)
+            captions = [camera.name or f"frame {number}" for number, camera in cameras]
+            self._write(output.name, [self._encode(sheet([_pixels(frame) for frame in drawn()], captions))])
         return WrittenPictures(facts, self._bytes, self._gain if self._reference is not None else None, empty)
-
-    def _captions(self) -> list[str]:
-        cameras = zip(self._path.numbers, self._path.cameras, strict=True)
-        return [camera.name or f"frame {number}" for number, camera in cameras]
-
-    def _frames(self) -> Iterator[_Frame]:
-        count = len(self._path.cameras)
-        for done, frame in enumerate(ordered_map(self._frame, range(count), min(self._settings.jobs, count)), 1):
-            self._progress("drawing", done, count, "frame")
-            yield frame
 
     def _frame(self, at: int) -> _Frame:
         camera, number = self._path.cameras[at], self._path.numbers[at]
@@ -190,7 +182,10 @@ class _Writer:
             image = codes.difference(image, reference, self._gain)
         empty = not drawn.image[..., 3].any()
         if self._output.form == "npy":
-            return _Frame(facts, None, codes.encode_floats(self._floats(drawn, image)), empty)
+            # The values behind the colours if they are per pixel, else the colours.
+            by = self._renderer.settings.color_by
+            values = drawn.values if by in OF_PIXELS and drawn.values is not None else image
+            return _Frame(facts, None, codes.encode_floats(values), empty)
         pixels = codes.eight_bits(image)
         bar = self._bar()
         if bar is not None:
@@ -233,11 +228,6 @@ class _Writer:
         if self._output.kind == "frames":
             facts["file"] = str(self._output.path(number))
         return facts
-
-    def _floats(self, drawn: DrawnPicture, image: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the content of a .npy file: the values behind the colours if they are per pixel, else the colours."""
-        by = self._renderer.settings.color_by
-        return drawn.values if by in OF_PIXELS and drawn.values is not None else image
 
     def _encode(self, pixels: Pixels) -> bytes:
         return codes.encode(pixels, self._output.form, self._settings.jpeg_quality)

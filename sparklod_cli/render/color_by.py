@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from ..cameras.camera import Camera
 from ..model.gaussian import lod_opacity, moved, spark_size
 from ..model.splats import FloatArray
-from ..render.color_scales import ticks
 from ..scenes.finder import CutSource
 from ..scenes.loaded import Part
 from ..scenes.loaded_scene import Index, LoadedScene
@@ -26,6 +25,7 @@ from .color_scales import (
     log_marks,
     log_range,
     smooth,
+    ticks,
     top_opacity,
     whole_numbers,
     with_ends,
@@ -47,7 +47,6 @@ class Scale:
     """Colour scale for numbers, the same for all pictures of a run.
 
     Attributes:
-        bar: the colours, with their meaning.
         low, high: numbers of the first colour and of the last; those beyond have these, too.
         log: they are powers of ten.
     """
@@ -82,13 +81,9 @@ def values_of(by: str, part: Part) -> FloatArray:
 
 
 def scale_of_splats(by: str, source: CutSource, cameras: Sequence[Camera], progress: Progress = silent) -> Scale:
-    """Return the scale of a number of splats, for all that cameras may see; of whole numbers, for what they do see.
+    """Return the scale of a quantity of `values_of`, for all splats that cameras may see; of whole numbers, do see.
 
-    Args:
-        by: "level", "lod-opacity", "size" or "chunk".
-
-    Raises:
-        SparklodError: by level, where no file has any.
+    `SparklodError` by level, where no file has any.
     """
     candidates = source.candidates().parts
     if by == "level" and not any(part.scene.has_cuts for part in candidates):

@@ -39,11 +39,11 @@ class SplatGradients:
 
 @dataclass(frozen=True)
 class Drawing:
-    """A picture that remembers how it was drawn; made by `draw`.
+    """A picture with the data that `gradients` needs; made by `draw`.
 
     Attributes:
-        image: (height, width, 4) float32, as `rasterizer.draw` gives it.
-        splats, camera, settings: what it was drawn of. The arrays of `splats` must not have changed before `gradients`.
+        image: (height, width, 4) float32, as `rasterizer.draw` returns it.
+        splats: their arrays must not have changed before `gradients`.
     """
 
     image: Image
@@ -83,11 +83,7 @@ class Drawing:
 
 
 def draw(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> Drawing:
-    """Draw the picture of `rasterizer.draw`, and keep what its gradients need.
-
-    Raises:
-        ValueError: the settings have the profile `shifted`, whose gradients are not implemented.
-    """
+    """Draw the picture of `rasterizer.draw` for its gradients; `ValueError` for the profile `shifted`, without any."""
     if settings.profile == "shifted":
         raise ValueError("gradients of the profile shifted are not implemented; use the profile spark")
     seen = rasterizer.project_splats(splats, camera, settings)

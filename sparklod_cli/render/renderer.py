@@ -44,10 +44,10 @@ class DrawnPicture:
 
 
 class Renderer:
-    """Draws pictures with the same settings; several threads may ask it.
+    """Draws pictures with the same settings; several threads may use it.
 
     Args:
-        cameras: that will be drawn; a color scale is the same in the pictures of all of them.
+        cameras: all that will be drawn; a color scale is the same in all of their pictures.
 
     Attributes:
         scale: the color scale; None where splats have their own colours.
@@ -176,15 +176,12 @@ def draw_styled(
     settings: RasterSettings,
     options: Mapping[str, Any] | None = None,
 ) -> Image:
-    """Draw what a camera sees, as `rasterizer.draw` does.
+    """Draw what a camera sees, as `rasterizer.draw` does; `BackendError` if the backend cannot draw here.
 
     Args:
         style: one of `settings.STYLES`. "points" are opaque, a pixel each, "billboards" discs of one opacity, as wide
             as the splats; both are drawn in the order of the file. "sorted-billboards" are drawn from far to near, as
             "splats" are.
-
-    Raises:
-        BackendError: the backend cannot draw here.
     """
     if not len(splats.center):  # no chunk has arrived yet
         return np.zeros((camera.height, camera.width, 4), np.float32)
@@ -220,8 +217,8 @@ def draw_styled(
 def _on_screen(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> tuple[NDArray[Any], ...]:
     """Return the splats between near and far whose centres are inside the picture, or within `CLIP` of it.
 
-    Returns:
-        (M,) indices; (M,) float32 x and y in pixels from the upper left corner, depths along the axis, and distances.
+    They are (M,) indices; (M,) float32 x and y in pixels from the upper left corner, depths along the axis, and
+    distances.
     """
     local = (splats.center - camera.position.astype(np.float32)) @ camera.camera_to_world[:3, :3].astype(np.float32)
     depth = -local[:, 2]
@@ -240,10 +237,7 @@ def _on_screen(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -
 
 
 def count_overdraw(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> NDArray[np.float32]:
-    """Return (height, width) number of splats blended into each pixel, including hidden ones.
-
-    Splats are those that the backend numba draws.
-    """
+    """Return (height, width) number of splats of the backend numba blended into each pixel, including hidden ones."""
     counts = np.zeros((camera.height, camera.width), np.int32)
     if len(splats.center):
         seen = rasterizer.project_splats(splats, camera, settings)

@@ -231,7 +231,8 @@ class Simulation(Viewer):
             if self.scenes.in_runs:
                 none = (*OF_TREES, *(OF_BUDGETS if self.scenes.tiled else ()))
                 rows = [row | dict.fromkeys(none) for row in rows]
-            yield SimulatedFrame(number, camera, drawn.cut, resident, [_rounded(row) for row in rows], in_front)
+            rows = [{column.name: column.rounded(row.get(column.name)) for column in COLUMNS} for row in rows]
+            yield SimulatedFrame(number, camera, drawn.cut, resident, rows, in_front)
             progress("traverse", at + 1, len(path.cameras), "frame")
 
     def _find(self, camera: Camera, resident: NDArray[np.bool_] | None = None) -> _MeasuredCut:
@@ -309,7 +310,3 @@ def _change(selected: int, retained: int | None, before: int) -> Row:
     added, removed = selected - retained, before - retained
     churn = (added + removed) / (selected + before) if selected + before else 0.0
     return {"added": added, "removed": removed, "churn": churn}
-
-
-def _rounded(row: Row) -> Row:
-    return {column.name: column.rounded(row.get(column.name)) for column in COLUMNS}

@@ -63,14 +63,11 @@ Log = Callable[[str], None]
 
 
 class Server(ThreadingHTTPServer):
-    """Serves a site, a thread for each connection.
+    """Serves a site, a thread for each connection; `SparklodError` if it cannot listen there.
 
     Args:
         host: name or address to listen on.
         port: to listen on; 0 for any that is free.
-
-    Raises:
-        SparklodError: it cannot listen there.
     """
 
     daemon_threads = True
@@ -89,7 +86,7 @@ class Server(ThreadingHTTPServer):
         self.names = {*OWN_NAMES, host.lower()}
 
     def server_bind(self) -> None:
-        """Binds the socket; unlike the base class it does not ask a name server for the name of the machine."""
+        """Bind the socket; unlike the base class, without asking a name server for the name of the machine."""
         socketserver.TCPServer.server_bind(self)
         self.server_name, self.server_port = str(self.server_address[0]), int(self.server_address[1])
 
@@ -271,10 +268,10 @@ class Handler(BaseHTTPRequestHandler):
 
 
 def span_of(text: str | None, size: int) -> range | None:
-    """Return the bytes of a file that a Range header asks for, none if it has none of them; None for the whole file.
+    """Return the bytes of a file that a Range header names, empty if the file has none of them; None for all of them.
 
-    That is where there is no header, or where it is one that a server may ignore: of another unit, with several
-    ranges, or broken.
+    The whole file is sent without a header, and where a server may ignore it: of another unit, with several ranges, or
+    broken.
     """
     found = RANGE.fullmatch(text.strip()) if text is not None else None
     if found is None:

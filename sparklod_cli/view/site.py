@@ -117,7 +117,6 @@ class Libraries:
         return _url(self.base, package, self.versions[package] if self.integrity else None, path)
 
     def notes(self) -> list[str]:
-        """Return notes on the versions for display."""
         return [
             f"{self.source} has {package} {version}; the page was tested with {VERSIONS[package]}"
             for package, version in self.versions.items()
@@ -132,8 +131,7 @@ def _url(base: str, package: str, version: str | None, path: str) -> str:
 def from_cdn(engine: str = "spark") -> Libraries:
     """Return the libraries of the CDN for an engine.
 
-    Raises:
-        SparklodError: the engine loads workers, which a browser does not check by digests.
+    `SparklodError` if the engine loads workers, which a browser does not check by digests.
     """
     if any(package in FILES for package in PACKAGES[engine]):
         raise SparklodError(
@@ -152,8 +150,7 @@ def from_cdn(engine: str = "spark") -> Libraries:
 def from_folder(folder: Path, engine: str = "spark") -> Libraries:
     """Return the libraries for an engine of a folder that has a node_modules, or is one.
 
-    Raises:
-        SparklodError: a package, or a module of it, is missing; the text says how to install it.
+    `SparklodError`, with the way to install it, if a package, or a module of it, is missing.
     """
     packages = folder if folder.name == "node_modules" else folder / "node_modules"
     install = _install(folder, engine)
@@ -201,14 +198,11 @@ MAX_CAMERAS = 20_000
 
 
 def parse_drop(body: bytes, settings: CameraSettings) -> dict[str, Any]:
-    """Return the path of some dropped files, as `frames_of` has it.
+    """Return the path of some dropped files, as `frames_of` has it; `CameraPathError` if they are no camera path.
 
     Args:
         body: JSON, {"files": [{"name": text, "data": base64}]}.
         settings: of the cameras; `up` is left out of those of files whose cameras have up axes of their own.
-
-    Raises:
-        CameraPathError: they are no camera path that sparklod reads.
     """
     contents = _contents(body)
     first = next((names[0] for names in NAMES if names[0] in contents), next(iter(contents)))
@@ -279,11 +273,7 @@ GENERATOR = "sparklod view"
 
 @dataclass(frozen=True)
 class Site:
-    """A site.
-
-    Attributes:
-        cameras: settings of camera paths that are dropped onto the page.
-    """
+    """A site; `cameras` are the settings of camera paths that are dropped onto the page."""
 
     resources: Resources
     cameras: CameraSettings
@@ -394,11 +384,9 @@ FOLDERS, SUFFIXES = ("data", "lib"), (".html", ".css", ".js", ".json")
 def check_folder(folder: Path, site: Site | None = None, *, overwrite: bool) -> None:
     """Raise an `OutputError` where a site cannot be written into a folder.
 
-    A folder that exists is replaced only if it is empty or a site that was exported before: what else somebody keeps
-    in a folder, such as the .git of the pages that it is published from, is not ours to remove.
-
-    Args:
-        site: that will be written; its files must lie elsewhere.
+    A folder that exists is replaced only if it is empty or a site that was exported before: what else somebody keeps in
+    a folder, such as the .git of the pages that it is published from, is not ours to remove. Files of the site must lie
+    elsewhere.
     """
     try:
         if folder.suffix.lower() in (".html", ".htm") and not folder.is_dir():
@@ -410,8 +398,9 @@ def check_folder(folder: Path, site: Site | None = None, *, overwrite: bool) -> 
                 raise OutputError(f"{folder} exists, add --overwrite to replace the site in it")
             if not _is_site(folder):
                 raise OutputError(f"{folder} holds something else than a site of sparklod view; name another folder")
-            for other in filter(_is_foreign, folder.iterdir()):
-                raise OutputError(f"{folder} holds {other.name}, which is not of the site; move it away first")
+            for other in folder.iterdir():
+                if other.name not in FOLDERS if other.is_dir() else other.suffix not in SUFFIXES:
+                    raise OutputError(f"{folder} holds {other.name}, which is not of the site; move it away first")
         real = folder.resolve()
     except OSError as error:
         raise OutputError(f"cannot write {folder}: {reason_of(error)}") from None
@@ -429,20 +418,8 @@ def _is_site(folder: Path) -> bool:
     return isinstance(settings, dict) and settings.get("generator") == GENERATOR
 
 
-def _is_foreign(path: Path) -> bool:
-    """Whether an entry of the folder of a site was put there by somebody else."""
-    return path.name not in FOLDERS if path.is_dir() else path.suffix not in SUFFIXES
-
-
 def export(site: Site, folder: Path, *, overwrite: bool, progress: Progress = silent) -> int:
-    """Write a site and return its bytes.
-
-    Args:
-        folder: that gets it; appears when it is complete.
-
-    Raises:
-        OutputError: see `check_folder`, or the file system refused something.
-    """
+    """Write a site into a folder, which appears when it is complete, and return its bytes."""
     check_folder(folder, site, overwrite=overwrite)
     real = folder.resolve()
     part = real.with_name(PARTS.format(secrets.token_hex(8)))
@@ -463,11 +440,9 @@ def export(site: Site, folder: Path, *, overwrite: bool, progress: Progress = si
 
 
 def _total(site: Site) -> int:
-    return sum(_size(content) for content in site.resources.values())
-
-
-def _size(content: bytes | Path) -> int:
-    return len(content) if isinstance(content, bytes) else content.stat().st_size
+    return sum(
+        len(content) if isinstance(content, bytes) else content.stat().st_size for content in site.resources.values()
+    )
 
 
 def _pieces(path: Path) -> Iterator[bytes]:
@@ -477,7 +452,7 @@ def _pieces(path: Path) -> Iterator[bytes]:
 
 
 def _replace(folder: Path, part: Path) -> None:
-    """Give a complete folder its name; what had it before is put aside, and back where that fails."""
+    """Replace a folder by a complete one; the former one comes back where that fails."""
     if not folder.exists():
         part.rename(folder)
         return

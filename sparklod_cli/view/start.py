@@ -67,7 +67,7 @@ class Extent:
 
 @dataclass(frozen=True)
 class Start:
-    """The first look at the scene.
+    """The first view of the scene.
 
     Attributes:
         eye, target: of the camera, world units.
@@ -88,11 +88,7 @@ class Start:
 
 
 def extent_of(shown: ShownFile, *, threads: int = 1, progress: Progress = silent) -> Extent:
-    """Return the extent of a file, for the first view.
-
-    Raises:
-        SparklodError: it is broken; the text names it.
-    """
+    """Return the extent of a file, for the first view; a `SparklodError` about a broken one names it."""
     try:
         with naming(shown.path):
             if shown.header is not None and shown.header.lod_tree and len(shown.header.chunks) > 1:
@@ -172,13 +168,10 @@ def _sizes(splats: Splats) -> tuple[float, float]:
 
 
 def start_of(extents: Sequence[Extent], view: tuple[Point, Point] | None, up: Point, fov: float) -> Start:
-    """Return the first look at some files together.
+    """Return the first view of some files together; `CameraPathError` if the camera makes no sense.
 
     Args:
         view: eye and target, where they are given; else the whole scene is in view, from its front.
-
-    Raises:
-        CameraPathError: the camera makes no sense.
     """
     balls = Balls.concat(extent.balls for extent in extents)
     settings = Settings(size=DEFAULT_SIZE, fov_y=math.radians(fov), up=up)

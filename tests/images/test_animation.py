@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageSequence
 
-from sparklod_cli.images import animation
+from sparklod_cli.images import pixels as animation
 from sparklod_cli.system.errors import SparklodError
 from sparklod_cli.system.optional import install_hint
 
@@ -121,7 +121,7 @@ PEAK = """
 import re, sys
 from pathlib import Path
 import numpy as np
-from sparklod_cli.images.animation import animate
+from sparklod_cli.images.pixels import animate
 
 def frames():
     for number in range(int(sys.argv[2])):
@@ -150,7 +150,7 @@ def test_memory_does_not_grow_with_the_number_of_frames(form: str) -> None:
 
 @pytest.mark.parametrize(("form", "longest"), [("gif", 655.35), ("webp", 16777.215)])
 def test_a_frame_lasts_as_long_as_its_format_can_say(form: str, longest: float) -> None:
-    animation.check(form, 1 / longest)
+    animation.check_animation(form, 1 / longest)
     data = animated(frames(), form, 1 / longest)
     with Image.open(io.BytesIO(data)) as picture:
         picture.seek(1)
@@ -158,7 +158,7 @@ def test_a_frame_lasts_as_long_as_its_format_can_say(form: str, longest: float) 
         assert picture.info["duration"] == pytest.approx(1000 * longest)
     for fps in (0.999 / longest, 1e-6, 1e-300):
         with pytest.raises(SparklodError, match=rf"^a frame of \.{form} lasts at most .* s, not .* s; raise --fps$"):
-            animation.check(form, fps)
+            animation.check_animation(form, fps)
 
 
 @pytest.mark.parametrize("form", ["mp4", "webm"])
@@ -178,5 +178,5 @@ def test_a_video_has_the_frames(size: tuple[int, int], form: str) -> None:
 def test_a_missing_imageio_is_named(form: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "imageio", None)
     with pytest.raises(SparklodError, match=rf"^\.{form} needs imageio: {re.escape(install_hint('video'))}"):
-        animation.check(form, 30)
-    animation.check("gif", 30)
+        animation.check_animation(form, 30)
+    animation.check_animation("gif", 30)

@@ -11,7 +11,6 @@ import numpy as np
 
 from ...system.errors import CameraPathError
 from ...system.untrusted import quoted_value
-from ..camera import Matrix
 from ..frame import NO_LENS, CameraJson, Files, Frame, Intrinsics, Parsed, Settings, finite, posed, side
 from ..generators import Key, between, frame_looking
 from .table import Axes
@@ -41,18 +40,15 @@ def parse_sparklod(files: Files, settings: Settings) -> Parsed:
         keys = [_key(item) for item in root.items("keyframes")]
         frames = between(keys, settings.fps or fps, settings.up_axis, lens)
         return Parsed(frames, fps=fps, turned=all(key.up for key in keys))
-    axes, items = _axes(root), list(root.items("frames"))
-    turned = all(item.has("up") or not item.has("eye") for item in items)
-    return Parsed([_frame(item, lens, axes, settings) for item in items], fps=fps, turned=turned)
-
-
-def _axes(root: CameraJson) -> Axes:
     name = root.optional("axes", CameraJson.text, Axes.OPENGL_C2W.value)
     try:
-        return Axes(name)
+        axes = Axes(name)
     except ValueError:
         known = ", ".join(axes.value for axes in Axes)
         raise CameraPathError(f"axes {name[:20]!r} are unknown; use one of {known}") from None
+    items = list(root.items("frames"))
+    turned = all(item.has("up") or not item.has("eye") for item in items)
+    return Parsed([_frame(item, lens, axes, settings) for item in items], fps=fps, turned=turned)
 
 
 def _frame(item: CameraJson, default: Intrinsics, axes: Axes, settings: Settings) -> Frame:
@@ -61,14 +57,12 @@ def _frame(item: CameraJson, default: Intrinsics, axes: Axes, settings: Settings
     if item.has("eye"):
         up = item.get("up").numbers(3) if item.has("up") else settings.up_axis
         return frame_looking(item.get("eye").numbers(3), item.get("target").numbers(3), up, lens, time, name)
-    return Frame(_matrix(item), lens, time, name, None if settings.axes else axes)
-
-
-def _matrix(item: CameraJson) -> Matrix:
     if item.has("matrix"):
-        return np.array(item.get("matrix").matrix(4)).reshape(4, 4)
-    x, y, z, w = item.get("quat_xyzw").numbers(4)
-    return posed([w, x, y, z], item.get("position").numbers(3), item.place or "it")
+        matrix = np.array(item.get("matrix").matrix(4)).reshape(4, 4)
+    else:
+        x, y, z, w = item.get("quat_xyzw").numbers(4)
+        matrix = posed([w, x, y, z], item.get("position").numbers(3), item.place or "it")
+    return Frame(matrix, lens, time, name, None if settings.axes else axes)
 
 
 def _key(item: CameraJson) -> Key:

@@ -77,7 +77,8 @@ def _of_track(track: CameraJson, fov: float, first_version: bool, settings: Sett
         length = (duration + (duration == times[-1] / rate)) * rate
     step = track.has("interpolation") and track.value["interpolation"] == "step"
     at = _curve(times, points, smoothness, length, step)
-    return _sampled(at, _whole(duration * rate), rate, settings)
+    count = duration * rate
+    return _sampled(at, float(round(count)) if math.isfinite(count) else count, rate, settings)
 
 
 def _of_document(root: CameraJson, settings: Settings) -> Parsed:
@@ -102,10 +103,6 @@ def _of_document(root: CameraJson, settings: Settings) -> Parsed:
     points = np.array([keys[time] for time in times]).reshape(-1, 7)
     curve = _curve(times, points, smoothness, count if looping else None, False)
     return dataclasses.replace(_sampled(curve, float(math.floor(count)), rate, settings), notes=tuple(notes))
-
-
-def _whole(frames: float) -> float:
-    return float(round(frames)) if math.isfinite(frames) else frames
 
 
 def _values(view: CameraJson, fov: float) -> list[float]:

@@ -102,9 +102,9 @@ _MAKE: dict[str, Callable[[], Any]] = {"osmesa": _osmesa, "egl": _egl}
 
 
 def create(kind: str) -> Any:
-    """Return a moderngl.Context over one of `PACKAGES`, current on this thread.
+    """Return a moderngl.Context over one of `PACKAGES`, current on this thread; `NoContextError` if that fails.
 
-    NoContextError if it cannot be created; a broken driver may end the process instead, see `probe`.
+    A broken driver may end the process instead, see `probe`.
     """
     try:
         context = _MAKE[kind]()

@@ -143,11 +143,8 @@ def draw(
 ) -> Image:
     """Draw the picture of a camera: (height, width, 4) float32 red, green, blue (premultiplied) and alpha, 0..1.
 
-    OpenGL objects are reused from frame to frame. `precision` is one of `gl.texture.PRECISIONS`; `sorting` and
-    `throttle` are those of `Order`.
-
-    Raises:
-        BackendError: OpenGL is not available, or the picture or the scene exceeds its limits.
+    OpenGL objects are reused from frame to frame. `precision` is one of `PRECISIONS`; `sorting` and `throttle` are
+    those of `Order`. `BackendError` if OpenGL is not available, or the picture or the scene exceeds its limits.
     """
     return _renderer(precision, sorting, throttle).draw(splats, camera, raster)
 
@@ -161,7 +158,7 @@ class OpenGLRenderer:
     """Draws a sequence of frames; compiles once, and uploads only what has changed."""
 
     def __init__(self, *, precision: str = "float", sorting: str = "exact", throttle: float = 0.0) -> None:
-        self._data, self._order = data_texture_of(precision), Order(sorting, throttle)
+        self._data, self._order = DATA_TEXTURES[precision](), Order(sorting, throttle)
         self.uploads = self.sorts = 0
         self._count, self._capacity, self._size = 0, 0, (0, 0)
         self._texture: Any = None
@@ -476,7 +473,7 @@ _FETCH = {"float": _FLOATS, "half": _HALVES}
 
 
 def sources(precision: str) -> dict[str, str]:
-    """Return the sources of the shaders for a data texture of one of `texture.PRECISIONS`."""
+    """Return the sources of the shaders for a data texture of one of `PRECISIONS`."""
     head = f"#version 420 core\n{_CONSTANTS}{GLSL}\n"
     declarations, main = _VERTEX.split("void main()")
     vertex = head + declarations + _FETCH[precision] + "void main()" + main
@@ -592,14 +589,11 @@ class Halves(DataTexture):
         self._extra(shaded)[:, 1] = gain
 
     def _extra(self, shaded: ShadedSplats) -> NDArray[np.float16]:
-        """Return (N, 2) the two halves of the word that the viewer leaves unused."""
         words: NDArray[np.float16] = self.texture.reshape(-1, 8).view(np.float16)[: len(shaded), 6:8]
         return words
 
 
-def data_texture_of(precision: str) -> DataTexture:
-    """Return an empty data texture of one of `PRECISIONS`."""
-    return {"float": Floats, "half": Halves}[precision]()
+DATA_TEXTURES = {"float": Floats, "half": Halves}
 
 
 def _clamped_colors(shaded: ShadedSplats) -> FloatArray:

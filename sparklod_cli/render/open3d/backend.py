@@ -56,8 +56,7 @@ ASKEW = 1e-5
 def draw(shaded: ShadedSplats, camera: Camera, raster: RasterSettings) -> Image:
     """Draw the picture of a camera: (height, width, 4) float32 red, green, blue (premultiplied) and alpha, 0..1.
 
-    Raises:
-        BackendError: Open3D is not installed, cannot draw here, or has crashed.
+    `BackendError` if Open3D is not installed, cannot draw here, or has crashed.
     """
     global _child
     image = np.zeros((camera.height, camera.width, 4), np.float32)

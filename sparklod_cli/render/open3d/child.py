@@ -116,11 +116,7 @@ class Painter:
         self._material.gaussian_splat_antialias = True
 
     def probe(self) -> None:
-        """Draw a splat to check that Open3D works: without a Vulkan device it draws nothing, and raises nothing.
-
-        Raises:
-            RuntimeError: the splat is not in the picture.
-        """
+        """Draw a splat; `RuntimeError` if it is missing: without a Vulkan device Open3D draws nothing, silently."""
         splat = np.array([[0.0, 0.0, 1.0, 0.2, 0.2, 0.2, 1.0, 0.0, 0.0, 0.0, 9.0, -1.7, 1.7, -1.7]], np.float32)
         request = {
             "side": 32,
@@ -137,16 +133,13 @@ class Painter:
             )
 
     def draw(self, request: dict[str, Any], splats: Array) -> Array:
-        """Return (2, side, side, 3) uint8: the picture on black, and on white.
+        """Return (2, side, side, 3) uint8: the picture on black, and on white; `RuntimeError` if Open3D dropped splats.
 
         Args:
             request: "side" of the picture; "intrinsic", (3, 3); "rotation", (3, 3) world to camera, with y down,
                 looking along z from the origin; "range", near and far distance; "entries", an upper bound of the number
                 of pairs of a splat and a tile of 16 x 16 pixels.
             splats: (N, COLUMNS) float32.
-
-        Raises:
-            RuntimeError: Open3D dropped splats.
         """
         side = request["side"]
         renderer = self._renderer(side)

@@ -300,7 +300,7 @@ def test_keys_are_sorted_upwards_and_equal_ones_backwards() -> None:
 def test_half_precision_has_the_texture_of_the_viewer() -> None:
     splats = random_splats(1500)
     shown = shade([(splats, np.eye(4))], CAMERAS["front"])
-    words = osmesa.data_texture_of("half")
+    words = osmesa.DATA_TEXTURES["half"]()
     assert words.update(shown) == (True, True)
     theirs = data_texture.pack(splats)["texture"]
     assert words.texture.shape == theirs.shape == (2, 2048, 4)
