@@ -17,7 +17,6 @@ import shutil
 import stat
 from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path, PurePosixPath
-from typing import BinaryIO
 
 try:
     import fcntl
@@ -100,8 +99,6 @@ _FLAGS = os.O_RDWR | getattr(os, "O_BINARY", 0) | getattr(os, "O_CLOEXEC", 0) | 
 
 _COPY_BYTES = 1 << 20  # per read when a file is copied
 
-_TRIED_BYTES = 4096  # a block of most file systems: less may fit into a full one
-
 
 def write(target: Path, pieces: Iterable[bytes | memoryview], *, overwrite: bool, sync: bool = True) -> int:
     """Write a file that appears only when it is complete, and return its size in bytes.
@@ -118,8 +115,8 @@ def write(target: Path, pieces: Iterable[bytes | memoryview], *, overwrite: bool
         OSError: the file system reported an error.
     """
     with contextlib.closing(NewFile(target, overwrite=overwrite)) as new:
-        size = fill(new.file, pieces, sync=sync)
-        new.publish()
+        size = sum(map(new.file.write, pieces))
+        new.publish(sync=sync)
     return size
 
 
@@ -128,56 +125,80 @@ class NewFile:
 
     Attributes:
         file: open for writing and reading.
+        part: its temporary name; None for an unnamed file.
     """
 
-    def __init__(self, target: Path, *, overwrite: bool) -> None:
+    def __init__(self, target: Path, *, overwrite: bool, unnamed: bool = True) -> None:
         sweep(target.parent)
-        self._target, self._overwrite, self._part = target, overwrite, None
-        descriptor = _open_unnamed(target, overwrite)
-        if descriptor is None:
-            self._part, descriptor = _open_part(target, overwrite)
-        self.file = os.fdopen(descriptor, "w+b")
+        self._target, self._overwrite = target, overwrite
+        self.part: Path | None = None
+        mode = _replaced_mode(target, overwrite)
+        mode = 0o666 if mode is None else mode & 0o600  # never more than that of the complete file
+        if unnamed and UNNAMED is not None and OPEN_FILES.exists():
+            with contextlib.suppress(OSError):
+                self.file = os.fdopen(os.open(target.parent, UNNAMED | os.O_RDWR | os.O_CLOEXEC, mode), "w+b")
+                return
+        while True:
+            part = target.with_name(unique(PARTS))
+            descriptor = os.open(part, _FLAGS | os.O_CREAT | os.O_EXCL, mode)
+            lock(descriptor)
+            with contextlib.suppress(FileNotFoundError):  # another process removed it before it was locked
+                if os.path.samestat(os.fstat(descriptor), part.stat()):
+                    self.part, self.file = part, os.fdopen(descriptor, "w+b")
+                    return
+            os.close(descriptor)
 
-    def publish(self) -> None:
-        """Give the file, which is complete and flushed, its name; raise `FileExistsError` if that is taken."""
-        target = self._target
-        if self._part is not None:
+    def publish(self, *, sync: bool = True) -> None:
+        """Give the file, which is complete, its name; raise `FileExistsError` if that is taken."""
+        self.file.flush()
+        number, target = self.file.fileno(), self._target
+        if sync:
+            os.fsync(number)
+        if self.part is not None:
             mode = _replaced_mode(target, self._overwrite)
             if mode is not None:
-                self._part.chmod(mode)
+                self.part.chmod(mode)
             if not HAS_LOCKS:
                 self.file.close()  # Windows cannot rename an open file
-            rename(self._part, target, self._overwrite)
+            rename(self.part, target, self._overwrite)
             return
         target.parent.mkdir(parents=True, exist_ok=True)  # another run that failed may have removed it as empty
+        # src_dir_fd has no other effect than that Python follows the symbolic link in /proc.
+        link = functools.partial(os.link, OPEN_FILES / str(number), src_dir_fd=number, follow_symlinks=True)
         try:
-            _name(self.file, target, self._overwrite)
+            mode = _replaced_mode(target, self._overwrite)
+            if mode is None:
+                try:
+                    link(target)
+                    return
+                except FileExistsError:
+                    if not self._overwrite:
+                        raise
+                    mode = _replaced_mode(target, self._overwrite)  # another process created it first
+            if mode is not None:
+                os.fchmod(number, mode)
+            lock(number)
+            temporary = target.with_name(unique(PARTS))
+            try:
+                link(temporary)  # link() cannot replace a file, so it has two names for a moment
+                temporary.replace(target)
+            finally:
+                temporary.unlink(missing_ok=True)
         except FileExistsError:
             raise
         except OSError:  # a file system without links
             self.file.seek(0)
-            self._part, descriptor = _open_part(target, self._overwrite)
-            with os.fdopen(descriptor, "w+b") as part:
-                fill(part, iter(lambda: self.file.read(_COPY_BYTES), b""))
-                self.publish()
+            with contextlib.closing(NewFile(target, overwrite=self._overwrite, unnamed=False)) as copy:
+                shutil.copyfileobj(self.file, copy.file, _COPY_BYTES)
+                copy.publish()
 
     def close(self) -> None:
         """Close the file; remove it, if it has no name of its own."""
         try:
             self.file.close()
         finally:
-            if self._part is not None:
-                self._part.unlink(missing_ok=True)
-
-
-def attempt(folder: Path) -> None:
-    """Try to write a file in a folder, and leave nothing behind.
-
-    Raises:
-        OSError: the file system refuses it, or is full.
-    """
-    with contextlib.closing(NewFile(folder / unique(PARTS), overwrite=False)) as new:
-        new.file.write(bytes(_TRIED_BYTES))
+            if self.part is not None:
+                self.part.unlink(missing_ok=True)
 
 
 def check_replaceable(path: Path) -> None:
@@ -199,76 +220,12 @@ def check_replaceable(path: Path) -> None:
                 raise
 
 
-def fill(file: BinaryIO, pieces: Iterable[bytes | memoryview], *, sync: bool = True) -> int:
-    """Write the content of a file, sync it if requested, and return its size in bytes."""
-    size = sum(map(file.write, pieces))
-    file.flush()
-    if sync:
-        os.fsync(file.fileno())
-    return size
-
-
 def _replaced_mode(target: Path, overwrite: bool) -> int | None:
     """Return permissions of the file that will be replaced; None if there is none."""
     try:
         return stat.S_IMODE(target.stat().st_mode) & 0o777 if overwrite else None
     except FileNotFoundError:
         return None
-
-
-def _first_mode(target: Path, overwrite: bool) -> int:
-    """Return permissions for creating a file, before the umask: never more than those of the complete file."""
-    mode = _replaced_mode(target, overwrite)
-    return 0o666 if mode is None else mode & 0o600
-
-
-def _open_unnamed(target: Path, overwrite: bool) -> int | None:
-    """Open an unnamed file in the folder of `target`; None if that is impossible."""
-    if UNNAMED is None or not OPEN_FILES.exists():
-        return None
-    try:
-        return os.open(target.parent, UNNAMED | os.O_RDWR | os.O_CLOEXEC, _first_mode(target, overwrite))
-    except OSError:
-        return None
-
-
-def _name(file: BinaryIO, target: Path, overwrite: bool) -> None:
-    """Give a complete, unnamed file its name."""
-    number = file.fileno()
-    mode = _replaced_mode(target, overwrite)
-    if mode is None:
-        try:
-            return _link(number, target)
-        except FileExistsError:
-            if not overwrite:
-                raise
-            mode = _replaced_mode(target, overwrite)  # another process created it first
-    if mode is not None:
-        os.fchmod(number, mode)
-    lock(number)
-    temporary = target.with_name(unique(PARTS))
-    try:
-        _link(number, temporary)  # link() cannot replace a file, so it has two names for a moment
-        temporary.replace(target)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-def _link(number: int, path: Path) -> None:
-    # src_dir_fd has no other effect than that Python follows the symbolic link in /proc.
-    os.link(OPEN_FILES / str(number), path, src_dir_fd=number, follow_symlinks=True)
-
-
-def _open_part(target: Path, overwrite: bool) -> tuple[Path, int]:
-    """Create a locked temporary file in the folder of `target`; return its path and descriptor."""
-    while True:
-        temporary = target.with_name(unique(PARTS))
-        descriptor = os.open(temporary, _FLAGS | os.O_CREAT | os.O_EXCL, _first_mode(target, overwrite))
-        lock(descriptor)
-        with contextlib.suppress(FileNotFoundError):  # another process removed it before it was locked
-            if os.path.samestat(os.fstat(descriptor), temporary.stat()):
-                return temporary, descriptor
-        os.close(descriptor)
 
 
 def rename(temporary: Path, target: Path, overwrite: bool) -> None:
@@ -331,7 +288,10 @@ def add(stage: Path, name: str, pieces: Iterable[bytes]) -> int:
     """Write and sync a file in the hidden folder, in folders there ("0_0/means_l.webp"); return its size in bytes."""
     (stage / name).parent.mkdir(parents=True, exist_ok=True)
     with (stage / name).open("xb") as file:
-        return fill(file, pieces)
+        size = sum(map(file.write, pieces))
+        file.flush()
+        os.fsync(file.fileno())
+    return size
 
 
 def publish(stage: Path, names: Collection[str], header: str, *, overwrite: bool, outdated: Iterable[str] = ()) -> None:

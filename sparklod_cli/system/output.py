@@ -22,6 +22,10 @@ from .units import format_size
 Files = Iterable[tuple[str, Iterable[bytes]]]
 
 
+#: Bytes written to try a folder, a block of most file systems: less may fit into a full one.
+_TRIED_BYTES = 4096
+
+
 @dataclass(frozen=True)
 class Siblings:
     """Names of the files that a format writes beside the first file of an output: chunks, images, or folders of them.
@@ -118,7 +122,19 @@ class Output:
         if self.place == DASH:
             return write_stdout(pieces, may_end=self._may_end)
         if self.siblings is None:
-            self._file = self._file or self._opened()
+            if self._file is None:
+                if isinstance(self.target, Address):
+                    import tempfile  # as every command loads this module
+
+                    temporary: Any = tempfile.NamedTemporaryFile(prefix="sparklod-")  # noqa: SIM115
+                    self._file = self._stack.enter_context(temporary)
+                elif isinstance(self.place, Path) and _is_no_file(self.place):
+                    self._file = self._stack.enter_context(self.place.open("wb"))
+                else:
+                    self._stack.enter_context(atomic.created(self.target.parent))
+                    self._new = atomic.NewFile(self.target, overwrite=self._overwrite)
+                    self._stack.enter_context(contextlib.closing(self._new))
+                    self._file = self._new.file
             return sum(map(self._file.write, pieces))
         if not self._written:
             self._begin(self.siblings)
@@ -129,21 +145,6 @@ class Output:
             return (self.target.parent / name).write(pieces)
         assert self._stage is not None
         return atomic.add(self._stage, name, pieces)
-
-    def _opened(self) -> BinaryIO:
-        """Open the file of an output of one: the device itself, or a new file that gets its name at the end."""
-        if isinstance(self.target, Address):
-            import tempfile  # as every command loads this module
-
-            file: Any = self._stack.enter_context(tempfile.NamedTemporaryFile(prefix="sparklod-"))  # noqa: SIM115
-            return file
-        assert isinstance(self.place, Path)
-        if _is_no_file(self.place):
-            return self._stack.enter_context(self.place.open("wb"))
-        self._stack.enter_context(atomic.created(self.target.parent))
-        self._new = atomic.NewFile(self.target, overwrite=self._overwrite)
-        self._stack.enter_context(contextlib.closing(self._new))
-        return self._new.file
 
     def _begin(self, siblings: Siblings) -> None:
         self._find_former(siblings)
@@ -178,7 +179,6 @@ class Output:
 
     def _publish(self) -> None:
         if self._new is not None:
-            atomic.fill(self._new.file, ())
             self._new.publish()
         elif isinstance(self.target, Address) and self._file is not None:
             check_free(self.target, overwrite=self._overwrite)
@@ -294,7 +294,8 @@ def try_place(path: Path, *, least: int = 0) -> None:
         for name in target.relative_to(nearest).parts:
             with contextlib.suppress(FileNotFoundError):
                 (nearest / name).lstat()  # raises where the file system takes no such name
-        atomic.attempt(nearest)
+        with contextlib.closing(atomic.NewFile(nearest / "tried", overwrite=False)) as new:
+            new.file.write(bytes(_TRIED_BYTES))
         if os.path.lexists(target):
             atomic.check_replaceable(target)
         free = shutil.disk_usage(nearest).free if least else 0

@@ -37,21 +37,18 @@ KILLS = 12
 
 
 def has_unnamed_files(folder: Path) -> bool:
-    target = folder / "out"
-    found = atomic._open_unnamed(target, False)
-    if found is not None:
-        os.close(found)
-    return found is not None
+    with contextlib.closing(atomic.NewFile(folder / "out", overwrite=False)) as new:
+        return new.part is None
 
 
 @pytest.fixture(params=[True, False], ids=["unnamed", "named"])
 def unnamed(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> bool:
     """Whether files have no name before they are complete."""
-    atomic.sweep.cache_clear()
     if not request.param:
         monkeypatch.setattr(atomic, "UNNAMED", None)
     elif not has_unnamed_files(tmp_path):
         pytest.skip("no files without names here")
+    atomic.sweep.cache_clear()
     return bool(request.param)
 
 

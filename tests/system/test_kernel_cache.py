@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from sparklod_cli.system import atomic, jit, kernel_cache
+from sparklod_cli.system import jit, kernel_cache
 from sparklod_cli.system.jit import f8
 from sparklod_cli.system.kernel_cache import SUFFIX, cache_folders, is_trusted, is_whole, start_of
 from sparklod_cli.warmup import units
@@ -250,10 +250,10 @@ def test_a_folder_that_was_removed_is_made_again(cache: Cache) -> None:
 
 
 def test_a_full_disk_leaves_no_part_of_a_file(cache: Cache, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(file: object, pieces: object, **_: object) -> int:
+    def full(descriptor: int) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(atomic, "fill", full)
+    monkeypatch.setattr(os, "fsync", full)
     assert cache.compiles()
     assert "no space left on device" in cache.told[0]
     assert cache.files() == []
