@@ -116,7 +116,8 @@ class InMemory:
 
     def encode(self, tree: BuiltTree, encoder: Encoder) -> Windows:
         """Encode the windows of a tree that is in order."""
-        return list(results(encoder, tree.scene, self.threads, self.progress, "encoding"))
+        windows = list(results(encoder, tree.scene, self.threads, self.progress, "encoding"))
+        return lambda number, name: windows[number][name]
 
 
 def build_tree(

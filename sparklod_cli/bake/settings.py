@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..codecs.clamps import Clamp
+from ..codecs.encoder import Clamp
 from ..codecs.options import WriteOptions
 from ..codecs.reader import Reader
 from ..codecs.statistics import Statistics

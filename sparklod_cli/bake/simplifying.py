@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras.camera import Camera
-from ..codecs.clamps import Losses, settled_with_losses
 from ..codecs.formats import WRITABLE
+from ..codecs.losses import Losses, settled_with_losses
 from ..codecs.options import WriteOptions
 from ..codecs.spz import like
 from ..codecs.validation import check_valid

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from pathlib import PurePath
 from typing import TYPE_CHECKING, Any
 
-from ..codecs import clamps
-from ..codecs.encoder import CLAMPED, Encoder, Stored, Windows, windows_of
+from ..codecs.encoder import CLAMPED, Encoder, Stored, Windows, clamps_of, windows_of
 from ..codecs.formats import RAD_SUFFIX as RAD
 from ..codecs.formats import WRITABLE, Format
 from ..codecs.options import DEFAULTS, RAD_ENCODINGS, WriteOptions
@@ -185,13 +184,10 @@ def _write_windows(
             for piece in encoder.pieces(windows, threads=threads, progress=progress):
                 size += out.write(name, (piece,))
         else:
-            chunks = map(windows.__getitem__, numbers)
+            chunks = (windows(number, codec.CHUNK).tobytes() for number in numbers)
             for each, pieces in encoder.files(chunks, PurePath(name).stem, progress=progress):
                 size += out.write(each, pieces)
-    beyond = clamps.Clamps()
-    if encoder.ranges:
-        tallies = [windows[number][CLAMPED] for number in numbers]
-        beyond = clamps.clamps_of(clamps.merged(tallies), encoder.ranges)
+    counts, clamps = clamps_of([windows(number, CLAMPED) for number in numbers] if ranges else [], ranges)
     clock.end("write")
     if not output.in_chunks:
         return WrittenTree(
@@ -199,8 +195,8 @@ def _write_windows(
             bytes=size,
             version=options.spz_version,
             fractional_bits=options.fractional_bits,
-            clamped=beyond.splats,
-            clamps=beyond.ends,
+            clamped=counts,
+            clamps=clamps,
         )
     return WrittenTree(
         output_format="rad-chunked" if options.rad.chunked else "rad",
@@ -208,8 +204,8 @@ def _write_windows(
         chunks=-(-count // CHUNK_NODES),
         encodings={name: getattr(options.rad, name) for name in RAD_ENCODINGS if encoder.sh_degree or name != "sh"},
         sh_codes=min(options.rad.sh_codes, count) if options.rad.sh_codes and encoder.sh_degree else None,
-        clamped=beyond.splats,
-        clamps=beyond.ends,
+        clamped=counts,
+        clamps=clamps,
     )
 
 

@@ -34,7 +34,7 @@ class Format:
         module: in this package; has `open_content(source) -> Reader`, see `content`.
         writable: its module also has `encode(scene, options, *, threads, progress) -> Iterator[bytes]`;
             `settled(scene, options) -> WriteOptions`, the options with nothing left open, which raises `FormatError`
-            if the scene cannot be written; and `held(options, sh_degree)`, the `clamps.CodeRange`s that it can hold.
+            if the scene cannot be written; and `held(options, sh_degree)`, the `encoder.CodeRange`s that it can hold.
         unbundled: the name of the first of the files as which a scene can also be written, all in one folder; None if
             there is no such way. Its module then has `encode_files(scene, options, *, threads, progress)`, too, which
             yields the name and the bytes of each, this one last.

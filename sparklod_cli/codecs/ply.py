@@ -25,7 +25,7 @@ from ..system.progress import Progress, silent
 from ..system.threads import blocks_of
 from ..system.untrusted import quoted
 from . import quantize
-from .clamps import CodeRange
+from .encoder import CodeRange
 from .file_notes import comment_of, read_comment
 from .options import DEFAULTS, WriteOptions
 from .ply_header import PlyHeader, first_value, offset_of, read_header

@@ -13,7 +13,7 @@ from ..model.splats import Splats
 from ..system.errors import FormatError, TruncatedError
 from ..system.progress import Progress, silent
 from . import quantize
-from .clamps import CodeRange
+from .encoder import CodeRange
 from .options import DEFAULTS, WriteOptions
 from .reader import OpenFile, Reader, Target, decode_rows, encode_rows, rows_of
 

@@ -29,9 +29,8 @@ from ..model.splats import FloatArray, Splats
 from ..system.errors import FormatError
 from ..system.progress import Progress, silent
 from ..system.threads import blocks_of, ordered_map
-from . import clamps, compression, quantize
-from .clamps import CodeRange
-from .encoder import Encoded, Encoder, Windows, results, windows_of
+from . import compression, quantize
+from .encoder import SPZ_RANGES, CodeRange, Encoded, Encoder, Windows, results, windows_of
 from .file_notes import comment_of
 from .options import DEFAULT_SPZ_VERSION, DEFAULTS, MAX_FRACTIONAL_BITS, TREE_SPZ_VERSIONS, WriteOptions
 from .quantize import Bytes
@@ -313,7 +312,7 @@ class SpzEncoder(Encoder):
             return
         fields = layout.version, count, layout.sh_degree, layout.fractional_bits, layout.flags, 0
         numbers = range(len(windows_of(count)))
-        data = (windows[number][stream.name] for stream in streams for number in numbers)
+        data = (windows(number, stream.name) for stream in streams for number in numbers)
         runs = [(stream.size * count, WAYS.get(stream.name, compression.MIXED)) for stream in streams]
         runs[0] = runs[0][0] + HEADER.size, runs[0][1]
         # A plain file without it would be one of another program, whose y is up.
@@ -332,7 +331,7 @@ class SpzEncoder(Encoder):
         layout, streams, frames = self.layout, self.layout.streams(), list[bytes]()
 
         def packed(stream: SpzStream) -> bytes:
-            parts = (windows[number][stream.name] for number in range(len(windows_of(layout.count))))
+            parts = (windows(number, stream.name) for number in range(len(windows_of(layout.count))))
             return compression.zstd_frame(parts, stream.size * layout.count, self.options.compression_level)
 
         sizes = [stream.size * layout.count for stream in streams]
@@ -401,7 +400,7 @@ def sh_codes(sh: FloatArray, is_leaf: NDArray[np.bool_] | None, sh_bits: int) ->
 
 def held(options: WriteOptions, sh_degree: int) -> Sequence[CodeRange]:
     """Return the values that SPZ holds without clamping them."""
-    return clamps.SPZ
+    return SPZ_RANGES
 
 
 def encode(
@@ -416,7 +415,7 @@ def encode(
     """
     of_scene = encoder(scene, settled(scene, options))
     windows = list(results(of_scene, scene, threads, progress, "encoding"))
-    yield from of_scene.pieces(windows, threads=threads, progress=progress)
+    yield from of_scene.pieces(lambda number, name: windows[number][name], threads=threads, progress=progress)
 
 
 def open_content(source: OpenFile) -> Reader:

@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from ..bake.parts_output import WrittenDetail
     from ..bake.settings import Baked, Source
     from ..bake.simplifying import Extracted, Refined, WrittenSet
-    from ..codecs.clamps import Clamp
+    from ..codecs.encoder import Clamp
     from ..model.instances import Instance
 
     #: Result for an input; None where the output exists already.
@@ -479,11 +479,11 @@ def _written(baked: Baked) -> str:
 
 def _consequences(baked: Baked) -> str:
     """Return a line on the visible effect of clamping; empty where nothing of it can be seen."""
-    from ..codecs.clamps import matters
+    from ..codecs.encoder import clamp_matters
 
     shares: dict[str, float] = {}
     for clamp in baked.clamps:
-        if matters(clamp.column, above=clamp.above, visible=clamp.visible, leaves=baked.splats):
+        if clamp_matters(clamp.column, above=clamp.above, visible=clamp.visible, leaves=baked.splats):
             text = CONSEQUENCES[clamp.column, clamp.above]
             shares[text] = max(shares.get(text, 0.0), clamp.visible / baked.splats)
     if not shares:

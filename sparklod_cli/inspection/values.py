@@ -10,8 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..codecs import clamps, quantize
-from ..codecs.gpu.layout_loss import MOST_PAGED_DEGREE, LayoutLoss, sample_loss
+from ..codecs import quantize
+from ..codecs.encoder import clamp_matters
+from ..codecs.losses import MOST_PAGED_DEGREE, LayoutLoss, sample_loss
 from ..codecs.statistics import Distribution
 from ..model.gaussian import spark_size
 from ..model.scene import Scene
@@ -329,7 +330,7 @@ class ValueTally:
             "far": valid & (furthest >= FLOAT16_END),
         }
         low, high = ends.scale
-        if high < math.inf:  # see `clamps.tally` for what of it can be seen
+        if high < math.inf:  # see `encoder.tally` for what of it can be seen
             masks["small"] = checked & valid & (most > 0) & (most <= low)
             masks["large"] = checked & valid & (most >= high)
         center = block.splats.center[valid] if block.invalid else block.splats.center
@@ -396,7 +397,7 @@ def findings_about(values: ValueTally, ends: Ends, *, is_tree: bool) -> list[Fin
         text = f"a coordinate is {ends.center:g}, the end of the range of its code"
         report("values.center-clamped", "center", text)
     for name, end in zip(("small", "large"), ends.scale, strict=True):
-        if clamps.matters("scale", above=name == "large", visible=values.number(name), leaves=values.checked):
+        if clamp_matters("scale", above=name == "large", visible=values.number(name), leaves=values.checked):
             text = f"a scale is {end:.2g}, the end of the range of its code; RAD with --rad-scales ln_f16 keeps such"
             report("values.scale-clamped", name, text)
     report("values.center-far", "far", f"a coordinate is {FLOAT16_END:,} or more, which float16 cannot hold")

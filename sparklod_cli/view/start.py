@@ -15,7 +15,7 @@ from ..cameras import DEFAULT_SIZE, ELEVATION, framing
 from ..cameras.camera import Camera, Matrix
 from ..cameras.frame import DEFAULT_FOV_Y, Settings
 from ..cameras.sources import SingleViews, WholeScene
-from ..codecs.gpu.layout_loss import MOST_PAGED_DEGREE, sample_loss
+from ..codecs.losses import MOST_PAGED_DEGREE, sample_loss
 from ..codecs.rad.rad_header import RadHeader
 from ..codecs.rad.rad_reader import count_leaves, file_of, read_chunk
 from ..io import read_parts, read_scene

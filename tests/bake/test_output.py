@@ -44,7 +44,8 @@ def written(output: BakeOutput, nodes: Scene | NodeStream, found: Statistics) ->
     def encode(tree: BuiltTree, made: encoder.Encoder) -> encoder.Windows:
         read = nodes.read if isinstance(nodes, NodeStream) else node_stream(nodes).read
         parts = encoder.windows_of(made.count)
-        return [made.encode(*read(part.start, part.stop), part.start) for part in parts]
+        windows = [made.encode(*read(part.start, part.stop), part.start) for part in parts]
+        return lambda number, name: windows[number][name]
 
     return write_tree(BuiltTree(nodes=nodes, output=output, statistics=found), encode, Clock(), 2, silent)
 
@@ -78,13 +79,12 @@ def test_windows_that_cannot_be_read_leave_no_output(scene: Scene, tmp_path: Pat
         def encode(tree: BuiltTree, made: encoder.Encoder) -> encoder.Windows:
             encoded = made.encode(*tree.nodes.read(0, len(scene)), 0)
 
-            class Gone(list):
-                def __getitem__(self, number: int) -> dict[str, np.ndarray]:
-                    if number:
-                        raise OSError("gone")
-                    return encoded
+            def read(number: int, array: str) -> np.ndarray:
+                if number:
+                    raise OSError("gone")
+                return encoded[array]
 
-            return Gone()
+            return read
 
         tree = BuiltTree(nodes=nodes, output=output, statistics=found)
         with pytest.MonkeyPatch.context() as patch, pytest.raises(OutputError, match="gone"):

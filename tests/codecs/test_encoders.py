@@ -9,7 +9,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from sparklod_cli.codecs import clamps, encoder, sh_palette, spz
+from sparklod_cli.codecs import encoder, sh_palette, spz
 from sparklod_cli.codecs.options import DEFAULTS, RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import codec as rad
 from sparklod_cli.codecs.rad import rad_options
@@ -44,17 +44,17 @@ def test_windows_are_encoded_anywhere_and_count_what_they_clamp(
         monkeypatch.setattr(encoder, "CHUNK_NODES", window)
     scene = tree_of(method, sh_degree)
     nodes, options = node_stream(scene), codec.settled(scene, PALETTE)
-    ranges = tuple(clamps.SPZ if codec is spz else rad_options.held(options, sh_degree))
+    ranges = tuple(encoder.SPZ_RANGES if codec is spz else rad_options.held(options, sh_degree))
     sent = pickle.dumps(codec.encoder(nodes, options, ranges))
     found = {}
     for number, part in reversed(list(enumerate(encoder.windows_of(len(scene))))):
         found[number] = pickle.loads(sent).encode(*nodes.read(part.start, part.stop), part.start)
-    pieces = pickle.loads(sent).pieces(found, threads=1, progress=silent)
+    pieces = pickle.loads(sent).pieces(lambda number, name: found[number][name], threads=1, progress=silent)
     assert b"".join(pieces) == b"".join(codec.encode(scene, PALETTE, threads=2))
     tallies = [found[number][encoder.CLAMPED] for number in sorted(found)]
-    expected = clamps.find(scene.splats, ranges=ranges, tree=scene.tree)
-    assert clamps.clamps_of(clamps.merged(tallies), ranges) == expected
-    assert not sh_degree or set(expected.splats) >= {"sh"}
+    expected = encoder.clamps_in(scene.splats, ranges=ranges, tree=scene.tree)
+    assert encoder.clamps_of(tallies, ranges) == expected
+    assert not sh_degree or set(expected[0]) >= {"sh"}
 
 
 @pytest.mark.parametrize("version", [2, 3])
@@ -74,7 +74,7 @@ def test_chunk_files_are_made_of_the_results_of_windows(options: WriteOptions, m
     assert [name for name, _ in whole] == ["town-0.radc", "town-1.radc", "town-2.radc", "town.rad"]
     chunks = rad.encoder(scene, rad.settled(scene, options))
     found = list(encoder.results(chunks, scene, 1, silent, "encoding"))
-    assembled = chunks.files(found, "town")
+    assembled = chunks.files((each[rad.CHUNK].tobytes() for each in found), "town")
     assert [(name, b"".join(pieces)) for name, pieces in assembled] == whole
 
 

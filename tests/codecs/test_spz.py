@@ -15,7 +15,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fixtures import by_hand
-from sparklod_cli.codecs import clamps, quantize, spz
+from sparklod_cli.codecs import quantize, spz
+from sparklod_cli.codecs.encoder import clamps_in
 from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.codecs.spz_reader import MOST_EXTENSION_BYTES
@@ -279,14 +280,14 @@ def test_clamped_values_are_counted_by_splat() -> None:
     low, high = math.exp(-10 - 1 / 32), math.exp(255.5 / 16 - 10)
     splats.scale[0] = low * 1.001  # rounds to the last code that is in
     splats.scale[1] = high * 0.999
-    assert clamps.find(splats) == clamps.Clamps()
+    assert clamps_in(splats) == ({}, ())
     splats.scale[2, 1] = low * 0.999
     splats.scale[3, 2] = high * 1.001
     splats.scale[4] = 0  # a splat counts once, however many of its axes are out
     splats.rgb[5] = -0.5
     splats.sh[6:, 2] = 1.1
-    assert clamps.find(splats, threads=2).splats == {"scale": 3, "rgb": 1, "sh": 2}
-    found = {(at.column, at.above): (at.splats, at.farthest) for at in clamps.find(splats).ends}
+    assert clamps_in(splats, threads=2)[0] == {"scale": 3, "rgb": 1, "sh": 2}
+    found = {(at.column, at.above): (at.splats, at.farthest) for at in clamps_in(splats)[1]}
     assert found == {
         ("scale", False): (2, 0.0),
         ("scale", True): (1, pytest.approx(high * 1.001)),

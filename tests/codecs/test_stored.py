@@ -63,7 +63,7 @@ def check(form: object, data: bytes, options: WriteOptions | None = None) -> Sce
     settled = codec.settled(scene, stored.like(options or WriteOptions()))
     encoder = stored.keeping(codec.encoder(scene, settled), kept)
     windows = list(results(encoder, scene, 2, lambda *_: None, "encoding"))
-    written = b"".join(encoder.pieces(windows, threads=2, progress=lambda *_: None))
+    written = b"".join(encoder.pieces(lambda number, name: windows[number][name], threads=2, progress=lambda *_: None))
     after = decode_file(codec, io.BytesIO(written))
     assert after.antialiased == before.antialiased
     assert after.tree is not None
@@ -86,7 +86,7 @@ def test_an_spz_keeps_any_code_of_a_rotation(version: int, sh_degree: int) -> No
     rng = np.random.default_rng(2)
     for name in {"rotations", "sh"} & {*result}:
         result[name] = rng.integers(0, 256, result[name].shape, dtype=np.uint8)
-    data = b"".join(encoder.pieces([result], threads=1, progress=lambda *_: None))
+    data = b"".join(encoder.pieces(lambda number, name: result[name], threads=1, progress=lambda *_: None))
     read = decode_file(spz, io.BytesIO(data))
     again = decode_file(spz, io.BytesIO(b"".join(spz.encode(read, like(read.header, WriteOptions())))))
     assert not same_rows(again.splats, read.splats).all()  # or there would be no need of codes
@@ -153,7 +153,7 @@ def test_a_property_in_another_encoding_is_encoded_anew() -> None:
     assert settled.rad.rgb == "f16"
     encoder = stored.keeping(rad.encoder(before, settled), np.ones(len(before), bool))
     made = list(results(encoder, before, 1, lambda *_: None, "encoding"))
-    pieces = encoder.pieces(made, threads=1, progress=lambda *_: None)
+    pieces = encoder.pieces(lambda number, name: made[number][name], threads=1, progress=lambda *_: None)
     after = decode_file(rad, io.BytesIO(b"".join(pieces)))
     assert np.abs(after.splats.rgb - before.splats.rgb).max() > 0
     for name in {*COLUMNS} - {"rgb"}:

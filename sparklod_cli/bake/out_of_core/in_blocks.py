@@ -42,7 +42,7 @@ from .job import (
     pending_of,
     stage_of,
 )
-from .order import WINDOW_NODES, EncodedChunks, Rows, encode, fill_rows, node_stream, put_order, rows_of, splats_of
+from .order import WINDOW_NODES, Rows, encode, encoded_array, fill_rows, node_stream, put_order, rows_of, splats_of
 from .store import Arrays
 
 #: Largest size of a block, as a multiple of the requested one; a scene with a larger block is divided again. Chosen.
@@ -135,7 +135,7 @@ class InBlocks:
         self.engine.run("encoding", tasks, job, self.progress)
         self.clock.end("encode")
         job.store.put(PUBLISHED, {})
-        return EncodedChunks(job.store)
+        return functools.partial(encoded_array, job.store)
 
     def _scatter(self) -> InputSummary:
         """Divide the scene into blocks and sort the splats of the input into them.

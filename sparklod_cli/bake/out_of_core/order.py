@@ -284,27 +284,11 @@ def encode(job: Job, window: int, *, threads: int, progress: Progress) -> None:
     job.store.put(encoded_of(window), arrays)
 
 
-@dataclass(frozen=True)
-class EncodedChunk:
-    """Encoded arrays of a chunk, read by name from a store."""
-
-    store: Store
-    number: int
-
-    def __getitem__(self, name: str) -> NDArray[np.generic]:
-        window, place = divmod(self.number, len(windows_of(WINDOW_NODES)))
-        key = f"{place}.{name}"
-        return self.store.get(encoded_of(window), [key])[key]
-
-
-@dataclass(frozen=True)
-class EncodedChunks:
-    """Encoded chunks in a store, by number."""
-
-    store: Store
-
-    def __getitem__(self, number: int) -> EncodedChunk:
-        return EncodedChunk(self.store, number)
+def encoded_array(store: Store, number: int, name: str) -> NDArray[np.generic]:
+    """Read an encoded array of a chunk."""
+    window, place = divmod(number, len(windows_of(WINDOW_NODES)))
+    key = f"{place}.{name}"
+    return store.get(encoded_of(window), [key])[key]
 
 
 def _read(store: Store, width: int, start: int, stop: int, threads: int = 1) -> tuple[Splats, LodTree]:

@@ -28,8 +28,8 @@ from ...system.threads import blocks_of, ordered_map
 from ...system.units import count_of
 from ...system.untrusted import quoted_value
 from .. import spz
-from ..clamps import SPZ, CodeRange
 from ..compression import check_promise
+from ..encoder import SPZ_RANGES, CodeRange
 from ..file_notes import FileNote, note_of, read_note
 from ..merging import copy_rows
 from ..options import CESIUM, DEFAULTS, KHRONOS, WriteOptions
@@ -381,7 +381,7 @@ def settled(scene: Scene, options: WriteOptions) -> WriteOptions:
 
 def held(options: WriteOptions, sh_degree: int) -> Sequence[CodeRange]:
     """Return the values that the profile holds without clamping them: all, or those of SPZ."""
-    return SPZ if profile_of(options) == CESIUM else ()
+    return SPZ_RANGES if profile_of(options) == CESIUM else ()
 
 
 def encode(

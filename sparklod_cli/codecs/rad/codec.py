@@ -23,8 +23,7 @@ from ...model.splats import COLUMNS, FloatArray, Splats
 from ...system.progress import Progress, silent
 from ...system.threads import blocks_of
 from .. import quantize, sh_palette, spark_codings
-from ..clamps import CodeRange
-from ..encoder import Encoded, Encoder, Named, Windows, results, windows_of
+from ..encoder import CodeRange, Encoded, Encoder, Windows, results, windows_of
 from ..file_notes import comment_of
 from ..options import AUTO, DEFAULTS, RAD_ENCODINGS, WriteOptions
 from ..quantize import Bytes
@@ -143,16 +142,15 @@ class RadEncoder(Encoder):
     def pieces(self, windows: Windows, *, threads: int, progress: Progress) -> Iterator[bytes]:
         """Return the bytes of one file, piece by piece."""
         numbers = range(len(windows_of(self.count)))
-        sizes = [int(windows[number][SIZE][0]) for number in numbers]
-        yield from self.one_file(sizes, (windows[number][CHUNK].tobytes() for number in numbers), progress)
+        sizes = [int(windows(number, SIZE)[0]) for number in numbers]
+        yield from self.one_file(sizes, (windows(number, CHUNK).tobytes() for number in numbers), progress)
 
     def one_file(self, sizes: Sequence[int], chunks: Iterable[bytes], progress: Progress) -> Iterator[bytes]:
         """Return the bytes of one file, piece by piece, of the sizes and the bytes of its chunks."""
         return in_one_file(self._header, sizes, self._counted(chunks, progress))
 
-    def files(self, windows: Iterable[Named], stem: str, *, progress: Progress = silent) -> Files:
-        """Return the name and the bytes of each file of a scene with a file a chunk; see `rad_header.in_files`."""
-        chunks = (window[CHUNK].tobytes() for window in windows)
+    def files(self, chunks: Iterable[bytes], stem: str, *, progress: Progress = silent) -> Files:
+        """Return the name and the bytes of each file, one for each of the chunks; see `rad_header.in_files`."""
         return in_files(self._header, self._counted(chunks, progress), stem)
 
     def _counted(self, chunks: Iterable[bytes], progress: Progress) -> Iterator[bytes]:
@@ -315,7 +313,7 @@ def encode_chunked(
     """
     of_scene = encoder(scene, settled(scene, options), threads=threads, progress=progress)
     windows = results(of_scene, scene, threads, progress, "writing")
-    yield from of_scene.files(windows, stem)
+    yield from of_scene.files((window[CHUNK].tobytes() for window in windows), stem)
 
 
 @dataclass(frozen=True, eq=False)

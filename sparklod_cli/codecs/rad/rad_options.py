@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ...model.scene import Scene
 from ...model.sh import COEFFICIENTS
 from ...system.errors import FormatError
-from ..clamps import CodeRange
+from ..encoder import CodeRange
 from ..options import AUTO, RAD_ENCODINGS, RadOptions, WriteOptions
 from ..splat_encoding import LARGEST_END, SCALE_ZERO, SplatEncoding
 from ..statistics import EXACT_BITS, LOWER, SMALL_QUANTILE, UPPER, Distribution, Statistics, fine_bits, tops

@@ -28,8 +28,8 @@ from ...system.threads import blocks_of, for_blocks, ordered_map
 from ...system.units import count_of
 from ...system.untrusted import Json, quoted_value
 from .. import quantize, sh_palette
-from ..clamps import CodeRange
 from ..compression import check_promise
+from ..encoder import CodeRange
 from ..file_notes import note_of, read_note
 from ..formats import META, SOG_IMAGES
 from ..kernels import texels

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sparklod_cli.codecs.gpu.layout_loss import SAMPLE, LayoutLoss, sample_loss
+from sparklod_cli.codecs.losses import SAMPLE, LayoutLoss, sample_loss
 from sparklod_cli.model.splats import Splats
 from tests.scenes import random_splats
 

@@ -14,7 +14,7 @@ import pytest
 
 from fixtures import by_hand_rad
 from sparklod_cli import __version__
-from sparklod_cli.codecs import clamps
+from sparklod_cli.codecs.encoder import clamps_in
 from sparklod_cli.codecs.options import DEFAULTS, RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import codec as rad
 from sparklod_cli.codecs.rad import rad_options
@@ -347,9 +347,9 @@ def test_ranges_hold_all_scales_and_most_of_the_rest() -> None:
     assert ranges.ln_scale_max - 0.03 < logs.max() <= ranges.ln_scale_max
     assert (ranges.rgb_min, ranges.rgb_max) == (0, 2.25)
     assert 0.3 < ranges.sh1_max < 4 and not ranges.lod_opacity
-    found = clamps.find(splats, ranges=rad_options.held(options, 3))
-    assert found.splats == {"sh": 1}
-    assert [(each.column, each.degree, each.both, each.splats) for each in found.ends] == [
+    counts, ends = clamps_in(splats, ranges=rad_options.held(options, 3))
+    assert counts == {"sh": 1}
+    assert [(each.column, each.degree, each.both, each.splats) for each in ends] == [
         ("sh", degree, True, 1) for degree in (1, 2, 3)
     ]
 
@@ -391,9 +391,9 @@ def test_scales_of_0_are_held_and_thin_ones_clamped_and_counted() -> None:
     options = rad.settled(Scene(splats), DEFAULTS)
     back = read(written(Scene(splats))).splats.scale
     assert back[4, 1] == 0
-    found = clamps.find(splats, 2, rad_options.held(options, 0))
-    assert found.splats == {"scale": 4}
-    (end,) = found.ends
+    counts, ends = clamps_in(splats, 2, rad_options.held(options, 0))
+    assert counts == {"scale": 4}
+    (end,) = ends
     assert (end.above, end.splats, end.farthest) == (False, 4, pytest.approx(np.exp(-20)))
     assert back[:4, 0] == pytest.approx(end.end, rel=0.03)
 
@@ -403,8 +403,8 @@ def test_what_float16_clamps_is_counted() -> None:
     splats.center[3, 1] = -60000
     splats.rgb[5] = 1e6
     options = rad.settled(Scene(splats), WriteOptions(rad=RadOptions(center="f16_lebytes", rgb="f16")))
-    found = clamps.find(splats, ranges=rad_options.held(options, 0))
-    assert found.splats == {"rgb": 1}
+    counts, _ = clamps_in(splats, ranges=rad_options.held(options, 0))
+    assert counts == {"rgb": 1}
     back = read(b"".join(rad.encode(Scene(splats), options))).splats
     assert (back.center[3, 1], back.rgb[5, 0]) == (-60000, 65504)
 

@@ -1,4 +1,4 @@
-"""Loss of splats in the two layouts in which Spark can hold them, and the layout that loses less.
+"""Losses of splats: in a file, and in the two layouts in which Spark can hold them, of which one loses less.
 
 ExtSplats clip SH: a coefficient keeps between half and all of its largest channel. PackedSplats have centres of float16
 and clamp base colours to 0..1 and SH to -1..1. So strong SH look better as PackedSplats, colours beyond 0..1 and
@@ -13,9 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ...model.splats import Splats
-from ...model.transforms import sh_basis
-from . import ext_splats, packed_splats
+from ..model.scene import Scene
+from ..model.splats import Splats
+from ..model.transforms import sh_basis
+from .encoder import clamps_in
+from .formats import Format
+from .options import WriteOptions
 
 #: Most splats of a sample, evenly spaced: losses are means. Chosen; takes about 0.2 s.
 SAMPLE = 1 << 15
@@ -48,6 +51,8 @@ class LayoutLoss:
     @np.errstate(over="ignore", invalid="ignore")  # of numbers near the end of float32
     def of(cls, splats: Splats) -> LayoutLoss:
         """Return the sums over the valid splats whose losses are finite."""
+        from .gpu import ext_splats, packed_splats
+
         splats = splats.take(
             np.flatnonzero(
                 ~np.logical_or.reduce([splats.scale.max(axis=1, initial=0) <= 0, *splats.invalid().values()])
@@ -95,3 +100,32 @@ def _colors(splats: Splats) -> NDArray[np.float64]:
     if splats.sh_degree:
         colors += np.einsum("dk,nkc->ndc", sh_basis(_DIRECTIONS, splats.sh_degree), splats.sh)
     return np.maximum(colors, 0)
+
+
+@dataclass(frozen=True)
+class Losses:
+    """Losses of a scene without a tree in a format.
+
+    Attributes:
+        clamped: by the column of `Splats`, the number of splats with a value that the output cannot hold.
+        drops_sh: the output has no SH, and some splats do.
+        up_lost: the axis that points up, which the format cannot note; None where nothing is lost.
+    """
+
+    clamped: dict[str, int]
+    drops_sh: bool
+    up_lost: str | None
+
+
+def settled_with_losses(scene: Scene, form: Format, options: WriteOptions, threads: int) -> tuple[WriteOptions, Losses]:
+    """Return the options with nothing left open, and what a format loses of a scene; see `formats.Format.writable`.
+
+    Raises:
+        FormatError: the scene cannot be written.
+    """
+    codec = form.codec()
+    settled: WriteOptions = codec.settled(scene, options)
+    counts, clamps = clamps_in(scene.splats, threads, codec.held(settled, scene.splats.sh_degree))
+    drops_sh = any(clamp.column == "sh" and clamp.end == 0 for clamp in clamps)
+    clamped = {column: count for column, count in counts.items() if column != "sh" or not drops_sh}
+    return settled, Losses(clamped, drops_sh, scene.up if form.bare else None)
