@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import bisect
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 
 from ..system.errors import FormatError
 from ..system.untrusted import Json, Origin
@@ -37,32 +37,31 @@ def place_of(
     return root + "".join(reversed(way))
 
 
-def nodes_of(tree: Json, most: int) -> Iterator[tuple[Json, int, list[int]]]:
-    """Yield the nodes of a tree, however deep, root first and depth first.
+def nodes_of(tree: Json, most: int) -> list[tuple[Json, int, list[int]]]:
+    """Return the nodes of a tree, however deep, root first and depth first.
 
-    A node is its object, the number of its parent, -1 of the root, and the numbers of its children, to which each is
-    added when it is reached.
+    A node is its object, the number of its parent, -1 of the root, and the numbers of its children.
 
     Raises:
         FormatError: there are more than `most` nodes, one is no object, or its children are no list.
     """
-    children = list[list[int]]()
+    nodes = list[tuple[Json, int, list[int]]]()
     waiting = [(tree, -1)]
     while waiting:
         node, parent = waiting.pop()
-        number = len(children)
+        number = len(nodes)
         if number == most:
             raise tree.error(f"it has more than {most:,} nodes")
-        children.append([])
-        if parent >= 0:
-            children[parent].append(number)
         if not isinstance(node.value, dict):
             raise node.unexpected("an object")
+        nodes.append((node, parent, []))
+        if parent >= 0:
+            nodes[parent][2].append(number)
         below = node.value.get("children")
         missing = below is None or below == "" or below is False  # as for viewers, which test for truth
         items = [] if missing else list(node.items("children"))
-        yield node, parent, children[number]
         waiting.extend((each, number) for each in reversed(items))
+    return nodes
 
 
 def leads_away(name: str) -> bool:

@@ -7,7 +7,7 @@ import contextlib
 import dataclasses
 import itertools
 import posixpath
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import BinaryIO
 
@@ -23,7 +23,7 @@ from ..system.threads import ordered_map
 from ..system.units import count_of
 from ..system.untrusted import quoted_value
 from .reader import Fill, OpenCompanion, OpenFile, Reader, Target
-from .validation import error_of
+from .validation import RuleViolation, error_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -257,6 +257,30 @@ class SceneFiles:
 
         return fill
 
+    def violations(
+        self,
+        chunks: Sequence[Chunk],
+        rules: Callable[[Chunk, Splats], Iterable[RuleViolation]],
+        threads: int = 1,
+        progress: Progress = silent,
+    ) -> Iterator[RuleViolation]:
+        """Yield the rules about splats that files break, which are decoded one at a time.
+
+        Args:
+            rules: yields those that the splats of a file break.
+        """
+        total, done = sum(chunk.count for chunk in chunks), 0
+        for chunk in chunks:
+            splats = Splats.empty(chunk.rows, chunk.sh_degree)
+            try:
+                self.read([chunk], splats, threads)
+            except FormatError as error:
+                yield RuleViolation(self.code, str(error))
+                continue
+            yield from rules(chunk, splats)
+            done += chunk.count
+            progress("checking", done, total, "splat")
+
     @contextlib.contextmanager
     def _opened(self, name: str) -> Iterator[OpenFile]:
         """Open a file, and what opens the files beside it; errors of the body name it."""
@@ -278,6 +302,16 @@ class SceneFiles:
                 raise UnsupportedError(f"{quoted_value(name)}: {error}") from None
             except FormatError as error:
                 raise error_of(self.code, f"{quoted_value(name)}: {error}") from None
+
+
+def not_finite(chunk: Chunk, splats: Splats) -> RuleViolation | None:
+    """Return the violation of a file that has splats with a number that is not finite; None if all are."""
+    invalid = splats.invalid()
+    if not invalid:
+        return None
+    count = int(np.count_nonzero(np.any(list(invalid.values()), axis=0)))
+    text = f"{count_of(count, 'splat')} of {quoted_value(chunk.name)} have a number that is not finite"
+    return RuleViolation("values.non-finite", text, fatal=False)
 
 
 def _copy(out: Splats, piece: Piece, row: int, splats: Splats) -> None:

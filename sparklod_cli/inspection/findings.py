@@ -5,12 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from ..codecs.rad.rad_rules import ERRORS as RAD_ERRORS
-from ..codecs.rad.rad_rules import WARNINGS as RAD_WARNINGS
-from ..codecs.streamed_sog.manifest_rules import ERRORS as STREAMED_SOG_ERRORS
-from ..codecs.streamed_sog.manifest_rules import WARNINGS as STREAMED_SOG_WARNINGS
-from ..codecs.tiles_3d.tileset_rules import ERRORS as TILE_ERRORS
-from ..codecs.tiles_3d.tileset_rules import WARNINGS as TILE_WARNINGS
+from ..codecs.rad import rad_rules
+from ..codecs.streamed_sog import manifest_rules
+from ..codecs.tiles_3d import tileset_rules
 from ..codecs.validation import RuleViolation
 
 ERROR, WARNING, NOTE = "error", "warning", "note"
@@ -32,12 +29,12 @@ CODES: dict[str, tuple[str, str]] = {
     "container.flags": (WARNING, "the header sets flags or reserved bytes without a meaning"),
     "container.lossy": (ERROR, "images of a SOG are compressed with losses, so that values are not those written"),
     "container.left-out": (WARNING, "the file holds data that sparklod does not read"),
-    **{code: (ERROR, meaning) for code, meaning in RAD_ERRORS.items()},
-    **{code: (WARNING, meaning) for code, meaning in RAD_WARNINGS.items()},
-    **{code: (ERROR, meaning) for code, meaning in STREAMED_SOG_ERRORS.items()},
-    **{code: (WARNING, meaning) for code, meaning in STREAMED_SOG_WARNINGS.items()},
-    **{code: (ERROR, meaning) for code, meaning in TILE_ERRORS.items()},
-    **{code: (WARNING, meaning) for code, meaning in TILE_WARNINGS.items()},
+    **{
+        code: (severity, meaning)
+        for rules in (rad_rules, manifest_rules, tileset_rules)
+        for severity, meanings in ((ERROR, rules.ERRORS), (WARNING, rules.WARNINGS))
+        for code, meaning in meanings.items()
+    },
     "values.empty": (ERROR, "there are no splats"),
     "values.non-finite": (ERROR, "a number is not finite, or a rotation has length 0"),
     "values.rotation": (ERROR, "the length of a rotation is not 1"),

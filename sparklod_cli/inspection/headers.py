@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, BinaryIO
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..codecs.merging import Chunk
 from ..codecs.rad.property_codings import BY_NAME, CODINGS, LARGEST_F16, PROPERTIES
@@ -16,24 +17,12 @@ from ..codecs.rad.rad_header import ENCODING_KEYS, RadChunkHeader, RadHeader
 from ..codecs.rad.rad_reader import scan_chunks, scan_header
 from ..codecs.reader import OpenCompanion, size_of
 from ..codecs.splat_encoding import log_scale_table
+from ..codecs.streamed_sog import manifest_rules
+from ..codecs.streamed_sog.codec import RegionLayout, layout_of
 from ..codecs.streamed_sog.manifest import VERSION as STREAMED_SOG_VERSION
-from ..codecs.streamed_sog.manifest import Manifest, ManifestNode
-from ..codecs.streamed_sog.manifest_rules import level_counts, scan_files, scan_splats
+from ..codecs.tiles_3d import tileset_rules
 from ..codecs.tiles_3d.codec import tile_files
 from ..codecs.tiles_3d.tileset import MAX_TILESET, Tileset, read_whole
-from ..codecs.tiles_3d.tileset_rules import (
-    depths_of,
-    matrices_of,
-    matrix_of,
-    read_violations,
-    violations,
-)
-from ..codecs.tiles_3d.tileset_rules import (
-    scan_files as scan_tile_files,
-)
-from ..codecs.tiles_3d.tileset_rules import (
-    scan_splats as scan_tile_splats,
-)
 from ..codecs.validation import RuleViolation
 from ..model.axes import common
 from ..model.georeference import EarthPlace, place_of
@@ -82,7 +71,7 @@ class ChunkBytes:
 QUANTILES = {"min": 0.0, "p25": 0.25, "p50": 0.5, "p75": 0.75, "max": 1.0}
 
 
-def quantiles_of(values: Sequence[float], weights: Sequence[float] | None = None) -> dict[str, float]:
+def quantiles_of(values: ArrayLike, weights: ArrayLike | None = None) -> dict[str, float]:
     """Return the quantiles of values, each of them one of these, and their mean.
 
     Args:
@@ -97,6 +86,11 @@ def quantiles_of(values: Sequence[float], weights: Sequence[float] | None = None
     found = numbers[order][places]
     mean = float(numbers @ (weighed / below[-1]))
     return {name: float(f"{each:.6g}") for name, each in [*zip(QUANTILES, found, strict=True), ("mean", mean)]}
+
+
+def _line(text: object) -> str | None:
+    """Return a text of a file in one line; None for anything else."""
+    return printable(" ".join(text.split()), MOST) if isinstance(text, str) else None
 
 
 @dataclass(frozen=True)
@@ -166,10 +160,10 @@ def survey_rad(file: BinaryIO, open_companion: OpenCompanion, *, check: bool) ->
     header, violations = scan_header(file, open_companion)
     gathered = _Gathered()
     if not any(each.fatal for each in violations):
-        for chunk in scan_chunks(file, open_companion, header, paddings=check):
-            violations += chunk.violations
-            if chunk.header is not None:
-                gathered.add(chunk.header)
+        for chunk, broken in scan_chunks(file, open_companion, header, paddings=check):
+            violations += broken
+            if chunk is not None:
+                gathered.add(chunk)
     if any(each.fatal for each in violations):
         return HeaderScan("rad", violations)
     facts, noted = _rad_facts(header, gathered), header.noted
@@ -204,7 +198,6 @@ def _rad_facts(header: RadHeader, gathered: _Gathered) -> RadFacts:
     ranges = None
     if header.encoding is not None:
         ranges = {key: getattr(header.encoding, name) for key, name in ENCODING_KEYS.items()}
-    comment = None if header.comment is None else printable(" ".join(header.comment.split()), MOST)
     names = [row.name for row in PROPERTIES if row.name in gathered.encodings]
     return RadFacts(
         chunked=header.chunked,
@@ -215,7 +208,7 @@ def _rad_facts(header: RadHeader, gathered: _Gathered) -> RadFacts:
         chunk_bytes=ChunkBytes.of(sizes),
         palette=header.sh_code_count or 0,
         ranges=ranges,
-        comment=comment,
+        comment=_line(header.comment),
         properties={
             name: PropertyFacts(
                 encoding=", ".join(gathered.encodings[name]),
@@ -293,37 +286,34 @@ def survey_streamed_sog(
         FormatError: the manifest cannot be parsed.
     """
     size = size_of(file)
-    manifest, files, violations = scan_files(file, open_companion)
+    manifest, files, violations = manifest_rules.scan_files(file, open_companion)
     if any(each.fatal for each in violations):
         return HeaderScan("streamed_sog", violations)
-    if check:
-        violations += scan_splats(open_companion, manifest, files, threads=threads, progress=progress)
     chunks = {name: chunk for name, chunk in files.items() if isinstance(chunk, Chunk)}
-    facts = _detail_facts(manifest, chunks, size)
-    return HeaderScan("streamed_sog", violations, _detail_head(manifest, chunks, facts), facts)
-
-
-def _detail_head(manifest: Manifest, chunks: Mapping[str, Chunk], facts: StreamedSogFacts) -> Head:
-    """Return what a reader of level 0 and the environment finds."""
-    read = [chunks[name] for name in _names_of(manifest, 0)]
-    count = facts.levels[0].splats
+    if check:
+        violations += manifest_rules.scan_splats(open_companion, manifest, chunks, threads=threads, progress=progress)
+    layout = layout_of(manifest)
+    facts = _detail_facts(layout, chunks, size)
+    # What a reader of level 0 and the environment finds.
+    read, count = _chunks_of(layout, chunks, 0), facts.levels[0].splats
     if manifest.environment is not None:
         read.append(chunks[manifest.environment])
         count += chunks[manifest.environment].count
     degree = max((chunk.sh_degree for chunk in read), default=0)
     antialiased = any(chunk.antialiased for chunk in read)
-    return Head(f"Streamed SOG {STREAMED_SOG_VERSION}", facts.bytes, count, degree, antialiased, manifest.noted.up)
+    head = Head(f"Streamed SOG {STREAMED_SOG_VERSION}", facts.bytes, count, degree, antialiased, manifest.noted.up)
+    return HeaderScan("streamed_sog", violations, head, facts)
 
 
-def _names_of(manifest: Manifest, level: int) -> list[str]:
+def _chunks_of(layout: RegionLayout, chunks: Mapping[str, Chunk], level: int) -> list[Chunk]:
     """Return the chunk files with splats of a level."""
-    held = {node.runs[level].file for _, node in manifest.regions() if node.runs and _count(node, level)}
-    return [manifest.filenames[number] for number in sorted(held)]
+    held = np.unique(layout.file[layout.level == level]).tolist()
+    return [chunks[layout.manifest.filenames[number]] for number in held]
 
 
-def _detail_facts(manifest: Manifest, chunks: Mapping[str, Chunk], size: int) -> StreamedSogFacts:
-    counts = level_counts(manifest)
-    levels = [_detail_level(manifest, chunks, level, counts) for level in range(manifest.levels)]
+def _detail_facts(layout: RegionLayout, chunks: Mapping[str, Chunk], size: int) -> StreamedSogFacts:
+    manifest = layout.manifest
+    levels = [_detail_level(layout, chunks, level) for level in range(manifest.levels)]
     environment = None
     if manifest.environment is not None:
         chunk = chunks[manifest.environment]
@@ -331,22 +321,22 @@ def _detail_facts(manifest: Manifest, chunks: Mapping[str, Chunk], size: int) ->
     beyond = 0 if environment is None else environment.bytes
     sizes = [chunks[name].bytes for name in manifest.filenames]
     asset = manifest.head.get("asset")
-    generator = asset.get("generator") if isinstance(asset, dict) else None
-    regions = [node for _, node in manifest.regions()]
-    edges = [max(map(_edge, *node.bound)) for node in regions if node.bound is not None]
-    full = [_count(node, 0) for node in regions]
+    edges = [max(map(_edge, *node.bound)) for _, node in manifest.regions() if node.bound is not None]
+    depths = [0]
+    for node in manifest.nodes[1:]:
+        depths.append(depths[node.parent] + 1)
     bound = manifest.nodes[0].bound
     assert bound is not None
     return StreamedSogFacts(
-        generator=printable(" ".join(generator.split()), MOST) if isinstance(generator, str) else None,
+        generator=_line(asset.get("generator") if isinstance(asset, dict) else None),
         bytes=size + sum(sizes) + beyond,
         manifest_bytes=size,
         first_bytes=size + levels[-1].bytes + beyond,
-        splats=sum(counts),
+        splats=int(layout.counts.sum()),
         levels=levels,
-        regions=len(regions),
-        depth=_depth(manifest),
-        region_splats=quantiles_of(full),
+        regions=len(layout.counts),
+        depth=max(depths),
+        region_splats=quantiles_of(layout.counts[:, 0]),
         region_edge=quantiles_of(edges),
         bound=Box(list(bound[0]), list(bound[1])),
         files=len(sizes),
@@ -355,33 +345,20 @@ def _detail_facts(manifest: Manifest, chunks: Mapping[str, Chunk], size: int) ->
     )
 
 
-def _detail_level(manifest: Manifest, chunks: Mapping[str, Chunk], level: int, counts: Sequence[int]) -> LevelFacts:
-    names = _names_of(manifest, level)
-    held = [node for _, node in manifest.regions() if _count(node, level)]
-    errors = [node.errors[level] for node in held if node.errors is not None]
-    weights = [_count(node, 0) for node in held]
-    known = bool(errors) and len(errors) == len(held) and any(weights)
+def _detail_level(layout: RegionLayout, chunks: Mapping[str, Chunk], level: int) -> LevelFacts:
+    files, held = _chunks_of(layout, chunks, level), layout.counts[:, level] > 0
+    nodes = [node for (_, node), has in zip(layout.manifest.regions(), held, strict=True) if has]
+    errors = [node.errors[level] for node in nodes if node.errors is not None]
+    splats, full, weights = int(layout.counts[:, level].sum()), int(layout.counts[:, 0].sum()), layout.counts[held, 0]
+    known = bool(errors) and len(errors) == len(nodes) and bool(weights.any())
     return LevelFacts(
-        splats=counts[level],
-        share=round(counts[level] / counts[0], 4) if counts[0] else None,
-        regions=len(held),
-        files=len(names),
-        bytes=sum(chunks[name].bytes for name in names),
+        splats=splats,
+        share=round(splats / full, 4) if full else None,
+        regions=len(nodes),
+        files=len(files),
+        bytes=sum(chunk.bytes for chunk in files),
         errors=quantiles_of(errors, weights) if known else None,
     )
-
-
-def _count(node: ManifestNode, level: int) -> int:
-    """Return the splats of a region at a level."""
-    return node.runs[level].count if node.runs and level in node.runs else 0
-
-
-def _depth(manifest: Manifest) -> int:
-    """Edges to the deepest node; each node comes after its parent."""
-    depths = [0] * len(manifest.nodes)
-    for number, node in enumerate(manifest.nodes[1:], 1):
-        depths[number] = depths[node.parent] + 1
-    return max(depths)
 
 
 def _edge(low: float, high: float) -> float:
@@ -435,27 +412,23 @@ def survey_tiles(
         FormatError: a tileset file cannot be parsed.
     """
     tileset = read_whole(file.read(MAX_TILESET + 1), open_companion)
-    found = list(read_violations(tileset))
+    found = list(tileset_rules.read_violations(tileset))
     if not found:
-        found += violations(tileset)
+        found += tileset_rules.violations(tileset)
     if any(each.fatal for each in found):
         return HeaderScan("tiles", found)
-    matrices = matrices_of(tileset)
+    matrices = tileset_rules.matrices_of(tileset)
     named = {name: matrices[at] for at, tile in enumerate(tileset.tiles) if (name := tile.name) is not None}
     files = tile_files(open_companion, named)
-    chunks, about_files = scan_tile_files(tileset, files)
+    chunks, about_files = tileset_rules.scan_files(tileset, files)
     found += about_files
     if any(each.fatal for each in found):
         return HeaderScan("tiles", found)
     if check:
-        found += scan_tile_splats(tileset, files, chunks, threads=threads, progress=progress)
-    return HeaderScan("tiles", found, _tile_head(tileset, chunks), _tile_facts(tileset, chunks))
-
-
-def _tile_head(tileset: Tileset, chunks: Mapping[int, Chunk]) -> Head:
-    """Return what a reader of the tiles without children finds."""
+        found += tileset_rules.scan_splats(tileset, files, chunks, threads=threads, progress=progress)
+    # What a reader of the tiles without children finds.
     read = [chunk for number, chunk in chunks.items() if not tileset.tiles[number].children]
-    return Head(
+    head = Head(
         f"3D Tiles {tileset.head['asset']['version']} of {read[0].format}" if read else "3D Tiles",
         tileset.bytes + sum(chunk.bytes for chunk in chunks.values()),
         sum(chunk.count for chunk in read),
@@ -464,19 +437,19 @@ def _tile_head(tileset: Tileset, chunks: Mapping[int, Chunk]) -> Head:
         common(chunk.up for chunk in read),
         common(chunk.up_by for chunk in read) or "",
     )
+    return HeaderScan("tiles", found, head, _tile_facts(tileset, chunks))
 
 
 def _tile_facts(tileset: Tileset, chunks: Mapping[int, Chunk]) -> TileFacts:
     asset = tileset.head["asset"]
     extras = asset.get("extras")
-    generator = extras.get("generator") if isinstance(extras, dict) else None
-    depths = depths_of(tileset)
+    depths = tileset_rules.depths_of(tileset)
     sizes = [chunk.bytes for chunk in chunks.values()]
     by_depth = [[at for at in range(len(depths)) if depths[at] == depth] for depth in range(max(depths) + 1)]
     total, error = tileset.bytes + sum(sizes), tileset.head.get("geometricError")
     first = next((chunk.bytes for number, chunk in chunks.items() if depths[number] == 0), 0)
     return TileFacts(
-        generator=printable(" ".join(generator.split()), MOST) if isinstance(generator, str) else None,
+        generator=_line(extras.get("generator") if isinstance(extras, dict) else None),
         version=asset["version"],
         bytes=total,
         tileset_bytes=tileset.bytes,
@@ -507,7 +480,7 @@ def _tile_level(tileset: Tileset, chunks: Mapping[int, Chunk], numbers: Sequence
 
 def _place(tileset: Tileset) -> EarthPlace | None:
     """Return where the transform of the root puts the origin of the scene; None where that is not on the Earth."""
-    matrix = matrix_of(tileset.tiles[0].record)
+    matrix = tileset_rules.matrix_of(tileset.tiles[0].record)
     if float(np.linalg.norm(matrix[:3, 3])) < ON_EARTH:
         return None
     found = place_of(tuple(matrix.T.ravel().tolist()))

@@ -300,22 +300,7 @@ def count_leaves(file: BinaryIO, header: RadHeader, open_companion: OpenCompanio
     return leaves
 
 
-@dataclass(frozen=True)
-class ChunkScan:
-    """Header of a chunk.
-
-    Attributes:
-        number: from 0.
-        header: as read; None where it cannot be.
-        violations: of its rules.
-    """
-
-    number: int
-    header: RadChunkHeader | None
-    violations: tuple[RuleViolation, ...]
-
-
-def scan_header(file: BinaryIO, open_companion: OpenCompanion) -> tuple[RadHeader, tuple[RuleViolation, ...]]:
+def scan_header(file: BinaryIO, open_companion: OpenCompanion) -> tuple[RadHeader, list[RuleViolation]]:
     """Read the header of a file, and return it with its violations, those about the files of chunks among them.
 
     Raises:
@@ -324,7 +309,7 @@ def scan_header(file: BinaryIO, open_companion: OpenCompanion) -> tuple[RadHeade
     size = size_of(file)
     header = read_header(file)
     sizes = {name: _size_or_reason(name, open_companion) for name in header.filenames}
-    return header, tuple(rad_rules.violations(header, size, sizes))
+    return header, list(rad_rules.violations(header, size, sizes))
 
 
 def _size_or_reason(name: str, open_companion: OpenCompanion) -> int | str:
@@ -338,8 +323,8 @@ def _size_or_reason(name: str, open_companion: OpenCompanion) -> int | str:
 
 def scan_chunks(
     file: BinaryIO, open_companion: OpenCompanion, header: RadHeader, *, paddings: bool
-) -> Iterator[ChunkScan]:
-    """Read the headers of the chunks, one after the other."""
+) -> Iterator[tuple[RadChunkHeader | None, list[RuleViolation]]]:
+    """Read the headers of the chunks, one after the other; None for one that cannot be read. Also their violations."""
     for number, entry in enumerate(header.chunks):
         with file_of(entry, file, open_companion) as source:
             start = entry.start(header)
@@ -347,8 +332,7 @@ def scan_chunks(
             try:
                 chunk = read_chunk_header(source)
             except FormatError as error:
-                violation = broken("chunk-header", f"chunk {number:,}: {error}")
-                yield ChunkScan(number, None, (violation,))
+                yield None, [broken("chunk-header", f"chunk {number:,}: {error}")]
                 continue
             violations = list(rad_rules.chunk_violations(header, number, chunk, entry.bytes))
             if paddings and not any(each.fatal for each in violations):
@@ -357,7 +341,7 @@ def scan_chunks(
                     if any(source.read(padding(each.bytes))):
                         text = f"bytes behind {each.name} of chunk {number:,} are not zeros"
                         violations.append(broken("padding", text, fatal=False))
-            yield ChunkScan(number, chunk, tuple(violations))
+            yield chunk, violations
 
 
 def decoded_bytes(header: RadHeader) -> int:

@@ -140,15 +140,13 @@ def parse(data: bytes) -> Manifest:
 
 def _nodes(tree: Json, levels: int, files: int) -> tuple[ManifestNode, ...]:
     """Return the nodes of a tree, however deep, root first and depth first."""
-    keys = {str(level): level for level in range(levels)}
-    rows = []
+    keys, nodes = {str(level): level for level in range(levels)}, list[ManifestNode]()
     for node, parent, children in nodes_of(tree, MAX_NODES):
         lods = node.get("lods")
         runs = _runs(lods, keys, files) if lods.value or lods.value == {} else None
-        rows.append((_bound(node.value.get("bound")), children, runs, node.value.get("errors"), parent))
-    return tuple(
-        ManifestNode(bound, tuple(children), runs, errors, parent) for bound, children, runs, errors, parent in rows
-    )
+        bound, errors = _bound(node.value.get("bound")), node.value.get("errors")
+        nodes.append(ManifestNode(bound, tuple(children), runs, errors, parent))
+    return tuple(nodes)
 
 
 def _runs(lods: Json, keys: Mapping[str, int], files: int) -> dict[int, Run]:

@@ -19,7 +19,7 @@ from ...system.units import count_of
 from ...system.untrusted import quoted_value
 from ..formats import MANIFEST, ZIP
 from ..json_trees import leads_away
-from ..merging import Chunk, SceneFiles
+from ..merging import Chunk, SceneFiles, not_finite
 from ..reader import OpenCompanion, code_of
 from ..sog import codec as sog
 from ..sog import texel_codings
@@ -173,7 +173,10 @@ def _counts(manifest: Manifest) -> Iterator[RuleViolation]:
     missing = [name for name in ("version", "count", "counts") if manifest.head.get(name) is None]
     if missing:
         yield broken("old", f"it has no {', '.join(missing)}, as before version 1", fatal=False)
-    held = level_counts(manifest)
+    held = [0] * manifest.levels
+    for _, runs, _ in regions_of(manifest):
+        for level, run in runs.items():
+            held[level] += run.count
     counts = manifest.head.get("counts")
     if counts is not None and counts != held:
         text = f"counts is {quoted_value(counts)}, but the runs have {quoted_value(held)} splats"
@@ -186,15 +189,6 @@ def _counts(manifest: Manifest) -> Iterator[RuleViolation]:
         if coarser >= finer:
             text = f"level {level} has {count_of(coarser, 'splat')}, level {level - 1} has {finer:,}"
             yield broken("decreasing", text, fatal=False)
-
-
-def level_counts(manifest: Manifest) -> list[int]:
-    """Return the number of splats of each level: the sums of the runs."""
-    held = [0] * manifest.levels
-    for _, runs, _ in regions_of(manifest):
-        for level, run in runs.items():
-            held[level] += run.count
-    return held
 
 
 def _details(manifest: Manifest) -> Iterator[RuleViolation]:
@@ -295,53 +289,38 @@ def scan_files(
         FormatError: the manifest cannot be parsed.
     """
     manifest = parse(file.read(MAX_MANIFEST + 1))
-    found = list(violations(manifest))
+    found, beside = list(violations(manifest)), chunk_files(open_companion)
     files: dict[str, Chunk | str] = {}
     for name in manifest.names():
         if leads_away(name):
             continue  # a violation says so
-        files[name] = _chunk_or_reason(open_companion, name)
+        try:
+            files[name] = beside.open(name)
+        except FormatError as error:
+            files[name] = str(error)
     return manifest, files, [*found, *file_violations(manifest, files)]
-
-
-def _chunk_or_reason(open_companion: OpenCompanion, name: str) -> Chunk | str:
-    """Read the meta.json of a file, or return why it cannot be read."""
-    try:
-        return chunk_files(open_companion).open(name)
-    except FormatError as error:
-        return str(error)
 
 
 def scan_splats(
     open_companion: OpenCompanion,
     manifest: Manifest,
-    files: Mapping[str, Chunk | str],
+    chunks: Mapping[str, Chunk],
     *,
     threads: int = 1,
     progress: Progress = silent,
 ) -> Iterator[RuleViolation]:
-    """Yield the rules about splats that `files` of `scan_files` break; one chunk file at a time is decoded."""
-    total = sum(chunk.count for chunk in files.values() if isinstance(chunk, Chunk))
-    done = 0
-    runs: list[list[tuple[int, int, Run]]] = [[] for _ in manifest.filenames]
+    """Yield the rules about splats that chunk files break, see `SceneFiles.violations`."""
+    runs: dict[str, list[tuple[int, int, Run]]] = {name: [] for name in manifest.filenames}
     for number, held, _ in regions_of(manifest):
         for level, run in held.items():
-            runs[run.file].append((number, level, run))
-    for name, here in zip(manifest.filenames, runs, strict=True):
-        chunk = files.get(name)
-        if not isinstance(chunk, Chunk):
-            continue
-        try:
-            splats = Splats.empty(chunk.rows, chunk.sh_degree)
-            chunk_files(open_companion).read([chunk], splats, threads)
-        except FormatError as error:
-            yield broken("chunk-files", str(error))
-            continue
-        if any(level for _, level, _ in here) and (invalid := splats.invalid()):
-            count = int(np.count_nonzero(np.any(list(invalid.values()), axis=0)))
-            text = f"{count_of(count, 'splat')} of {quoted_value(name)} have a number that is not finite"
-            yield RuleViolation("values.non-finite", text, fatal=False)
-            continue
+            runs[manifest.filenames[run.file]].append((number, level, run))
+
+    def broken_by(chunk: Chunk, splats: Splats) -> Iterator[RuleViolation]:
+        here = runs[chunk.name]
+        # Those of level 0 are found by the report on the scene, which they are.
+        if any(level for _, level, _ in here) and (violation := not_finite(chunk, splats)) is not None:
+            yield violation
+            return
         steps = np.ptp(texel_codings.sign_log(splats.center), axis=0) / texel_codings.LAST_WORD if len(splats) else 0.0
         for number, level, run in here:
             part = splats.take(slice(run.offset, run.offset + run.count))
@@ -349,15 +328,15 @@ def scan_splats(
             bound = manifest.nodes[number].bound
             outside = count_outside(part, np.array(bound), steps) if bound is not None and is_box(bound) else 0
             if outside:
-                yield broken(
-                    "extents", f"{count_of(outside, 'splat')} of {subject} lie outside of its bound", fatal=False
-                )
+                text = f"{count_of(outside, 'splat')} of {subject} lie outside of its bound"
+                yield broken("extents", text, fatal=False)
             descents = _descents(part.center)
             if descents > max(FEW, OUT_OF_ORDER * run.count):
                 text = f"{descents:,} of {count_of(run.count, 'splat')} of {subject} come after one that they precede"
                 yield broken("order", text, fatal=False)
-        done += chunk.count
-        progress("checking", done, total, "splat")
+
+    named = [chunks[name] for name in manifest.filenames if name in chunks]
+    return chunk_files(open_companion).violations(named, broken_by, threads, progress)
 
 
 def _descents(center: FloatArray) -> int:

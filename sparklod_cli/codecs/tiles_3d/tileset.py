@@ -140,12 +140,12 @@ def parse(data: bytes, file: str = "") -> Tileset:
 
 def _tiles(root: Json, file: str) -> tuple[TileRecord, ...]:
     """Return the tiles of a file, root first and depth first."""
-    rows = []
+    tiles = list[TileRecord]()
     for tile, parent, children in nodes_of(root, MAX_TILES):
         record = {key: value for key, value in tile.value.items() if key != "children" and value is not None}
         uri = tile.text("content", "uri") if "content" in record else None
-        rows.append((record, uri, children, parent))
-    return tuple(TileRecord(record, uri, tuple(children), parent, file) for record, uri, children, parent in rows)
+        tiles.append(TileRecord(record, uri, tuple(children), parent, file))
+    return tuple(tiles)
 
 
 def read_whole(data: bytes, open_companion: OpenCompanion | None) -> Tileset:

@@ -17,7 +17,7 @@ from ...system.untrusted import quoted_value
 from ..glb.attributes import COMPRESSION, EXTENSION
 from ..glb.glb_container import product
 from ..json_trees import leads_away
-from ..merging import Chunk, SceneFiles
+from ..merging import Chunk, SceneFiles, not_finite
 from ..validation import LOOSE_BOUND, RuleViolation, count_outside, error_of
 from .tileset import (
     CONTENT_GLTF,
@@ -316,31 +316,24 @@ def scan_splats(
     threads: int = 1,
     progress: Progress = silent,
 ) -> Iterator[RuleViolation]:
-    """Yield the rules about splats that tiles break, whose files are decoded one at a time.
+    """Yield the rules about splats that tiles break, see `SceneFiles.violations`.
 
     Args:
         chunks: by the number of the tile, of `scan_files`.
     """
-    total, done, volumes = sum(chunk.count for chunk in chunks.values()), 0, volumes_of(tileset)
-    for number, chunk in chunks.items():
-        splats = Splats.empty(chunk.count, chunk.sh_degree)
-        try:
-            files.read([chunk], splats, threads)
-        except FormatError as error:
-            yield broken("files", str(error))
-            continue
-        done += chunk.count
-        progress("checking", done, total, "splat")
-        if invalid := splats.invalid():
-            count = int(np.count_nonzero(np.any(list(invalid.values()), axis=0)))
-            text = f"{count_of(count, 'splat')} of {quoted_value(chunk.name)} have a number that is not finite"
-            yield RuleViolation("values.non-finite", text, fatal=False)
-            continue
-        volume = volumes[number]
+    volumes, numbers = volumes_of(tileset), {chunk.name: number for number, chunk in chunks.items()}
+
+    def broken_by(chunk: Chunk, splats: Splats) -> Iterator[RuleViolation]:
+        if (violation := not_finite(chunk, splats)) is not None:
+            yield violation
+            return
+        volume, place = volumes[numbers[chunk.name]], tileset.place(numbers[chunk.name])
         outside = _outside(splats, volume, to_tileset(chunk.up)) if isinstance(volume, Volume) else 0
         if outside:
-            text = f"{count_of(outside, 'splat')} of {tileset.place(number)} lie outside of its bounding volume"
+            text = f"{count_of(outside, 'splat')} of {place} lie outside of its bounding volume"
             yield broken("extents", text, fatal=False)
+
+    return files.violations(list(chunks.values()), broken_by, threads, progress)
 
 
 def _outside(splats: Splats, volume: Volume, rotation: NDArray[np.float64]) -> int:
