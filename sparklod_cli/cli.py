@@ -87,35 +87,32 @@ def cli(ctx: click.Context) -> None:
 
 def run(arguments: list[str] | None = None) -> int:
     """Run a command line, by default that of the process, and return its exit code."""
+    verbosity, code = Verbosity(), 1
     with stdio.guarded():
-        code = _run(arguments)
+        try:
+            result = cli.main(arguments, prog_name="sparklod", standalone_mode=False, obj=verbosity)
+            code = result if isinstance(result, int) else 0
+        except click.ClickException as error:
+            say_usage_error(error)
+            code = error.exit_code
+        except stdio.ReaderGoneError:
+            pass
+        except SparklodError as error:
+            say_error(str(error))
+        except (click.Abort, KeyboardInterrupt):
+            say("interrupted")
+            code = interrupts.INTERRUPTED
+        except OSError as error:  # not about a named file or standard output; those are reported at the source
+            if out_of_memory(error):
+                code = _failed(error, verbosity)
+            else:
+                is_named = isinstance(error.filename, (str, bytes, os.PathLike))
+                where = f"{os.fsdecode(error.filename)}: " if is_named else ""
+                say_error(f"cannot go on: {where}{reason_of(error)}")
+        except Exception as error:
+            cause = error.__cause__ if isinstance(error, _EndOfFileError) else None
+            code = _failed(cause or error, verbosity)
     return interrupts.INTERRUPTED if code and interrupts.came() else code
-
-
-def _run(arguments: list[str] | None) -> int:
-    verbosity = Verbosity()
-    try:
-        code = cli.main(arguments, prog_name="sparklod", standalone_mode=False, obj=verbosity)
-    except click.ClickException as error:
-        say_usage_error(error)
-        return error.exit_code
-    except stdio.ReaderGoneError:
-        return 1
-    except SparklodError as error:
-        say_error(str(error))
-        return 1
-    except (click.Abort, KeyboardInterrupt):
-        say("interrupted")
-        return interrupts.INTERRUPTED
-    except OSError as error:  # not about a named file or standard output; those are reported at the source
-        if out_of_memory(error):
-            return _failed(error, verbosity)
-        where = f"{os.fsdecode(error.filename)}: " if isinstance(error.filename, (str, bytes, os.PathLike)) else ""
-        say_error(f"cannot go on: {where}{reason_of(error)}")
-        return 1
-    except Exception as error:
-        return _failed(error.__cause__ if isinstance(error, _EndOfFileError) and error.__cause__ else error, verbosity)
-    return code if isinstance(code, int) else 0
 
 
 def _failed(error: BaseException, verbosity: Verbosity) -> int:
@@ -142,18 +139,12 @@ def _failed(error: BaseException, verbosity: Verbosity) -> int:
     return 1
 
 
-def one_thread_of_blas() -> None:
-    """Keep numpy's OpenBLAS from starting threads: each spins for some 60 ms when numpy is loaded.
-
-    Matrices are small, or are blocks of large ones on threads of our own.
-    """
-    if not any(map(os.environ.get, BLAS_THREADS)):
-        os.environ[BLAS_THREADS[0]] = "1"
-
-
 def main() -> NoReturn:
     """Entry point of the script; cleans up on a polite kill as on Ctrl-C."""
-    one_thread_of_blas()
+    # Each thread of numpy's OpenBLAS spins for some 60 ms when numpy is loaded. Matrices here are small, or are blocks
+    # of large ones on threads of our own.
+    if not any(map(os.environ.get, BLAS_THREADS)):
+        os.environ[BLAS_THREADS[0]] = "1"
     try:
         stdio.reserve()
         interrupts.handle()

@@ -9,7 +9,7 @@ import sys
 import pytest
 
 from sparklod_cli import __version__
-from sparklod_cli.cli import BLAS_THREADS, COMMANDS, one_thread_of_blas
+from sparklod_cli.cli import BLAS_THREADS, COMMANDS
 from tests.commands.build_lod.runs import sparklod
 from tests.conftest import ROOT
 
@@ -32,13 +32,17 @@ def test_completion_knows_the_options() -> None:
 
 
 @pytest.mark.parametrize(("given", "found"), [(None, "1"), ("3", None)])
-def test_numpy_starts_no_threads_unless_a_person_asks_for_them(
-    given: str | None, found: str | None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for name in BLAS_THREADS:
-        monkeypatch.delenv(name, raising=False)
+def test_numpy_starts_no_threads_unless_a_person_asks_for_them(given: str | None, found: str | None) -> None:
+    code = """
+import atexit, os, sys
+from sparklod_cli.cli import main
+atexit.register(lambda: print(os.environ.get("OPENBLAS_NUM_THREADS"), os.environ.get("OMP_NUM_THREADS")))
+sys.argv = ["sparklod", "--version"]
+main()
+"""
+    environment = {name: value for name, value in os.environ.items() if name not in BLAS_THREADS}
     if given is not None:
-        monkeypatch.setenv("OMP_NUM_THREADS", given)
-    one_thread_of_blas()
-    assert os.environ.pop("OPENBLAS_NUM_THREADS", None) == found
-    assert os.environ.get("OMP_NUM_THREADS") == given
+        environment["OMP_NUM_THREADS"] = given
+    command = [sys.executable, "-c", code]
+    result = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT, env=environment)
+    assert result.stdout.splitlines()[-1] == f"{found} {given}", result.stderr

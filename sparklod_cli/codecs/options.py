@@ -56,7 +56,7 @@ AUTO = "auto"
 
 def _encoding(option: str, plural: str) -> Any:
     encodings = (AUTO, *RAD_ENCODINGS[option])
-    return setting(AUTO, f"Encoding of {plural}; auto suits the scene.", encodings, name=f"rad_{option}")
+    return setting(f"Encoding of {plural}; auto suits the scene.", encodings, AUTO, name=f"rad_{option}")
 
 
 @dataclass(frozen=True)
@@ -125,28 +125,25 @@ class WriteOptions(CheckedSettings):
     HEADING: ClassVar[str] = "File format"
 
     spz_version: int | None = setting(
-        None,
         "SPZ version: 2 gives files 4 to 8 % smaller, 3 rotations ten times as exact. 4 is 3 in zstd, for files without"
         f" a tree (--unlod, simplify).  [default: {DEFAULT_SPZ_VERSION}]",
         SPZ_VERSIONS,
     )
     fractional_bits: int | None = setting(
-        None,
         "Bits after the binary point of SPZ positions, 0 to 24; auto goes by the extent of the scene and its smallest"
         " splats.  [default: auto]",
         Quantity("auto|N", _bits, whole(0, MAX_FRACTIONAL_BITS)),
     )
     compression_level: int = setting(
-        DEFAULT_COMPRESSION,
         "Compression of SPZ and RAD, from 1 (fast) to 9 (small).",
         whole(MIN_COMPRESSION, MAX_COMPRESSION),
+        DEFAULT_COMPRESSION,
     )
     rad: RadOptions = field(default_factory=RadOptions)
     sog: SogOptions = field(default_factory=SogOptions)
     sh_bits: int | None = None
     covering: bool = True
     glb_profile: str | None = setting(
-        None,
         "GLB with 32-bit floats, as KHR_gaussian_splatting defines it, or with SPZ inside, as CesiumJS reads it."
         f"  [default: {KHRONOS}; {CESIUM} of 3D Tiles]",
         PROFILES,

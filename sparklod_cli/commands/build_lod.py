@@ -20,7 +20,7 @@ from ..system.errors import SparklodError
 from ..system.printable import MOST, shortened
 from ..system.stdio import DASH, name_of
 from ..system.units import format_size, percent_of
-from .command import COMMON, check_declared, command, is_set, refuse, values_of
+from .command import COMMON, Command, check_declared, is_set, refuse, values_of
 from .console import Console, count_of, print_json, say
 from .options.baking import (
     CLUSTER,
@@ -90,7 +90,8 @@ BOTH = "--output cannot be used with --output-dir"
 HEADINGS = (COMMON, TREE, SELECTION, POSITION, FILE_FORMAT, "RAD", DETAIL, TILED, REFINING, LARGE, CLUSTER)
 
 
-@command("build-lod", BuildLodOptions, examples=EXAMPLES, headings=HEADINGS)
+@click.command("build-lod", cls=Command, options=BuildLodOptions, examples=EXAMPLES, headings=HEADINGS)
+@click.pass_context
 def build_lod(ctx: click.Context, /, **_: Any) -> None:
     """Bake splat files into Level-of-Detail files for Spark, PlayCanvas, SuperSplat, Babylon.js and CesiumJS.
 

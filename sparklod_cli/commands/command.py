@@ -8,7 +8,7 @@ import math
 import os
 import re
 import string
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any, TypeVar
@@ -71,15 +71,13 @@ ALIASES = {
 class Option(click.Option):
     """An option that stands under a heading of `--help`.
 
-    Args:
+    Attributes:
         bare: its value where it stands alone; another one follows after "=", never as the next argument.
     """
 
-    def __init__(
-        self, *arguments: Any, declared: Setting, heading: str = GENERAL, bare: str | None = None, **attributes: Any
-    ) -> None:
-        super().__init__(*arguments, **attributes)
-        self.declared, self.heading, self.bare = declared, heading, bare
+    declared: Setting
+    heading: str
+    bare: str | None
 
 
 class _Formatter(click.HelpFormatter):
@@ -104,14 +102,24 @@ class Command(click.Command):
     `--help` lists the options under `COMMON`, in a sentence each, if the command has many; `--help-all` lists all.
 
     Args:
+        options: dataclass whose fields, and those of groups in it, are the options, see `setting`; `--version` follows.
         examples: lines with a command each, the most useful ones first. A command may take several lines.
         headings: the order of the headings; others follow in the order of their first options, `GENERAL` last.
     """
 
     def __init__(
-        self, *arguments: Any, examples: str = "", headings: Sequence[str] = (COMMON,), **attributes: Any
+        self,
+        *arguments: Any,
+        options: type[Any] | None = None,
+        examples: str = "",
+        headings: Sequence[str] = (COMMON,),
+        **attributes: Any,
     ) -> None:
         super().__init__(*arguments, **attributes)
+        if options is not None:
+            self.context_settings["show_default"] = True
+            self.params += _parameters(options, GENERAL)
+            click.version_option(__version__, package_name="sparklod")(self)
         self.examples = examples.splitlines()
         self.headings = headings
         self.abridged = len(self.params) > MOST_LISTED
@@ -300,52 +308,24 @@ def help(ctx: click.Context, command: str | None) -> None:
 Options = TypeVar("Options")
 
 
-def option(help: str, kind: Any = None, default: Any = None, **attributes: Any) -> Any:
-    """Return a field that is an option, see `setting`; `flags` replaces the flag, `heading` the group's."""
-    return setting(default, help, kind, **attributes)
-
-
 def flag(help: str, **attributes: Any) -> Any:
-    """Return a field that is an option without a value."""
-    return setting(False, help, **attributes)
+    """Return a field that is an option without a value, see `setting`."""
+    return setting(help, default=False, **attributes)
 
 
-def argument(kind: click.ParamType, **attributes: Any) -> Any:
-    """Return a field that holds the arguments which are no options."""
-    return setting((), "", kind, argument=True, nargs=-1, **attributes)
-
-
-def command(
-    name: str, options: type[Any], *, examples: str, headings: Sequence[str] = (COMMON,)
-) -> Callable[[Callable[..., None]], click.Command]:
-    """Return the decorator that makes a command of a function of the context.
-
-    The options are those of a group and of the groups in it, and `--version`; `headings` are as for `Command`.
-    """
-
-    def decorate(function: Callable[..., None]) -> click.Command:
-        decorated = click.version_option(__version__, package_name="sparklod")(click.pass_context(function))
-        for decorator in reversed(list(_options(options, GENERAL))):
-            decorated = decorator(decorated)
-        how: dict[str, Any] = {"headings": headings, "examples": examples, "context_settings": {"show_default": True}}
-        return click.command(name, cls=Command, **how)(decorated)
-
-    return decorate
-
-
-def _options(kind: type[Any], heading: str) -> Iterator[Callable[[Any], Any]]:
-    """Yield the decorators of a group; its heading is its class attribute `HEADING`, or that of the group around it."""
+def _parameters(kind: type[Any], heading: str) -> Iterator[click.Parameter]:
+    """Yield those of a group; its heading is its class attribute `HEADING`, or that of the group around it."""
     heading = getattr(kind, "HEADING", heading)
     for field, declared in settings_in(kind):
         if declared is None:
-            yield from _options(field.default_factory, heading)  # type: ignore[arg-type]
+            yield from _parameters(field.default_factory, heading)  # type: ignore[arg-type]
             continue
         name, attributes = declared.name or field.name, dict(declared.attributes)
         if attributes.pop("argument", False):
-            yield click.argument(name, type=declared.kind, **attributes)
+            yield click.Argument([name], type=declared.kind, **attributes)
             continue
         flags = attributes.pop("flags", None) or (f"--{name.replace('_', '-')}",)
-        attributes.setdefault("heading", heading)
+        own_heading, bare = attributes.pop("heading", heading), attributes.pop("bare", None)
         if field.default is False:
             attributes["is_flag"] = True
         else:
@@ -355,7 +335,9 @@ def _options(kind: type[Any], heading: str) -> Iterator[Callable[[Any], Any]]:
             attributes["show_default"] = False
         if not attributes.get("required"):  # click 8.3 and later take a default of None for a value
             attributes["default"] = () if attributes.get("multiple") else field.default
-        yield click.option(*flags, name, cls=Option, declared=declared, help=declared.help, **attributes)
+        option = Option([*flags, name], help=declared.help, **attributes)
+        option.declared, option.heading, option.bare = declared, own_heading, bare
+        yield option
 
 
 def values_of(ctx: click.Context, kind: type[Options]) -> Options:
@@ -421,9 +403,9 @@ MAX_SIDE, DIGITS = 1 << 16, 6
 def click_type(kind: Any) -> click.ParamType | None:
     """Return the parameter type for the kind of a `Setting`."""
     if isinstance(kind, Quantity):
-        return Text(kind)
+        return Text()
     if not isinstance(kind, Range):
-        return Choice(kind) if isinstance(kind, tuple) else kind
+        return Choice(list(map(str, kind))) if isinstance(kind, tuple) else kind
     base: type[Any] = Whole if kind.whole else Real
     least, most = (kind.least, kind.above), (kind.most, kind.below)
     low, high = (next((end for end in ends if end is not None), None) for ends in (least, most))
@@ -431,53 +413,51 @@ def click_type(kind: Any) -> click.ParamType | None:
     return result
 
 
-class Whole(click.IntRange):
-    """An integer of a range; unlike its base it takes none that arrays cannot hold."""
+class _Number(click.ParamType):
+    """A number; unlike click's it is none that arrays cannot hold, and not NaN, which is in no range."""
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
-        number: int = super().convert(value, param, ctx)
-        if abs(number) > MOST_WHOLE:
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        number = super().convert(value, param, ctx)
+        if isinstance(number, int) and abs(number) > MOST_WHOLE:
             self.fail(f"a number of {len(str(abs(number)))} digits is too large", param, ctx)
-        return number
-
-
-class Real(click.FloatRange):
-    """A number of a range; unlike its base it knows that NaN is in none."""
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        number: float = super().convert(value, param, ctx)
-        if math.isnan(number):
+        if number != number:
             self.fail(f"{value!r} is not a number", param, ctx)
         return number
 
 
-class Choice(click.Choice):
-    """One of some texts or numbers."""
+class Whole(_Number, click.IntRange):
+    """An integer of a range."""
 
-    def __init__(self, values: tuple[Any, ...]) -> None:
-        super().__init__([str(value) for value in values])
-        self._values = {str(value): value for value in values}
+
+class Real(_Number, click.FloatRange):
+    """A number of a range."""
+
+
+class Choice(click.Choice):
+    """One of the values of a `Setting`, which need not be texts."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        return self._values[super().convert(str(value), param, ctx)]
+        text = super().convert(str(value), param, ctx)
+        assert isinstance(param, Option)
+        return next(each for each in param.declared.kind if str(each) == text)
 
 
 class Text(click.ParamType):
-    """A text that a `Quantity` parses."""
+    """A text that the `Quantity` of a `Setting` parses."""
 
-    def __init__(self, quantity: Quantity) -> None:
-        self.name = quantity.unit
-        self._quantity = quantity
+    name = "text"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         if not isinstance(value, str):
             return value
+        assert isinstance(param, Option)
+        quantity = param.declared.kind
         try:
-            parsed = self._quantity.parse(value)
+            parsed = quantity.parse(value)
         except ValueError as error:
             self.fail(str(error), param, ctx)
-        if parsed is not None and self._quantity.range is not None and parsed not in self._quantity.range:
-            self.fail(f"{value!r} is out of range; give {self._quantity.range}", param, ctx)
+        if parsed is not None and quantity.range is not None and parsed not in quantity.range:
+            self.fail(f"{value!r} is out of range; give {quantity.range}", param, ctx)
         return parsed
 
 

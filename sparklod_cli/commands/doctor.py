@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ..system.printable import printable
-from .command import command, flag, values_of
+from .command import Command, flag, values_of
 from .console import Console, count_of, print_json
 from .options.common import QUIET, VERBOSE, Messages
 
@@ -32,7 +32,8 @@ class _Messages(Messages):
     verbose: bool = flag("Print what is being checked.", **VERBOSE)
 
 
-@command("doctor", _Messages, examples=EXAMPLES)
+@click.command("doctor", cls=Command, options=_Messages, examples=EXAMPLES)
+@click.pass_context
 def doctor(ctx: click.Context, /, **_: Any) -> None:
     """Check the installation: packages, extras, OpenGL, compiled kernels, threads and memory.
 

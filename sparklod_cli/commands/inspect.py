@@ -18,10 +18,10 @@ from ..images.output import PLOT_BY
 from ..model import MAX_SH_DEGREE
 from ..system.errors import OutOfMemoryError, SparklodError, StdoutError
 from ..system.printable import MOST, printable, shortened
-from ..system.setting_fields import Quantity, Range, whole
+from ..system.setting_fields import Quantity, Range, setting, whole
 from ..system.stdio import name_of
 from ..system.units import format_size, parse_size
-from .command import COMMON, argument, command, flag, option, refuse, values_of
+from .command import COMMON, Command, flag, refuse, values_of
 from .console import Console, count_of, rows
 from .options.common import QUIET, General, assert_errors, assert_option, overwrite_flag, plot_option, table_form
 from .paths import InputPath, OutputPath, keep_apart, name_outputs
@@ -71,24 +71,24 @@ class Checks:
         heading=COMMON,
     )
     require_lod: bool = flag("Expect a Level-of-Detail tree.", heading=COMMON)
-    leaves_of: Path | None = option(
+    leaves_of: Path | None = setting(
         "Expect the leaves to be exactly the splats of this file, within the rounding of the format.",
         InputPath(),
         heading=COMMON,
     )
-    expect: Path | None = option("Take expectations from a .toml or .json file.", InputPath(), heading=COMMON)
-    fail_on: str = option("Lowest severity of a finding that makes the exit status 3.", ("error", "warning"), "error")
-    style: str = option(
+    expect: Path | None = setting("Take expectations from a .toml or .json file.", InputPath(), heading=COMMON)
+    fail_on: str = setting("Lowest severity of a finding that makes the exit status 3.", ("error", "warning"), "error")
+    style: str = setting(
         "How findings are printed; github prints annotations for GitHub Actions.",
         ("text", "github"),
         "text",
         flags=("--format",),
     )
-    max_bytes: int | None = option("Expect files of at most this size, such as 3MB.", Quantity("SIZE", parse_size))
-    min_splats: int | None = option("Expect at least N splats; in a tree, leaves.", whole(0))
-    max_splats: int | None = option("Expect at most N splats; in a tree, leaves.", whole(0))
-    sh: int | None = option("Expect this SH degree.", whole(0, MAX_SH_DEGREE))
-    max_growth: float | None = option("Expect a tree with at most X nodes for each leaf.", Range(1))
+    max_bytes: int | None = setting("Expect files of at most this size, such as 3MB.", Quantity("SIZE", parse_size))
+    min_splats: int | None = setting("Expect at least N splats; in a tree, leaves.", whole(0))
+    max_splats: int | None = setting("Expect at most N splats; in a tree, leaves.", whole(0))
+    sh: int | None = setting("Expect this SH degree.", whole(0, MAX_SH_DEGREE))
+    max_growth: float | None = setting("Expect a tree with at most X nodes for each leaf.", Range(1))
 
     @property
     def has_expectations(self) -> bool:
@@ -129,28 +129,28 @@ class InspectOutput:
 
     overwrite: bool = overwrite_flag()
     stats: bool = flag("Report statistics of all quantities, not only of the main ones.", heading=COMMON)
-    field: str | None = option(
+    field: str | None = setting(
         "Print one value of the JSON report, such as tree.leaves, instead of a report.", metavar="NAME", heading=COMMON
     )
-    html: Path | None = option(
+    html: Path | None = setting(
         "Write the reports as one HTML page, with pictures.", OutputPath(suffixes=[".html", ".htm"]), heading=COMMON
     )
-    histogram: tuple[str, ...] = option(
+    histogram: tuple[str, ...] = setting(
         "Print a histogram of a quantity that --stats lists; can be given several times.", metavar="NAME", multiple=True
     )
     chunks: bool = flag(
         "Print a table of the chunks; with --json, put it into the report. Files without chunks have those of 65,536"
         " splats in which a viewer would stream them."
     )
-    chunks_out: Path | None = option(
+    chunks_out: Path | None = setting(
         "Write the table of the chunks of a single file to FILE: .csv, .json or .parquet.", OutputPath()
     )
     json_schema: bool = flag("Print the JSON Schema of --json and exit.", is_eager=True, callback=_print_schema)
     plot: Path | None = plot_option("Draw the structure of a single file as a .png, with pyvista.", heading=PICTURES)
-    plot_level: int | None = option(
+    plot_level: int | None = setting(
         "Draw the nodes at this depth of the tree.  [default: the leaves]", whole(0), heading=PICTURES
     )
-    plot_by: str = option("What the colours of the picture show.", PLOT_BY, PLOT_BY[0], heading=PICTURES)
+    plot_by: str = setting("What the colours of the picture show.", PLOT_BY, PLOT_BY[0], heading=PICTURES)
 
     def table(self) -> TableOutput | None:
         from ..inspection.blocks import CHUNK_COLUMNS
@@ -201,13 +201,16 @@ class _InspectGeneral(General):
 class InspectOptions:
     """Options of the command, group by group."""
 
-    files: tuple[Path, ...] = argument(InputPath(stdin=True), metavar="FILE...", required=True)
+    files: tuple[Path, ...] = setting(
+        "", InputPath(stdin=True), (), argument=True, nargs=-1, metavar="FILE...", required=True
+    )
     checks: Checks = dataclasses.field(default_factory=Checks)
     output: InspectOutput = dataclasses.field(default_factory=InspectOutput)
     general: _InspectGeneral = dataclasses.field(default_factory=_InspectGeneral)
 
 
-@command("inspect", InspectOptions, examples=EXAMPLES)
+@click.command("inspect", cls=Command, options=InspectOptions, examples=EXAMPLES)
+@click.pass_context
 def inspect(ctx: click.Context, /, **_: Any) -> None:
     """Report on splat files and check them.
 

@@ -15,7 +15,7 @@ from ..images.output import THUMBNAIL_SIZE, THUMBNAIL_SUPERSAMPLE
 from ..render.settings import OF_PIXELS
 from ..system.stdio import DASH
 from ..system.units import format_size
-from .command import COMMON, check_declared, command, flag, flags_set, refuse, values_of
+from .command import COMMON, Command, check_declared, flag, flags_set, refuse, values_of
 from .console import Console, count_of, for_screen, is_terminal, print_json
 from .options.cameras import PictureCameras
 from .options.common import JSON, General, question_budgets, report_outcomes, table_form
@@ -97,7 +97,8 @@ class RenderOptions:
         return dataclasses.replace(options, cameras=small, appearance=look)
 
 
-@command("render", RenderOptions, examples=EXAMPLES, headings=HEADINGS)
+@click.command("render", cls=Command, options=RenderOptions, examples=EXAMPLES, headings=HEADINGS)
+@click.pass_context
 def render(ctx: click.Context, /, **_: Any) -> None:
     """Draw pictures of splat files as a viewer draws them.
 

@@ -17,19 +17,17 @@ from ..lod.builders import DETAIL_GROWTH
 from ..system import interrupts
 from ..system.addresses import Place
 from ..system.errors import FormatError, naming
-from ..system.setting_fields import Quantity, Range, setting_of, whole
+from ..system.setting_fields import Quantity, Range, setting, setting_of, whole
 from ..system.stdio import DASH, name_of
 from ..system.units import parse_size
 from .build_lod import record_of, report_simplified
 from .command import (
     COMMON,
+    Command,
     OptionalNumber,
-    argument,
     check_declared,
-    command,
     flags_set,
     is_set,
-    option,
     values_of,
 )
 from .console import Console, print_json, say
@@ -45,7 +43,6 @@ from .options.baking import (
     BuildLodOptions,
     SceneOptions,
     memory_size,
-    palette_option,
     refuse_others,
     write_options,
 )
@@ -86,29 +83,31 @@ GOALS = ("to", "max_bytes", "psnr")
 class SimplifyOptions:
     """Options of simplify."""
 
-    inputs: tuple[Place, ...] = argument(InputPath(stdin=True, addresses=True), metavar="INPUT...", required=True)
-    to: Budget | None = option(
+    inputs: tuple[Place, ...] = setting(
+        "", InputPath(stdin=True, addresses=True), (), argument=True, nargs=-1, metavar="INPUT...", required=True
+    )
+    to: Budget | None = setting(
         "Number of splats, such as 100k, or share of the INPUT's, such as 10%.",
         Quantity("N|P%", parse_budget),
         heading=COMMON,
     )
-    max_bytes: int | None = option(
+    max_bytes: int | None = setting(
         "Largest size of the file, such as 8MB: as many splats as fit into its format.",
         Quantity("SIZE", parse_size, whole(1)),
         heading=COMMON,
     )
-    psnr: float | None = option(
+    psnr: float | None = setting(
         "PSNR in dB that pictures have against the INPUT's, such as 40: as few splats as hold it.",
         Range(above=0, below=100, unit="DB"),
         heading=COMMON,
     )
-    camera_path: Path | None = option(
+    camera_path: Path | None = setting(
         "Cameras that --psnr is measured with and --refine fits for, in the coordinates of the output, in any format"
         " that render reads.  [default: cameras around and inside the scene]",
         InputPath(),
         heading=COMMON,
     )
-    refine: int | None = option(
+    refine: int | None = setting(
         "Fit the splats to pictures of the INPUT, in STEPS pictures: a minute or more, for some dB."
         "  [default, without STEPS: by the size of the scene]",
         OptionalNumber(STEPS, placeholder="STEPS", example=EXAMPLE_STEPS, zero=BY_SIZE),
@@ -119,7 +118,7 @@ class SimplifyOptions:
     )
     seed: int = setting_of(FitSettings, "seed")
     device: str = setting_of(FitSettings, "device")
-    output: Place = option(
+    output: Place = setting(
         "Output, whose name chooses the format: .ply, .spz, .sog, DIR/meta.json (an unpacked SOG), .glb, .rad or"
         " .splat, which has no SH; DIR/ means DIR/NAME-small.spz, - standard output, as SPZ.",
         OutputPath(addresses=True),
@@ -129,7 +128,7 @@ class SimplifyOptions:
     )
     overwrite: bool = overwrite_flag()
     max_sh: int = setting_of(BuildLodOptions, "max_sh")
-    memory: int | None = option(
+    memory: int | None = setting(
         "Memory that the tree may take, such as 4G; a scene that needs more is refused."
         "  [default: 75 % of what is available]",
         Quantity("SIZE", memory_size),
@@ -137,7 +136,7 @@ class SimplifyOptions:
 
     scene: SceneOptions = field(default_factory=SceneOptions)
     written: WriteOptions = field(default_factory=WriteOptions)
-    cluster_sh: int | None = palette_option()
+    cluster_sh: int | None = setting_of(BuildLodOptions, "cluster_sh")
     general: General = field(default_factory=General)
 
     @property
@@ -167,7 +166,8 @@ class SimplifyOptions:
 HEADINGS = (COMMON, SELECTION, POSITION, FILE_FORMAT, "RAD")
 
 
-@command("simplify", SimplifyOptions, examples=EXAMPLES, headings=HEADINGS)
+@click.command("simplify", cls=Command, options=SimplifyOptions, examples=EXAMPLES, headings=HEADINGS)
+@click.pass_context
 def simplify(ctx: click.Context, /, **_: Any) -> None:
     """Write a scene with fewer splats, the same for all cameras. Give one of --to, --max-bytes and --psnr.
 

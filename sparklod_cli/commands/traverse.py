@@ -13,10 +13,11 @@ import click
 
 from ..simulation.streaming_settings import StreamingSettings
 from ..system.printable import printable
+from ..system.setting_fields import setting
 from ..system.stdio import DASH
 from ..system.units import format_size, percent_of
 from ..tables.columns import FORMS
-from .command import COMMON, check_declared, command, flag, option, refuse, values_of
+from .command import COMMON, Command, check_declared, flag, refuse, values_of
 from .console import WIDTH, Console, count_of, for_screen, is_terminal, print_json, rows
 from .options.cameras import Cameras
 from .options.common import (
@@ -73,7 +74,7 @@ class FrameTable:
         " terminal, which gets the summary]"
     )
     overwrite: bool = overwrite_flag()
-    summary: bool | None = option(
+    summary: bool | None = setting(
         "Print a summary of the frames on standard error.  [default: if that is a terminal]",
         flags=("--summary/--no-summary",),
         heading=COMMON,
@@ -82,14 +83,14 @@ class FrameTable:
         "Condition that must hold, such as 'churn_p95<0.2'; the exit status is 3 if it does not.", heading=COMMON
     )
     plot: Path | None = plot_option("Draw charts of the table and the path over the scene, as a .png.", heading=COMMON)
-    form: str | None = option(
+    form: str | None = setting(
         "Format of the table.  [default: by the suffix of --output, or csv]", tuple(FORMS), flags=("--format",)
     )
     per_instance: bool = flag("Write a row for each instance, besides that of all together.")
     no_timing: bool = flag(
         "Leave out traverse_ms, the time that each traversal took, so that two runs write the same bytes."
     )
-    indices_out: Path | None = option(
+    indices_out: Path | None = setting(
         "Write the nodes of every cut to DIR, as .npy of uint32.", OutputPath(folder=True)
     )
     padded: bool = flag(
@@ -150,7 +151,8 @@ class TraverseOptions:
     general: _TraverseGeneral = field(default_factory=_TraverseGeneral)
 
 
-@command("traverse", TraverseOptions, examples=EXAMPLES, headings=HEADINGS)
+@click.command("traverse", cls=Command, options=TraverseOptions, examples=EXAMPLES, headings=HEADINGS)
+@click.pass_context
 def traverse(ctx: click.Context, /, **_: Any) -> None:
     """Simulate what a viewer draws of Level-of-Detail files or Streamed SOG along a camera path.
 

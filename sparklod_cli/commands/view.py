@@ -14,9 +14,9 @@ import click
 
 from ..lod.budget import doubt
 from ..system.printable import printable
-from ..system.setting_fields import Quantity, Range, whole
+from ..system.setting_fields import Quantity, Range, setting, whole
 from ..system.units import format_size, parse_count
-from .command import COMMON, VIEW, argument, check_declared, command, flag, option, values_of
+from .command import COMMON, VIEW, Command, check_declared, flag, values_of
 from .console import Console, count_of, print_json
 from .options.common import JSON, QUIET, VERBOSE, General, overwrite_flag, up_option
 from .paths import InputPath, OutputPath, keep_apart
@@ -43,27 +43,27 @@ class _Page:
 
     HEADING: ClassVar[str] = "Page"
 
-    look_at: Any = option(
+    look_at: Any = setting(
         "Place the camera at EYE, looking at TARGET, each x,y,z.  [default: it sees the whole scene]",
         VIEW,
         heading=COMMON,
     )
-    camera_path: Path | None = option(
+    camera_path: Path | None = setting(
         "Play the cameras of a file, or of a folder written by COLMAP.", InputPath(), heading=COMMON
     )
-    spark_dir: Path | None = option(
+    spark_dir: Path | None = setting(
         "Take Spark, PlayCanvas or CesiumJS, and three.js from the node_modules of a folder.  [default: from a CDN, but"
         " for CesiumJS]",
         InputPath(),
         heading=COMMON,
         metavar="DIR",
     )
-    budget: int | None = option(
+    budget: int | None = setting(
         "Most splats of trees that are drawn, such as 500k.  [default: as Spark chooses for the device]",
         Quantity("N", parse_count, whole(1)),
     )
     up: tuple[float, float, float] | None = up_option()
-    fov: float | None = option(
+    fov: float | None = setting(
         "Vertical field of view, in degrees.  [default: 60]", Range(above=0, below=180, unit="DEGREES")
     )
 
@@ -74,15 +74,15 @@ class _Place:
 
     HEADING: ClassVar[str] = "Server"
 
-    export: Path | None = option(
+    export: Path | None = setting(
         "Write the page and the files into a folder, for any web server, in place of serving them.",
         OutputPath(folder=True),
         heading=COMMON,
         excludes=("host", "port", "cors", "no_open"),
     )
     overwrite: bool = overwrite_flag(needs="export")
-    port: int = option("Port to listen on.", whole(0, 65_535), 0, show_default="any that is free")
-    host: str = option(
+    port: int = setting("Port to listen on.", whole(0, 65_535), 0, show_default="any that is free")
+    host: str = setting(
         "Address to listen on; 0.0.0.0 lets everybody on the network read the files.",
         default="127.0.0.1",
         metavar="NAME",
@@ -103,7 +103,7 @@ class _ViewGeneral(General):
 class _ViewOptions:
     """Options of the command, group by group."""
 
-    files: tuple[Path, ...] = argument(InputPath(), metavar="FILE...", required=True)
+    files: tuple[Path, ...] = setting("", InputPath(), (), argument=True, nargs=-1, metavar="FILE...", required=True)
     page: _Page = field(default_factory=_Page)
     place: _Place = field(default_factory=_Place)
     general: _ViewGeneral = field(default_factory=_ViewGeneral)
@@ -112,7 +112,8 @@ class _ViewOptions:
 HEADINGS = (COMMON, "Page", "Server")
 
 
-@command("view", _ViewOptions, examples=EXAMPLES, headings=HEADINGS)
+@click.command("view", cls=Command, options=_ViewOptions, examples=EXAMPLES, headings=HEADINGS)
+@click.pass_context
 def view(ctx: click.Context, /, **_: Any) -> None:
     """Show splat files in Spark, PlayCanvas or CesiumJS, in a browser.
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import click
 
-from ..system.setting_fields import whole
-from .command import command, flag, option, values_of
+from ..system.setting_fields import setting, whole
+from .command import Command, flag, values_of
 from .console import Console, count_of, print_json
 from .options.common import VERBOSE, Messages, processors_to_use
 
@@ -22,7 +22,7 @@ EXAMPLES = """\
 
 @dataclass(frozen=True)
 class _Options(Messages):
-    jobs: int = option(
+    jobs: int = setting(
         "Number of processes to compile in.",
         whole(1, 64),
         lambda: min(processors_to_use(), 4),
@@ -31,7 +31,8 @@ class _Options(Messages):
     verbose: bool = flag("Print which kernels are missing.", **VERBOSE)
 
 
-@command("warmup", _Options, examples=EXAMPLES)
+@click.command("warmup", cls=Command, options=_Options, examples=EXAMPLES)
+@click.pass_context
 def warmup(ctx: click.Context, /, **_: Any) -> None:
     """Compile all kernels for this machine, so that no later command has to.
 

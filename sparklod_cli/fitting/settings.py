@@ -27,10 +27,8 @@ class FitSettings(CheckedSettings):
     """
 
     steps: int | None = setting(
-        None,
-        "Pictures of cuts that are drawn and compared; None for a number that suits the size of the tree.",
-        STEPS,
+        "Pictures of cuts that are drawn and compared; None for a number that suits the size of the tree.", STEPS
     )
-    seed: int = setting(0, "Seed of the cameras and budgets that --refine draws at random.", SEED, needs="refine")
+    seed: int = setting("Seed of the cameras and budgets that --refine draws at random.", SEED, 0, needs="refine")
     path: CameraPath | None = None
-    device: str = setting("cpu", DEVICE_HELP.format("--refine"), DEVICES, needs="refine")
+    device: str = setting(DEVICE_HELP.format("--refine"), DEVICES, "cpu", needs="refine")

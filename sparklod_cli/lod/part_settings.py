@@ -52,24 +52,23 @@ class DetailSettings(CheckedSettings):
     HEADING: ClassVar[str] = "Streamed SOG"
 
     levels: tuple[float, ...] | None = setting(
-        None,
         "Splats of each detail level after full detail, as shares of it in descending order, such as 50%,25%,12%,6%;"
         " auto suits the scene.  [default: auto]",
         Quantity("SHARES|auto", parse_levels),
     )
     chunk_splats: int = setting(
-        524_288, "Splats, about, after which a chunk file is closed.", Quantity("N", parse_count, whole(1))
+        "Splats, about, after which a chunk file is closed.", Quantity("N", parse_count, whole(1)), 524_288
     )
     extent: float = setting(
-        16.0,
         "Longest side of a region, in world units of the output; regions that are longer are divided.",
         Range(above=0),
+        16.0,
         name="region_extent",
     )
     min_splats: int = setting(
-        8_192,
         "Splats below which a region is not divided, however long it is.",
         Quantity("N", parse_count, whole(1)),
+        8_192,
         name="region_min_splats",
     )
 
@@ -114,22 +113,18 @@ class TileSettings(CheckedSettings):
 
     HEADING: ClassVar[str] = "3D Tiles"
 
-    tile_splats: int = setting(100_000, "Most splats of a tile, which is a file.", Quantity("N", parse_count, whole(1)))
+    tile_splats: int = setting("Most splats of a tile, which is a file.", Quantity("N", parse_count, whole(1)), 100_000)
     lat: float | None = setting(
-        None,
-        "Latitude of the origin of the scene, in degrees, geodetic (WGS 84).",
-        Range(-90, 90, unit="DEG"),
+        "Latitude of the origin of the scene, in degrees, geodetic (WGS 84).", Range(-90, 90, unit="DEG")
     )
-    lon: float | None = setting(None, "Longitude of the origin, in degrees.", Range(-180, 180, unit="DEG"))
-    height: float | None = setting(None, "Height of the origin above the ellipsoid, in metres.", Range(unit="M"))
+    lon: float | None = setting("Longitude of the origin, in degrees.", Range(-180, 180, unit="DEG"))
+    height: float | None = setting("Height of the origin above the ellipsoid, in metres.", Range(unit="M"))
     heading: float | None = setting(
-        None,
         "Direction that the scene's forward axis, -z where y is up, points to on the ground, in degrees clockwise from"
         " north.",
         Range(unit="DEG"),
     )
     transform: tuple[float, ...] | None = setting(
-        None,
         "Transform of the root tile instead: 16 numbers, column by column, from the axes of the tileset, x right, y"
         " forward, z up, to those of the Earth (ECEF), in metres.",
         Quantity("NUMBERS", parse_matrix),

@@ -66,32 +66,32 @@ class DetailRule(CheckedSettings):
     HEADING: ClassVar[str] = "Streamed SOG"
 
     mode: str = setting(
-        BUDGET_MODES[0],
         "Spend the whole budget, or take the levels that distances ask for, and coarser ones only where those exceed"
         " it.",
         BUDGET_MODES,
+        BUDGET_MODES[0],
         name="budget_mode",
     )
     base_distance: float = setting(
-        5.0,
         "Distance at which level 1 replaces full detail, in world units; with --budget-mode limit.",
         Range(LEAST_BASE_DISTANCE),
+        5.0,
         name="lod_base_distance",
-        needs="budget_mode=limit",  # a budget that is always spent depends on ratios of distances alone
+        needs="budget_mode=limit",
     )
     multiplier: float = setting(
-        3.0, "Ratio of the distances at which successive levels begin.", Range(1.2), name="lod_multiplier"
+        "Ratio of the distances at which successive levels begin.", Range(1.2), 3.0, name="lod_multiplier"
     )
     behind_penalty: float = setting(
-        1.5, "Factor of the distance of regions straight behind the camera.", Range(1), name="lod_behind_penalty"
+        "Factor of the distance of regions straight behind the camera.", Range(1), 1.5, name="lod_behind_penalty"
     )
     shrink: float = 0.75
     finest: int = 0
     coarsest: int = 99
     underfill: int = setting(
-        0,
         "With --bandwidth: while the file of a level loads, draw one that is up to this many levels coarser.",
         whole(0, 100),
+        0,
         name="lod_underfill",
         needs="bandwidth",
     )
@@ -118,14 +118,13 @@ class LodSettings(CheckedSettings):
     budget: int = PRESETS["desktop"]
     foveation: Foveation = SPARK
     pixel_scale_limit: float | None = setting(
-        None,
         "Stop refining nodes of this size over distance, or smaller.  [default: that of a pixel, times"
         " --lod-render-scale]",
         FACTOR,
         excludes=("lod_render_scale",),
     )
     render_scale: float = setting(
-        1.0, "Stop refining nodes smaller than this many pixels.", FACTOR, name="lod_render_scale"
+        "Stop refining nodes smaller than this many pixels.", FACTOR, 1.0, name="lod_render_scale"
     )
     continuous: float | None = None
     detail: DetailRule = field(default_factory=DetailRule)

@@ -95,25 +95,25 @@ class RasterSettings(CheckedSettings):
     """
 
     near: float = setting(
-        0.01,
         "Distance of the near plane along the optical axis, in world units; nearer splats are left out."
         "  [default: 0.01, or less where the camera is chosen for the scene]",
         DISTANCE,
+        0.01,
     )
     far: float = setting(
-        1000.0,
         "Distance of the far plane along the optical axis, in world units; farther splats are left out."
         "  [default: 1000, or more where the camera is chosen for the scene]",
         DISTANCE,
+        1000.0,
     )
     profile: str = setting(
-        PROFILES[0],
         "Falloff of splats with a LoD opacity above 1: as Spark 2 draws it (spark), or as its LoD design describes it"
         " (shifted).",
         PROFILES,
+        PROFILES[0],
     )
     sort: str = setting(
-        SORTS[0], "Order of the splats: by distance from the camera (radial), or along its axis (z).", SORTS
+        "Order of the splats: by distance from the camera (radial), or along its axis (z).", SORTS, SORTS[0]
     )
     max_radius: float = MAX_PIXEL_RADIUS
 
@@ -130,24 +130,23 @@ class RenderSettings(CheckedSettings):
 
     raster: RasterSettings = field(default_factory=RasterSettings)
     style: str = setting(
-        STYLES[0],
         "Shape of each splat: its Gaussian, one opaque pixel (points), or an opaque disc, in the order of the file"
         " (billboards) or from far to near (sorted-billboards).",
         STYLES,
+        STYLES[0],
     )
     backend: str = setting(
-        "numba",
         "Renderer: numba is the reference, osmesa is OpenGL in software, open3d is a quick look.",
         tuple(name for name in BACKENDS if name != ON_CARD),
+        "numba",
     )
-    device: str = setting("cpu", DEVICE_HELP.format("the backend numba"), DEVICES)
+    device: str = setting(DEVICE_HELP.format("the backend numba"), DEVICES, "cpu")
     color_by: str | None = setting(
-        None,
         "Colour splats by a quantity, unlit, with a colour bar beside the picture.  [default: their own colours]",
         COLOR_BY,
     )
     supersample: int = setting(
-        1, "Draw each pixel as the mean of N x N samples, up to 4 x 4.", whole(1, MAX_SUPERSAMPLE)
+        "Draw each pixel as the mean of N x N samples, up to 4 x 4.", whole(1, MAX_SUPERSAMPLE), 1
     )
     max_sh: int = MAX_SH_DEGREE
     options: Mapping[str, Any] = field(default_factory=dict)

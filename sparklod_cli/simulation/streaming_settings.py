@@ -22,18 +22,17 @@ class Network(CheckedSettings):
     """
 
     bandwidth: float = setting(
-        math.inf,
         "Simulate streaming over a network of this bandwidth, such as 20Mbit.  [default: every chunk is resident]",
         Quantity("RATE", parse_bandwidth, Range(above=0)),
+        math.inf,
     )
     latency: float = setting(
-        0.0,
         "Time from a request to the first byte, such as 60ms.  [default: 0ms]",
         Quantity("TIME", parse_time, Range(0, below=math.inf)),
+        0.0,
         needs="bandwidth",
     )
     fetchers: int | None = setting(
-        None,
         f"Number of chunks that are fetched at a time.  [default: {FETCHERS}; {PLAYCANVAS_FETCHERS} of Streamed SOG,"
         f" {CESIUM_FETCHERS} of 3D Tiles]",
         whole(1, 1000),
@@ -54,5 +53,5 @@ class StreamingSettings(CheckedSettings):
 
     network: Network = field(default_factory=Network)
     chunk_cache: int | None = setting(
-        None, "Number of chunks, of 65,536 nodes each, that fit into memory.  [default: all]", whole(1)
+        "Number of chunks, of 65,536 nodes each, that fit into memory.  [default: all]", whole(1)
     )

@@ -116,16 +116,16 @@ class Setting:
 
 
 def setting(
-    default: Any,
     help: str,
     kind: Any = None,
+    default: Any = None,
     *,
     name: str = "",
     needs: str = "",
     excludes: tuple[str, ...] = (),
     **attributes: Any,
 ) -> Any:
-    """Return a dataclass field with a default value and a `Setting`, whose attributes the other arguments are."""
+    """Return a dataclass field with a `Setting`, whose attributes the arguments are, and a default value."""
     declared = Setting(help, kind, name, needs, excludes, attributes)
     return field(default=default, metadata={SETTING: declared})
 

@@ -15,10 +15,11 @@ from click.testing import CliRunner, Result
 from sparklod_cli.cameras import generators
 from sparklod_cli.cameras.framing import FILLED
 from sparklod_cli.cameras.sources import CameraPath
-from sparklod_cli.commands.command import argument, command, values_of
+from sparklod_cli.commands.command import Command, values_of
 from sparklod_cli.commands.options.cameras import Cameras
 from sparklod_cli.model.balls import Balls
 from sparklod_cli.system.errors import CameraPathError
+from sparklod_cli.system.setting_fields import setting
 from tests.cameras.known import FOLDER, KNOWN, SIZE, check_pose
 
 #: A ball around (1, 2, 3), of which nine in ten are nearer than 2.
@@ -28,7 +29,7 @@ TURN = "-1,0,0,0,0,-1,0,0,0,0,1,0,0,0,0,1"
 
 @dataclass(frozen=True)
 class Flight(Cameras):
-    inputs: tuple[str, ...] = argument(click.STRING)
+    inputs: tuple[str, ...] = setting("", click.STRING, (), argument=True, nargs=-1)
 
 
 def scene_of_shells() -> Balls:
@@ -42,7 +43,8 @@ def scene_of_shells() -> Balls:
 def run(*arguments: str | Path, scene: Any = scene_of_shells) -> tuple[Result, list[CameraPath]]:
     found: list[CameraPath] = []
 
-    @command("fly", Flight, examples="")
+    @click.command("fly", cls=Command, options=Flight)
+    @click.pass_context
     def fly(ctx: click.Context, **_: Any) -> None:
         asked = values_of(ctx, Flight)
         asked.check(ctx)

@@ -100,8 +100,8 @@ class Example(CheckedSettings):
     """
 
     plain: int = 0
-    share: float | None = setting(None, "Share of the splats.", Range(above=0, most=1))
-    angle: float = setting(60.0, "Field of view.", Range(above=0, below=180))
+    share: float | None = setting("Share of the splats.", Range(above=0, most=1))
+    angle: float = setting("Field of view.", Range(above=0, below=180), 60.0)
 
 
 def test_ranges_say_what_they_allow() -> None:

@@ -28,10 +28,10 @@ from ...lod.builders import (
 from ...lod.part_settings import DetailSettings, TileSettings
 from ...model import MAX_SH_DEGREE, UP_AXES
 from ...system.addresses import Place
-from ...system.setting_fields import Quantity, Range, setting_of, whole
+from ...system.setting_fields import Quantity, Range, setting, setting_of, whole
 from ...system.stdio import DASH
 from ...system.units import parse_size
-from ..command import BALL, COMMON, POINT, OptionalNumber, argument, flag, flags_set, option, parameters_of, refuse
+from ..command import BALL, COMMON, POINT, OptionalNumber, flag, flags_set, parameters_of, refuse
 from ..paths import InputPath, OutputPath, stem_of
 from .common import General, output_option, overwrite_flag
 
@@ -95,49 +95,49 @@ MANIFESTS = {form.manifest: name for name, form in FORMS.items() if form.manifes
 class SceneOptions:
     """Options of which splats of the input are kept, and how the scene is turned, scaled and moved."""
 
-    min_opacity: float = option(
+    min_opacity: float = setting(
         "Leave out splats whose opacity is lower than this.", Range(0, 1, unit="N"), 0.0, heading=COMMON
     )
-    within: Any = option(
+    within: Any = setting(
         "Leave out splats whose centre is outside this ball, in the input's coordinates.", BALL, heading=COMMON
     )
-    min_box: tuple[float, ...] | None = option(
+    min_box: tuple[float, ...] | None = setting(
         "Leave out splats whose centre is below this on any axis, in the input's coordinates.", POINT, heading=SELECTION
     )
-    max_box: tuple[float, ...] | None = option(
+    max_box: tuple[float, ...] | None = setting(
         "Leave out splats whose centre is above this on any axis, in the input's coordinates.", POINT, heading=SELECTION
     )
-    on_invalid: str = option(
+    on_invalid: str = setting(
         "Whether to fail on invalid splats or leave them out: numbers that are not finite, negative scales.",
         ("error", "drop"),
         "error",
         heading=SELECTION,
     )
-    rgba: Path | None = option(
+    rgba: Path | None = setting(
         "Replace colours and opacities by those of a .npy or raw file of (N, 4) bytes or floats 0..1; splats of alpha 0"
         " are left out.",
         InputPath(),
         heading=SELECTION,
     )
-    up: str | None = option(
+    up: str | None = setting(
         "Axis that is up in the input: turn it to +y, and note that in the output for render, traverse and view."
         " y turns nothing; scenes as trained are mostly -y.  [default: note what the file says, and turn nothing]",
         UP_AXES,
         heading=COMMON,
     )
-    rotate: tuple[float, ...] = option(
+    rotate: tuple[float, ...] = setting(
         "Turn the scene by these angles in degrees, about x, then y, then z, after --up.",
         POINT,
         "0,0,0",
         heading=POSITION,
     )
-    scale: float = option(
+    scale: float = setting(
         "Multiply the size of the scene by this, about its origin, after --rotate.",
         Range(above=0),
         1.0,
         heading=POSITION,
     )
-    translate: tuple[float, ...] = option(
+    translate: tuple[float, ...] = setting(
         "Move the scene by this, in world units, after --scale.", POINT, "0,0,0", heading=POSITION
     )
 
@@ -170,19 +170,6 @@ OF_TREES = ("method", "max_sh", *(builder.setting for builder in BUILDERS.values
 OF_SCRATCH, OF_CLUSTERS = ("memory", "scratch_dir", "resume"), ("workers", "scheduler")
 
 
-def palette_option() -> Any:
-    """Return the field of `--cluster-sh`, the palettes of spherical harmonics that RAD and SOG have."""
-    return option(
-        "Write spherical harmonics to RAD as a palette of at most N entries, 2 to 65,536, and a label for each splat:"
-        " the file gets smaller, and reflections less exact. N is 65,536 if it is left out. SOG always has a palette;"
-        " this chooses its size, which otherwise suits the number of splats.",
-        OptionalNumber(SH_CODES, example=MAX_SH_CODES),
-        is_flag=False,
-        flag_value=str(MAX_SH_CODES),
-        heading=FILE_FORMAT,
-    )
-
-
 def write_options(options: WriteOptions, sh_codes: int | None, *, chunked: bool = False) -> WriteOptions:
     """Return write options with those of the command; defaults are left to the library, which knows the input."""
     rad = dataclasses.replace(options.rad, chunked=chunked, sh_codes=sh_codes)
@@ -203,13 +190,15 @@ def memory_size(text: str) -> int:
 class BuildLodOptions:
     """Options of build-lod."""
 
-    inputs: tuple[Place, ...] = argument(InputPath(stdin=True, addresses=True), metavar="INPUT...")
+    inputs: tuple[Place, ...] = setting(
+        "", InputPath(stdin=True, addresses=True), (), argument=True, nargs=-1, metavar="INPUT..."
+    )
     merge: bool = flag(
         "Bake all INPUTs as one scene, into the file that --output names: tiles of a city, each where its own"
         " coordinates put it.",
         heading=COMMON,
     )
-    scene: Path | None = option(
+    scene: Path | None = setting(
         "Merge the files of an instances file, each where it stands there, in place of INPUTs (see docs/build-lod.md).",
         InputPath(),
         heading=COMMON,
@@ -221,13 +210,13 @@ class BuildLodOptions:
         " NAME-lod-refined.spz of a NAME-lod.spz with --refine]",
         addresses=True,
     )
-    output_dir: Place | None = option(
+    output_dir: Place | None = setting(
         "Folder for the outputs; created if it does not exist.",
         OutputPath(folder=True, addresses=True),
         heading=COMMON,
     )
     overwrite: bool = overwrite_flag()
-    skip_existing: str | None = option(
+    skip_existing: str | None = setting(
         "Skip inputs whose output exists already, made from the same inputs and settings, as a small file beside it,"
         " NAME.sparklod.json, records. Files whose size and date are unchanged are not read;"
         " --skip-existing=verify reads all, and so finds damage that left both as they were.",
@@ -242,7 +231,7 @@ class BuildLodOptions:
         " SOG), .glb or .splat, which has no SH.",
         heading=COMMON,
     )
-    form: str | None = option(
+    form: str | None = setting(
         "Format of the output. rad is what Spark streams; rad-chunked writes each chunk to a file of its own,"
         " NAME-lod-0.radc and so on, beside NAME-lod.rad; streamed-sog is what PlayCanvas, SuperSplat and Babylon.js"
         f" stream, {MANIFEST} and folders beside it; 3d-tiles is what CesiumJS streams, {TILESET} and a folder beside"
@@ -252,7 +241,7 @@ class BuildLodOptions:
         flags=("--format",),
         heading=COMMON,
     )
-    refine: int | None = option(
+    refine: int | None = setting(
         "Fit merged splats to pictures of full detail, in STEPS pictures of cuts: minutes, for cuts that come closer to"
         " it. The leaves stay as they are, and so does the tree of a Level-of-Detail file. Ctrl-C ends it early and"
         " keeps what was gained.  [default, without STEPS: by the size of the tree]",
@@ -261,7 +250,7 @@ class BuildLodOptions:
         flag_value=BY_SIZE,
         heading=REFINING,
     )
-    camera_path: Path | None = option(
+    camera_path: Path | None = setting(
         "Cameras that --refine fits for, in the coordinates of the output, in any format that render reads: those of"
         " visitors whose paths are known.  [default: cameras around and inside the scene]",
         InputPath(),
@@ -270,29 +259,29 @@ class BuildLodOptions:
     )
     seed: int = setting_of(FitSettings, "seed", heading=REFINING)
     device: str = setting_of(FitSettings, "device", heading=REFINING)
-    encoding: str | None = option(
+    encoding: str | None = setting(
         f"Write arrays in a viewer's memory layout instead: a {NPZ} file, or the words alone if FILE ends in"
         f" {' or '.join(RAW_SUFFIXES)}.",
         tuple(ENCODINGS),
         heading=FILE_FORMAT,
     )
-    method: str | None = option(
+    method: str | None = setting(
         "How splats are merged: quick takes seconds; quality takes longer, and its cuts come closer to full detail."
         f"  [default: {METHOD}; {METHOD_OF_DETAIL} with --format {STREAMED_SOG} or {TILES_3D}]",
         METHODS,
         heading=COMMON,
     )
-    max_sh: int = option(
+    max_sh: int = setting(
         "Highest degree of spherical harmonics to keep.", whole(0, MAX_SH_DEGREE), MAX_SH_DEGREE, heading=COMMON
     )
-    base: float = option(
+    base: float = setting(
         "Growth of the voxel grid from level to level, with --method quick. Smaller values give smoother transitions"
         " and more nodes.",
         Range(MIN_BASE, MAX_BASE, unit="N"),
         DEFAULT_BASE,
         heading=TREE,
     )
-    growth: float | None = option(
+    growth: float | None = setting(
         "Largest number of nodes for each leaf, with --method quality."
         f"  [default: {DEFAULT_GROWTH:g}; {DETAIL_GROWTH:g} with --format {STREAMED_SOG} or"
         f" {TILES_3D}]",
@@ -301,28 +290,36 @@ class BuildLodOptions:
     )
     input_scene: SceneOptions = field(default_factory=SceneOptions)
     written: WriteOptions = field(default_factory=WriteOptions)
-    cluster_sh: int | None = palette_option()
+    cluster_sh: int | None = setting(
+        "Write spherical harmonics to RAD as a palette of at most N entries, 2 to 65,536, and a label for each splat:"
+        " the file gets smaller, and reflections less exact. N is 65,536 if it is left out. SOG always has a palette;"
+        " this chooses its size, which otherwise suits the number of splats.",
+        OptionalNumber(SH_CODES, example=MAX_SH_CODES),
+        is_flag=False,
+        flag_value=str(MAX_SH_CODES),
+        heading=FILE_FORMAT,
+    )
     detail: DetailSettings = field(default_factory=DetailSettings)
-    environment: Path | None = option(
+    environment: Path | None = setting(
         "Splats that are always drawn, such as a sky, from a file of any format without a tree; turned and moved as the"
         " scene.",
         InputPath(),
         heading=DETAIL,
     )
-    environment_beyond: float | None = option(
+    environment_beyond: float | None = setting(
         "Make splats whose centre is farther than this from the median of all centres the environment, in the input's"
         " units.",
         Range(above=0, unit="RADIUS"),
         heading=DETAIL,
     )
     tiles: TileSettings = field(default_factory=TileSettings)
-    memory: int | None = option(
+    memory: int | None = setting(
         "Memory that a bake may take, such as 4G or '600 MB'. A scene that needs more is baked out of core: block by"
         " block, with a scratch folder.  [default: 75 % of what is available]",
         Quantity("SIZE", memory_size),
         heading=LARGE,
     )
-    scratch_dir: Place | None = option(
+    scratch_dir: Place | None = setting(
         "Where a bake out of core makes its scratch folder, which is removed at the end.  [default: beside the output]",
         OutputPath(folder=True, addresses=True),
         heading=LARGE,
@@ -331,12 +328,12 @@ class BuildLodOptions:
         "Go on with a bake out of core that was interrupted; it must be the same bake. Without one, begin.",
         heading=LARGE,
     )
-    workers: int | None = option(
+    workers: int | None = setting(
         "Bake on this many processes of this machine, which share --threads and --memory.",
         whole(1, 256),
         heading=CLUSTER,
     )
-    scheduler: str | None = option(
+    scheduler: str | None = setting(
         "Bake on the Dask cluster whose scheduler has this address, as tcp://host:8786.",
         metavar="ADDRESS",
         heading=CLUSTER,

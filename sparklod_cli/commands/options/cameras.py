@@ -14,8 +14,8 @@ import click
 from ...cameras import DEFAULT_SIZE, ELEVATION, ORBIT
 from ...cameras.formats.table import FORMATS, Axes
 from ...system.errors import CameraPathError, TooManyCamerasError
-from ...system.setting_fields import Range, whole
-from ..command import COMMON, POINT, SIZE, VIEW, VIEWS, flag, flag_of, is_set, option, refuse
+from ...system.setting_fields import Range, setting, whole
+from ..command import COMMON, POINT, SIZE, VIEW, VIEWS, flag, flag_of, is_set, refuse
 from ..paths import InputPath, file_of
 from .common import up_option
 
@@ -54,7 +54,7 @@ SECONDS, RATE = Range(above=0, most=1e6, unit="S"), Range(above=0, most=1e6, uni
 
 def _orbit_option(default: str) -> Any:
     help = f"Place N cameras around the scene.  [default, without any source of cameras: {default}]"
-    return option(help, whole(1, 1 << 20), heading=COMMON)
+    return setting(help, whole(1, 1 << 20), heading=COMMON)
 
 
 @dataclass(frozen=True)
@@ -63,65 +63,65 @@ class Cameras:
 
     HEADING: ClassVar[str] = "Cameras"
 
-    camera_path: Path | None = option(
+    camera_path: Path | None = setting(
         "Read the cameras from a file, or from a folder written by COLMAP.", InputPath(), heading=COMMON
     )
     orbit: int | None = _orbit_option(f"an orbit of {ORBIT}")
-    look_at: Any = option("Place one camera at EYE that looks at TARGET, each x,y,z.", VIEW, heading=COMMON)
-    size: tuple[int, int] | None = option(
+    look_at: Any = setting("Place one camera at EYE that looks at TARGET, each x,y,z.", VIEW, heading=COMMON)
+    size: tuple[int, int] | None = setting(
         "Width and height of the images, in pixels; the vertical field of view is kept."
         f"  [default: the file's, or {DEFAULT_SIZE[0]}x{DEFAULT_SIZE[1]}]",
         SIZE,
         heading=COMMON,
     )
     dolly: bool = flag("Move the camera straight towards the scene, from far to near.")
-    keyframes: Any = option(
+    keyframes: Any = setting(
         "Move the camera smoothly through two or more views, separated by spaces or semicolons.", VIEWS
     )
-    camera_format: str | None = option(
+    camera_format: str | None = setting(
         f"Format of --camera-path: {', '.join(form.name for form in FORMATS)}, or auto, which recognises it by its"
         " content.  [default: auto]",
         ("auto", *(form.name for form in FORMATS)),
         metavar="FORMAT",
     )
-    camera_axes: str | None = option(
+    camera_axes: str | None = setting(
         "Axes of the matrices of --camera-path: y up (opengl) or down (opencv), camera to world (c2w) or world to"
         " camera (w2c).  [default: those of its format]",
         tuple(axes.value for axes in Axes),
     )
-    center: tuple[float, ...] | None = option(
+    center: tuple[float, ...] | None = setting(
         "Point that --orbit and --dolly look at.  [default: the middle of the scene]", POINT
     )
-    distance: float | None = option(
+    distance: float | None = setting(
         "Distance from that point, in world units: of --orbit, and of the first camera of --dolly."
         "  [default: where the scene fits the image; 4 times that with --dolly]",
         Range(above=0, unit="D"),
     )
-    elevation: float | None = option(
+    elevation: float | None = setting(
         f"Angle of --orbit and --dolly above that point, in degrees.  [default: {ELEVATION:g}]",
         Range(-89, 89, unit="DEGREES"),
     )
     up: tuple[float, float, float] | None = up_option(
         " For cameras of which only eye and target are known.", "; y in SuperSplat's camera files"
     )
-    world_transform: str | None = option(
+    world_transform: str | None = setting(
         "Transform from the world of the cameras to that of the splats: 16 numbers with commas between, row by row, or"
         " a file of them.",
         metavar="MATRIX",
     )
-    fov: float | None = option(
+    fov: float | None = setting(
         "Vertical field of view, in degrees.  [default: the file's, or 60]",
         Range(above=0, below=180, unit="DEGREES"),
     )
-    seconds: float | None = option(
+    seconds: float | None = setting(
         "Duration of --orbit, of --dolly, and of --keyframes from one view to the next, in seconds.  [default: 2; of"
         " --orbit, N frames at --fps]",
         SECONDS,
     )
-    fps: float | None = option(
+    fps: float | None = setting(
         "Frames per second of the path; times are counted by it.  [default: the file's times, or 30]", RATE
     )
-    every: int = option("Take every K-th camera of the path.", whole(1, unit="K"), 1)
+    every: int = setting("Take every K-th camera of the path.", whole(1, unit="K"), 1)
 
     #: Without a source there is one camera that sees the whole scene, in place of an orbit.
     still: ClassVar[bool] = False
@@ -232,7 +232,7 @@ class PictureCameras(Cameras):
     """Options of the cameras of pictures: without a source there is one camera, and there is `--view`."""
 
     orbit: int | None = _orbit_option("one camera that sees the whole scene")
-    views: tuple[Any, ...] = option(
+    views: tuple[Any, ...] = setting(
         "Place a camera as --look-at does; several --view make a contact sheet.",
         VIEW,
         flags=("--view",),

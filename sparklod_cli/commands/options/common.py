@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ...system.setting_fields import whole
-from ..command import COMMON, DIRECTION, flag, option
+from ...system.setting_fields import setting, whole
+from ..command import COMMON, DIRECTION, flag
 from ..console import Console, Verbosity
 from ..paths import OutputPath, require_suffix
 
@@ -56,7 +56,7 @@ class Messages:
 class General(Messages):
     """General options of the commands that read splat files."""
 
-    threads: int = option(
+    threads: int = setting(
         "Number of threads to work on.", whole(1, MAX_THREADS), processors_to_use, show_default="all processors"
     )
     as_json: bool = flag("Print one JSON object for each file on standard output.", flags=JSON)
@@ -69,12 +69,12 @@ def overwrite_flag(**attributes: Any) -> Any:
 
 def output_option(help: str, *, addresses: bool = False) -> Any:
     """Return the field of `-o`, `--output`, whose help says the default; with `addresses` as of `OutputPath`."""
-    return option(help, OutputPath(addresses=addresses), flags=("-o", "--output"), heading=COMMON)
+    return setting(help, OutputPath(addresses=addresses), flags=("-o", "--output"), heading=COMMON)
 
 
 def assert_option(help: str, **attributes: Any) -> Any:
     """Return the field of `--assert`, which can be given several times."""
-    return option(help, flags=("--assert",), metavar="TEXT", multiple=True, **attributes)
+    return setting(help, flags=("--assert",), metavar="TEXT", multiple=True, **attributes)
 
 
 def up_option(about: str = "", besides: str = "") -> Any:
@@ -84,7 +84,7 @@ def up_option(about: str = "", besides: str = "") -> Any:
         about: sentence of the help on the cameras that it applies to.
         besides: phrase on another default, such as that of a camera format.
     """
-    return option(
+    return setting(
         f"Axis that is up, such as -y, or a direction x,y,z.{about}  [default: what the files or their formats say, or"
         f" -y, as training leaves scenes{besides}]",
         DIRECTION,
@@ -94,7 +94,7 @@ def up_option(about: str = "", besides: str = "") -> Any:
 
 def plot_option(help: str, **attributes: Any) -> Any:
     """Return the field of `--plot`, a picture of a table or of a file."""
-    return option(help, OutputPath(suffixes=[".png"]), **attributes)
+    return setting(help, OutputPath(suffixes=[".png"]), **attributes)
 
 
 def table_form(flag: str, output: Path | None, form: str | None = None) -> str:

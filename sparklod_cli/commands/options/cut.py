@@ -13,9 +13,9 @@ from ...lod.settings import BLEND, FACTOR, PLAYCANVAS_BUDGET, PRESETS, DetailRul
 from ...model.foveation import BEHIND_FOVEATE, CONE_FOV, CONE_FOV0, CONE_FOVEATE, Cones, Foveation, Frustum
 from ...simulation.streaming_settings import Network, StreamingSettings
 from ...system.printable import printable
-from ...system.setting_fields import Quantity, Range
+from ...system.setting_fields import Quantity, Range, setting
 from ...system.units import check_grouping, parse_time
-from ..command import COMMON, argument, flag, option, parameters_of, refuse
+from ..command import COMMON, flag, parameters_of, refuse
 from ..paths import InputPath
 
 if TYPE_CHECKING:
@@ -58,8 +58,8 @@ class Inputs:
 
     HEADING: ClassVar[str] = "Inputs"
 
-    files: tuple[Path, ...] = argument(InputPath(), metavar="[FILE]...")
-    scene: Path | None = option(
+    files: tuple[Path, ...] = setting("", InputPath(), (), argument=True, nargs=-1, metavar="[FILE]...")
+    scene: Path | None = setting(
         "Read an instances file: JSON that lists splat files and where they stand (see docs/traverse.md).", InputPath()
     )
 
@@ -91,7 +91,7 @@ def _parse_budgets(text: str) -> tuple[Budget, ...]:
 
 
 def _budget_option(unit: str, several: str = "") -> Any:
-    return option(
+    return setting(
         f"Largest number of splats to draw, such as 500k, or a share of the leaves, such as 5%{several}."
         "  [default: that of --preset]",
         Quantity(unit, _parse_budgets),
@@ -107,32 +107,32 @@ class CutOptions:
     HEADING: ClassVar[str] = "Cut"
 
     budget: tuple[Budget, ...] | None = _budget_option("N|P%")
-    preset: str | None = option(
+    preset: str | None = setting(
         "Budget of a device: Spark 2's, or that of Spark's LoD design with preview-desktop and mobile."
         f"  [default: {DEFAULT_PRESET}; for Streamed SOG PlayCanvas's, {PLAYCANVAS_BUDGET:,} splats]",
         tuple(PRESETS),
     )
-    lod_splat_scale: float = option("Factor by which the budget is multiplied.", Range(above=0), 1.0)
+    lod_splat_scale: float = setting("Factor by which the budget is multiplied.", Range(above=0), 1.0)
     lod: LodSettings = field(default_factory=LodSettings)
-    cone_fov0: float = option(
+    cone_fov0: float = setting(
         "Full angle of the inner foveation cone, in degrees: full priority inside it.", DEGREES, CONE_FOV0
     )
-    cone_fov: float = option(
+    cone_fov: float = setting(
         "Full angle of the outer cone, in degrees, where priority has fallen to --cone-foveate.",
         DEGREES,
         CONE_FOV,
     )
-    cone_foveate: float = option(f"Priority of nodes at the outer cone, {PRIORITY}.", FACTOR, CONE_FOVEATE)
-    outside_foveate: float | None = option(
+    cone_foveate: float = setting(f"Priority of nodes at the outer cone, {PRIORITY}.", FACTOR, CONE_FOVEATE)
+    outside_foveate: float | None = setting(
         "Priority of nodes outside the frustum, in place of the cones, as in Spark's LoD design.",
         FACTOR,
         excludes=CONES,
     )
-    behind_foveate: float | None = option(
+    behind_foveate: float | None = setting(
         f"Priority of nodes behind the camera.  [default: {BEHIND_FOVEATE:g}; 1 with --outside-foveate]",
         FACTOR,
     )
-    precision: str = option(
+    precision: str = setting(
         "Precision of the centres and sizes that cuts are found with: the file's, its half floats, or what Spark has of"
         " the file, for the same cuts to the last node: ext with extSplats, else packed, or packed-pages of a RAD file"
         " that it streams.",
@@ -186,7 +186,7 @@ class PictureCut(CutOptions):
         "Blend nodes and their children where one replaces the other, so that nothing pops; draws 18 to 40 % more"
         " splats than the budget."
     )
-    blend: float | None = option(
+    blend: float | None = setting(
         f"With --continuous: ratio of the pixel scales between which nodes blend.  [default: {BLEND:g}]",
         Range(above=1),
         needs="continuous",
@@ -203,7 +203,7 @@ class PictureStreaming:
 
     HEADING: ClassVar[str] = "Streaming"
 
-    after: float | None = option(
+    after: float | None = setting(
         "Draw what a visitor sees this long after opening a page with the files, such as 500ms, who waits in front of"
         " the camera; with --bandwidth.  [default: what is drawn once every chunk has arrived]",
         Quantity("TIME", parse_time),

@@ -15,8 +15,8 @@ from ...images.output import JPEG_QUALITY, MOVING, STILL, THUMBNAIL_SIZE, THUMBN
 from ...model import MAX_SH_DEGREE
 from ...render.devices import uses_card
 from ...render.settings import SORTINGS, RenderSettings
-from ...system.setting_fields import Range, whole
-from ..command import COLOR, COMMON, flag, is_set, option, refuse
+from ...system.setting_fields import Range, setting, whole
+from ..command import COLOR, COMMON, flag, is_set, refuse
 from ..paths import Folder, InputPath, require_suffix, stem_of
 from .common import assert_errors, assert_option, output_option, overwrite_flag, plot_option
 
@@ -61,24 +61,24 @@ class Appearance:
 
     HEADING: ClassVar[str] = "Appearance"
 
-    background: Color | None = option(
+    background: Color | None = setting(
         "Colour behind the splats: '#rrggbb', black, white or transparent.", COLOR, "black", heading=COMMON
     )
     alpha: bool = flag("Keep alpha, as --background transparent does.")
     render: RenderSettings = field(default_factory=RenderSettings)
     no_bar: bool = flag("Leave out the colour bar of --color-by or --diff.")
-    through: str | None = option(
+    through: str | None = setting(
         "Draw splats as Spark's PackedSplats or ExtSplats, SPZ or RAD round them; cuts stay those of the file."
         "  [default: as in the file]",
         tuple(ROUND_TRIPS),
     )
-    sorting: str | None = option(
+    sorting: str | None = setting(
         "With --backend osmesa: sort exactly, or by 16 bits of the depth as antimatter15's viewer does (counting16)."
         "  [default: exact]",
         SORTINGS,
         needs="backend=osmesa",
     )
-    sort_throttle: float | None = option(
+    sort_throttle: float | None = setting(
         "With --backend osmesa: keep the order until the cosine between the view directions falls below 1 - X, such as"
         " 0.01.  [default: 0]",
         Range(0, 2),
@@ -148,14 +148,16 @@ class ComparisonOptions:
         needs="compare",
     )
     plot: Path | None = plot_option("With --compare: draw charts of the table as a .png.", needs="compare")
-    max_sh: int = option(
+    max_sh: int = setting(
         "With --compare: highest degree of spherical harmonics to draw.",
         whole(0, MAX_SH_DEGREE),
         MAX_SH_DEGREE,
         needs="compare",
     )
-    diff: Path | None = option("Draw the difference from the picture of another file, and print its PSNR.", InputPath())
-    gain: float | None = option(
+    diff: Path | None = setting(
+        "Draw the difference from the picture of another file, and print its PSNR.", InputPath()
+    )
+    gain: float | None = setting(
         "Factor by which --diff multiplies differences.  [default: chosen for the pictures]",
         Range(above=0),
         needs="diff",
@@ -218,10 +220,10 @@ class PictureFiles:
         excludes=NO_THUMBNAIL,
     )
     sheet: bool = flag("Put the pictures of all cameras on one contact sheet.")
-    jobs: int = option(
+    jobs: int = setting(
         "Number of pictures to work on at a time: while one is drawn, others are sorted and written.", whole(1, 256), 2
     )
-    jpeg_quality: int = option("Quality of a .jpg, from 1 to 100.", whole(1, 100), JPEG_QUALITY)
+    jpeg_quality: int = setting("Quality of a .jpg, from 1 to 100.", whole(1, 100), JPEG_QUALITY)
 
     def place(self, ctx: click.Context, scene: Path, cameras: int, *, sheet: bool) -> PictureOutput:
         """Return the output of the pictures of some cameras.
