@@ -25,8 +25,7 @@ from sparklod_cli.cameras.camera import look_at
 from sparklod_cli.cameras.framing import framing
 from sparklod_cli.codecs.gpu import lod_tree
 from sparklod_cli.lod.continuous import ContinuousCuts
-from sparklod_cli.lod.cut_statistics import Changes, measure
-from sparklod_cli.lod.traversal import CutView, Forest, Traversal, TreeInstance
+from sparklod_cli.lod.traversal import Changes, CutView, Forest, Traversal, TreeInstance, measure
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.model.traversed import Nodes

@@ -186,12 +186,12 @@ def split_environment(splats: Splats, distance: float) -> tuple[Splats, Splats |
     """Separate splats far outside of a scene, which become its environment; None without any.
 
     Args:
-        distance: see `lod.regions.beyond`.
+        distance: see `lod.detail_levels.beyond`.
 
     Raises:
         InvalidSplatsError: all splats are far outside.
     """
-    from ..lod.regions import beyond
+    from ..lod.detail_levels import beyond
 
     far = beyond(splats, distance)
     return (splats.take(~far), splats.take(far)) if far.any() else (splats, None)

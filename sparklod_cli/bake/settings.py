@@ -18,8 +18,7 @@ from ..lod.budget import Budget
 from ..lod.builders import DEFAULT_BASE, DEFAULT_GROWTH, METHODS
 from ..lod.part_settings import DetailSettings, TileSettings
 from ..model import MAX_SH_DEGREE
-from ..model.axes import line, rotated
-from ..model.scene import NodeStream, Scene
+from ..model.scene import NodeStream, Scene, rotated_axis, up_notes
 from ..model.selection import Selection
 from ..model.splats import Splats
 from ..model.transforms import Transform
@@ -68,7 +67,7 @@ class BakeSettings:
         max_sh: the highest SH degree that is kept.
         selection: which splats are kept; its coordinates are those of the input.
         transform: turns, scales and moves the splats that are kept.
-        up: axis of the input that points up, one of `axes.AXES`, which `transform` may have turned to another; None
+        up: axis of the input that points up, one of `scene.AXES`, which `transform` may have turned to another; None
             for that of the file.
         rgba: a file of colours and opacities that replace the splats' own, see `io.read_rgba`.
         suffix: of the format, one of `WRITABLE` that holds trees.
@@ -79,7 +78,7 @@ class BakeSettings:
         tiles: of tiles and where they stand, to write 3D Tiles instead.
         environment: of a Streamed SOG, a file whose splats are always drawn; turned and moved as the scene.
         environment_beyond: of a Streamed SOG, splats of the input farther out than this become its environment, see
-            `lod.regions.beyond`; in the input's units. None for none.
+            `lod.detail_levels.beyond`; in the input's units. None for none.
         simplify: how many splats a cut of the tree has, to write that without a tree instead.
         refine: how merged splats are fitted to pictures of full detail, its cameras left out; None for not at all.
         camera_path: a file of training cameras, or of those by which a PSNR is measured, in the coordinates of the
@@ -119,11 +118,11 @@ class BakeSettings:
     def up_of(self, found: str | None) -> str | None:
         """Return the axis of the output that points up, for that of the input."""
         up = self.up or found
-        return rotated(up, self.transform.rotation) if up else None
+        return rotated_axis(up, self.transform.rotation) if up else None
 
     def notes_on(self, source: Scene | Reader) -> tuple[str, ...]:
         """Return notes on an input for the user: its own, and on its up axis if a specification names that."""
-        return source.notes + (line(source.up, source.up_by) if source.up and self.up is None else ())
+        return source.notes + (up_notes(source.up, source.up_by) if source.up and self.up is None else ())
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from typing import Any, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from ..model.axes import ASSUMED, AXES
+from ..model.scene import ASSUMED, AXES
 from ..system import untrusted
 from ..system.errors import CameraPathError, TooManyCamerasError
 from ..system.untrusted import LARGEST, Origin, decoded_text, quoted_value

@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
-from typing import TypeVar
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..model import FARTHEST
-from ..model.balls import Balls
+from ..model.splats import Splats
 from ..system.errors import InvalidSplatsError
 from .camera import Camera, Matrix
+
+#: Standard deviations out to which an opaque splat counts. There an opacity of an eighth is left, exp(-2); fainter
+#: splats count out to where as much is left of them.
+SEEN = 2.0
+
+#: Columns of `Splats` that `balls_of` reads.
+USED = ("center", "scale", "opacity")
 
 #: The share of the splats in the ball around the middle whose radius is the size of a scene.
 SHARE = 0.9
@@ -46,6 +54,50 @@ STEPS = 1e-6
 CAMERAS = 64
 
 Item = TypeVar("Item")
+
+
+@dataclass(frozen=True)
+class Balls:
+    """N bounding spheres of splats.
+
+    Attributes:
+        center: (N, 3) float64 world units.
+        radius: (N,) float64 world units.
+        box: (2, 3) lowest and highest coordinates of all centres, where these are a sample; None where they are all.
+        largest: radius, where these are a sample.
+    """
+
+    center: Matrix
+    radius: Matrix
+    box: Matrix | None = None
+    largest: float | None = None
+
+    def take(self, index: NDArray[np.bool_]) -> Balls:
+        """Return the balls of a mask (N,)."""
+        return Balls(self.center[index], self.radius[index])
+
+    @classmethod
+    def concat(cls, parts: Iterable[Balls]) -> Balls:
+        """Concatenate the balls of several parts, at least one."""
+        every = list(parts)
+        return cls(np.concatenate([part.center for part in every]), np.concatenate([part.radius for part in every]))
+
+
+def balls_of(splats: Splats, index: NDArray[Any] | slice, object_to_world: Matrix) -> Balls:
+    """Return what some splats cover where they stand; those without finite numbers are left out.
+
+    Args:
+        splats: all of an object.
+        index: which of them.
+        object_to_world: (4, 4) a rotation, a uniform scale and a translation.
+    """
+    with np.errstate(all="ignore"):
+        center = splats.center[index].astype(np.float64) @ object_to_world[:3, :3].T + object_to_world[:3, 3]
+        times = float(np.cbrt(np.linalg.det(object_to_world[:3, :3])))
+        seen = np.sqrt(np.clip(SEEN**2 + 2 * np.log(splats.opacity[index].astype(np.float64)), 0, SEEN**2))
+        radius = seen * times * splats.scale[index].max(axis=1, initial=0).astype(np.float64)
+        finite = np.isfinite(center).all(axis=1) & np.isfinite(radius)
+    return Balls(center[finite], radius[finite])
 
 
 def framing(center: NDArray[np.floating]) -> tuple[NDArray[np.float64], float]:

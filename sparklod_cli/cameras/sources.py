@@ -38,7 +38,7 @@ from .frame import (
 )
 
 if TYPE_CHECKING:
-    from ..model.balls import Balls
+    from .framing import Balls
 
 #: Bytes of a camera path's file. COLMAP's images.txt has all points that its images see.
 LARGEST = 1 << 31

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from .. import __version__
-from ..model.axes import AXES, SPECIFIED
+from ..model.scene import AXES, SPECIFIED
 from ..system.untrusted import parse_json, quoted_value
 
 #: How the "generator" of a note of sparklod begins; its version follows.

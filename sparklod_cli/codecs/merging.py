@@ -13,7 +13,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from ..model.axes import common, differing, rotated
+from ..model.scene import common_axis, differing_axes, rotated_axis
 from ..model.sh import COEFFICIENTS
 from ..model.splats import COLUMNS, Splats
 from ..model.transforms import Transform
@@ -54,8 +54,8 @@ def merged(parts: Sequence[Placed]) -> Reader:
     degree = max(part.reader.sh_degree for part in parts)
     antialiased, notes = _antialiased(parts)
     notes += tuple(f"{part.name}: {note}" for part in parts for note in part.reader.notes)
-    axes = [rotated(part.reader.up, part.transform.rotation) for part in parts]
-    notes += tuple(f"{text}, so none is noted unless --up names it" for text in differing(axes))
+    axes = [rotated_axis(part.reader.up, part.transform.rotation) for part in parts]
+    notes += tuple(f"{text}, so none is noted unless --up names it" for text in differing_axes(axes))
     return Reader(
         firsts[-1],
         degree,
@@ -63,8 +63,10 @@ def merged(parts: Sequence[Placed]) -> Reader:
         _FillMerged(tuple(parts), firsts, degree),
         antialiased,
         tuple(dict.fromkeys(notes)),
-        up=common(axes),
-        up_by=(common(part.reader.up_by for part in parts) or "") if axes == [part.reader.up for part in parts] else "",
+        up=common_axis(axes),
+        up_by=(common_axis(part.reader.up_by for part in parts) or "")
+        if axes == [part.reader.up for part in parts]
+        else "",
     )
 
 

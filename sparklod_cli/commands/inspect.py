@@ -393,7 +393,7 @@ MOST_DEPTHS = 64
 
 def lines(name: str, report: dict[str, Any]) -> Iterator[str]:
     """Yield the lines of a report on a file, given as its JSON."""
-    from ..model.axes import line
+    from ..model.scene import up_notes
 
     tree, values = report["tree"], report["values"]
     noun = "node" if tree else "splat"
@@ -409,7 +409,7 @@ def lines(name: str, report: dict[str, Any]) -> Iterator[str]:
         ratio = report["compression_ratio"]
         less = "" if ratio is None else f", {ratio:.1f} times less than as floats"
         yield from rows("takes", f"{report['bytes_per_splat']:.1f} bytes a {noun}{less}")
-    for note in (*report["notes"], *line(report["up"], report["up_by"])):
+    for note in (*report["notes"], *up_notes(report["up"], report["up_by"])):
         yield from rows("note", note)
     for hint in report["hints"]:
         yield from rows("hint", hint)

@@ -24,8 +24,8 @@ from ..codecs.tiles_3d import tileset_rules
 from ..codecs.tiles_3d.codec import tile_files
 from ..codecs.tiles_3d.tileset import MAX_TILESET, Tileset, read_whole
 from ..codecs.validation import RuleViolation
-from ..model.axes import common
 from ..model.georeference import EarthPlace, place_of
+from ..model.scene import common_axis
 from ..system.printable import MOST, printable
 from ..system.progress import Progress, silent
 from ..system.untrusted import LARGEST
@@ -434,8 +434,8 @@ def survey_tiles(
         sum(chunk.count for chunk in read),
         max((chunk.sh_degree for chunk in read), default=0),
         any(chunk.antialiased for chunk in read),
-        common(chunk.up for chunk in read),
-        common(chunk.up_by for chunk in read) or "",
+        common_axis(chunk.up for chunk in read),
+        common_axis(chunk.up_by for chunk in read) or "",
     )
     return HeaderScan("tiles", found, head, _tile_facts(tileset, chunks))
 

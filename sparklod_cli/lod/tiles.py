@@ -16,9 +16,8 @@ from ..model.lod_tree import LodTree
 from ..model.splats import FloatArray, Splats
 from ..model.traversed import TileScene
 from ..system.progress import Progress, silent
-from .detail_levels import STEP, Nodes, RefinementOrder, owners_of, with_plain_opacity
+from .detail_levels import STEP, Nodes, RefinementOrder, extents, owners_of, united, with_plain_opacity
 from .part_settings import TileSettings
-from .regions import extents, united
 
 #: Geometric error of a splat in its feature sizes: pixels of error that CesiumJS allows unless told otherwise
 #: (`maximumScreenSpaceError`), so that a splat is refined where it is larger than a pixel.

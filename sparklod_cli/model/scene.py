@@ -1,13 +1,18 @@
 """Contents of one splat file: `Scene`, splats with their tree if they have one, and metadata of the file.
 
 `FileCoding` describes how the file holds its scales, from which the numbers that another reader decodes follow.
+
+The axis that points up is known from a note of sparklod, from the coordinate system of an SPZ 4, or for the formats of
+`SPECIFIED` from their specification; outputs note it. All other formats, and trees in SPZ, have the axes of the files
+that they were made from: their axis is unknown and not noted, and cameras take `ASSUMED`. No coordinate is turned
+unless a user asks for it.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,10 +20,26 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..system.errors import InvalidSplatsError, TreeError
-from .axes import AXES
 from .lod_tree import LodTree
 from .sh import COEFFICIENTS
 from .splats import Splats, describe_invalid
+
+#: Unit vectors of the axes, by name.
+AXES: dict[str, tuple[float, float, float]] = {
+    "x": (1.0, 0.0, 0.0),
+    "-x": (-1.0, 0.0, 0.0),
+    "y": (0.0, 1.0, 0.0),
+    "-y": (0.0, -1.0, 0.0),
+    "z": (0.0, 0.0, 1.0),
+    "-z": (0.0, 0.0, -1.0),
+}
+
+#: By format, the axis that points up by its specification. z is up in a tileset of 3D Tiles, and y in the glTF of its
+#: tiles, whose axes splats are read in. Files of SPZ without a tree; Spark's builder and sparklod's keep other axes.
+SPECIFIED: Mapping[str, str] = {"SPZ": "y", "glTF": "y"}
+
+#: The axis that cameras take for up in scenes that do not say it: training leaves them with y down.
+ASSUMED = "-y"
 
 
 @dataclass(frozen=True)
@@ -82,7 +103,7 @@ class Scene:
         header: numbers of the file's header that the splats do not tell, by name ("version", "fractional_bits").
         chunk_bytes: of each of its chunks in the file, where its format has chunks; None elsewhere.
         coding: how the file holds its scales; `PLAIN` where it has the very numbers.
-        up: the axis that points up, one of `axes.AXES` ("y", "-z"); None where it is unknown.
+        up: the axis that points up, one of `AXES` ("y", "-z"); None where it is unknown.
         up_by: the format whose specification says so ("SPZ", "glTF"); empty where the file itself does, or nobody.
     """
 
@@ -232,3 +253,54 @@ class NodeStream:
     antialiased: bool
     read: Callable[[int, int], tuple[Splats, LodTree]]
     up: str | None = None
+
+
+def up_notes(up: str | None, up_by: str) -> tuple[str, ...]:
+    """Return the message on an axis that a specification names, which a file may contradict; empty for other axes.
+
+    Args:
+        up, up_by: of a `Scene`.
+    """
+    if up is None or not up_by:
+        return ()
+    return (f"{up} is up, as {up_by} specifies; if the scene is upside down, its converter kept y down: give --up -y",)
+
+
+def up_notes_of(files: Iterable[tuple[str, str | None, str]]) -> list[str]:
+    """Return the messages on the axes of files that are shown together: that of each file, and one if they differ.
+
+    Args:
+        files: the name of each, and `up` and `up_by` of its scene.
+    """
+    each = list(dict.fromkeys(files))
+    messages = [f"{name}: {text}" for name, up, up_by in each for text in up_notes(up, up_by)]
+    return messages + [
+        f"{text}, so {ASSUMED} is taken; --up chooses" for text in differing_axes(up for _, up, _ in each)
+    ]
+
+
+def differing_axes(axes: Iterable[str | None]) -> tuple[str, ...]:
+    """Return the beginning of a sentence that names the different axes of files; empty if all have the same."""
+    names = list(dict.fromkeys(axis or "unknown" for axis in axes))
+    return (f"the files differ in the axis that is up ({', '.join(names)})",) if len(names) > 1 else ()
+
+
+def rotated_axis(axis: str | None, rotation: ArrayLike) -> str | None:
+    """Return the axis nearest to where a rotation takes an axis; None for None.
+
+    The nearest one, since a rotation by a few degrees levels a scene whose axis was only roughly up.
+
+    Args:
+        axis: one of `AXES`.
+        rotation: (3, 3) matrix that multiplies column vectors.
+    """
+    if axis is None:
+        return None
+    up = np.asarray(rotation, np.float64) @ AXES[axis]
+    return max(AXES, key=lambda name: float(up @ AXES[name]))
+
+
+def common_axis(axes: Iterable[str | None]) -> str | None:
+    """Return the axis that all scenes have up; None where one is unknown or two differ."""
+    distinct = set(axes)
+    return distinct.pop() if len(distinct) == 1 else None

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ..cameras.framing import Balls, balls_of
 from ..codecs.formats import PRECISIONS
 from ..lod.budget import Budget
 from ..lod.continuous import faded
@@ -16,12 +17,10 @@ from ..lod.detail_traversal import DetailForest, DetailTraversal
 from ..lod.settings import PLAYCANVAS_BUDGET, LodSettings
 from ..lod.tile_traversal import TileForest, TileTraversal
 from ..lod.traversal import Forest, Traversal, TreeCut, TreeInstance
-from ..model.axes import common, lines_of, rotated
-from ..model.balls import Balls, balls_of
 from ..model.foveation import Foveation
 from ..model.gaussian import placed
 from ..model.instances import Instance, Matrix
-from ..model.scene import Scene
+from ..model.scene import Scene, common_axis, rotated_axis, up_notes_of
 from ..model.splats import Splats
 from ..model.traversed import Nodes
 from ..system.units import count_of
@@ -129,20 +128,20 @@ class Scenes:
 
     @property
     def up(self) -> str | None:
-        """The axis of the world that points up, one of `axes.AXES`, where it is the same for all files; else None."""
-        return common(axis for _, axis, _ in self._axes)
+        """The axis of the world that points up, one of `scene.AXES`, where it is the same for all files; else None."""
+        return common_axis(axis for _, axis, _ in self._axes)
 
     @property
     def axis_notes(self) -> list[str]:
         """Lines for a user whose cameras take `up`: who says it, and whether files differ."""
-        return lines_of(self._axes)
+        return up_notes_of(self._axes)
 
     @property
     def _axes(self) -> list[tuple[str, str | None, str]]:
         """For each instance the name of its file, the axis of the world that is up, and which specification says so."""
         axes = list[tuple[str, str | None, str]]()
         for instance, loaded in zip(self.instances, self.of_instance, strict=True):
-            up = rotated(loaded.scene.up, instance.transform.rotation)
+            up = rotated_axis(loaded.scene.up, instance.transform.rotation)
             axes.append((loaded.name, up, loaded.scene.up_by if up == loaded.scene.up else ""))
         return axes
 

@@ -12,11 +12,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cameras.framing import SAMPLE
+from ..cameras.framing import SAMPLE, USED, Balls, balls_of
 from ..io.rad_file import RadFile
 from ..lod.kernels.pixel_scale import NODE
 from ..lod.traversal import Forest, fill_nodes
-from ..model.balls import USED, Balls, balls_of
 from ..model.instances import Instance
 from ..model.lod_tree import CHUNK_BITS, CHUNK_NODES, LodTree
 from ..model.scene import FileCoding

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from ..cameras.camera import Camera
 from ..cameras.sources import CameraPath
-from ..lod.cut_statistics import Changes, CutStatistics, measure
 from ..lod.settings import LodSettings
-from ..lod.traversal import TreeCut
+from ..lod.traversal import Changes, CutStatistics, TreeCut, measure
 from ..model.instances import TOTAL
 from ..scenes.finder import CutFinder, view_of
 from ..scenes.loaded import Cut, Scenes

@@ -28,7 +28,7 @@ from ..cameras.frame import Settings as CameraSettings
 from ..cameras.sources import CameraPath, read
 from ..io import read_text
 from ..io.local_files import leads_away, open_plain
-from ..model.axes import lines_of
+from ..model.scene import up_notes_of
 from ..system.errors import CameraPathError, OutputError, SparklodError, reason_of
 from ..system.output import try_place, write_file
 from ..system.printable import printable
@@ -324,7 +324,7 @@ def site_of(
         resources.update(file.files)
     notes = [file.note for file in shown if file.note is not None]
     if cameras.up is None:
-        notes += lines_of((file.name, each.up, each.up_by) for file, each in zip(shown, extents, strict=True))
+        notes += up_notes_of((file.name, each.up, each.up_by) for file, each in zip(shown, extents, strict=True))
     return Site(resources, cameras, shown, [*libraries.notes(), *notes, *(path.notes if path else ())])
 
 

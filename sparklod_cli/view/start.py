@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 from ..cameras import DEFAULT_SIZE, ELEVATION, framing
 from ..cameras.camera import Camera, Matrix
 from ..cameras.frame import DEFAULT_FOV_Y, Settings
+from ..cameras.framing import Balls, balls_of
 from ..cameras.sources import SingleViews, WholeScene
 from ..codecs.losses import MOST_PAGED_DEGREE, sample_loss
 from ..codecs.rad.rad_header import RadHeader
 from ..codecs.rad.rad_reader import count_leaves, file_of, read_chunk
 from ..io import read_parts, read_scene
 from ..io.local_files import open_plain
-from ..model.balls import Balls, balls_of
 from ..model.splats import Splats
 from ..model.traversed import DetailScene, TileScene
 from ..system.errors import InvalidSplatsError, UnreadableError, naming, reason_of

@@ -14,6 +14,8 @@ from sparklod_cli.cameras.frame import DEFAULT_UP, Settings, camera_of
 from sparklod_cli.cameras.framing import (
     FILLED,
     OUTSIDE,
+    Balls,
+    balls_of,
     covered,
     distance,
     fitted,
@@ -22,7 +24,6 @@ from sparklod_cli.cameras.framing import (
     reach,
 )
 from sparklod_cli.cameras.generators import orbit
-from sparklod_cli.model.balls import Balls, balls_of
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.render.settings import RasterSettings
 from sparklod_cli.system.errors import InvalidSplatsError

@@ -7,7 +7,7 @@ import json
 import pytest
 
 from sparklod_cli.codecs.file_notes import FileNote, comment_of, note_of, read_comment, read_note
-from sparklod_cli.model.axes import AXES
+from sparklod_cli.model.scene import AXES
 
 
 @pytest.mark.parametrize("up", [None, *AXES])

@@ -20,8 +20,7 @@ from sparklod_cli.codecs.glb.glb_container import TURNS
 from sparklod_cli.codecs.options import PROFILES, WriteOptions
 from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.io import read_scene
-from sparklod_cli.model.axes import AXES
-from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.scene import AXES, Scene
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.model.transforms import Transform
 from sparklod_cli.system.errors import FormatError

@@ -15,8 +15,7 @@ from fixtures import by_hand_glb, by_hand_tiles
 from sparklod_cli.cli import COMMANDS, cli, run
 from sparklod_cli.codecs import spz
 from sparklod_cli.codecs.options import WriteOptions
-from sparklod_cli.model.axes import ASSUMED, SPECIFIED
-from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.scene import ASSUMED, SPECIFIED, Scene
 from tests.codecs.cases import linear
 from tests.conftest import Capture
 

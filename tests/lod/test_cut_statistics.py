@@ -10,9 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sparklod_cli.lod.cut_statistics import Changes, CutStatistics, measure
 from sparklod_cli.lod.settings import pixel_limit
-from sparklod_cli.lod.traversal import CutView, Traversal, TreeCut, TreeInstance
+from sparklod_cli.lod.traversal import Changes, CutStatistics, CutView, Traversal, TreeCut, TreeInstance, measure
 from sparklod_cli.model.traversed import Nodes
 from tests.lod.forests import Case, cases, drawn, expected_cut, links, views
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sparklod_cli.lod.detail_choice import Chains, DetailChoice, Distant, RegionBounds, choose
+from sparklod_cli.lod.detail_traversal import Chains, DetailChoice, Distant, RegionBounds, choose
 from sparklod_cli.lod.settings import DetailRule
 from sparklod_cli.lod.traversal import CutView
 from tests.lod.details import random_regions, random_view

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from sparklod_cli.lod.detail_choice import Chains
 from sparklod_cli.lod.detail_traversal import (
     ANOTHER_LEVEL,
     ENVIRONMENT,
     NEXT,
     NOTHING_DRAWN,
+    Chains,
     DetailFiles,
     loading,
 )

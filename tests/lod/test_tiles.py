@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from sparklod_cli.lod import quality, quick
-from sparklod_cli.lod.detail_levels import RefinementOrder, with_plain_opacity
+from sparklod_cli.lod.detail_levels import RefinementOrder, extents, with_plain_opacity
 from sparklod_cli.lod.part_settings import TileSettings
-from sparklod_cli.lod.regions import extents
 from sparklod_cli.lod.tiles import PIXEL_ERROR, make, tile_cuts
 from sparklod_cli.model.gaussian import spark_size
 from sparklod_cli.model.lod_tree import LodTree

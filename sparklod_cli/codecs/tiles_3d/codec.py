@@ -17,8 +17,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from ...model.axes import common
-from ...model.scene import Scene, facts_of
+from ...model.scene import Scene, common_axis, facts_of
 from ...model.sh import width_of
 from ...model.traversed import TileScene
 from ...system.errors import FormatError
@@ -176,11 +175,11 @@ def _open(source: OpenFile, tileset: Tileset, wanted: Sequence[int]) -> tuple[Re
         notes += (NOT_PLACED,)
     if len({chunk.up for chunk in chunks}) > 1:
         raise error_of("tiles.kind", "the axes that point up in its tiles differ; such tilesets are not read")
-    up, antialiased = common(chunk.up for chunk in chunks), any(chunk.antialiased for chunk in chunks)
+    up, antialiased = common_axis(chunk.up for chunk in chunks), any(chunk.antialiased for chunk in chunks)
     form = f"3D Tiles {tileset.head['asset']['version']} of {chunks[0].format}"
     header = {"tiles": len(chunks), "bytes": size}
     fill = beside.fill(chunks, degree, source.threads)
-    by = common(chunk.up_by for chunk in chunks) or ""
+    by = common_axis(chunk.up_by for chunk in chunks) or ""
     return Reader(row, degree, form, fill, antialiased, notes, header, up, up_by=by), chunks
 
 

@@ -22,8 +22,7 @@ from sparklod_cli.io import open_reader, read_parts, read_scene
 from sparklod_cli.lod import quality
 from sparklod_cli.lod.part_settings import TileSettings
 from sparklod_cli.lod.tiles import make
-from sparklod_cli.model.axes import AXES
-from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.scene import AXES, Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.model.transforms import Transform
 from sparklod_cli.model.traversed import TileScene

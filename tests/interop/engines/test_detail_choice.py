@@ -1,4 +1,4 @@
-"""The detail levels that PlayCanvas's engine chooses, by its own modules, and those of `lod.detail_choice`."""
+"""The detail levels that PlayCanvas's engine chooses, by its own modules, and those of `lod.detail_traversal`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sparklod_cli.lod.detail_choice import Chains, Distant, RegionBounds, choose
+from sparklod_cli.lod.detail_traversal import Chains, Distant, RegionBounds, choose
 from sparklod_cli.lod.settings import DetailRule
 from sparklod_cli.lod.traversal import CutView
 from tests.interop.node import Node
