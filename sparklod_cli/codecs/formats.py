@@ -194,11 +194,10 @@ def sniff(head: bytes, suffix: str) -> Format | None:
     The suffix decides only for formats that may begin with any bytes, and not if the file is recognized as something
     else.
     """
-    keys = _keys(head)
     for form in FORMATS:
         if form.beginning is not None and re.match(form.beginning, head, re.DOTALL):
             return form
-        if form.keys and set(form.keys) <= set(keys):
+        if form.keys and set(form.keys) <= set(_keys(head)):
             return form
     if lookalike_of(head) is not None:
         return None

@@ -128,7 +128,7 @@ def _echo(text: str) -> None:
         silence(sys.stderr)
 
 
-class Console:
+class Console(contextlib.AbstractContextManager["Console"]):
     """Prints lines on standard error, and the progress of each stage of work: a bar on a terminal, lines in a log.
 
     Used as a context manager, which clears the bar. With `verbose` it prints details. Its `progress` is a
@@ -149,9 +149,6 @@ class Console:
         self._ahead: CompileAhead | None = None
         self._work: str | BakeSettings | None = None
         self._troubles: set[str] = set()
-
-    def __enter__(self) -> Console:
-        return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         self.clear()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import functools
+import contextlib
 import os
 import stat
 import sys
@@ -36,7 +36,8 @@ class Folder:
 class _NamedPath(click.Path):
     """A path as given. Whether it can be opened is checked later, so that a bad file does not stop the others."""
 
-    _to_do = ""
+    #: Whether a command reads it, and what to do about an address that it cannot use.
+    _is_input, _to_do = True, "download it first"
 
     def __init__(
         self, *, folder: bool = False, suffixes: Sequence[str] = (), addresses: bool = False, stdin: bool = False
@@ -49,12 +50,17 @@ class _NamedPath(click.Path):
         text = os.fsdecode(value)
         if not text:
             self.fail("the name is empty", param, ctx)
-        place = place_of(text)
+        place: Any = place_of(text)
         if isinstance(place, Path):
-            return super().convert(os.fspath(place), param, ctx)
-        if not self.addresses:
+            place = super().convert(os.fspath(place), param, ctx)
+        elif not self.addresses:
             self.fail(f"'{place}' is an address on a network, not a path; {self._to_do}", param, ctx)
-        return place
+        if self._is_input and place == DASH and not self.stdin:
+            self.fail("standard input is not read here; save it to a file first", param, ctx)
+        if self._is_input or self.folder:
+            return place
+        is_folder = text.endswith(("/", os.sep)) or (isinstance(place, Path) and os.path.isdir(place))  # noqa: PTH112
+        return Folder(place) if is_folder else place
 
 
 class InputPath(_NamedPath):
@@ -62,14 +68,6 @@ class InputPath(_NamedPath):
 
     With `addresses`, also s3://bucket/file and the like.
     """
-
-    _to_do = "download it first"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        path = super().convert(value, param, ctx)
-        if path == DASH and not self.stdin:
-            self.fail("standard input is not read here; save it to a file first", param, ctx)
-        return path
 
 
 class OutputPath(_NamedPath):
@@ -80,14 +78,7 @@ class OutputPath(_NamedPath):
     and the like.
     """
 
-    _to_do = "write a file and upload that"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        place = super().convert(value, param, ctx)
-        is_folder = not self.folder and (
-            os.fsdecode(value).endswith(("/", os.sep)) or (isinstance(place, Path) and os.path.isdir(place))  # noqa: PTH112
-        )
-        return Folder(place) if is_folder else place
+    _is_input, _to_do = False, "write a file and upload that"
 
 
 def name_outputs(ctx: click.Context, source: Place | None) -> None:
@@ -236,19 +227,13 @@ def _place(path: Place) -> str:
     """Return the path of a file that exists or not: the same for all links and spellings. Or its address."""
     if isinstance(path, Address):
         return path.url
-    place = os.path.realpath(path)
-    folder = os.path.dirname(place)  # noqa: PTH120
-    return os.path.join(folder, os.path.basename(place).casefold()) if _folds_case(folder) else place  # noqa: PTH118, PTH119
-
-
-@functools.lru_cache(256)
-def _folds_case(folder: str) -> bool:
-    """Return whether a folder ignores the case of names, judged by its own name."""
-    path = Path(folder)
-    try:
-        return path.name.swapcase() != path.name and path.samefile(path.with_name(path.name.swapcase()))
-    except (OSError, ValueError):
-        return False
+    place = Path(os.path.realpath(path))
+    folder, other = place.parent, place.parent.name.swapcase()
+    with contextlib.suppress(OSError, ValueError):
+        # A folder that can be found by its name in the other case ignores the case of names.
+        if other != folder.name and folder.samefile(folder.with_name(other)):
+            return str(folder / place.name.casefold())
+    return str(place)
 
 
 def stem_of(source: Place) -> str:

@@ -75,7 +75,7 @@ class Siblings:
         return [name for name in names if name in known]
 
 
-class Output:
+class Output(contextlib.AbstractContextManager["Output"]):
     """An output, tried when it is made, before any work; its files appear at the end of the context, all or none.
 
     With `overwrite`, existing files are replaced, and those of a former output that have no successor are removed. An
@@ -109,9 +109,6 @@ class Output:
             self._check_together(siblings)
         elif place != DASH:
             check_writable(place, overwrite=overwrite)
-
-    def __enter__(self) -> Output:
-        return self
 
     def write(self, name: str, pieces: Iterable[bytes]) -> int:
         """Write a file and return its size in bytes; further calls continue the file of an output of one.

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from collections.abc import Callable
 
-
-class Progress(Protocol):
-    """Called repeatedly with a stage ("reading", "building", "encoding"), the amount done, the total and the unit."""
-
-    def __call__(self, stage: str, done: int, total: int, unit: str) -> None: ...
+#: Called repeatedly with a stage ("reading", "building", "encoding"), the amount done, the total and the unit.
+Progress = Callable[[str, int, int, str], None]
 
 
 def silent(stage: str, done: int, total: int, unit: str) -> None:

@@ -105,15 +105,6 @@ class Setting:
     excludes: tuple[str, ...] = ()
     attributes: Mapping[str, Any] = field(default_factory=dict)
 
-    def check(self, name: str, value: Any) -> None:
-        """Raise TypeError or ValueError unless the declaration allows a value."""
-        numbers = self.kind.range if isinstance(self.kind, Quantity) else self.kind
-        if isinstance(numbers, Range):
-            numbers.check(name, value)
-        elif isinstance(self.kind, tuple) and value not in self.kind:
-            noun = (self.name or name).replace("_", " ")
-            raise ValueError(f"there is no {noun} {value!r}; give one of {', '.join(map(str, self.kind))}")
-
 
 def setting(
     help: str,
@@ -164,5 +155,11 @@ class CheckedSettings:
     def __post_init__(self) -> None:
         for each, declared in settings_in(type(self)):
             value = getattr(self, each.name)
-            if declared is not None and value is not each.default:
-                declared.check(each.name, value)
+            if declared is None or value is each.default:
+                continue
+            allowed = declared.kind.range if isinstance(declared.kind, Quantity) else declared.kind
+            if isinstance(allowed, Range):
+                allowed.check(each.name, value)
+            elif isinstance(allowed, tuple) and value not in allowed:
+                noun = (declared.name or each.name).replace("_", " ")
+                raise ValueError(f"there is no {noun} {value!r}; give one of {', '.join(map(str, allowed))}")
