@@ -24,7 +24,7 @@ from sparklod_cli.codecs.gpu import packed_splats
 from sparklod_cli.codecs.options import DEFAULTS, RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import codec as rad
 from sparklod_cli.codecs.reader import decode_file
-from sparklod_cli.codecs.splat_encoding import SplatEncoding
+from sparklod_cli.codecs.spark_codings import SplatEncoding
 from sparklod_cli.model.sh import COEFFICIENTS
 
 #: The encodings that Spark's program chooses for a tree, and the ranges that it widens if many values are outside.

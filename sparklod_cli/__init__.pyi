@@ -39,7 +39,7 @@ if TYPE_CHECKING:  # mypy then resolves the modules first, which import this one
     from .codecs.rad.rad_header import RadChunkEntry as RadChunkEntry
     from .codecs.rad.rad_header import RadChunkHeader as RadChunkHeader
     from .codecs.rad.rad_header import RadHeader as RadHeader
-    from .codecs.splat_encoding import SplatEncoding as SplatEncoding
+    from .codecs.spark_codings import SplatEncoding as SplatEncoding
     from .fitting.settings import FitSettings as FitSettings
     from .inspection.report import Report as Report
     from .lod.part_settings import DetailSettings as DetailSettings

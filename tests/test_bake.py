@@ -23,7 +23,7 @@ from sparklod_cli.codecs import ply, spz
 from sparklod_cli.codecs.formats import ENCODINGS
 from sparklod_cli.codecs.options import MAX_FRACTIONAL_BITS, TREE_SPZ_VERSIONS, RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import rad_options
-from sparklod_cli.codecs.splat_encoding import log_scale_table
+from sparklod_cli.codecs.spark_codings import log_scale_table
 from sparklod_cli.inspection import leaves, values
 from sparklod_cli.inspection.findings import ERROR, NOTE, Finding
 from sparklod_cli.inspection.report import ReportSettings, inspect

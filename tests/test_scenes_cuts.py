@@ -11,7 +11,7 @@ from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.cameras.framing import COVERED, covered, fitted
 from sparklod_cli.codecs import ply
 from sparklod_cli.codecs.gpu import ext_splats, packed_splats
-from sparklod_cli.codecs.splat_encoding import SplatEncoding
+from sparklod_cli.codecs.spark_codings import SplatEncoding
 from sparklod_cli.images.metrics import psnr
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod.settings import LodSettings

@@ -108,7 +108,7 @@ def unpack(arrays: Mapping[str, NDArray[np.uint32]], *, threads: int | None = No
         TreeError: the tree is broken.
     """
     from ..codecs.gpu import ext_splats, lod_tree, packed_splats
-    from ..codecs.splat_encoding import SplatEncoding
+    from ..codecs.spark_codings import SplatEncoding
 
     count = thread_count(threads)
     tree = lod_tree.unpack(arrays).tree if "lod_tree" in arrays else None

@@ -133,7 +133,7 @@ def draw_files(
         budget: of the cuts; None draws full detail.
         place: returns the output of the pictures of some cameras; called before a file is read if the cameras do not
             depend on one.
-        through: one of `rounding.ROUND_TRIPS`, after which splats are drawn.
+        through: one of `formats.ROUND_TRIPS`, after which splats are drawn.
         loading: how chunks get to the viewer, and and the seconds since a visitor opened the page in front of
             each camera; None where every chunk is resident.
         reference: the file whose pictures are subtracted from these.

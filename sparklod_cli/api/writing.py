@@ -90,7 +90,7 @@ def write(
     """
     from ..codecs.formats import WRITABLE, ending_of
     from ..codecs.options import RadOptions, SogOptions, WriteOptions
-    from ..codecs.splat_encoding import SplatEncoding
+    from ..codecs.spark_codings import SplatEncoding
     from ..codecs.validation import check_valid
     from ..lod.part_settings import DetailSettings
 

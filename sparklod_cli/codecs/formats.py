@@ -155,9 +155,13 @@ WRITABLE = {ending: form for form in FORMATS if form.writable for ending in form
 #: words of a scene by their names; docs/formats/memory.md has their layout.
 ENCODINGS = {"packed": "packed_splats", "ext": "ext_splats", "lodtree": "lod_tree", "texture": "data_texture"}
 
-#: Layouts after which `gpu.loaded_nodes` measures nodes, as Spark does once it has loaded a file: ExtSplats,
+#: Layouts after which `gpu.lod_tree.nodes` measures nodes, as Spark does once it has loaded a file: ExtSplats,
 #: PackedSplats of a file that it loads whole, and those of a RAD file that it streams.
 LOADED = ("ext", "packed", "packed-pages")
+
+#: Encodings whose rounding `losses.after` shows: PackedSplats as Spark has them for a scene, ExtSplats, and SPZ and RAD
+#: as build-lod writes them.
+ROUND_TRIPS = ("packed", "ext", "spz", "rad")
 
 #: Precisions of the nodes that cuts are found with: the file's, its half floats, and what Spark has in each layout.
 PRECISIONS = ("float32", "float16", *LOADED)

@@ -1,24 +1,28 @@
-"""Losses of splats: in a file, and in the two layouts in which Spark can hold them, of which one loses less.
+"""Losses of splats: in files, after a round trip through an encoding, and in the two layouts of Spark.
 
 ExtSplats clip SH: a coefficient keeps between half and all of its largest channel. PackedSplats have centres of float16
 and clamp base colours to 0..1 and SH to -1..1. So strong SH look better as PackedSplats, colours beyond 0..1 and
-places far from the origin as ExtSplats.
+places far from the origin as ExtSplats; `LayoutLoss` says which layout loses less.
 """
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..model.scene import Scene
-from ..model.splats import Splats
+from ..model.splats import Splats, describe_invalid
 from ..model.transforms import sh_basis
+from ..system.errors import FormatError
 from .encoder import clamps_in
-from .formats import Format
+from .formats import WRITABLE, Format
 from .options import WriteOptions
+from .reader import decode_file
 
 #: Most splats of a sample, evenly spaced: losses are means. Chosen; takes about 0.2 s.
 SAMPLE = 1 << 15
@@ -129,3 +133,31 @@ def settled_with_losses(scene: Scene, form: Format, options: WriteOptions, threa
     drops_sh = any(clamp.column == "sh" and clamp.end == 0 for clamp in clamps)
     clamped = {column: count for column, count in counts.items() if column != "sh" or not drops_sh}
     return settled, Losses(clamped, drops_sh, scene.up if form.bare else None)
+
+
+def after(through: str | None, file: Path, scene: Scene, threads: int = 1) -> Splats:
+    """Encode and decode the splats of a scene in one of `formats.ROUND_TRIPS`; None leaves them as they are.
+
+    Raises:
+        FormatError: SPZ cannot hold the splats, or some are invalid; names the file.
+    """
+    if through is None:
+        return scene.splats
+    from .gpu import ext_splats, packed_splats
+
+    invalid = scene.splats.invalid()
+    if invalid:  # of a tree: those of plain files are left out
+        raise FormatError(f"{file}: {describe_invalid(invalid)}; no encoding holds such splats")
+    try:
+        if through == "packed":
+            encoding = packed_splats.of_scene(scene)
+            arrays = packed_splats.pack(scene.splats, encoding, threads=threads)
+            return packed_splats.unpack(arrays, encoding, threads=threads)
+        if through == "ext":
+            return ext_splats.unpack(ext_splats.pack(scene.splats, threads=threads), threads=threads)
+        codec = WRITABLE[f".{through}"].codec()
+        options = WriteOptions(compression_level=1)  # the bytes live for a moment only, so they need not be small
+        data = b"".join(codec.encode(scene, options, threads=threads))
+        return decode_file(codec, io.BytesIO(data), threads=threads).splats
+    except FormatError as error:
+        raise FormatError(f"{file}: {error}") from None

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from ..system.setting_fields import CheckedSettings, Quantity, setting, whole
 
 if TYPE_CHECKING:
-    from .splat_encoding import SplatEncoding
+    from .spark_codings import SplatEncoding
 
 #: SPZ versions that can be written, those that hold trees, and the default; see docs/decisions/05-spz.md.
 SPZ_VERSIONS, TREE_SPZ_VERSIONS, DEFAULT_SPZ_VERSION = (2, 3, 4), (2, 3), 3

@@ -16,7 +16,7 @@ from ..codecs.rad.property_codings import BY_NAME, CODINGS, LARGEST_F16, PROPERT
 from ..codecs.rad.rad_header import ENCODING_KEYS, RadChunkHeader, RadHeader
 from ..codecs.rad.rad_reader import scan_chunks, scan_header
 from ..codecs.reader import OpenCompanion, size_of
-from ..codecs.splat_encoding import log_scale_table
+from ..codecs.spark_codings import log_scale_table
 from ..codecs.streamed_sog import manifest_rules
 from ..codecs.streamed_sog.codec import RegionLayout, layout_of
 from ..codecs.streamed_sog.manifest import VERSION as STREAMED_SOG_VERSION

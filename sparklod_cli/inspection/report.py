@@ -13,7 +13,7 @@ import numpy as np
 from ..codecs.gpu import data_texture, ext_splats, lod_tree, packed_splats
 from ..codecs.gpu.dump import Arrays
 from ..codecs.reader import code_of
-from ..codecs.splat_encoding import SplatEncoding
+from ..codecs.spark_codings import SplatEncoding
 from ..codecs.spz import KNOWN_FLAGS
 from ..io import opened, read_arrays, read_scene, size_of_input
 from ..io.rad_file import FORMAT as RAD

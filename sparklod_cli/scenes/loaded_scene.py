@@ -11,7 +11,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ..codecs.gpu import loaded_nodes, lod_tree
+from ..codecs.gpu import lod_tree
 from ..lod.detail_traversal import DetailFiles
 from ..lod.settings import CESIUM_FETCHERS, CONNECTIONS, PLAYCANVAS_FETCHERS
 from ..model.lod_tree import CHUNK_NODES, LodTree
@@ -123,7 +123,7 @@ def nodes_of(splats: Splats, tree: LodTree, coding: FileCoding, *, precision: st
         return Nodes.of(splats, tree)
     if precision == "float16":
         return lod_tree.unpack(lod_tree.pack(splats, tree, threads=threads))
-    return loaded_nodes.nodes(splats, tree, precision, coding, threads=threads)
+    return lod_tree.nodes(splats, tree, precision, coding, threads=threads)
 
 
 class LoadedRuns(LoadedScene):

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from ..codecs.formats import PRECISIONS
+from ..codecs.losses import after
 from ..codecs.reader import OpenCompanion, decode_file, size_of
-from ..codecs.rounding import after
 from ..codecs.streamed_sog.manifest import MAX_MANIFEST, parse
 from ..codecs.streamed_sog.manifest_rules import files_of_chunk
 from ..io import opened, size_of_input
@@ -61,7 +61,7 @@ def read_scenes(
     Args:
         columns: of `Splats` that are read; only with `trees_only`; of scenes without trees all are read.
         trees_only: refuse scenes of which no cuts are drawn: those with neither a tree nor detail levels nor tiles.
-        through: one of `rounding.ROUND_TRIPS`, a coding after which splats are drawn; cuts are those of the scene.
+        through: one of `formats.ROUND_TRIPS`, a coding after which splats are drawn; cuts are those of the scene.
         precision: one of `PRECISIONS`, of the nodes that cuts are found with.
         paged: only cuts are looked at, so that of large RAD trees those chunks suffice
             that cuts need. Chunks that no cut needs are not looked at; all the rest is the same.

@@ -15,7 +15,7 @@ from sparklod_cli.bake.settings import BakeSettings
 from sparklod_cli.bake.simplifying import extract_leaves
 from sparklod_cli.codecs.formats import ENCODINGS, MANIFEST, WRITABLE
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
-from sparklod_cli.codecs.splat_encoding import SplatEncoding
+from sparklod_cli.codecs.spark_codings import SplatEncoding
 from sparklod_cli.lod.part_settings import DetailSettings
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene, Tree

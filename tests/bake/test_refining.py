@@ -13,7 +13,7 @@ from sparklod_cli.bake.settings import BakeSettings, Resources
 from sparklod_cli.bake.skipping import SUFFIX, bake_unless_there
 from sparklod_cli.codecs.formats import WRITABLE
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
-from sparklod_cli.codecs.splat_encoding import SplatEncoding
+from sparklod_cli.codecs.spark_codings import SplatEncoding
 from sparklod_cli.fitting.settings import FitSettings
 from sparklod_cli.io import read_scene
 from sparklod_cli.model.scene import Scene

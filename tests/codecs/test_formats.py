@@ -80,7 +80,7 @@ def test_what_holds_no_tree_says_so_before_a_byte_is_written(suffix: str) -> Non
 def test_tables_load_nothing_heavy() -> None:
     """`--help` names what stands in them."""
     program = (
-        "import sys; from sparklod_cli.codecs import formats, rounding;"
+        "import sys; from sparklod_cli.codecs import formats;"
         "from sparklod_cli.tables import columns; from sparklod_cli.cameras.formats import table;"
         "assert not {'numpy', 'numba'} & set(sys.modules), 'heavy'"
     )

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli.codecs import spz
-from sparklod_cli.codecs.rounding import after
+from sparklod_cli.codecs.losses import after
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quick
 from sparklod_cli.model.scene import Scene

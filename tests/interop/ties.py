@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from sparklod_cli.codecs import spark_codings
 from sparklod_cli.codecs.gpu import ext_splats, packed_splats
-from sparklod_cli.codecs.splat_encoding import SplatEncoding
+from sparklod_cli.codecs.spark_codings import SplatEncoding
 from sparklod_cli.model.gaussian import lod_opacity
 from sparklod_cli.model.splats import Splats
 

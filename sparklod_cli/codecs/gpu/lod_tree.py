@@ -1,21 +1,27 @@
-"""LodTree, Spark's layout of 16 bytes per node: what its traversal reads of a Level-of-Detail tree."""
+"""Nodes of a Level-of-Detail tree as Spark's traversal reads them: its layout of 16 bytes per node, and loaded nodes.
+
+Loaded nodes are measured after Spark's own coding of the splats: it decodes a file to float32, codes the splats as
+ExtSplats or PackedSplats, decodes those, and takes of them centres and sizes, which it rounds to half floats. All of
+that is repeated here in the same arithmetic, for the columns that matter.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...model.gaussian import spark_size
+from ...model.gaussian import size_factor, spark_size
 from ...model.lod_tree import MAX_CHILDREN, LodTree
-from ...model.scene import Scene
-from ...model.splats import Splats
+from ...model.scene import PLAIN, FileCoding, ScaleCoding, Scene
+from ...model.splats import FloatArray, Splats
 from ...model.traversed import Nodes
 from ...system.errors import FormatError
 from ...system.threads import for_blocks
-from ..spark_codings import Words, checked_words
+from .. import quantize, spark_codings
+from ..spark_codings import SplatEncoding, Words, checked_words
 
 NODE = np.dtype(
     [
@@ -75,3 +81,122 @@ def unpack(arrays: Mapping[str, NDArray[Any]]) -> Nodes:
         raise FormatError(f"node {node} has {child_count[node]:,} children, a uint16 holds at most {MAX_CHILDREN:,}")
     tree = LodTree(child_count.astype(np.uint16), rows["child_start"].copy())
     return Nodes(rows["center"].astype(np.float32), rows["size"].astype(np.float32), tree)
+
+
+Recode = Callable[[FloatArray], FloatArray]
+
+#: Every half float.
+_HALVES = np.arange(1 << 16, dtype=np.uint16).view(np.float16)
+
+#: Spark's worker codes no other scales as 0 than those below this; its documentation says e ** -30.
+_LEAST = np.finfo(np.float32).smallest_subnormal
+
+#: Share of a scale by which it may differ from that of its code: several times what exponentials disagree by.
+_SAME = np.float32(2**-20)
+
+
+class LoadedPrecision(NamedTuple):
+    """Rounding of splats loaded into a viewer's memory: of alphas, 0..2, and of linear scales."""
+
+    alpha: Recode
+    scale: Recode
+
+
+def nodes(splats: Splats, tree: LodTree, layout: str, coding: FileCoding = PLAIN, *, threads: int = 1) -> Nodes:
+    """Return the nodes of a tree as Spark's traversal reads them.
+
+    Args:
+        splats: N, as they were decoded; their centres, scales and opacities matter.
+        layout: one of `formats.LOADED`.
+        coding: of the file that they were read from. Scales that do not come from its codes, or of splats that were not
+            read from a file, are taken to be those that Spark has.
+    """
+    held = _layout(layout, coding.packed_range)
+    found = Nodes(np.empty((len(splats), 3), np.float32), np.empty(len(splats), np.float32), tree)
+    for rows, scales in coding.parts(len(splats)):
+        recode = _recoded(scales, held.scale)
+
+        @np.errstate(over="ignore", invalid="ignore")
+        def measure(part: slice, start: int = rows.start, recode: Recode = recode) -> None:
+            part = slice(start + part.start, start + part.stop)
+            alpha = held.alpha(spark_codings.stored_lod_alpha(splats.opacity[part]))
+            x, y, z = recode(np.ascontiguousarray(splats.scale[part].T))
+            factor = np.float32(2) * size_factor(spark_codings.lod_opacity_of_alpha(alpha))
+            found.center[part] = splats.center[part].astype(np.float16)
+            found.size[part] = (factor * ((x + y + z) / np.float32(3))).astype(np.float16)
+
+        for_blocks(measure, rows.stop - rows.start, threads)
+    return found
+
+
+def _layout(name: str, packed_range: tuple[float, float] | None) -> LoadedPrecision:
+    """Return one of `formats.LOADED`, with the range of logarithms that a file sets for PackedSplats."""
+    if name == "ext":
+        scales = spark_codings.exp(_HALVES.astype(np.float32))
+        return LoadedPrecision(
+            lambda alpha: alpha.astype(np.float16).astype(np.float32),
+            lambda scale: scales[spark_codings.log(scale).astype(np.float16).view(np.uint16)],
+        )
+    own = SplatEncoding(lod_opacity=True)
+    low, high = own.ln_scale_min, own.ln_scale_max
+    if name == "packed" and packed_range is not None:
+        low, high = packed_range
+    table = spark_codings.log_scale_table(low, high, exp=spark_codings.exp)
+
+    def alpha_held(alpha: FloatArray) -> FloatArray:
+        codes = spark_codings.encode_linear(alpha, 0, own.alpha_max)
+        return spark_codings.decode_linear(codes.astype(np.uint8), 0, own.alpha_max)
+
+    def scale_held(scale: FloatArray) -> FloatArray:
+        known = np.where(np.isnan(scale), _LEAST, scale)
+        return table[spark_codings.encode_log_scale(known, low, high, log=spark_codings.log, least=_LEAST)]
+
+    return LoadedPrecision(alpha_held, scale_held)
+
+
+class _Codes(NamedTuple):
+    """Codes of a file's scales: whole numbers from 0 on, and the scale of each in `Splats` and in Spark."""
+
+    of: Callable[[FloatArray], NDArray[np.unsignedinteger[Any]]]
+    ours: FloatArray
+    theirs: FloatArray
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def _codes(coding: ScaleCoding) -> _Codes | None:
+    """Return the codes of a coding; None for plain numbers."""
+    if coding.name == "ln_0r8":
+        low, high = coding.low, coding.high
+        ours = spark_codings.log_scale_table(low, high)
+        theirs = spark_codings.log_scale_table(low, high, exp=spark_codings.exp)
+        return _Codes(lambda scale: spark_codings.encode_log_scale(scale, low, high), ours, theirs)
+    if coding.name == "spz":
+        logs = np.arange(256, dtype=np.float32) / quantize.SCALE_STEPS - quantize.SCALE_OFFSET
+        return _Codes(quantize.encode_log_scale, np.exp(logs), spark_codings.exp(logs))
+    if coding.name == "ln_f16":
+        logs = _HALVES.astype(np.float32)
+        return _Codes(_half_log, np.exp(logs), spark_codings.exp(logs))
+    return None
+
+
+@np.errstate(divide="ignore", invalid="ignore")
+def _half_log(scale: FloatArray) -> NDArray[np.uint16]:
+    return np.log(scale).astype(np.float16).view(np.uint16)
+
+
+def _recoded(coding: ScaleCoding, held: Recode) -> Recode:
+    """Return what a layout keeps (`held`) of scales that come from codes, whose last bits are others in Spark."""
+    codes = _codes(coding)
+    if codes is None:
+        return held
+    of_code = held(codes.theirs)
+
+    def of_scale(scale: FloatArray) -> FloatArray:
+        code = codes.of(scale)
+        found, ours = of_code[code], codes.ours[code]
+        other = ~((ours == scale) | (np.abs(ours - scale) <= _SAME * scale))
+        if other.any():
+            found[other] = held(scale[other])
+        return found
+
+    return of_scale

@@ -18,8 +18,16 @@ from ...model.splats import FloatArray, Splats
 from ...system.errors import FormatError
 from ...system.threads import for_blocks
 from .. import spark_codings
-from ..spark_codings import STEPS_8_8_8, Words
-from ..splat_encoding import DEFAULT, SplatEncoding, decode_linear, encode_linear, encode_log_scale, log_scale_table
+from ..spark_codings import (
+    DEFAULT,
+    STEPS_8_8_8,
+    SplatEncoding,
+    Words,
+    decode_linear,
+    encode_linear,
+    encode_log_scale,
+    log_scale_table,
+)
 
 SPLAT = np.dtype(
     [

@@ -28,7 +28,7 @@ from ..file_notes import comment_of
 from ..options import AUTO, DEFAULTS, RAD_ENCODINGS, WriteOptions
 from ..quantize import Bytes
 from ..reader import OpenCompanion
-from ..splat_encoding import SplatEncoding
+from ..spark_codings import SplatEncoding
 from .property_codings import BLOCK, BY_NAME, CODINGS, PROPERTIES, Row, encodings_of
 from .rad_header import (
     GZ,

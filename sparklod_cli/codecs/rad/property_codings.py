@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ...model.splats import FloatArray
 from ...system.threads import blocks_of
-from .. import spark_codings, splat_encoding
+from .. import spark_codings
 from ..options import RAD_ENCODINGS
 from ..quantize import Bytes
 from ..spark_codings import STEPS_8_8_8
@@ -152,7 +152,7 @@ def _decode_octahedral(codes: Bytes, count: int, numbers: int, low: float, high:
 
 
 _F32, _F16 = _plain("<f4"), _plain("<f2", LARGEST_F16)
-_R8 = _by_table(splat_encoding.encode_linear, functools.partial(splat_encoding.decode_linear, _ALL))
+_R8 = _by_table(spark_codings.encode_linear, functools.partial(spark_codings.decode_linear, _ALL))
 _S8 = _by_table(_encode_signed, lambda low, high: _ALL.view(np.int8) / np.float32(127) * np.float32(high), ("max",))
 
 #: By name. Largest errors inside the range of the codes, apart from that of float32:
@@ -168,7 +168,7 @@ CODINGS = {
     "r8_delta": _by_differences(_R8),
     "s8": _S8,
     "s8_delta": _by_differences(_S8),
-    "ln_0r8": _by_table(splat_encoding.encode_log_scale, splat_encoding.log_scale_table),
+    "ln_0r8": _by_table(spark_codings.encode_log_scale, spark_codings.log_scale_table),
     "ln_f16": PropertyCoding(
         lambda values, low, high: _plain("<f2").encode(_encode_log(values, low, high), low, high), _decode_log_f16, 2
     ),

@@ -19,7 +19,7 @@ from ...system.errors import FormatError, NotSplatsError, PromiseError, Truncate
 from ...system.untrusted import Json, Origin, quoted_value
 from ..file_notes import FileNote, read_comment
 from ..formats import RAD_SUFFIX, rad_chunk_name
-from ..splat_encoding import SplatEncoding
+from ..spark_codings import SplatEncoding
 
 #: The first bytes of a file, and of a chunk.
 MAGIC, CHUNK_MAGIC = b"RAD0", b"RADC"

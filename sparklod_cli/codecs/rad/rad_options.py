@@ -14,7 +14,7 @@ from ...model.sh import COEFFICIENTS
 from ...system.errors import FormatError
 from ..encoder import CodeRange
 from ..options import AUTO, RAD_ENCODINGS, RadOptions, WriteOptions
-from ..splat_encoding import LARGEST_END, SCALE_ZERO, SplatEncoding
+from ..spark_codings import LARGEST_END, SCALE_ZERO, SplatEncoding
 from ..statistics import EXACT_BITS, LOWER, SMALL_QUANTILE, UPPER, Distribution, Statistics, fine_bits, tops
 from .property_codings import CODINGS, LARGEST_F16, PROPERTIES, Row
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import click
 
-from ...codecs.rounding import ROUND_TRIPS
+from ...codecs.formats import ROUND_TRIPS
 from ...images.output import JPEG_QUALITY, MOVING, STILL, THUMBNAIL_SIZE, THUMBNAIL_SUPERSAMPLE
 from ...model import MAX_SH_DEGREE
 from ...render.devices import uses_card
@@ -70,7 +70,7 @@ class Appearance:
     through: str | None = setting(
         "Draw splats as Spark's PackedSplats or ExtSplats, SPZ or RAD round them; cuts stay those of the file."
         "  [default: as in the file]",
-        tuple(ROUND_TRIPS),
+        ROUND_TRIPS,
     )
     sorting: str | None = setting(
         "With --backend osmesa: sort exactly, or by 16 bits of the depth as antimatter15's viewer does (counting16)."

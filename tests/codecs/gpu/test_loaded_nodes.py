@@ -12,8 +12,8 @@ import pytest
 
 from sparklod_cli.codecs import quantize, spark_codings
 from sparklod_cli.codecs.formats import LOADED
-from sparklod_cli.codecs.gpu import ext_splats, loaded_nodes, lod_tree, packed_splats
-from sparklod_cli.codecs.splat_encoding import SplatEncoding, log_scale_table
+from sparklod_cli.codecs.gpu import ext_splats, lod_tree, packed_splats
+from sparklod_cli.codecs.spark_codings import SplatEncoding, log_scale_table
 from sparklod_cli.lod import quick
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import PLAIN, FileCoding, ScaleCoding, Scene
@@ -32,7 +32,7 @@ def scene() -> Scene:
 
 def nodes(scene: Scene, layout: str, coding: FileCoding = PLAIN, threads: int = 1) -> Nodes:
     assert scene.tree is not None
-    return loaded_nodes.nodes(scene.splats, scene.tree, layout, coding, threads=threads)
+    return lod_tree.nodes(scene.splats, scene.tree, layout, coding, threads=threads)
 
 
 def unpacked(scene: Scene, layout: str, encoding: SplatEncoding) -> Splats:

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from sparklod_cli.codecs.gpu import packed_splats
-from sparklod_cli.codecs.splat_encoding import DEFAULT, SplatEncoding
+from sparklod_cli.codecs.spark_codings import DEFAULT, SplatEncoding
 from sparklod_cli.model.gaussian import linear_opacity, lod_opacity
 from sparklod_cli.model.sh import COEFFICIENTS
 from sparklod_cli.model.splats import Splats

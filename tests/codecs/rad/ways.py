@@ -17,7 +17,7 @@ from sparklod_cli.codecs.rad import codec as rad
 from sparklod_cli.codecs.rad.property_codings import LARGEST_F16
 from sparklod_cli.codecs.rad.rad_header import ENCODING_KEYS
 from sparklod_cli.codecs.rad.rad_options import HALF
-from sparklod_cli.codecs.splat_encoding import SplatEncoding
+from sparklod_cli.codecs.spark_codings import SplatEncoding
 from sparklod_cli.model.scene import Scene
 from tests.codecs.cases import Array, Case, Content, Precision, linear
 from tests.codecs.test_quantize import stated_degrees
