@@ -6,8 +6,8 @@ import dataclasses
 from collections.abc import Callable, Iterable
 
 from ..bake.in_memory import build_tree, select
-from ..bake.settings import BakeSettings, SimplifyGoal
-from ..bake.simplifying import Refined, Simplifier, refined
+from ..bake.settings import BakeSettings
+from ..bake.simplifying import Refined, Simplifier, SimplifyGoal, refined
 from ..cameras.camera import Camera
 from ..cameras.sources import CameraPath
 from ..codecs.validation import check_valid

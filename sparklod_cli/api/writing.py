@@ -162,8 +162,8 @@ def _write_levels(
     if environment is not None and not len(environment.splats):
         raise InvalidSplatsError(f"{path}: the environment has no splats to write")
     always = None if environment is None else environment.splats
-    written = write_levels(scene, always, out, settings, options, Clock(), threads, progress)
-    return Written(path, "Streamed SOG", written.bytes)
+    size, _ = write_levels(scene, always, out, settings, options, Clock(), threads, progress)
+    return Written(path, "Streamed SOG", size)
 
 
 def _write_arrays(path: Path, scene: Scene, encoding: str, *, overwrite: bool, threads: int) -> Written:

@@ -6,16 +6,11 @@ Coefficients are measured as those of `lod.builders.SplatBytes`.
 from __future__ import annotations
 
 import functools
-from typing import TYPE_CHECKING
 
 from ..lod.builders import BUILDERS, SplatBytes
 from ..system import machine
 from ..system.errors import OutOfMemoryError
 from ..system.units import format_size
-
-if TYPE_CHECKING:
-    from ..codecs.reader import Reader
-    from .settings import BakeSettings
 
 #: Default share of the available memory that a bake may take: other programs need some, and these figures are
 #: estimates. Chosen.
@@ -55,12 +50,6 @@ def in_memory_bytes(method: str, splats: int, sh_degree: int, *, refines: bool =
     """Return the peak memory of a bake in memory, bytes; `refines` if its tree is refined."""
     refining = PICTURES + OF_REFINED.of(splats, sh_degree) if refines else 0
     return PROCESS + BUILDERS[method].in_memory.of(splats, sh_degree) + refining
-
-
-def in_memory_bytes_of(header: Reader, settings: BakeSettings) -> int:
-    """Return the peak memory of the bake of an input in memory, bytes."""
-    refines = settings.refine is not None
-    return in_memory_bytes(settings.method, header.count, header.sh_degree, refines=refines)
 
 
 def most_in_memory(memory: int, method: str, sh_degree: int, *, refines: bool = False) -> int:

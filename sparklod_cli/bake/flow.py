@@ -14,13 +14,14 @@ from ..codecs.formats import META, RAD_SUFFIX
 from ..codecs.reader import Reader
 from ..io.reading import Source, open_reader
 from ..lod.builders import METHODS
+from ..model.scene import up_notes
 from ..system.addresses import Place
 from ..system.errors import FormatError, memory_errors_translated
 from ..system.progress import Progress, silent
 from ..system.stdio import DASH
 from . import estimate
 from .in_memory import InMemory
-from .settings import Baked, BakeSettings, Clock, Resources
+from .settings import Baked, BakeSettings, BuiltTree, Clock, Resources
 from .tree_output import output_of, write_tree
 
 if TYPE_CHECKING:
@@ -97,32 +98,22 @@ def bake(
             )
         if blocks is not None:
             opened.close()
-        work = blocks or InMemory(source, reader, opened, settings, output, clock, threads, progress)
+        baked = Baked(format=reader.format, notes=reader.notes, read=reader.count, seconds=clock.seconds)
+        if settings.up is None and reader.up:
+            baked.notes += up_notes(reader.up, reader.up_by)
+        tree = BuiltTree(output=output, baked=baked)
+        work = blocks or InMemory(source, reader, opened, settings, clock, threads, progress)
         del reader  # which may hold much memory until the last splat was read
-        tree, fit = work.build(), None
+        work.build(tree)
         if fitting is not None and settings.simplify is None:  # which fits its one cut
-            tree.nodes, fit = refined(tree.scene, fitting, threads=threads, progress=progress, say=say)
+            tree.nodes, baked.refine = refined(tree.scene, fitting, threads=threads, progress=progress, say=say)
             clock.end("refine")
         work.order(tree)
-        written = write_tree(tree, work.encode, clock, threads, progress)
-        traffic = None if blocks is None else blocks.job.store.traffic
-    return Baked(
-        **vars(written),
-        format=tree.format,
-        read=tree.read,
-        splats=tree.splats,
-        sh_degree=tree.sh_degree,
-        dropped=tree.dropped,
-        method=tree.method,
-        nodes=tree.count,
-        levels=tree.levels,
-        notes=tree.notes,
-        seconds=clock.seconds,
-        refine=fit,
-        blocks=tree.blocks,
-        scratch_bytes_written=None if traffic is None else traffic.written,
-        scratch_bytes_read=None if traffic is None else traffic.read,
-    )
+        write_tree(tree, work.encode, clock, threads, progress)
+        if blocks is not None:
+            traffic = blocks.job.store.traffic
+            baked.scratch_bytes_written, baked.scratch_bytes_read = traffic.written, traffic.read
+    return baked
 
 
 def has_published(source: Source, target: Place, settings: BakeSettings, resources: Resources) -> bool:
@@ -141,7 +132,11 @@ def fits_in_memory(source: Source, settings: BakeSettings, memory: int | None) -
     """
     try:
         with open_reader(source) as header:
-            return header.has_tree or memory is None or estimate.in_memory_bytes_of(header, settings) <= memory
+            if header.has_tree or memory is None:
+                return True
+            refines = settings.refine is not None
+            needed = estimate.in_memory_bytes(settings.method, header.count, header.sh_degree, refines=refines)
+            return needed <= memory
     except FormatError:  # reported when it is baked
         return True
 
@@ -181,7 +176,9 @@ def _may_need_blocks(
     if engine is not None or resources != Resources(memory=resources.memory):
         return True
     memory = estimate.default_memory() if resources.memory is None else resources.memory
-    if settings.files or (memory is not None and estimate.in_memory_bytes_of(header, settings) > memory):
+    refines = settings.refine is not None
+    needed = estimate.in_memory_bytes(settings.method, header.count, header.sh_degree, refines=refines)
+    if settings.files or (memory is not None and needed > memory):
         return True
     if not isinstance(target, Path):
         return True

@@ -16,7 +16,7 @@ from ..io import read_rgba, read_scene
 from ..io.reading import Source
 from ..lod.builders import BUILDERS
 from ..model.lod_tree import LodTree
-from ..model.scene import Scene
+from ..model.scene import Scene, rotated_axis
 from ..model.selection import Selection, SelectionTally
 from ..model.splats import Splats
 from ..model.transforms import Transform
@@ -24,7 +24,7 @@ from ..system.errors import FormatError, InvalidSplatsError, naming
 from ..system.progress import Progress
 from ..system.threads import on_threads
 from .settings import BakeSettings, BuiltTree, Clock
-from .tree_output import BakeOutput, output_of_existing_tree
+from .tree_output import output_of_existing_tree
 
 
 @dataclass
@@ -41,34 +41,28 @@ class InMemory:
     reader: Reader | None
     opened: contextlib.ExitStack
     settings: BakeSettings
-    output: BakeOutput
     clock: Clock
     threads: int
     progress: Progress
     _leaves: Statistics | None = None
 
-    def build(self) -> BuiltTree:
+    def build(self, tree: BuiltTree) -> None:
         """Read the input, select and transform its splats, and build their tree, or keep the one that it has."""
-        settings, threads, progress = self.settings, self.threads, self.progress
+        settings, threads, progress, baked = self.settings, self.threads, self.progress, tree.baked
         assert self.reader is not None
         with self.opened:
             scene, self.reader = self.reader.scene(progress=progress), None
-        tree = BuiltTree(
-            nodes=None,
-            output=self.output,
-            format=scene.format,
-            notes=settings.notes_on(scene),
-            read=len(scene),
-            environment=None if settings.environment is None else read_environment(settings, threads, progress),
-        )
-        antialiased, up = scene.antialiased, settings.up_of(scene.up)
+        if settings.environment is not None:
+            tree.environment = read_environment(settings, threads, progress)
+        antialiased, up = scene.antialiased, settings.up or scene.up
+        up = rotated_axis(up, settings.transform.rotation) if up else None
         if scene.tree is not None:
-            tree.output, tree.is_ordered = output_of_existing_tree(self.output, self.source, scene, settings)
+            tree.output, tree.is_ordered = output_of_existing_tree(tree.output, self.source, scene, settings)
             check_valid(scene.splats, threads)
-            tree.splats = int(np.count_nonzero(scene.tree.is_leaf))
+            baked.splats = int(np.count_nonzero(scene.tree.is_leaf))
             tree.nodes = Scene(scene.splats, scene.tree, antialiased, up=up)
             self.clock.end("read")
-            return tree
+            return
         splats, tally = select(scene.splats, settings, threads=threads)
         settings.selection.check(tally)
         far = None
@@ -78,23 +72,25 @@ class InMemory:
         if far is not None and tree.environment is None:
             tree.environment = transformed(far, settings.transform, threads)
         self.clock.end("read")
-        if self.output.form is not None:
-            self._leaves = Statistics.of(splats, np.ones(len(splats), np.bool_), self.output.needed, threads)
-            self.output.check(self._leaves)  # before building, so that an impossible output is reported at once
-        tree.splats, tree.dropped, tree.method = len(splats), tally.dropped, settings.method
+        output = tree.output
+        if output.form is not None:
+            self._leaves = Statistics.of(splats, np.ones(len(splats), np.bool_), output.needed, threads)
+            # An output that cannot hold the tree is reported before the tree is built.
+            output.form.codec().settled(self._leaves, output.options)
+        baked.splats, baked.dropped, baked.method = len(splats), tally.dropped, settings.method
         leaves = [splats]
         del scene, splats, far  # the builder frees its input as it goes, if nobody else holds it: a third of the peak
         with on_threads(threads):
-            built = build_tree(leaves, settings, in_chunks=self.output.in_chunks, progress=progress)
+            built = build_tree(leaves, settings, in_chunks=output.in_chunks, progress=progress)
         tree.nodes = Scene(*built, antialiased, up=up)
         self.clock.end("build")
-        return tree
 
     def order(self, tree: BuiltTree) -> None:
         """Put the nodes of a tree into the order of its output, and count them."""
         scene, output = tree.scene, tree.output
         assert scene.tree is not None
-        tree.levels = int(scene.tree.depths().max()) + 1
+        tree.baked.nodes, tree.baked.sh_degree = len(scene), scene.splats.sh_degree
+        tree.baked.levels = int(scene.tree.depths().max()) + 1
         if output.in_chunks and not tree.is_ordered:
             with on_threads(self.threads):
                 from ..lod.chunk_order import chunk_order

@@ -16,7 +16,7 @@ from ..model.traversed import DetailScene, TileScene
 from ..system.output import Output
 from ..system.progress import Progress
 from ..system.threads import on_threads
-from .settings import Clock, WrittenTree
+from .settings import Clock
 
 
 @dataclass(frozen=True)
@@ -100,8 +100,8 @@ def write_levels(
     clock: Clock,
     threads: int,
     progress: Progress,
-) -> WrittenTree:
-    """Make the levels of a tree and write them as a Streamed SOG, with the splats of an environment."""
+) -> tuple[int, WrittenDetail]:
+    """Make the levels of a tree and write them as a Streamed SOG; return the bytes of its files."""
     from ..codecs.streamed_sog.codec import encode_files
 
     made = detail_levels(scene, environment, settings, clock, threads=threads, progress=progress)
@@ -111,7 +111,7 @@ def write_levels(
             size += out.write(name, pieces)
             names.append(name)
     clock.end("write")
-    return WrittenTree(output_format="streamed-sog", bytes=size, detail=_written_detail(made, names))
+    return size, _written_detail(made, names)
 
 
 def _written_detail(made: DetailScene, names: list[str]) -> WrittenDetail:
@@ -136,8 +136,8 @@ def write_tiles(
     clock: Clock,
     threads: int,
     progress: Progress,
-) -> WrittenTree:
-    """Make the tiles of a tree and write them as 3D Tiles."""
+) -> tuple[int, WrittenTiles]:
+    """Make the tiles of a tree and write them as 3D Tiles; return the bytes of their files."""
     from ..codecs.tiles_3d.codec import encode_files
     from ..lod.tiles import make
 
@@ -150,7 +150,7 @@ def write_tiles(
         files = encode_files(made, options, threads=threads, progress=progress)
         size = sum(out.write(*file) for file in files)
     clock.end("write")
-    return WrittenTree(output_format="3d-tiles", bytes=size, tiles=_written_tiles(made))
+    return size, _written_tiles(made)
 
 
 def _written_tiles(made: TileScene) -> WrittenTiles:

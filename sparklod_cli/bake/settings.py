@@ -7,53 +7,28 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..codecs.encoder import Clamp
 from ..codecs.options import WriteOptions
-from ..codecs.reader import Reader
-from ..codecs.statistics import Statistics
-from ..fitting.settings import FitSettings
 from ..io.reading import Merged as Merged
 from ..io.reading import Source as Source
-from ..lod.budget import Budget
 from ..lod.builders import DEFAULT_BASE, DEFAULT_GROWTH, METHODS
-from ..lod.part_settings import DetailSettings, TileSettings
 from ..model import MAX_SH_DEGREE
-from ..model.scene import NodeStream, Scene, rotated_axis, up_notes
+from ..model.scene import NodeStream, Scene
 from ..model.selection import Selection
-from ..model.splats import Splats
 from ..model.transforms import Transform
-from ..system.addresses import Place
+
+if TYPE_CHECKING:
+    from ..codecs.encoder import Clamp
+    from ..codecs.statistics import Statistics
+    from ..fitting.settings import FitSettings
+    from ..lod.part_settings import DetailSettings, TileSettings
+    from ..model.splats import Splats
+    from ..system.addresses import Place
+    from .parts_output import WrittenDetail, WrittenTiles
+    from .simplifying import Refined, SimplifyGoal, WrittenSet
+    from .tree_output import BakeOutput
 
 #: Suffix of the format that is written unless another one is chosen.
 SPZ = ".spz"
-
-
-@dataclass(frozen=True)
-class SimplifyGoal:
-    """Size or fidelity of a simplified scene. One of the three is not None.
-
-    Attributes:
-        to: number of splats, or a share of all.
-        max_bytes: size of a file that as many splats as possible shall fill.
-        psnr: least PSNR against full detail, dB, of as few splats as possible.
-
-    Raises:
-        ValueError: not exactly one is given, or it is out of its range.
-    """
-
-    to: Budget | None = None
-    max_bytes: int | None = None
-    psnr: float | None = None
-
-    def __post_init__(self) -> None:
-        from ..images.metrics import MOST_PSNR
-
-        if sum(each is not None for each in (self.to, self.max_bytes, self.psnr)) != 1:
-            raise ValueError("give one of to, max_bytes and psnr")
-        if self.max_bytes is not None and self.max_bytes < 1:
-            raise ValueError(f"max_bytes is {self.max_bytes}; give 1 or more")
-        if self.psnr is not None and not 0 < self.psnr < MOST_PSNR:
-            raise ValueError(f"psnr is {self.psnr}; give more than 0 and less than {MOST_PSNR:g} dB")
 
 
 @dataclass(frozen=True)
@@ -115,15 +90,6 @@ class BakeSettings:
         named = {"rgba": self.rgba, "environment": self.environment, "camera_path": self.camera_path}
         return {name: path for name, path in named.items() if path is not None}
 
-    def up_of(self, found: str | None) -> str | None:
-        """Return the axis of the output that points up, for that of the input."""
-        up = self.up or found
-        return rotated_axis(up, self.transform.rotation) if up else None
-
-    def notes_on(self, source: Scene | Reader) -> tuple[str, ...]:
-        """Return notes on an input for the user: its own, and on its up axis if a specification names that."""
-        return source.notes + (up_notes(source.up, source.up_by) if source.up and self.up is None else ())
-
 
 @dataclass(frozen=True)
 class Resources:
@@ -143,18 +109,12 @@ class Resources:
     block_splats: int | None = None
 
 
-if TYPE_CHECKING:
-    from .parts_output import WrittenDetail, WrittenTiles
-    from .simplifying import Refined, WrittenSet
-    from .tree_output import BakeOutput
-
-
+@dataclass
 class Clock:
     """Seconds by stage."""
 
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self._start = time.perf_counter()
+    seconds: dict[str, float] = field(default_factory=dict)
+    _start: float = field(default_factory=time.perf_counter)
 
     def end(self, stage: str) -> None:
         """End a stage; the next one begins."""
@@ -163,79 +123,37 @@ class Clock:
         self._start = now
 
 
-@dataclass(kw_only=True, eq=False)
-class BuiltTree:
-    """Tree on its way from the splats of an input to a file.
+@dataclass(kw_only=True)
+class Baked:
+    """Result of a bake, which its steps fill in.
 
     Attributes:
-        nodes: in memory or in a store; None while a step replaces them.
-        format, notes: of the input, for display.
-        read: number of splats of the input, or of its nodes if it has a tree.
-        splats: number of leaves.
-        dropped: number of dropped splats by reason (`selection.REASONS`).
-        method: builder of the tree; None for the tree of the input.
-        environment: splats that are always drawn; None without.
-        levels: depth plus 1.
-        statistics: those of all nodes that `output.needed` names; None for an output that needs none.
-        is_ordered: the nodes have the order of the output.
-        blocks: number of blocks, out of core; None in memory.
-    """
-
-    nodes: Scene | NodeStream | None
-    output: BakeOutput
-    format: str = ""
-    notes: tuple[str, ...] = ()
-    read: int = 0
-    splats: int = 0
-    dropped: dict[str, int] = field(default_factory=dict)
-    method: str | None = None
-    environment: Splats | None = None
-    levels: int = 0
-    statistics: Statistics | None = None
-    is_ordered: bool = False
-    blocks: int | None = None
-
-    @property
-    def scene(self) -> Scene:
-        """The tree in memory."""
-        assert isinstance(self.nodes, Scene)
-        return self.nodes
-
-    @property
-    def count(self) -> int:
-        """Number of nodes."""
-        assert self.nodes is not None
-        return len(self.nodes) if isinstance(self.nodes, Scene) else self.nodes.count
-
-    @property
-    def sh_degree(self) -> int:
-        """SH degree of the nodes."""
-        assert self.nodes is not None
-        return self.nodes.splats.sh_degree if isinstance(self.nodes, Scene) else self.nodes.sh_degree
-
-
-@dataclass(frozen=True, kw_only=True)
-class WrittenTree:
-    """Result of writing a tree.
-
-    Attributes:
-        output_format: "spz", "rad", "rad-chunked", "streamed-sog", "3d-tiles", the name of the encoding of
-            arrays, or the name of the format of a simplified scene.
+        output_format: "spz", "rad", "rad-chunked", "streamed-sog", "3d-tiles", the name of the encoding of arrays, or
+            the name of the format of a simplified scene.
         bytes: size of all files of the output.
         version, fractional_bits: of an SPZ output, else None.
         chunks: of a RAD output, else None.
         encodings: of a RAD output, by the field of `RadOptions`.
         sh_codes: the most entries of the SH palette of a RAD output; None without one.
         arrays: shapes of the arrays of another output, in its order.
-        detail: of a Streamed SOG, else None.
-        tiles: of 3D Tiles, else None.
-        simplified: of a simplified scene, else None.
+        detail, tiles, simplified: of a Streamed SOG, of 3D Tiles, and of a simplified scene, else None.
         clamped: number of nodes with a value that the output cannot hold, by column of `Splats`.
         clamps: at which ends of the range, and how far beyond.
+        format, notes: of the input, for display.
+        read: number of splats of the input, or of its nodes if it has a tree.
+        splats: number of leaves.
+        sh_degree, nodes: of the tree.
+        dropped: number of dropped splats by reason (`selection.REASONS`).
+        method: builder of the tree; None for the tree of the input.
+        levels: depth plus 1.
+        seconds: by stage (read, build, order, refine, arrange, levels, tiles, errors, simplify, encode, write).
+        refine: result of fitting merged splats; None without `--refine`.
+        blocks: number of blocks, out of core; None in memory.
+        scratch_bytes_written, scratch_bytes_read: in the scratch folder; None in memory.
     """
 
-    output_format: str
-    bytes: int
+    output_format: str = ""
+    bytes: int = 0
     version: int | None = None
     fractional_bits: int | None = None
     chunks: int | None = None
@@ -247,31 +165,43 @@ class WrittenTree:
     simplified: WrittenSet | None = None
     clamped: dict[str, int] = field(default_factory=dict)
     clamps: tuple[Clamp, ...] = ()
-
-
-@dataclass(frozen=True, kw_only=True)
-class Baked(WrittenTree):
-    """Result of a bake.
-
-    Attributes:
-        format, read, splats, dropped, method, levels, notes, blocks: as in `BuiltTree`.
-        sh_degree, nodes: of the tree.
-        seconds: by stage (read, build, order, refine, arrange, levels, tiles, errors, simplify, encode, write).
-        refine: result of fitting merged splats; None without `--refine`.
-        scratch_bytes_written, scratch_bytes_read: in the scratch folder; None in memory.
-    """
-
-    format: str
-    read: int
-    splats: int
-    sh_degree: int
-    dropped: dict[str, int]
-    method: str | None
-    nodes: int
-    levels: int
-    notes: tuple[str, ...]
-    seconds: dict[str, float]
+    format: str = ""
+    read: int = 0
+    splats: int = 0
+    sh_degree: int = 0
+    dropped: dict[str, int] = field(default_factory=dict)
+    method: str | None = None
+    nodes: int = 0
+    levels: int = 0
+    notes: tuple[str, ...] = ()
+    seconds: dict[str, float] = field(default_factory=dict)
     refine: Refined | None = None
     blocks: int | None = None
     scratch_bytes_written: int | None = None
     scratch_bytes_read: int | None = None
+
+
+@dataclass(kw_only=True, eq=False)
+class BuiltTree:
+    """Tree on its way from the splats of an input to a file.
+
+    Attributes:
+        nodes: in memory or in a store; None before the tree is built, and while a step replaces them.
+        baked: what the steps report.
+        environment: splats that are always drawn; None without.
+        statistics: those of all nodes that `output.needed` names; None for an output that needs none.
+        is_ordered: the nodes have the order of the output.
+    """
+
+    output: BakeOutput
+    nodes: Scene | NodeStream | None = None
+    baked: Baked = field(default_factory=Baked)
+    environment: Splats | None = None
+    statistics: Statistics | None = None
+    is_ordered: bool = False
+
+    @property
+    def scene(self) -> Scene:
+        """The tree in memory."""
+        assert isinstance(self.nodes, Scene)
+        return self.nodes

@@ -20,8 +20,10 @@ from ..codecs.spz import like
 from ..codecs.validation import check_valid
 from ..fitting.report import FitReport
 from ..fitting.settings import FitSettings
+from ..images.metrics import MOST_PSNR
 from ..io import read_scene
 from ..io.writing import encoded, scene_output, write_scene
+from ..lod.budget import Budget
 from ..lod.detail_levels import RefinementOrder, with_plain_opacity
 from ..model.falloff import MIN_ALPHA
 from ..model.scene import Scene
@@ -32,7 +34,7 @@ from ..system.errors import FormatError, SparklodError, memory_errors_translated
 from ..system.progress import Progress, silent
 from ..system.threads import on_threads
 from ..system.units import count_of
-from .settings import BakeSettings, BuiltTree, Clock, SimplifyGoal, WrittenTree
+from .settings import BakeSettings, BuiltTree, Clock
 
 #: Number of cameras for a PSNR unless cameras are given, and their seed; a fitted tree is judged by as many.
 CAMERAS, SEED = 16, 0
@@ -43,6 +45,33 @@ CLOSE_BYTES, CLOSE_COUNT = 0.002, 0.01
 
 #: Encodings at most. Files grow nearly in proportion to their splats, so 3 to 6 do. Chosen.
 MOST_TRIALS = 16
+
+
+@dataclass(frozen=True)
+class SimplifyGoal:
+    """Size or fidelity of a simplified scene. One of the three is not None.
+
+    Attributes:
+        to: number of splats, or a share of all.
+        max_bytes: size of a file that as many splats as possible shall fill.
+        psnr: least PSNR against full detail, dB, of as few splats as possible.
+
+    Raises:
+        ValueError: not exactly one is given, or it is out of its range.
+    """
+
+    to: Budget | None = None
+    max_bytes: int | None = None
+    psnr: float | None = None
+
+    def __post_init__(self) -> None:
+        if sum(each is not None for each in (self.to, self.max_bytes, self.psnr)) != 1:
+            raise ValueError("give one of to, max_bytes and psnr")
+        if self.max_bytes is not None and self.max_bytes < 1:
+            raise ValueError(f"max_bytes is {self.max_bytes}; give 1 or more")
+        if self.psnr is not None and not 0 < self.psnr < MOST_PSNR:
+            raise ValueError(f"psnr is {self.psnr}; give more than 0 and less than {MOST_PSNR:g} dB")
+
 
 #: Measures a number of a cut of so many splats.
 Measure = Callable[[int], float]
@@ -253,13 +282,11 @@ class WrittenSet(Losses):
     refine: Refined | None
 
 
-def write_simplified(
-    tree: BuiltTree, simplifier: Simplifier, clock: Clock, threads: int, progress: Progress
-) -> WrittenTree:
+def write_simplified(tree: BuiltTree, simplifier: Simplifier, clock: Clock, threads: int, progress: Progress) -> None:
     """Cut a tree and write the cut, a scene without a tree."""
     out, form = tree.output.out, WRITABLE[tree.output.settings.suffix]
     # The opacities of a tree that was read make up for the rounding of its scales already.
-    options = dataclasses.replace(tree.output.options, covering=tree.method is not None)
+    options = dataclasses.replace(tree.output.options, covering=tree.baked.method is not None)
 
     def bytes_of(scene: Scene) -> int:
         files = encoded(out, form, scene, form.codec().settled(scene, options), threads=threads)
@@ -269,14 +296,17 @@ def write_simplified(
         chosen = simplifier.choose(tree.scene, bytes_of=bytes_of, threads=threads, progress=progress)
     settled, losses = settled_with_losses(chosen.scene, form, options, threads)
     clock.end("simplify")
-    size = write_scene(out, form, chosen.scene, settled, threads=threads, progress=progress)
+    baked = tree.baked
+    baked.bytes = write_scene(out, form, chosen.scene, settled, threads=threads, progress=progress)
     clock.end("write")
     count = len(chosen.scene)
-    share = round(count / tree.splats, 6)
-    made = WrittenSet(
-        **vars(losses), splats=count, share=share, faint=chosen.faint, psnr=chosen.psnr, refine=chosen.refine
+    share = round(count / baked.splats, 6)
+    baked.output_format, baked.simplified = (
+        form.name,
+        WrittenSet(
+            **vars(losses), splats=count, share=share, faint=chosen.faint, psnr=chosen.psnr, refine=chosen.refine
+        ),
     )
-    return WrittenTree(output_format=form.name, bytes=size, simplified=made)
 
 
 @dataclass(frozen=True, kw_only=True)

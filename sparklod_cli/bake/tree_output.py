@@ -12,17 +12,15 @@ from ..codecs.encoder import CLAMPED, Encoder, Stored, Windows, clamps_of, windo
 from ..codecs.formats import RAD_SUFFIX as RAD
 from ..codecs.formats import WRITABLE, Format
 from ..codecs.options import DEFAULTS, RAD_ENCODINGS, WriteOptions
-from ..codecs.statistics import Statistics
 from ..io.reading import Merged, Source, opened, read_stored
 from ..io.writing import parts_output, scene_output
-from ..model.lod_tree import CHUNK_NODES
 from ..model.scene import Scene
 from ..model.splats import Splats, same_rows
 from ..system.addresses import Place
 from ..system.errors import FormatError
 from ..system.output import Output
 from ..system.progress import Progress
-from .settings import SPZ, BakeSettings, BuiltTree, Clock, WrittenTree
+from .settings import SPZ, Baked, BakeSettings, BuiltTree, Clock
 
 if TYPE_CHECKING:
     from .simplifying import Simplifier
@@ -64,11 +62,6 @@ class BakeOutput:
     def needed(self) -> frozenset[str]:
         """Statistics of all nodes by which the codec settles options, see `codecs.statistics`."""
         return frozenset() if self.form is None else self.form.codec().needed(self.options)
-
-    def check(self, leaves: Statistics) -> None:
-        """Raise `FormatError` where the format cannot hold a tree of leaves with these statistics."""
-        if self.form is not None:
-            self.form.codec().settled(leaves, self.options)
 
 
 def output_of(
@@ -141,99 +134,84 @@ def output_of_existing_tree(
     return dataclasses.replace(output, options=dataclasses.replace(options, covering=False)), False
 
 
-def write_tree(tree: BuiltTree, encode: Encode, clock: Clock, threads: int, progress: Progress) -> WrittenTree:
+def write_tree(tree: BuiltTree, encode: Encode, clock: Clock, threads: int, progress: Progress) -> None:
     """Write a tree whose nodes are in order to its output; all but SPZ and RAD files need its nodes in memory."""
-    output = tree.output
-    settings, options = output.settings, output.options
+    output, baked = tree.output, tree.baked
+    out, settings, options = output.out, output.settings, output.options
     if output.form is not None:
-        return _write_windows(tree, output.form, encode, clock, threads, progress)
-    if output.repacked is not None:
-        return _repack(output.repacked, output.out, clock)
-    if settings.detail is not None or settings.tiles is not None:
-        from .parts_output import write_levels, write_tiles
+        _write_windows(tree, output.form, encode, clock, threads, progress)
+    elif output.repacked is not None:
+        _repack(output.repacked, out, baked)
+        clock.end("write")
+    elif settings.tiles is not None:
+        from .parts_output import write_tiles
 
-        if settings.tiles is not None:
-            return write_tiles(tree.scene, output.out, settings.tiles, options, clock, threads, progress)
-        assert settings.detail is not None
-        return write_levels(
-            tree.scene, tree.environment, output.out, settings.detail, options, clock, threads, progress
+        baked.output_format = "3d-tiles"
+        baked.bytes, baked.tiles = write_tiles(tree.scene, out, settings.tiles, options, clock, threads, progress)
+    elif settings.detail is not None:
+        from .parts_output import write_levels
+
+        baked.output_format = "streamed-sog"
+        baked.bytes, baked.detail = write_levels(
+            tree.scene, tree.environment, out, settings.detail, options, clock, threads, progress
         )
-    if output.simplifier is not None:
+    elif output.simplifier is not None:
         from .simplifying import write_simplified
 
-        return write_simplified(tree, output.simplifier, clock, threads, progress)
-    assert settings.encoding is not None
-    return _write_arrays(tree.scene, output.out, settings.encoding, clock, threads, raw=settings.raw)
+        write_simplified(tree, output.simplifier, clock, threads, progress)
+    else:
+        assert settings.encoding is not None
+        from ..codecs.gpu import dump
+
+        arrays = dump.pack(tree.scene, settings.encoding, threads)
+        pieces = dump.encode_raw(arrays) if settings.raw else dump.encode_npz(arrays)
+        with out:
+            baked.bytes = out.write(out.target.name, pieces)
+        baked.output_format, baked.arrays = settings.encoding, {name: words.shape for name, words in arrays.items()}
+        clock.end("write")
 
 
 def _write_windows(
     tree: BuiltTree, form: Format, encode: Encode, clock: Clock, threads: int, progress: Progress
-) -> WrittenTree:
+) -> None:
     """Encode the windows of an SPZ or RAD file and write them."""
-    output, codec = tree.output, form.codec()
+    output, baked, codec = tree.output, tree.baked, form.codec()
     settled: WriteOptions = codec.settled(tree.statistics, output.options)
-    ranges = tuple(codec.held(settled, tree.sh_degree))
+    ranges = tuple(codec.held(settled, baked.sh_degree))
     encoder: Any = codec.encoder(tree.nodes, settled, ranges, threads=threads, progress=progress)
     if output.stored is not None and output.before is not None:
         encoder = output.stored.keeping(encoder, same_rows(tree.scene.splats, output.before))
-    windows, options, count, size = encode(tree, encoder), encoder.options, encoder.count, 0
+    windows, options, count = encode(tree, encoder), encoder.options, encoder.count
     numbers = range(len(windows_of(count)))
     with output.out as out:
         name = out.target.name
         if out.siblings is None:
             for piece in encoder.pieces(windows, threads=threads, progress=progress):
-                size += out.write(name, (piece,))
+                baked.bytes += out.write(name, (piece,))
         else:
             chunks = (windows(number, codec.CHUNK).tobytes() for number in numbers)
             for each, pieces in encoder.files(chunks, PurePath(name).stem, progress=progress):
-                size += out.write(each, pieces)
-    counts, clamps = clamps_of([windows(number, CLAMPED) for number in numbers] if ranges else [], ranges)
+                baked.bytes += out.write(each, pieces)
+    if ranges:
+        baked.clamped, baked.clamps = clamps_of([windows(number, CLAMPED) for number in numbers], ranges)
     clock.end("write")
     if not output.in_chunks:
-        return WrittenTree(
-            output_format="spz",
-            bytes=size,
-            version=options.spz_version,
-            fractional_bits=options.fractional_bits,
-            clamped=counts,
-            clamps=clamps,
-        )
-    return WrittenTree(
-        output_format="rad-chunked" if options.rad.chunked else "rad",
-        bytes=size,
-        chunks=-(-count // CHUNK_NODES),
-        encodings={name: getattr(options.rad, name) for name in RAD_ENCODINGS if encoder.sh_degree or name != "sh"},
-        sh_codes=min(options.rad.sh_codes, count) if options.rad.sh_codes and encoder.sh_degree else None,
-        clamped=counts,
-        clamps=clamps,
-    )
+        baked.output_format, baked.version, baked.fractional_bits = "spz", options.spz_version, options.fractional_bits
+        return
+    baked.output_format = "rad-chunked" if options.rad.chunked else "rad"
+    baked.chunks = len(numbers)
+    baked.encodings = {name: getattr(options.rad, name) for name in RAD_ENCODINGS if encoder.sh_degree or name != "sh"}
+    if options.rad.sh_codes and encoder.sh_degree:
+        baked.sh_codes = min(options.rad.sh_codes, count)
 
 
-def _repack(source: Place, out: Output, clock: Clock) -> WrittenTree:
+def _repack(source: Place, out: Output, baked: Baked) -> None:
     """Write a RAD file with the chunks of another one."""
     with opened(source) as (file, form, more), out:
         chunks = form.codec().RadReader.open(file, **more)
         name = out.target.name
         files = [(name, chunks.in_one_file())] if out.siblings is None else chunks.in_files(PurePath(name).stem)
-        size = sum(out.write(*each) for each in files)
-        encodings = chunks.encodings
-    clock.end("write")
-    return WrittenTree(
-        output_format="rad" if chunks.header.chunked else "rad-chunked",
-        bytes=size,
-        chunks=len(chunks.header.chunks),
-        encodings=encodings,
-        sh_codes=chunks.header.sh_code_count,
-    )
-
-
-def _write_arrays(scene: Scene, out: Output, encoding: str, clock: Clock, threads: int, *, raw: bool) -> WrittenTree:
-    """Write arrays in the layout of a viewer's memory: as .npz, or their words alone."""
-    from ..codecs.gpu import dump
-
-    arrays = dump.pack(scene, encoding, threads)
-    with out:
-        size = out.write(out.target.name, dump.encode_raw(arrays) if raw else dump.encode_npz(arrays))
-    shapes = {name: words.shape for name, words in arrays.items()}
-    clock.end("write")
-    return WrittenTree(output_format=encoding, bytes=size, arrays=shapes)
+        baked.bytes = sum(out.write(*each) for each in files)
+        baked.encodings = chunks.encodings
+    baked.output_format = "rad" if chunks.header.chunked else "rad-chunked"
+    baked.chunks, baked.sh_codes = len(chunks.header.chunks), chunks.header.sh_code_count

@@ -146,7 +146,8 @@ class SimplifyOptions:
 
     def settings(self, ctx: click.Context) -> BakeSettings:
         """Return the settings of the bake whose tree is cut; loads numpy."""
-        from ..bake.settings import BakeSettings, SimplifyGoal
+        from ..bake.settings import BakeSettings
+        from ..bake.simplifying import SimplifyGoal
 
         return BakeSettings(
             method=METHOD_OF_DETAIL,

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 import sparklod_cli as sparklod
-from sparklod_cli.bake.settings import SimplifyGoal
-from sparklod_cli.bake.simplifying import CLOSE_BYTES, CLOSE_COUNT, count_for
+from sparklod_cli.bake.simplifying import CLOSE_BYTES, CLOSE_COUNT, SimplifyGoal, count_for
 from sparklod_cli.fitting.nodes import FittedNodes
 from sparklod_cli.lod.budget import parse_budget
 from sparklod_cli.lod.detail_levels import RefinementOrder

@@ -8,7 +8,8 @@ from typing import Any
 import pytest
 
 from sparklod_cli.bake.flow import bake, stage_shares
-from sparklod_cli.bake.settings import BakeSettings, Resources, SimplifyGoal
+from sparklod_cli.bake.settings import BakeSettings, Resources
+from sparklod_cli.bake.simplifying import SimplifyGoal
 from sparklod_cli.codecs.options import RadOptions, SogOptions, WriteOptions
 from sparklod_cli.fitting.settings import FitSettings
 from sparklod_cli.lod.budget import parse_budget

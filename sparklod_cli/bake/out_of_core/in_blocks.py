@@ -26,7 +26,6 @@ from ...system.progress import Progress
 from ...system.threads import blocks_of, on_threads
 from ..in_memory import check_transformed, select, transform
 from ..settings import BakeSettings, BuiltTree, Clock
-from ..tree_output import BakeOutput
 from .job import (
     ORDER,
     PUBLISHED,
@@ -77,37 +76,29 @@ class InBlocks:
     """
 
     job: Job
-    output: BakeOutput
     clock: Clock
     engine: Engine
     block_splats: int
     windows: int
     progress: Progress
 
-    def build(self) -> BuiltTree:
+    def build(self, tree: BuiltTree) -> None:
         """Scatter the splats of the input to blocks, and build the tree in stages."""
         stream, settings = self.job.stream, self.job.settings
         if not stream.count:
             settings.selection.check(SelectionTally())
         summary = self._scatter()
         self.clock.end("read")
-        self.output.check(summary.statistics)
+        if (form := tree.output.form) is not None:  # one that cannot hold the tree is reported now
+            form.codec().settled(summary.statistics, tree.output.options)
         setting = getattr(settings, BUILDERS[settings.method].setting)
         plan = self.job.builder().plan(summary.bounds, splats_of(summary.sample), setting)
         self.job = job = dataclasses.replace(self.job, plan=plan)
         self.engine.run("building", list(_stages(job)), job, self.progress)
         self.clock.end("build")
-        return BuiltTree(
-            nodes=None,
-            output=self.output,
-            format=stream.format,
-            notes=settings.notes_on(stream),
-            read=stream.count,
-            splats=summary.tally.selected,
-            dropped=summary.tally.dropped,
-            method=settings.method,
-            blocks=job.blocks.count,
-        )
+        baked = tree.baked
+        baked.splats, baked.dropped, baked.method = summary.tally.selected, summary.tally.dropped, settings.method
+        baked.blocks = job.blocks.count
 
     def order(self, tree: BuiltTree) -> None:
         """Order the nodes; put the plan of each window into the store."""
@@ -121,9 +112,10 @@ class InBlocks:
             self.progress,
         )
         self.clock.end("order")
-        count, tree.levels = job.store.get(ORDER, ["counts"])["counts"].tolist()
+        tree.baked.nodes, tree.baked.levels = job.store.get(ORDER, ["counts"])["counts"].tolist()
+        tree.baked.sh_degree = job.sh_degree
         tree.statistics = Statistics.merged([Statistics.from_array(stage["statistics"]) for stage in stages])
-        tree.nodes = node_stream(job, count)
+        tree.nodes = node_stream(job, tree.baked.nodes)
 
     def encode(self, tree: BuiltTree, encoder: Encoder) -> Windows:
         """Encode the windows of the tree; the output may be in place if the bake is interrupted from then on."""

@@ -18,7 +18,7 @@ from ...lod.families import band_order
 from ...lod.kernels.tree_links import find_limits
 from ...lod.stage_records import NO_FAMILY, STAGE_BITS
 from ...model.lod_tree import CHUNK_NODES, LodTree
-from ...model.scene import NodeStream
+from ...model.scene import NodeStream, rotated_axis
 from ...model.sh import degree_of, width_of
 from ...model.splats import COLUMNS, FloatArray, Splats
 from ...system.progress import Progress
@@ -263,7 +263,8 @@ def _keys(store: Store, run: Run, words: int) -> NDArray[np.uint64]:
 def node_stream(job: Job, count: int) -> NodeStream:
     """Return the nodes of an ordered tree."""
     read = functools.partial(_read, job.store, width_of(job.sh_degree))
-    up = job.settings.up_of(job.stream.up)
+    up = job.settings.up or job.stream.up
+    up = rotated_axis(up, job.settings.transform.rotation) if up else None
     return NodeStream(count, job.sh_degree, job.stream.antialiased, read, up)
 
 

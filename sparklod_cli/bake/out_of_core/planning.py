@@ -98,7 +98,7 @@ def blocks_for(
         settings = dataclasses.replace(settings, rgba=settings.rgba and settings.rgba.absolute())
         job = Job(store, stream, settings, output.needed, output.in_chunks)
         windows = estimate.windows_within(memory, splats, degree, threads)
-        yield InBlocks(job, output, clock, engine or LocalEngine(threads), block_splats, windows, progress)
+        yield InBlocks(job, clock, engine or LocalEngine(threads), block_splats, windows, progress)
 
 
 def _reason(
@@ -115,9 +115,10 @@ def _reason(
     Raises:
         OutOfMemoryError: it would, but its output is made of a whole tree.
     """
-    needed = estimate.in_memory_bytes_of(header, settings)
+    refines = settings.refine is not None
+    needed = estimate.in_memory_bytes(settings.method, header.count, header.sh_degree, refines=refines)
     if memory is not None and needed > memory:
-        whole, refines = _needs_whole_tree(settings), settings.refine is not None
+        whole = _needs_whole_tree(settings)
         if whole is not None:
             most = estimate.most_in_memory(memory, settings.method, header.sh_degree, refines=refines)
             raise OutOfMemoryError(

@@ -50,8 +50,8 @@ def built(folder: str, splats: Splats, how: BakeSettings, block: int, engine: Lo
     """A tree in a store, of blocks of about so many splats."""
     job = Job(Store(Path(folder)), reader_of(Scene(splats)), how, ALL, in_chunks)
     output = BakeOutput(Output(Path(folder) / "out", overwrite=False), how, how.options)
-    blocks = InBlocks(job, output, Clock(), engine, block, 1, silent)
-    tree = blocks.build()
+    blocks, tree = InBlocks(job, Clock(), engine, block, 1, silent), BuiltTree(output=output)
+    blocks.build(tree)
     blocks.order(tree)
     return tree
 
@@ -89,4 +89,4 @@ def test_quick_makes_the_tree_of_a_bake_in_memory(
             window = slice(start, stop)
             tree = LodTree(expected[1].child_count[window], expected[1].child_start[window])
             same(found.nodes.read(start, stop), (expected[0].take(window), tree))
-    assert found.levels == expected[1].depths().max() + 1
+    assert found.baked.levels == expected[1].depths().max() + 1
