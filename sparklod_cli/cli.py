@@ -13,7 +13,7 @@ from .commands.command import Group
 from .commands.console import Verbosity, say, say_error, say_usage_error
 from .system import interrupts, stdio
 from .system.errors import SparklodError, out_of_memory, reason_of
-from .system.printable import printable
+from .system.untrusted import printable
 
 #: Most characters of an unexpected error in its message.
 QUOTED = 200

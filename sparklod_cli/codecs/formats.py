@@ -13,8 +13,7 @@ from importlib import import_module
 from pathlib import PurePath
 from typing import Any, BinaryIO, Literal
 
-from ..system.printable import printable
-from ..system.untrusted import keys_of_object
+from ..system.untrusted import keys_of_object, printable
 
 #: Bytes at the beginning of a file by which its format is recognized, and of a JSON object, whose first value may be
 #: long.

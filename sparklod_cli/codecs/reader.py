@@ -18,9 +18,9 @@ from ..model.lod_tree import LodTree
 from ..model.scene import PLAIN, FileCoding, Scene, facts_of
 from ..model.splats import COLUMNS, Splats
 from ..system.errors import HasTreeError, TruncatedError
-from ..system.printable import printable
 from ..system.progress import Progress, silent
 from ..system.threads import BLOCK_ROWS, blocks_of, ordered_map
+from ..system.untrusted import printable
 from .validation import with_valid_tree
 
 #: Least bytes of a block: with narrow rows, such as SPZ's streams, handing a smaller one to a thread costs more than it

@@ -17,9 +17,9 @@ from ..lod.builders import BUILDERS
 from ..system import interrupts
 from ..system.addresses import Address, Place
 from ..system.errors import SparklodError
-from ..system.printable import MOST, shortened
 from ..system.stdio import DASH, name_of
 from ..system.units import format_size, percent_of
+from ..system.untrusted import MOST, shortened
 from .command import COMMON, Command, check_declared, is_set, refuse, values_of
 from .console import Console, count_of, print_json, say
 from .options.baking import (

@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Any, TextIO
 import click
 
 from ..system import interrupts
-from ..system.printable import MOST, printable
 from ..system.stdio import silence
 from ..system.units import count_of as count_of
 from ..system.units import format_duration, format_size
+from ..system.untrusted import MOST, printable
 
 if TYPE_CHECKING:
     from ..bake.settings import BakeSettings

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..system.printable import printable
+from ..system.untrusted import printable
 from .command import Command, flag, values_of
 from .console import Console, count_of, print_json
 from .options.common import QUIET, VERBOSE, Messages

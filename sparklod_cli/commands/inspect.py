@@ -17,10 +17,10 @@ import click
 from ..images.output import PLOT_BY
 from ..model import MAX_SH_DEGREE
 from ..system.errors import OutOfMemoryError, SparklodError, StdoutError
-from ..system.printable import MOST, printable, shortened
 from ..system.setting_fields import Quantity, Range, setting, whole
 from ..system.stdio import name_of
 from ..system.units import format_size, parse_size
+from ..system.untrusted import MOST, printable, shortened
 from .command import COMMON, Command, flag, refuse, values_of
 from .console import Console, count_of, rows
 from .options.common import QUIET, General, assert_errors, assert_option, overwrite_flag, plot_option, table_form

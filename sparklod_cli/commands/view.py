@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import click
 
 from ..lod.budget import doubt
-from ..system.printable import printable
 from ..system.setting_fields import Quantity, Range, setting, whole
 from ..system.units import format_size, parse_count
+from ..system.untrusted import printable
 from .command import COMMON, VIEW, Command, check_declared, flag, values_of
 from .console import Console, count_of, print_json
 from .options.common import JSON, QUIET, VERBOSE, General, overwrite_flag, up_option

@@ -11,8 +11,7 @@ from typing import Any
 
 from ..io import read_text
 from ..system.errors import SparklodError
-from ..system.printable import near, printable
-from ..system.untrusted import QUOTED, parse_json, parse_toml, quoted, quoted_value
+from ..system.untrusted import QUOTED, near, parse_json, parse_toml, printable, quoted, quoted_value
 from ..tables.assertions import BadAssertionError, Condition, is_number, number_text, parse_condition
 from .findings import Finding
 from .report import NoFieldError, Report, value_at

@@ -26,9 +26,8 @@ from ..codecs.tiles_3d.tileset import MAX_TILESET, Tileset, read_whole
 from ..codecs.validation import RuleViolation
 from ..model.georeference import EarthPlace, place_of
 from ..model.scene import common_axis
-from ..system.printable import MOST, printable
 from ..system.progress import Progress, silent
-from ..system.untrusted import LARGEST
+from ..system.untrusted import LARGEST, MOST, printable
 from .findings import Finding, findings_of
 from .values import Box, Ends
 

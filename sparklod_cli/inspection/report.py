@@ -22,9 +22,8 @@ from ..model.scene import Scene
 from ..model.sh import width_of
 from ..model.splats import COLUMNS, Splats
 from ..system.errors import FormatError, SparklodError
-from ..system.printable import printable
 from ..system.progress import Progress, silent
-from ..system.untrusted import QUOTED
+from ..system.untrusted import QUOTED, printable
 from ..tables.columns import Row
 from . import headers, tree, values
 from .blocks import Block, ReportBlocks, chunk_row, chunk_table, merged

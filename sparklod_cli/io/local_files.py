@@ -16,9 +16,8 @@ from ..codecs.formats import FIRST_FILES, FORMATS, MANIFEST, META, POINTER, SHOR
 from ..model.splats import FloatArray
 from ..system.addresses import Place, size_of
 from ..system.errors import FormatError, UnreadableError, reason_of
-from ..system.printable import near
 from ..system.stdio import DASH, spooled
-from ..system.untrusted import decoded_text, quoted_value
+from ..system.untrusted import decoded_text, near, quoted_value
 
 #: Names in a folder that are compared with one that is missing: more take longer than a person expects of an error.
 MOST_NAMES = 10_000

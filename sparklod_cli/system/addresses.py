@@ -18,7 +18,7 @@ from typing import Any, Literal
 from urllib.parse import unquote, urlsplit
 
 from .errors import SparklodError
-from .printable import redacted, without_secrets
+from .untrusted import redacted, without_secrets
 
 #: How addresses begin, chained ones too (simplecache::s3://). A letter and a colon alone are a drive of Windows.
 ADDRESS = re.compile(r"((?:[A-Za-z][A-Za-z0-9+.-]*::)*[A-Za-z][A-Za-z0-9+.-]+)://")

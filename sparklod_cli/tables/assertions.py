@@ -16,8 +16,8 @@ import numpy as np
 
 from ..model.instances import TOTAL
 from ..system.errors import SparklodError
-from ..system.printable import near
 from ..system.units import PREFIXES
+from ..system.untrusted import near
 from .columns import Column, Row
 
 Number = int | float

@@ -27,8 +27,7 @@ from ..io.local_files import companion_path, in_folder, open_named, open_plain, 
 from ..io.reading import recognised
 from ..model.lod_tree import CHUNK_NODES
 from ..system.errors import FormatError, NotSplatsError, UnreadableError, naming
-from ..system.printable import printable
-from ..system.untrusted import quoted_value
+from ..system.untrusted import printable, quoted_value
 
 #: What Spark calls the formats that sparklod reads.
 SPARK_TYPES = {

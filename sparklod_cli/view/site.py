@@ -31,9 +31,8 @@ from ..io.local_files import leads_away, open_plain
 from ..model.scene import up_notes_of
 from ..system.errors import CameraPathError, OutputError, SparklodError, reason_of
 from ..system.output import try_place, write_file
-from ..system.printable import printable
 from ..system.progress import Progress, silent
-from ..system.untrusted import parse_json, quoted_value
+from ..system.untrusted import parse_json, printable, quoted_value
 from .files import ENGINES, Resources, ShownFile
 from .start import Extent, Start
 

@@ -6,7 +6,7 @@ from sparklod_cli import io
 from sparklod_cli.cameras import frame
 from sparklod_cli.codecs import compression
 from sparklod_cli.inspection import tree
-from sparklod_cli.system import printable, untrusted
+from sparklod_cli.system import untrusted
 from tests.conftest import ROOT
 
 
@@ -16,7 +16,7 @@ def test_the_figures_of_security_are_those_of_the_code() -> None:
         f"promises more than {compression.TRUSTED_SIZE >> 20} MiB",
         f"at most {compression.MAX_RATIO} times the size of the file",
         f"read up to {io.MAX_TEXT >> 20} MiB and {untrusted.MAX_DEPTH} levels deep",
-        f"shorten texts to {printable.MOST} characters",
+        f"shorten texts to {untrusted.MOST} characters",
     ):
         assert said in text
     assert (tree.MAX_DEPTHS, frame.MAX_FRAMES) == (1000, 1 << 20)

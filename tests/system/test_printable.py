@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from sparklod_cli.cli import run
 from sparklod_cli.commands.console import for_screen
-from sparklod_cli.system.printable import MOST, printable, shortened
+from sparklod_cli.system.untrusted import MOST, printable, shortened
 from tests.conftest import FIXTURES
 
 TREE, PLAIN = FIXTURES / "golden" / "tree-v3.spz", FIXTURES / "one.ply"

@@ -12,9 +12,9 @@ from ...codecs.formats import PRECISIONS
 from ...lod.settings import BLEND, FACTOR, PLAYCANVAS_BUDGET, PRESETS, DetailRule, LodSettings
 from ...model.foveation import BEHIND_FOVEATE, CONE_FOV, CONE_FOV0, CONE_FOVEATE, Cones, Foveation, Frustum
 from ...simulation.streaming_settings import Network, StreamingSettings
-from ...system.printable import printable
 from ...system.setting_fields import Quantity, Range, setting
 from ...system.units import check_grouping, parse_time
+from ...system.untrusted import printable
 from ..command import COMMON, flag, parameters_of, refuse
 from ..paths import InputPath
 
