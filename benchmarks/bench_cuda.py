@@ -25,8 +25,7 @@ import sparklod_cli as sparklod
 from sparklod_cli.fitting import pictures as training
 from sparklod_cli.fitting.cuda.optimiser import CardOptimiser
 from sparklod_cli.fitting.fit import AHEAD, MOST_SHARE, RATES, Optimiser, raster_for
-from sparklod_cli.fitting.nodes import FittedNodes
-from sparklod_cli.fitting.pictures import TRAINING, FullDetailPicture, Place, pictures, placed
+from sparklod_cli.fitting.pictures import TRAINING, FittedNodes, FullDetailPicture, Place, pictures, placed
 from sparklod_cli.model.gaussian import lod_opacity
 from sparklod_cli.render.cuda.card import find_card, to_card
 from sparklod_cli.render.cuda.rasterizer import CardSplats, CardView, draw_on_card

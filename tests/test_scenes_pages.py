@@ -21,10 +21,10 @@ from sparklod_cli.model.instances import Instance
 from sparklod_cli.model.lod_tree import CHUNK_NODES, LodTree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS
-from sparklod_cli.scenes import pages
+from sparklod_cli.scenes import loaded_scene
 from sparklod_cli.scenes.finder import CutFinder, view_of
 from sparklod_cli.scenes.loaded import Scenes
-from sparklod_cli.scenes.pages import PagedForest, PagedScene
+from sparklod_cli.scenes.loaded_scene import PagedForest, PagedScene
 from sparklod_cli.scenes.reading import read_scenes
 from sparklod_cli.simulation.streaming_settings import Network, StreamingSettings
 from sparklod_cli.system.errors import FormatError, TreeError
@@ -58,7 +58,7 @@ def file(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def little_memory(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """As if files did not fit into memory."""
     with pytest.MonkeyPatch.context() as patch:
-        for module in ("io.rad_file", "scenes.pages"):
+        for module in ("io.rad_file", "scenes.loaded_scene"):
             patch.setattr(f"sparklod_cli.{module}.available_memory", lambda: 1 << 20)
         yield
 
@@ -170,7 +170,7 @@ def test_cameras_see_what_they_see_of_scenes_read_whole(
         spoiled = Scene(dataclasses.replace(scene.splats, center=center), scene.tree)
         file = tmp_path / "b.rad"
         file.write_bytes(b"".join(rad.encode(spoiled, WriteOptions(compression_level=1), threads=2)))
-    for module in (framing, pages):
+    for module in (framing, loaded_scene):
         monkeypatch.setattr(module, "SAMPLE", 50_000)
     whole, paged = (scenes.balls() for scenes in both(instances(file)))
     assert len(paged.radius) < len(whole.radius) / 4

@@ -23,7 +23,7 @@ from sparklod_cli.model.lod_tree import CHUNK_NODES
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.scenes import reading
 from sparklod_cli.scenes.loaded import Cut, Part
-from sparklod_cli.scenes.pages import TRAVERSED
+from sparklod_cli.scenes.loaded_scene import TRAVERSED
 from sparklod_cli.scenes.reading import read_scenes
 from sparklod_cli.system.errors import FormatError, SparklodError, TreeError
 from tests.conftest import FIXTURES

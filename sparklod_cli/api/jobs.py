@@ -19,7 +19,7 @@ from ..cameras.framing import reach
 from ..model.instances import instances_of
 from ..model.splats import COLUMNS
 from ..scenes.finder import CutFinder, CutSource
-from ..scenes.pages import TRAVERSED
+from ..scenes.loaded_scene import TRAVERSED
 from ..scenes.reading import read_scenes
 from ..system.output import check_writable, write_file
 from ..system.progress import Progress, silent

@@ -149,8 +149,7 @@ class Fidelity:
 
     def __init__(self, tree: Scene, cameras: Sequence[Camera] | None, threads: int) -> None:
         from ..fitting.fit import raster_for
-        from ..fitting.nodes import FittedNodes
-        from ..fitting.pictures import Place, pictures, placed
+        from ..fitting.pictures import FittedNodes, Place, pictures, placed
 
         assert tree.tree is not None
         place = Place.of(tree.splats.center[tree.tree.is_leaf])
@@ -168,7 +167,7 @@ class Fidelity:
 
     def fitted(self, cut: NDArray[np.int64], nodes: Splats) -> float:
         """Return the mean PSNR of a cut of the tree with other nodes, dB; later ones are measured with them, too."""
-        from ..fitting.nodes import columns_of
+        from ..fitting.pictures import columns_of
 
         self._nodes.restore(cut, columns_of(nodes))
         return self.psnr(cut)

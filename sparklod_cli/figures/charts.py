@@ -373,16 +373,10 @@ CALLED = {
 }
 
 
-@dataclass(frozen=True)
-class Plot:
-    """The bytes of a PNG, and the reason why it has no picture of the path, if one was requested."""
-
-    png: bytes
-    note: str | None
-
-
-def plot(rows: Iterable[Row], marked: Mapping[str, int], title: str, scene: PathScene | None = None) -> Plot:
-    """Draw charts of all columns that are not empty and, if it can be drawn, the path in the scene.
+def plot(
+    rows: Iterable[Row], marked: Mapping[str, int], title: str, scene: PathScene | None = None
+) -> tuple[bytes, str | None]:
+    """Return the PNG of charts of all columns that have numbers, and of the path; a note says why that is missing.
 
     Args:
         rows: of all frames; those of single instances are left out.
@@ -405,7 +399,7 @@ def plot(rows: Iterable[Row], marked: Mapping[str, int], title: str, scene: Path
             images.append(Image.open(io.BytesIO(picture)).convert("RGB"))
         except SparklodError as error:
             note = f"drawn without the picture of the path: {error}"
-    return Plot(stacked(*images), note)
+    return stacked(*images), note
 
 
 def _about(frames: Sequence[Row]) -> str:

@@ -23,11 +23,13 @@ from ..system.threads import on_threads
 from ..system.units import percent_of
 from .kernels import adam
 from .kernels.adam import Rates
-from .nodes import FittedNodes, FittedSet, Index
 from .pictures import (
     HELD_OUT,
     TRAINING,
+    FittedNodes,
+    FittedSet,
     FullDetailPicture,
+    Index,
     Place,
     Scores,
     gain,

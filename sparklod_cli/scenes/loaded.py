@@ -24,8 +24,17 @@ from ..model.scene import Scene, common_axis, rotated_axis, up_notes_of
 from ..model.splats import Splats
 from ..model.traversed import Nodes
 from ..system.units import count_of
-from .loaded_scene import Index, LoadedDetail, LoadedRuns, LoadedScene, LoadedTiles, nodes_of
-from .pages import PagedForest, PagedScene, sampled_balls
+from .loaded_scene import (
+    Index,
+    LoadedDetail,
+    LoadedRuns,
+    LoadedScene,
+    LoadedTiles,
+    PagedForest,
+    PagedScene,
+    nodes_of,
+    sampled_balls,
+)
 
 Weights = NDArray[np.float64]
 

@@ -35,12 +35,13 @@ from .loaded_scene import (
     LoadedRuns,
     LoadedScene,
     LoadedTiles,
+    PagedScene,
+    Pages,
     bytes_of,
     files_in_memory,
     nodes_of,
     whole_scene,
 )
-from .pages import PagedScene, Pages
 
 
 def read_scenes(

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import io
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -367,8 +367,9 @@ class FrameOutputs:
 
     def index_files(self, numbers: Sequence[int], instances: int) -> Iterator[Path]:
         if self.indices is not None:
+            names = [""] if instances == 1 else [f".{instance}" for instance in range(instances)]
             for number in numbers:
-                yield from index_files(self.indices, number, instances)
+                yield from (self.indices / f"{number:06d}{name}.npy" for name in names)
 
 
 @dataclass(frozen=True)
@@ -386,28 +387,6 @@ class WrittenFrames:
     note: str | None
 
 
-@dataclass
-class _ChartData:
-    """Data for the charts: rows, and the extreme frames so far."""
-
-    rows: list[Row] = field(default_factory=list)
-    in_front: list[float] = field(default_factory=list)
-    lookout: Lookout = field(default_factory=Lookout)
-    frames: dict[str, SimulatedFrame] = field(default_factory=dict)
-
-    def add(self, frame: SimulatedFrame) -> None:
-        """Store a frame if it exceeds all earlier frames in one of the criteria."""
-        for criterion in self.lookout.add(frame.rows[0]):
-            self.frames[criterion] = frame
-        self.frames.setdefault("first", frame)
-
-    def best(self) -> SimulatedFrame:
-        """Return the first extreme frame that draws anything, as none does before the first chunk has arrived."""
-        criteria = [moment.criterion for moment in self.lookout.moments()]
-        extremes = [self.frames[criterion] for criterion in (*criteria, "first")]
-        return next((each for each in extremes if len(each.cut)), extremes[0])
-
-
 def write_frames(
     simulation: Simulation,
     path: CameraPath,
@@ -421,34 +400,30 @@ def write_frames(
 
     `passed` filters the bytes of a table on standard output. `OutputError` if a file cannot be written.
     """
-    data = _ChartData()
+    together, in_front, lookout = list[Row](), list[float](), Lookout()
+    extremes: dict[str, SimulatedFrame] = {}  # by criterion, and the first frame
 
     def rows() -> Iterator[Row]:
         for frame in simulation.run(path, threads=threads, progress=progress):
-            data.in_front.append(frame.in_front)
-            data.rows.append(frame.rows[0])
+            in_front.append(frame.in_front)
+            together.append(frame.rows[0])
             _write_indices(frame, outputs)
             if outputs.plot is not None:
-                data.add(frame)
+                extremes.update(dict.fromkeys(lookout.add(frame.rows[0]), frame))
+                extremes.setdefault("first", frame)
             yield from frame.rows
 
     outputs.table.write(rows(), passed=passed)
-    note = None if outputs.plot is None else _plot(simulation, path, outputs.plot, data, overwrite=outputs.overwrite)
-    return WrittenFrames(data.rows, float(np.mean(data.in_front)), note)
-
-
-def index_files(folder: Path, frame: int, instances: int) -> list[Path]:
-    """Return the index files of a frame, one per instance."""
-    if instances == 1:
-        return [folder / f"{frame:06d}.npy"]
-    return [folder / f"{frame:06d}.{instance}.npy" for instance in range(instances)]
+    note = None
+    if outputs.plot is not None:
+        png, note = _charts(simulation, path, together, lookout.moments(), extremes)
+        write_file(outputs.plot, [png], overwrite=outputs.overwrite)
+    return WrittenFrames(together, float(np.mean(in_front)), note)
 
 
 def _write_indices(frame: SimulatedFrame, outputs: FrameOutputs) -> None:
-    if outputs.indices is None:
-        return
-    parts = frame.cut.indices()
-    for nodes, file in zip(parts, index_files(outputs.indices, frame.number, len(parts)), strict=True):
+    parts = frame.cut.indices() if outputs.indices is not None else []
+    for nodes, file in zip(parts, outputs.index_files([frame.number], len(parts)), strict=True):
         if outputs.padded:
             nodes = np.concatenate([nodes, np.zeros(-len(nodes) % ROW, np.uint32)]).reshape(-1, ROW)
         out = io.BytesIO()
@@ -456,11 +431,19 @@ def _write_indices(frame: SimulatedFrame, outputs: FrameOutputs) -> None:
         write_file(file, [out.getvalue()], overwrite=outputs.overwrite)
 
 
-def _plot(simulation: Simulation, path: CameraPath, target: Path, data: _ChartData, *, overwrite: bool) -> str | None:
-    """Write the charts, with the path over the cut of an extreme frame; return a note if that picture is missing."""
+def _charts(
+    simulation: Simulation,
+    path: CameraPath,
+    rows: Sequence[Row],
+    moments: Sequence[Moment],
+    extremes: Mapping[str, SimulatedFrame],
+) -> tuple[bytes, str | None]:
+    """Return the charts, with the path over the cut of an extreme frame, and why that picture is missing, if it is."""
     from ..figures import charts
 
-    frame = data.best()
+    frames = [extremes[criterion] for criterion in (*(moment.criterion for moment in moments), "first")]
+    # The first that draws anything, as none does before the first chunk has arrived.
+    frame = next((each for each in frames if len(each.cut)), frames[0])
     cut = simulation.scenes.cut_of(frame.cut)
     scene = charts.PathScene(
         path.cameras,
@@ -469,7 +452,5 @@ def _plot(simulation: Simulation, path: CameraPath, target: Path, data: _ChartDa
         path.numbers.index(frame.number),
         "level" if simulation.scenes.in_runs else "tree depth",
     )
-    marked = {moment.criterion: moment.frame for moment in data.lookout.moments()}
-    drawn = charts.plot(data.rows, marked, simulation.scenes.title, scene)
-    write_file(target, [drawn.png], overwrite=overwrite)
-    return drawn.note
+    marked = {moment.criterion: moment.frame for moment in moments}
+    return charts.plot(rows, marked, simulation.scenes.title, scene)

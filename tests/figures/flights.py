@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image
 
 from sparklod_cli.cameras.camera import Camera
-from sparklod_cli.figures.charts import PathScene, Plot, plot
+from sparklod_cli.figures.charts import PathScene, plot
 from sparklod_cli.simulation.results import Lookout
 from sparklod_cli.tables.assertions import totals
 from sparklod_cli.tables.columns import Row
@@ -48,7 +48,7 @@ def marked(rows: list[Row]) -> dict[str, int]:
     return {moment.criterion: moment.frame for moment in lookout.moments()}
 
 
-def plotted(rows: list[Row], title: str = "scene.spz", path_scene: PathScene | None = None) -> Plot:
+def plotted(rows: list[Row], title: str = "scene.spz", path_scene: PathScene | None = None) -> tuple[bytes, str | None]:
     """The plot of `traverse --plot`."""
     return plot(rows, marked(rows), title, path_scene)
 

@@ -37,9 +37,9 @@ def test_a_missing_matplotlib_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_without_pyvista_there_are_charts_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyvista", None)
     both = plotted(flight(5), path_scene=path_scene())
-    assert both.note is not None
-    assert install_hint("render", package="pyvista") in both.note
-    assert both.png == plotted(flight(5)).png
+    assert both[1] is not None
+    assert install_hint("render", package="pyvista") in both[1]
+    assert both[0] == plotted(flight(5))[0]
 
 
 @pytest.mark.parametrize("most", [0, 1, 2, 3, 7, 999, 12_345, 2_500_000])
@@ -61,7 +61,7 @@ class TestCharts:
     def test_a_chart_has_its_width_and_the_same_rows_give_the_same_picture(self) -> None:
         made = plotted(flight(60))
         assert plotted(flight(60)) == made
-        image = pixels(made.png)
+        image = pixels(made[0])
         assert image.shape[1] == charts.WIDTH
         assert image.shape[0] > charts.ROW * len(charts.PANELS) / 2
 
@@ -70,8 +70,8 @@ class TestCharts:
         for each in quiet:
             each |= dict.fromkeys(("churn", "bytes_new", "missing", "complete_in_s", "overdraw_estimate"), 0)
             each["pixel_scale_min"] = each["pixel_scale_limit"]
-        assert count_of(pixels(plotted(flight(60)).png), charts.PINK) > 500
-        assert count_of(pixels(plotted(quiet).png), charts.PINK) == 0
+        assert count_of(pixels(plotted(flight(60))[0]), charts.PINK) > 500
+        assert count_of(pixels(plotted(quiet)[0]), charts.PINK) == 0
 
     def test_empty_columns_leave_their_panel_out(self) -> None:
         rows = flight(60)
@@ -90,7 +90,7 @@ class TestCharts:
             assert not np.array_equal(charts.draw_charts(other, marked(other)), before), name
 
     def test_a_path_of_one_frame_has_a_chart_of_full_width(self) -> None:
-        assert pixels(plotted(flight(1)).png).shape[1] == charts.WIDTH
+        assert pixels(plotted(flight(1))[0]).shape[1] == charts.WIDTH
 
     @pytest.mark.parametrize(
         "cells",
@@ -105,11 +105,11 @@ class TestCharts:
     @pytest.mark.filterwarnings("error")
     def test_rows_of_any_cells_are_drawn(self, cells: dict[str, int | float]) -> None:
         rows: list[Row] = [row(frame, **cells) for frame in range(4)]
-        assert plotted(rows).note is None
+        assert plotted(rows)[1] is None
 
     @pytest.mark.parametrize("title", ["$x\n城.spz", "", "w" * 1000])
     def test_any_name_can_be_a_title(self, title: str) -> None:
-        assert plotted(flight(3), title).png
+        assert plotted(flight(3), title)[0]
 
     @pytest.mark.parametrize(("limit", "said"), [(0.001, "edges from the root"), (None, "level")])
     def test_levels_without_pixel_scales_are_detail_levels(self, limit: float | None, said: str) -> None:

@@ -160,9 +160,9 @@ class TestPictureOfPath:
     @pytest.mark.usefixtures("charting")
     def test_the_figure_is_below_the_charts(self) -> None:
         whole = plotted(flight(5), path_scene=path_scene())
-        alone = pixels(plotted(flight(5)).png)
-        both = pixels(whole.png)
-        assert whole.note is None
+        alone = pixels(plotted(flight(5))[0])
+        both = pixels(whole[0])
+        assert whole[1] is None
         assert both.shape == (len(alone) + 1000, charts.WIDTH, 3)
         assert (both[: len(alone)] == alone).all()
 

@@ -10,8 +10,7 @@ import pytest
 from sparklod_cli.fitting import fit as fit_module
 from sparklod_cli.fitting.fit import Optimiser, fit
 from sparklod_cli.fitting.kernels.adam import Rates
-from sparklod_cli.fitting.nodes import FittedNodes, Index
-from sparklod_cli.fitting.pictures import FullDetailPicture
+from sparklod_cli.fitting.pictures import FittedNodes, FullDetailPicture, Index
 from sparklod_cli.fitting.report import FitReport
 from sparklod_cli.fitting.settings import FitSettings
 from sparklod_cli.lod import quality

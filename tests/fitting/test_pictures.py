@@ -6,8 +6,7 @@ import itertools
 
 import numpy as np
 
-from sparklod_cli.fitting.nodes import FittedNodes
-from sparklod_cli.fitting.pictures import Place, keep_gains, keep_sizes, pictures, placed, scores_of
+from sparklod_cli.fitting.pictures import FittedNodes, Place, keep_gains, keep_sizes, pictures, placed, scores_of
 from sparklod_cli.fitting.settings import SHARES
 from sparklod_cli.inspection.tree import examine
 from sparklod_cli.lod import quality

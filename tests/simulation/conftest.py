@@ -10,7 +10,7 @@ from sparklod_cli.io import read_scene
 from sparklod_cli.model.foveation import Frustum
 from sparklod_cli.model.instances import Instance
 from sparklod_cli.scenes.loaded import Scenes
-from sparklod_cli.scenes.pages import TRAVERSED
+from sparklod_cli.scenes.loaded_scene import TRAVERSED
 from sparklod_cli.scenes.reading import read_scenes
 from tests.lod.forests import transform
 from tests.simulation.paths import HAND, TOWN

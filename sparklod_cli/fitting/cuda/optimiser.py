@@ -12,8 +12,7 @@ from ...render.cuda.card import CardArray, card_errors, on_card, to_card
 from ...render.cuda.rasterizer import CardPicture, CardSplats, CardView, draw_on_card
 from ..fit import Optimiser, slots_of
 from ..kernels import adam
-from ..nodes import FittedNodes, Index
-from ..pictures import LEAST_ERROR, FullDetailPicture
+from ..pictures import LEAST_ERROR, FittedNodes, FullDetailPicture, Index
 from . import kernels
 
 

@@ -165,9 +165,9 @@ def test_a_plot_shows_what_the_frame_had(tmp_path: Path, monkeypatch: pytest.Mon
 
     shown: list[charts.PathScene] = []
 
-    def drawn(rows: object, marked: object, title: str, scene: charts.PathScene) -> charts.Plot:
+    def drawn(rows: object, marked: object, title: str, scene: charts.PathScene) -> tuple[bytes, str | None]:
         shown.append(scene)
-        return charts.Plot(b"a plot", None)
+        return b"a plot", None
 
     monkeypatch.setattr(charts, "plot", drawn)
     slow = ("--bandwidth", "0.1Mbit", "--latency", "50ms")
