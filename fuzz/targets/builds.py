@@ -28,7 +28,7 @@ def make(rng: Rng) -> Case:
     output = "baked.spz"
     if rng.integers(4) == 0:
         output = pick(rng, ("baked.npz", "baked.bin"))
-        options += ["--encoding", pick(rng, tuple(ENCODINGS))]
+        options += ["--encoding", pick(rng, ENCODINGS)]
     else:
         options += ["--spz-version", pick(rng, ("2", "3"))]
         if rng.integers(3) == 0:

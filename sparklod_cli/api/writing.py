@@ -176,6 +176,6 @@ def _write_arrays(path: Path, scene: Scene, encoding: str, *, overwrite: bool, t
     out = Output(path, overwrite=overwrite)
     with naming(path, OF_FILES):
         arrays = pack(scene, encoding, threads=threads)
-    pieces = dump.encode_raw(arrays) if path.suffix.lower() in RAW_SUFFIXES else dump.encode_npz(arrays)
     with out:
-        return Written(path, encoding, out.write(path.name, pieces))
+        size = out.write(path.name, dump.encode(arrays, raw=path.suffix.lower() in RAW_SUFFIXES))
+        return Written(path, encoding, size)

@@ -164,7 +164,7 @@ def write_tree(tree: BuiltTree, encode: Encode, clock: Clock, threads: int, prog
         from ..codecs.gpu import dump
 
         arrays = dump.pack(tree.scene, settings.encoding, threads)
-        pieces = dump.encode_raw(arrays) if settings.raw else dump.encode_npz(arrays)
+        pieces = dump.encode(arrays, raw=settings.raw)
         with out:
             baked.bytes = out.write(out.target.name, pieces)
         baked.output_format, baked.arrays = settings.encoding, {name: words.shape for name, words in arrays.items()}

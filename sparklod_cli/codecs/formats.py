@@ -150,9 +150,8 @@ FORMATS = (
 #: The formats that can be written, by how the name of the file ends, see `Format.endings`.
 WRITABLE = {ending: form for form in FORMATS if form.writable for ending in form.endings}
 
-#: By the name that `--encoding` knows: the module in `gpu`, which has `dump(scene, *, threads)`, the arrays of
-#: words of a scene by their names; docs/formats/memory.md has their layout.
-ENCODINGS = {"packed": "packed_splats", "ext": "ext_splats", "lodtree": "lod_tree", "texture": "data_texture"}
+#: Layouts that `--encoding` knows, see `gpu.dump.pack`; docs/formats/memory.md has the arrays of each.
+ENCODINGS = ("packed", "ext", "lodtree", "texture")
 
 #: Layouts after which `gpu.lod_tree.nodes` measures nodes, as Spark does once it has loaded a file: ExtSplats,
 #: PackedSplats of a file that it loads whole, and those of a RAD file that it streams.

@@ -5,12 +5,11 @@ from __future__ import annotations
 import inspect
 import subprocess
 import sys
-from importlib import import_module
 
 import numpy as np
 import pytest
 
-from sparklod_cli.codecs.formats import ENCODINGS, FORMATS, WRITABLE, Format, ending_of
+from sparklod_cli.codecs.formats import FORMATS, WRITABLE, Format, ending_of
 from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
@@ -85,9 +84,3 @@ def test_tables_load_nothing_heavy() -> None:
         "assert not {'numpy', 'numba'} & set(sys.modules), 'heavy'"
     )
     subprocess.run([sys.executable, "-c", program], check=True)
-
-
-@pytest.mark.parametrize("name", ENCODINGS)
-def test_an_encoding_has_a_module_that_dumps(name: str) -> None:
-    module = import_module(f"sparklod_cli.codecs.gpu.{ENCODINGS[name]}")
-    assert parameters(module.dump) == {"scene": False, "threads": True}

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...model.gaussian import covariance
-from ...model.scene import Scene
 from ...model.splats import Splats
 from ...system.errors import FormatError
 from ...system.threads import for_blocks
@@ -58,11 +57,6 @@ def pack(splats: Splats, *, threads: int = 1) -> dict[str, Words]:
 
     for_blocks(encode, len(splats), threads)
     return {"texture": texture}
-
-
-def dump(scene: Scene, *, threads: int = 1) -> dict[str, Words]:
-    """Return the texture of a scene; it does not hold the children of a tree."""
-    return pack(scene.splats, threads=threads)
 
 
 def capacity(arrays: Mapping[str, NDArray[Any]]) -> int:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import zipfile
 from collections.abc import Iterator
-from importlib import import_module
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -15,30 +14,37 @@ from ...model.scene import Scene
 from ...system.errors import FormatError
 from ...system.untrusted import quoted, quoted_value
 from .. import rgba
-from ..formats import ENCODINGS
 from ..zip_folder import ZIP_ERRORS
+from . import data_texture, ext_splats, lod_tree, packed_splats
 
 Arrays = dict[str, NDArray[Any]]
 
 
 def pack(scene: Scene, encoding: str, threads: int = 1) -> Arrays:
-    """Return the arrays of a scene in one of `formats.ENCODINGS`, by name: uint32 words, see docs/formats/memory.md."""
-    module = import_module(f".{ENCODINGS[encoding]}", __package__)
-    arrays: Arrays = module.dump(scene, threads=threads)
-    return arrays
+    """Return the arrays of a scene in one of `formats.ENCODINGS`, by name: uint32 words, see docs/formats/memory.md.
+
+    Raises:
+        ValueError: the encoding is that of a tree, and the scene has none.
+    """
+    if encoding == "packed":
+        return packed_splats.pack(scene.splats, packed_splats.of_scene(scene), threads=threads)
+    if encoding == "ext":
+        return ext_splats.pack(scene.splats, threads=threads)
+    if encoding == "texture":  # which does not hold the children of a tree
+        return data_texture.pack(scene.splats, threads=threads)
+    if scene.tree is None:
+        raise ValueError("the scene has no tree")
+    return lod_tree.pack(scene.splats, scene.tree, threads=threads)
 
 
-def encode_npz(arrays: Arrays) -> Iterator[bytes]:
-    """Return the bytes of a .npz file of these arrays; the same arrays give the same bytes."""
+def encode(arrays: Arrays, *, raw: bool = False) -> Iterator[bytes]:
+    """Return the bytes of a .npz file, the same for the same arrays; or, if `raw`, their little-endian words alone."""
+    if raw:
+        yield from (words.astype("<u4", copy=False).tobytes() for words in arrays.values())
+        return
     file = io.BytesIO()
     np.savez(file, **arrays)  # type: ignore[arg-type]
     yield file.getvalue()
-
-
-def encode_raw(arrays: Arrays) -> Iterator[bytes]:
-    """Return the little-endian words of all the arrays, one after the other."""
-    for words in arrays.values():
-        yield words.astype("<u4", copy=False).tobytes()
 
 
 def decode_npz(file: BinaryIO) -> Arrays | None:

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...model.scene import Scene
 from ...model.splats import FloatArray, Splats
 from ...system.threads import for_blocks
 from .. import spark_codings
@@ -71,11 +70,6 @@ def pack(splats: Splats, *, threads: int = 1) -> dict[str, Words]:
 
     for_blocks(encode, len(splats), threads)
     return arrays
-
-
-def dump(scene: Scene, *, threads: int = 1) -> dict[str, Words]:
-    """Return the arrays of a scene, with or without a tree."""
-    return pack(scene.splats, threads=threads)
 
 
 def unpack(arrays: Mapping[str, NDArray[Any]], *, threads: int = 1) -> Splats:

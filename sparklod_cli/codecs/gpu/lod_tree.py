@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ...model.gaussian import size_factor, spark_size
 from ...model.lod_tree import MAX_CHILDREN, LodTree
-from ...model.scene import PLAIN, FileCoding, ScaleCoding, Scene
+from ...model.scene import PLAIN, FileCoding, ScaleCoding
 from ...model.splats import FloatArray, Splats
 from ...model.traversed import Nodes
 from ...system.errors import FormatError
@@ -57,13 +57,6 @@ def pack(splats: Splats, tree: LodTree, *, threads: int = 1) -> dict[str, Words]
 
     for_blocks(encode, len(splats), threads)
     return {"lod_tree": words}
-
-
-def dump(scene: Scene, *, threads: int = 1) -> dict[str, Words]:
-    """Return the words of a scene that is a tree; raises `ValueError` if it is none."""
-    if scene.tree is None:
-        raise ValueError("the scene has no tree")
-    return pack(scene.splats, scene.tree, threads=threads)
 
 
 def unpack(arrays: Mapping[str, NDArray[Any]]) -> Nodes:

@@ -84,11 +84,6 @@ def pack(splats: Splats, encoding: SplatEncoding = DEFAULT, *, threads: int = 1)
     return arrays
 
 
-def dump(scene: Scene, *, threads: int = 1) -> dict[str, Words]:
-    """Return the arrays of a scene, in the encoding of `of_scene`."""
-    return pack(scene.splats, of_scene(scene), threads=threads)
-
-
 def unpack(arrays: Mapping[str, NDArray[Any]], encoding: SplatEncoding = DEFAULT, *, threads: int = 1) -> Splats:
     """Return the splats of the arrays of `pack`; arrays of SH may be missing from the highest degree down.
 

@@ -262,7 +262,7 @@ class BuildLodOptions:
     encoding: str | None = setting(
         f"Write arrays in a viewer's memory layout instead: a {NPZ} file, or the words alone if FILE ends in"
         f" {' or '.join(RAW_SUFFIXES)}.",
-        tuple(ENCODINGS),
+        ENCODINGS,
         heading=FILE_FORMAT,
     )
     method: str | None = setting(
