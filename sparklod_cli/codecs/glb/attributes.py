@@ -87,14 +87,7 @@ def sh_attributes(degree: int) -> list[Attribute]:
 
 
 def attributes_of(names: Mapping[str, Any]) -> tuple[list[Attribute], int]:
-    """Return the attributes that the splats of a primitive are read from, and the SH degree of these.
-
-    Args:
-        names: of the attributes that the primitive has.
-
-    Raises:
-        FormatError: one is missing.
-    """
+    """Return the attributes that splats are read from, of those that a primitive names, and their SH degree."""
     chosen = [_named(each, names) or _drafted(each, names) for each in ATTRIBUTES]
     missing = [each.semantic for each, found in zip(ATTRIBUTES, chosen, strict=True) if found is None]
     if missing:
@@ -159,12 +152,7 @@ READ_AS_LOGS = (
 
 
 def are_logs(scales: FloatArray, generator: object) -> bool:
-    """Return whether scales are logarithms beyond doubt.
-
-    Args:
-        scales: (n, 3) values as the file has them, of splats from all over it.
-        generator: of the file.
-    """
+    """Return whether scales, (n, 3) values of splats from all over a file, are logarithms beyond doubt."""
     if isinstance(generator, str) and WRITERS.match(generator):
         return True
     negative = scales[scales < 0]
@@ -173,11 +161,10 @@ def are_logs(scales: FloatArray, generator: object) -> bool:
 
 
 def doubt_about(scales: FloatArray, centers: FloatArray, count: int) -> str | None:
-    """Return a note on linear scales that may be logarithms, all of them positive; None where nothing speaks for it.
+    """Return a note on positive scales that are read as linear and may be logarithms; None if they seem linear.
 
     Args:
-        scales, centers: (n, 3) values as the file has them, of splats from all over it.
-        count: all splats of the file.
+        scales, centers: (n, 3) values of splats from all over a file of `count` splats.
     """
     if count < LEAST or not (np.isfinite(scales).all() and np.isfinite(centers).all() and (scales > 0).all()):
         return None

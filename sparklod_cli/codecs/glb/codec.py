@@ -13,7 +13,6 @@ import dataclasses
 import io
 from collections import ChainMap
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
@@ -78,21 +77,9 @@ MAX_PARTS = 1 << 14
 #: Places of an accessor that are sampled, and values at each, to tell logarithms from scales. Chosen.
 PLACES, PLACE_ROWS = 64, 1 << 10
 
-#: Number of a mesh, and of a primitive of it.
+#: Number of a mesh, and of a primitive of it; and a primitive with the transform to the scene that its node has.
 Key = tuple[int, int]
-
-
-@dataclass(frozen=True, eq=False)
-class PlacedPrimitive:
-    """Primitive of splats, and where a node puts it.
-
-    Attributes:
-        key: of the primitive.
-        transform: to the scene.
-    """
-
-    key: Key
-    transform: Transform
+PlacedPrimitive = tuple[Key, Transform]
 
 
 def open_content(source: OpenFile) -> Reader:
@@ -114,17 +101,16 @@ def open_content(source: OpenFile) -> Reader:
     extras = asset.get("extras")
     noted = read_note({**(extras if isinstance(extras, dict) else {}), "generator": asset.get("generator")})
     if noted.up is not None:
-        if all(is_turn_of(part.transform, noted.up) for part in parts):
-            parts = [PlacedPrimitive(part.key, Transform()) for part in parts]
+        if all(is_turn_of(transform, noted.up) for _, transform in parts):
+            parts = [(key, Transform()) for key, _ in parts]
         else:
             noted = FileNote(noted.antialiased, problems=noted.problems)  # another program has turned it
     up, up_by = noted.axis_of("glTF")
     opened, contents, total = dict[Key, Reader](), list[Reader](), 0
-    for part in parts:
-        if part.key not in opened:
-            alone = len(parts) == 1
-            opened[part.key] = _opened(file, primitives[part.key], source, asset.get("generator"), alone=alone)
-        contents.append(placed(opened[part.key], part.transform))
+    for key, transform in parts:
+        if key not in opened:
+            opened[key] = _opened(file, primitives[key], source, asset.get("generator"), alone=len(parts) == 1)
+        contents.append(placed(opened[key], transform))
         total += contents[-1].count * 4 * width_of(contents[-1].sh_degree)
         check_promise(total, file.size)
     content = contents[0] if len(contents) == 1 else _joined(contents)
@@ -141,7 +127,6 @@ def open_content(source: OpenFile) -> Reader:
 
 
 def _primitives(file: GltfFile) -> dict[Key, dict[str, Any]]:
-    """Return the primitives of splats."""
     found = dict[Key, dict[str, Any]]()
     for number, mesh in enumerate(file.items("meshes")):
         primitives = mesh.get("primitives", [])
@@ -180,7 +165,7 @@ def _parts(file: GltfFile, primitives: Mapping[Key, dict[str, Any]]) -> tuple[li
     for node in having:
         record = nodes.records[node]
         transform = transform_of(nodes.matrix(node))
-        parts += [PlacedPrimitive(key, transform) for key in by_mesh[record["mesh"]]]
+        parts += [(key, transform) for key in by_mesh[record["mesh"]]]
         unknown |= dict.fromkeys(_extensions(record))
     if hidden:
         notes.append(f"left out: {count_of(hidden, 'node')} with splats outside of the scene that viewers show")
@@ -200,7 +185,7 @@ def _parts(file: GltfFile, primitives: Mapping[Key, dict[str, Any]]) -> tuple[li
     notes += left_out(
         "extension", "extensions", (name for name in unknown if name not in READ and not name.startswith(INDIFFERENT))
     )
-    return parts or [PlacedPrimitive(key, Transform()) for key in primitives], notes
+    return parts or [(key, Transform()) for key in primitives], notes
 
 
 def _opened(file: GltfFile, primitive: dict[str, Any], source: OpenFile, generator: object, *, alone: bool) -> Reader:
@@ -457,7 +442,6 @@ def _root(
     *,
     required: bool,
 ) -> dict[str, Any]:
-    """Return the JSON of a file with one mesh of one primitive, in one node."""
     note = note_of(antialiased=scene.antialiased, up=scene.up)
     asset = {"version": "2.0", "generator": note.pop("generator")} | ({"extras": note} if note else {})
     extensions = extensions_of(CESIUM if required else KHRONOS)

@@ -62,17 +62,11 @@ MAX_STRIDE = 252
 
 @dataclass(frozen=True)
 class Buffer:
-    """Place of the bytes that buffer views divide.
-
-    Attributes:
-        start, length: position in the file, and number of bytes.
-        name: of the file, from the folder of the JSON on; None for the file with the JSON.
-        data: the bytes themselves, where the JSON has them.
-    """
+    """Place of the bytes that buffer views divide: a part of a file, or data within the JSON."""
 
     start: int
     length: int
-    name: str | None = None
+    name: str | None = None  # from the folder of the JSON on; None for the file with the JSON
     data: bytes | None = None
 
 
@@ -82,15 +76,11 @@ Readers = Mapping[int, OpenFile]
 
 @dataclass(frozen=True)
 class Accessor:
-    """Values of an attribute in a buffer.
+    """`count` values of `width` components in a buffer.
 
     Attributes:
-        buffer: number of the buffer.
         offset: of the first value, in the file of the buffer.
-        stride: bytes from one to the next.
-        count: number of splats.
-        width: components of each.
-        dtype: of a component.
+        stride: bytes from one value to the next.
         normalized: integers mean 0..1, or -1..1.
     """
 
@@ -102,18 +92,9 @@ class Accessor:
     dtype: np.dtype[Any]
     normalized: bool
 
-    @property
-    def size(self) -> int:
-        """Bytes of one value."""
-        return self.width * self.dtype.itemsize
-
     def read(self, readers: Readers, start: int, stop: int) -> FloatArray:
-        """Return (stop - start, width) float32 values.
-
-        Raises:
-            TruncatedError: the file has become shorter.
-        """
-        length = (stop - start - 1) * self.stride + self.size
+        """Return (stop - start, width) float32 values."""
+        length = (stop - start - 1) * self.stride + self.width * self.dtype.itemsize
         data = readers[self.buffer].read_at(self.offset + start * self.stride, length)
         if len(data) < length:
             raise TruncatedError(f"cut short inside the values of splats {start:,} to {stop:,}")
@@ -126,11 +107,7 @@ class Accessor:
 
 
 class GltfFile:
-    """JSON of a glTF file, and its buffers, which are opened when they are needed.
-
-    Attributes:
-        is_binary: whether it is a GLB.
-        root: its JSON.
+    """A glTF file: `root`, its JSON, and its buffers, which are opened when they are needed.
 
     Raises:
         FormatError: the file is no glTF 2, or cut short.
@@ -163,7 +140,7 @@ class GltfFile:
             raise VersionError(f"glTF version {quoted_value(version)} is unknown, only {VERSION} is read")
 
     def _chunks(self, head: bytes) -> bytes:
-        """Return the JSON of a GLB, and note where its BIN chunk is."""
+        """Return the JSON of a GLB, and set where its BIN chunk is."""
         if len(head) < HEADER.size:
             raise TruncatedError("cut short inside its header")
         _, version, length = HEADER.unpack(head)
@@ -209,11 +186,8 @@ class GltfFile:
         named = {each.name: each.length for each in self._buffers.values() if each.name is not None}
         return self._size + sum(named.values())
 
-    def items(self, name: str) -> Iterator[dict[str, Any]]:
-        """Yield the objects of an array of the JSON, such as "nodes"."""
-        yield from self._array(name)
-
-    def _array(self, name: str) -> list[dict[str, Any]]:
+    def items(self, name: str) -> list[dict[str, Any]]:
+        """Return the objects of an array of the JSON, such as "nodes"."""
         if name not in self._arrays:
             found = self.root.get(name, [])
             if not isinstance(found, list) or not all(isinstance(each, dict) for each in found):
@@ -223,7 +197,7 @@ class GltfFile:
 
     def item(self, name: str, index: Any) -> Json:
         """Return an object of an array of the JSON by its number."""
-        found = self._array(name)
+        found = self.items(name)
         if isinstance(index, bool) or not isinstance(index, int) or not 0 <= index < len(found):
             raise FormatError(f"there is no {quoted_value(index)} among the {len(found):,} {name} of its JSON")
         return Json(found[index], Origin(f"{name}[{index}]", FormatError))
@@ -236,11 +210,7 @@ class GltfFile:
                 yield _name_of(uri)
 
     def buffer(self, index: Any) -> Buffer:
-        """Return a buffer, all of whose bytes are there.
-
-        Raises:
-            FormatError: its file cannot be opened, or is shorter than the buffer; its data are no base64.
-        """
+        """Return a buffer, all of whose bytes are there; `FormatError` otherwise."""
         record = self.item("buffers", index)
         if index not in self._buffers:
             found = self._found(index, record.value.get("uri"))
@@ -309,12 +279,9 @@ class GltfFile:
         """Return an accessor, all of whose values lie within its buffer view.
 
         Args:
-            index: in the JSON, whatever it is there.
-            kind: its type, such as "VEC3".
-            components: possible component types.
-
-        Raises:
-            FormatError: it is of another type, or reaches beyond its buffer view.
+            index: as the JSON has it, a number or anything else.
+            kind: expected type, such as "VEC3".
+            components: expected component types.
         """
         record = self.item("accessors", index)
         accessor = record.value
@@ -367,14 +334,7 @@ def _bytes(value: Json) -> int:
 
 
 def head_of(root: Mapping[str, Any], length: int) -> bytes:
-    """Return all that comes before the content of the BIN chunk.
-
-    Args:
-        length: bytes of that content, a multiple of 4.
-
-    Raises:
-        FormatError: the file would be too large for its header.
-    """
+    """Return the bytes before the content of the BIN chunk, which has `length` bytes, a multiple of 4."""
     text = json.dumps(root, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     total = HEADER.size + 2 * CHUNK.size + len(text) + length
@@ -406,14 +366,10 @@ SKEW = 1e-5
 
 
 class GltfNodes:
-    """Nodes of a glTF, and the scene that a viewer shows.
-
-    Raises:
-        FormatError: the nodes are linked in a circle.
-    """
+    """Nodes of a glTF, and the scene that a viewer shows."""
 
     def __init__(self, file: GltfFile) -> None:
-        self.records = list(file.items("nodes"))
+        self.records = file.items("nodes")
         self._parent: dict[int, int] = {}
         for number, node in enumerate(self.records):
             children = node.get("children", [])
@@ -443,11 +399,7 @@ class GltfNodes:
         return (shown, len(having) - len(shown)) if shown else (having, 0)
 
     def matrix(self, number: int) -> Matrix:
-        """Return the (4, 4) matrix from a node to the scene, for column vectors.
-
-        Raises:
-            FormatError: a number of it is beyond `LARGEST`, or a node above has no transform that can be read.
-        """
+        """Return the (4, 4) matrix from a node to the scene, for column vectors."""
         for each in self._down_to(number, self._matrices):
             own, parent = _matrix(self.records[each]), self._parent.get(each)
             self._matrices[each] = own if parent is None else product(self._matrices[parent], own)
@@ -468,7 +420,7 @@ class GltfNodes:
 
 def _roots_of_scene(file: GltfFile) -> frozenset[int]:
     """Return the roots of the scene that a viewer shows, the first unless the file says otherwise."""
-    scenes = list(file.items("scenes"))
+    scenes = file.items("scenes")
     number = file.root.get("scene", 0)
     if type(number) is not int or not 0 <= number < len(scenes):
         return frozenset()
@@ -477,11 +429,7 @@ def _roots_of_scene(file: GltfFile) -> frozenset[int]:
 
 
 def product(outer: Matrix, inner: Matrix) -> Matrix:
-    """Return the product of two (4, 4) matrices for column vectors.
-
-    Raises:
-        FormatError: a number of it is not finite, or beyond `LARGEST`.
-    """
+    """Return the product of two (4, 4) matrices; `FormatError` if a number of it is not finite or beyond `LARGEST`."""
     with np.errstate(all="ignore"):
         matrix = outer @ inner
         if not (np.abs(matrix) <= LARGEST).all():

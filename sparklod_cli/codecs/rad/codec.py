@@ -85,8 +85,8 @@ class Palette:
 
     Attributes:
         codes: (codes, K, 3) coefficients, as many codes as the first chunk has splats: Spark reads no other number.
-        used: how many of them are codes; the others, behind them, are 0.
-        labels: (N,) the code of each splat; None where it is searched for in each chunk.
+        used: codes in use; the others, behind them, are 0.
+        labels: (N,) the code of each splat; None if it is searched for in each chunk.
     """
 
     codes: FloatArray
@@ -130,12 +130,11 @@ class RadEncoder(Encoder):
 
     @property
     def _codes(self) -> SplatEncoding:
-        """The ranges of the codes."""
         assert self.options.rad.ranges is not None
         return self.options.rad.ranges
 
     def codes(self, splats: Splats, tree: LodTree | None, start: int) -> Encoded:
-        """Encode a chunk: its bytes, and how many they are."""
+        """Encode a chunk: its bytes, and their number."""
         chunk = np.frombuffer(self._chunk(splats, tree, start), np.uint8)
         return {CHUNK: chunk, SIZE: np.array([len(chunk)])}
 
@@ -160,7 +159,6 @@ class RadEncoder(Encoder):
 
     @property
     def _header(self) -> RadHeader:
-        """The header of the file, without its chunks."""
         codes = None if self.palette is None else len(self.palette.codes)
         comment = comment_of(antialiased=self.antialiased, up=self.up)
         return RadHeader(self.count, self.sh_degree, self.tree, CHUNK_NODES, 0, (), self._codes, codes, comment)
@@ -187,7 +185,6 @@ class RadEncoder(Encoder):
         return CodedProperty(encoding, codes, *((low, high) if CODINGS[encoding].ends else (None, None)))
 
     def _rows(self, *, first: bool) -> Iterator[Row]:
-        """Yield the properties of a chunk."""
         for row in PROPERTIES:
             if row.degree:
                 own = row.codes and first if self.palette is not None else not row.codes
@@ -233,10 +230,7 @@ class RadEncoder(Encoder):
         return kept
 
     def _deflated(self, codes: NDArray[Any], encoding: str) -> bytes:
-        """Compress codes to a raw deflate stream.
-
-        Of codes of a byte, only runs are looked for: longer matches are chance, which makes them longer and slower.
-        """
+        # Of codes of a byte, only runs are searched for: longer matches are chance, and make streams longer and slower.
         strategy = zlib_ng.Z_RLE if CODINGS[encoding].size == 1 else zlib_ng.Z_DEFAULT_STRATEGY
         packer = zlib_ng.compressobj(
             self.options.compression_level, zlib_ng.DEFLATED, _RAW, zlib_ng.DEF_MEM_LEVEL, strategy
@@ -252,14 +246,7 @@ def encoder(
     threads: int = 1,
     progress: Progress = silent,
 ) -> RadEncoder:
-    """Return the encoder of a scene; finds its palette, if there is to be one.
-
-    Args:
-        scene: of which nothing is read but what the palette is made of.
-
-    Raises:
-        ValueError: the options are not settled.
-    """
+    """Return the encoder of a scene, of which only the splats for a palette are read."""
     if options.rad.ranges is None:
         raise ValueError("the options leave choices open; `settled` makes them")
     bare, codes = RadEncoder.of(scene, options, ranges), options.rad.sh_codes
@@ -292,9 +279,6 @@ def encode(
 
     The same scene and options give the same bytes for any number of threads. Nodes keep their order; that of
     `lod.chunk_order` is for streaming.
-
-    Raises:
-        FormatError, ValueError: see `rad_options.settled`.
     """
     of_scene = encoder(scene, settled(scene, options), threads=threads, progress=progress)
     with tempfile.SpooledTemporaryFile(SPOOLED) as file:
@@ -306,11 +290,7 @@ def encode(
 def encode_chunked(
     scene: Scene, options: WriteOptions, stem: str, *, threads: int = 1, progress: Progress = silent
 ) -> Files:
-    """Return the name and the bytes of each file of a scene with a file a chunk, see `RadEncoder.files`.
-
-    Raises:
-        FormatError, ValueError: see `rad_options.settled`.
-    """
+    """Return the name and the bytes of each file of a scene with a file a chunk, see `RadEncoder.files`."""
     of_scene = encoder(scene, settled(scene, options), threads=threads, progress=progress)
     windows = results(of_scene, scene, threads, progress, "writing")
     yield from of_scene.files((window[CHUNK].tobytes() for window in windows), stem)
@@ -318,11 +298,9 @@ def encode_chunked(
 
 @dataclass(frozen=True, eq=False)
 class StoredChunk:
-    """Codes of a chunk.
+    """Codes of a chunk whose first node is `start`.
 
     Attributes:
-        start: its first node.
-        properties: by name.
         codes: (n, ...) of the properties of splats, by name: the bytes of each splat, of differences their sums.
     """
 
@@ -341,7 +319,7 @@ class StoredRad:
     def like(self, options: WriteOptions) -> WriteOptions:
         """Return the options, and where they leave a choice open, that of the first chunk of the file.
 
-        How centres are rounded stays open where the encoding is that of "auto": it matters for merged splats.
+        The rounding of centres stays open where the encoding is that of "auto": it matters for merged splats.
         """
         rad = options.rad
         found = encodings_of(self.chunks[0].properties.values())
@@ -352,7 +330,6 @@ class StoredRad:
         return dataclasses.replace(options, rad=dataclasses.replace(rad, **chosen, ranges=ranges))
 
     def _ranges(self) -> SplatEncoding:
-        """Return the ranges of the codes of the first chunk."""
         ranges, properties = self.header.encoding or SplatEncoding(lod_opacity=True), self.chunks[0].properties
         for name, low, high in (("rgb", "rgb_min", "rgb_max"), ("scales", "ln_scale_min", "ln_scale_max")):
             each = properties.get(name)
@@ -362,7 +339,7 @@ class StoredRad:
         return ranges
 
     def keeping(self, encoder: RadEncoder, unchanged: NDArray[np.bool_]) -> KeepingEncoder:
-        """Return an encoder of as many nodes that gives some the codes of the file, where its encoding is the same."""
+        """Return an encoder that gives (N,) `unchanged` nodes the codes of the file, where its encoding is the same."""
         given = {each.name: getattr(encoder, each.name) for each in dataclasses.fields(RadEncoder)}
         return KeepingEncoder(**given, stored=self, unchanged=unchanged)
 
@@ -370,20 +347,20 @@ class StoredRad:
         """Return a property of some nodes and (n, ...) their codes; None where its coding differs between chunks."""
         found, codes = [], []
         for chunk in self.chunks:
-            some = chunk.codes.get(name)
+            own = chunk.codes.get(name)
             part = slice(max(start - chunk.start, 0), max(stop - chunk.start, 0))
-            if some is None:
+            if own is None:
                 return None
-            if len(some[part]):
+            if len(own[part]):
                 found.append(chunk.properties[name])
-                codes.append(some[part])
+                codes.append(own[part])
         if len({(each.encoding, each.min, each.max) for each in found}) != 1:
             return None
         return found[0], np.concatenate(codes)
 
 
 def stored(file: BinaryIO, *, open_companion: OpenCompanion | None = None) -> StoredRad:
-    """Read the codes of a file and of those that it names; raises `FormatError` as `RadReader.open`."""
+    """Read the codes of a file and of the files that it names."""
     reader, chunks = RadReader.open(file, open_companion), []
     for packed in reader.packed():
         count, properties = packed.header.count, {each.name: each for each in packed.header.properties}
@@ -407,7 +384,7 @@ class KeepingEncoder(RadEncoder):
     def coded(
         self, row: Row, splats: Splats, tree: LodTree | None, labels: NDArray[np.uint32] | None, start: int
     ) -> CodedProperty:
-        """Encode a property of a chunk in the range that it had."""
+        """Encode a property of a chunk in its former range."""
         made, stop = super().coded(row, splats, tree, labels, start), start + len(splats)
         found = None if self.stored is None else self.stored.codes(row.name, start, stop)
         if found is None or found[0].encoding != made.encoding:
@@ -427,7 +404,6 @@ def _flat(codes: NDArray[Any], encoding: str, count: int) -> Bytes:
 
 
 def _stored(flat: Bytes, encoding: str, count: int) -> Bytes:
-    """Return the bytes of a property as they are stored."""
     if not _differs(encoding):
         return flat
     planes = flat.reshape(-1, count)

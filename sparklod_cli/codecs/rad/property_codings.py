@@ -182,13 +182,12 @@ class Row(NamedTuple):
     """A property.
 
     Attributes:
-        name: in the file.
         option: the field of `RadOptions` that chooses its encoding; empty where there is no choice.
         column: of `Splats` or `LodTree`; "labels" for those of the palette.
         numbers: of a splat.
         encodings: that it may be in; the first is the one that Spark writes.
-        degree: of spherical harmonics; 0 for what is none of them.
-        codes: whether it is a part of the palette of spherical harmonics, of which only the first chunk has one.
+        degree: of spherical harmonics; 0 for other properties.
+        codes: whether it is a part of the palette of spherical harmonics, which only the first chunk has.
     """
 
     name: str

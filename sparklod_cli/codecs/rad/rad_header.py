@@ -124,11 +124,9 @@ class Property:
 
     Attributes:
         offset: from the beginning of the payload.
-        bytes: as stored.
-        name: one of `property_codings.PROPERTIES`, as far as it is known.
-        encoding: one of `property_codings.CODINGS`, as far as it is known.
-        compression: "gz" for a raw deflate stream, None for none.
-        min, max: ends of the range of the codes; None where there is none.
+        name: one of `property_codings.PROPERTIES`, or unknown.
+        encoding: one of `property_codings.CODINGS`, or unknown.
+        min, max: ends of the range of the codes; None without a range.
     """
 
     offset: int
@@ -169,16 +167,12 @@ class RadChunkHeader:
 
 
 def padding(size: int) -> int:
-    """Return how many zeros follow `size` bytes."""
+    """Return the number of zeros after `size` bytes."""
     return -size % ALIGNMENT
 
 
 def read_header(file: BinaryIO) -> RadHeader:
-    """Read the header of a file, and nothing behind it; the file is left where its first chunk would begin.
-
-    Raises:
-        FormatError: it is not that of a RAD file, cut short, or lacks something; what it promises is not checked.
-    """
+    """Read the header of a file, up to its first chunk; its promises are not checked, see `rad_rules`."""
     fields, size, zeros = _read_json(file, MAGIC, MAX_JSON, "RAD header")
     if fields.text("type") != TYPE:
         raise NotSplatsError(f"a RAD file of {quoted_value(fields.text('type'))}, not of {TYPE}")
@@ -203,7 +197,7 @@ def read_header(file: BinaryIO) -> RadHeader:
 
 
 def read_chunk_header(file: BinaryIO) -> RadChunkHeader:
-    """Read the header of a chunk; the file is left at its payload; raises `FormatError` as for `read_header`."""
+    """Read the header of a chunk, up to its payload."""
     fields, size, zeros = _read_json(file, CHUNK_MAGIC, MAX_CHUNK_JSON, "header of a RAD chunk")
     stored = file.read(PAYLOAD.size)
     if len(stored) < PAYLOAD.size:
@@ -294,7 +288,7 @@ def _encoding_fields(encoding: SplatEncoding | None) -> dict[str, float | bool] 
 
 
 def _read_json(file: BinaryIO, magic: bytes, limit: int, subject: str) -> tuple[Json, int, bool]:
-    """Read the JSON after a magic word, how many bytes it takes with its padding, and whether that is zeros."""
+    """Read the JSON after a magic word; also return its bytes with the padding, and whether that is zeros."""
     prefix = file.read(PREFIX.size)
     if len(prefix) < PREFIX.size:
         raise TruncatedError(f"cut short inside the {subject}")
@@ -316,7 +310,7 @@ def _read_json(file: BinaryIO, magic: bytes, limit: int, subject: str) -> tuple[
 
 
 def _encoding(fields: Json) -> SplatEncoding | None:
-    """Return the ranges of the codes, where the header has them; what it leaves out is Spark's default."""
+    """Return the ranges of the codes, if the header has them; missing ones are Spark's defaults."""
     if not fields.has("splatEncoding"):
         return None
     given: dict[str, Any] = {
@@ -337,12 +331,7 @@ def in_one_file(header: RadHeader, sizes: Sequence[int], chunks: Iterable[bytes]
 
 
 def in_files(header: RadHeader, chunks: Iterable[bytes], stem: str) -> Files:
-    """Return the files of a scene whose chunks are files of their own.
-
-    Args:
-        header, chunks: as for `in_one_file`.
-        stem: of the names: the header's is "stem.rad", and those of the chunks are "stem-0.radc" and so on.
-    """
+    """Return the files of a scene with a file a chunk, "stem-0.radc" and so on, and the header, "stem.rad"."""
     entries = list[RadChunkEntry]()
     for number, chunk in enumerate(chunks):
         entries.append(RadChunkEntry(0, len(chunk), rad_chunk_name(stem, number)))

@@ -69,16 +69,12 @@ def needed(options: WriteOptions) -> frozenset[str]:
 
 
 def _rounds(rad: RadOptions) -> bool:
-    """Return True if it is left open how centres are rounded."""
+    """Return whether the rounding of centres is left open."""
     return rad.center == AUTO and rad.center_bits is None
 
 
 def settled(scene: Scene | Statistics, options: WriteOptions) -> WriteOptions:
-    """Return the options with nothing left open: `encode` writes the scene with them.
-
-    Raises:
-        FormatError: there are more splats than the format can number, or centres as float16 do not reach far enough.
-    """
+    """Return the options with nothing left open; `FormatError` if they or the format cannot hold the scene."""
     rad = options.rad
     statistics = scene if isinstance(scene, Statistics) else Statistics.of_scene(scene, needed(options))
     if statistics.count >= 1 << 32:

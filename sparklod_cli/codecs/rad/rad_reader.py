@@ -44,7 +44,7 @@ from .rad_rules import broken
 
 @contextlib.contextmanager
 def file_of(entry: RadChunkEntry, file: BinaryIO, open_companion: OpenCompanion | None) -> Iterator[BinaryIO]:
-    """Open the file that has a chunk: `file`, which has the header, or one that is closed afterwards."""
+    """Open the file that has a chunk: `file`, which has the header, or one of its own."""
     if entry.filename is None:
         yield file
         return
@@ -70,14 +70,7 @@ def bytes_of(entry: RadChunkEntry, header: RadHeader, file: BinaryIO) -> bytes:
 
 @dataclass(frozen=True, eq=False)
 class RadReader:
-    """RAD file whose header has been read and checked.
-
-    Attributes:
-        header: of the file.
-        file: open for reading.
-        open_companion: opens the files that the header names.
-        palette: (codes, K, 3) of SH; None without one.
-    """
+    """RAD file whose header has been read and checked; `palette` is (codes, K, 3) of SH, None without one."""
 
     header: RadHeader
     file: BinaryIO
@@ -122,11 +115,11 @@ class RadReader:
         return {} if first is None else encodings_of(first.header.properties)
 
     def in_one_file(self) -> Iterator[bytes]:
-        """Return the bytes of one file that holds all chunks as they stand."""
+        """Return the bytes of one file that holds all chunks unchanged."""
         return in_one_file(self.header, [entry.bytes for entry in self.header.chunks], self.raw())
 
     def in_files(self, stem: str) -> Files:
-        """Return a file for each chunk as it stands, and their header; see `rad_header.in_files`."""
+        """Return a file for each unchanged chunk, and their header; see `rad_header.in_files`."""
         return in_files(self.header, self.raw(), stem)
 
     def first(self) -> PackedChunk | None:
@@ -141,11 +134,7 @@ class RadReader:
                 yield bytes_of(entry, self.header, source)
 
     def packed(self, numbers: range | None = None) -> Iterator[PackedChunk]:
-        """Read chunks, all by default, when they are asked for.
-
-        Raises:
-            FormatError: a chunk is cut short, or not the one that the header means.
-        """
+        """Read chunks, all by default, when they are asked for."""
         numbers = range(len(self.header.chunks)) if numbers is None else numbers
         for number, data in zip(numbers, self.raw(numbers), strict=True):
             yield PackedChunk.of(data, number, self.header)
@@ -162,10 +151,7 @@ class RadReader:
 
         Args:
             target: rows to fill; None for new ones.
-            thorough: unpack the other columns, too, which finds what is corrupt.
-
-        Raises:
-            FormatError: the chunk is corrupt.
+            thorough: unpack the other columns, too, which finds corrupt ones.
         """
         splats, tree = target or _new_rows(packed.header.count, self.header)
         if fill(packed, self.header, splats, tree, self.palette, columns, thorough=thorough) is not None:
@@ -194,7 +180,6 @@ class RadReader:
         return FileCoding(tuple(scales), self.header.chunk_size, packed_range)
 
     def content(self) -> Reader:
-        """Return the content of the file."""
         header, size = self.header, self.header.chunk_size
         codings = [ScaleCoding()] * max(len(header.chunks), 1)
 
@@ -278,11 +263,7 @@ def read_chunk(file: BinaryIO, entry: RadChunkEntry, header: RadHeader, palette:
 
 
 def count_leaves(file: BinaryIO, header: RadHeader, open_companion: OpenCompanion | None) -> int:
-    """Return the number of leaves of a tree, of which only the numbers of children are read.
-
-    Raises:
-        FormatError: a chunk is cut short, corrupt, or not the one that the header means.
-    """
+    """Return the number of leaves of a tree, of which only the numbers of children are read."""
     leaves = 0
     for number, entry in enumerate(header.chunks):
         with file_of(entry, file, open_companion) as source:
@@ -301,11 +282,7 @@ def count_leaves(file: BinaryIO, header: RadHeader, open_companion: OpenCompanio
 
 
 def scan_header(file: BinaryIO, open_companion: OpenCompanion) -> tuple[RadHeader, list[RuleViolation]]:
-    """Read the header of a file, and return it with its violations, those about the files of chunks among them.
-
-    Raises:
-        FormatError: the header cannot be read.
-    """
+    """Read the header of a file, and its violations, those about the files of chunks among them."""
     size = size_of(file)
     header = read_header(file)
     sizes = {name: _size_or_reason(name, open_companion) for name in header.filenames}
@@ -361,7 +338,7 @@ def _check_promise(count: int, header: RadHeader, size: int) -> None:
 
 @dataclass(frozen=True)
 class PackedChunk:
-    """Chunk as it stands in the file: number from 0, its own header, which is checked, and the payload after that."""
+    """Chunk of a file: number from 0, its own header, which is checked, and the payload after that."""
 
     number: int
     header: RadChunkHeader
@@ -369,32 +346,19 @@ class PackedChunk:
 
     @classmethod
     def of(cls, data: bytes, number: int, header: RadHeader) -> PackedChunk:
-        """Parse the header of a chunk.
-
-        Raises:
-            FormatError: its header is broken, or breaks a fatal rule of `rad_rules`.
-        """
+        """Parse the header of a chunk; `FormatError` if it breaks a fatal rule of `rad_rules`."""
         chunk = read_chunk_header(io.BytesIO(data))
         check_rules(rad_rules.chunk_violations(header, number, chunk, len(data)))
         return cls(number, chunk, memoryview(data)[chunk.bytes :])
 
-    def property(self, name: str) -> Property | None:
-        """Return a property by its name; None where the chunk has none."""
-        return next((each for each in self.header.properties if each.name == name), None)
-
     def scale_coding(self) -> ScaleCoding:
-        """Return how the chunk holds its scales."""
-        scales = self.property("scales")
+        scales = next((each for each in self.header.properties if each.name == "scales"), None)
         if scales is None or not scales.encoding.startswith("ln_"):
             return ScaleCoding()
         return ScaleCoding(scales.encoding, scales.min or 0.0, scales.max or 0.0)
 
     def palette(self, header: RadHeader) -> FloatArray | None:
-        """Return (codes, K, 3) SH coefficients that labels point to; None where the chunk has no palette.
-
-        Raises:
-            FormatError: it is corrupt, or of another size than the header says.
-        """
+        """Return (codes, K, 3) SH coefficients that labels point to; None where the chunk has no palette."""
         codes = {row.degree: each for each in self.header.properties if (row := BY_NAME[each.name]).codes}
         if not codes:
             return None
@@ -406,25 +370,19 @@ class PackedChunk:
         return palette
 
     def values(self, each: Property, row: Row, count: int) -> NDArray[Any]:
-        """Decode a property to (count, numbers) values.
-
-        Raises:
-            FormatError: it is corrupt, or has more or fewer bytes than that takes.
-        """
-        low = 0.0 if each.min is None else each.min
-        high = 0.0 if each.max is None else each.max
-        codes = self.unpacked(each, row, count)
-        return CODINGS[each.encoding].decode(codes, count, row.numbers, low, high)
+        """Decode a property to (count, numbers) values."""
+        low, high = (0.0 if end is None else end for end in (each.min, each.max))
+        return CODINGS[each.encoding].decode(self.unpacked(each, row, count), count, row.numbers, low, high)
 
     def unpacked(self, each: Property, row: Row, count: int) -> Bytes:
-        """Return the bytes of a property; raises `FormatError` as `values`."""
+        """Return the bytes of a property; `FormatError` if it is corrupt, or has more or fewer than it should."""
         expected = count * row.numbers * CODINGS[each.encoding].size
         data = self.payload[each.offset : each.offset + each.bytes]
         subject = f"{each.name} of chunk {self.number:,}"
         if each.compression is not None:
             unpacker = raw_unpacker()
             try:
-                data = unpacker.decompress(data, expected + 1)  # a byte more, which tells what is too long
+                data = unpacker.decompress(data, expected + 1)  # a byte more, to find what is too long
             except ERRORS:
                 raise FormatError(f"corrupt data in {subject}") from None
             if len(data) == expected and not unpacker.eof:
@@ -454,18 +412,11 @@ def fill(
     *,
     thorough: bool = True,
 ) -> NDArray[np.uint32] | None:
-    """Decode a chunk.
+    """Decode these columns of a chunk, and return its (N,) labels of SH if it has some and `palette` is None.
 
     Args:
-        splats: as many as the chunk has; other columns are left as they are.
-        palette: of SH that labels point to; None where it is not known, which leaves SH at 0.
-        thorough: unpack the others, too, which finds what is corrupt.
-
-    Returns:
-        (N,) labels, where the chunk has some, and no palette was given.
-
-    Raises:
-        FormatError: a property is corrupt, or a label is beyond the palette.
+        palette: of SH that labels point to; None if it is not known, which leaves SH at 0.
+        thorough: unpack the other columns, too, which finds corrupt ones.
     """
     count, labels = packed.header.count, None
     present = {each.name for each in packed.header.properties}
@@ -508,7 +459,7 @@ def _fill_column(splats: Splats, row: Row, values: NDArray[Any]) -> None:
 
 
 def _set_defaults(present: Collection[str], splats: Splats, tree: LodTree | None, columns: Collection[str]) -> None:
-    """Give the columns of missing properties what a viewer's arrays begin with: 0, and no rotation."""
+    """Give the columns of missing properties the initial values of a viewer's arrays: 0, and no rotation."""
     for row in BY_NAME.values():
         if row.name in present or row.codes or row.column == "labels":
             continue

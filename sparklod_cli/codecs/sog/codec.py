@@ -12,8 +12,7 @@ import json
 import math
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,17 +48,11 @@ MAX_SPLATS = 1 << 28
 RED_GREEN_BLUE, ALPHA = np.array([16, 8, 0], np.uint32), np.array([24], np.uint32)
 
 
-@dataclass(frozen=True)
-class Step:
-    """Decoding of an image.
-
-    Attributes:
-        texture, index: of the image.
-        fill: called with rows of a scene and their pixels; returns what is wrong with their values, or None.
-    """
+class Step(NamedTuple):
+    """Decoding of an image, by its texture and number: `fill` fills rows by their pixels, and may return a problem."""
 
     texture: str
-    index: int
+    number: int
     fill: Callable[[Splats, Pixels], str | None]
 
 
@@ -89,12 +82,12 @@ def open_content(source: OpenFile) -> Reader:
     center_tables = codings.center_table(*_ends(meta, "means", 3))
 
     def in_order() -> list[Step]:
-        """Return the steps, the largest first, so that no thread is left alone with it; SH labels need the palette."""
-        return sorted(steps, key=lambda step: (step.texture == "shN", -files.bytes_of(step.texture, step.index)))
+        """Sort the steps, the largest first, so that no thread is left alone with it; SH labels need the palette."""
+        return sorted(steps, key=lambda step: (step.texture == "shN", -files.bytes_of(step.texture, step.number)))
 
     def unpacked() -> Iterator[bytes]:
         for step in in_order():
-            yield files.pixels(step.texture, step.index, count).tobytes()
+            yield files.pixels(step.texture, step.number, count).tobytes()
 
     def fill(target: Target, threads: int, progress: Progress) -> None:
         if palette is not None:
@@ -104,7 +97,7 @@ def open_content(source: OpenFile) -> Reader:
         def work(item: tuple[int, Step]) -> None:
             number, step = item
             if scratch is None:
-                pixels = files.pixels(step.texture, step.index, count)
+                pixels = files.pixels(step.texture, step.number, count)
             else:
                 data = scratch.read_at(4 * (number * count + target.start), 4 * len(target.splats))
                 pixels = np.frombuffer(data, np.uint32)
@@ -191,11 +184,7 @@ def _codebook(meta: Json, name: str) -> FloatArray:
 
 
 class SogPalette:
-    """Palette of SH, decoded when it is needed: K coefficients of each entry, and the number of entries.
-
-    Raises:
-        FormatError: its header, or what meta.json says of it, is wrong.
-    """
+    """Palette of SH, decoded when it is needed: K coefficients of each entry, and the number of entries."""
 
     def __init__(self, files: SogFiles, version: int) -> None:
         width, height = files.sides("shN", 0, MAX_PALETTE * COEFFICIENTS[3])
@@ -251,9 +240,8 @@ LARGEST_COLOR = 1e15
 Order = NDArray[np.intp]
 
 
-@dataclass(frozen=True)
-class Texture:
-    """Texture: what meta.json says of it besides the names of its files, and the image of each of these."""
+class Texture(NamedTuple):
+    """Texture: its facts for meta.json, without the names of its files, and the image of each of these."""
 
     facts: Mapping[str, Any]
     images: Sequence[Texels]
@@ -266,7 +254,7 @@ def codes_for(count: int) -> int:
 
 
 def settled(scene: Scene, options: WriteOptions) -> WriteOptions:
-    """Return the options with nothing left open: `encode` writes the scene with them.
+    """Return the options with nothing left open.
 
     Raises:
         FormatError: the scene has a tree or no splats, or values that SOG cannot hold: opacities above 1, more splats
@@ -305,13 +293,7 @@ def _check(splats: Splats) -> None:
 def encode(
     scene: Scene, options: WriteOptions = DEFAULTS, *, threads: int = 1, progress: Progress = silent
 ) -> Iterator[bytes]:
-    """Return the bytes of a bundled SOG, piece by piece: the same for any number of threads.
-
-    Splats are in Morton order.
-
-    Raises:
-        FormatError, ValueError: see `settled`.
-    """
+    """Return the bytes of a bundled SOG, piece by piece: the same for any number of threads, in Morton order."""
     yield from zipped(encode_files(scene, options, threads=threads, progress=progress))
 
 
@@ -325,7 +307,7 @@ def encode_files(
 ) -> Iterator[tuple[str, bytes]]:
     """Return the files of an unbundled SOG: the name of each, and its bytes; meta.json is last.
 
-    Splats are in Morton order, or `in_order` in their own; other arguments and errors are those of `encode`.
+    Splats are in Morton order, or `in_order` in their own.
     """
     options = settled(scene, options)
     splats = scene.splats
@@ -363,7 +345,6 @@ def encode_files(
 
 
 def _per_splat(texels: Texels) -> Texels:
-    """Return the image of (N, C) texels, one for each splat."""
     return image_of(texels, *size_for(len(texels)))
 
 

@@ -8,8 +8,7 @@ import math
 import struct
 import zipfile
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
-from typing import IO, BinaryIO
+from typing import IO, BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,13 +51,8 @@ MOST_BEFORE = 16
 ANIMATED = 2
 
 
-@dataclass(frozen=True)
-class WebPHeader:
-    """First bytes of a WebP file, `start`, and the width and height in pixels in them.
-
-    Attributes:
-        lossy: its pixels are not those that were encoded.
-    """
+class WebPHeader(NamedTuple):
+    """First bytes of a WebP file, `start`, and what they say of its pixels."""
 
     start: bytes
     width: int
@@ -67,11 +61,7 @@ class WebPHeader:
 
 
 def read_header(read: Read, name: str) -> WebPHeader:
-    """Read the header of a file: its first chunk, of one of three kinds, and of an extended one those up to the pixels.
-
-    Raises:
-        FormatError: it is no still WebP image.
-    """
+    """Read the header of a still WebP image: its first chunk; in an extended file, all chunks up to the pixels."""
     data = read(START)
     kind = data[12:16] if data[:4] == b"RIFF" and data[8:12] == b"WEBP" and len(data) == START else b""
     if kind == b"VP8X":  # 24 bits each, minus one
@@ -90,7 +80,7 @@ def read_header(read: Read, name: str) -> WebPHeader:
 
 
 def _up_to_pixels(data: bytes, read: Read) -> tuple[bytes, bool]:
-    """Read the chunks up to that of the pixels, and return all bytes so far, and whether the pixels are lossy."""
+    """Read the chunks up to the pixels; return all bytes so far, and whether the pixels are lossy."""
     for _ in range(MOST_BEFORE):
         head = read(8)
         data += head
@@ -102,12 +92,9 @@ def _up_to_pixels(data: bytes, read: Read) -> tuple[bytes, bool]:
 
 
 def pixels_of(header: WebPHeader, read: Read, name: str) -> Pixels:
-    """Return (width * height,) pixels, row by row, of a file whose sides are known to be in bounds.
+    """Return (width * height,) pixels, row by row, of a file whose sides are in bounds: libwebp allocates them.
 
-    libwebp asks for memory by them; `read` gives what comes after the header.
-
-    Raises:
-        FormatError: libwebp refuses the file, or its image is not complete.
+    `read` returns the bytes after the header.
     """
     data = header.start + b"".join(iter(lambda: read(PIECE), b""))
     try:
@@ -120,7 +107,7 @@ def pixels_of(header: WebPHeader, read: Read, name: str) -> Pixels:
 
 
 def size_for(count: int) -> tuple[int, int]:
-    """Return width and height of the image that holds so many splats: about a square."""
+    """Return width and height of the image for a number of splats: about a square."""
     width = STEP * math.ceil(math.sqrt(count) / STEP)
     return width, STEP * math.ceil(count / width / STEP)
 
@@ -133,7 +120,7 @@ def image_of(texels: Texels, width: int, height: int) -> Texels:
 
 
 def encode_webp(image: Texels) -> bytes:
-    """Encode a file of (height, width, 3 or 4) texels, in which colours of alpha 0 stay what they are."""
+    """Encode a file of (height, width, 3 or 4) texels, which keeps colours of alpha 0."""
     file = io.BytesIO()
     Image.fromarray(image).save(file, "WEBP", lossless=True, exact=True, quality=QUALITY, method=METHOD)
     return file.getvalue()
@@ -155,11 +142,7 @@ LARGEST = 1e38
 
 
 def parse_meta(data: bytes) -> Json:
-    """Parse a meta.json.
-
-    Raises:
-        FormatError: it is not JSON, or not that of a SOG.
-    """
+    """Parse the meta.json of a SOG."""
     meta = Json.parse(data, Origin(META, FormatError), most=MAX_META)
     if not isinstance(meta.value, dict) or meta.value.keys().isdisjoint(("means", "quats")):
         raise NotSplatsError(f"its {META} is not that of a SOG")
@@ -173,13 +156,13 @@ def has(meta: Json, key: str) -> bool:
 
 
 def image_names(meta: Json) -> list[str]:
-    """Return the images of a scene that a meta.json names, texture by texture; `FormatError` if it lacks one."""
+    """Return the images of a scene that a meta.json names, texture by texture."""
     images = {texture: len(files) for texture, files in SOG_IMAGES.items() if texture != "shN" or has(meta, "shN")}
     return [meta.text(texture, "files", index) for texture, count in images.items() for index in range(count)]
 
 
 def companion_names(data: bytes) -> list[str]:
-    """Return all files that a meta.json names, images or not, as far as it can be parsed; otherwise none."""
+    """Return all files that a meta.json names, images or not; none if it cannot be parsed."""
     try:
         root = parse_meta(data).value
     except FormatError:
@@ -233,11 +216,7 @@ class SogFiles:
             return header.width, header.height
 
     def pixels(self, texture: str, index: int, count: int) -> Pixels:
-        """Decode the first `count` pixels of an image, row by row.
-
-        Raises:
-            FormatError: it is corrupt, or has fewer, or far more.
-        """
+        """Decode the first `count` pixels of an image, row by row; `FormatError` if it has fewer, or far more."""
         name = self.meta.text(texture, "files", index)
         with self._opened(name, SPARE_FACTOR * count + SPARE_TEXELS) as (header, file):
             total = header.width * header.height
@@ -246,7 +225,7 @@ class SogFiles:
             return pixels_of(header, file.read, name)[:count]
 
     def lossy(self) -> list[str]:
-        """Return the names of the images that are compressed with losses, as far as their headers can be read."""
+        """Return the names of the images that are compressed with losses."""
         return [name for name in image_names(self.meta) if self._is_lossy(name)]
 
     def _is_lossy(self, name: str) -> bool:
@@ -257,15 +236,14 @@ class SogFiles:
             return False
 
     def bytes_of(self, texture: str, index: int) -> int:
-        """Return the bytes of an image, as they are stored."""
+        """Return the stored size of an image."""
         name = self.meta.text(texture, "files", index)
         return self._archive.bytes_of(name) if self._archive else self._sizes[name]
 
 
 def zipped(files: Iterable[tuple[str, bytes]]) -> Iterator[bytes]:
     """Return the bytes of a zip, piece by piece: the same for the same files, as its members have no dates."""
-    # A buffer that is emptied member by member could not be sought, and sizes would follow the members' contents
-    # instead of standing before them.
+    # A buffer that is emptied member by member could not be sought, and sizes would follow the members' contents.
     buffer, done = io.BytesIO(), 0
     with zipfile.ZipFile(buffer, "w") as archive:
         for name, content in files:

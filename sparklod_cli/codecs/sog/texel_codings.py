@@ -46,7 +46,7 @@ def sign_log(values: FloatArray) -> Wide:
 
 
 def encode_center(center: FloatArray, low: Wide, high: Wide) -> Words:
-    """Encode (N, 3) coordinates as words in equal steps of `sign_log`, of which (3,) `low` and `high` are the ends."""
+    """Encode (N, 3) coordinates as words in equal steps of `sign_log` from (3,) `low` to `high`."""
     words = np.empty(center.shape, np.uint16)
     for axis, extent in enumerate(high - low):
         steps = LAST_WORD / extent if extent > 0 else 0.0

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import BinaryIO, Protocol
+from typing import BinaryIO, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,9 +41,6 @@ def open_content(source: OpenFile) -> Reader:
     """Open level 0, chunk after chunk, and then the environment.
 
     Nothing is unpacked to `scratch`: where blocks are read, one chunk at a time stays in memory.
-
-    Raises:
-        FormatError: the file is no manifest, a chunk is missing or no SOG, or the runs do not tile the chunks.
     """
     return _open(source, full_detail=True)[1]
 
@@ -51,13 +48,7 @@ def open_content(source: OpenFile) -> Reader:
 def decode_parts(
     file: BinaryIO, *, threads: int = 1, progress: Progress = silent, open_companion: OpenCompanion | None = None
 ) -> DetailScene:
-    """Read all detail levels, in whatever order the runs lie in the chunks.
-
-    Regions are in the order of the tree, depth first.
-
-    Raises:
-        FormatError: as `open_content`; also where another fatal rule of `manifest_rules` is broken.
-    """
+    """Read all detail levels, in any order of the runs in the chunks; regions are in the order of the tree."""
     layout, content = _open(OpenFile(file, open_companion, threads=threads), full_detail=False)
     bounds, children, errors = layout.bounds(), layout.children(), layout.errors()
     scene, environment = replace(content, threads=threads).scene(progress=progress), None
@@ -73,9 +64,8 @@ class RegionLayout:
     """Manifest as arrays: R regions in the order of the tree, L detail levels.
 
     Attributes:
-        manifest: as parsed.
-        file, offset, count, level, region: (n,) int64, of the runs that are not empty, in the order of the files, which
-            they tile.
+        file, offset, count, level, region: (n,) of the runs that are not empty, in the order of the files, which they
+            tile.
         counts: (R, L) splats of each region at each level.
     """
 
@@ -88,7 +78,7 @@ class RegionLayout:
     counts: Counts
 
     def starts(self) -> Counts:
-        """Return (n,) the first splat of each run in a `DetailScene`, where they lie level after level."""
+        """Return (n,) the first splat of each run in a `DetailScene`, level after level."""
         flat = self.counts.T.ravel()
         before = np.cumsum(flat) - flat
         return before[self.level * len(self.counts) + self.region]
@@ -107,7 +97,7 @@ class RegionLayout:
         return numbers[np.array([nodes[number].children for number in inner], np.int64).reshape(-1, 2)]
 
     def errors(self) -> NDArray[np.float64] | None:
-        """Return (R, L) the error of each region at each level, as numbers; None unless all regions have some."""
+        """Return (R, L) the error of each region at each level; None unless all regions have errors."""
         found = [node.errors for _, node in self.manifest.regions()]
         return None if None in found else np.array(found, np.float64)
 
@@ -188,8 +178,7 @@ class Divided(Protocol):
         """A region of fewer splats is not divided for its extent."""
 
 
-@dataclass(frozen=True)
-class ChunkPlan:
+class ChunkPlan(NamedTuple):
     """Chunk to write: its folder, the detail level of its runs, and the regions whose runs it has, side by side."""
 
     folder: str
@@ -209,9 +198,6 @@ def encode_files(
 
     Within a run, splats are in Morton order. The bytes are the same for any number of threads.
 
-    Args:
-        scene: whose splats are valid.
-
     Raises:
         FormatError: SOG cannot hold the splats, or float32, as viewers have it, not the bounds of the regions.
     """
@@ -225,7 +211,7 @@ def encode_files(
     together = min(threads, TOGETHER)
 
     def encoded(plan: ChunkPlan | None) -> tuple[int, list[tuple[str, bytes]]]:
-        """Return the files of a chunk; of the environment for None."""
+        """Return the number of splats and the files of a chunk; of the environment for None."""
         part = scene.environment if plan is None else _ordered(scene, plan)
         assert part is not None
         one = Scene(part, antialiased=scene.antialiased, up=scene.up)
@@ -248,7 +234,7 @@ def encode_files(
 
 
 def planned(scene: DetailScene, chunk_splats: int) -> list[ChunkPlan]:
-    """Return the chunks of a scene: those of each level have its runs, region by region, until one is large enough."""
+    """Divide the runs of each level into chunks, region by region, until a chunk is large enough."""
     plans = list[ChunkPlan]()
     for level in range(scene.levels):
         number = first = size = 0
@@ -261,14 +247,13 @@ def planned(scene: DetailScene, chunk_splats: int) -> list[ChunkPlan]:
 
 
 def _ordered(scene: DetailScene, plan: ChunkPlan) -> Splats:
-    """Return the splats of a chunk, each run in Morton order."""
     runs = (scene.run(region, plan.level) for region in plan.regions)
     index = [run.start + morton.order(scene.splats.center[run]) for run in runs if run.start < run.stop]
     return scene.splats.take(np.concatenate(index))
 
 
 def manifest_of(scene: DetailScene, plans: list[ChunkPlan], settings: Divided) -> Manifest:
-    """Return the manifest of a scene in these chunks."""
+    """Return the manifest of a scene in chunks."""
     runs: list[dict[int, Run]] = [{} for _ in range(scene.regions)]
     for number, plan in enumerate(plans):
         offset = 0
@@ -296,7 +281,7 @@ def manifest_of(scene: DetailScene, plans: list[ChunkPlan], settings: Divided) -
 
 
 def _nodes(scene: DetailScene, runs: list[dict[int, Run]]) -> list[ManifestNode]:
-    """Return the tree of a scene, root first and depth first; an inner node has the union of the bounds below."""
+    """Return the tree of a scene, depth first; an inner node has the union of the bounds below."""
     corners = _inner_bounds(scene)
     nodes, children = list[ManifestNode](), list[list[int]]()
     waiting = [(0 if len(scene.children) else -1, -1)]
@@ -317,7 +302,7 @@ def _nodes(scene: DetailScene, runs: list[dict[int, Run]]) -> list[ManifestNode]
 
 
 def _inner_bounds(scene: DetailScene) -> Bounds:
-    """Return (R - 1, 2, 3) the bounds of inner nodes: those of children, which come after their parents, first."""
+    """Return (R - 1, 2, 3) the bounds of inner nodes; children come after their parents."""
     bounds = np.empty((len(scene.children), 2, 3))
     for number in reversed(range(len(bounds))):
         below = [bounds[child] if child >= 0 else scene.bounds[-1 - child] for child in scene.children[number]]

@@ -1,7 +1,7 @@
 """The manifest of Streamed SOG, lod-meta.json, as it is read and written.
 
-What reading needs is checked when it is parsed; every other rule of the format is for `promises` to tell of, so that a
-report can be made of a file that breaks it.
+Parsing checks what reading needs; all other rules of the format are in `manifest_rules`, so that a file which breaks
+them can be reported on.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ Bound = tuple[Corner, Corner]
 
 @dataclass(frozen=True)
 class Run:
-    """Run of splats of a region at a detail level: `count` of them from `offset` on in a file, by its number."""
+    """Run of `count` splats of a region at a detail level, from `offset` on in a file, by its number."""
 
     file: int
     offset: int
@@ -62,10 +62,10 @@ class ManifestNode:
     """Node of the tree of regions.
 
     Attributes:
-        bound: lowest and highest corner in world units; None where it is missing, or is not of finite numbers.
-        children: numbers of nodes, ascending; two in a tree that keeps the rules, none of a region.
+        bound: lowest and highest corner in world units; None if it is missing, or not finite.
+        children: numbers of nodes, ascending; none of a region.
         runs: of a region, by detail level; None where the node has no `lods`.
-        errors: of a region, as the file has them; None where it has none.
+        errors: of a region, not checked; None without errors.
         parent: number of the node above, -1 of the root.
     """
 
@@ -81,11 +81,11 @@ class Manifest:
     """Contents of a lod-meta.json.
 
     Attributes:
-        levels: how many detail levels there are.
+        levels: number of detail levels.
         filenames: paths of the meta.json of each chunk, from the folder of the manifest on.
-        nodes: of the tree, root first and depth first; regions are counted in this order.
+        nodes: of the tree, depth first; regions are counted in this order.
         environment: path of the meta.json of the environment.
-        head: everything else at the top level, as the file has it: "version", "asset", "count", "counts", "lodErrors".
+        head: all other keys at the top level, not checked: "version", "asset", "count", "counts", "lodErrors".
     """
 
     levels: int
@@ -96,11 +96,10 @@ class Manifest:
 
     @functools.cached_property
     def noted(self) -> FileNote:
-        """Note of sparklod in "asset"."""
         return read_note(self.head.get("asset"))
 
     def place(self, number: int) -> str:
-        """Return where a node is in the file: "tree.children[0]"."""
+        """Return the place of a node in the file: "tree.children[0]"."""
         return place_of("tree", number, lambda each: self.nodes[each].parent, lambda each: self.nodes[each].children)
 
     def regions(self) -> Iterator[tuple[int, ManifestNode]]:
@@ -108,22 +107,16 @@ class Manifest:
         return ((number, node) for number, node in enumerate(self.nodes) if not node.children)
 
     def names(self) -> list[str]:
-        """Return the files that it names."""
         return [*self.filenames, *([] if self.environment is None else [self.environment])]
 
     def read_names(self) -> list[str]:
-        """Return the files that readers of the scene open: `names` without chunk files that no run has splats of."""
+        """Return the files that readers of the scene open: `names` without chunk files that no run uses."""
         read = {run.file for _, node in self.regions() for run in (node.runs or {}).values() if run.count}
         return [name for number, name in enumerate(self.names()) if number in read or number >= len(self.filenames)]
 
 
 def parse(data: bytes) -> Manifest:
-    """Parse the bytes of a lod-meta.json.
-
-    Raises:
-        VersionError: it is of another version than 1.
-        FormatError: it is not JSON, or lacks what reading needs; names the value and its place.
-    """
+    """Parse the bytes of a lod-meta.json; errors name the value and its place."""
     root = parse_manifest(data, MANIFEST, MAX_MANIFEST)
     version = root.value.get("version")
     if version is not None and (type(version) is not int or version != VERSION):
@@ -139,7 +132,6 @@ def parse(data: bytes) -> Manifest:
 
 
 def _nodes(tree: Json, levels: int, files: int) -> tuple[ManifestNode, ...]:
-    """Return the nodes of a tree, however deep, root first and depth first."""
     keys, nodes = {str(level): level for level in range(levels)}, list[ManifestNode]()
     for node, parent, children in nodes_of(tree, MAX_NODES):
         lods = node.get("lods")
@@ -176,8 +168,7 @@ def _bound(value: Any) -> Bound | None:
 def serialise(manifest: Manifest) -> bytes:
     """Return the bytes of a lod-meta.json.
 
-    Bounds are rounded outward, so that they still enclose what they enclosed. `lodLevels` comes early, since a file is
-    recognised by it, and the tree last.
+    Bounds are rounded outward. `lodLevels` comes early, since a file is recognised by it, and the tree last.
     """
     head = dict(manifest.head)
     first: dict[str, Any] = {key: head.pop(key) for key in ("version", "asset", "count", "counts") if key in head}
@@ -189,7 +180,7 @@ def serialise(manifest: Manifest) -> bytes:
 
 
 def _tree(nodes: tuple[ManifestNode, ...]) -> str:
-    """Write the tree, node by node from its end, since it may be deeper than functions can call themselves."""
+    """Write the tree, node by node from its end, since it may be too deep for recursion."""
     texts = [""] * len(nodes)
     for number in reversed(range(len(nodes))):
         node = nodes[number]
