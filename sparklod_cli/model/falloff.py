@@ -1,4 +1,4 @@
-"""The falloff of a splat, in one place: alpha by the distance from its centre, its slopes, end and coverage.
+"""The falloff of a splat: alpha by the distance from its centre, its slopes, end and coverage.
 
 A splat of D up to 1 has the alpha D exp(-z^2 / 2), z being the distance in standard deviations; one of linear opacity A
 above 1, or D = sqrt(1 + e ln A), has 1 - (1 - exp(-z^2 / 2)) ** A, which is that of A equal splats on top of each other
@@ -6,7 +6,7 @@ and flat on top. Spark's LoD design has exp(-D / 2 * max(0, z - (D - 1)) ** 2) i
 
 Kernels take the exponent t of 2 ** t, which is D exp(-z^2 / 2) up to D = 1, and exp(-z^2 / 2) above. Pictures are drawn
 with `plain`, `merged` and `shifted`, approximations that LLVM vectorizes; `alpha_at` has the same formulas in libm's
-functions, and `GLSL` in those of OpenGL.
+functions, and `render.gl.osmesa` in those of OpenGL.
 """
 
 from __future__ import annotations
@@ -148,60 +148,3 @@ def harmonic(a: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.fl
 def nearly_harmonic(a: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return H(a) of a >= 1 within 1.5 %, and its derivative by ln(a) within 4 %, in a fraction of the time."""
     return np.log(a) + EULER + (1 - EULER) / a, a / (a + 0.5)
-
-
-# OpenGL
-
-
-def glsl_constants(**values: float) -> str:
-    """Return declarations of float32 constants in all their digits."""
-    texts = {name: f"{np.float32(value):.9g}" for name, value in values.items()}
-    return "".join(
-        f"const float {name} = {text if '.' in text or 'e' in text else f'{text}.0'};\n" for name, text in texts.items()
-    )
-
-
-#: `deviations_of`, the root of `end_of`, and the alpha of a splat by z^2; `shifted` is a uniform of the shader.
-GLSL = f"""
-{
-    glsl_constants(
-        LEAST_EXPONENT=float(LEAST_EXPONENT),
-        LEAST_REST=float(LEAST_REST),
-        MAX_STD_DEV=MAX_STD_DEV,
-        MIN_ALPHA=MIN_ALPHA,
-        MINUS_HALF_LOG2E=-float(HALF_LOG2E),
-        STD_DEV_PER_D=STD_DEV_PER_D,
-    )
-}
-const int ROOT_HALF = 0x3F3504F3;  // the bits of sqrt(1 / 2)
-
-// The rasterizer's: to 4e-7 of itself near 1 as well, which logarithms of drivers need not be.
-float log2_exactly(float v) {{
-    int bits = floatBitsToInt(v), whole = (bits - ROOT_HALF) >> 23;
-    float m = intBitsToFloat(bits - (whole << 23));  // from sqrt(1 / 2) to sqrt(2)
-    precise float s = (m - 1.0) / (m + 1.0), q = s * s;
-    float p = 0.41219858;
-    p = p * q + 0.57707802;
-    p = p * q + 0.96179669;
-    p = p * q + 2.8853901;
-    return float(whole) + s * p;
-}}
-
-float alpha_at(float z2, float d, float power, bool shifted) {{
-    if (d <= 1.0) return d * exp2(MINUS_HALF_LOG2E * z2);
-    if (shifted) {{
-        float beyond = max(sqrt(max(z2, 0.0)) - (d - 1.0), 0.0);
-        return exp2(MINUS_HALF_LOG2E * d * beyond * beyond);
-    }}
-    float rest = max(1.0 - exp2(MINUS_HALF_LOG2E * z2), LEAST_REST);
-    return 1.0 - exp2(max(power * log2_exactly(rest), LEAST_EXPONENT));
-}}
-
-float deviations_of(float d) {{
-    return MAX_STD_DEV + STD_DEV_PER_D * max(d - 1.0, 0.0);
-}}
-
-float edge_of(float d, float deviations) {{
-    return d <= 1.0 ? min(deviations, sqrt(2.0 * log(d / MIN_ALPHA))) : deviations;
-}}
-"""

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .sh import COEFFICIENTS, degree_of
+from .sh import COEFFICIENTS
 
 FloatArray = NDArray[np.floating[Any]]
 
@@ -27,15 +27,6 @@ INVALID = {
 #: Largest difference between a rotation's squared length and 1. Codings with a byte per component are normalized when
 #: they are read, so that only float32 rounding, about 1e-7, remains. Chosen.
 UNIT_TOLERANCE = 1e-3
-
-
-def read_only(array: NDArray[Any]) -> NDArray[Any]:
-    """Return a read-only view of an array, or the array itself if it is read-only."""
-    if not array.flags.writeable:
-        return array
-    view = array.view()
-    view.flags.writeable = False
-    return view
 
 
 @dataclass(frozen=True)
@@ -78,7 +69,7 @@ class Splats:
     @property
     def sh_degree(self) -> int:
         """SH degree, 0 to 3."""
-        return degree_of(self.sh.shape[1])
+        return COEFFICIENTS.index(self.sh.shape[1])
 
     @classmethod
     def empty(cls, count: int, sh_degree: int) -> Splats:
@@ -99,8 +90,12 @@ class Splats:
 
     def frozen(self) -> Splats:
         """Return these splats with read-only columns: views, so that the arrays of other owners stay writable."""
-        columns = {name: read_only(getattr(self, name)) for name in COLUMNS}
-        return self if all(columns[name] is getattr(self, name) for name in COLUMNS) else Splats(**columns)
+        if not any(getattr(self, name).flags.writeable for name in COLUMNS):
+            return self
+        columns = {name: getattr(self, name).view() for name in COLUMNS}
+        for column in columns.values():
+            column.flags.writeable = False
+        return Splats(**columns)
 
     def take(self, index: NDArray[Any] | slice) -> Splats:
         """Return the splats of an index array, a mask or a slice: the one way to filter, permute and truncate."""
@@ -134,10 +129,7 @@ class Splats:
 
     def is_valid(self) -> NDArray[np.bool_]:
         """Return (N,) bool, false for invalid splats."""
-        valid = np.ones(len(self), np.bool_)
-        for mask in self.invalid().values():
-            valid &= ~mask
-        return valid
+        return ~np.logical_or.reduce([np.zeros(len(self), np.bool_), *self.invalid().values()])
 
     def _is_finite(self) -> NDArray[np.bool_]:
         finite = np.ones(len(self), np.bool_)
@@ -173,7 +165,7 @@ def same_rows(one: Splats, other: Splats) -> NDArray[np.bool_]:
 
 
 def describe_invalid(invalid: dict[str, NDArray[np.bool_]]) -> str:
-    """Return a message such as "3 of 50 splats are invalid (3 a scale below 0; the first is splat 7)"."""
+    """Return a message such as "3 of 50 splats are invalid (3 negative scale; the first is splat 7)"."""
     counts = {kind: int(np.count_nonzero(mask)) for kind, mask in invalid.items()}
     total = len(next(iter(invalid.values())))
     return describe_counts(counts, total, min(int(np.argmax(mask)) for mask in invalid.values()))

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ...cameras.camera import Camera
 from ...codecs.gpu import data_texture
-from ...model.falloff import GLSL, MIN_ALPHA, glsl_constants
+from ...model.falloff import HALF_LOG2E, LEAST_EXPONENT, LEAST_REST, MAX_STD_DEV, MIN_ALPHA, STD_DEV_PER_D
 from ...model.sh import COEFFICIENTS
 from ...model.splats import FloatArray, Splats
 from ...system.errors import BackendError
@@ -306,7 +306,61 @@ def open_context() -> Any:
     )
 
 
-_CONSTANTS = glsl_constants(
+def _glsl_constants(**values: float) -> str:
+    """Return declarations of float32 constants in all their digits."""
+    texts = {name: f"{np.float32(value):.9g}" for name, value in values.items()}
+    return "".join(
+        f"const float {name} = {text if '.' in text or 'e' in text else f'{text}.0'};\n" for name, text in texts.items()
+    )
+
+
+#: Of `model.falloff`: `deviations_of`, the root of `end_of`, and the alpha of a splat by z^2; `shifted` is a uniform of
+#: the shader.
+_FALLOFF = f"""
+{
+    _glsl_constants(
+        LEAST_EXPONENT=float(LEAST_EXPONENT),
+        LEAST_REST=float(LEAST_REST),
+        MAX_STD_DEV=MAX_STD_DEV,
+        MIN_ALPHA=MIN_ALPHA,
+        MINUS_HALF_LOG2E=-float(HALF_LOG2E),
+        STD_DEV_PER_D=STD_DEV_PER_D,
+    )
+}
+const int ROOT_HALF = 0x3F3504F3;  // the bits of sqrt(1 / 2)
+
+// The rasterizer's: to 4e-7 of itself near 1 as well, which logarithms of drivers need not be.
+float log2_exactly(float v) {{
+    int bits = floatBitsToInt(v), whole = (bits - ROOT_HALF) >> 23;
+    float m = intBitsToFloat(bits - (whole << 23));  // from sqrt(1 / 2) to sqrt(2)
+    precise float s = (m - 1.0) / (m + 1.0), q = s * s;
+    float p = 0.41219858;
+    p = p * q + 0.57707802;
+    p = p * q + 0.96179669;
+    p = p * q + 2.8853901;
+    return float(whole) + s * p;
+}}
+
+float alpha_at(float z2, float d, float power, bool shifted) {{
+    if (d <= 1.0) return d * exp2(MINUS_HALF_LOG2E * z2);
+    if (shifted) {{
+        float beyond = max(sqrt(max(z2, 0.0)) - (d - 1.0), 0.0);
+        return exp2(MINUS_HALF_LOG2E * d * beyond * beyond);
+    }}
+    float rest = max(1.0 - exp2(MINUS_HALF_LOG2E * z2), LEAST_REST);
+    return 1.0 - exp2(max(power * log2_exactly(rest), LEAST_EXPONENT));
+}}
+
+float deviations_of(float d) {{
+    return MAX_STD_DEV + STD_DEV_PER_D * max(d - 1.0, 0.0);
+}}
+
+float edge_of(float d, float deviations) {{
+    return d <= 1.0 ? min(deviations, sqrt(2.0 * log(d / MIN_ALPHA))) : deviations;
+}}
+"""
+
+_CONSTANTS = _glsl_constants(
     BLUR=BLUR,
     CLIP=CLIP,
     E=np.e,
@@ -474,7 +528,7 @@ _FETCH = {"float": _FLOATS, "half": _HALVES}
 
 def sources(precision: str) -> dict[str, str]:
     """Return the sources of the shaders for a data texture of one of `PRECISIONS`."""
-    head = f"#version 420 core\n{_CONSTANTS}{GLSL}\n"
+    head = f"#version 420 core\n{_CONSTANTS}{_FALLOFF}\n"
     declarations, main = _VERTEX.split("void main()")
     vertex = head + declarations + _FETCH[precision] + "void main()" + main
     return {"vertex_shader": vertex, "fragment_shader": head + _FRAGMENT}
