@@ -15,7 +15,7 @@ import pytest
 from sparklod_cli.bake.identity import files_of
 from sparklod_cli.io import companions, parts_output, read_parts, read_scene
 from sparklod_cli.io.local_files import leads_away
-from sparklod_cli.io.writing import PARTS
+from sparklod_cli.io.writing import siblings_of
 from sparklod_cli.system import atomic
 from sparklod_cli.system.addresses import Address
 from sparklod_cli.system.errors import OutputError
@@ -61,7 +61,7 @@ def test_the_folders_of_chunks_stand_beside_the_manifest(name: str, tmp_path: Pa
     assert write(target, files) == sum(map(len, files.values()))
     manifest = files.pop("lod-meta.json")
     assert held(target.parent) == files | {name: manifest}
-    assert sorted(PARTS["lod-meta.json"].existing(target)) == sorted(files)
+    assert sorted(siblings_of(Path("lod-meta.json")).existing(target)) == sorted(files)
 
 
 def test_a_former_output_is_replaced_and_its_further_chunks_are_removed(tmp_path: Path) -> None:

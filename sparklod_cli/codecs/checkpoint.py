@@ -48,39 +48,28 @@ TRAINING = {"optimizer", "optimizers", "scheduler", "schedulers", "scaler", "sca
 TRAINING |= {"psnr", "ssim", "lpips", "device_indicator", "device_indicator_param"}
 
 
-@dataclass(frozen=True)
-class TensorColumn:
-    """A tensor of the checkpoint, and the column that it fills.
+Decode = Callable[[FloatArray], FloatArray]
 
-    Attributes:
-        names: those of gsplat and of nerfstudio.
-        column: of `Splats`.
-        width: numbers of a splat; None for three for each coefficient of SH.
-        decode: from its values to those of the column.
-    """
-
-    names: tuple[str, str]
-    column: str
-    width: int | None
-    decode: Callable[[FloatArray], FloatArray]
-
-
-#: The tensors of every checkpoint: scales are logarithms, opacities logits, rotations not normalized.
-COLUMNS = (
-    TensorColumn(("means", "means"), "center", 3, np.asarray),
-    TensorColumn(("scales", "scales"), "scale", 3, quantize.decode_log),
-    TensorColumn(("quats", "quats"), "quat_xyzw", 4, lambda wxyz: normalized_quat(wxyz)[:, [1, 2, 3, 0]]),
-    TensorColumn(("opacities", "opacities"), "opacity", 1, quantize.decode_logit),
-    TensorColumn(("sh0", "features_dc"), "rgb", 3, quantize.decode_dc),
-    TensorColumn(("shN", "features_rest"), "sh", None, np.asarray),
+#: The tensors of every checkpoint: the names in gsplat and in nerfstudio, the column of `Splats`, the numbers of a
+#: splat (None for three for each coefficient of SH), and the decoder. Scales are logarithms, opacities logits,
+#: rotations of any length.
+COLUMNS: tuple[tuple[tuple[str, str], str, int | None, Decode], ...] = (
+    (("means", "means"), "center", 3, np.asarray),
+    (("scales", "scales"), "scale", 3, quantize.decode_log),
+    (("quats", "quats"), "quat_xyzw", 4, lambda wxyz: normalized_quat(wxyz)[:, [1, 2, 3, 0]]),
+    (("opacities", "opacities"), "opacity", 1, quantize.decode_logit),
+    (("sh0", "features_dc"), "rgb", 3, quantize.decode_dc),
+    (("shN", "features_rest"), "sh", None, np.asarray),
 )
 
 
 @dataclass(frozen=True)
 class _StoredColumn:
-    """Values of a column in the file: of a splat, those of `type`, every `pitch` bytes from `offset` on."""
+    """Values of a tensor for a column of `Splats`: `type` of a splat, every `pitch` bytes from `offset` on."""
 
-    of: TensorColumn
+    tensor: str
+    column: str
+    decode: Decode
     type: np.dtype[Any]
     offset: int
     pitch: int
@@ -92,7 +81,7 @@ class _StoredColumn:
         size = (stop - start - 1) * self.pitch + self.type.itemsize
         data = source.read_at(self.offset + start * self.pitch, size)
         if len(data) < size:
-            raise TruncatedError(f"cut short inside its tensor {self.of.names[0]}")
+            raise TruncatedError(f"cut short inside its tensor {self.tensor}")
         rows = np.ndarray(
             (stop - start, *self.type.shape), self.type.base, data, strides=(self.pitch, self.type.base.itemsize)
         )
@@ -108,34 +97,34 @@ def open_content(source: OpenFile) -> Reader:
     archive = _TensorArchive(source)
     root = archive.root()
     tensors, program = _tensors_of(root)
-    missing = [each.names[program] for each in COLUMNS if each.names[program] not in tensors]
+    known = [names[program] for names, *_ in COLUMNS]
+    missing = [name for name in known if name not in tensors]
     if missing:
         why = ", as trainings with another colour model" if {*missing} <= {"sh0", "shN"} else ""
         raise FormatError(f"its splats have no {', '.join(missing)}{why}")
-    count = tensors[COLUMNS[0].names[program]].size[:1]
+    count = tensors[known[0]].size[:1]
     stored = []
-    for each in COLUMNS:
-        name = each.names[program]
+    for names, column, width, decode in COLUMNS:
+        name = names[program]
         tensor = tensors[name]
         values = math.prod(tensor.size[1:]) if tensor.size else 0
-        widths = [each.width] if each.width else [3 * terms for terms in COEFFICIENTS]
+        widths = [width] if width else [3 * terms for terms in COEFFICIENTS]
         if tensor.size[:1] != count or values not in widths:
             raise FormatError(f"its tensor {name} has the shape {tensor.size}, which is not one of splats")
         offset, pitch = archive.place_of(name, tensor)
-        stored.append(_StoredColumn(each, np.dtype((tensor.type, (values,))), offset, pitch))
-    degree, known = COEFFICIENTS.index(values // 3), {each.names[program] for each in COLUMNS} | HARMLESS
-    notes = notes_on_degree(degree) + left_out("tensor", "tensors", _others(root, known))
-    # Without SH nerfstudio trains logits of colours.
-    decode_plain = quantize.decode_logit if program and not degree else None
+        if program and name == "features_dc" and not math.prod(tensors["features_rest"].size[1:]):
+            decode = quantize.decode_logit  # without SH nerfstudio trains logits of colours
+        stored.append(_StoredColumn(names[0], column, decode, np.dtype((tensor.type, (values,))), offset, pitch))
+    degree = COEFFICIENTS.index(values // 3)
+    notes = notes_on_degree(degree) + left_out("tensor", "tensors", _others(root, {*known, *HARMLESS}))
 
     def fill(target: Target, threads: int, progress: Progress) -> None:
         @np.errstate(over="ignore", invalid="ignore")  # whether numbers are valid is for others to say
         def read(part: slice) -> slice:
             for each in stored:
-                out = getattr(target.splats, each.of.column)[part]
-                decode = decode_plain if decode_plain and each.of.column == "rgb" else each.of.decode
+                out = getattr(target.splats, each.column)[part]
                 values = each.read(source, target.start + part.start, target.start + part.stop)
-                out[...] = decode(values[:, : math.prod(out.shape[1:])]).reshape(out.shape)  # no SH above degree 3
+                out[...] = each.decode(values[:, : math.prod(out.shape[1:])]).reshape(out.shape)  # no SH above degree 3
             return part
 
         for part in ordered_map(read, blocks_of(len(target.splats)), threads):

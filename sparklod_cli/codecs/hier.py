@@ -8,7 +8,6 @@ Facts: `hierarchy_loader.cpp`, `writer.cpp` and `traversal.cpp` of graphdeco-inr
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -37,21 +36,6 @@ HALF_NODE = np.dtype(
 BOX_NUMBERS = 8
 
 
-@dataclass(frozen=True)
-class HierColumn:
-    """Column of the file.
-
-    Attributes:
-        numbers: of a splat.
-        put: decodes its (n, numbers) values into a column of n splats.
-        is_float: its numbers are floats even where the file has halves.
-    """
-
-    numbers: int
-    put: Callable[[Splats, FloatArray], None]
-    is_float: bool = False
-
-
 def _put_center(splats: Splats, values: FloatArray) -> None:
     splats.center[:] = values
 
@@ -78,13 +62,14 @@ def _put_colours(splats: Splats, values: FloatArray) -> None:
 #: SH degree of all files.
 DEGREE = 3
 
-#: The columns in the order of the file.
-COLUMNS = (
-    HierColumn(3, _put_center, is_float=True),
-    HierColumn(4, _put_rotation),
-    HierColumn(3, _put_scale),
-    HierColumn(1, _put_opacity),
-    HierColumn(3 * (1 + COEFFICIENTS[DEGREE]), _put_colours),
+#: The columns in the order of the file: the numbers of a splat, whether they are floats even where the file has halves,
+#: and the decoder of (n, numbers) values into a column of n splats.
+COLUMNS: tuple[tuple[int, bool, Callable[[Splats, FloatArray], None]], ...] = (
+    (3, True, _put_center),
+    (4, False, _put_rotation),
+    (3, False, _put_scale),
+    (1, False, _put_opacity),
+    (3 * (1 + COEFFICIENTS[DEGREE]), False, _put_colours),
 )
 
 
@@ -97,7 +82,7 @@ def open_content(source: OpenFile) -> Reader:
     count = _count(source, 0)
     is_half, count = count < 0, abs(count)
     number, node = (np.dtype("<f2"), HALF_NODE) if is_half else (np.dtype("<f4"), NODE)
-    types = [np.dtype(("<f4" if each.is_float else number, (each.numbers,))) for each in COLUMNS]
+    types = [np.dtype(("<f4" if is_float else number, (numbers,))) for numbers, is_float, _ in COLUMNS]
     starts = COUNT.itemsize + count * np.cumsum([0, *(each.itemsize for each in types)], dtype=np.int64)
     nodes_at = int(starts[-1])
     nodes = _count(source, nodes_at)
@@ -112,10 +97,10 @@ def open_content(source: OpenFile) -> Reader:
             first, last = np.searchsorted(rows, [part.start, part.stop])
             splats = target.splats.rows(slice(first, last))
             some = rows[first:last] - part.start
-            for column, row_type, start in zip(COLUMNS, types, starts[:-1], strict=True):
+            for (_, _, put), row_type, start in zip(COLUMNS, types, starts[:-1], strict=True):
                 between = rows_of(source.read_at, int(start), row_type, part.start, part.stop, count)
                 values = np.concatenate([values for _, values in between])
-                column.put(splats, values[some].astype(np.float32))
+                put(splats, values[some].astype(np.float32))
             return target.start + int(last)
 
         rows = leaves[target.start : target.stop]

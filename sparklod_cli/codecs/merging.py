@@ -28,13 +28,7 @@ from .validation import RuleViolation, error_of
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """A scene and where it stands.
-
-    Attributes:
-        reader: of its splats.
-        name: in messages.
-        transform: turns, scales and moves them.
-    """
+    """A scene, its name in messages, and the transform of its splats."""
 
     reader: Reader
     name: str
@@ -44,8 +38,8 @@ class Placed:
 def merged(parts: Sequence[Placed]) -> Reader:
     """Merge scenes into one: their splats in this order, of the highest SH degree; lower ones are padded with zeros.
 
-    It is antialiased if most of the splats are; notes tell where they differ. An axis points up that does in all of
-    them. What is wrong with one of them is raised with its name.
+    The result is antialiased if most of the splats are, and a note says where they differ. It has an up axis if all
+    scenes have the same. Errors name the scene.
 
     Args:
         parts: at least one.
@@ -111,25 +105,19 @@ def _padded(splats: Splats, sh_degree: int) -> Splats:
     return dataclasses.replace(splats, sh=sh)
 
 
-@dataclass(frozen=True)
-class Piece:
-    """Run of splats of a file: the first, how many, and the row that the first of them gets."""
-
-    start: int
-    count: int
-    row: int
+#: Run of splats of a file: the first, their number, and the row that the first of them gets.
+Piece = tuple[int, int, int]
 
 
 @dataclass(frozen=True)
 class Chunk:
-    """Splat file, as far as its header tells, and the pieces of it to read.
+    """Facts in the header of a splat file that a manifest names, and the pieces of it to read.
 
     Attributes:
-        name: path from the manifest's folder on.
+        name: path relative to the manifest's folder.
         count: all its splats.
-        sh_degree, antialiased, up, up_by, format, notes: as of a scene.
-        bytes: of it and the files that it names.
-        pieces: to read.
+        sh_degree, antialiased, up, up_by, format, notes: as in `Scene`.
+        bytes: of the file and the files that it names.
     """
 
     name: str
@@ -146,17 +134,17 @@ class Chunk:
     @property
     def rows(self) -> int:
         """Number of splats in the pieces."""
-        return sum(piece.count for piece in self.pieces)
+        return sum(count for _, count, _ in self.pieces)
 
 
 @dataclass(frozen=True)
 class SceneFiles:
-    """Splat files beside a manifest.
+    """Splat files beside a manifest: chunks of a Streamed SOG, tiles of 3D Tiles.
 
     Attributes:
         open_companion: opens them; None where there are no other files to open.
-        manifest: what it is called, for messages.
-        code: of the rule that they can be read.
+        manifest: its name in messages.
+        code: of the finding that one cannot be read.
         open_content: reads the header of one, given its name, too.
     """
 
@@ -182,7 +170,7 @@ class SceneFiles:
             content.sh_degree,
             content.antialiased,
             content.header.get("bytes", source.size),
-            (Piece(0, content.count, row),) if pieces is None else tuple(pieces),
+            ((0, content.count, row),) if pieces is None else tuple(pieces),
             content.up,
             content.format,
             content.notes,
@@ -215,8 +203,9 @@ class SceneFiles:
                 splats, _ = reader.read(0, reader.count, once=True)
             if (reader.count, reader.sh_degree) != (chunk.count, chunk.sh_degree):
                 raise FormatError(f"{quoted_value(chunk.name)} was changed while it was read; start again")
-            for piece in chunk.pieces:
-                _copy(out, piece, piece.row - first_row, splats)
+            for start, count, row in chunk.pieces:
+                rows = slice(row - first_row, row - first_row + count)
+                copy_rows(splats.rows(slice(start, start + count)), out.rows(rows))
             return chunk.rows
 
         done = 0
@@ -225,7 +214,7 @@ class SceneFiles:
             progress("reading", done, len(out), "splat")
 
     def fill(self, chunks: Sequence[Chunk], degree: int, threads: int) -> Fill:
-        """Return what fills the rows of files, one after the other; where blocks are read, one file stays in memory.
+        """Return the `Reader.fill` of files, one after the other; where blocks are read, one file stays in memory.
 
         Args:
             chunks: whose pieces have the rows in order where they are read in blocks.
@@ -233,15 +222,7 @@ class SceneFiles:
             threads: to read a file on, for a block.
         """
         count = sum(chunk.rows for chunk in chunks)
-        last: dict[int, Splats] = {}
-
-        def decoded(chunk: Chunk, row: int) -> Splats:
-            if row not in last:
-                last.clear()
-                splats = Splats.empty(chunk.rows, degree)
-                self.read([chunk], splats, threads, first_row=row)
-                last[row] = splats
-            return last[row]
+        last: dict[int, Splats] = {}  # of the file that was read last, by its first row
 
         def fill(target: Target, threads: int, progress: Progress) -> None:
             if len(target.splats) == count:
@@ -251,9 +232,15 @@ class SceneFiles:
             for chunk in chunks:
                 begin, end = end, end + chunk.rows
                 start, stop = max(target.start, begin), min(target.stop, end)
-                if start < stop:
-                    part = decoded(chunk, begin).rows(slice(start - begin, stop - begin))
-                    copy_rows(part, target.rows(slice(start, stop)))
+                if start >= stop:
+                    continue
+                if begin not in last:
+                    last.clear()
+                    splats = Splats.empty(chunk.rows, degree)
+                    self.read([chunk], splats, threads, first_row=begin)
+                    last[begin] = splats
+                part = last[begin].rows(slice(start - begin, stop - begin))
+                copy_rows(part, target.rows(slice(start, stop)))
             if target.stop == count:
                 last.clear()
 
@@ -314,11 +301,6 @@ def not_finite(chunk: Chunk, splats: Splats) -> RuleViolation | None:
     count = int(np.count_nonzero(np.any(list(invalid.values()), axis=0)))
     text = f"{count_of(count, 'splat')} of {quoted_value(chunk.name)} have a number that is not finite"
     return RuleViolation("values.non-finite", text, fatal=False)
-
-
-def _copy(out: Splats, piece: Piece, row: int, splats: Splats) -> None:
-    """Copy a piece of a file to rows."""
-    copy_rows(splats.rows(slice(piece.start, piece.start + piece.count)), out.rows(slice(row, row + piece.count)))
 
 
 def copy_rows(splats: Splats, out: Splats) -> None:

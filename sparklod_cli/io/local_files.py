@@ -1,4 +1,4 @@
-"""Plain files: their names and places, files that belong to another one, texts, and why one cannot be opened."""
+"""Plain files: names, companions of a splat file, texts, and reasons why a file cannot be opened."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from ..system.errors import FormatError, UnreadableError, reason_of
 from ..system.stdio import DASH, spooled
 from ..system.untrusted import decoded_text, near, quoted_value
 
-#: Names in a folder that are compared with one that is missing: more take longer than a person expects of an error.
+#: Names in a folder that are compared with a missing one: more take longer than a person waits for an error.
 MOST_NAMES = 10_000
 
-#: How similar two names are that may be meant by one another, as `difflib` measures it: a letter or two differ, or
-#: the suffix.
+#: Least similarity, as `difflib` measures it, of a missing name and a suggested one: a letter or two differ, or the
+#: suffix.
 SIMILAR = 0.75
 
 
 def is_file_name(text: str) -> bool:
-    """Return whether a text can be a file name: no system takes the byte 0 or half of a surrogate pair."""
+    """Return whether a text can be a file name, without the byte 0 or half of a surrogate pair."""
     try:
         return b"\0" not in os.fsencode(text)
     except UnicodeEncodeError:
@@ -36,14 +36,18 @@ def is_file_name(text: str) -> bool:
 
 
 def leads_away(name: str, *, folders: bool = False) -> bool:
-    """Return whether a name could mean anything but a file in the same folder, or in folders there if `folders`."""
+    """Return whether a name may lead out of the folder of the file that has it, or into a folder below it.
+
+    Args:
+        folders: folders below it are allowed.
+    """
     if folders and "/" in name:
         return any(leads_away(part) for part in name.split("/"))
     return name in ("", ".", "..") or any(mark in name for mark in "/\\:") or not is_file_name(name)
 
 
 def reason_unreadable(error: OSError) -> str:
-    """Return what the system says of an input that cannot be read, and a file of a similar name if it is missing."""
+    """Return the system's reason why an input cannot be read, and a file of a similar name if it is missing."""
     reason = reason_of(error)
     if not isinstance(error, FileNotFoundError) or not isinstance(error.filename, (str, PurePath)):
         return reason
@@ -56,7 +60,7 @@ def reason_unreadable(error: OSError) -> str:
     return reason + near(name, names, cutoff=SIMILAR, folder=folder)
 
 
-#: For reading; neither follows a link nor waits for the other end of a pipe.
+#: Flags that open a file for reading, without following a link or waiting for the other end of a pipe.
 _FLAGS = os.O_RDONLY
 for _name in ("O_BINARY", "O_CLOEXEC", "O_NOFOLLOW", "O_NONBLOCK"):
     _FLAGS |= getattr(os, _name, 0)
@@ -66,7 +70,7 @@ def open_plain(path: Path) -> BinaryIO:
     """Open a file for reading.
 
     Args:
-        path: absolute, without links: as `Path.resolve` gave it.
+        path: absolute, without links, from `Path.resolve`.
 
     Raises:
         OSError: it does not exist, it is a folder, a pipe or a device, or it or a folder above it has become a link.
@@ -90,7 +94,7 @@ GLTF = ("GLB", "glTF")
 
 
 def companions(path: Path, sets: Collection[Collection[str]]) -> list[Path]:
-    """Return the files that are read together with one, as far as can be told; nothing is raised."""
+    """Return the files that are read together with one; none if they cannot be found. Raises nothing."""
     try:
         folder = path if path.is_dir() else path.parent
         first: Path | None = path
@@ -118,25 +122,20 @@ def _named_in(path: Path) -> list[Path]:
         from ..codecs.rad import rad_header
         from ..codecs.reader import OpenFile  # what most jobs do without, as what follows
         from ..codecs.streamed_sog.manifest import MAX_MANIFEST, parse
+        from ..codecs.tiles_3d.codec import names_of
         from ..codecs.tiles_3d.tileset import MAX_TILESET
 
         if head.startswith(rad_header.MAGIC):
             return _companion_paths(path, rad_header.read_header(file).filenames)
         if form is not None and form.parts == "tiles":
-            return _tiles_of(path, file.read(MAX_TILESET + 1))
+            names = names_of(file.read(MAX_TILESET + 1), functools.partial(open_named, path, folders=True))
+            return _companion_paths(path, names, folders=True)
         if form is not None and form.name in GLTF:
             return _companion_paths(path, GltfFile(OpenFile(file)).names(), folders=True)
         if form is not None and form.folders:
             metas = _companion_paths(path, parse(file.read(MAX_MANIFEST + 1)).names(), folders=True)
             return [*metas, *itertools.chain(*map(_images_of, metas))]
     return _images_of(path)
-
-
-def _tiles_of(path: Path, data: bytes) -> list[Path]:
-    """Return the files of the tiles of a tileset and of the nested ones that it names, and the buffers of these."""
-    from ..codecs.tiles_3d.codec import names_of
-
-    return _companion_paths(path, names_of(data, functools.partial(open_named, path, folders=True)), folders=True)
 
 
 def _images_of(path: Path) -> list[Path]:
@@ -149,12 +148,12 @@ def _images_of(path: Path) -> list[Path]:
 
 
 def _companion_paths(path: Path, names: Iterable[str], *, folders: bool = False) -> list[Path]:
-    each = dict.fromkeys(names)  # a manifest of strangers may name one file half a million times
-    return [path.parent / name for name in each if not leads_away(name, folders=folders)]
+    unique = dict.fromkeys(names)  # an untrusted manifest may name one file half a million times
+    return [path.parent / name for name in unique if not leads_away(name, folders=folders)]
 
 
 def in_folder(folder: Place) -> Place:
-    """Return the splat file that a folder stands for: a manifest of Streamed SOG or 3D Tiles, or a SOG's meta.json.
+    """Return the splat file in a folder: a manifest of Streamed SOG or 3D Tiles, or a SOG's meta.json.
 
     Raises:
         UnreadableError: the folder holds none, or several.
@@ -171,7 +170,7 @@ def in_folder(folder: Place) -> Place:
 
 
 def _scans_in(folder: Path) -> str:
-    """Return what to give instead of a folder of splat files, to stand at the end of an error; empty without any."""
+    """Return the end of an error on a folder of splat files: the files to give instead; empty if it has none."""
     known = {suffix for form in FORMATS for suffix in form.suffixes} - {PurePath(META).suffix}
     with os.scandir(folder) as entries:
         files = [entry.name for entry in itertools.islice(entries, MOST_NAMES) if entry.is_file()]
@@ -183,21 +182,21 @@ def _scans_in(folder: Path) -> str:
     return f"; give {shlex.quote(str(folder))}/{f'*{suffix}' if count > 1 else shlex.quote(only)}"
 
 
-def companion_path(first: Path, name: str) -> Path:
-    """Return the path of a file that another names; raise `FormatError` where the name could leave their folder."""
-    _check_name(name)
-    return first.parent / name
+def check_companion(name: str, *, folders: bool = False) -> None:
+    """Raise `FormatError` if a name in a file may lead out of its folder, see `leads_away`."""
+    if leads_away(name, folders=folders):
+        raise FormatError(f"it names {quoted_value(name)}, which is not a file beside it")
 
 
 def open_named(first: Place, name: str, *, folders: bool = False) -> BinaryIO:
-    """Open a file that another one names, which may be in folders there if `folders`.
+    """Open a file that another one names, which may be in a folder there if `folders`.
 
     Raises:
         FormatError: it cannot be opened, or the name could lead out of the folder of the first.
     """
     if first == DASH:
         raise FormatError(f"it names {quoted_value(name)}, but standard input has no folder; give the path instead")
-    _check_name(name, folders=folders)
+    check_companion(name, folders=folders)
     path = first.parent / name
     try:
         if path.exists() and not path.is_file():
@@ -212,29 +211,22 @@ def open_named(first: Place, name: str, *, folders: bool = False) -> BinaryIO:
     return file
 
 
-def _check_name(name: str, *, folders: bool = False) -> None:
-    if leads_away(name, folders=folders):
-        raise FormatError(f"it names {quoted_value(name)}, which is not a file beside it")
-
-
 def size_of_input(path: Place) -> int | None:
-    """Return bytes of a file, or of standard input; None where that cannot be told."""
+    """Return bytes of a file, or of standard input; None if unknown."""
     try:
         if path == DASH:
             return spooled().seek(0, os.SEEK_END)
         return size_of(path) if path.is_file() else None
-    except UnreadableError:
-        return None
-    except OSError:
+    except (UnreadableError, OSError):
         return None
 
 
-#: Bytes of a text that is read whole: instances, expectations, matrices. Parsed it may take thirty times as much.
+#: Most bytes of a text that is read whole: instances, expectations, matrices. Parsed, it may take thirty times as much.
 MAX_TEXT = 1 << 24
 
 
 def read_text(path: Path) -> str:
-    """Return a text file of at most `MAX_TEXT` bytes; `UnreadableError`, naming it, where that cannot be."""
+    """Read a text file of at most `MAX_TEXT` bytes; raises `UnreadableError`, which names it."""
     try:
         return decoded_text(_read_up_to(path, MAX_TEXT))
     except (OSError, ValueError) as error:
@@ -243,14 +235,15 @@ def read_text(path: Path) -> str:
 
 
 def read_together(path: Path, sets: Collection[Collection[str]], limit: int) -> dict[str, bytes]:
-    """Return files that belong together, by name, the one that `path` names first.
+    """Read files that belong together, and return them by name; the file of `path` is the first.
 
     Args:
         path: of a file, or of a folder that holds one of the sets.
-        sets: names of files that belong together; where `path` is one of a set, the others beside it are read, too.
+        sets: names of files that belong together; if `path` is in a set, the other files of it are read, too.
+        limit: most bytes of a file.
 
     Raises:
-        UnreadableError: there is no such file or set, or one is too large; the text names it.
+        UnreadableError: a file is missing or too large; names it.
     """
     try:
         if path.is_dir():
@@ -269,10 +262,10 @@ def read_together(path: Path, sets: Collection[Collection[str]], limit: int) -> 
 
 
 def read_rgba(path: Path, count: int, rows: slice | None = None) -> FloatArray:
-    """Return colours and opacities for the `count` splats of a scene, or for a range of them, see `rgba.decode`.
+    """Read colours and opacities for the `count` splats of a scene, or for a range of them, see `rgba.decode`.
 
     Raises:
-        FormatError: it cannot be read or is not such a file; names it.
+        FormatError: as `rgba.decode`, or the file cannot be read; names it.
     """
     from ..codecs import rgba
 

@@ -33,12 +33,7 @@ AT_ONCE, SHARE = 1 << 28, 0.25
 
 @dataclass(frozen=True, eq=False)
 class RadFile:
-    """A RAD file; none of its chunks stays in memory.
-
-    Attributes:
-        path: of the file.
-        header: of the file.
-    """
+    """A RAD file; none of its chunks stays in memory."""
 
     path: Path
     header: RadHeader
@@ -51,12 +46,12 @@ class RadFile:
         Raises:
             FormatError: it cannot be read, or breaks a promise without which its chunks cannot be.
         """
-        with _opened(path) as found:
-            return None if found is None else cls.of(path, *found)
+        with opened(path) as (file, form, more):
+            return cls.of(path, file, more["open_companion"]) if form.name == FORMAT else None
 
     @classmethod
     def of(cls, path: Path, file: BinaryIO, open_companion: Any) -> RadFile:
-        """As `open`, of a file that is open already, and need not stay so."""
+        """Read the header of an open file, and its palette; the file may be closed afterwards. Raises as `open`."""
         reader = RadReader.open(file, open_companion)
         return cls(path, reader.header, reader)
 
@@ -86,38 +81,34 @@ class RadFile:
         """Yield all chunks in order: the index of the first splat of each, its splats, and its nodes if it has a tree.
 
         Args:
-            thorough: unpack the others, too, which finds what is corrupt.
+            thorough: unpack the other columns, too, which finds corrupt data.
 
         Raises:
             FormatError: a chunk is damaged.
         """
-        with _opened(self.path) as found:
-            assert found is not None
-            yield from self._reader.reopened(*found).chunks(columns, thorough=thorough, threads=threads)
+        with self._reopened() as reader:
+            yield from reader.chunks(columns, thorough=thorough, threads=threads)
 
     def chunk(self, number: int, columns: Collection[str]) -> tuple[Splats, LodTree | None, FileCoding]:
-        """Return one chunk and its coding; only these columns are unpacked. Several threads may ask.
+        """Return one chunk and its coding; only these columns are unpacked. Several threads may call this.
 
         Raises:
             FormatError: it is damaged.
         """
-        with _opened(self.path) as found:
-            assert found is not None
-            return self._reader.reopened(*found).chunk(number, columns)
+        with self._reopened() as reader:
+            return reader.chunk(number, columns)
 
-
-@contextlib.contextmanager
-def _opened(path: Path) -> Iterator[tuple[BinaryIO, Any] | None]:
-    """Yield a RAD file and what opens the files beside it; None for a file of another format."""
-    with opened(path) as (file, form, more):
-        yield (file, more["open_companion"]) if form.name == FORMAT else None
+    @contextlib.contextmanager
+    def _reopened(self) -> Iterator[RadReader]:
+        with opened(self.path) as (file, _, more):
+            yield self._reader.reopened(file, more["open_companion"])
 
 
 def read_rad_header(path: Path) -> RadHeader:
     """Read the header of a RAD file; its chunks need not be there.
 
     Raises:
-        FormatError: it cannot be read, is no such header, or promises what cannot be.
+        FormatError: it cannot be read, is not RAD, or breaks a fatal rule of `rad_rules`.
     """
     with _opened_plain(path) as file:
         return _header(file)
@@ -127,7 +118,6 @@ def read_rad_chunk(path: Path, number: int, *, palette: FloatArray | None = None
     """Read the header of a RAD file, and one chunk of it.
 
     Args:
-        path: of the file, or of the header whose chunks are files beside it.
         palette: that of the first chunk, see `codecs.rad.codec.read_chunk`.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Splat files of any format, which their content tells, alone or several as one scene: whole, in parts, in blocks."""
+"""Reads splat files of any format, which is recognised by content, alone or merged: whole, in parts, in blocks."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     from ..model.instances import Instance
     from ..model.traversed import DetailScene, TileScene
 
-#: Files that stay open together, of one scene, and of those that were closed or that another process opened: each has
-#: a palette of up to 12 MB. Chosen.
+#: Files of one scene that stay open, and files that are opened again and stay open: each has a palette of up to 12 MB.
+#: Chosen.
 MOST = 4
 
 _LOCK = threading.Lock()
@@ -98,11 +98,11 @@ def read_scene(
     progress: Progress = silent,
     validate: bool = True,
 ) -> Scene:
-    """Read a splat file of any known format, told by its content, or else by its suffix.
+    """Read a splat file of any known format, recognised by its content, or else by its suffix.
 
     Args:
         path: of a file, or of a folder that holds an unpacked SOG or a Streamed SOG; - is standard input.
-        columns: of the splats that are needed; the others may be 0.
+        columns: of `Splats` to read; the others may be 0.
         validate: refuse a broken tree.
 
     Raises:
@@ -113,10 +113,7 @@ def read_scene(
 
 
 def read_stored(path: Place) -> Stored:
-    """Return the codes of a Level-of-Detail file, so that its leaves can be written again bit for bit.
-
-    Args:
-        path: of a file whose format can be written with a tree; - is standard input.
+    """Read the codes of a file whose format can hold a tree, so that its leaves can be written again bit for bit.
 
     Raises:
         FormatError: as `read_scene`.
@@ -127,14 +124,7 @@ def read_stored(path: Place) -> Stored:
 
 
 def read_parts(path: Place, *, threads: int = 1, progress: Progress = silent) -> DetailScene | TileScene | None:
-    """Read a scene with all its detail levels or tiles; None where its format has neither.
-
-    Args:
-        path: of the lod-meta.json of a Streamed SOG, of the tileset.json of 3D Tiles, or of the folder that holds it.
-
-    Raises:
-        FormatError: as `read_scene`.
-    """
+    """Read a scene with all its detail levels or tiles; None if its format has neither. Raises as `read_scene`."""
     with opened(path) as (file, form, more):
         if form.parts is None:
             return None
@@ -144,7 +134,7 @@ def read_parts(path: Place, *, threads: int = 1, progress: Progress = silent) ->
 
 @contextlib.contextmanager
 def opened(path: Place) -> Iterator[tuple[BinaryIO, Format, dict[str, Any]]]:
-    """Yield a splat file of any known format, the format, and what else its codec takes.
+    """Yield a splat file of any known format, the format, and more arguments for its codec.
 
     Raises:
         FormatError: it is not a file, empty, or of no known format; an `OSError` of the body becomes one.
@@ -242,15 +232,15 @@ def open_reader(source: Source, *, scratch: Path | None = None, threads: int = 1
 
     Only its header is read now. Any range of splats can be read until the end, on several threads. Columns that lie one
     after the other (SPZ, SOG), and text, are unpacked once, when a block is first read; see docs/formats.md for the
-    room that takes.
+    size of the unpacked file.
 
     Args:
-        scratch: folder for what is unpacked, which stays there, so that other processes find it; whoever owns the
+        scratch: folder for the unpacked file, which stays there, so that other processes find it; the owner of the
             folder removes it. The reader can be pickled then. None for one of the system's temporary files.
 
     Raises:
-        FormatError: as `io.read_scene`. What is wrong behind the header is raised by reading; so is `OutputError`,
-            where there is no room for what is unpacked. Of several files, errors name the file.
+        FormatError: as `io.read_scene`. Reading raises errors behind the header, and `OutputError` if there is no room
+            for the unpacked file. Of several files, errors name the file.
         HasTreeError: one of several files has a tree.
     """
     with contextlib.ExitStack() as closing:
@@ -265,7 +255,7 @@ def open_reader(source: Source, *, scratch: Path | None = None, threads: int = 1
 
 
 def _version(path: Place, scratch: Path | None) -> tuple[Any, ...]:
-    """Return what changes with a file; nothing where finding out takes a request that only large scenes are worth."""
+    """Return size and time of a file, or the version of an address; () if that takes a request without need."""
     if path == DASH or (isinstance(path, Address) and scratch is None):
         return ()
     if isinstance(path, Address):
@@ -277,14 +267,22 @@ def _version(path: Place, scratch: Path | None) -> tuple[Any, ...]:
 def _opened(
     path: Place, version: tuple[Any, ...], folder: Path | None, threads: int, closing: contextlib.ExitStack
 ) -> Reader:
-    """Open a file until `closing` closes it, and what is unpacked of it."""
+    """Open a file, and later its unpacked rows, until `closing` closes them."""
     lock, unpacked = threading.Lock(), list[OpenFile]()
 
     def scratch(pieces: Callable[[], Iterable[bytes]]) -> OpenFile:
-        with lock, _room(folder):
+        with lock:
             if not unpacked:
-                place = folder and folder / f"{_digest(path, version)}.unpacked"
-                file = _temporary(pieces) if place is None else _kept(place, pieces)
+                try:
+                    if folder is None:
+                        file = _temporary(pieces)
+                    else:
+                        parts = (path.url if isinstance(path, Address) else path.absolute(), *version)
+                        text = "\n".join(map(str, parts)).encode("utf-8", "surrogateescape")
+                        file = _kept(folder / f"{hashlib.sha256(text).hexdigest()[:32]}.unpacked", pieces)
+                except OSError as error:
+                    where = folder or tempfile.gettempdir()
+                    raise OutputError(f"cannot write to the scratch folder {where}: {reason_of(error)}") from None
                 unpacked.append(OpenFile(closing.enter_context(file)))
         return unpacked[0]
 
@@ -294,7 +292,7 @@ def _opened(
 
 
 def _temporary(pieces: Callable[[], Iterable[bytes]]) -> BinaryIO:
-    """Write a file without a name, which is gone with this process at the latest."""
+    """Write a file without a name, which the system removes."""
     file: BinaryIO = tempfile.TemporaryFile(prefix="sparklod-")  # noqa: SIM115
     try:
         for piece in _readable(pieces):
@@ -307,7 +305,7 @@ def _temporary(pieces: Callable[[], Iterable[bytes]]) -> BinaryIO:
 
 
 def _kept(target: Path, pieces: Callable[[], Iterable[bytes]]) -> BinaryIO:
-    """Write a file unless it is there; it appears whole or not at all."""
+    """Write a file unless it exists; it appears whole or not at all."""
     if not target.exists():
         target.parent.mkdir(parents=True, exist_ok=True)
         atomic.write(target, _readable(pieces), overwrite=True)
@@ -319,25 +317,9 @@ def _readable(pieces: Callable[[], Iterable[bytes]]) -> Iterator[bytes]:
         yield from pieces()
 
 
-def _digest(path: Place, version: tuple[Any, ...]) -> str:
-    """Return a name for this version of a file."""
-    parts = (path.url if isinstance(path, Address) else path.absolute(), *version)
-    return hashlib.sha256("\n".join(map(str, parts)).encode("utf-8", "surrogateescape")).hexdigest()[:32]
-
-
-@contextlib.contextmanager
-def _room(folder: Path | None) -> Iterator[None]:
-    """Turn an `OSError` of the body into an `OutputError`."""
-    try:
-        yield
-    except OSError as error:
-        where = folder or tempfile.gettempdir()
-        raise OutputError(f"cannot write to the scratch folder {where}: {reason_of(error)}") from None
-
-
 @dataclass(frozen=True, eq=False)
 class _FillFromFile:
-    """`Reader.fill` of a file, which is opened again in another process, where it was closed, and where it changed."""
+    """`Reader.fill` of a file, which is opened again in another process, after it was closed, and if it changed."""
 
     path: Place
     version: tuple[Any, ...]
@@ -365,7 +347,7 @@ class _FillFromFile:
 
 @functools.lru_cache(MOST)
 def _opened_again(path: Place, version: tuple[Any, ...], scratch: Path | None, threads: int) -> Reader:
-    """Open a file, which is closed when many others have been opened since and nobody reads it."""
+    """Open a file; it is closed when it is not read and `MOST` others have been opened since."""
     closing = contextlib.ExitStack()
     with contextlib.ExitStack() as after_an_error:
         after_an_error.enter_context(closing)
@@ -376,7 +358,7 @@ def _opened_again(path: Place, version: tuple[Any, ...], scratch: Path | None, t
 
 
 def _merged(source: Merged, scratch: Path | None, threads: int, closing: contextlib.ExitStack) -> Reader:
-    """Open several files; the header of one that is named twice is read once."""
+    """Open several files; the header of a file that is named twice is read once."""
     from ..codecs.merging import Placed, merged  # what a single file does without
 
     closing.callback(_opened_again.cache_clear)

@@ -1,6 +1,6 @@
 """Files that a viewer shows, and the names under which they are served.
 
-A site is a closed table of names: whatever is not in it is not served, so no name can lead out of it.
+A site is a closed table of names: nothing else is served, so no name can lead out of it.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from ..codecs.streamed_sog.manifest_rules import files_of_chunk
 from ..codecs.tiles_3d.codec import names_of
 from ..codecs.tiles_3d.tileset import MAX_TILESET
 from ..codecs.zip_folder import ZipFolder
-from ..io.local_files import companion_path, in_folder, open_named, open_plain, reason_unreadable
+from ..io.local_files import check_companion, in_folder, open_named, open_plain, reason_unreadable
 from ..io.reading import recognised
 from ..model.lod_tree import CHUNK_NODES
 from ..system.errors import FormatError, NotSplatsError, UnreadableError, naming
 from ..system.untrusted import printable, quoted_value
 
-#: What Spark calls the formats that sparklod reads.
+#: Spark's names of the formats that sparklod reads.
 SPARK_TYPES = {
     "compressed PLY": "ply",
     "PLY": "ply",
@@ -43,13 +43,13 @@ SPARK_TYPES = {
 #: Engines of the other formats, except formats that no engine shows.
 OTHER_ENGINES = {"Streamed SOG": "playcanvas", "GLB": "playcanvas", "3D Tiles": "cesium"}
 
-#: How files begin that sparklod reads and Spark 2.2.0 does not, and what they are.
+#: Beginnings of files that sparklod reads and Spark 2.2.0 does not, and names of their formats.
 UNREAD = (
     (rb"NGSP", "SPZ version 4"),
     (rb"ply\s+((comment|obj_info)\b.*\s+)*format\s+(?!binary_little)", "PLY that is ascii or big-endian"),
 )
 
-#: What can show files, and its name for display.
+#: Engines that show files, and their names for display.
 ENGINES = {"spark": "Spark", "playcanvas": "PlayCanvas", "cesium": "CesiumJS"}
 
 #: Media types by suffix; anything else is bytes.
@@ -76,11 +76,11 @@ class ShownFile:
     """A splat file that the page shows.
 
     Attributes:
-        url: where the page finds it, relative to the page.
+        url: relative to the page.
         format: for display: "RAD", "SPZ".
-        spark_type: what Spark calls its format; None where another engine shows it.
-        files: itself and what it refers to, by the names that it is served under.
-        note: why Spark will not show it; None where nothing is known against it.
+        spark_type: Spark's name of its format; None if another engine shows it.
+        files: itself and its companions, by the names under which they are served.
+        note: why Spark will not show it; None if no reason is known.
     """
 
     path: Path
@@ -184,7 +184,8 @@ def _note(name: str, head: bytes, header: RadHeader | None) -> str | None:
 
 def _chunk_files(path: Path, header: RadHeader) -> Iterator[tuple[str, Path]]:
     for name in header.filenames:
-        companion = companion_path(path, name)
+        check_companion(name)
+        companion = path.parent / name
         if not companion.is_file():
             raise FormatError(f"its chunk file {quoted_value(name)} is missing")
         real = _inside(path, companion)

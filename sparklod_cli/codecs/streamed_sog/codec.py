@@ -26,7 +26,7 @@ from .. import quantize
 from ..compression import check_promise
 from ..file_notes import note_of
 from ..formats import ENVIRONMENT_FILE, MANIFEST, META, chunk_folder
-from ..merging import Chunk, Piece
+from ..merging import Chunk
 from ..options import WriteOptions
 from ..reader import OpenCompanion, OpenFile, Reader, size_of
 from ..sog import codec as sog
@@ -136,7 +136,7 @@ def _open(source: OpenFile, *, full_detail: bool) -> tuple[RegionLayout, Reader]
         if name in names:
             raise FormatError(f"{MANIFEST} names {quoted_value(name)} twice")
         names.add(name)
-        pieces = [Piece(int(layout.offset[run]), int(layout.count[run]), int(rows[run])) for run in here]
+        pieces = [(int(layout.offset[run]), int(layout.count[run]), int(rows[run])) for run in here]
         chunks.append(beside.open(name, pieces))
         if chunks[-1].count != (expected := int(layout.count[begin:end].sum())):
             has = count_of(chunks[-1].count, "splat")
