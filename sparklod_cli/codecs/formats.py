@@ -51,7 +51,7 @@ class Format:
             replace each other; None if its files have neither. Its module then has `decode_parts(file, *, threads,
             progress, open_companion)`, which gives a `DetailScene` or a `TileScene`, and `encode_files` of such a
             scene, as above.
-        bare: its files hold nothing but splats, so that nothing can be noted in them, see `file_notes`.
+        bare: its files hold nothing but splats, so that nothing can be noted in them, see `reader.note_of`.
     """
 
     name: str

@@ -26,7 +26,6 @@ from ..system.threads import blocks_of
 from ..system.untrusted import quoted
 from . import quantize
 from .encoder import CodeRange
-from .file_notes import comment_of, read_comment
 from .options import DEFAULTS, WriteOptions
 from .ply_header import PlyHeader, first_value, offset_of, read_header
 from .reader import (
@@ -36,9 +35,11 @@ from .reader import (
     Reader,
     Rows,
     Target,
+    comment_of,
     decode_rows,
     encode_rows,
     left_out,
+    read_comment,
     rows_of,
 )
 

@@ -1,9 +1,14 @@
-"""Files as streams of rows, decoded and encoded in blocks, so that a file is never in memory as a whole."""
+"""Files as streams of rows, decoded and encoded in blocks so that no file is in memory as a whole, and their notes.
+
+Formats without a field for it hold a note of sparklod: a JSON object with "generator". It is the comment of a RAD, PLY
+or SPZ file, and "asset" of a SOG or a Streamed SOG, which may have more keys.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import io
+import json
 import os
 import re
 import threading
@@ -14,13 +19,14 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from .. import __version__
 from ..model.lod_tree import LodTree
-from ..model.scene import PLAIN, FileCoding, Scene, facts_of
+from ..model.scene import AXES, PLAIN, SPECIFIED, FileCoding, Scene, facts_of
 from ..model.splats import COLUMNS, Splats
 from ..system.errors import HasTreeError, TruncatedError
 from ..system.progress import Progress, silent
 from ..system.threads import BLOCK_ROWS, blocks_of, ordered_map
-from ..system.untrusted import printable
+from ..system.untrusted import parse_json, printable, quoted_value
 from .validation import with_valid_tree
 
 #: Least bytes of a block: with narrow rows, such as SPZ's streams, handing a smaller one to a thread costs more than it
@@ -354,3 +360,59 @@ def _counted(name: str) -> tuple[str, int]:
     """Return a name without the number at its end, and that number; -1 for none."""
     match = _COUNTED.fullmatch(name)
     return (match[1], int(match[2])) if match else (name, -1)
+
+
+#: How the "generator" of a note of sparklod begins; its version follows.
+GENERATOR = "sparklod "
+
+
+@dataclass(frozen=True)
+class FileNote:
+    """Contents of the note in a file.
+
+    Attributes:
+        antialiased, up: as in `Scene`.
+        problems: what is ignored of it, as sentences for `Scene.notes`.
+        is_ours: sparklod wrote the file.
+    """
+
+    antialiased: bool = False
+    up: str | None = None
+    problems: tuple[str, ...] = ()
+    is_ours: bool = False
+
+    def axis_of(self, form: str) -> tuple[str | None, str]:
+        """Return `up` and `up_by` of a file: its note, or what `SPECIFIED` says if another program wrote it."""
+        if self.up is None and not self.is_ours:
+            return SPECIFIED[form], form
+        return self.up, ""
+
+
+def note_of(*, antialiased: bool = False, up: str | None = None) -> dict[str, Any]:
+    """Return the note of a file: "generator", "antialiased" where that is true, and "up" where it is known."""
+    note: dict[str, Any] = {"generator": GENERATOR + __version__}
+    return note | ({"antialiased": True} if antialiased else {}) | ({} if up is None else {"up": up})
+
+
+def comment_of(*, antialiased: bool = False, up: str | None = None) -> str:
+    """Return the note of a file as one line of ASCII."""
+    return json.dumps(note_of(antialiased=antialiased, up=up))
+
+
+def read_note(note: Any) -> FileNote:
+    """Parse a note; one that is not of sparklod says nothing."""
+    if not isinstance(note, dict) or not str(note.get("generator", "")).startswith(GENERATOR):
+        return FileNote()
+    up, problems = note.get("up"), tuple[str, ...]()
+    if up is not None and not (isinstance(up, str) and up in AXES):
+        problems = (f"its up axis {quoted_value(up)} is ignored; it is none of {', '.join(AXES)}",)
+        up = None
+    return FileNote(note.get("antialiased") is True, up, problems, is_ours=True)
+
+
+def read_comment(comment: str | bytes | None) -> FileNote:
+    """Parse a comment; free text says nothing."""
+    try:
+        return read_note(parse_json(comment or "null"))
+    except ValueError:
+        return FileNote()

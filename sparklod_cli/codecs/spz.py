@@ -31,9 +31,9 @@ from ..system.progress import Progress, silent
 from ..system.threads import blocks_of, ordered_map
 from . import compression, quantize
 from .encoder import SPZ_RANGES, CodeRange, Encoded, Encoder, Windows, results, windows_of
-from .file_notes import comment_of
 from .options import DEFAULT_SPZ_VERSION, DEFAULTS, MAX_FRACTIONAL_BITS, TREE_SPZ_VERSIONS, WriteOptions
 from .quantize import Bytes
+from .reader import comment_of
 from .statistics import ALL_BITS, Statistics, enough, fine_bits
 
 if TYPE_CHECKING:

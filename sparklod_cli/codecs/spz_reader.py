@@ -19,11 +19,10 @@ from ..system.errors import FormatError, MembersError, NotSplatsError, Truncated
 from ..system.progress import Progress
 from ..system.threads import ordered_map
 from .compression import GZIP_MAGIC, check_promise
-from .file_notes import FileNote, read_comment
 from .inflate import PIECE, Inflate, Unzstd
 from .options import MAX_FRACTIONAL_BITS, WriteOptions
 from .quantize import Bytes
-from .reader import OpenFile, Read, Reader, Target, rows_of
+from .reader import FileNote, OpenFile, Read, Reader, Target, read_comment, rows_of
 from .spz import (
     ANTIALIASED,
     COORDINATE_SYSTEM,

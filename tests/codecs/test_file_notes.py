@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from sparklod_cli.codecs.file_notes import FileNote, comment_of, note_of, read_comment, read_note
+from sparklod_cli.codecs.reader import FileNote, comment_of, note_of, read_comment, read_note
 from sparklod_cli.model.scene import AXES
 
 

@@ -29,10 +29,9 @@ from ...system.untrusted import quoted_value
 from .. import spz
 from ..compression import check_promise
 from ..encoder import SPZ_RANGES, CodeRange
-from ..file_notes import FileNote, note_of, read_note
 from ..merging import copy_rows
 from ..options import CESIUM, DEFAULTS, KHRONOS, WriteOptions
-from ..reader import OpenFile, Reader, Target, encode_rows, left_out
+from ..reader import FileNote, OpenFile, Reader, Target, encode_rows, left_out, note_of, read_note
 from .attributes import (
     ATTRIBUTES,
     COMPRESSION,

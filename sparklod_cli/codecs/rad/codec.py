@@ -24,10 +24,9 @@ from ...system.progress import Progress, silent
 from ...system.threads import blocks_of
 from .. import quantize, sh_palette, spark_codings
 from ..encoder import CodeRange, Encoded, Encoder, Windows, results, windows_of
-from ..file_notes import comment_of
 from ..options import AUTO, DEFAULTS, RAD_ENCODINGS, WriteOptions
 from ..quantize import Bytes
-from ..reader import OpenCompanion
+from ..reader import OpenCompanion, comment_of
 from ..spark_codings import SplatEncoding
 from .property_codings import BLOCK, BY_NAME, CODINGS, PROPERTIES, Row, encodings_of
 from .rad_header import (

@@ -17,8 +17,8 @@ from typing import Any, BinaryIO
 
 from ...system.errors import FormatError, NotSplatsError, PromiseError, TruncatedError, VersionError
 from ...system.untrusted import Json, Origin, quoted_value
-from ..file_notes import FileNote, read_comment
 from ..formats import RAD_SUFFIX, rad_chunk_name
+from ..reader import FileNote, read_comment
 from ..spark_codings import SplatEncoding
 
 #: The first bytes of a file, and of a chunk.

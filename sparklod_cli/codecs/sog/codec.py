@@ -29,11 +29,10 @@ from ...system.untrusted import Json, quoted_value
 from .. import quantize, sh_palette
 from ..compression import check_promise
 from ..encoder import CodeRange
-from ..file_notes import note_of, read_note
 from ..formats import META, SOG_IMAGES
 from ..kernels import texels
 from ..options import DEFAULTS, MAX_SH_CODES, WriteOptions
-from ..reader import Note, OpenFile, Reader, Target
+from ..reader import Note, OpenFile, Reader, Target, note_of, read_note
 from . import texel_codings as codings
 from .sog_container import LARGEST, MAX_SIDE, Pixels, SogFiles, Texels, encode_webp, has, image_of, size_for, zipped
 from .texel_codings import codebook, even_codebook, nearest

@@ -24,11 +24,10 @@ from ...system.units import count_of
 from ...system.untrusted import quoted_value
 from .. import quantize
 from ..compression import check_promise
-from ..file_notes import note_of
 from ..formats import ENVIRONMENT_FILE, MANIFEST, META, chunk_folder
 from ..merging import Chunk
 from ..options import WriteOptions
-from ..reader import OpenCompanion, OpenFile, Reader, size_of
+from ..reader import OpenCompanion, OpenFile, Reader, note_of, size_of
 from ..sog import codec as sog
 from ..validation import check_rules, error_of
 from .manifest import MAX_MANIFEST, VERSION, Bound, Manifest, ManifestNode, Run, parse, serialise

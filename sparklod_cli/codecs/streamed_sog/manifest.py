@@ -16,9 +16,9 @@ from typing import Any
 from ...system.errors import VersionError
 from ...system.untrusted import Json, quoted_value
 from .. import quantize
-from ..file_notes import FileNote, read_note
 from ..formats import MANIFEST
 from ..json_trees import nodes_of, parse_manifest, place_of
+from ..reader import FileNote, read_note
 
 #: The version that is read and written. A manifest from before versions has none.
 VERSION = 1

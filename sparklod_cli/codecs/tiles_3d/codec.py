@@ -25,13 +25,12 @@ from ...system.progress import Progress, silent
 from ...system.threads import ordered_map
 from ...system.untrusted import quoted_value
 from ..compression import check_promise
-from ..file_notes import note_of
 from ..formats import TILES, TILESET
 from ..glb import codec as glb
 from ..glb.glb_container import transform_of
 from ..merging import Chunk, SceneFiles
 from ..options import CESIUM, WriteOptions
-from ..reader import Note, OpenCompanion, OpenFile, Reader
+from ..reader import Note, OpenCompanion, OpenFile, Reader, note_of
 from ..validation import check_rules, error_of
 from .tileset import (
     CONTENT_GLTF,

@@ -19,11 +19,10 @@ from numpy.typing import NDArray
 from ...model.traversed import Bounds
 from ...system.errors import FormatError, VersionError
 from ...system.untrusted import Json, quoted_value
-from ..file_notes import FileNote, read_note
 from ..formats import TILESET
 from ..glb.glb_container import rotation_of_up
 from ..json_trees import nodes_of, parse_manifest, place_of
-from ..reader import OpenCompanion
+from ..reader import FileNote, OpenCompanion, read_note
 from ..validation import error_of
 
 #: The version that is written, and the one before it, which is read, too.
