@@ -229,7 +229,6 @@ class Files:
 
     @cached_property
     def json(self) -> CameraJson | None:
-        """The first file; None if it is not JSON."""
         try:
             return CameraJson.parse(self.text or "", ORIGIN)
         except CameraPathError:
@@ -275,7 +274,6 @@ class CameraJson(untrusted.Json):
         return _finite(value)
 
     def first_has(self, *keys: str) -> bool:
-        """Return True if this is a list whose first item has all of these keys."""
         return isinstance(self.value, list) and bool(self.value) and self.get(0).has(*keys)
 
     def pair(self) -> tuple[float, float]:

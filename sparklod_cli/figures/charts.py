@@ -54,7 +54,6 @@ class FrameColumns:
         return all(numbers(self.rows, name) for name in names)
 
     def column(self, name: str) -> Series:
-        """(N,) values of a column; NaN for empty cells."""
         return np.array([np.nan if row[name] is None else row[name] for row in self.rows], np.float64)
 
     def ratio(self, name: str, of: str) -> Series:

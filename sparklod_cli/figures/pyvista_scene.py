@@ -248,7 +248,7 @@ def write_png(
 def _axes(
     draw: ImageDraw.ImageDraw, unit: float, size: tuple[int, int], eye: Viewpoint, low: Points, high: Points
 ) -> None:
-    """Draws axes along three edges of a box: the two near ones of its floor, and the upright one on the left."""
+    """Draw axes along three edges of a box: the two near ones of its floor, and the upright one on the left."""
     upright = int(np.abs(eye.axes[1]).argmax())
     down = bool(eye.axes[1, upright] < 0)
     ends = np.stack([low, high])
@@ -406,7 +406,6 @@ class PyvistaStage:
         return local
 
     def photograph(self, eye: Viewpoint) -> NDArray[np.uint8]:
-        """(H, W, 3) the picture from a viewpoint."""
         camera = self._plotter.camera
         camera.position, camera.focal_point = self._local(eye.position), self._local(eye.target)
         camera.up, camera.view_angle = eye.axes[1], eye.angle

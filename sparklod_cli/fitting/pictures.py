@@ -86,7 +86,6 @@ class FittedNodes:
         return seen, ShadedSplats(found.center, found.scale, found.quat_xyzw, found.lod_opacity, found.rgb)
 
     def renew(self, index: Index) -> None:
-        """Update the nodes that cuts are found with."""
         self.place(index, self.columns.center[index], self.sizes(index))
 
     @np.errstate(over="ignore")  # what float16 cannot hold is infinite, as in Spark

@@ -61,7 +61,6 @@ class PictureOutput:
         return [self.path(number) for number in (numbers if self.kind == "frames" else [0])]
 
     def check(self, numbers: Sequence[int], *, overwrite: bool) -> None:
-        """Raise an `OutputError` if a file cannot be written; called before any work is done."""
         for path in self.paths(numbers):
             check_free(path, overwrite=overwrite)
         self.try_place()

@@ -24,7 +24,6 @@ from .pixels import animate, sheet
 if TYPE_CHECKING:
     from ..cameras.camera import Camera
     from ..cameras.sources import CameraPath
-    from ..render.color_scales import Coloring
     from ..render.renderer import DrawnPicture
     from ..render.settings import RenderSettings
     from ..scenes.finder import CutSource
@@ -172,8 +171,12 @@ class _Writer:
     def _frame(self, at: int) -> _Frame:
         camera, number = self._path.cameras[at], self._path.numbers[at]
         with on_threads(self._settings.threads):  # the setting is per Python thread
-            drawn, other = self._draw(at)
-        facts = self._facts(number, camera, drawn)
+            both = self._drawn.pop(at, None)
+            drawn, other = both or self._both(camera)
+        facts = {"frame": number, "time_s": camera.time, "name": camera.name, "splats": drawn.splats}
+        facts |= {"width": camera.width, "height": camera.height}
+        if self._output.kind == "frames":
+            facts["file"] = str(self._output.path(number))
         image = codes.over(drawn.image, self._settings.background)
         if other is not None:
             check_covered(other.image, f"what --diff names, in frame {number},")
@@ -187,26 +190,18 @@ class _Writer:
             values = drawn.values if by in OF_PIXELS and drawn.values is not None else image
             return _Frame(facts, None, codes.encode_floats(values), empty)
         pixels = codes.eight_bits(image)
-        bar = self._bar()
-        if bar is not None:
+        bar = self._renderer.scale.bar if self._renderer.scale is not None else None
+        if self._reference is not None:
+            bar = codes.difference_bar(self._gain)
+        if self._settings.bar and bar is not None:
             pixels = codes.with_scale(pixels, bar)
             facts["width"] = pixels.shape[1]
         if self._output.kind in ("picture", "frames"):
             return _Frame(facts, None, self._encode(pixels), empty)
         return _Frame(facts, pixels, b"", empty)
 
-    def _draw(self, at: int) -> tuple[DrawnPicture, DrawnPicture | None]:
-        if at in self._drawn:
-            return self._drawn.pop(at)
-        camera = self._path.cameras[at]
+    def _both(self, camera: Camera) -> tuple[DrawnPicture, DrawnPicture | None]:
         return self._renderer.draw(camera), None if self._reference is None else self._reference.draw(camera)
-
-    def _bar(self) -> Coloring | None:
-        if not self._settings.bar:
-            return None
-        if self._reference is not None:
-            return codes.difference_bar(self._gain)
-        return self._renderer.scale.bar if self._renderer.scale is not None else None
 
     def _fitting_gain(self, reference: Renderer) -> float:
         """Return the gain for all pictures, chosen from the first, the middle and the last one."""
@@ -221,13 +216,6 @@ class _Writer:
                 self._drawn[at] = both
             self._progress("comparing", done, len(some), "frame")
         return codes.gain_for(differences)
-
-    def _facts(self, number: int, camera: Camera, drawn: DrawnPicture) -> dict[str, Any]:
-        facts = {"frame": number, "time_s": camera.time, "name": camera.name, "splats": drawn.splats}
-        facts |= {"width": camera.width, "height": camera.height}
-        if self._output.kind == "frames":
-            facts["file"] = str(self._output.path(number))
-        return facts
 
     def _encode(self, pixels: Pixels) -> bytes:
         return codes.encode(pixels, self._output.form, self._settings.jpeg_quality)

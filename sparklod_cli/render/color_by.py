@@ -95,7 +95,13 @@ def scale_of_splats(by: str, source: CutSource, cameras: Sequence[Camera], progr
         return _whole(by, by, source, cameras, progress)
     every = max(1, sum(len(part.index) for part in candidates) // SAMPLE)
     values = np.concatenate([values_of(by, part)[::every] for part in candidates])
-    return _opacities(values) if by == "lod-opacity" else _sizes(values)
+    if by == "lod-opacity":
+        top = top_opacity(values)
+        return _linear("LoD opacity", 0.0, top, MAGMA, ends=bool(values.max() > top))
+    logs = np.log10(np.clip(values, 1e-30, 1e30).astype(np.float64))
+    low, high = log_range(logs)
+    marks = with_ends(log_marks(low, high), f"{10**low:.2g} or less", f"{10**high:.2g} or more", APART)
+    return Scale(smooth("feature size", np.empty(0), PLASMA, marks), low, high, log=True)
 
 
 def scale_of_depth(source: CutSource, cameras: Sequence[Camera], settings: RasterSettings) -> Scale:
@@ -142,9 +148,7 @@ def _whole(by: str, title: str, source: CutSource, cameras: Sequence[Camera], pr
 
 def numbers_of(by: str, scene: LoadedScene, index: Index) -> NDArray[np.int64]:
     """Return (M,) the "level" or the "chunk" of some splats of a file; without levels, all are of level 0."""
-    if by == "chunk":
-        return scene.chunk_of(index)
-    return np.zeros(len(index), np.int64) if scene.depth is None else scene.depth[index].astype(np.int64)
+    return scene.chunk_of(index) if by == "chunk" else scene.depth[index].astype(np.int64)
 
 
 def _linear(title: str, low: float, high: float, stops: tuple[str, ...], *, ends: bool) -> Scale:
@@ -152,15 +156,3 @@ def _linear(title: str, low: float, high: float, stops: tuple[str, ...], *, ends
     if ends:
         marks = with_ends(marks, f"{low:.3g} or less" if low else None, f"{high:.3g} or more", APART)
     return Scale(smooth(title, np.empty(0), stops, marks), low, high)
-
-
-def _opacities(values: FloatArray) -> Scale:
-    top = top_opacity(values)
-    return _linear("LoD opacity", 0.0, top, MAGMA, ends=bool(values.max() > top))
-
-
-def _sizes(values: FloatArray) -> Scale:
-    logs = np.log10(np.clip(values, 1e-30, 1e30).astype(np.float64))
-    low, high = log_range(logs)
-    marks = with_ends(log_marks(low, high), f"{10**low:.2g} or less", f"{10**high:.2g} or more", APART)
-    return Scale(smooth("feature size", np.empty(0), PLASMA, marks), low, high, log=True)

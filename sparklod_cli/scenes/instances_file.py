@@ -62,7 +62,6 @@ def read_instances(path: Path | str) -> list[Instance]:
 
 
 def _instance(item: Json, folder: Path) -> Instance:
-    """Return one instance, its name empty where it has none."""
     _check_keys(item, KEYS)
     file, name = item.text("file"), item.optional("name", Json.text, "")
     if not file or not is_file_name(file):
@@ -85,7 +84,6 @@ def _check_keys(item: Json, known: Collection[str]) -> None:
 
 
 def _matrix(item: Json) -> Matrix:
-    """Return the (4, 4) matrix of a matrix, or of scale, rotation and translation."""
     if item.has("matrix"):
         if any(map(item.has, PARTS)):
             raise item.error("it has a matrix, and parts of one too")

@@ -208,7 +208,6 @@ class Scenes:
 
     @functools.cached_property
     def forest(self) -> Forest:
-        """The trees, detail levels or tiles, as traversals read them."""
         if self.details:
             return DetailForest(
                 *zip(*((each.detail, each.scene.splats, each.files) for each in self.details), strict=True)
@@ -301,7 +300,6 @@ class Scenes:
         return Part(loaded, loaded.leaves, None, self.instances[number].object_to_world)
 
     def balls(self) -> Balls:
-        """Return what the splats of full detail of every instance cover, in the world."""
         if any(isinstance(loaded, PagedScene) for loaded in self.loaded):
             return sampled_balls(self.instances, self.of_instance)
         return Balls.concat(

@@ -88,12 +88,10 @@ class LoadedScene:
 
     @property
     def count(self) -> int:
-        """N."""
         return len(self.splats)
 
     @property
     def leaf_count(self) -> int:
-        """M."""
         return len(self.leaves)
 
     @property
@@ -391,11 +389,9 @@ class Pages:
                 yield splats, tree
 
     def leaf_count(self) -> int:
-        """Return the number of leaves; reads the children of all nodes."""
         return sum(int(np.count_nonzero(tree.is_leaf)) for _, tree in self.blocks(()))
 
     def leaves(self) -> NDArray[np.int64]:
-        """Return the (M,) indices of all leaves."""
         found = [np.flatnonzero(tree.is_leaf) for _, tree in self.blocks(())]
         return np.concatenate([number * CHUNK_NODES + leaves for number, leaves in enumerate(found)])
 
@@ -523,7 +519,6 @@ class _Sample:
 
 
 def _leaves_of(loaded: LoadedScene) -> Iterator[tuple[Splats, Index]]:
-    """Yield splats of a scene, and which of them are its leaves."""
     if not isinstance(loaded, PagedScene):
         yield loaded.splats, loaded.leaves
         return

@@ -313,7 +313,6 @@ class Lookout:
         return found
 
     def moments(self) -> list[Moment]:
-        """Return the extreme frames so far, in the order of `MOMENTS`."""
         moments = []
         for criterion, (_, _, unit) in MOMENTS.items():
             if criterion in self._most:
@@ -350,7 +349,6 @@ class FrameOutputs:
     overwrite: bool = False
 
     def check(self) -> None:
-        """Raise a `SparklodError` if an output cannot be written; called before any work is done."""
         self.table.check()
         if self.plot is not None:
             check_writable(self.plot, overwrite=self.overwrite)

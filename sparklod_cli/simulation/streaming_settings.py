@@ -41,7 +41,6 @@ class Network(CheckedSettings):
 
     @property
     def instant(self) -> bool:
-        """Whether everything arrives at once."""
         return self.bandwidth == math.inf and self.latency == 0
 
 

@@ -129,18 +129,16 @@ def parse_condition(text: str, *, example: str) -> Condition:
         raise BadAssertionError(f"{text!r} is not an assertion like {example!r}")
     if sign not in SIGNS:
         raise BadAssertionError(f"{text!r}: {sign} is not one of {' '.join(SIGNS)}")
-    return Condition(text.strip(), left, sign, _value(text, right))
-
-
-def _value(text: str, right: str) -> Any:
     if right in WORDS:
-        return WORDS[right]
-    if right.startswith('"'):
+        bound = WORDS[right]
+    elif right.startswith('"'):
         try:
-            return json.loads(right)
+            bound = json.loads(right)
         except ValueError:
             raise BadAssertionError(f"{text!r}: {right} is not a text in double quotes") from None
-    return _number(text, right)
+    else:
+        bound = _number(text, right)
+    return Condition(text.strip(), left, sign, bound)
 
 
 def _number(text: str, right: str) -> Number:

@@ -63,10 +63,10 @@ def histogram(values: FloatArray, *, bins: int = 40, log: bool | None = None) ->
         log = least > 0 and most > LOG_SPAN * least
     if log:
         np.log(finite, out=finite)
-    ends = _range(finite)
-    if ends[1] - ends[0] <= 1e-12 * max(
-        abs(ends[0]), abs(ends[1])
-    ):  # a single value, in a bin one float wide on either side
+    first, low, high, last = (float(end) for end in np.percentile(finite, [0, 0.5, 99.5, 100]))
+    ends = (low, high) if high > low and last - first > FAR_SPAN * (high - low) else (first, last)
+    if ends[1] - ends[0] <= 1e-12 * max(map(abs, ends)):
+        # A single value, in a bin one float wide on either side.
         edges = np.array([np.nextafter(least, -np.inf), np.nextafter(most, np.inf)])
         return Histogram(edges, np.array([len(finite)]), log, not_finite=not_finite)
     counts, edges = np.histogram(finite, bins, ends)
@@ -75,13 +75,6 @@ def histogram(values: FloatArray, *, bins: int = 40, log: bool | None = None) ->
         edges = np.exp(edges)  # exp rounds, but the outermost edges are known exactly
         edges[0], edges[-1] = edges[0] if below else least, edges[-1] if above else most
     return Histogram(edges, counts.astype(np.int64), log, below, above, not_finite)
-
-
-def _range(values: NDArray[np.float64]) -> tuple[float, float]:
-    least, low, high, most = (float(end) for end in np.percentile(values, [0, 0.5, 99.5, 100]))
-    if high > low and most - least > FAR_SPAN * (high - low):
-        return low, high
-    return least, most
 
 
 def as_text(histogram: Histogram, *, width: int = 60, rows: int = 20) -> str:

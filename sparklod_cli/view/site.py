@@ -217,17 +217,16 @@ def parse_drop(body: bytes, settings: CameraSettings) -> dict[str, Any]:
 
 
 def _contents(body: bytes) -> Mapping[str, bytes]:
-    """Return the dropped files by their names, at least one."""
     try:
         files = parse_json(body)["files"]
         contents = {file["name"]: b64decode(file["data"], validate=True) for file in files[:MAX_FILES]}
     except (ValueError, KeyError, TypeError, binascii.Error):
-        raise CameraPathError("the request holds no files") from None
+        contents = {}
+    if not contents:
+        raise CameraPathError("the request holds no files")
     for name in contents:
         if not isinstance(name, str) or leads_away(name):
             raise CameraPathError(f"{quoted_value(name)} is no name of a file; rename it")
-    if not contents:
-        raise CameraPathError("the request holds no files")
     return contents
 
 

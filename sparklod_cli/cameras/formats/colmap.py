@@ -54,12 +54,10 @@ class Model:
 
     @property
     def count(self) -> int:
-        """Number of parameters of a camera."""
         return self.focals + 2 + self.others
 
     @property
     def distorts(self) -> bool:
-        """Whether its images may differ from those of a pinhole camera."""
         return self.others > 0 or "FISHEYE" in self.name
 
 
@@ -102,7 +100,6 @@ def recognises_colmap(files: Files) -> bool:
 
 
 def _begins_with_rotation(line: str) -> bool:
-    """Return whether a line of text is an image whose quaternion is of length 1."""
     try:
         return _is_unit(_text_image(line, "")[2])
     except CameraPathError:
@@ -274,7 +271,6 @@ class _Reader:
         return layout.unpack_from(self._data, self._at - layout.size)
 
     def text(self) -> str:
-        """Return the text up to a zero byte."""
         end = self._data.find(b"\0", self._at)
         if end < 0:
             raise CameraPathError(f"{self._name} ends inside a name")

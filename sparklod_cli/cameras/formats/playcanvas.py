@@ -106,7 +106,6 @@ def _of_document(root: CameraJson, settings: Settings) -> Parsed:
 
 
 def _values(view: CameraJson, fov: float) -> list[float]:
-    """Return position, target and field of view in degrees."""
     degrees = view.optional("fov", CameraJson.number, fov)
     return [*view.get("position").numbers(3), *view.get("target").numbers(3), degrees]
 

@@ -11,7 +11,6 @@ import ctypes.util
 import functools
 import subprocess
 import sys
-from collections.abc import Callable
 from typing import Any
 
 from ...system.python_process import module_command
@@ -46,7 +45,15 @@ class OSMesa:
     """
 
     def __init__(self) -> None:
-        self._library = _load(OSMESA_NAMES)
+        reason = ""
+        for library in OSMESA_NAMES:
+            try:
+                self._library: Any = ctypes.CDLL(library)
+                break
+            except OSError as error:
+                reason = reason or str(error)
+        else:
+            raise NoContextError(reason)
         for name in ("OSMesaCreateContextAttribs", "OSMesaGetProcAddress"):
             if not hasattr(self._library, name):
                 raise NoContextError(f"this libOSMesa is too old: it has no {name}")
@@ -71,43 +78,24 @@ class OSMesa:
         self._library.OSMesaDestroyContext(self._context)
 
 
-def _load(names: tuple[str, ...]) -> Any:
-    reason = ""
-    for name in names:
-        try:
-            return ctypes.CDLL(name)
-        except OSError as error:  # noqa: PERF203
-            reason = reason or str(error)
-    raise NoContextError(reason)
-
-
-def _osmesa() -> Any:
-    import moderngl
-
-    options: Any = {"context": OSMesa()}  # missing in moderngl's type hints
-    return moderngl.create_context(require=VERSION, **options)
-
-
-def _egl() -> Any:
-    import moderngl
-
-    # glcontext looks for file names that only development packages have; with glvnd either library has the functions.
-    libgl = ctypes.util.find_library("GL") or ctypes.util.find_library("OpenGL") or "libGL.so.1"
-    libegl = ctypes.util.find_library("EGL") or "libEGL.so.1"
-    options: Any = {"backend": "egl", "libgl": libgl, "libegl": libegl}
-    return moderngl.create_context(require=VERSION, standalone=True, **options)
-
-
-_MAKE: dict[str, Callable[[], Any]] = {"osmesa": _osmesa, "egl": _egl}
-
-
 def create(kind: str) -> Any:
     """Return a moderngl.Context over one of `PACKAGES`, current on this thread; `NoContextError` if that fails.
 
     A broken driver may end the process instead, see `probe`.
     """
     try:
-        context = _MAKE[kind]()
+        import moderngl
+
+        options: Any  # some are missing in moderngl's type hints
+        if kind == "osmesa":
+            options = {"context": OSMesa()}
+        else:
+            # glcontext looks for file names that only development packages have; with glvnd either library has the
+            # functions.
+            libgl = ctypes.util.find_library("GL") or ctypes.util.find_library("OpenGL") or "libGL.so.1"
+            libegl = ctypes.util.find_library("EGL") or "libEGL.so.1"
+            options = {"backend": "egl", "libgl": libgl, "libegl": libegl, "standalone": True}
+        context = moderngl.create_context(require=VERSION, **options)
         # Python frees objects on any thread at any time; OpenGL objects must be freed on this thread, by `gc`.
         context.gc_mode = "context_gc"
         return context

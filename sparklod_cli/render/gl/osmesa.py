@@ -48,7 +48,6 @@ class Order:
         self._sorted: tuple[Camera, RasterSettings, float] | None = None
 
     def forget(self) -> None:
-        """Discard the last order, because the splats have changed."""
         self._sorted = None
 
     def update(self, splats: ShadedSplats, camera: Camera, raster: RasterSettings) -> Indices | None:
@@ -146,12 +145,7 @@ def draw(
     OpenGL objects are reused from frame to frame. `precision` is one of `PRECISIONS`; `sorting` and `throttle` are
     those of `Order`. `BackendError` if OpenGL is not available, or the picture or the scene exceeds its limits.
     """
-    return _renderer(precision, sorting, throttle).draw(splats, camera, raster)
-
-
-@functools.lru_cache(maxsize=2)
-def _renderer(precision: str, sorting: str, throttle: float) -> OpenGLRenderer:
-    return OpenGLRenderer(precision=precision, sorting=sorting, throttle=throttle)
+    return _renderer(precision=precision, sorting=sorting, throttle=throttle).draw(splats, camera, raster)
 
 
 class OpenGLRenderer:
@@ -254,6 +248,9 @@ class OpenGLRenderer:
         error = self._context.error
         if error != "GL_NO_ERROR":
             raise BackendError(f"OpenGL failed at {what}: {error}; try the backend numba")
+
+
+_renderer = functools.lru_cache(maxsize=2)(OpenGLRenderer)
 
 
 def on_gl_thread(work: Callable[..., _T], *arguments: Any) -> _T:
