@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import sparklod_cli as sparklod
-from sparklod_cli.compare import PicturePair, measured
+from sparklod_cli.api.views import PicturePair, measured
 from sparklod_cli.images.metrics import BACKGROUNDS, edges
 from sparklod_cli.tables.columns import Row
 from sparklod_cli.tables.comparison import rows_by_budget

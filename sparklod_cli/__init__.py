@@ -65,7 +65,7 @@ def __dir__() -> list[str]:
 
 
 class _Package(ModuleType):
-    """Module that keeps public functions, which importing a module of the same name (`render`, `compare`) replaces."""
+    """Module that keeps public functions, which importing a package of the same name (`render`) replaces."""
 
     def __setattr__(self, name: str, value: Any) -> None:
         if name not in _HOMES or not isinstance(value, ModuleType):

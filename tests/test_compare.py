@@ -15,12 +15,12 @@ import pytest
 from PIL import Image
 
 import sparklod_cli as sparklod
+from sparklod_cli.api.views import Comparison, measured
 from sparklod_cli.bake.flow import bake
 from sparklod_cli.bake.settings import BakeSettings
 from sparklod_cli.cameras.camera import Camera, look_at
 from sparklod_cli.cameras.sources import CameraPath
 from sparklod_cli.cli import run as program
-from sparklod_cli.compare import Comparison, measured
 from sparklod_cli.images.metrics import MOST_PSNR, on_background
 from sparklod_cli.lod.budget import parse_budgets
 from sparklod_cli.lod.settings import LodSettings

@@ -10,8 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from sparklod_cli import doctor, warmup
-from sparklod_cli.doctor import Check, check_all
+from sparklod_cli import warmup
+from sparklod_cli.commands import doctor
+from sparklod_cli.commands.doctor import Check, check_all
 from sparklod_cli.render.gl import context
 from sparklod_cli.system import jit, machine
 from sparklod_cli.system.optional import Required, install_hint, pip_install

@@ -229,9 +229,9 @@ def compare_files(
         UnfitError: there are both trees and Streamed SOG, or too many instances.
         SparklodError: a file cannot be read or written, has no levels, or a picture cannot be drawn.
     """
-    from ..compare import Comparison
     from ..tables.assertions import check
     from ..tables.comparison import EMPTY, rows_by_budget, summarize
+    from .views import Comparison
 
     table.check()
     if plot is not None:

@@ -1,20 +1,36 @@
-"""`sparklod doctor`: what sparklod needs, whether it is here, and what to do where it is not."""
+"""`sparklod doctor`: what sparklod needs, whether it is here, and what to do where it is not.
+
+The checks must work where nothing else does: packages are looked up by their metadata and tried in processes of their
+own, as a broken one may end its process instead of raising.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import json
+import os
+import platform
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from importlib import metadata
+from pathlib import Path
+from typing import Any, Literal
 
 import click
 
+from .. import __version__
+from ..system import machine
+from ..system.optional import DISTRIBUTION, install_hint, pip_install, required_by
+from ..system.python_process import program_command
+from ..system.threads import processors
 from ..system.untrusted import printable
 from .command import Command, flag, values_of
 from .console import Console, count_of, print_json
 from .options.common import QUIET, VERBOSE, Messages
-
-if TYPE_CHECKING:
-    from ..doctor import Check
 
 #: Beginning of the names of checks of extras.
 EXTRA = "extra "
@@ -42,8 +58,6 @@ def doctor(ctx: click.Context, /, **_: Any) -> None:
     """
     messages = values_of(ctx, _Messages)
     with Console(quiet=messages.quiet, verbose=messages.verbose) as console:
-        from ..doctor import check_all
-
         checks = check_all(lambda name: console.detail(f"checking {name}"))
         problems = [check for check in checks if check.state == "problem"]
         if messages.as_json:
@@ -79,3 +93,284 @@ def _lines(checks: list[Check]) -> list[str]:
         if check.advice:
             lines.append(" " * (8 + width + 2) + printable(f"-> {check.advice}"))
     return lines
+
+
+#: ok: works. note: something optional is missing, or could be better. problem: baking does not work.
+State = Literal["ok", "note", "problem"]
+
+#: Extras for developers of sparklod.
+INTERNAL_EXTRAS = ("dev", "docs", "test")
+
+#: Purposes of the other extras, for display.
+PURPOSES = {
+    "cloud": "files at addresses such as s3://bucket/scan.ply",
+    "cluster": "build-lod on several processes or machines",
+    "cuda": "pictures and --refine on NVIDIA cards",
+    "parquet": "Parquet tables",
+    "render": "figures, charts, and the backends osmesa and open3d of render",
+    "video": ".mp4 animations",
+}
+
+#: Time limit of a child process, seconds; Open3D alone may load for a minute.
+PATIENCE = 120
+
+#: Below so many bytes of available memory, little can be baked.
+LITTLE_MEMORY = 1 << 30
+
+#: Program of the child process that calls `_print_kernels`.
+KERNELS = f"import {__name__} as doctor; doctor._print_kernels()"
+
+#: Prints the card, its driver and the versions of its compilers, or exits with the reason why no card can be used.
+CARD = "from sparklod_cli.render.cuda.card import print_card; print_card()"
+
+#: Prints the encoder of videos.
+FFMPEG = "import imageio_ffmpeg; print(imageio_ffmpeg.get_ffmpeg_exe())"
+
+
+@dataclass(frozen=True)
+class Check:
+    """Result of one check.
+
+    Attributes:
+        advice: what to do about it; empty where nothing need be done.
+    """
+
+    name: str
+    state: State
+    value: str
+    advice: str = ""
+
+
+def check_all(begun: Callable[[str], None] = lambda name: None) -> list[Check]:
+    """Run all checks, the most important first; takes some seconds."""
+    found: list[Check] = []
+    parts: list[tuple[str, Callable[[], Iterator[Check]]]] = [
+        ("versions", _versions),
+        ("packages", _packages),
+        ("kernels", _kernels),
+        ("processors", _processors),
+        ("memory", _memory),
+        ("extras", _extras),
+        ("OpenGL", _opengl),
+        ("Open3D", _open3d),
+        ("NVIDIA card", _card),
+        ("ffmpeg", _ffmpeg),
+        ("Node and Chromium", _programs),
+    ]
+    for name, look in parts:
+        begun(name)
+        try:
+            found.extend(look())
+        except Exception as error:  # doctor must work where things are broken in unexpected ways
+            value = f"cannot be checked ({type(error).__name__}: {error})"
+            found.append(Check(name, "note", value, "please report this, with what sparklod doctor --json prints"))
+    return found
+
+
+def _versions() -> Iterator[Check]:
+    yield Check("sparklod", "ok", f"{__version__} in {Path(__file__).parents[1]}")
+    system = f"{platform.system()} {platform.release()} on {platform.machine()}"
+    yield Check("Python", "ok", f"{platform.python_version()}, {sys.executable}; {system}")
+
+
+# Packages
+
+
+def _packages() -> Iterator[Check]:
+    try:
+        for one in required_by(DISTRIBUTION):
+            advice = pip_install(one.requirement, options=["--upgrade"]) if one.missing else ""
+            yield Check(one.name, "problem" if one.missing else "ok", one.state, advice)
+    except metadata.PackageNotFoundError:
+        value = "sparklod itself is not installed, so its requirements are unknown"
+        yield Check("packages", "note", value, install_hint())
+
+
+def _extras() -> Iterator[Check]:
+    try:
+        extras = metadata.metadata(DISTRIBUTION).get_all("Provides-Extra") or []
+    except metadata.PackageNotFoundError:
+        return
+    for extra in sorted(set(extras) - set(INTERNAL_EXTRAS)):
+        packages = list(required_by(DISTRIBUTION, extra))
+        missing = any(package.missing for package in packages)
+        purpose = f"   # {PURPOSES[extra]}" if extra in PURPOSES else ""
+        advice = f"{install_hint(extra)}{purpose}" if missing else ""
+        yield _optional(f"extra {extra}", ", ".join(f"{each.name} {each.state}" for each in packages), advice)
+
+
+# What is compiled, and what it runs on
+
+
+def _print_kernels() -> None:
+    """Import everything that a bake needs, and print the state of the kernels as JSON."""
+    from .. import warmup
+    from ..bake.flow import bake  # noqa: F401
+    from ..system import jit
+
+    jit.load_numba()
+    folder = jit.CACHE_FOLDER or next(iter(jit.READ_FOLDERS), None)
+    about = {
+        "folder": None if folder is None else str(folder.resolve()),
+        "distrusted": jit.DISTRUSTED,
+        "wanted": len(warmup.units()),
+        "missing": len(warmup.missing()),
+    }
+    print(json.dumps(about))
+
+
+def _kernels() -> Iterator[Check]:
+    code, out, err = _run(program_command(KERNELS))
+    try:
+        about = json.loads(out.splitlines()[-1])
+    except (IndexError, ValueError):
+        advice = (
+            f"{install_hint(options=['--force-reinstall'])}   # in a new virtual environment, if that does not help"
+        )
+        yield Check("kernels", "problem", f"the modules of bakes cannot be imported: {_last_line(err, code)}", advice)
+        return
+    for text in about["distrusted"]:
+        yield Check("kernel cache", "problem", *text.split("; ", 1))
+    wanted, folder = about["wanted"], about["folder"]
+    if folder is None:
+        advice = "set NUMBA_CACHE_DIR to a folder that can be written to"
+        yield Check("kernel cache", "note", "no folder can be written to, so every run compiles its kernels", advice)
+    else:
+        compiled = wanted - about["missing"]
+        value = f"{compiled} of {wanted} kernels are compiled, {_megabytes(_size_of(Path(folder)))} in {folder}"
+        advice = "sparklod warmup   # compiles the others now, instead of when they are first used"
+        yield _optional("kernel cache", value, advice if about["missing"] else "")
+        old = [path for path in Path(folder).parent.glob("kernels-*") if path != Path(folder)]
+        if old:
+            value = f"{len(old)} of other versions of sparklod, {_megabytes(sum(map(_size_of, old)))}"
+            advice = f"delete the other kernels-* in {Path(folder).parent}, unless those versions are still used"
+            yield _optional("old caches", value, advice)
+
+
+def _processors() -> Iterator[Check]:
+    usable, quota = processors(), machine.processor_quota()
+    value, advice = f"{usable} of {os.cpu_count() or usable} can be used", ""
+    if quota is not None and quota < usable:
+        value += f", for the time of {quota:g}: a limit of the container"
+        advice = f"--threads {max(1, round(quota))}, since more threads get no more time"
+    yield _optional("processors", value, advice)
+
+
+def _memory() -> Iterator[Check]:
+    total, available = machine.total_memory(), machine.available_memory()
+    if total is None or available is None:
+        yield Check("memory", "ok", "this system does not say" if total is None else f"{total / 1e9:.1f} GB")
+        return
+    advice = "free some: a bake takes about three times the size of its PLY file" if available < LITTLE_MEMORY else ""
+    yield _optional("memory", f"{available / 1e9:.1f} of {total / 1e9:.1f} GB are available", advice)
+
+
+# What draws
+
+
+def _opengl() -> Iterator[Check]:
+    if not _is_installed("moderngl"):
+        yield Check("OpenGL", "note", "not tried without moderngl", install_hint("render", package="moderngl"))
+        return
+    from ..render.gl.context import PACKAGES, probe
+
+    reasons = {kind: probe(kind) for kind in PACKAGES}
+    value = ", ".join(f"{kind} draws" if not reason else f"{kind}: {reason}" for kind, reason in reasons.items())
+    packages = " or ".join(PACKAGES.values())
+    advice = f"on Debian and Ubuntu: apt install {packages}   # render --backend osmesa draws with it"
+    yield _optional("OpenGL", value, advice if all(reasons.values()) else "")
+
+
+def _open3d() -> Iterator[Check]:
+    if not _is_installed("open3d"):
+        yield Check("Open3D", "note", "not tried, since it is not installed", install_hint("render", package="open3d"))
+        return
+    try:
+        from ..render.open3d.backend import command
+        from ..render.open3d.child import PACKAGES
+    except ImportError as error:  # numpy
+        yield Check("Open3D", "note", f"not tried ({error})", install_hint())
+        return
+    code, out, err = _run(command())  # it draws a splat before it looks for requests, of which there are none
+    try:
+        reason = json.loads(out.splitlines()[0]).get("error", "")
+    except (IndexError, ValueError):
+        reason = f"it has crashed: {_last_line(err, code)}"
+    advice = f"on Debian and Ubuntu: apt install {PACKAGES}   # render --backend open3d draws with it" if reason else ""
+    yield _optional("Open3D", reason or "draws", advice)
+
+
+def _card() -> Iterator[Check]:
+    if not _is_installed("numba-cuda"):
+        has_driver = shutil.which("nvidia-smi") is not None
+        advice = install_hint("cuda") if has_driver else ""
+        value = "not tried without numba-cuda" if has_driver else "none: no driver is installed"
+        yield _optional("NVIDIA card", value, advice)
+        return
+    code, out, err = _run(program_command(CARD))
+    yield Check("NVIDIA card", "note" if code else "ok", _last_line(err, code) if code else out.strip())
+
+
+def _ffmpeg() -> Iterator[Check]:
+    if _is_installed("imageio-ffmpeg"):
+        code, out, err = _run(program_command(FFMPEG))
+        value = _last_line(err, code) if code else out.strip()
+        advice = "install ffmpeg, or set IMAGEIO_FFMPEG_EXE to it   # .mp4 animations take it" if code else ""
+        yield _optional("ffmpeg", value, advice)
+
+
+# What only the tests take
+
+
+def _programs() -> Iterator[Check]:
+    for name, command, packages in (("Node", "node", "nodejs npm"), ("Chromium", "chromium", "chromium")):
+        advice = f"on Debian and Ubuntu: apt install {packages}   # only sparklod's own tests take it"
+        program = shutil.which(command)
+        if program is None:
+            yield _optional(name, "is not installed", advice)
+            continue
+        code, out, err = _run([program, "--version"])
+        value = f"{program} does not run: {_last_line(err, code)}" if code else f"{_last_line(out, code)}, {program}"
+        yield _optional(name, value, advice if code else "")
+
+
+def _optional(name: str, value: str, advice: str) -> Check:
+    """Return the check of something optional, a note if there is advice."""
+    return Check(name, "note" if advice else "ok", value, advice)
+
+
+def _is_installed(package: str) -> bool:
+    try:
+        metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return False
+    return True
+
+
+def _run(command: list[str]) -> tuple[int, str, str]:
+    try:
+        done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, check=False, timeout=PATIENCE)
+    except subprocess.TimeoutExpired:
+        return 1, "", f"no answer within {PATIENCE} seconds"
+    except OSError as error:
+        return 1, "", str(error)
+    return done.returncode, done.stdout.decode("utf-8", "replace"), done.stderr.decode("utf-8", "replace")
+
+
+def _last_line(text: str, code: int) -> str:
+    lines = text.strip().splitlines()
+    if lines:
+        return lines[-1].strip()
+    return f"ended by signal {-code}" if code < 0 else f"exit status {code}"
+
+
+def _size_of(folder: Path) -> int:
+    total = 0
+    for path in folder.glob("*"):
+        with contextlib.suppress(OSError):  # another process has just replaced it
+            total += path.stat().st_size
+    return total
+
+
+def _megabytes(size: int) -> str:
+    return f"{size / 1e6:.1f} MB"

@@ -19,7 +19,6 @@ from ..system.untrusted import printable
 from ..tables.columns import FORMS
 from .command import COMMON, Command, check_declared, flag, refuse, values_of
 from .console import WIDTH, Console, count_of, for_screen, is_terminal, print_json, rows
-from .options.cameras import Cameras
 from .options.common import (
     JSON,
     General,
@@ -32,7 +31,7 @@ from .options.common import (
     report_outcomes,
     table_form,
 )
-from .options.cut import CutOptions, Inputs, check_scenes, files_read, notes_on_loading, viewed_files
+from .options.viewing import Cameras, CutOptions, Inputs, check_scenes, files_read, notes_on_loading, viewed_files
 from .paths import OutputPath, claim_stdout, keep_apart, name_outputs
 
 if TYPE_CHECKING:

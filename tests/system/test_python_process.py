@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import sparklod_cli
-from sparklod_cli import doctor
+from sparklod_cli.commands import doctor
 from sparklod_cli.system.errors import SparklodError
 from sparklod_cli.system.python_process import check_current_folder, module_command, program_command
 from tests.conftest import ROOT
@@ -79,7 +79,7 @@ def import_numba_without_forks() -> None:
 #: All that starts a process of Python, by the module that does.
 STARTED: dict[str, list[Callable[[], object]]] = {
     "bake/out_of_core/cluster": [start_workers],
-    "doctor": [check_kernels, find_ffmpeg],
+    "commands/doctor": [check_kernels, find_ffmpeg],
     "figures/pyvista_scene": [probe_pyvista],
     "render/gl/context": [probe_opengl],
     "render/open3d/backend": [start_open3d],
@@ -130,7 +130,11 @@ def test_every_process_of_python_is_started_in_this_way() -> None:
     helper = "system/python_process"
     users = {name for name, text in texts.items() if "system.python_process import" in text}
     assert users == set(STARTED)
-    shown = {"commands/completion", "doctor", "system/optional"}  # which show the interpreter, and start nothing by it
+    shown = {
+        "commands/completion",
+        "commands/doctor",
+        "system/optional",
+    }  # which show the interpreter, and start nothing by it
     assert {name for name, text in texts.items() if "sys.executable" in text} == {helper, *shown}
 
 
