@@ -15,6 +15,7 @@ from pathlib import Path
 from scenes import load, ply_header, ply_rows, tiled
 
 from sparklod_cli.bake import estimate
+from sparklod_cli.bake.settings import BakeSettings as Settings
 from sparklod_cli.lod.builders import METHODS
 from sparklod_cli.model.sh import COEFFICIENTS
 
@@ -86,7 +87,7 @@ def report(found: dict[str, float], method: str, degree: int, suffix: str, count
     if size:
         guess = estimate.out_of_core_bytes(method, count, degree, size, in_chunks=suffix == ".rad")
     else:
-        guess = estimate.in_memory_bytes(method, count, degree)
+        guess = estimate.in_memory_bytes(Settings(method), count, degree)
     each = (found["peak"] - estimate.PROCESS) / (size or count)
     scratch, of_scratch = found["scratch"] / count, estimate.scratch_bytes(method, count, degree) / count
     print(

@@ -11,6 +11,7 @@ from ..lod.builders import BUILDERS, SplatBytes
 from ..system import machine
 from ..system.errors import OutOfMemoryError
 from ..system.units import format_size
+from .settings import BakeSettings
 
 #: Default share of the available memory that a bake may take: other programs need some, and these figures are
 #: estimates. Chosen.
@@ -46,28 +47,22 @@ def default_memory() -> int | None:
     return None if available is None else int(MEMORY_SHARE * available)
 
 
-def in_memory_bytes(method: str, splats: int, sh_degree: int, *, refines: bool = False) -> int:
-    """Return the peak memory of a bake in memory, bytes; `refines` if its tree is refined."""
-    refining = PICTURES + OF_REFINED.of(splats, sh_degree) if refines else 0
-    return PROCESS + BUILDERS[method].in_memory.of(splats, sh_degree) + refining
+def in_memory_bytes(settings: BakeSettings, splats: int, sh_degree: int) -> int:
+    """Return the peak memory of a bake in memory, bytes."""
+    refining = 0 if settings.refine is None else PICTURES + OF_REFINED.of(splats, sh_degree)
+    return PROCESS + BUILDERS[settings.method].in_memory.of(splats, sh_degree) + refining
 
 
-def most_in_memory(memory: int, method: str, sh_degree: int, *, refines: bool = False) -> int:
+def most_in_memory(memory: int, settings: BakeSettings, sh_degree: int) -> int:
     """Return the size of the largest scene, splats, that can be baked in memory of this many bytes."""
-    fixed, one = (in_memory_bytes(method, splats, sh_degree, refines=refines) for splats in (0, 1))
+    fixed, one = (in_memory_bytes(settings, splats, sh_degree) for splats in (0, 1))
     return max(memory - fixed, 0) // (one - fixed)
 
 
 def out_of_core_bytes(
     method: str, splats: int, sh_degree: int, block_splats: int, *, in_chunks: bool = False, threads: int = 1
 ) -> int:
-    """Return the peak memory of a bake out of core, bytes.
-
-    Args:
-        splats: of the input.
-        sh_degree: of the tree.
-        in_chunks: the output has the order for streaming.
-    """
+    """Return the peak memory of a bake out of core, bytes; `in_chunks` if the output has the order for streaming."""
     from ..lod.chunk_order import MOST_FAMILIES, family_bytes  # takes long to load, and this is asked out of core only
 
     window = OF_WINDOW.of(min(2 * splats, WINDOW), sh_degree)

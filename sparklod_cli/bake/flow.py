@@ -16,7 +16,7 @@ from ..io.reading import Source, open_reader
 from ..lod.builders import METHODS
 from ..model.scene import up_notes
 from ..system.addresses import Place
-from ..system.errors import FormatError, memory_errors_translated
+from ..system.errors import memory_errors_translated
 from ..system.progress import Progress, silent
 from ..system.stdio import DASH
 from . import estimate
@@ -46,14 +46,14 @@ def bake(
     engine: Engine | None = None,
     say: Callable[[str], None] = lambda text: None,
 ) -> Baked:
-    """Read splat files, build a tree of them and write a Level-of-Detail file. The tree of a single input may be kept.
+    """Read splat files, build a tree of them or keep that of a single input, and write a Level-of-Detail file.
 
     A scene too large for the memory allowed is baked out of core: block by block, with a scratch folder.
 
     Args:
-        source: a file of any format that is read, - for standard input, or several files as one scene.
-        target: a file of the chosen format, or of arrays, whatever its name; - is standard output.
-        resources: memory and scratch folder; None for those of an otherwise idle machine.
+        source: - is standard input; several files are one scene.
+        target: of the chosen format, whatever its name; - is standard output.
+        resources: None for those of an otherwise idle machine.
         engine: runs the tasks of the bake, which then goes out of core; None for this process.
         say: receives one-line messages for the user.
 
@@ -124,23 +124,6 @@ def has_published(source: Source, target: Place, settings: BakeSettings, resourc
     return Store(scratch_folder(source, target, settings, resources.scratch_dir)).has(PUBLISHED)
 
 
-def fits_in_memory(source: Source, settings: BakeSettings, memory: int | None) -> bool:
-    """Return whether an input can be baked in this much memory; trees and unreadable inputs do.
-
-    Args:
-        memory: bytes; None for any number.
-    """
-    try:
-        with open_reader(source) as header:
-            if header.has_tree or memory is None:
-                return True
-            refines = settings.refine is not None
-            needed = estimate.in_memory_bytes(settings.method, header.count, header.sh_degree, refines=refines)
-            return needed <= memory
-    except FormatError:  # reported when it is baked
-        return True
-
-
 def scratch_folder(source: Source, target: Place, settings: BakeSettings, parent: Place | None) -> Place:
     """Return the scratch folder of a bake.
 
@@ -173,14 +156,12 @@ def _may_need_blocks(
     engine: Engine | None,
 ) -> bool:
     """Return whether a bake goes out of core, or an interrupted one may have left a scratch folder."""
-    if engine is not None or resources != Resources(memory=resources.memory):
+    if engine is not None or settings.files or not isinstance(target, Path):
         return True
     memory = estimate.default_memory() if resources.memory is None else resources.memory
-    refines = settings.refine is not None
-    needed = estimate.in_memory_bytes(settings.method, header.count, header.sh_degree, refines=refines)
-    if settings.files or (memory is not None and needed > memory):
-        return True
-    if not isinstance(target, Path):
+    if resources != Resources(memory=resources.memory) or (
+        memory is not None and estimate.in_memory_bytes(settings, header.count, header.sh_degree) > memory
+    ):
         return True
     if target == DASH:
         return any(Path(tempfile.gettempdir()).glob(f"standard-output-*{SCRATCH}"))

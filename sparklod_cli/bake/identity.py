@@ -42,8 +42,6 @@ class FileState:
     """State of an input file.
 
     Attributes:
-        name: for messages.
-        bytes: size.
         modified: nanoseconds since 1970; 0 for standard input and at an address.
         sample: digest of bytes from all over the file; at an address, of its version.
         content: digest of all bytes; empty if they were not read.
@@ -57,11 +55,7 @@ class FileState:
 
     @classmethod
     def of(cls, path: Place) -> FileState:
-        """Examine a file without reading much of it; - is standard input.
-
-        Raises:
-            UnreadableError: it cannot be read.
-        """
+        """Examine a file without reading much of it; raise `UnreadableError` if it cannot be read."""
         digest = _digest()
         if isinstance(path, Address):
             with readable():
@@ -98,19 +92,16 @@ class BakeIdentity:
     def of(
         cls, source: Source, settings: BakeSettings, *, whole: bool = False, former: BakeIdentity | None = None
     ) -> BakeIdentity:
-        """Examine the inputs of a bake.
+        """Examine the inputs of a bake; raise `UnreadableError` if one cannot be read.
 
         Args:
-            source: the input; - is standard input.
             whole: read all of each input for a digest of its content.
             former: identity whose digests are taken over for inputs of the same size, date and sample.
-
-        Raises:
-            UnreadableError: an input cannot be read.
         """
         known = {} if former is None else {dataclasses.replace(each, content=""): each for each in former.inputs}
         files = [(file, "") for place in places_of(source) for file in files_of(place)]
-        files += [(file, f"{file} ") for file in _files_named_in(settings)]
+        for setting, place in settings.files.items():
+            files += [(file, f"{file} ") for file in files_of(place, NAMES if setting == "camera_path" else ())]
         states = []
         for file, name in files:
             try:
@@ -167,11 +158,7 @@ def files_of(path: Place, sets: Collection[Collection[str]] = ()) -> list[Place]
 
 
 def content_of(path: Place) -> str:
-    """Return a digest of all bytes of a file, about 0.5 GB a second; - is standard input.
-
-    Raises:
-        UnreadableError: it cannot be read.
-    """
+    """Return a digest of all bytes of a file, about 0.5 GB a second."""
     digest = _digest()
     with readable(), file_of(path) as file:
         while piece := file.read(_READ_BYTES):
@@ -181,11 +168,6 @@ def content_of(path: Place) -> str:
 
 def _digest() -> hashlib.blake2b:
     return hashlib.blake2b(digest_size=16)
-
-
-def _files_named_in(settings: BakeSettings) -> list[Place]:
-    sets = {"camera_path": NAMES}
-    return [file for name, path in settings.files.items() for file in files_of(path, sets.get(name, ()))]
 
 
 def _flat(name: str, value: Any) -> Iterable[tuple[str, Any]]:

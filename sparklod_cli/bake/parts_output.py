@@ -12,7 +12,6 @@ from ..codecs.options import WriteOptions
 from ..lod.part_settings import DetailSettings, TileSettings
 from ..model.scene import Scene
 from ..model.splats import Splats
-from ..model.traversed import DetailScene, TileScene
 from ..system.output import Output
 from ..system.progress import Progress
 from ..system.threads import on_threads
@@ -21,13 +20,7 @@ from .settings import Clock
 
 @dataclass(frozen=True)
 class WrittenLevel:
-    """Detail level of a Streamed SOG.
-
-    Attributes:
-        splats: of all regions.
-        share: of the splats of level 0.
-        worst_error: largest error of a region.
-    """
+    """Detail level of a Streamed SOG: splats of all regions, their share of level 0, and the largest error."""
 
     splats: int
     share: float
@@ -40,7 +33,7 @@ class WrittenDetail:
 
     Attributes:
         levels: full detail first.
-        regions, chunks: how many; each chunk is a folder.
+        chunks: number of folders.
         environment: number of splats that are always drawn.
     """
 
@@ -55,7 +48,6 @@ class WrittenTiles:
     """Tiles of a tileset.
 
     Attributes:
-        tiles, levels: how many.
         splats: of each level's cut, the root's first; the last has full detail.
         error: geometric error of the root.
         georeferenced: the tileset stands on the Earth.
@@ -66,29 +58,6 @@ class WrittenTiles:
     splats: tuple[int, ...]
     error: float
     georeferenced: bool
-
-
-def detail_levels(
-    scene: Scene,
-    environment: Splats | None,
-    settings: DetailSettings,
-    clock: Clock,
-    *,
-    threads: int,
-    progress: Progress,
-) -> DetailScene:
-    """Return regions of a tree at several detail levels, with their errors, and an environment, if any."""
-    from ..lod.detail_levels import make
-    from .region_errors import measured
-
-    assert scene.tree is not None
-    with on_threads(threads):
-        made = make(scene.splats, scene.tree, settings, progress=progress)
-    clock.end("levels")
-    errors = measured(made, threads=threads, progress=progress)
-    clock.end("errors")
-    antialiased, up = scene.antialiased, scene.up
-    return dataclasses.replace(made, errors=errors, environment=environment, antialiased=antialiased, up=up)
 
 
 def write_levels(
@@ -111,21 +80,13 @@ def write_levels(
             size += out.write(name, pieces)
             names.append(name)
     clock.end("write")
-    return size, _written_detail(made, names)
-
-
-def _written_detail(made: DetailScene, names: list[str]) -> WrittenDetail:
-    """Return the statistics of a scene that was written to files of these names."""
     assert made.errors is not None
     splats, errors = made.counts.sum(axis=0).tolist(), made.errors.max(axis=0).tolist()
-    return WrittenDetail(
-        levels=tuple(
-            WrittenLevel(count, round(count / splats[0], 6), error) for count, error in zip(splats, errors, strict=True)
-        ),
-        regions=made.regions,
-        chunks=len({*folders_of(names)} - {ENVIRONMENT}),
-        environment=0 if made.environment is None else len(made.environment),
+    levels = tuple(
+        WrittenLevel(count, round(count / splats[0], 6), error) for count, error in zip(splats, errors, strict=True)
     )
+    chunks = len({*folders_of(names)} - {ENVIRONMENT})
+    return size, WrittenDetail(levels, made.regions, chunks, 0 if environment is None else len(environment))
 
 
 def write_tiles(
@@ -150,12 +111,7 @@ def write_tiles(
         files = encode_files(made, options, threads=threads, progress=progress)
         size = sum(out.write(*file) for file in files)
     clock.end("write")
-    return size, _written_tiles(made)
-
-
-def _written_tiles(made: TileScene) -> WrittenTiles:
-    """Return the statistics of tiles that were written."""
     levels = int(made.level.max()) + 1
     splats = tuple(int(made.counts[made.at_level(level)].sum()) for level in range(levels))
-    placed = not np.array_equal(made.transform, np.eye(4))
-    return WrittenTiles(made.tiles, levels, splats, float(made.errors[0]), placed)
+    georeferenced = not np.array_equal(made.transform, np.eye(4))
+    return size, WrittenTiles(made.tiles, levels, splats, float(made.errors[0]), georeferenced)

@@ -7,11 +7,12 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from ..io.reading import Source, absolute_source, places_of
+from ..io.reading import Source, absolute_source, open_reader, places_of
 from ..system.addresses import Place, absolute
-from ..system.errors import SparklodError
+from ..system.errors import FormatError, SparklodError
 from ..system.progress import Progress, silent
-from .flow import bake, fits_in_memory
+from .estimate import in_memory_bytes
+from .flow import bake
 from .out_of_core.cluster import ClusterEngine
 from .settings import Baked, BakeSettings, Resources
 
@@ -35,18 +36,32 @@ def bake_side_by_side(
         bake_large: bakes a scene too large for one worker, and returns the result.
         make: function of a module that bakes a scene.
     """
-    small = [fits_in_memory(source, settings, resources.memory) for source, _ in pairs]
+    small = [_fits_in_memory(source, settings, resources.memory) for source, _ in pairs]
     settings = dataclasses.replace(settings, **{name: path.absolute() for name, path in settings.files.items()})
-    whole = [
-        (absolute_source(source), absolute(target)) for source, target in pairs
-    ]  # workers have folders of their own
+    sources = [absolute_source(source) for source, _ in pairs]  # workers have folders of their own
     calls = [
-        (make, *pair, settings, overwrite, resources) for pair, is_small in zip(whole, small, strict=True) if is_small
+        (make, source, absolute(target), settings, overwrite, resources)
+        for source, (_, target), is_small in zip(sources, pairs, small, strict=True)
+        if is_small
     ]
-    engine.check(None, [place for source, _ in whole for place in places_of(source)])
+    engine.check(None, [place for source in sources for place in places_of(source)])
     with engine.map_calls("baking", _bake_small, calls, progress, "scene") as outcomes:
         for pair, is_small in zip(pairs, small, strict=True):
             yield _checked_outcome(next(outcomes), pair[1]) if is_small else bake_large(*pair)
+
+
+def _fits_in_memory(source: Source, settings: BakeSettings, memory: int | None) -> bool:
+    """Return whether an input can be baked in this much memory; trees and unreadable inputs can.
+
+    Args:
+        memory: bytes; None for any number.
+    """
+    try:
+        with open_reader(source) as header:
+            needed = in_memory_bytes(settings, header.count, header.sh_degree)
+            return header.has_tree or memory is None or needed <= memory
+    except FormatError:  # reported when it is baked
+        return True
 
 
 def _checked_outcome(outcome: Any, target: Place) -> Any:

@@ -7,6 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sparklod_cli.bake import estimate
+from sparklod_cli.bake.settings import BakeSettings
+from sparklod_cli.fitting.settings import FitSettings
 from sparklod_cli.lod.builders import METHODS
 from sparklod_cli.model import MAX_SH_DEGREE
 from sparklod_cli.system import machine
@@ -32,17 +34,18 @@ def test_a_block_is_the_largest_power_of_two_that_fits(method: str, splats: int,
 
 @given(*CASES)
 def test_more_splats_and_more_coefficients_take_more(method: str, splats: int, degree: int) -> None:
-    for of in (estimate.in_memory_bytes, estimate.scratch_bytes):
-        assert of(method, splats, degree) <= of(method, splats + 1, degree)
-        assert of(method, splats, degree) <= of(method, splats, MAX_SH_DEGREE)
+    for of, what in ((estimate.in_memory_bytes, BakeSettings(method)), (estimate.scratch_bytes, method)):
+        assert of(what, splats, degree) <= of(what, splats + 1, degree)
+        assert of(what, splats, degree) <= of(what, splats, MAX_SH_DEGREE)
     assert estimate.block_splats_within(None, method, splats, degree) == estimate.MOST_BLOCK_SPLATS
 
 
 @given(*CASES, st.booleans())
 def test_the_most_splats_in_memory_fill_it(method: str, splats: int, degree: int, refines: bool) -> None:
-    memory = estimate.in_memory_bytes(method, splats, degree, refines=refines)
-    assert estimate.most_in_memory(memory, method, degree, refines=refines) == splats
-    assert estimate.most_in_memory(memory - 1, method, degree, refines=refines) == splats - 1
+    settings = BakeSettings(method, refine=FitSettings() if refines else None)
+    memory = estimate.in_memory_bytes(settings, splats, degree)
+    assert estimate.most_in_memory(memory, settings, degree) == splats
+    assert estimate.most_in_memory(memory - 1, settings, degree) == splats - 1
 
 
 @given(st.integers(0, 10**9), st.integers(0, MAX_SH_DEGREE), st.integers(0, 1 << 40), st.integers(1, 64))

@@ -45,7 +45,7 @@ def test_large_scenes_are_baked_here_in_their_place(tmp_path: Path, monkeypatch:
         pairs,
         settings=BakeSettings(),
         engine=engine,  # type: ignore[arg-type]
-        resources=Resources(memory=in_memory_bytes("quick", *HELD)),
+        resources=Resources(memory=in_memory_bytes(BakeSettings(), *HELD)),
         bake_large=lambda source, target: large if (source, target) == pairs[1] else None,
     )
     found = list(outcomes)

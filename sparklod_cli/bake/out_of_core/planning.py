@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import json
 import os
 import shutil
@@ -68,15 +69,14 @@ def blocks_for(
     memory = estimate.default_memory() if resources.memory is None else resources.memory
     store = Store(folder if engine is None else absolute(folder))  # other processes have working folders of their own
     is_left = bool(store.names())
-    why = _reason(header, settings, resources, memory, engine, is_left=is_left)
     whole = _needs_whole_tree(settings)
+    why = _reason(header, settings, resources, memory, engine, whole, is_left=is_left)
+    work = functools.partial(at_work, store, resume=resources.resume, overwrite=overwrite, say=say)
     if why is not None and whole is not None:
         say(f"{name}: goes on in memory, although {why}: {whole}")
     if why is None or whole is not None:
         if is_left:
-            with at_work(
-                store, BakeIdentity.of(source, settings), 0, resume=resources.resume, overwrite=overwrite, say=say
-            ):
+            with work(BakeIdentity.of(source, settings), 0):
                 pass
         yield None
         return
@@ -90,9 +90,8 @@ def blocks_for(
         f"{name}: goes out of core, as {why}; {count_of(splats, 'splat')} in blocks of up to"
         f" {block_splats:,}, scratch of about {format_size(scratch)} in {store}"
     )
-    identity = BakeIdentity.of(source, settings)
     with (
-        at_work(store, identity, block_splats, resume=resources.resume, overwrite=overwrite, say=say) as block_splats,
+        work(BakeIdentity.of(source, settings), block_splats) as block_splats,
         _opened(source, store.folder, threads, engine) as stream,
     ):
         settings = dataclasses.replace(settings, rgba=settings.rgba and settings.rgba.absolute())
@@ -107,6 +106,7 @@ def _reason(
     resources: Resources,
     memory: int | None,
     engine: Engine | None,
+    whole: str | None,
     *,
     is_left: bool,
 ) -> str | None:
@@ -115,12 +115,10 @@ def _reason(
     Raises:
         OutOfMemoryError: it would, but its output is made of a whole tree.
     """
-    refines = settings.refine is not None
-    needed = estimate.in_memory_bytes(settings.method, header.count, header.sh_degree, refines=refines)
+    needed = estimate.in_memory_bytes(settings, header.count, header.sh_degree)
     if memory is not None and needed > memory:
-        whole = _needs_whole_tree(settings)
         if whole is not None:
-            most = estimate.most_in_memory(memory, settings.method, header.sh_degree, refines=refines)
+            most = estimate.most_in_memory(memory, settings, header.sh_degree)
             raise OutOfMemoryError(
                 f"{whole}, not in blocks: {count_of(header.count, 'splat')} would take about"
                 f" {format_size(needed)} of memory, and {format_size(memory)} are enough for {most:,}; give --memory"
@@ -199,17 +197,10 @@ def at_work(
     overwrite: bool,
     say: Callable[[str], None],
 ) -> Iterator[int]:
-    """Lock a scratch folder for the tasks of a bake, and remove the folder at the end.
+    """Lock a scratch folder for the tasks of a bake, and remove the folder at the end; yield the size of a block.
 
-    The results stay after an interrupt, and after an error that another run need not meet.
-
-    Args:
-        block_splats: size of a block, unless a resumed bake has another.
-        overwrite: remove results of an earlier bake, unless `resume` is set.
-        say: receives one-line messages for the user.
-
-    Yields:
-        size of a block; that of the bake that is resumed.
+    The results stay after an interrupt, and after an error that another run need not meet. A resumed bake keeps its
+    size of blocks. `overwrite` removes the results of an earlier bake, unless `resume` is set.
 
     Raises:
         ScratchError: another run is at work there; there are results and neither `resume` nor `overwrite` is set, or
@@ -224,7 +215,22 @@ def at_work(
                 f"an interrupted bake left {store}; continue it with --resume, or begin anew with --overwrite"
             )
         if names and resume:
-            block_splats = _resume(store, identity, former, names, say)
+            if former is None:
+                raise ScratchError(
+                    f"{store} has no record of its bake's inputs and settings; begin anew with --overwrite, without"
+                    " --resume"
+                )
+            if differences := identity.differences(former[0]):
+                raise ScratchError(
+                    f"{store} has the results of another bake: {'; '.join(differences)}. Begin anew with --overwrite,"
+                    " without --resume"
+                )
+            sound = ordered_map(store.is_sound, names, 2)
+            damaged = [name for name, is_sound in zip(names, sound, strict=True) if not is_sound]
+            forget(store, damaged)
+            lost = f"; {count_of(len(damaged), 'other')} that a failure damaged will be made again" if damaged else ""
+            say(f"continues with {count_of(len(names) - len(damaged), 'result')} in {store}{lost}")
+            block_splats = former[1]
         else:
             _clear(store)
             manifest = {"layout": LAYOUT, "block_splats": block_splats, "bake": dataclasses.asdict(identity)}
@@ -264,31 +270,6 @@ def _clear(store: Store) -> None:
                 path.unlink(missing_ok=True)
     for name in store.names():
         store.remove(name)
-
-
-def _resume(
-    store: Store,
-    identity: BakeIdentity,
-    former: tuple[BakeIdentity, int] | None,
-    names: list[str],
-    say: Callable[[str], None],
-) -> int:
-    """Check that the results belong to the bake, and remove damaged ones; return the size of a block."""
-    if former is None:
-        raise ScratchError(
-            f"{store} has no record of its bake's inputs and settings; begin anew with --overwrite, without --resume"
-        )
-    if differences := identity.differences(former[0]):
-        raise ScratchError(
-            f"{store} has the results of another bake: {'; '.join(differences)}. Begin anew with --overwrite, without"
-            " --resume"
-        )
-    sound = ordered_map(store.is_sound, names, 2)
-    damaged = [name for name, is_sound in zip(names, sound, strict=True) if not is_sound]
-    forget(store, damaged)
-    lost = f"; {count_of(len(damaged), 'other')} that a failure damaged will be made again" if damaged else ""
-    say(f"continues with {count_of(len(names) - len(damaged), 'result')} in {store}{lost}")
-    return former[1]
 
 
 @contextlib.contextmanager
