@@ -72,18 +72,26 @@ def write_levels(
 ) -> tuple[int, WrittenDetail]:
     """Make the levels of a tree and write them as a Streamed SOG; return the bytes of its files."""
     from ..codecs.streamed_sog.codec import encode_files
+    from ..lod.detail_levels import make
+    from .region_errors import measured
 
-    made = detail_levels(scene, environment, settings, clock, threads=threads, progress=progress)
+    assert scene.tree is not None
+    with on_threads(threads):
+        made = make(scene.splats, scene.tree, settings, progress=progress)
+    clock.end("levels")
+    errors = measured(made, threads=threads, progress=progress)
+    clock.end("errors")
+    antialiased, up = scene.antialiased, scene.up
+    made = dataclasses.replace(made, errors=errors, environment=environment, antialiased=antialiased, up=up)
     size, names = 0, list[str]()
     with out:
         for name, pieces in encode_files(made, options, settings, threads=threads, progress=progress):
             size += out.write(name, pieces)
             names.append(name)
     clock.end("write")
-    assert made.errors is not None
-    splats, errors = made.counts.sum(axis=0).tolist(), made.errors.max(axis=0).tolist()
+    splats, worst = made.counts.sum(axis=0).tolist(), errors.max(axis=0).tolist()
     levels = tuple(
-        WrittenLevel(count, round(count / splats[0], 6), error) for count, error in zip(splats, errors, strict=True)
+        WrittenLevel(count, round(count / splats[0], 6), error) for count, error in zip(splats, worst, strict=True)
     )
     chunks = len({*folders_of(names)} - {ENVIRONMENT})
     return size, WrittenDetail(levels, made.regions, chunks, 0 if environment is None else len(environment))
