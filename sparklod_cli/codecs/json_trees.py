@@ -23,10 +23,9 @@ def parse_manifest(data: bytes, called: str, most: int) -> Json:
 def place_of(
     root: str, number: int, parent_of: Callable[[int], int], children_of: Callable[[int], Sequence[int]]
 ) -> str:
-    """Return where a node is in a file, such as "tree.children[0]".
+    """Return the place of a node in a file, such as "tree.children[0]", where "tree" is `root`.
 
     Args:
-        root: name of the root.
         parent_of: number of the parent of a node, -1 of the root.
         children_of: numbers of the children, ascending.
     """
@@ -41,9 +40,6 @@ def nodes_of(tree: Json, most: int) -> list[tuple[Json, int, list[int]]]:
     """Return the nodes of a tree, however deep, root first and depth first.
 
     A node is its object, the number of its parent, -1 of the root, and the numbers of its children.
-
-    Raises:
-        FormatError: there are more than `most` nodes, one is no object, or its children are no list.
     """
     nodes = list[tuple[Json, int, list[int]]]()
     waiting = [(tree, -1)]

@@ -1,4 +1,4 @@
-"""Splats as a report reads them, block by block and as often as it takes, and tallies of what some of them have."""
+"""Blocks of splats that a report reads one by one, tallies of faults in them, and the table of chunks."""
 
 from __future__ import annotations
 
@@ -40,13 +40,7 @@ def smallest(rows: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Consecutive splats.
-
-    Attributes:
-        start: index of the first.
-        splats: n of them.
-        tree: (n,) nodes with children as the whole tree numbers them; None without a tree.
-    """
+    """Consecutive splats from index `start` on, and their nodes, whose children are numbered as in the whole tree."""
 
     start: int
     splats: Splats
@@ -64,7 +58,7 @@ class Block:
 
     @functools.cached_property
     def valid(self) -> Mask:
-        """(n,) bool, true for splats that are in no mask of `invalid`."""
+        """(n,) bool, true for splats in no mask of `invalid`."""
         return ~np.logical_or.reduce([*self.invalid.values(), np.zeros(len(self.splats), np.bool_)])
 
 
@@ -74,10 +68,8 @@ class ReportBlocks:
 
     Attributes:
         about: scene with the header of the file, and with the splats and the tree if they are in memory.
-        count: N splats.
-        is_tree: whether they are the nodes of a tree.
         map: called with a function of a block, columns of `Splats` and a number of threads, returns the results in
-            order; may be called again. Blocks in memory have all columns and are processed on that many threads.
+            order; may be called again. Blocks in memory have all columns and are processed on these threads.
         in_memory: whether several threads may call `map`.
     """
 
@@ -91,8 +83,7 @@ class ReportBlocks:
     def of(cls, scene: Scene, unread: Collection[str] = ()) -> ReportBlocks:
         """Blocks of an in-memory scene, as long as the chunks of its file, or `CHUNK_NODES`.
 
-        Args:
-            unread: columns that were not read and count as valid.
+        Columns in `unread` were not read and count as valid.
         """
         step, tree = scene.header.get("chunk_size") or CHUNK_NODES, scene.tree
         blank = Splats.zeros(step if unread else 0, 0)
@@ -115,7 +106,7 @@ class ReportBlocks:
 
     @classmethod
     def of_file(cls, file: RadFile, *, threads: int = 1, progress: Progress = silent) -> ReportBlocks:
-        """Chunks of a file. The first time they are read, all of their columns are unpacked, to find damage."""
+        """Chunks of a file. The first time, all columns are unpacked, to find damage."""
         header, again = file.header, False
 
         def mapped(work: Callable[[Block], Any], columns: Collection[str], _: int) -> Iterator[Any]:
@@ -130,7 +121,7 @@ class ReportBlocks:
 
 @dataclass(frozen=True)
 class MaskTally:
-    """Number of splats or nodes that have something, and the index of the first."""
+    """Number of splats or nodes in a mask, and the index of the first."""
 
     count: int = 0
     first: int = -1
@@ -146,7 +137,7 @@ class MaskTally:
         return MaskTally(self.count + following.count, self.first if self.count else following.first)
 
     def finding(self, code: str, text: str) -> list[Finding]:
-        """Return a finding if there are any; in its text, {first} is the first and {more} how many others."""
+        """Return a finding if there are any; in its text, {first} is the first and {more} the number of the rest."""
         if not self.count:
             return []
         message = text.format(first=f"{self.first:,}", more=f"{self.count - 1:,}")
@@ -159,7 +150,7 @@ def tallies(masks: dict[str, Mask], start: int) -> dict[str, MaskTally]:
 
 
 def merged(parts: Iterable[dict[str, MaskTally]]) -> dict[str, MaskTally]:
-    """Tallies of all blocks, in order; a name that a block lacks counts as none there."""
+    """Tallies of all blocks, in order."""
     total: dict[str, MaskTally] = {}
     for part in parts:
         for name, tally in part.items():
@@ -202,7 +193,7 @@ SHOWN_COLUMNS = {
 
 
 def chunk_row(block: Block) -> dict[str, Any]:
-    """Return the row of a chunk, a block with center, scale and opacity, without its number and its bytes."""
+    """Return the row of a chunk with center, scale and opacity, without its number and its bytes."""
     center, size = block.splats.center, spark_size(block.splats)
     low, high = center.min(axis=0), center.max(axis=0)
     with np.errstate(invalid="ignore", over="ignore"):
@@ -224,7 +215,7 @@ def chunk_table(
     Args:
         rows: of all chunks in order, see `chunk_row`.
         chunk_bytes: of the chunks in the file; None where its format has no chunks.
-        nodes: the tree and its (N,) feature sizes; None without one.
+        nodes: the tree and its (N,) feature sizes.
     """
     for chunk, row in enumerate(rows):
         row["chunk"], row["bytes"] = chunk, None if chunk_bytes is None else chunk_bytes[chunk]
@@ -246,7 +237,7 @@ def _add_links(rows: Sequence[dict[str, Any]], tree: LodTree, size: FloatArray) 
 
 
 def chunk_lines(rows: list[dict[str, Any]]) -> Iterator[str]:
-    """Yield the table as a person reads it; its rows may come from JSON."""
+    """Yield the lines of a readable table; its rows may come from JSON."""
     shown = {name: column for name, column in SHOWN_COLUMNS.items() if any(row[name] is not None for row in rows)}
     yield "".join(f"{heading:>{width}}" for heading, width in shown.values())
     for row in rows:

@@ -21,7 +21,7 @@ class ExpectationError(SparklodError):
     """An expectation cannot be understood."""
 
 
-#: Short names for what most assertions are about, beside the fields of the report, and how a report gives them.
+#: Short names for values of a report, besides its fields.
 NAMES: dict[str, Callable[[dict[str, Any]], Any]] = {
     "nodes": lambda report: report["splats"],
     "leaves": lambda report: report["tree"]["leaves"] if report["tree"] else report["splats"],
@@ -38,12 +38,12 @@ NAMES: dict[str, Callable[[dict[str, Any]], Any]] = {
     "tiles": lambda report: report["tiles"]["tiles"],
 }
 
-#: The formats of those of them that are not about a tree.
+#: The formats that have the names which are not about a tree.
 FORMATS = dict.fromkeys(("chunk_bytes", "first_bytes"), "RAD, Streamed SOG or 3D Tiles")
 FORMATS["tiles"] = "3D Tiles"
 FORMATS |= dict.fromkeys(("chunked", "palette"), "RAD") | dict.fromkeys(("levels", "regions"), "Streamed SOG")
 
-#: The codes of findings about some names; that of the others is expect.value.
+#: The codes of findings about names; all others have expect.value.
 CODES = {
     "bytes": "expect.bytes",
     "leaves": "expect.splats",
@@ -52,7 +52,7 @@ CODES = {
     "growth": "expect.growth",
 }
 
-#: What the keys of a file mean, and the options of their names: a name and a sign.
+#: Keys of a file of expectations, also options of inspect: the name and the sign of their conditions.
 KEYS = {
     "max_bytes": ("bytes", "<="),
     "min_splats": ("leaves", ">="),
@@ -69,10 +69,9 @@ class Expectations:
 
     Attributes:
         min_splats, max_splats: of a plain file, or leaves of a tree.
-        lod: whether it should be a tree.
         max_growth: nodes over leaves.
-        values: by the field of the report ("tree.depth"), what it should be: a value, or a table of `min` and `max`.
-        asserts: texts such as "nodes<=5M"; they are about `NAMES` and fields of the report.
+        values: expected value, or a table of `min` and `max`, by the field of the report ("tree.depth").
+        asserts: texts such as "nodes<=5M"; they name `NAMES` and fields of the report.
     """
 
     max_bytes: int | None = None
@@ -98,11 +97,7 @@ class Expectations:
 
 
 def parse_assertion(text: str) -> Condition:
-    """Return a condition on a report.
-
-    Raises:
-        BadAssertionError: it cannot be understood, or is about nothing that a report has.
-    """
+    """Return a condition on a report; `BadAssertionError` if it names nothing that a report has."""
     condition = parse_condition(text, example="nodes<=5M")
     known = [*NAMES, *(each.name for each in fields(Report))]
     if condition.name.partition(".")[0] not in known:
@@ -112,11 +107,7 @@ def parse_assertion(text: str) -> Condition:
 
 
 def read(path: Path) -> Expectations:
-    """Return the expectations in a .json or .toml file: keys that are attributes of `Expectations`, and `assert`.
-
-    Raises:
-        ExpectationError: it cannot be read, or says something that is not an expectation.
-    """
+    """Return the expectations in a .json or .toml file: keys that are attributes of `Expectations`, and `assert`."""
     try:
         text = read_text(path)
         data = parse_toml(text) if path.suffix.lower() == ".toml" else parse_json(text)
@@ -146,7 +137,7 @@ def read(path: Path) -> Expectations:
 
 
 def _flat(table: dict[str, Any], path: str, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Return expectations by the full names of their fields; in TOML `tree.depth = 2` is a table in a table."""
+    """Yield expectations by the full names of their fields; in TOML `tree.depth = 2` is a table in a table."""
     for key, expected in table.items():
         name = prefix + key
         if isinstance(expected, dict) and expected and not expected.keys() & {"min", "max"}:
@@ -178,7 +169,6 @@ def _value(plain: dict[str, Any], name: str) -> Any:
 
 
 def _streamed(report: dict[str, Any]) -> Any:
-    """Facts of a format that a viewer fetches in parts."""
     return report["rad"] or report["streamed_sog"] or report["tiles"]
 
 

@@ -76,13 +76,10 @@ CODES: dict[str, tuple[str, str]] = {
 
 @dataclass(frozen=True)
 class Finding:
-    """One finding.
+    """One fault of a file; `code` is one of `CODES`, and `message` has the numbers, in a line.
 
     Attributes:
-        code: one of `CODES`.
-        message: the fault, with numbers, in a line.
-        index: of the first splat or node concerned; None for the file as a whole.
-        count: of the splats or nodes concerned; None for the file as a whole.
+        index, count: the first splat or node concerned, and their number; None for the file as a whole.
     """
 
     code: str
@@ -96,12 +93,11 @@ class Finding:
 
     @property
     def severity(self) -> str:
-        """error, warning or note."""
         return CODES[self.code][0]
 
 
 def findings_of(violations: Iterable[RuleViolation]) -> list[Finding]:
-    """Return a finding for each code: the text of its first violation, and how many more there are."""
+    """Return a finding for each code: the text of its first violation, and the number of further ones."""
     by_code: dict[str, list[str]] = {}
     for each in violations:
         by_code.setdefault(each.code, []).append(each.text)

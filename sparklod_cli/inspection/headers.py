@@ -34,14 +34,7 @@ from .values import Box, Ends
 
 @dataclass(frozen=True)
 class Head:
-    """Head of a report, known from headers before any splat is read.
-
-    Attributes:
-        format: name for display.
-        bytes: of all files together.
-        splats: as reading gives them; nodes of a tree.
-        sh_degree, antialiased, up, up_by: of the splats.
-    """
+    """First fields of a report, known before any splat is read: `bytes` are those of all files together."""
 
     format: str
     bytes: int
@@ -71,12 +64,7 @@ QUANTILES = {"min": 0.0, "p25": 0.25, "p50": 0.5, "p75": 0.75, "max": 1.0}
 
 
 def quantiles_of(values: ArrayLike, weights: ArrayLike | None = None) -> dict[str, float]:
-    """Return the quantiles of values, each of them one of these, and their mean.
-
-    Args:
-        values: one or more.
-        weights: of the values, not all 0; without, all count the same.
-    """
+    """Return the quantiles of one or more values, each of them one of these, and their mean; weights are not all 0."""
     numbers = np.asarray(values, np.float64)
     order = np.argsort(numbers, kind="stable")
     weighed = np.ones(len(numbers)) if weights is None else np.asarray(weights, np.float64)
@@ -98,10 +86,7 @@ class HeaderScan:
 
     Attributes:
         field: of the report that has the facts, "rad", "streamed_sog" or "tiles".
-        violations: broken rules.
-        head: what a report begins with; None where `facts` is.
-        facts: `RadFacts`, `StreamedSogFacts` or `TileFacts`; None where a rule is broken without which the rest cannot
-            be trusted.
+        facts: `RadFacts`, `StreamedSogFacts` or `TileFacts`; None, as `head`, if a fatal rule is broken.
     """
 
     field: str
@@ -148,14 +133,7 @@ class RadFacts:
 
 
 def survey_rad(file: BinaryIO, open_companion: OpenCompanion, *, check: bool) -> HeaderScan:
-    """Read the headers of a RAD file and of its chunks.
-
-    Args:
-        check: look at the padding of properties, too.
-
-    Raises:
-        FormatError: the header of the file cannot be read.
-    """
+    """Read the headers of a RAD file and of its chunks, and to `check` them the padding of properties."""
     header, violations = scan_header(file, open_companion)
     gathered = _Gathered()
     if not any(each.fatal for each in violations):
@@ -222,7 +200,7 @@ def _rad_facts(header: RadHeader, gathered: _Gathered) -> RadFacts:
 
 
 def ends_of_rad(facts: RadFacts) -> Ends:
-    """Return the ends of the codes of a file; there are none where chunks have several encodings."""
+    """Return the ends of the codes of a file; none if chunks have several encodings."""
     center, scales = facts.properties.get("center"), facts.properties.get("scales")
     ends = Ends()
     if center is not None and center.encoding in ("f16", "f16_lebytes"):
@@ -247,7 +225,7 @@ class LevelFacts:
 
 @dataclass(frozen=True)
 class EnvironmentFacts:
-    """The splats that are drawn whatever the detail levels are: how many, and the bytes of their files."""
+    """The splats that are drawn at all detail levels, and the bytes of their files."""
 
     splats: int
     bytes: int
@@ -276,14 +254,7 @@ class StreamedSogFacts:
 def survey_streamed_sog(
     file: BinaryIO, open_companion: OpenCompanion, *, check: bool, threads: int = 1, progress: Progress = silent
 ) -> HeaderScan:
-    """Read a manifest and the headers of its chunk files.
-
-    Args:
-        check: decode the chunk files and look at their splats, too.
-
-    Raises:
-        FormatError: the manifest cannot be parsed.
-    """
+    """Read a manifest and the headers of its chunk files, and to `check` them their splats."""
     size = size_of(file)
     manifest, files, violations = manifest_rules.scan_files(file, open_companion)
     if any(each.fatal for each in violations):
@@ -402,14 +373,7 @@ class TileFacts:
 def survey_tiles(
     file: BinaryIO, open_companion: OpenCompanion, *, check: bool, threads: int = 1, progress: Progress = silent
 ) -> HeaderScan:
-    """Read a tileset and the headers of its tiles.
-
-    Args:
-        check: decode the tiles and look at their splats, too.
-
-    Raises:
-        FormatError: a tileset file cannot be parsed.
-    """
+    """Read a tileset and the headers of its tiles, and to `check` them their splats."""
     tileset = read_whole(file.read(MAX_TILESET + 1), open_companion)
     found = list(tileset_rules.read_violations(tileset))
     if not found:

@@ -83,7 +83,7 @@ class FileSection:
     """The part of a page about one file.
 
     Attributes:
-        report: as for JSON (`report.Report.as_dict`); fields that are missing or None are left out.
+        report: `Report.as_dict`; fields that are missing or None are left out.
         picture: of the structure of the scene.
         histograms: by the name of the quantity.
         thumbnail: of the scene as a viewer draws it.

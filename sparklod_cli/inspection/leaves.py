@@ -50,8 +50,8 @@ class CodedSplats:
 
     Attributes:
         rows: (N,) all bytes of a splat as one value, to compare whole splats.
-        numbers: (N, n) int32 codes; the first three are those of the centre.
-        quat_xyzw: (N, 4) rotations.
+        numbers: (N, n) codes; the first three are those of the centre.
+        quat_xyzw: (N, 4).
     """
 
     rows: NDArray[np.void]
@@ -61,11 +61,10 @@ class CodedSplats:
 
 @dataclass(frozen=True)
 class LeafCoding:
-    """Coding of splats as integers, for comparing the splats of a file, and its tolerances.
+    """Coding of splats as integers, to compare the splats of a file, and its tolerances.
 
     Attributes:
-        encode: N splats to codes.
-        steps: (n,) int64 largest differences of `CodedSplats.numbers` between two codes of one splat.
+        steps: (n,) largest differences of `CodedSplats.numbers` between two codes of one splat.
         degrees: largest angle between two codes of one rotation.
     """
 
@@ -75,12 +74,7 @@ class LeafCoding:
 
 
 def codings_of(scene: Scene, leaves: Splats, original: Splats, facts: RadFacts | None) -> Iterator[LeafCoding | str]:
-    """Yield the codings in which a writer may have put leaves, the most likely first; or why there is none.
-
-    Args:
-        original: the splats that may have become the leaves.
-        facts: of the RAD file that the tree is from; None for SPZ.
-    """
+    """Yield the possible codings of leaves that were `original`, the most likely first; or why there is none."""
     if facts is None:
         yield from (of_spz(scene, leaves, covering=covering) for covering in (True, False))
         return
@@ -94,8 +88,6 @@ def of_spz(scene: Scene, leaves: Splats, *, covering: bool) -> LeafCoding:
     """Return the coding of an SPZ file that a scene was read from.
 
     Args:
-        scene: with a tree.
-        leaves: of the tree.
         covering: opacities make up for the rounding of scales, see `quantize.compensated`; only sparklod writes so.
     """
     version, bits = max(2, int(scene.header["version"])), int(scene.header["fractional_bits"])
@@ -123,10 +115,10 @@ def of_spz(scene: Scene, leaves: Splats, *, covering: bool) -> LeafCoding:
 
 
 def of_rad(facts: RadFacts, leaves: Splats, rounded_to: int | None, *, covering: bool) -> LeafCoding | str:
-    """Yield the coding of a RAD file; or why there is none. A palette of SH, whose entries stand for many, is left out.
+    """Return the coding of a RAD file, without a palette of SH; or why there is none.
 
     Args:
-        rounded_to: bits after the binary point to which its writer rounded centres; None for not at all.
+        rounded_to: bits after the binary point to which its writer rounded centres; None if it did not.
     """
     mixed = [name for name, found in facts.properties.items() if "," in found.encoding]
     if mixed:
@@ -163,7 +155,7 @@ def of_rad(facts: RadFacts, leaves: Splats, rounded_to: int | None, *, covering:
 
 
 def _fractional_bits(center: FloatArray) -> int | None:
-    """Bits after the binary point that all coordinates do with; None where they are not rounded, or need too many."""
+    """Bits after the binary point of all coordinates; None if they are not rounded, or have too many."""
     most = float(np.abs(center).max(initial=0))
     for bits in range(MOST_BITS + 1):
         scaled = center * np.float32(2.0**bits)
@@ -175,7 +167,7 @@ def _fractional_bits(center: FloatArray) -> int | None:
 
 
 def _covering(splats: Splats, facts: RadFacts, bits: int | None) -> Splats:
-    """Splats whose opacities make up for how a RAD file rounds their scales."""
+    """Splats whose opacities make up for the rounding of their scales in a RAD file."""
     found = facts.properties.get("scales")
     if found is None:
         return splats
@@ -213,11 +205,10 @@ MAX_SEARCHED = 20_000
 def check(scene: Scene, original: Scene, facts: RadFacts | None = None) -> list[Finding]:
     """Return a finding if the leaves of `scene`, a tree, are not exactly the splats of `original` that can be drawn.
 
-    Both are compared as codes of the tree's file, as sparklod makes them or as others do: most are equal, and each of
-    the others must pair with one whose codes all lie within a step.
+    Both are compared as codes of the tree's file: most are equal, and each of the rest must pair with one whose codes
+    all lie within a step.
 
     Args:
-        scene: of an SPZ or RAD file.
         facts: of the RAD file that the tree is from; None for SPZ.
     """
     if scene.tree is None:
@@ -248,7 +239,7 @@ def check(scene: Scene, original: Scene, facts: RadFacts | None = None) -> list[
 
 
 def _unpaired(ours: CodedSplats, theirs: CodedSplats, coding: LeafCoding) -> NDArray[np.intp]:
-    """Ascending indices of ours without a counterpart among theirs; each of theirs pairs with one of ours only."""
+    """Ascending indices of ours without a counterpart among theirs; each of theirs pairs with only one of ours."""
     left, right = _not_equal(ours.rows, theirs.rows)
     # Splats of a writer that rounds differently mostly still have the same order when sorted.
     left = left[np.lexsort(ours.numbers[left].T[::-1])]

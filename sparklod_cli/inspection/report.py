@@ -130,11 +130,7 @@ class Report:
 
 
 def value_at(plain: dict[str, Any], name: str) -> Any:
-    """Return the value of a field of a report as JSON: keys and indices with dots between ("tree.levels.0.nodes").
-
-    Raises:
-        NoFieldError: there is no such field.
-    """
+    """Return the value of a field of a report as JSON: keys and indices with dots between ("tree.levels.0.nodes")."""
     value: Any = plain
     try:
         for key in name.split("."):
@@ -147,13 +143,10 @@ def value_at(plain: dict[str, Any], name: str) -> Any:
 def inspect(
     path: Path, settings: ReportSettings, *, threads: int = 1, progress: Progress = silent
 ) -> tuple[Report, Scene | None]:
-    """Return the report on a file, and its scene if it was read.
+    """Return the report on a file, or on the folder of an unpacked SOG, and its scene if it was read.
 
     A file that cannot be read gives a finding, not an error, and None for the scene. Unless the scene is wanted as a
     whole (`ReportSettings.at_once`), it is None of RAD files that are read chunk by chunk and of SPZ files.
-
-    Args:
-        path: of the file, or of the folder of an unpacked SOG.
     """
     columns = set(COLUMNS) if settings.values or settings.check or settings.chunks else OF_TREE
     size, unread, surveyed = size_of_input(path), set[str](), None
@@ -188,7 +181,7 @@ def inspect(
 
 
 def _surveyed(path: Path, check: bool, threads: int, progress: Progress) -> HeaderScan | None:
-    """Return facts and findings from the headers of a file; None for formats with few."""
+    """Return facts and findings from the headers of a file; None for formats of one part."""
     with opened(path) as (file, form, more):
         if form.name == RAD:
             return headers.survey_rad(file, more["open_companion"], check=check)
@@ -300,14 +293,7 @@ NO_CHILDREN = "its splats are the nodes of a tree, but it has no child indices, 
 
 
 def _of_arrays(arrays: Arrays, settings: ReportSettings, *, threads: int = 1) -> tuple[dict[str, Any], Scene | None]:
-    """Return the fields of a report on the arrays of one of `codecs.formats.ENCODINGS`, and the splats if complete.
-
-    Args:
-        arrays: by name; the names identify the encoding.
-
-    Raises:
-        FormatError: the arrays match no encoding, or have wrong shapes.
-    """
+    """Return the fields of a report on the arrays of one of `codecs.formats.ENCODINGS`, and the splats if complete."""
     if "packed" in arrays:
         # build-lod writes trees, for which Spark stores LoD opacities; the file does not record that.
         splats = packed_splats.unpack(arrays, SplatEncoding(lod_opacity=True), threads=threads)
@@ -361,6 +347,5 @@ def _of_texture(arrays: Arrays, settings: ReportSettings) -> dict[str, Any]:
 
 
 def _array_fields(form: str, splats: int, note: str, settings: ReportSettings, **more: Any) -> dict[str, Any]:
-    """Return the fields of a report; spherical harmonics and findings are left out unless they are among `more`."""
     fields = {"format": form, "splats": splats, "sh_degree": 0, "antialiased": False, "notes": [note], "findings": []}
     return fields | more | ({} if settings.check else {"findings": None})

@@ -48,7 +48,7 @@ USED = ("scale", "opacity")
 
 
 def parts_of(tree: LodTree) -> list[slice]:
-    """Nodes that are looked at together, so that what is computed of them is small."""
+    """Parts of the nodes that are examined at a time, to bound memory."""
     return blocks_of(len(tree), CHUNK_NODES)
 
 
@@ -60,12 +60,7 @@ def node_text(tally: MaskTally, what: str) -> str:
 def link_findings(
     tree: LodTree, parent: NDArray[np.int32], references: NDArray[np.int32], depth: NDArray[np.int32], threads: int
 ) -> list[Finding]:
-    """Return findings about the links of a tree of N nodes.
-
-    Args:
-        parent, references: (N,) of `find_parents`.
-        depth: (N,) of `find_depths`.
-    """
+    """Return findings about the links of a tree; `parent`, `references` and `depth` are those of its kernels."""
     faults = {
         "tree.root": "is the root but the child of another node",
         "tree.range": f"has children beyond the last node, {len(tree) - 1:,}",
@@ -106,16 +101,13 @@ def size_findings(
     scale_ends: tuple[float, float],
     threads: int,
 ) -> list[Finding]:
-    """Return findings about nodes that are much smaller than their children, N nodes in all.
+    """Return findings about nodes that are much smaller than their children, by (N,) feature sizes.
 
     Args:
         blocks: of the nodes; read if a node may be too small.
-        parent: (N,) of `find_parents`.
-        size: (N,) feature sizes, world units.
         scale_ends: as for `tree.examine_blocks`.
     """
-    # No mean is larger than the largest child, but for rounding. In a good tree, that tells of nearly all nodes that
-    # they are large enough.
+    # No mean is larger than the largest child, but for rounding: in a good tree, nearly all nodes pass this test.
     marks = np.zeros(len(parent), np.bool_)
     if not mark_small(tree.child_count, tree.child_start, size, MIN_SIZE_RATIO * ROUNDING, marks):
         return []
@@ -123,11 +115,11 @@ def size_findings(
     low, high = scale_ends
 
     def sized(block: Block) -> tuple[slice, NDArray[np.int32], NDArray[np.float64], Mask, Mask] | None:
-        """Return what the comparison needs of a block; None if nothing.
+        """Return the data of a block for the comparison; None if none of its nodes is compared.
 
-        That are its place, the parents that its nodes are compared with, -1 for none, their weights in the mean size of
-        those parents' children, whether each is a line whose width, and so its area, the format cannot hold, and
-        whether it has a scale as large as the format holds.
+        Its place, the parents that its nodes are compared with, -1 for none, their weights in the mean size of those
+        parents' children, whether each is a line whose width, and so its area, the format cannot hold, and whether it
+        has a scale as large as the format holds.
         """
         part, scale = block.part, block.splats.scale
         above = np.where(marks[parent[part]], parent[part], -1)
@@ -158,12 +150,7 @@ def size_findings(
 
 
 def order_findings(parent: NDArray[np.int32], limit: FloatArray, threads: int) -> list[Finding]:
-    """Return a finding if a tree of N nodes is not in the order coarse before fine.
-
-    Args:
-        parent: (N,) of `find_parents`.
-        limit: (N,) of `find_depths`.
-    """
+    """Return a finding if nodes with these parents and limits are not in the order coarse before fine."""
     held = parent >= 0
     count = int(np.count_nonzero(held))
     if count < MIN_NODES:
@@ -174,8 +161,8 @@ def order_findings(parent: NDArray[np.int32], limit: FloatArray, threads: int) -
     ends = [count // PARTS * end + min(count % PARTS, end) for end in range(PARTS + 1)]
 
     def median(part: int) -> np.float32:
-        some = children[ends[part] : ends[part + 1]]
-        above = parent[some.start : some.stop] if isinstance(some, range) else parent[some]
+        nodes = children[ends[part] : ends[part + 1]]
+        above = parent[nodes.start : nodes.stop] if isinstance(nodes, range) else parent[nodes]
         found: np.float32 = np.median(limit[above])
         return found
 
@@ -220,12 +207,11 @@ class TreeFacts:
 
 @dataclass(frozen=True, eq=False)
 class TreeColumns:
-    """Columns of a tree of N nodes that its facts are computed from; 10 bytes a node.
+    """Columns of N nodes for the facts of their tree; 10 bytes a node.
 
     Attributes:
-        tree: children, (N,); as far as the blocks have come, unless all are in memory.
-        is_whole: the tree is in memory.
-        size: (N,) float32 feature sizes, world units.
+        tree: filled by `add`, unless it `is_whole`, in memory.
+        size: (N,) float32 feature sizes, world units; filled by `add`.
     """
 
     tree: LodTree
@@ -234,7 +220,7 @@ class TreeColumns:
 
     @classmethod
     def of(cls, blocks: ReportBlocks) -> TreeColumns:
-        """Return columns for the nodes of some blocks, none of which has been added."""
+        """Return columns for the nodes of blocks, none of which has been added."""
         count, tree = blocks.count, blocks.about.tree
         size = np.empty(count, np.float32)
         if tree is None:
@@ -242,11 +228,7 @@ class TreeColumns:
         return cls(tree, True, size)
 
     def add(self, block: Block) -> dict[str, MaskTally]:
-        """Set what is here of the nodes of a block; return the tallies of its nodes and of its leaves of D > 1.
-
-        Args:
-            block: with the columns `USED`.
-        """
+        """Add the nodes of a block with the columns `USED`; return the tallies of its nodes and its leaves of D > 1."""
         assert block.tree is not None
         part = block.part
         if not self.is_whole:
@@ -259,13 +241,7 @@ class TreeColumns:
 def examine(
     splats: Splats, tree: LodTree, *, check: bool = True, scale_ends: tuple[float, float] = (0.0, math.inf)
 ) -> tuple[TreeFacts, list[Finding]]:
-    """Return the facts of a tree in memory and findings about it, see `examine_blocks`.
-
-    Args:
-        splats: N nodes, of which scale and opacity are used.
-        tree: of N nodes, at least one.
-        scale_ends: smallest and largest scale that the format holds, world units.
-    """
+    """Return the facts of a tree of one or more nodes in memory and findings about it, see `examine_blocks`."""
     blocks = ReportBlocks.of(Scene(splats, tree))
     columns = TreeColumns.of(blocks)
     opaque = merged(blocks.map(columns.add, USED, 1))
@@ -287,9 +263,8 @@ def examine_blocks(
     At most 31 bytes a node are in memory, those of `columns` among them; 18 where nothing is checked.
 
     Args:
-        blocks: read once more to compare nodes with their children, where faults are looked for.
-        columns: of all blocks, and
-        opaque: what `TreeColumns.add` returned of them.
+        blocks: read once more by a check, to compare nodes with their children.
+        opaque: tallies that `TreeColumns.add` returned of all blocks.
         scale_ends: smallest and largest scale that the format holds, world units. A scale at one of them may have been
             clamped.
         in_chunks: the format orders nodes by chunks, so that they need not be coarse before fine.
@@ -336,7 +311,7 @@ def examine_blocks(
 
 
 def _coarse_cut(tree: LodTree, limit: FloatArray) -> tuple[NDArray[np.int64], int]:
-    """Return the nodes of the cut that refines the largest nodes first, until it would have more than `CHUNK_NODES`.
+    """Return the nodes of the cut that refines the largest nodes first, up to `CHUNK_NODES` nodes.
 
     Also the number of inner nodes whose children lie in more than one chunk.
     """
@@ -346,7 +321,7 @@ def _coarse_cut(tree: LodTree, limit: FloatArray) -> tuple[NDArray[np.int64], in
     above = np.cumsum(counts[::-1])[::-1]  # nodes of this limit or more
     bucket = max(0, int(np.count_nonzero(above > CHUNK_NODES)) - 1)
     least = float(np.array(bucket << (32 - LIMIT_BITS), np.uint32).view(np.float32)[()])
-    inner = np.concatenate([part.start + _large(tree, limit, least, part) for part in parts_of(tree)])
+    inner = np.concatenate([_large(tree, limit, least, part) for part in parts_of(tree)])
     if len(inner) > CHUNK_NODES:
         limits = limit[inner]
         inner = inner[limits >= -np.partition(-limits, CHUNK_NODES)[CHUNK_NODES]]
@@ -362,6 +337,6 @@ def _coarse_cut(tree: LodTree, limit: FloatArray) -> tuple[NDArray[np.int64], in
 
 
 def _large(tree: LodTree, limit: FloatArray, least: float, part: slice) -> NDArray[np.intp]:
-    """Return the places in a part of the inner nodes whose limits are above 0 and `least` or more."""
-    some = limit[part]
-    return np.flatnonzero((tree.child_count[part] > 0) & (some > 0) & (some >= least))
+    """Return the inner nodes of a part whose limits are above 0 and `least` or more."""
+    limits = limit[part]
+    return part.start + np.flatnonzero((tree.child_count[part] > 0) & (limits > 0) & (limits >= least))

@@ -31,10 +31,9 @@ class SplatQuantity(NamedTuple):
     """A number of each splat.
 
     Attributes:
-        meaning: for display.
         columns: of `Splats` that it is computed from.
-        of: function of N splats to (N,) numbers, some of which may not be finite.
-        linear: its histogram has bins of equal width, however many decades the numbers span.
+        of: function of N splats to (N,) numbers, which may not be finite.
+        linear: its histogram has bins of equal width, for any range of the numbers.
         sh_degree: least SH degree of splats that have it.
     """
 
@@ -94,12 +93,11 @@ KEPT = 1 << 18
 class Numbers:
     """Percentiles and mean of numbers that are added block by block.
 
-    Percentiles are exact for numbers up to a limit. More than that are counted in a `Distribution` of their distances
-    from an origin, in memory that does not depend on their number: a percentile is then off by at most 0.8 % of its
-    distance from there, and stands for one within float32.
+    Up to `limit` numbers are kept, and percentiles are exact. More numbers are counted in a `Distribution` of their
+    distances from an origin, in memory that does not depend on their number: a percentile is then off by at most 0.8 %
+    of its distance from there, within float32.
 
     Args:
-        limit: how many numbers are kept.
         centred: the origin is the median of the first numbers, instead of 0.
     """
 
@@ -120,7 +118,7 @@ class Numbers:
             self._merge()
 
     def _merge(self) -> None:
-        """Count the numbers that were kept instead of keeping them."""
+        """Count the kept numbers instead."""
         values = np.concatenate(self._kept).astype(np.float64)
         self._kept = []
         if self._distribution is None and self._centred:
@@ -131,7 +129,7 @@ class Numbers:
         self._distribution = Distribution.merged([*known, added])
 
     def summary(self) -> dict[str, float]:
-        """Return the percentiles and the mean by name; nothing without numbers."""
+        """Return the percentiles and the mean by name; empty without numbers."""
         if not self.count:
             return {}
         if self._distribution is not None:
@@ -166,12 +164,12 @@ class ValueFacts:
 
 
 def names_of(splats: Splats) -> list[str]:
-    """Return the names of the quantities of these splats: those of SH by their degree."""
+    """Return the names of the quantities of splats, without SH of higher degrees."""
     return [name for name, row in QUANTITIES.items() if row.sh_degree <= splats.sh_degree]
 
 
 def quantity(splats: Splats, name: str) -> FloatArray:
-    """(N,) a quantity by its name; some numbers may not be finite."""
+    """(N,) a quantity by its name, which may not be finite."""
     with np.errstate(all="ignore"):
         return QUANTITIES[name].of(splats)
 
@@ -189,11 +187,7 @@ def examine(splats: Splats, *, all_quantities: bool = False) -> ValueFacts:
 
 
 def statistics_of(blocks: ReportBlocks, tally: ValueTally, *, all_quantities: bool, threads: int) -> ValueFacts:
-    """Statistics of splats, which are read once more.
-
-    Args:
-        threads: to work on, each on quantities of some columns, where blocks are in memory.
-    """
+    """Statistics of splats, which are read once more; in memory, threads work on quantities of different columns."""
     none = blocks.about.splats.take(slice(0))
     shown = names_of(none) if all_quantities else MAIN
     groups: dict[tuple[str, ...], list[str]] = {}
@@ -214,8 +208,8 @@ def statistics_of(blocks: ReportBlocks, tally: ValueTally, *, all_quantities: bo
         return {name: numbers.pop(name).summary() for name in names}
 
     found: dict[str, dict[str, float]] = {}
-    for some in ordered_map(summaries, groups.values(), threads):
-        found |= some
+    for summary in ordered_map(summaries, groups.values(), threads):
+        found |= summary
     box = box_98 = None
     if found["x"]:
         box = Box(_numbers(tally.low), _numbers(tally.high))
@@ -276,7 +270,7 @@ class Ends:
 
 
 def ends_of(header: Mapping[str, int]) -> Ends:
-    """Return the ends of the codes of an SPZ file by its header; none for other formats, whose numbers are floats."""
+    """Return the ends of the codes of an SPZ file by its header; none for other formats, which have floats."""
     if "fractional_bits" not in header:
         return Ends()
     low, high = quantize.decode_log_scale(np.array([0, 255], np.uint8))
@@ -289,8 +283,7 @@ class ValueTally:
     """Tallies of splats by their values.
 
     Attributes:
-        count: splats.
-        checked: of them, those of which few may be invisible or clamped: the leaves of a tree, or all.
+        checked: number of splats of which few may be invisible or clamped: the leaves of a tree, or all.
         invisible: of these, valid or not.
         by_name: tallies of valid splats that are "opaque", "invisible", "transparent", ..., and of the kinds of
             `splats.INVALID`.
@@ -310,11 +303,7 @@ class ValueTally:
 
     @classmethod
     def of(cls, block: Block, ends: Ends, *, layouts: bool = False) -> ValueTally:
-        """Tallies of a block with the columns center, scale and opacity, and others that may be invalid.
-
-        Args:
-            layouts: measure the loss in Spark's layouts, which takes all columns.
-        """
+        """Tallies of a block with the columns center, scale and opacity; all columns to measure losses in `layouts`."""
         opacity, most = block.splats.opacity, largest(block.splats.scale)
         furthest, valid = largest(np.abs(block.splats.center)), block.valid
         checked = np.ones(len(opacity), np.bool_) if block.tree is None else block.tree.is_leaf

@@ -57,9 +57,6 @@ def open_content(source: OpenFile) -> Reader:
 
     The transform of the root is not applied: splats are where they are in the axes of the scene, not on the Earth.
     Nothing is unpacked to `scratch`: where blocks are read, one tile at a time stays in memory.
-
-    Raises:
-        FormatError: the file is no tileset, a tile is missing or no glTF of splats, or what it holds is not read.
     """
     tileset = _read(source.file, source.open_companion)
     wanted = [number for number, tile in enumerate(tileset.tiles) if not tile.children and tile.uri is not None]
@@ -69,7 +66,7 @@ def open_content(source: OpenFile) -> Reader:
 def decode_parts(
     file: BinaryIO, *, threads: int = 1, progress: Progress = silent, open_companion: OpenCompanion | None = None
 ) -> TileScene:
-    """Read all tiles, those with most edges to the root last. The level of a tile is the number of these edges.
+    """Read all tiles, level by level: the level of a tile is the number of edges to the root.
 
     A tile that stands for a nested tileset is one with the root of that.
 
@@ -104,12 +101,9 @@ def decode_parts(
 
 
 def names_of(data: bytes, open_companion: OpenCompanion) -> list[str]:
-    """Return the files that a tileset and the nested ones name, and those that their tiles are read from.
+    """Return the files that a tileset, nested tilesets and their tiles name, except buffers without splats.
 
-    Paths begin in the folder of the tileset. A buffer that no splats are in is not among them.
-
-    Raises:
-        FormatError: a tileset or a tile cannot be opened, or is broken.
+    Paths begin in the folder of the tileset.
     """
     names = dict.fromkeys(read_whole(data, open_companion).names())
     for name in [each for each in names if each.lower().endswith(".gltf")]:
@@ -132,7 +126,7 @@ def _read(file: BinaryIO, open_companion: OpenCompanion | None) -> Tileset:
 
 
 def _hierarchy(tileset: Tileset) -> tuple[list[int], NDArray[np.int32], NDArray[np.int32]]:
-    """Return the tiles in order of their depth, without those that stand for nested tilesets, and their links."""
+    """Return tiles in order of depth, without those that stand for nested tilesets, their parents and levels."""
     tiles, order, parent, level = tileset.tiles, list[int](), list[int](), list[int]()
     frontier = [(0, -1)]
     while frontier:
@@ -150,7 +144,7 @@ def _hierarchy(tileset: Tileset) -> tuple[list[int], NDArray[np.int32], NDArray[
 
 
 def _open(source: OpenFile, tileset: Tileset, wanted: Sequence[int]) -> tuple[Reader, list[Chunk]]:
-    """Return the content of some tiles, one after the other, and the files of these."""
+    """Return the content of tiles, one after the other, and their files."""
     if not wanted:
         raise FormatError("no tile of it has splats")
     matrices, files = matrices_of(tileset), dict[str, int]()
@@ -183,7 +177,7 @@ def _open(source: OpenFile, tileset: Tileset, wanted: Sequence[int]) -> tuple[Re
 
 
 def tile_files(open_companion: OpenCompanion | None, matrices: dict[str, Matrix]) -> SceneFiles:
-    """Return the glTF files of tiles, each read where its (4, 4) transform puts it."""
+    """Return the glTF files of tiles, whose (4, 4) transforms are applied when they are read."""
 
     def open_tile(name: str, source: OpenFile) -> Reader:
         content = glb.open_content(source)
@@ -221,12 +215,9 @@ def encode_files(
     The bytes are the same for any number of threads.
 
     Args:
-        scene: whose splats are valid, with opacities of at most 1.
-        options: the profile of the GLBs is "cesium" unless they say otherwise.
+        scene: its opacities are at most 1.
+        options: the profile of the GLBs is "cesium" by default.
         most_tiles: of a tileset file; more are in nested ones.
-
-    Raises:
-        FormatError: the tiles cannot hold the splats, or JSON not the extent of the scene.
     """
     if not (np.abs(scene.bounds) <= LARGEST).all() or not (scene.errors <= LARGEST).all():
         raise FormatError("its splats reach beyond what float32 holds, in which viewers draw; scale it down")
@@ -245,7 +236,7 @@ def encode_files(
 
 
 def tile_names(scene: TileScene) -> list[str]:
-    """Return the name of each tile, its level and its number there, without a suffix."""
+    """Return the name of each tile, its level and its number in that, without a suffix."""
     numbers = defaultdict[int, Iterator[int]](itertools.count)
     return [f"{level}-{next(numbers[level])}" for level in scene.level.tolist()]
 
@@ -294,11 +285,7 @@ def box_of(corners: Any) -> list[float]:
 
 
 def _tileset(scene: TileScene, options: WriteOptions, root: JsonObject, error: float) -> JsonObject:
-    """Return a tileset.
-
-    Args:
-        error: the geometric error where nothing of it is drawn.
-    """
+    """Return a tileset; `error` is its geometric error where none of it is drawn."""
     extensions = glb.extensions_of(options.glb_profile or CESIUM)
     return {
         "asset": {"version": VERSION, "extras": note_of(antialiased=scene.antialiased, up=scene.up)},

@@ -1,7 +1,8 @@
 """Tilesets of 3D Tiles as they are read: one file, and a file with the nested ones that it names.
 
-What reading needs is checked when a file is parsed; every other rule is for `tileset_rules` to tell of. Facts: the
-specification of 3D Tiles 1.1 (OGC 22-025r4), sections 5 and 6.
+Parsing checks what reading needs; all other rules are in `tileset_rules`. z is up in a tileset and its volumes, y in
+the glTF content of its tiles, which a viewer turns when it loads it: (x, y, z) becomes (x, -z, y). Facts: the
+specification of 3D Tiles 1.1 (OGC 22-025r4), sections 5 and 6, and "glTF transforms".
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ VERSION, OLD_VERSION = "1.1", "1.0"
 #: How the children of a tile refine it, the one way that is read and written.
 REPLACE = "REPLACE"
 
-#: The extension that tells which extensions of glTF the tiles use.
+#: The extension that names the extensions of glTF which the tiles use.
 CONTENT_GLTF = "3DTILES_content_gltf"
 
 #: Largest tileset file, bytes: that of 100,000 tiles.
@@ -49,14 +50,14 @@ UNREAD = ("implicitTiling", "contents")
 
 @dataclass(frozen=True)
 class TileRecord:
-    """A tile as a file has it.
+    """A tile of a file, not checked.
 
     Attributes:
         record: its JSON object.
         uri: of its content; None without.
         children: numbers of tiles, ascending.
         parent: number of the tile above, -1 of a root.
-        file: the tileset file that it is in, by its path from the folder of the first one on; empty for that.
+        file: path of its tileset file from the folder of the first one on; empty for the first one.
     """
 
     record: Mapping[str, Any]
@@ -84,8 +85,8 @@ class Tileset:
     """Contents of a tileset file, or of one and the nested ones.
 
     Attributes:
-        head: everything but the tiles, as the first file has it: "asset", "geometricError", "extensions".
-        tiles: root first, each after its parent; that with a nested tileset has the root of that as its child.
+        head: everything but the tiles in the first file: "asset", "geometricError", "extensions".
+        tiles: each after its parent; the child of one with a nested tileset is the root of that.
         heads: `head` of each file, by its path; empty for the first one.
         bytes: of all files.
     """
@@ -97,11 +98,10 @@ class Tileset:
 
     @property
     def noted(self) -> FileNote:
-        """Note of sparklod in the first file."""
         return read_note(self.head["asset"].get("extras"))
 
     def place(self, number: int) -> str:
-        """Return where a tile is: "root.children[0]", in a nested file with its name before that."""
+        """Return the place of a tile: "root.children[0]", in a nested file with its name before that."""
         file = self.tiles[number].file
 
         def parent_of(each: int) -> int:
@@ -117,15 +117,7 @@ class Tileset:
 
 
 def parse(data: bytes, file: str = "") -> Tileset:
-    """Parse the bytes of a tileset file, without the nested ones that it names.
-
-    Args:
-        file: path of it, for messages and for what it names; empty for the first one.
-
-    Raises:
-        VersionError: it is of another version than 1.0 or 1.1.
-        FormatError: it is not JSON, or lacks what reading needs; names the value and its place.
-    """
+    """Parse a tileset file, without nested ones; `file` is its path from the folder of the first one on."""
     called = quoted_value(file) if file else TILESET
     root = parse_manifest(data, called, MAX_TILESET)
     version = root.get("asset", "version").value
@@ -138,7 +130,6 @@ def parse(data: bytes, file: str = "") -> Tileset:
 
 
 def _tiles(root: Json, file: str) -> tuple[TileRecord, ...]:
-    """Return the tiles of a file, root first and depth first."""
     tiles = list[TileRecord]()
     for tile, parent, children in nodes_of(root, MAX_TILES):
         record = {key: value for key, value in tile.value.items() if key != "children" and value is not None}
@@ -148,11 +139,7 @@ def _tiles(root: Json, file: str) -> tuple[TileRecord, ...]:
 
 
 def read_whole(data: bytes, open_companion: OpenCompanion | None) -> Tileset:
-    """Return a tileset with all tiles of the nested ones. Nested files that cannot be opened are named by an error.
-
-    Raises:
-        FormatError: as `parse`; or nested tilesets are too many, or name each other in a circle.
-    """
+    """Return a tileset with all tiles of the nested ones; errors name nested files that cannot be opened."""
     first = parse(data)
     tiles, heads, size = list(first.tiles), dict(first.heads), first.bytes
     number = 0
@@ -191,7 +178,7 @@ def _opened(name: str, open_companion: OpenCompanion | None) -> Tileset:
 
 Vector = NDArray[np.float64]
 
-#: Numbers of each kind of volume that is read.
+#: Numbers of each kind of bounding volume.
 KINDS = {"box": 12, "sphere": 4, "region": 6}
 
 #: Largest magnitude of a number: that of float32, in which viewers draw.
@@ -200,12 +187,10 @@ LARGEST = 3.4e38
 
 @dataclass(frozen=True, eq=False)
 class Volume:
-    """A box or a sphere.
+    """A box or a sphere around (3,) `center`; a box has a radius of 0.
 
     Attributes:
-        center: (3,).
         axes: (3, 3) halves of the sides of a box as rows; (0, 3) of a sphere.
-        radius: of a sphere, else 0.
     """
 
     center: Vector
@@ -213,7 +198,7 @@ class Volume:
     radius: float = 0.0
 
     def reach(self, directions: Vector) -> Vector:
-        """Return (n,) how far it reaches from its centre along (n, 3) directions of length 1."""
+        """Return (n,) extents from its centre along (n, 3) directions of length 1."""
         return np.abs(directions @ self.axes.T).sum(axis=1) + self.radius
 
     def corners(self) -> Vector:
@@ -222,7 +207,7 @@ class Volume:
         return self.center + signs @ self.axes
 
     def directions(self) -> Vector:
-        """Return (3, 3) directions of the sides of a box as rows, right angles between those that have no length."""
+        """Return (3, 3) directions of the sides of a box as rows; sides of length 0 get perpendicular directions."""
         found = list[Vector]()
         for axis in self.axes[np.argsort(-np.linalg.norm(self.axes, axis=1), kind="stable")]:
             length = float(np.linalg.norm(axis))
@@ -240,12 +225,12 @@ class Volume:
         return np.stack([self.center - half, self.center + half])
 
     def moved(self, matrix: Vector) -> Volume:
-        """Return it after a (4, 4) transform; a sphere grows by the largest scale."""
+        """Return the volume after a (4, 4) transform; a sphere grows by the largest scale."""
         scale = float(np.linalg.norm(matrix[:3, :3], axis=0).max())
         return Volume(matrix[:3, :3] @ self.center + matrix[:3, 3], self.axes @ matrix[:3, :3].T, scale * self.radius)
 
     def holds(self, other: Volume, loose: float) -> bool:
-        """Return whether another volume is inside, but for a distance."""
+        """Return whether another volume is inside, or at most `loose` outside."""
         if not len(self.axes):
             if len(other.axes):
                 far = float(np.linalg.norm(other.corners() - self.center, axis=1).max())
@@ -264,7 +249,7 @@ class Volume:
 
 
 def volume_of(value: Any) -> Volume | str | None:
-    """Return the volume of a "boundingVolume"; None for a region, whose numbers are angles; a text on what is none."""
+    """Return the volume of a "boundingVolume"; None for a region, whose numbers are angles; a text if it is invalid."""
     kind = next((kind for kind in KINDS if isinstance(value, dict) and kind in value), None)
     if kind is None:
         return "none of box, sphere and region"
@@ -296,12 +281,7 @@ def to_tileset(up: str | None) -> NDArray[np.float64]:
 
 
 def turned(bounds: Bounds, rotation: NDArray[np.float64]) -> Bounds:
-    """Return (..., 2, 3) corners of the boxes around turned ones.
-
-    Args:
-        bounds: (..., 2, 3) lowest and highest corners.
-        rotation: (3, 3), of column vectors.
-    """
+    """Return (..., 2, 3) corners of the boxes around boxes turned by a (3, 3) rotation of column vectors."""
     middle, half = bounds.mean(axis=-2), (bounds[..., 1, :] - bounds[..., 0, :]) / 2
     center, reach = middle @ rotation.T, half @ np.abs(rotation).T
     return np.stack([center - reach, center + reach], axis=-2)

@@ -133,11 +133,7 @@ def matrix_of(record: Mapping[str, object]) -> NDArray[np.float64]:
 
 
 def matrices_of(tileset: Tileset, *, of_root: bool = False) -> list[NDArray[np.float64]]:
-    """Return the (4, 4) transform of each tile to the axes of the tileset, with that of the root if `of_root`.
-
-    Raises:
-        FormatError: transforms multiply to numbers that are too large.
-    """
+    """Return the (4, 4) transform of each tile to the axes of the tileset, with that of the root if `of_root`."""
     matrices = list[NDArray[np.float64]]()
     for number, tile in enumerate(tileset.tiles):
         matrix = matrices[tile.parent] if tile.parent >= 0 else np.eye(4)
@@ -316,11 +312,7 @@ def scan_splats(
     threads: int = 1,
     progress: Progress = silent,
 ) -> Iterator[RuleViolation]:
-    """Yield the rules about splats that tiles break, see `SceneFiles.violations`.
-
-    Args:
-        chunks: by the number of the tile, of `scan_files`.
-    """
+    """Yield the rules about splats that tiles, by number, break; see `SceneFiles.violations`."""
     volumes, numbers = volumes_of(tileset), {chunk.name: number for number, chunk in chunks.items()}
 
     def broken_by(chunk: Chunk, splats: Splats) -> Iterator[RuleViolation]:
@@ -337,11 +329,7 @@ def scan_splats(
 
 
 def _outside(splats: Splats, volume: Volume, rotation: NDArray[np.float64]) -> int:
-    """Count splats outside of a volume.
-
-    Args:
-        rotation: (3, 3) from the axes of the splats to those of the volume.
-    """
+    """Count splats outside of a volume; `rotation` is (3, 3), from the axes of the splats to those of the volume."""
     if not len(volume.axes):
         far = np.linalg.norm(splats.center @ rotation.T - volume.center, axis=1)
         return int(np.count_nonzero(far > volume.radius * (1 + LOOSE_BOUND)))
