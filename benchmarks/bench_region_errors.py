@@ -19,7 +19,7 @@ import sparklod_cli
 from sparklod_cli.bake import region_errors
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.lod import quality
-from sparklod_cli.lod.detail_levels import detail_cuts, make
+from sparklod_cli.lod.detail_levels import detail_cuts, make, owners_of
 from sparklod_cli.lod.part_settings import DetailSettings
 from sparklod_cli.model.gaussian import covariance
 from sparklod_cli.model.traversed import DetailScene
@@ -76,17 +76,16 @@ def tree_errors(nodes, tree, scene: DetailScene):
     """(R, L) the tree's own errors: those of all merges below the nodes of a level, by the energy of the leaves."""
     error, own = merging_errors(nodes, tree)
     below = error.copy()  # children come after their parents
-    cuts = detail_cuts(nodes, tree, SHARES)
-    parent = cuts.parent
+    cuts, parent = detail_cuts(nodes, tree, SHARES)
     for node in range(len(tree) - 1, 0, -1):
         below[parent[node]] += below[node]
-    owner = cuts.owners()
+    owner = owners_of(parent, cuts[-1])
     # Regions of the nodes of the coarsest level, found by centres in the runs.
     last = scene.levels - 1
     place = {tuple(c): r for r in range(scene.regions) for c in scene.splats.center[scene.run(r, last)].tolist()}
-    region = np.array([place[tuple(c)] for c in nodes.center[cuts.coarsest].tolist()])
-    sums = [np.bincount(region[owner[level]], below[level], scene.regions) for level in cuts.nodes]
-    energy = np.bincount(region[owner[cuts.nodes[0]]], own[cuts.nodes[0]], scene.regions)
+    region = np.array([place[tuple(c)] for c in nodes.center[cuts[-1]].tolist()])
+    sums = [np.bincount(region[owner[level]], below[level], scene.regions) for level in cuts]
+    energy = np.bincount(region[owner[cuts[0]]], own[cuts[0]], scene.regions)
     return np.maximum.accumulate(np.stack(sums, 1) / energy[:, None], axis=1)
 
 

@@ -119,7 +119,10 @@ def family_order(
     for members in parts_of(parent, center, limit, most or len(parent)):
         with threads_for(len(members)) as threads:
             at = slice(None) if len(members) == len(parent) else members  # all of them without a copy
-            largest = _largest_first(limit[at], threads)
+            # Parents first: by descending limit.
+            keys = np.uint64(0x7FFFFFFF) - limit[at].view(np.uint32).astype(np.uint64)
+            largest = sort_by_key(keys, np.arange(len(members), dtype=np.uint32), 31, threads)[1]
+            del keys
             part = _part(parent, members), count[at], center[at], size[at]
             families = _families(*part, largest, threads)
             found.append(members[largest[_sequence(families, filled, total, progress)]])
@@ -139,12 +142,6 @@ def _part(parent: Index, members: Index) -> Index:
     place = np.full(len(parent) + 1, -1, np.int32)
     place[members] = np.arange(len(members), dtype=np.int32)
     return place[parent[members]]  # -1, of no parent, is the place behind all
-
-
-def _largest_first(limit: FloatArray, threads: int) -> NDArray[np.uint32]:
-    """Return the (F,) families, parents first: by descending limit, the least size from the root to the parent."""
-    keys = np.uint64(0x7FFFFFFF) - limit.view(np.uint32).astype(np.uint64)
-    return sort_by_key(keys, np.arange(len(limit), dtype=np.uint32), 31, threads)[1]
 
 
 def _families(

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,45 +80,21 @@ def make(nodes: Splats, tree: LodTree, settings: DetailSettings, *, progress: Pr
     shares = shares_of(settings.levels, leaves)
     levels = len(shares) + 1
     progress("dividing", 0, levels, "level")
-    cuts = detail_cuts(nodes, tree, shares)
-    owner = cuts.owners()
-    order = np.concatenate(cuts.nodes)
-    owner = owner[order]
-    under = len(cuts.coarsest)
+    cuts, parent = detail_cuts(nodes, tree, shares)
+    order, coarsest = np.concatenate(cuts), cuts[-1]
+    owner, under = owners_of(parent, coarsest)[order], len(coarsest)
     center = nodes.center[order]
     box = united(np.stack([center, center], axis=1), owner, under)
     under_each = np.bincount(owner, minlength=under)
-    number, children = divide(nodes.center[cuts.coarsest], box, under_each, settings)
+    number, children = divide(nodes.center[coarsest], box, under_each, settings)
     region, count = number[owner], int(number.max()) + 1
-    level = np.repeat(np.arange(levels), [len(some) for some in cuts.nodes])
+    level = np.repeat(np.arange(levels), [len(some) for some in cuts])
     key = level * count + region
     splats = with_plain_opacity(nodes.take(order[np.argsort(key, kind="stable")]))
     counts = np.bincount(key, minlength=levels * count).reshape(levels, count).T
     bounds = united(extents(splats), np.sort(key) % count, count)
     progress("dividing", levels, levels, "level")
     return DetailScene(splats, np.ascontiguousarray(counts), bounds, children)
-
-
-@dataclass(frozen=True, eq=False)
-class DetailCuts:
-    """The nodes of each detail level.
-
-    Attributes:
-        nodes: (n,) int64 ascending, those of each level; level 0 has the leaves.
-        parent: (M,) int32 parent of each node, -1 of the root.
-    """
-
-    nodes: list[Nodes]
-    parent: NDArray[np.int32]
-
-    @property
-    def coarsest(self) -> Nodes:
-        """The nodes of the last level."""
-        return self.nodes[-1]
-
-    def owners(self) -> NDArray[np.int64]:
-        """Return the (M,) place in `coarsest` of each node or its ancestor that is there; -1 above the coarsest."""
-        return owners_of(self.parent, self.coarsest)
 
 
 def owners_of(parent: NDArray[np.int32], cut: Nodes) -> NDArray[np.int64]:
@@ -185,16 +160,19 @@ class RefinementOrder:
         return np.flatnonzero((self._turn_of_parent < refined) & (self._turn >= refined))
 
 
-def detail_cuts(nodes: Splats, tree: LodTree, shares: Sequence[float]) -> DetailCuts:
+def detail_cuts(nodes: Splats, tree: LodTree, shares: Sequence[float]) -> tuple[list[Nodes], NDArray[np.int32]]:
     """Return cuts of a tree with shares of its leaves, rounded, never more and less by at most the children of a node.
 
     Args:
         nodes: M splats, final order.
         shares: of each level after full detail, descending, between 0 and 1.
+
+    Returns:
+        (n,) ascending nodes of each level, the leaves first; and (M,) int32 parent of each node, -1 of the root.
     """
     order = RefinementOrder(nodes, tree)
     cuts = [order.cut(round(share * order.leaves)) for share in shares]
-    return DetailCuts([np.flatnonzero(tree.is_leaf), *cuts], order.parent)
+    return [np.flatnonzero(tree.is_leaf), *cuts], order.parent
 
 
 @np.errstate(over="ignore", invalid="ignore")  # where splats are as large as numbers are

@@ -10,7 +10,6 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 from ..model.splats import Splats
 from ..model.traversed import DetailScene
 from .settings import LEAST_BASE_DISTANCE, DetailRule
-from .traversal import CutView, SplatForest, TreeCut, TreeInstance, views_of
+from .traversal import CutView, SplatForest, TreeCut, TreeInstance
 
 Levels = NDArray[np.int64]
 
@@ -127,7 +126,7 @@ def choose(instances: Sequence[Distant], budget: int, rule: DetailRule) -> Detai
         return _chosen(instances, [np.full(len(each.chains.level), -1) for each in instances], "budget")
     if not limit and finest <= budget:
         return _chosen(instances, [np.zeros(len(each.chains.level), np.int64) for each in instances], "exhausted")
-    keys = [_keys(_positions(each, rule)) for each in instances]
+    keys = [_keys(each, rule) for each in instances]
     if limit:
         due = [(key >= DUE * PARTS).sum(axis=1) for key in keys]
         chosen = _chosen(instances, due, "distance")
@@ -137,17 +136,12 @@ def choose(instances: Sequence[Distant], budget: int, rule: DetailRule) -> Detai
     return _chosen(instances, [(key >= threshold).sum(axis=1) for key in keys], "budget")
 
 
-def _positions(instance: Distant, rule: DetailRule) -> Distances:
-    """Return the (R, S - 1) positions of the steps of each region, in bins, descending."""
+def _keys(instance: Distant, rule: DetailRule) -> Levels:
+    """Return the (R, S - 1) positions of the steps of each region, descending, in whole numbers of parts of bins."""
     chains, step = instance.chains, math.log(rule.multiplier) * PER_LOG
     zero = (-math.log(instance.base_distance) - LOWEST) * PER_LOG - (chains.finest - 1) * step
     distance = np.log(np.maximum(instance.squared_distance, NEAREST_SQUARED)) * (PER_LOG * 0.5) + zero
     positions: Distances = distance[:, None] - np.arange(1, chains.level.shape[1]) * step
-    return positions
-
-
-def _keys(positions: Distances) -> Levels:
-    """Return positions as whole numbers of parts, in their order."""
     bins = np.clip(positions, 0, BINS - 1).astype(np.int64)
     parts = np.clip((positions - bins) * PARTS, 0, PARTS - 1).astype(np.int64)
     return bins * PARTS + parts
@@ -222,8 +216,8 @@ class RegionBounds:
         )
         world_to_object = np.linalg.inv(placed).astype(np.float32).astype(np.float64)
         eye = world_to_object[:3, :3] @ camera[:3, 3] + world_to_object[:3, 3]
-        forward = world_to_object[:3, :3] @ -_unit(camera[:3, 2])
-        forward = _unit(forward)
+        forward = world_to_object[:3, :3] @ -(camera[:3, 2] / np.linalg.norm(camera[:3, 2]))
+        forward /= np.linalg.norm(forward)
         low, high = self.low + self.excess * rule.shrink, self.high - self.excess * rule.shrink
         offset = np.where(eye < low, low, np.where(eye > high, high, eye)) - eye
         squared: Distances = (offset**2).sum(axis=1)
@@ -234,11 +228,6 @@ class RegionBounds:
         tangent = min(math.tan(view.fov_x / 2), math.tan(view.fov_y / 2))
         scale = tangent / REFERENCE_TANGENT * float(np.linalg.norm(placed[:3, 0]))
         return squared * factor * factor * (scale * scale)
-
-
-def _unit(vector: Matrix) -> Matrix:
-    unit: Matrix = vector / np.linalg.norm(vector)
-    return unit
 
 
 class DetailForest(SplatForest):
@@ -317,18 +306,8 @@ class DetailTraversal:
             wrong = (drawn != levels) & (levels >= 0)
             missing += int(scene.counts[wrong, levels[wrong]].sum())
             demand[own] = np.maximum(demand[own], np.maximum(priority, np.where(priority > 0, 1e-30, 0)))
-        return TreeCut(
-            views=views_of(forest, self.instances, view),
-            node=np.concatenate(nodes),
-            instance=np.repeat(np.arange(len(nodes), dtype=np.uint16), [len(each) for each in nodes]),
-            limit=np.full(sum(map(len, nodes)), -1, np.float32),
-            reason="missing" if missing else choice.reason,
-            missing=missing,
-            least=np.inf,
-            stop=None,
-            demand=demand,
-            seconds=time.perf_counter() - start,
-        )
+        reason = "missing" if missing else choice.reason
+        return forest.cut_of(self.instances, view, nodes, reason, missing, demand, start)
 
 
 def _splats_of(scene: DetailScene, levels: Levels, *, environment: bool) -> NDArray[np.uint32]:
@@ -412,11 +391,12 @@ def _desired(chains: Chains, files: DetailFiles, chosen: Levels, resident: NDArr
 
     That is the finest whose file is there, and where none is, the coarsest that has a file.
     """
-    found, coarsest, level = chosen.copy(), chosen.copy(), chosen.copy()
+    found, coarsest, level, rows = chosen.copy(), chosen.copy(), chosen.copy(), np.arange(len(chosen))
     open_ = (chosen >= 0) & ~_there(files, chosen, resident)
     waiting = open_.copy()
     for _ in range(min(underfill, chains.level.shape[1])):
-        level = _coarser(chains, level)
+        above = (chains.level > level[:, None]) & (level >= 0)[:, None]  # the next coarser levels, or none
+        level = np.where(above.any(axis=1), chains.level[rows, np.argmax(above, axis=1)], -1)
         waiting &= level >= 0
         if not waiting.any():
             break
@@ -441,19 +421,8 @@ def _file(files: DetailFiles, level: Levels) -> NDArray[np.int64]:
     return file
 
 
-def _coarser(chains: Chains, level: Levels) -> Levels:
-    """Return the (R,) next coarser levels of chains; -1 where there is none."""
-    above = (chains.level > level[:, None]) & (level >= 0)[:, None]
-    first = np.argmax(above, axis=1)
-    return np.where(above.any(axis=1), chains.level[np.arange(len(level)), first], -1)
-
-
 def _finer(chains: Chains, level: Levels) -> Levels:
     """Return the (R,) next finer levels of chains; -1 where there is none."""
     below = (chains.level < level[:, None]) & (chains.level >= 0)
     last = below.shape[1] - 1 - np.argmax(below[:, ::-1], axis=1)
     return np.where(below.any(axis=1), chains.level[np.arange(len(level)), last], -1)
-
-
-if TYPE_CHECKING:
-    from .traversal import CutView

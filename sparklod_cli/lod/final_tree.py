@@ -218,13 +218,12 @@ def drop_nodes(
     """Drop the least useful merged nodes until `most` are left, or none can be dropped.
 
     Args:
-        leaves: number of leaves; they come first, and have no place in arrays of merged nodes.
         most: number of merged nodes to keep, at least 1, the root.
         parent: (T,) uint32, updated for what is kept: the nearest ancestor that is kept.
-        log_size, lost, weight: of `fill_usefulness_terms`; the error cost of a dropped node is added to its parent's.
+        leaves, log_size, lost, weight, blocks: of `fill_usefulness_terms`; `lost` of a dropped node is added to its
+            parent's.
         saved: (T - leaves,) int32, on entry 1 for each merged node; what is less for the root allows it that many more
             children. Updated: the number of children minus 1 of those that are kept, -1 for dropped nodes.
-        blocks: ranges of nodes to process in parallel; the result does not depend on it.
     """
     slots = len(saved) - 1
     # Merged nodes but the root, less `leaves`, parents first.

@@ -93,7 +93,7 @@ class Curve:
 
     @property
     def space(self) -> node_rows.Space:
-        """The coordinates, for kernels."""
+        """Coordinates, for kernels."""
         return node_rows.Space(self.middle, self.unit)
 
     def order(self, center: FloatArray, threads: int) -> Nodes:
@@ -127,13 +127,10 @@ class Curve:
     def keys(self, rows: FloatArray, at: Nodes, turn: int) -> Keys:
         """Return the (n,) Morton codes of rows on the curve of a round."""
         keys = np.empty(len(at), np.uint64)
-        node_rows.fill_morton_keys(len(at), rows, at, *self._grid(turn), keys)
-        return keys
-
-    def _grid(self, turn: int) -> tuple[NDArray[np.float64], float]:
-        """Return the lowest corner of the curve's box in a round, and the edge of a cell, units."""
         shift = np.modf(np.array([1, 2, 3]) * GOLDEN * turn)[0] * SLACK * self.extent
-        return self.low - shift, (1 + SLACK) * self.extent / (1 << node_rows.CURVE_BITS)
+        cell = (1 + SLACK) * self.extent / (1 << node_rows.CURVE_BITS)
+        node_rows.fill_morton_keys(len(at), rows, at, self.low - shift, cell, keys)
+        return keys
 
 
 @dataclass
@@ -229,8 +226,13 @@ def merge_levels(
         levels: (n,) at which they would have merged next.
     """
     lowest = int(levels.min())
-    by_level, ends = _by_level(levels - np.int32(lowest))
+    keys = (levels - np.int32(lowest)).astype(np.uint64)
+    ends = np.cumsum(np.bincount(levels - np.int32(lowest)))
     del levels
+    with threads_for(len(keys)) as threads:
+        leaves = np.arange(len(keys), dtype=np.uint32)
+        by_level = sort_by_key(keys, leaves, len(ends).bit_length(), threads)[1]
+    del keys, leaves
     corners = (region.low, region.high) if region else ((-math.inf,) * 3, (math.inf,) * 3)
     low, high = ((np.array(corner) - curve.middle) / curve.unit for corner in corners)
     active = np.empty(0, np.uint32)
@@ -253,14 +255,6 @@ def merge_levels(
         active = _merge(binary, active, curve, math.inf, None, progress)
     waiting.append((active, np.full(len(active), lowest + level, np.int32)))
     return np.concatenate([nodes for nodes, _ in waiting]), np.concatenate([at for _, at in waiting])
-
-
-def _by_level(level: Levels) -> tuple[Nodes, NDArray[np.int64]]:
-    """Return the (N,) leaves by level, and how many there are up to each; levels are at least 0."""
-    counts = np.bincount(level)
-    with threads_for(len(level)) as threads:
-        leaves = np.arange(len(level), dtype=np.uint32)
-        return sort_by_key(level.astype(np.uint64), leaves, len(counts).bit_length(), threads)[1], np.cumsum(counts)
 
 
 def _merge(

@@ -74,18 +74,14 @@ def build(splats: Splats, growth: float = DEFAULT_GROWTH, *, progress: Progress 
     with threads_for(n) as threads:
         index = curve.order(splats.center, threads)
         binary = BinaryTree.of_leaves(*curve.leaf_rows(splats, index))
-        merge_levels(binary, _levels(binary.size[:n]), curve, None, progress)
+        levels = levels_of(binary.size[:n])
+        np.maximum(levels, lowest_level(levels), out=levels)
+        merge_levels(binary, levels, curve, None, progress)
         goal = PruningGoal(max(int(growth * n) - n, 1), n)
         columns = dict(vars(splats))
         del splats
         final = in_final_order(binary, index, columns, goal, curve, progress)
         return final.splats, final.tree
-
-
-def _levels(size: FloatArray) -> Levels:
-    """Return the (n,) levels that leaves of a size, in units, join at."""
-    levels = levels_of(size)
-    return np.maximum(levels, lowest_level(levels), out=levels)
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +156,10 @@ def advance(
     splats, count = pending.splats, len(pending)
     if count <= 1:
         everything = np.arange(count, dtype=np.uint32)
-        return _no_families(splats), _Nodes.of(pending, everything, plan).pending(splats)
+        none = splats.take(slice(0, 0))
+        empty = np.empty(0, np.int32), np.empty((0, 1), np.uint64), np.empty(0, np.uint16)
+        families = StageFamilies(*empty, none, np.empty(0, np.int64), none.center, none.opacity)
+        return families, _Nodes.of(pending, everything, plan).pending(splats)
     curve = plan.curve.around(splats.center)
     with threads_for(count) as threads:
         index = curve.order(splats.center, threads)
@@ -198,13 +197,6 @@ def _families(final: FinalTree, numbers: NDArray[np.int64]) -> StageFamilies:
     nodes, parents = final.splats.take(children), final.splats.take(final.parents)
     count, size = final.tree.child_count[final.parents], spark_size(parents)
     return StageFamilies(final.ranks, final.keys[:, None], count, nodes, numbers[children], parents.center, size)
-
-
-def _no_families(splats: Splats) -> StageFamilies:
-    """Return the empty families of a stage without a merge."""
-    none = splats.take(slice(0, 0))
-    empty = np.empty(0, np.int32), np.empty((0, 1), np.uint64), np.empty(0, np.uint16)
-    return StageFamilies(*empty, none, np.empty(0, np.int64), none.center, none.opacity)
 
 
 def _rest(

@@ -145,6 +145,30 @@ class SplatForest(Forest):
             part["child_count"] = coarse
         return nodes
 
+    def cut_of(
+        self,
+        instances: Sequence[TreeInstance],
+        view: CutView,
+        nodes: Sequence[NDArray[np.uint32]],
+        reason: str,
+        missing: int,
+        demand: NDArray[np.float32],
+        start: float,
+    ) -> TreeCut:
+        """Return the cut of these nodes of each instance, which `time.perf_counter` timed from `start` on."""
+        return TreeCut(
+            views=views_of(self, instances, view),
+            node=np.concatenate(nodes),
+            instance=np.repeat(np.arange(len(nodes), dtype=np.uint16), [len(each) for each in nodes]),
+            limit=np.full(sum(map(len, nodes)), -1, np.float32),
+            reason=reason,
+            missing=missing,
+            least=np.inf,
+            stop=None,
+            demand=demand,
+            seconds=time.perf_counter() - start,
+        )
+
 
 def fill_nodes(rows: NDArray[np.void], nodes: Nodes) -> None:
     """Fill rows of `pixel_scale.NODE`."""

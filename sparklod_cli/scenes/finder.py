@@ -10,7 +10,7 @@ from ..cameras.camera import Camera
 from ..lod.continuous import ContinuousCuts
 from ..lod.detail_traversal import DetailTraversal
 from ..lod.settings import LodSettings
-from ..lod.tile_traversal import TileTraversal
+from ..lod.tiles import TileTraversal
 from ..lod.traversal import CutView, Traversal
 from .loaded import Cut, Part, Scenes
 

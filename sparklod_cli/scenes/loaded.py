@@ -15,7 +15,7 @@ from ..lod.budget import Budget
 from ..lod.continuous import faded
 from ..lod.detail_traversal import DetailForest, DetailTraversal
 from ..lod.settings import PLAYCANVAS_BUDGET, LodSettings
-from ..lod.tile_traversal import TileForest, TileTraversal
+from ..lod.tiles import TileForest, TileTraversal
 from ..lod.traversal import Forest, Traversal, TreeCut, TreeInstance
 from ..model.foveation import Foveation
 from ..model.gaussian import placed

@@ -18,6 +18,7 @@ from sparklod_cli.lod.detail_levels import (
     detail_cuts,
     losses,
     make,
+    owners_of,
     picture_errors,
     shares_of,
     with_plain_opacity,
@@ -73,24 +74,24 @@ def check(splats: Splats, made: DetailScene, shares: tuple[float, ...]) -> None:
 def test_levels_are_nested_cuts_that_stand_for_every_leaf_once(seed: int, growth: float) -> None:
     nodes, tree = quality.build(random_splats(400, seed=seed), growth)
     under = leaves_under(tree)
-    cuts = detail_cuts(nodes, tree, SHARES)
-    assert cuts.nodes[0].tolist() == np.flatnonzero(tree.is_leaf).tolist()
-    for some in cuts.nodes:
+    cuts, parent = detail_cuts(nodes, tree, SHARES)
+    assert cuts[0].tolist() == np.flatnonzero(tree.is_leaf).tolist()
+    for some in cuts:
         assert sum(len(under[node]) for node in some) == 400
         assert frozenset().union(*(under[node] for node in some)) == under[0]
-    for fine, coarse in itertools.pairwise(cuts.nodes):
+    for fine, coarse in itertools.pairwise(cuts):
         assert all(any(under[node] <= under[above] for above in coarse) for node in fine)
-    owners = cuts.owners()
+    owners = owners_of(parent, cuts[-1])
     for node, place in enumerate(owners):
-        above = [at for at, coarse in enumerate(cuts.coarsest) if under[node] <= under[coarse]]
-        inside = above and len(under[node]) <= len(under[cuts.coarsest[above[0]]])
+        above = [at for at, coarse in enumerate(cuts[-1]) if under[node] <= under[coarse]]
+        inside = above and len(under[node]) <= len(under[cuts[-1][above[0]]])
         assert place == (above[0] if inside else -1)
 
 
 @pytest.mark.parametrize("growth", [1.4, 2.0])
 def test_a_level_has_its_share_but_for_the_children_of_a_node(growth: float) -> None:
     nodes, tree = quality.build(random_splats(2_000, seed=4), growth)
-    for share, some in zip(SHARES, detail_cuts(nodes, tree, SHARES).nodes[1:], strict=True):
+    for share, some in zip(SHARES, detail_cuts(nodes, tree, SHARES)[0][1:], strict=True):
         assert share * 2_000 - tree.child_count.max() < len(some) <= share * 2_000
 
 

@@ -16,7 +16,7 @@ from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quality, tiles
 from sparklod_cli.lod.part_settings import TileSettings
 from sparklod_cli.lod.settings import pixel_limit
-from sparklod_cli.lod.tile_traversal import TileForest, TileTraversal, choose
+from sparklod_cli.lod.tiles import TileForest, TileTraversal, choose
 from sparklod_cli.lod.traversal import CutView, TreeInstance
 from sparklod_cli.model.traversed import TileScene
 from sparklod_cli.scenes.finder import view_of

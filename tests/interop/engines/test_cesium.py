@@ -18,8 +18,7 @@ from sparklod_cli.codecs.formats import TILESET
 from sparklod_cli.io import read_parts, read_scene
 from sparklod_cli.lod.part_settings import TileSettings
 from sparklod_cli.lod.settings import pixel_limit
-from sparklod_cli.lod.tile_traversal import choose
-from sparklod_cli.lod.tiles import PIXEL_ERROR
+from sparklod_cli.lod.tiles import PIXEL_ERROR, choose
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.scenes.finder import view_of
 from tests.conftest import FIXTURES, ROOT
