@@ -19,7 +19,6 @@ from ..system.stdio import DASH
 from .command import flag_of
 from .console import is_terminal
 
-#: What a place is taken by.
 INPUT, OUTPUT = "an input", "an output"
 
 #: Why no output is named after standard input, and what to do.
@@ -28,7 +27,7 @@ NAMELESS = "standard input has no name to derive one from; name the output file"
 
 @dataclass(frozen=True)
 class Folder:
-    """A folder named where an output file is expected: the file is written into it, as cp and mv do."""
+    """A folder given as an output file: the file is written into it, as cp and mv do."""
 
     path: Place
 
@@ -73,9 +72,8 @@ class InputPath(_NamedPath):
 class OutputPath(_NamedPath):
     """A file that a command writes, or with `folder` a folder that it fills.
 
-    A file may be given as a `Folder`: a name that ends in a slash, or an existing folder. With `suffixes`, that is all
-    it is written as: `keep_apart` refuses a name that promises something else. With `addresses`, also s3://bucket/file
-    and the like.
+    A file may be given as a `Folder`: a name that ends in a slash, or an existing folder. `suffixes` are those of the
+    formats that it can have: `keep_apart` refuses others. With `addresses`, also s3://bucket/file and the like.
     """
 
     _is_input, _to_do = False, "write a file and upload that"
@@ -85,7 +83,7 @@ def name_outputs(ctx: click.Context, source: Place | None) -> None:
     """Replace each parameter that is a `Folder` by the path of the file in it, which is named after an input.
 
     Args:
-        source: the input; None if missing, which other checks report.
+        source: the input; None if it is missing, which other checks report.
     """
     from ..tables.columns import FORMS
 
@@ -117,15 +115,13 @@ def require_suffix(flag: str, output: Place, endings: Iterable[str]) -> None:
 def keep_apart(ctx: click.Context, stands_for: Mapping[str, Iterable[Place]] | None = None) -> None:
     """Raise a `click.UsageError` if an output of a command is also an input or another output of it.
 
-    Also raises one if an output has the suffix of another format than the one written.
-
-    Compares the files themselves, so that links and other spellings of a name do not matter. Pipes and devices are
-    never replaced.
+    Also if the suffix of an output is that of another format than the written one. Files themselves are compared, so
+    that links and other spellings of a name do not matter. Pipes and devices are never replaced.
 
     Args:
         ctx: of the command; its parameters of type `InputPath` and `OutputPath` are checked.
-        stands_for: by the name of a parameter, other files that it means: those which an input names besides itself,
-            and files that are written into an output folder.
+        stands_for: by the name of a parameter, further files that it means: files that an input names, and files that
+            are written into an output folder.
     """
     stands_for = stands_for or {}
     inputs: list[Place] = []

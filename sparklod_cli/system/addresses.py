@@ -23,27 +23,23 @@ from .untrusted import redacted, without_secrets
 #: How addresses begin, chained ones too (simplecache::s3://). A letter and a colon alone are a drive of Windows.
 ADDRESS = re.compile(r"((?:[A-Za-z][A-Za-z0-9+.-]*::)*[A-Za-z][A-Za-z0-9+.-]+)://")
 
-#: Bytes that are asked for at once by those who read little at a time; a request takes as long as some megabytes.
+#: Bytes requested at once where little is read at a time; a request takes as long as some megabytes.
 READ_AHEAD = 1 << 23
-
-#: Schemes of addresses that are only read.
-READ_ONLY = ("http", "https")
 
 
 @dataclass(frozen=True)
 class Address:
-    """A file or folder that fsspec opens. Has those attributes and methods of a `Path` that the program needs.
+    """A file or folder that fsspec opens; the attributes and methods are those of a `Path`.
 
-    What goes wrong is an `OSError`, or a `SparklodError` where a package is missing.
+    Methods raise `OSError`, or `SparklodError` where a package is missing.
 
     Attributes:
-        url: all of it, with passwords.
+        url: with passwords; the text of an address has none.
     """
 
     url: str
 
     def __str__(self) -> str:
-        """Return the address without a password, or a query, which may be a signature."""
         return redacted(self.url)
 
     def __repr__(self) -> str:
@@ -61,52 +57,44 @@ class Address:
     @property
     def is_read_only(self) -> bool:
         """Whether its service takes no files."""
-        return self.scheme in READ_ONLY
+        return self.scheme in ("http", "https")
 
     @property
     def name(self) -> str:
-        """Its last part."""
         return posixpath.basename(_cut(self.url)[0].rstrip("/").split("://", 1)[-1])
 
     @property
     def suffix(self) -> str:
-        """As that of a path."""
         return Path(self.name).suffix
 
     @property
     def stem(self) -> str:
-        """As that of a path."""
         return Path(self.name).stem
 
     @property
     def parent(self) -> Address:
-        """The folder that it is in."""
         path, query = _cut(self.url)
         scheme, rest = path.split("://", 1)
         folder = rest.rstrip("/").rpartition("/")[0]
         return Address(f"{scheme}://{folder}{query}") if folder else self
 
     def exists(self) -> bool:
-        """Return whether there is a file or folder."""
         with self._opened() as (system, path):
             return bool(system.exists(path))
 
     def is_file(self) -> bool:
-        """Return whether it is a file."""
         with self._opened() as (system, path):
             return bool(system.isfile(path))
 
     def is_dir(self) -> bool:
-        """Return whether it is a folder."""
         with self._opened() as (system, path):
             return bool(system.isdir(path))
 
     def size(self) -> int:
-        """Return the size of the file in bytes."""
         with self._opened() as (system, path):
             size = system.info(path)["size"]
         if size is None:
-            raise OSError(f"{self} does not tell its size; download it first")
+            raise OSError(f"the size of {self} is unknown; download it first")
         return int(size)
 
     def version(self) -> str:
@@ -117,11 +105,10 @@ class Address:
     def open(
         self, mode: Literal["rb"] = "rb", buffering: int = READ_AHEAD, *, size: int | None = None
     ) -> io.BufferedReader:
-        """Open the file, whose size in bytes may be known, for reading wherever in it."""
+        """Open the file for reading; `size` is its size in bytes, if that is known."""
         return io.BufferedReader(_Ranged(self, self.size() if size is None else size), buffering)
 
     def read(self, start: int, stop: int) -> bytes:
-        """Read a range of bytes of the file."""
         with self._opened() as (system, path):
             data = bytes(system.cat_file(path, start=start, end=stop))
         if len(data) > stop - start:
@@ -129,10 +116,7 @@ class Address:
         return data
 
     def write(self, pieces: Iterable[bytes | memoryview]) -> int:
-        """Write the file, which appears when all of it is there, and return its size.
-
-        It is made as a temporary file on this machine first, so that nothing is sent of what fails halfway.
-        """
+        """Write the file and return its size. It is sent when it is complete, so that no failure leaves half of it."""
         import tempfile  # as every command loads this module
 
         with tempfile.NamedTemporaryFile(prefix="sparklod-") as file:
@@ -142,12 +126,11 @@ class Address:
         return size
 
     def send(self, file: str) -> None:
-        """Copy a file of this machine to the address, where it appears when all of it is there."""
+        """Copy a file of this machine to the address, where it appears when it is complete."""
         with self._opened() as (system, path):
             system.put_file(file, path)
 
     def unlink(self, missing_ok: bool = False) -> None:
-        """Remove the file."""
         try:
             with self._opened() as (system, path):
                 system.rm_file(path)
@@ -156,7 +139,7 @@ class Address:
                 raise
 
     def files(self) -> list[str]:
-        """Return the names of all files in this folder and those in it, as they are below it."""
+        """Return the names of all files below this folder, relative to it."""
         with self._opened() as (system, path):
             try:
                 found = system.find(path)
@@ -167,7 +150,7 @@ class Address:
 
     @contextlib.contextmanager
     def _opened(self) -> Iterator[tuple[Any, str]]:
-        """Return the file system of the address, and what the latter is called there."""
+        """Yield the file system of the address and its name there; errors inside name the address."""
         system, path = _system(self.url)
         try:
             yield system, path
@@ -183,12 +166,11 @@ class Address:
             raise OSError(errno.EIO, f"{type(error).__name__}: {self._shown(error)}", str(self)) from None
 
     def _shown(self, error: Exception | str) -> str:
-        """Return the text of an error, which may have the address in it, or parts that must not be shown."""
         return without_secrets(str(error), self.url)
 
 
 class _Ranged(io.RawIOBase):
-    """A file at an address, whose bytes are asked for when they are read."""
+    """A file at an address, whose bytes are requested when they are read."""
 
     def __init__(self, address: Address, size: int) -> None:
         self._address, self._size, self._at = address, size, 0
@@ -251,7 +233,7 @@ def _cut(url: str) -> tuple[str, str]:
 
 @functools.lru_cache(maxsize=64)
 def _system(url: str) -> tuple[Any, str]:
-    """Return the file system that opens an address, and what the address is called there."""
+    """Return the file system that opens an address, and the name of the address there."""
     from .optional import optional_import  # which few commands need
 
     with optional_import("addresses need fsspec and the package of their service", "cloud"):
@@ -262,7 +244,7 @@ def _system(url: str) -> tuple[Any, str]:
             system, path = fsspec.core.url_to_fs(url, use_listings_cache=False)
         except ImportError:
             raise
-        except Exception as error:  # services take their addresses apart, each in its way
+        except Exception as error:  # services parse their addresses, each in its way
             reason = f"{type(error).__name__}: {without_secrets(str(error), url)}"
             scheme = url.split("://", 1)[0]
             raise SparklodError(

@@ -1,8 +1,8 @@
-"""Atomic writes on this machine: a file gets its name when it is complete, files that belong together get all or none.
+"""Atomic writes on this machine: a file gets its name when it is complete; of files that belong together, all or none.
 
 On systems with unnamed files (Linux), a killed writer of one file leaves nothing behind. Elsewhere the file has a
-temporary name. Files that belong together are filled in a hidden folder beside their places. Such a file or folder is
-locked while its writer is alive, so that the next run can recognise and remove what a killed one left behind.
+temporary name. Files that belong together are written to a hidden folder beside their places. Writers lock such a file
+or folder, so that the next run can recognise and remove the remains of killed writers.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ FORMER = "former"
 
 
 def unique(name: str) -> str:
-    """Return `PARTS` or `STAGES` with a random number."""
+    """Return a name of the form `PARTS` or `STAGES` with a random number."""
     return name.format(secrets.token_hex(8))
 
 
@@ -48,7 +48,7 @@ def lock(descriptor: int) -> None:
 
 
 def try_lock(descriptor: int) -> bool:
-    """Lock a file as `lock` does, without waiting; return False if another process has locked it."""
+    """Lock a file without waiting; return False if another process has locked it."""
     if fcntl is None:
         return True
     try:
@@ -245,7 +245,7 @@ def rename(temporary: Path, target: Path, overwrite: bool) -> None:
 
 @contextlib.contextmanager
 def created(folder: Path) -> Iterator[None]:
-    """Create a folder and its parents for a context; new ones that are empty at its end are removed."""
+    """Create a folder and its parents for a context; at its end, new folders that are empty are removed."""
     new = [each for each in (folder, *folder.parents) if not each.exists()]
     folder.mkdir(parents=True, exist_ok=True)
     try:
@@ -260,27 +260,23 @@ def created(folder: Path) -> Iterator[None]:
 def staged(folder: Path) -> Iterator[Path]:
     """Create a locked, hidden folder in a folder for files that belong together; it is removed at the end."""
     sweep(folder)
-    stage, descriptor = _open_stage(folder)
+    descriptor: int | None = None
+    while True:
+        stage = folder / unique(STAGES)
+        stage.mkdir(0o700)
+        if not HAS_LOCKS:
+            break
+        with contextlib.suppress(FileNotFoundError):  # another process removed it before it was locked
+            descriptor = os.open(stage, os.O_RDONLY | os.O_CLOEXEC)
+            lock(descriptor)
+            if stage.exists():
+                break
+            os.close(descriptor)
     try:
         yield stage
     finally:
         shutil.rmtree(stage, ignore_errors=True)
         if descriptor is not None:
-            os.close(descriptor)
-
-
-def _open_stage(folder: Path) -> tuple[Path, int | None]:
-    """Create a locked, hidden folder; its path, and the descriptor that holds the lock, None without locks."""
-    while True:
-        stage = folder / unique(STAGES)
-        stage.mkdir(0o700)
-        if not HAS_LOCKS:
-            return stage, None
-        with contextlib.suppress(FileNotFoundError):  # another process removed it before it was locked
-            descriptor = os.open(stage, os.O_RDONLY | os.O_CLOEXEC)
-            lock(descriptor)
-            if stage.exists():
-                return stage, descriptor
             os.close(descriptor)
 
 
@@ -297,19 +293,19 @@ def add(stage: Path, name: str, pieces: Iterable[bytes]) -> int:
 def publish(stage: Path, names: Collection[str], header: str, *, overwrite: bool, outdated: Iterable[str] = ()) -> None:
     """Give files that were added to a hidden folder their names beside it: all of them, or none.
 
-    Where files are replaced, the header is taken away before any other is touched, and is the last to get its name:
-    for some milliseconds there is none. An error or an interrupt at any time leaves the former files; a kill within
-    these milliseconds leaves new files without a header. A folder that a removed file leaves empty is removed, too.
-    Other files in it are not touched. Permissions are those of `write`.
+    A former header is moved away before any other file is touched, and the new one is the last to get its name: for
+    some milliseconds there is none. An error or an interrupt at any time leaves the former files; a kill within these
+    milliseconds leaves new files without a header. A folder that becomes empty is removed, too; other files in it are
+    not touched. Permissions are those of `write`.
 
     Args:
         names: all files that were added.
-        header: the one of them that readers open first.
+        header: the file that readers open first.
         outdated: existing files that are removed where `overwrite` is set.
 
     Raises:
-        FileExistsError: a file exists, and `overwrite` is not set; or the place of a folder is taken by something else,
-            such as a link. It has the path.
+        FileExistsError: a file exists, and `overwrite` is not set; or something else, such as a link, is in the place
+            of a folder. The error has the path.
         OSError: the file system reported an error.
     """
     folder, written = stage.parent, {*names}
@@ -339,7 +335,7 @@ def publish(stage: Path, names: Collection[str], header: str, *, overwrite: bool
 
 
 def _folders_of(names: Iterable[str]) -> list[str]:
-    """Return the folders of files, by their names, outer folders first."""
+    """Return the folders of files, outer folders first."""
     found = {str(parent) for name in names for parent in PurePosixPath(name).parents if parent.name}
     return sorted(found, key=lambda folder: (folder.count("/"), folder))
 
@@ -370,7 +366,7 @@ def _put_aside(stage: Path, name: str) -> None:
 
 
 def _undo(stage: Path, names: Collection[str]) -> None:
-    """Take names away from new files again and give former files theirs back, the header, which is last, last.
+    """Take the names of new files away again and give former files theirs back, the header's, the last name, at last.
 
     The folders show which steps were done, so that an interrupt between two steps is undone, too.
     """

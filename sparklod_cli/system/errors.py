@@ -120,7 +120,7 @@ class OutOfMemoryError(SparklodError):
 
 
 def reason_of(error: OSError) -> str:
-    """Return the reason of an error of the system, to stand after a colon."""
+    """Return the reason of an error of the system, for the end of a message."""
     return (error.strerror or str(error)).lower()
 
 
@@ -128,7 +128,7 @@ def reason_of(error: OSError) -> str:
 def naming(
     name: object, kinds: type[SparklodError] | tuple[type[SparklodError], ...] = SparklodError
 ) -> Iterator[None]:
-    """Put a name, such as that of a file, before the messages of errors of these kinds."""
+    """Put a name, such as that of a file, before the messages of errors."""
     try:
         yield
     except kinds as error:
@@ -137,7 +137,7 @@ def naming(
 
 @contextlib.contextmanager
 def memory_errors_translated() -> Iterator[None]:
-    """Translate every error of the body that means memory ran out into an `OutOfMemoryError` that names the array."""
+    """Translate errors that mean that memory ran out into an `OutOfMemoryError` with the shape of the array."""
     try:
         yield
     except Exception as error:

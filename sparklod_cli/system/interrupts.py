@@ -36,12 +36,12 @@ _came = threading.Event()
 
 
 class _Deferral:
-    """Whether a first Ctrl-C waits for the work to come to an end by itself, see `deferred`.
+    """Whether a first Ctrl-C waits until the work ends by itself, see `deferred`.
 
     Attributes:
-        lasts: there is such work.
-        asked: the main thread has handled the first one.
-        seen: the watching thread has seen the first one, which may be before that.
+        lasts: such work is running.
+        asked: the main thread has handled the first Ctrl-C.
+        seen: the watching thread has seen it, maybe before the main thread.
     """
 
     def __init__(self) -> None:
@@ -100,18 +100,18 @@ def handle() -> None:
 def came() -> bool:
     """Return whether a signal has interrupted the run.
 
-    A failure after that is a consequence: libraries turn a `KeyboardInterrupt` into errors of their own, as the import
-    of numpy's C modules does.
+    Failures after that are its consequences: libraries, such as numpy's C modules, turn `KeyboardInterrupt` into errors
+    of their own.
     """
     return _came.is_set()
 
 
 @contextlib.contextmanager
 def deferred() -> Iterator[Callable[[], bool]]:
-    """Let work that can stop early do so by itself at the first Ctrl-C; yield the function that tells it to.
+    """Let work stop early by itself at the first Ctrl-C; yield a function that returns whether it has to stop.
 
-    `came` knows of that Ctrl-C. A second one, and every other signal, interrupts as ever, and so does the first one
-    after the context has ended. Without `handle`, as in a library, nothing is deferred.
+    `came` is True then, too. A second Ctrl-C and other signals interrupt as usual, and so does a Ctrl-C after the
+    context. Without `handle`, as in a library, nothing is deferred.
     """
     _deferral.asked = _deferral.seen = False
     _deferral.lasts = True
@@ -134,14 +134,14 @@ def _watch(reader: int, handled: list[signal.Signals]) -> None:
     while True:
         read = os.read(reader, 64)
         if LOST in read:
-            time.sleep(PATIENCE)  # until the callback is left that lost it
+            time.sleep(PATIENCE)  # until the callback that lost it has returned
             signal.pthread_kill(main, handled[0])
         if any(number in handled and not _waits(number) for number in read):
             _leave_if_compiling()
 
 
 def _waits(number: int) -> bool:
-    """Return whether the watching thread sees a first Ctrl-C that is deferred."""
+    """Return whether a signal, seen by the watching thread, is a first Ctrl-C that is deferred."""
     waits = number == signal.SIGINT and _deferral.lasts and not _deferral.seen
     _deferral.seen |= waits
     return waits
@@ -158,16 +158,13 @@ def _leave_if_compiling() -> None:
 
 
 def leave_if_lost() -> None:
-    """End the process if it goes on although a signal has interrupted it: a library has lost the exception.
-
-    Called before what takes long, such as compilation.
-    """
+    """End the process if a library has lost the exception of an interruption; called before long work."""
     if _came.is_set() and not _deferral.asked:
         _leave()
 
 
 def _leave() -> NoReturn:
-    """Write the message and end the process, without any clean-up."""
+    """Write the message and end the process without clean-up."""
     # A second thread, or a second signal in the same one, does not wait for the lock.
     if _leaving.acquire(blocking=False):
         with contextlib.suppress(OSError):  # not `sys.stderr`, whose lock the other thread may hold

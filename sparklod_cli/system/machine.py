@@ -54,7 +54,7 @@ def _meminfo(name: str) -> int | None:
 
 
 def _memory_limits() -> Iterator[tuple[int, int]]:
-    """Return memory limit and usage in bytes of each cgroup of this process."""
+    """Yield memory limit and usage in bytes of each cgroup of this process."""
     for folder in _groups("memory"):
         for limit_name, used_name in (
             ("memory.max", "memory.current"),  # version 2
@@ -87,7 +87,7 @@ def _text(path: Path) -> str | None:
 
 
 def release_memory() -> None:
-    """Return freed memory to the system, which the C library keeps for what comes: glibc's does so by up to 200 MB."""
+    """Return freed memory to the system; glibc keeps up to 200 MB for later."""
     import ctypes  # which most commands do without
 
     with contextlib.suppress(AttributeError, OSError, TypeError):  # another C library; Windows has no name for it

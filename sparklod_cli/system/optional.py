@@ -24,7 +24,7 @@ _PIPX, _UV_TOOL = "pipx_metadata.json", "uv-receipt.toml"
 def optional_import(
     purpose: str, extra: str = "", error: type[SparklodError] = SparklodError, *, package: str = ""
 ) -> Iterator[None]:
-    """Turn failed imports inside into an error that says what to install.
+    """Turn failed imports inside into an error, of the class `error`, that says what to install.
 
     The import stays a statement, so that type checkers and import-linter see it.
 
@@ -32,9 +32,6 @@ def optional_import(
         purpose: what needs which package: "--plot needs matplotlib".
         extra: the extra that brings it: "render".
         package: name for pip, where one package of the extra suffices, or no extra brings it.
-
-    Raises:
-        SparklodError: the package is not installed, or does not load; of the class `error`.
     """
     try:
         yield
@@ -43,7 +40,7 @@ def optional_import(
 
 
 def pip_install(*packages: str, options: Sequence[str] = ()) -> str:
-    """Return a command line that installs packages into the environment of this interpreter, whatever manages it."""
+    """Return a command line that installs packages into the environment of this interpreter."""
     import shlex
 
     environment = Path(sys.prefix)
@@ -55,7 +52,7 @@ def pip_install(*packages: str, options: Sequence[str] = ()) -> str:
 
 
 def _pip(environment: Path) -> list[str]:
-    """Return the words of a command line for the pip of an environment, or for uv where it has none."""
+    """Return the words of a command line for the pip of an environment, or for uv if it has no pip."""
     import shutil
     from importlib.util import find_spec
 
@@ -74,13 +71,13 @@ def _pip(environment: Path) -> list[str]:
 
 
 def install_hint(extra: str = "", *, package: str = "", options: Sequence[str] = ()) -> str:
-    """Return a command line that installs what this installation of sparklod, or one of its extras, requires.
+    """Return a command line that installs the requirements of this installation of sparklod, or of one of its extras.
 
     No package index is known to have sparklod. So the command names the checkout that it was installed from, or else
     the packages that are missing.
 
     Args:
-        extra: name of the extra; empty for what sparklod always requires.
+        extra: empty for the requirements without extras.
         package: the only package to install, in the version that the extra requires; empty for all of them.
         options: of pip.
     """
@@ -105,7 +102,7 @@ def install_hint(extra: str = "", *, package: str = "", options: Sequence[str] =
 
 
 def _checkout() -> Path | None:
-    """Return the folder of the repository that this package is in, or was installed from, if there is one."""
+    """Return the folder of the repository that holds this package, or that it was installed from, if any."""
     import json
     from importlib import metadata
     from urllib.parse import unquote, urlsplit
@@ -126,7 +123,7 @@ class Required:
     Attributes:
         least: the minimum version; empty for any.
         version: the installed version; None if it is not installed.
-        source: the requirement that brings it, for pip, if that is of another distribution: "imageio[ffmpeg]>=2.31".
+        source: the requirement of pip that brings it, if it names another distribution: "imageio[ffmpeg]>=2.31".
     """
 
     name: str
@@ -136,26 +133,24 @@ class Required:
 
     @property
     def requirement(self) -> str:
-        """Argument of pip that meets the requirement."""
         return self.source or (f"{self.name}>={self.least}" if self.least else self.name)
 
     @property
     def missing(self) -> bool:
-        """Whether it has to be installed or upgraded."""
         from packaging.version import Version
 
         return self.version is None or bool(self.least and Version(self.version) < Version(self.least))
 
     @property
     def state(self) -> str:
-        """Return the state for display: "2.4.6", "is missing", or "1.20, older than 1.26"."""
+        """The state for display: "2.4.6", "is missing", or "1.20, older than 1.26"."""
         if self.version is None:
             return "is missing"
         return f"{self.version}, older than {self.least}" if self.missing else self.version
 
 
 def required_by(distribution: str, extra: str = "") -> Iterator[Required]:
-    """Yield the requirements of an installed distribution or, if an extra is given, those of the extra alone.
+    """Yield the requirements of a distribution or, if an extra is given, of the extra alone.
 
     Raises:
         importlib.metadata.PackageNotFoundError: the distribution is not installed.

@@ -32,10 +32,10 @@ class Siblings:
 
     Attributes:
         is_member: whether a name ("0_0/meta.json") is one of them.
-        is_folder: whether a name is one of their folders; None where they stand in the folder of the first file.
+        is_folder: whether a name is one of their folders; None where they are in the folder of the first file.
         first_folder: the folder that every output has.
-        named: reads the names that an existing first file, and the files that it names, hold, whatever they are;
-            raises `OSError` or `FormatError` if it cannot be read. None: every file of such a name belongs to it.
+        named: reads all names in an existing first file and in the files that it names; raises `OSError` or
+            `FormatError` if it cannot be read. None: every file of such a name belongs to it.
     """
 
     is_member: Callable[[str], bool]
@@ -78,19 +78,19 @@ class Siblings:
 class Output(contextlib.AbstractContextManager["Output"]):
     """An output, tried when it is made, before any work; its files appear at the end of the context, all or none.
 
-    With `overwrite`, existing files are replaced, and those of a former output that have no successor are removed. An
+    With `overwrite`, existing files are replaced, and files of a former output without a successor are removed. An
     error or an interrupt leaves the former files. See `atomic.publish` for a kill. At an address, files are sent one by
-    one: the former first file is removed first, the new one must be written last, and an error removes what was sent.
+    one: the former first file is removed first, the new one must be written last, and an error removes the sent files.
 
     Args:
-        place: of the file, or of the first file; files go to where a symbolic link leads. - is standard output. A pipe
-            or a device is written to and never replaced.
+        place: of the file, or of the first file; a symbolic link is followed. - is standard output. A pipe or a device
+            is never replaced.
         siblings: names of the files beside the first one; None for an output of one file.
         may_end: the reader of standard output may close it early, see `write_stdout`.
 
     Raises:
-        OutputError: it cannot be written, see `check_writable`; or it is no place for several files, siblings exist, or
-            a folder of something else is in their way.
+        OutputError: it cannot be written, see `check_writable`; or it cannot take several files, siblings exist, or
+            another folder is in their way.
     """
 
     def __init__(
@@ -114,7 +114,7 @@ class Output(contextlib.AbstractContextManager["Output"]):
         """Write a file and return its size in bytes; further calls continue the file of an output of one.
 
         Args:
-            name: in the folder of the output; a name that is none of its siblings is that of the first file.
+            name: in the folder of the output; the name of no sibling means the first file.
         """
         if self.place == DASH:
             return write_stdout(pieces, may_end=self._may_end)
@@ -217,7 +217,7 @@ class Output(contextlib.AbstractContextManager["Output"]):
         return existing
 
     def _check_folder(self, folder: str) -> None:
-        """Raise `OutputError` where a folder is not empty, and not one of the former output."""
+        """Raise `OutputError` if a folder is neither empty nor of the former output."""
         if folder in self._ours:
             return
         place = self.target.parent / folder
@@ -244,12 +244,12 @@ def write_file(place: Place, pieces: Iterable[bytes], *, overwrite: bool, may_en
 
 
 def real_target(place: Place) -> Place:
-    """Return where the files of an output go: where a symbolic link leads."""
+    """Return the place of an output, with symbolic links followed."""
     return place if isinstance(place, Address) or place == DASH else Path(os.path.realpath(place))
 
 
 def check_writable(place: Place, *, overwrite: bool) -> None:
-    """Raise `OutputError` where a file cannot be written, before work goes into it.
+    """Raise `OutputError` if a file cannot be written.
 
     At an address, its service has to answer; permission to write is not tried, as others would see the file.
     """
@@ -261,7 +261,7 @@ def check_writable(place: Place, *, overwrite: bool) -> None:
 
 
 def check_free(place: Place, *, overwrite: bool) -> None:
-    """Raise `OutputError` where a folder or an existing file is in the way, or the name is impossible."""
+    """Raise `OutputError` if a folder or an existing file is in the way, or the name is impossible."""
     try:
         if isinstance(place, Address):
             if place.is_read_only:
@@ -279,12 +279,9 @@ def check_free(place: Place, *, overwrite: bool) -> None:
 
 
 def try_place(path: Path, *, least: int = 0) -> None:
-    """Raise `OutputError` where a file or a folder cannot be written or replaced; leave nothing there.
+    """Raise `OutputError` if a file or a folder, of at least `least` bytes, cannot be written or replaced.
 
     Permission and room are tried by a temporary file in its folder, or in the nearest existing folder on the way to it.
-
-    Args:
-        least: bytes that it will take at least.
     """
     try:
         target, nearest = Path(os.path.realpath(path)), _nearest_folder(path)
@@ -305,7 +302,7 @@ def try_place(path: Path, *, least: int = 0) -> None:
 
 
 def _nearest_folder(path: Path) -> Path:
-    """Return the nearest existing folder on the way to a file; raise `OutputError` where a file is in its place."""
+    """Return the nearest existing folder on the way to a file; raise `OutputError` if that is a file."""
     nearest = next(folder for folder in Path(os.path.realpath(path)).parents if os.path.lexists(folder))
     if not nearest.is_dir():
         raise OutputError(f"cannot write {path}: {nearest} is a file, not a folder")

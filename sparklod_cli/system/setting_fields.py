@@ -15,7 +15,6 @@ from typing import Any
 #: Key of a `Setting` in the metadata of its field.
 SETTING = "setting"
 
-
 #: Largest integer that arrays hold.
 MOST_WHOLE = (1 << 63) - 1
 
@@ -54,7 +53,7 @@ class Range:
         return " and ".join(f"{words} {end}" for words, end in ends if end is not None)
 
     def check(self, name: str, value: Any) -> None:
-        """Raise TypeError unless a value is a number, and ValueError unless it is in the range; both name it."""
+        """Raise TypeError unless a value is a number, and ValueError unless it is in the range."""
         if isinstance(value, bool) or not isinstance(value, numbers.Integral if self.whole else numbers.Real):
             raise TypeError(f"{name} is {value!r}; give a {'whole ' * self.whole}number, {self}")
         number: Any = value  # abstract numbers have no operators for mypy

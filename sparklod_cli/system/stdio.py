@@ -37,11 +37,10 @@ def silence(stream: Any) -> None:
 
 
 class _GuardedStream:
-    """Wraps a stream or its buffer, or None for a closed one."""
+    """A stream or its buffer; None if it is closed."""
 
     def __init__(self, stream: Any) -> None:
         self._stream = stream
-        #: Attributes that callers read.
         self.encoding = getattr(stream, "encoding", None) or "utf-8"
         self.errors = "backslashreplace"  # characters that the terminal cannot show are escaped
 
@@ -83,9 +82,9 @@ class _GuardedStream:
 
 
 def reserve() -> None:
-    """Open those of standard input, output and error that are closed, so that no other file gets their descriptors.
+    """Open closed standard streams, so that no other file gets their descriptors, and with them what libraries print.
 
-    Such a file would receive what libraries print. In Python they remain closed, as they were at startup.
+    In Python they remain closed, as they were at startup.
     """
     while True:
         descriptor = os.open(os.devnull, os.O_RDWR)
@@ -99,7 +98,7 @@ DASH = Path("-")
 
 
 def name_of(path: object) -> str:
-    """Return the name of an input, a path or what has one as its text, in messages."""
+    """Return the name of an input in messages."""
     return "standard input" if path == DASH else str(path)
 
 
@@ -116,7 +115,7 @@ def spooled() -> BinaryIO:
 
 @functools.lru_cache(maxsize=1)
 def _copy_of(stream: Any) -> BinaryIO:
-    import shutil  # which take milliseconds, and every command loads this module
+    import shutil  # these take milliseconds, and every command loads this module
     import tempfile
 
     file: BinaryIO = tempfile.TemporaryFile(prefix="sparklod-")  # noqa: SIM115

@@ -15,7 +15,6 @@ SIZE = rf"{NUMBER}{PREFIX}(?i:B|bytes?)?"
 TIME = rf"{NUMBER}(?P<unit>ms|s)"
 BANDWIDTH = rf"{NUMBER}{PREFIX}(?P<unit>(?i:bits?|bytes?)|b|B)(?:/s|ps)?"
 
-
 #: Digits in groups of three: by country, one of the signs between them separates the decimals instead.
 GROUPED = re.compile(r"[0-9]{1,3}(?:([.,'_ \u00a0\u2019\u202f])[0-9]{3})(?:\1[0-9]{3})*")
 
@@ -51,10 +50,7 @@ def parse_bandwidth(text: str) -> float:
     """Parse a bandwidth such as 20Mbit, 20Mbit/s, 20Mbps (bits) or 2.5MB/s, 2.5MBps, 2.5Mbyte (bytes) to bytes/s.
 
     As a letter, b is a bit and B a byte; words may have either case. k, M, G and T are powers of 1000, or of 1024 with
-    an i.
-
-    Raises:
-        ValueError: the text is not a bandwidth above 0.
+    an i. Other texts, and a bandwidth of 0, raise `ValueError`.
     """
     match = re.fullmatch(BANDWIDTH, text.strip())
     if match is None:
@@ -69,12 +65,9 @@ def parse_bandwidth(text: str) -> float:
 
 
 def parse_time(text: str) -> float:
-    """Return the seconds of a text such as 60ms or 0.1s.
+    """Parse a time such as 60ms or 0.1s to seconds; raise `ValueError` for other texts.
 
     A number without a unit is an error: some tools mean seconds by it, others milliseconds.
-
-    Raises:
-        ValueError: the text is not a time.
     """
     match = re.fullmatch(TIME, text.strip())
     if match is None:
@@ -84,20 +77,12 @@ def parse_time(text: str) -> float:
 
 
 def parse_count(text: str) -> int:
-    """Parse a whole number such as 65536, 500k or 1.5M; k, M, G and T are powers of 1000.
-
-    Raises:
-        ValueError: the text is not a count.
-    """
+    """Parse a whole number such as 65536, 500k or 1.5M, with powers of 1000; raise `ValueError` for other texts."""
     return _whole(COUNT, text, "is not a count: a whole number, such as 500000, 500k or 1.5M")
 
 
 def parse_size(text: str) -> int:
-    """Parse a number of bytes such as 3000000, 3M, 3 MB or 3MiB: powers of 1000, or of 1024 with an i.
-
-    Raises:
-        ValueError: the text is not a size.
-    """
+    """Parse a number of bytes such as 3000000, 3M, 3 MB or 3MiB; raise `ValueError` for other texts."""
     return _whole(SIZE, text, "is not a size: whole bytes, such as 3000000, 3MB or 3MiB")
 
 
@@ -110,7 +95,7 @@ def check_grouping(text: str) -> None:
 
 
 def _whole(pattern: str, text: str, otherwise: str) -> int:
-    from fractions import Fraction  # which takes milliseconds, and every command loads this module
+    from fractions import Fraction  # takes milliseconds to load, and every command loads this module
 
     check_grouping(text)
     match = re.fullmatch(pattern, text.strip())

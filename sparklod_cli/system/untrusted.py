@@ -34,7 +34,7 @@ QUOTED = 100
 _SURROGATE = re.compile("[\ud800-\udfff]")
 _ESCAPED_SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
 
-#: For a value at a time; `float` takes any number of digits in time proportional to it.
+#: Decodes a value at a time; `float` takes any number of digits in time proportional to it.
 _DECODER = json.JSONDecoder(parse_int=float)
 
 #: A sign of the syntax, with the blanks around it.
@@ -91,8 +91,8 @@ def _too_deep(depth: int) -> ValueError:
 
 
 def _checked(root: Any, depth: int, *, replace_surrogates: bool) -> Any:
-    """Check a parsed value level by level, since recursion would fail on the nesting it guards against."""
-    whole = [root]  # in a list, so that every value is an item of a container
+    """Check a value level by level, since recursion would fail on the nesting that it guards against."""
+    whole = [root]  # so that every value is an item of a container
     containers: list[Any] = [whole]
     for _ in range(depth + 1):
         inner: list[Any] = []
@@ -120,7 +120,7 @@ def well_formed(text: str) -> str:
 
 
 def quoted_value(value: Any) -> str:
-    """Return a value as quoted in an error: on one line and shortened, at any nesting depth."""
+    """Return a value, nested at any depth, as errors quote it: shortened, on one line."""
     return printable(reprlib.repr(value), QUOTED)
 
 
@@ -130,17 +130,13 @@ def quoted(error: Exception) -> str:
 
 
 def decoded_text(data: bytes, errors: str = "strict") -> str:
-    """Decode a text in UTF-8, or in UTF-16 where a byte order mark says so, as Windows programs write it.
-
-    Raises:
-        ValueError: it is not text.
-    """
+    """Decode UTF-8, or UTF-16 with a byte order mark, as Windows programs write it; raise `ValueError` if invalid."""
     marked = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     return str(data, "utf-16" if marked else "utf-8-sig", errors)
 
 
 def keys_of_object(beginning: bytes) -> list[str]:
-    """Return the keys of a JSON object as far as its beginning shows them; none of any other data."""
+    """Return the keys in the beginning of a JSON object; none for other data."""
     text, keys, at, sign = decoded_text(beginning, "replace"), list[str](), 0, "{"
     with contextlib.suppress(ValueError, RecursionError):  # the beginning ends there, or it is not JSON
         while (mark := _MARK.match(text, at)) and mark[1] == sign:
@@ -155,7 +151,7 @@ def keys_of_object(beginning: bytes) -> list[str]:
 
 
 class Origin(NamedTuple):
-    """A JSON file as errors call it, and the class of these errors."""
+    """Name of a JSON file in errors, and the class of these errors."""
 
     called: str
     error: Callable[[str], Exception]
@@ -164,8 +160,8 @@ class Origin(NamedTuple):
 class Json:
     """A value of an untrusted JSON file and its place there: `lods[3].file of lod-meta.json: expected a text, not 5`.
 
-    The arguments `way` are keys and indices that lead from here to a value. A key whose value is null is missing, as
-    it is for viewers. A method raises the error of the file if a value, also one on the way, is of another kind.
+    The arguments `way` are keys and indices that lead from here to a value. Null values count as missing, as in
+    viewers. Methods raise the error of the file if a value, or one on the way to it, is of another kind.
     """
 
     __slots__ = ("_above", "_key", "value")
@@ -175,7 +171,7 @@ class Json:
 
     @classmethod
     def parse(cls, data: str | bytes, origin: Origin, *, most: int | None = None, **options: Any) -> Self:
-        """Parse a file of at most `most` bytes; `options` are those of `parse_json`."""
+        """Parse a file of at most `most` bytes, with options of `parse_json`."""
         if most is not None and len(data) > most:
             raise origin.error(f"{origin.called} has more than {most:,} bytes")
         try:
@@ -185,7 +181,7 @@ class Json:
 
     @property
     def place(self) -> str:
-        """Keys and indices that lead to it from the top of the file; empty there."""
+        """Keys and indices that lead to the value from the top of the file; empty at the top."""
         words, here = list[str](), self
         while isinstance(here._above, Json):
             words.append(f"[{here._key}]" if isinstance(here._key, int) else f".{printable(here._key, QUOTED)}")
@@ -206,7 +202,6 @@ class Json:
         return self.error(f"expected {kind}, {found}")
 
     def get(self, *way: str | int) -> Self:
-        """Return a value, whose own value is None if it is missing."""
         here = self
         for key in way:
             value = here.value
@@ -227,7 +222,6 @@ class Json:
         return self.get(*way).value
 
     def has(self, *keys: str) -> bool:
-        """Return True if this is an object with all of these keys."""
         return isinstance(self.value, dict) and all(self.value.get(key) is not None for key in keys)
 
     @overload
@@ -237,26 +231,23 @@ class Json:
     def optional(self, key: str, read: Callable[[Self], T], default: T) -> T: ...
 
     def optional(self, key: str, read: Callable[[Self], T], default: T | None = None) -> T | None:
-        """Return what a method returns for a key; the default if the key is missing."""
+        """Return the result of a method for a key; the default if the key is missing."""
         found = self.get(key)
         return default if found.value is None else read(found)
 
     def items(self, *way: str | int) -> Iterator[Self]:
-        """Return the items of a list."""
         here = self.get(*way)
         if not isinstance(here.value, list):
             raise here.unexpected("a list")
         return (type(self)(value, here, index) for index, value in enumerate(here.value))
 
     def entries(self, *way: str | int) -> Iterator[tuple[str, Self]]:
-        """Return the keys and values of an object."""
         here = self.get(*way)
         if not isinstance(here.value, dict):
             raise here.unexpected("an object")
         return ((key, type(self)(value, here, key)) for key, value in here.value.items() if value is not None)
 
     def whole(self, *way: str | int, least: int = 0, most: float = math.inf) -> int:
-        """Return a whole number in a range."""
         value = self._at(way)
         if type(value) is int and least <= value <= most:
             return value
@@ -274,31 +265,25 @@ class Json:
         return float(value) if type(value) in (int, float) else None
 
     def numbers(self, *counts: int, most: float = LARGEST) -> list[float]:
-        """Return a list of numbers, of one of these lengths; of any length without them."""
+        """Return a list of numbers, of one of these lengths; without lengths, of any."""
         if not isinstance(self.value, list) or (counts and len(self.value) not in counts):
             raise self.unexpected(f"a list of {''.join(f'{count} or ' for count in counts)[:-3]}numbers")
         return [item.number(most=most) for item in self.items()]
 
     def matrix(self, *rows: int, columns: int = 4, most: float = LARGEST) -> list[float]:
-        """Return the numbers of a matrix, row by row, from a list of rows or of all numbers.
-
-        Args:
-            rows: accepted numbers of rows.
-        """
+        """Return the numbers of a matrix of one of these numbers of rows, from a list of rows or of numbers."""
         value = self.value
         if isinstance(value, list) and len(value) in rows and all(isinstance(row, list) for row in value):
             return [number for row in self.items() for number in row.numbers(columns, most=most)]
         return self.numbers(*(columns * count for count in rows), most=most)
 
     def text(self, *way: str | int) -> str:
-        """Return a text."""
         value = self._at(way)
         if not isinstance(value, str):
             raise self.get(*way).unexpected("a text")
         return value
 
     def flag(self, *way: str | int) -> bool:
-        """Return true or false."""
         value = self._at(way)
         if not isinstance(value, bool):
             raise self.get(*way).unexpected("true or false")
@@ -332,7 +317,7 @@ def printable(text: str, most: int | None = None) -> str:
     """Return a text on one line that cannot control a terminal or a log.
 
     Unprintable characters are escaped as in Python strings: control characters, line ends, directional marks and lone
-    surrogates. So is the start of a GitHub Actions command. What addresses must not show is hidden, see `redacted`.
+    surrogates; so is the start of a GitHub Actions command. Secrets in addresses are hidden, see `redacted`.
 
     Args:
         most: maximum length. A longer text loses its middle, since it may begin with a path and end with a reason.
@@ -347,12 +332,12 @@ def printable(text: str, most: int | None = None) -> str:
 
 
 def redacted(text: str) -> str:
-    """Return a text in which the addresses have no passwords, and no queries, which may be signatures."""
+    """Return a text whose addresses have no passwords, and no queries, which may be signatures."""
     return _QUERY.sub(rf"\1?{HIDDEN}", _CREDENTIALS.sub(f"{HIDDEN}@", text)) if "://" in text else text
 
 
 def without_secrets(text: str, url: str) -> str:
-    """Return a text about an address without its passwords and queries, which it may quote by themselves."""
+    """Return a text without the passwords and queries of an address, even where it quotes them alone."""
     credentials = [match[0][:-1] for match in _CREDENTIALS.finditer(url)]
     queries = [match[0][len(match[1]) + 1 :] for match in _QUERY.finditer(url)]
     secrets = (*credentials, *(each.partition(":")[2] for each in credentials), *queries)
@@ -382,10 +367,10 @@ def near(name: str, known: Iterable[str], *, cutoff: float = 0.6, folder: Path |
     """Return the end of an error about an unknown name, ", did you mean ...?"; empty if no known name is similar.
 
     Args:
-        cutoff: how similar they must be, 0 to 1, as `difflib` measures it.
-        folder: of the names, where they are files.
+        cutoff: least similarity, 0 to 1, see `difflib`.
+        folder: of the names, if they are files.
     """
-    import difflib  # which takes a millisecond, and is needed after a mistake only
+    import difflib  # takes a millisecond to load, and is needed after a mistake only
 
     found = difflib.get_close_matches(name, list(known), n=3, cutoff=cutoff)
     return f", did you mean {' or '.join(str(folder / each) if folder else each for each in found)}?" if found else ""
