@@ -89,11 +89,7 @@ class _StoredColumn:
 
 
 def open_content(source: OpenFile) -> Reader:
-    """Open a checkpoint of gsplat or of nerfstudio's splatfacto.
-
-    Raises:
-        FormatError: the file is cut short or corrupt, has no splats, or tensors of other shapes or types.
-    """
+    """Open a checkpoint of gsplat or of nerfstudio's splatfacto."""
     archive = _TensorArchive(source)
     root = archive.root()
     tensors, program = _tensors_of(root)
@@ -134,7 +130,7 @@ def open_content(source: OpenFile) -> Reader:
 
 
 def _tensors_of(root: Any) -> tuple[Mapping[str, Tensor], int]:
-    """Return the tensors of the splats by their names, and which of the programs in `COLUMNS` they are of."""
+    """Return the tensors of the splats by their names, and the number of the program in `COLUMNS`."""
     splats, pipeline = (root.get(key) if isinstance(root, dict) else None for key in ("splats", "pipeline"))
     if isinstance(splats, dict):
         return {name: each for name, each in splats.items() if isinstance(each, Tensor)}, 0
@@ -167,11 +163,7 @@ def _others(root: Mapping[str, Any], known: Collection[str]) -> Iterator[str]:
 
 
 class _TensorArchive:
-    """The zip of a checkpoint.
-
-    Raises:
-        FormatError: it is no zip, or has several pickles or members of one name.
-    """
+    """The zip of a checkpoint."""
 
     def __init__(self, source: OpenFile) -> None:
         self._file, self._size = source.file, source.size
@@ -198,7 +190,6 @@ class _TensorArchive:
         return member
 
     def _offset(self, member: zipfile.ZipInfo) -> int:
-        """Return where the bytes of a member begin."""
         self._file.seek(max(member.header_offset, 0))  # a damaged directory gives negative ones
         header = self._file.read(LOCAL_HEADER)
         if len(header) < LOCAL_HEADER or not header.startswith(ZIP):
@@ -221,11 +212,7 @@ class _TensorArchive:
         return unpickled(self._read("data.pkl", MOST_PICKLE))
 
     def place_of(self, name: str, tensor: Tensor) -> tuple[int, int]:
-        """Return where the values of a tensor begin in the file, and the bytes from one row to the next.
-
-        Raises:
-            FormatError: they are not there, not in order, or no floating-point numbers.
-        """
+        """Return where the values of a tensor begin in the file, and the bytes from one row to the next."""
         if tensor.type is None:
             raise FormatError(f"its tensor {name} has no numbers of 16, 32 or 64 bits with a point")
         member, values = self._member(f"data/{tensor.key}"), math.prod(tensor.size)
@@ -274,7 +261,7 @@ class Tensor:
     """Description of a tensor.
 
     Attributes:
-        type: of its numbers; None for other ones than `STORAGES` has.
+        type: of its numbers; None if it is not in `STORAGES`.
         key: of its storage.
         first: index of its first number in the storage.
         size, stride: of each axis, in numbers.
@@ -311,7 +298,7 @@ class _Global:
 
 @dataclass(frozen=True)
 class _Storage:
-    """Numbers that a persistent identifier names; attributes as those of `Tensor`."""
+    """Numbers that a persistent identifier names; fields as in `Tensor`."""
 
     type: np.dtype[Any] | None
     key: str
@@ -322,9 +309,6 @@ def unpickled(data: bytes) -> Any:
 
     Entries of dicts whose keys are no texts are left out. Lists and tuples may contain themselves, and each other many
     times: do not walk through them.
-
-    Raises:
-        FormatError: the pickle is corrupt, takes too many steps, or has opcodes that PyTorch does not write.
     """
     machine = _Machine()
     try:
@@ -344,9 +328,9 @@ def unpickled(data: bytes) -> Any:
 class _Machine:
     """Stack machine of pickles (PEP 307) that builds data only: nothing that a pickle names is imported or called.
 
-    What a pickle can bring about is bounded: the number of its steps, each of which takes time in proportion to the
-    bytes of its argument and the values that it takes from the stack, the axes of a tensor, and the size of a number.
-    Texts and names are those that stand in the pickle, never made from other objects.
+    The effort is bounded: the number of steps, each of which takes time in proportion to the bytes of its argument and
+    the values that it takes from the stack, the axes of a tensor, and the size of a number. Texts and names are taken
+    from the pickle, never made from other objects.
     """
 
     def __init__(self) -> None:
@@ -422,19 +406,17 @@ def _extend(container: Any, values: list[Any]) -> None:
 
 
 def _named(module: Any, name: Any) -> _Global | None:
-    """Return a function or class by the texts of its module and name."""
     return _Global(f"{module} {name}") if isinstance(module, str) and isinstance(name, str) else None
 
 
 def _storage(pid: Any) -> _Storage | None:
-    """Return the storage that a persistent identifier names."""
     if not (isinstance(pid, tuple) and len(pid) >= 3 and pid[0] == "storage" and isinstance(pid[1], _Global)):
         return None
     return _Storage(STORAGES.get(pid[1].name), pid[2]) if isinstance(pid[2], str) else None
 
 
 def _called(function: Any, arguments: Any) -> Any:
-    """Return what a call that the pickle describes makes, if it is a tensor or a dict; None for all else."""
+    """Return the tensor or dict that a call in the pickle makes; None for other results."""
     name = function.name if isinstance(function, _Global) else ""
     if name == "collections OrderedDict":
         return {}
@@ -446,7 +428,7 @@ def _called(function: Any, arguments: Any) -> Any:
 
 
 def _tensor(storage: Any, first: Any, size: Any, stride: Any) -> Tensor | None:
-    """Return a tensor by the arguments of its function; None for one of many axes."""
+    """Return a tensor by the arguments of its function; None if it has more than `MOST_AXES` axes."""
     if not (isinstance(storage, _Storage) and isinstance(size, tuple) and isinstance(stride, tuple)):
         raise ValueError("no storage, size or stride")
     if len(size) > MOST_AXES:

@@ -33,11 +33,7 @@ BOUNDS = {
 
 
 def open_content(source: OpenFile) -> Reader:
-    """Open a compressed PLY file, with or without bounds of colours and SH.
-
-    Raises:
-        FormatError: the file is not compressed PLY, or cut short.
-    """
+    """Open a compressed PLY file, with or without bounds of colours and SH."""
     header = read_header(source.file)
     count, coefficients = _checked(header)
     trailing = header.check_size(source.size)

@@ -30,7 +30,8 @@ class Format:
 
     Attributes:
         name: for display.
-        module: in this package; has `open_content(source) -> Reader`, see `content`.
+        module: in this package; has `open_content(source) -> Reader`, which raises `FormatError` if the file is of
+            another format, cut short or corrupt.
         writable: its module also has `encode(scene, options, *, threads, progress) -> Iterator[bytes]`;
             `settled(scene, options) -> WriteOptions`, the options with nothing left open, which raises `FormatError`
             if the scene cannot be written; and `held(options, sh_degree)`, the `encoder.CodeRange`s that it can hold.
@@ -47,11 +48,11 @@ class Format:
             and `keys`, any bytes are possible, so that only the suffix decides.
         companions: its files refer to others beside them, which the `open_companion` of a source opens.
         folders: those may be in folders there.
-        parts: what viewers draw some of instead of splats chosen one by one: "levels" of detail, or "tiles" that
-            replace each other; None if its files have neither. Its module then has `decode_parts(file, *, threads,
+        parts: the units that viewers choose instead of single splats: "levels" of detail, or "tiles" that replace each
+            other; None if its files have neither. Its module then has `decode_parts(file, *, threads,
             progress, open_companion)`, which gives a `DetailScene` or a `TileScene`, and `encode_files` of such a
             scene, as above.
-        bare: its files hold nothing but splats, so that nothing can be noted in them, see `reader.note_of`.
+        bare: its files hold only splats, and no notes, see `reader.note_of`.
     """
 
     name: str

@@ -74,11 +74,7 @@ COLUMNS: tuple[tuple[int, bool, Callable[[Splats, FloatArray], None]], ...] = (
 
 
 def open_content(source: OpenFile) -> Reader:
-    """Open a hierarchy.
-
-    Raises:
-        FormatError: the file is cut short, or its nodes name splats that are not there, or the same ones.
-    """
+    """Open a hierarchy."""
     count = _count(source, 0)
     is_half, count = count < 0, abs(count)
     number, node = (np.dtype("<f2"), HALF_NODE) if is_half else (np.dtype("<f4"), NODE)
@@ -115,7 +111,6 @@ def open_content(source: OpenFile) -> Reader:
 
 
 def _count(source: OpenFile, at: int) -> int:
-    """Return a number of splats or nodes."""
     if at + COUNT.itemsize > source.size:
         raise TruncatedError("cut short, or no .hier: it has fewer splats than it announces")
     return int(np.frombuffer(source.read_at(at, COUNT.itemsize), COUNT)[0])
@@ -124,7 +119,7 @@ def _count(source: OpenFile, at: int) -> int:
 def _leaves(source: OpenFile, at: int, node: np.dtype[Any], nodes: int, count: int) -> NDArray[np.int64]:
     """Return the splats of full detail, ascending: leaves of all nodes, and merged splats of nodes without children.
 
-    Hierarchies that were cut to a chunk have nodes that lost their children.
+    Nodes of hierarchies that were cut to a chunk may have lost their children.
     """
     runs = [np.empty((0, 2), np.int64)]
     for _, some in rows_of(source.read_at, at, node, 0, nodes, nodes, "nodes"):

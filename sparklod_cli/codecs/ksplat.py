@@ -84,8 +84,6 @@ class KsplatSection:
 
     Attributes:
         first: index of its first splat in the scene.
-        count: number of splats.
-        row_type: type of a splat's row.
         offset, end: positions in the file of its first row and after its last.
         middles: (buckets, 3) centres of the buckets, world units.
         ends: (buckets,) number of splats up to the end of each bucket.
@@ -105,11 +103,7 @@ class KsplatSection:
 
 
 def open_content(source: OpenFile) -> Reader:
-    """Open a .ksplat file of any compression level.
-
-    Raises:
-        FormatError: the file is not KSPLAT, of an unknown version, level or SH degree, or cut short.
-    """
+    """Open a .ksplat file of any compression level."""
     file = source.file
     header = _read(file, HEADER, 1, "the header")[0]
     level, count = int(header["level"]), int(header["splats"])

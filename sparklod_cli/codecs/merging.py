@@ -65,7 +65,7 @@ def merged(parts: Sequence[Placed]) -> Reader:
 
 
 def _antialiased(parts: Sequence[Placed]) -> tuple[bool, tuple[str, ...]]:
-    """Return whether most splats are antialiased, and notes where they differ."""
+    """Return whether most splats are antialiased, and a note if they differ."""
     count = sum(part.reader.count for part in parts)
     found = sum(part.reader.count for part in parts if part.reader.antialiased)
     most = 2 * found > count
@@ -154,13 +154,10 @@ class SceneFiles:
     open_content: Callable[[str, OpenFile], Reader]
 
     def open(self, name: str, pieces: Sequence[Piece] | None = None, row: int = 0) -> Chunk:
-        """Read the header of a file.
+        """Read the header of a file; errors name it.
 
         Args:
             pieces: to read later; None for all of it, from `row` on.
-
-        Raises:
-            FormatError: it cannot be read, or is of another format; names it.
         """
         with self._opened(name) as source:
             content = self.open_content(name, source)
@@ -185,15 +182,12 @@ class SceneFiles:
         progress: Progress = silent,
         first_row: int = 0,
     ) -> None:
-        """Fill rows with the pieces of files, several files at a time, on several threads.
+        """Fill rows with the pieces of files, several files at a time, on several threads; errors name the file.
 
         Args:
             chunks: whose pieces together have every row of `out` once.
             out: SH coefficients that a file does not have become 0.
-            first_row: that the first row of `out` has in the pieces.
-
-        Raises:
-            FormatError: a file is broken; names it.
+            first_row: number of the first row of `out` in the pieces.
         """
         together = min(threads, len(chunks))
 
@@ -218,7 +212,6 @@ class SceneFiles:
 
         Args:
             chunks: whose pieces have the rows in order where they are read in blocks.
-            degree: SH degree of the rows.
             threads: to read a file on, for a block.
         """
         count = sum(chunk.rows for chunk in chunks)

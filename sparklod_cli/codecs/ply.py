@@ -85,11 +85,7 @@ WINDOWS_NAN = re.compile(rb"(?<!\S)([+-]?)(?:nan\([^\s()]*\)|1[.,]#(inf)?\w*)(?!
 
 
 def open_content(source: OpenFile) -> Reader:
-    """Open a PLY file. An ascii file is unpacked to `scratch`, as binary rows.
-
-    Raises:
-        FormatError: the file is not PLY, cut short, or does not hold splats.
-    """
+    """Open a PLY file. An ascii file is unpacked to `scratch`, as binary rows."""
     file = source.file
     header = read_header(file)
     row_type = _row_type(header)
@@ -147,9 +143,6 @@ def _columns(names: Collection[str], mode: str) -> dict[str, tuple[tuple[str, ..
     """Return the columns that vertices with these properties fill: the properties of each, and its decode.
 
     Splats with one scale are balls, which need no rotation; those with two are disks, see `THIN`.
-
-    Raises:
-        NotSplatsError: splats need more properties.
     """
     have, columns = {*names}, dict[str, tuple[tuple[str, ...], Coding]]()
     widths = (2, 1) if mode == "2dgs" else (3, 2, 1)
@@ -263,7 +256,7 @@ def _text_rows(file: BinaryIO, header: PlyHeader, row_type: np.dtype[Any], neede
 
 
 def _parsed(lines: list[bytes], row_type: np.dtype[Any], needed: Collection[str]) -> NDArray[Any]:
-    """Parse vertices; where that fails, again without properties that nobody needs, and with `WINDOWS_NAN`."""
+    """Parse vertices; if that fails, again without properties that are not read, and with `WINDOWS_NAN`."""
     load = functools.partial(np.loadtxt, dtype=row_type, ndmin=1, comments=None)
     try:
         return load(lines)
@@ -273,7 +266,7 @@ def _parsed(lines: list[bytes], row_type: np.dtype[Any], needed: Collection[str]
 
 
 def _mended(line: bytes, are_needed: Sequence[bool]) -> bytes:
-    """Return a line with 0 for each value that nobody needs, and nan or inf for each `WINDOWS_NAN`."""
+    """Return a line with 0 for each value that is not read, and nan or inf for each `WINDOWS_NAN`."""
     words = WINDOWS_NAN.sub(lambda match: match[1] + (match[2] or b"nan"), line).split()
     if len(words) != len(are_needed):
         return line
@@ -299,9 +292,6 @@ def encode(
 
     All numbers are finite: for opacities of 0 and 1 and scales of 0, whose logits and logarithms are infinite, those of
     `quantize.FAR` are written, which decode to the same values.
-
-    Raises:
-        FormatError: the scene is a tree, which PLY cannot hold.
     """
     settled(scene, options)
     splats = scene.splats

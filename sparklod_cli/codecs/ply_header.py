@@ -45,7 +45,7 @@ class PlyHeader:
     mode: str = "default"
 
     def count(self, name: str) -> int:
-        """Return the rows of an element; 0 if there is none of this name."""
+        """Return the number of rows of an element; 0 if it is missing."""
         return self.elements[name][1] if name in self.elements else 0
 
     def row_type(self, name: str) -> np.dtype[Any] | None:
@@ -58,10 +58,7 @@ class PlyHeader:
         """Check that a file of `size` bytes can hold all rows, before memory is allocated for them.
 
         Returns:
-            Bytes after the last row; 0 where their number is unknown.
-
-        Raises:
-            TruncatedError: the file is too small.
+            Bytes after the last row; 0 if their number is unknown.
         """
         need = self.size
         for name, (element, count) in self.elements.items():
@@ -77,11 +74,7 @@ class PlyHeader:
 
 
 def read_header(file: BinaryIO) -> PlyHeader:
-    """Read a header, up to the line end_header, after which the file is left.
-
-    Raises:
-        FormatError: the file does not begin with a PLY header.
-    """
+    """Read a header, and leave the file behind the line end_header."""
     text = line = b""
     while line.strip() != b"end_header":
         line = file.readline(MAX_HEADER)
@@ -116,11 +109,7 @@ def read_header(file: BinaryIO) -> PlyHeader:
 
 
 def offset_of(file: BinaryIO, header: PlyHeader, name: str) -> int:
-    """Return where rows of an element begin in a binary file; lists before them are read for their sizes.
-
-    Raises:
-        FormatError: those rows are cut short, or a list has a size that none can have.
-    """
+    """Return where rows of an element begin in a binary file; lists before them are read for their sizes."""
     at = header.size
     for other, (element, count) in header.elements.items():
         if other == name:

@@ -103,9 +103,6 @@ def rows_of(
 
     Args:
         offset: of the first of the `count` rows of the file.
-
-    Raises:
-        TruncatedError: the data ends early.
     """
     step = max(BLOCK_ROWS, BLOCK_BYTES // row_type.itemsize)
     for first in range(start, stop, step):
@@ -241,11 +238,7 @@ class Reader:
         return splats, tree
 
     def scene(self, *, columns: Collection[str] = COLUMNS, progress: Progress = silent, validate: bool = True) -> Scene:
-        """Read all splats, once.
-
-        Args:
-            columns: as for `read`.
-            validate: refuse a broken tree.
+        """Read all splats, once; `validate` refuses a broken tree.
 
         Raises:
             FormatError: the file is cut short or corrupt, or its tree is broken.
@@ -256,12 +249,7 @@ class Reader:
         return with_valid_tree(scene) if validate else scene
 
     def blocks(self, start: int = 0, stop: int | None = None) -> Iterator[Splats]:
-        """Read a range of splats, all by default, in blocks.
-
-        Raises:
-            HasTreeError: the file has a tree.
-            FormatError: as `read`.
-        """
+        """Read a range of splats, all by default, in blocks; raises as `check_plain` and `read`."""
         self.check_plain()
         stop = self.count if stop is None else stop
         step = self.block * max(1, BLOCK_SPLATS // self.block)
@@ -269,11 +257,7 @@ class Reader:
             yield self.read(max(first, start), min(first + step, stop))[0]
 
     def check_plain(self) -> None:
-        """Check that the file has no tree, and if it has no splats either, that it is sound.
-
-        Raises:
-            HasTreeError, FormatError: it has one, or is corrupt.
-        """
+        """Raise `HasTreeError` if the file has a tree, and `FormatError` if it has no splats and is corrupt."""
         if self.has_tree:
             raise HasTreeError("it is a Level-of-Detail file already; give the splats that it was built from")
         if not self.count:
@@ -327,12 +311,7 @@ def code_of(note: str) -> str | None:
 
 
 def left_out(noun: str, plural: str, names: Iterable[str]) -> tuple[str, ...]:
-    """Return the note that names data, such as "its properties label and motion_0 to motion_8 are left out".
-
-    Args:
-        noun, plural: what the names are of.
-        names: in any order; without any there is no note.
-    """
+    """Return the note that names data, such as "its properties label and motion_0 to motion_8 are left out"."""
     every = sorted(set(names), key=_counted)
     if not every:
         return ()
@@ -357,7 +336,7 @@ def _families(names: list[str]) -> Iterator[str]:
 
 
 def _counted(name: str) -> tuple[str, int]:
-    """Return a name without the number at its end, and that number; -1 for none."""
+    """Return a name without the number at its end, and that number; -1 without one."""
     match = _COUNTED.fullmatch(name)
     return (match[1], int(match[2])) if match else (name, -1)
 

@@ -62,11 +62,7 @@ def read_layout(file: BinaryIO) -> ArrayLayout | None:
 
 
 def read_values(file: BinaryIO, layout: ArrayLayout) -> NDArray[Any]:
-    """Read the array at the current position of a file. The caller has checked that its shape is the expected one.
-
-    Raises:
-        TruncatedError: the file is too short; the text continues a sentence about the file.
-    """
+    """Read the array at the current position of a file; raises `TruncatedError`, see `read_layout`."""
     size = math.prod(layout.shape) * layout.dtype.itemsize
     data = file.read(size)
     if len(data) < size:
@@ -81,11 +77,10 @@ def decode(file: BinaryIO, count: int, rows: slice | None = None) -> FloatArray:
     The type of a raw file follows from its size.
 
     Args:
-        rows: a range of them, from a start to a stop, to read alone; None for all.
+        rows: the range of them to read; None for all.
 
     Raises:
-        FormatError: it is neither, of another length, or has values that are not 0..1; continues a sentence about the
-            file.
+        FormatError: the format, length or values are wrong; the text continues a sentence about the file.
     """
     layout = read_layout(file) or _raw_layout(file, count)
     shape, dtype = layout.shape, layout.dtype
@@ -104,7 +99,6 @@ def decode(file: BinaryIO, count: int, rows: slice | None = None) -> FloatArray:
 
 
 def _raw_layout(file: BinaryIO, count: int) -> ArrayLayout:
-    """Return the layout of a file without a header, by its size."""
     size = os.fstat(file.fileno()).st_size
     if size == 16 * count:
         return ArrayLayout((count, 4), np.dtype("<f4"))

@@ -33,11 +33,7 @@ HELD = (CodeRange("rgb", -0.5 / 255, 255.5 / 255), CodeRange("sh", 0, 0))
 
 
 def open_content(source: OpenFile) -> Reader:
-    """Open a .splat file. The format has no header: any file whose size is a multiple of 32 is accepted.
-
-    Raises:
-        TruncatedError: the size is not a multiple of 32.
-    """
+    """Open a .splat file. The format has no header: any file whose size is a multiple of 32 is accepted."""
     size = source.size
     if size % ROW.itemsize:
         raise TruncatedError(f"cut short, or not .splat: its {size:,} bytes are not a multiple of {ROW.itemsize}")
@@ -65,11 +61,7 @@ def importance_order(splats: Splats) -> NDArray[np.intp]:
 
 
 def settled(scene: Scene, options: WriteOptions) -> WriteOptions:
-    """Return the options: .splat has no choices.
-
-    Raises:
-        FormatError: the scene is a tree, which .splat cannot hold.
-    """
+    """Return the options: .splat has no choices; raises `FormatError` for a tree, which it cannot hold."""
     if scene.tree is not None:
         raise FormatError("SPLAT holds no Level-of-Detail tree")
     return options
@@ -83,11 +75,7 @@ def held(options: WriteOptions, sh_degree: int) -> Sequence[CodeRange]:
 def encode(
     scene: Scene, options: WriteOptions = DEFAULTS, *, threads: int = 1, progress: Progress = silent
 ) -> Iterator[bytes]:
-    """Return the bytes of a .splat file, piece by piece, in order of importance and without SH.
-
-    Raises:
-        FormatError: the scene is a tree, which .splat cannot hold.
-    """
+    """Return the bytes of a .splat file, piece by piece, in order of importance and without SH."""
     settled(scene, options)
     order = importance_order(scene.splats)
 

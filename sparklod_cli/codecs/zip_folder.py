@@ -36,9 +36,6 @@ class ZipFolder:
 
     Attributes:
         first: name of the file that names the others, such as meta.json; the others' names are relative to it.
-
-    Raises:
-        FormatError: it is no complete zip, has no such file, or several.
     """
 
     def __init__(self, file: BinaryIO) -> None:
@@ -74,7 +71,7 @@ class ZipFolder:
         """Open a member, whose checksum is checked at the end, also if its content turns out to be corrupt.
 
         Args:
-            whole: read what is left of it at the end; False where nothing but its beginning is needed.
+            whole: read the rest of it at the end; False if only its beginning is needed.
         """
         member = self._member(name)
         if member.compress_type not in METHODS or member.flag_bits & ENCRYPTED:

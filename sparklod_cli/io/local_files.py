@@ -139,7 +139,6 @@ def _named_in(path: Path) -> list[Path]:
 
 
 def _images_of(path: Path) -> list[Path]:
-    """Return the images that the meta.json of an unpacked SOG names."""
     from ..codecs.sog.sog_container import MAX_META, companion_names
 
     if not path.is_file() or path.stat().st_size > MAX_META:
@@ -156,7 +155,7 @@ def in_folder(folder: Place) -> Place:
     """Return the splat file in a folder: a manifest of Streamed SOG or 3D Tiles, or a SOG's meta.json.
 
     Raises:
-        UnreadableError: the folder holds none, or several.
+        UnreadableError: the folder has none or several.
     """
     found = [name for name in FIRST_FILES if (folder / name).is_file()]
     if len(found) > 1:
@@ -189,11 +188,7 @@ def check_companion(name: str, *, folders: bool = False) -> None:
 
 
 def open_named(first: Place, name: str, *, folders: bool = False) -> BinaryIO:
-    """Open a file that another one names, which may be in a folder there if `folders`.
-
-    Raises:
-        FormatError: it cannot be opened, or the name could lead out of the folder of the first.
-    """
+    """Open a file that another one names, which may be in a folder there if `folders`; raises `FormatError`."""
     if first == DASH:
         raise FormatError(f"it names {quoted_value(name)}, but standard input has no folder; give the path instead")
     check_companion(name, folders=folders)

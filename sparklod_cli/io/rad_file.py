@@ -41,10 +41,10 @@ class RadFile:
 
     @classmethod
     def open(cls, path: Path) -> RadFile | None:
-        """Read the header of a file, and its palette; None where the file is of another format.
+        """Read the header of a file, and its palette; None for a file of another format.
 
         Raises:
-            FormatError: it cannot be read, or breaks a promise without which its chunks cannot be.
+            FormatError: it cannot be read, or breaks a fatal rule of `rad_rules`.
         """
         with opened(path) as (file, form, more):
             return cls.of(path, file, more["open_companion"]) if form.name == FORMAT else None
@@ -82,19 +82,12 @@ class RadFile:
 
         Args:
             thorough: unpack the other columns, too, which finds corrupt data.
-
-        Raises:
-            FormatError: a chunk is damaged.
         """
         with self._reopened() as reader:
             yield from reader.chunks(columns, thorough=thorough, threads=threads)
 
     def chunk(self, number: int, columns: Collection[str]) -> tuple[Splats, LodTree | None, FileCoding]:
-        """Return one chunk and its coding; only these columns are unpacked. Several threads may call this.
-
-        Raises:
-            FormatError: it is damaged.
-        """
+        """Return one chunk and its coding; only these columns are unpacked. Several threads may call this."""
         with self._reopened() as reader:
             return reader.chunk(number, columns)
 

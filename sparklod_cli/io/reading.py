@@ -113,11 +113,7 @@ def read_scene(
 
 
 def read_stored(path: Place) -> Stored:
-    """Read the codes of a file whose format can hold a tree, so that its leaves can be written again bit for bit.
-
-    Raises:
-        FormatError: as `read_scene`.
-    """
+    """Read the codes of a file whose format can hold a tree, so that its leaves can be written again bit for bit."""
     with opened(path) as (file, form, more):
         found: Stored = form.codec().stored(file, **more)
     return found
@@ -168,11 +164,7 @@ def open_splats(path: Place, closing: contextlib.ExitStack) -> tuple[BinaryIO, F
 
 
 def recognised(head: bytes, path: Place) -> Format:
-    """Return the format of a file by its first bytes, see `head_of`, or else by its suffix.
-
-    Raises:
-        FormatError: it is empty, or of no known format.
-    """
+    """Return the format of a file by its first bytes, see `head_of`, or else by its suffix; raises `FormatError`."""
     if not head:
         raise UnreadableError("the file is empty")
     form = sniff(head, path.suffix)
@@ -203,11 +195,7 @@ def readable() -> Iterator[None]:
 
 
 def read_arrays(path: Path) -> dump.Arrays | None:
-    """Return the arrays of a .npz file; None where a file is something else, or cannot be opened.
-
-    Raises:
-        FormatError: an array is damaged, or of no plain numbers.
-    """
+    """Return the arrays of a .npz file; None if a file has another format, or cannot be opened."""
     from ..codecs.gpu import dump
 
     try:

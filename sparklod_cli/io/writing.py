@@ -73,11 +73,7 @@ def siblings_of(path: Place) -> Siblings:
 
 
 def parts_output(path: Place, *, overwrite: bool) -> Output:
-    """Return the output of a manifest and its folders; a manifest of an unknown name is that of a Streamed SOG.
-
-    Raises:
-        OutputError: see `Output`.
-    """
+    """Return the output of a manifest and its folders; a manifest of an unknown name is that of a Streamed SOG."""
     return Output(path, overwrite=overwrite, siblings=_TILES_3D if path.name == TILESET else _STREAMED_SOG)
 
 
@@ -87,9 +83,6 @@ def scene_output(path: Place, form: Format, *, chunked: bool = False, overwrite:
     Args:
         path: of the file, or of the header where `chunked`, as for the name `form.unbundled`; - is standard output.
         chunked: each chunk has a file of its own, beside the header; of RAD.
-
-    Raises:
-        OutputError: see `Output`.
     """
     several = chunked or path.name.lower() == form.unbundled
     return Output(path, overwrite=overwrite, siblings=siblings_of(path) if several else None)
@@ -115,10 +108,6 @@ def encoded(
 def write_scene(
     out: Output, form: Format, scene: Scene, options: WriteOptions, *, threads: int = 1, progress: Progress = silent
 ) -> int:
-    """Write a scene to an output of `scene_output`, and return how many bytes it wrote.
-
-    Raises:
-        OutputError: see `Output`; and what the codec raises.
-    """
+    """Write a scene to an output of `scene_output`, and return the number of bytes."""
     with out:
         return sum(out.write(*file) for file in encoded(out, form, scene, options, threads=threads, progress=progress))

@@ -60,15 +60,14 @@ def read_scenes(
     Splats that cannot be drawn are left out of scenes without trees; `Scenes.notes` has their number.
 
     Args:
-        columns: of `Splats` that are read; only with `trees_only`; of scenes without trees all are read.
-        trees_only: refuse scenes of which no cuts are drawn: those with neither a tree nor detail levels nor tiles.
+        columns: of `Splats` to read; only with `trees_only`; of scenes without trees all are read.
+        trees_only: refuse scenes without a tree, detail levels or tiles, of which no cuts are drawn.
         through: one of `formats.ROUND_TRIPS`, a coding after which splats are drawn; cuts are those of the scene.
         precision: one of `PRECISIONS`, of the nodes that cuts are found with.
-        paged: only cuts are looked at, so that of large RAD trees those chunks suffice
-            that cuts need. Chunks that no cut needs are not looked at; all the rest is the same.
+        paged: only cuts are needed, so that only those chunks of large RAD trees are read that cuts need.
 
     Raises:
-        FormatError: a file cannot be read, is no tree but has to be, or does not fit the coding; names the file.
+        FormatError: a file cannot be read, has no tree but needs one, or does not fit the coding; names the file.
         TreeError: a tree is broken; names the file.
         InvalidSplatsError: a scene has nothing to draw; names it.
         OutOfMemoryError: a file does not fit into memory; names it.
@@ -131,11 +130,7 @@ def _loaded_runs(
 
 
 def read_detail_files(path: Path) -> DetailFiles:
-    """Return the files of a lod-meta.json, or of the folder that holds it; regions are in the order of the manifest.
-
-    Raises:
-        FormatError: it cannot be read, or is no such manifest.
-    """
+    """Return the files of a lod-meta.json, or of the folder that holds it; regions are in the order of the manifest."""
     with opened(path) as (file, _, more):
         data = file.read(MAX_MANIFEST + 1)
         manifest = parse(data)
@@ -167,7 +162,7 @@ def _read(
     """Read a file: a scene, or one at several detail levels, or of tiles.
 
     Args:
-        paged: precision of the pages that a file too large to be read whole becomes; None to read it nevertheless.
+        paged: precision of the pages of a file that is too large to be read at once; None to read it nevertheless.
     """
     with naming(path), memory_errors_translated(), opened(path) as (file, form, more):
         if paged is not None and form.name == RAD and path != DASH:
@@ -192,7 +187,6 @@ def _check_tree(name: Path | str, scene: Scene) -> None:
 
 
 def _drawable(name: str, scene: Scene, notes: list[str]) -> Scene:
-    """Return a scene without the splats that cannot be drawn."""
     with naming(name, InvalidSplatsError):
         splats, dropped = Selection(drop_invalid=True).apply(scene.splats)
     if dropped:

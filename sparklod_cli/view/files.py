@@ -217,12 +217,9 @@ def _tileset_files(path: Path) -> list[str]:
 
 
 def _inside(path: Path, companion: Path) -> Path:
-    """Return the real path of a file that another one names.
+    """Return the real path of a file that another one names; raises `FormatError` if it must not be published.
 
-    The author of a manifest is a stranger, and chooses which of the files beside it are published.
-
-    Raises:
-        FormatError: it is not called like a part of a scene, is in a hidden folder, or a link leads out of its folder.
+    The author of a manifest is untrusted, and chooses which of the files beside it are published.
     """
     name = companion.relative_to(path.parent)
     if name.suffix.lower() not in PARTS or any(part.startswith(".") for part in name.parts):
