@@ -87,7 +87,7 @@ def pack(scene: Scene, encoding: str, *, threads: int | None = None) -> dict[str
     """
     from ..codecs.formats import ENCODINGS
     from ..codecs.gpu import dump
-    from ..codecs.validation import check_valid
+    from ..codecs.reader import check_valid
 
     if encoding not in ENCODINGS:
         raise ValueError(f"there is no encoding {encoding!r}; give one of {', '.join(ENCODINGS)}")

@@ -10,7 +10,7 @@ from ..bake.settings import BakeSettings
 from ..bake.simplifying import Refined, Simplifier, SimplifyGoal, refined
 from ..cameras.camera import Camera
 from ..cameras.sources import CameraPath
-from ..codecs.validation import check_valid
+from ..codecs.reader import check_valid
 from ..fitting.settings import STEPS, FitSettings
 from ..lod.builders import (
     BUILDERS,

@@ -90,8 +90,8 @@ def write(
     """
     from ..codecs.formats import WRITABLE, ending_of
     from ..codecs.options import RadOptions, SogOptions, WriteOptions
+    from ..codecs.reader import check_valid
     from ..codecs.spark_codings import SplatEncoding
-    from ..codecs.validation import check_valid
     from ..lod.part_settings import DetailSettings
 
     path, count = file_path(path), thread_count(threads)

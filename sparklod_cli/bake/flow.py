@@ -59,7 +59,7 @@ def bake(
 
     Raises:
         FormatError, InvalidSplatsError, OutputError: see `io.open_reader`, `Selection.check`,
-            `validation.check_valid` and `system.output.Output`; or the input has a tree, and the settings do not keep
+            `reader.check_valid` and `system.output.Output`; or the input has a tree, and the settings do not keep
             it.
         ScratchError: the scratch folder is full, in use, or belongs to another bake.
         OutOfMemoryError: the scene does not fit into memory.

@@ -9,9 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..codecs.encoder import Encoder, Windows, results
-from ..codecs.reader import Reader
+from ..codecs.reader import Reader, check_valid, is_valid_and_visible
 from ..codecs.statistics import Statistics
-from ..codecs.validation import check_valid, is_valid_and_visible
 from ..io import read_rgba, read_scene
 from ..io.reading import Source
 from ..lod.builders import BUILDERS

@@ -16,8 +16,8 @@ from ..cameras.camera import Camera
 from ..codecs.formats import WRITABLE
 from ..codecs.losses import Losses, settled_with_losses
 from ..codecs.options import WriteOptions
+from ..codecs.reader import check_valid
 from ..codecs.spz import like
-from ..codecs.validation import check_valid
 from ..fitting.report import FitReport
 from ..fitting.settings import FitSettings
 from ..images.metrics import MOST_PSNR

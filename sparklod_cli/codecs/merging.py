@@ -23,7 +23,7 @@ from ..system.threads import ordered_map
 from ..system.units import count_of
 from ..system.untrusted import quoted_value
 from .reader import Fill, OpenCompanion, OpenFile, Reader, Target
-from .validation import RuleViolation, error_of
+from .rules import RuleViolation, error_of
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""Files as streams of rows, decoded and encoded in blocks so that no file is in memory as a whole, and their notes.
+"""Files as streams of rows, in blocks so that no file is in memory as a whole; their notes; checks of what they hold.
 
 Formats without a field for it hold a note of sparklod: a JSON object with "generator". It is the comment of a RAD, PLY
 or SPZ file, and "asset" of a SOG or a Streamed SOG, which may have more keys.
@@ -22,12 +22,13 @@ from numpy.typing import NDArray
 from .. import __version__
 from ..model.lod_tree import LodTree
 from ..model.scene import AXES, PLAIN, SPECIFIED, FileCoding, Scene, facts_of
-from ..model.splats import COLUMNS, Splats
-from ..system.errors import HasTreeError, TruncatedError
+from ..model.selection import EXAMINED
+from ..model.splats import COLUMNS, UNIT_TOLERANCE, Splats, describe_invalid
+from ..system.errors import FormatError, HasTreeError, InvalidSplatsError, TreeError, TruncatedError
 from ..system.progress import Progress, silent
 from ..system.threads import BLOCK_ROWS, blocks_of, ordered_map
 from ..system.untrusted import parse_json, printable, quoted_value
-from .validation import with_valid_tree
+from .kernels.drawable import count_doubtful
 
 #: Least bytes of a block: with narrow rows, such as SPZ's streams, handing a smaller one to a thread costs more than it
 #: saves.
@@ -395,3 +396,43 @@ def read_comment(comment: str | bytes | None) -> FileNote:
         return read_note(parse_json(comment or "null"))
     except ValueError:
         return FileNote()
+
+
+def with_valid_tree(scene: Scene) -> Scene:
+    """Return a scene whose tree, if it has one, is valid; its leaves have a `child_start` of 0.
+
+    Raises:
+        FormatError: its tree is broken.
+    """
+    if scene.tree is None:
+        return scene
+    try:
+        scene.tree.validate()
+    except TreeError as error:
+        raise FormatError(f"its Level-of-Detail tree is broken: {error}") from error
+    start = scene.tree.first_child()
+    if np.array_equal(start, scene.tree.child_start):
+        return scene  # whose tree knows that it is valid
+    return dataclasses.replace(scene, tree=LodTree(scene.tree.child_count, start))
+
+
+def is_valid_and_visible(splats: Splats, threads: int) -> tuple[bool, bool]:
+    """Return whether all splats are certainly valid, and visible; otherwise `Splats.invalid` and `Selection` decide.
+
+    Rounding differs from theirs, so a rotation has to be nearer to a unit one.
+    """
+    tolerance = np.float32(UNIT_TOLERANCE / 2)
+
+    def counts(part: slice) -> tuple[int, int]:
+        columns = (getattr(splats, name)[part].reshape(-1) for name in COLUMNS)
+        doubtful, invisible = count_doubtful(*columns, tolerance)
+        return int(doubtful), int(invisible)
+
+    tallies = list(ordered_map(counts, blocks_of(len(splats), EXAMINED), threads))
+    return not any(doubtful for doubtful, _ in tallies), not any(invisible for _, invisible in tallies)
+
+
+def check_valid(splats: Splats, threads: int) -> None:
+    """Check splats where they enter: from a file or from the API; `InvalidSplatsError` if one is invalid."""
+    if not is_valid_and_visible(splats, threads)[0] and (invalid := splats.invalid()):
+        raise InvalidSplatsError(f"{describe_invalid(invalid)}; such splats are not written, leave them out")

@@ -6,9 +6,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from ..codecs.rad import rad_rules
+from ..codecs.rules import RuleViolation
 from ..codecs.streamed_sog import manifest_rules
 from ..codecs.tiles_3d import tileset_rules
-from ..codecs.validation import RuleViolation
 
 ERROR, WARNING, NOTE = "error", "warning", "note"
 

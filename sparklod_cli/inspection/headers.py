@@ -16,6 +16,7 @@ from ..codecs.rad.property_codings import BY_NAME, CODINGS, LARGEST_F16, PROPERT
 from ..codecs.rad.rad_header import ENCODING_KEYS, RadChunkHeader, RadHeader
 from ..codecs.rad.rad_reader import scan_chunks, scan_header
 from ..codecs.reader import OpenCompanion, size_of
+from ..codecs.rules import RuleViolation
 from ..codecs.spark_codings import log_scale_table
 from ..codecs.streamed_sog import manifest_rules
 from ..codecs.streamed_sog.codec import RegionLayout, layout_of
@@ -23,7 +24,6 @@ from ..codecs.streamed_sog.manifest import VERSION as STREAMED_SOG_VERSION
 from ..codecs.tiles_3d import tileset_rules
 from ..codecs.tiles_3d.codec import tile_files
 from ..codecs.tiles_3d.tileset import MAX_TILESET, Tileset, read_whole
-from ..codecs.validation import RuleViolation
 from ..model.georeference import EarthPlace, place_of
 from ..model.scene import common_axis
 from ..system.progress import Progress, silent

@@ -13,7 +13,7 @@ from ..codecs.rad import rad_rules
 from ..codecs.rad.codec import RadChunk, read_chunk
 from ..codecs.rad.rad_header import RadHeader, read_header
 from ..codecs.rad.rad_reader import RadReader, decoded_bytes, file_of
-from ..codecs.validation import check_rules
+from ..codecs.rules import check_rules
 from ..model.lod_tree import LodTree
 from ..model.scene import FileCoding, Scene
 from ..model.splats import FloatArray, Splats

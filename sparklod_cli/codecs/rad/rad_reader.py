@@ -24,7 +24,7 @@ from .. import compression, spark_codings
 from ..inflate import ERRORS, raw_unpacker
 from ..quantize import Bytes, quat_of_xyz
 from ..reader import OpenCompanion, OpenFile, Reader, Target, size_of
-from ..validation import RuleViolation, check_rules, error_of
+from ..rules import RuleViolation, check_rules, error_of
 from . import rad_rules
 from .property_codings import BY_NAME, CODINGS, Row, encodings_of
 from .rad_header import (

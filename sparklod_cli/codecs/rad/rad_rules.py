@@ -9,7 +9,7 @@ from ...model import MAX_SH_DEGREE
 from ...model.lod_tree import CHUNK_NODES
 from ...system.untrusted import quoted_value
 from ..quantize import LARGEST
-from ..validation import RuleViolation
+from ..rules import RuleViolation
 from .property_codings import BY_NAME, CODINGS, PROPERTIES, Row
 from .rad_header import ALIGNMENT, GZ, Property, RadChunkEntry, RadChunkHeader, RadHeader, padding
 

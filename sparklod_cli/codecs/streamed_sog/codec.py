@@ -28,8 +28,8 @@ from ..formats import ENVIRONMENT_FILE, MANIFEST, META, chunk_folder
 from ..merging import Chunk
 from ..options import WriteOptions
 from ..reader import OpenCompanion, OpenFile, Reader, note_of, size_of
+from ..rules import check_rules, error_of
 from ..sog import codec as sog
-from ..validation import check_rules, error_of
 from .manifest import MAX_MANIFEST, VERSION, Bound, Manifest, ManifestNode, Run, parse, serialise
 from .manifest_rules import chunk_files, run_violations, violations
 

@@ -17,8 +17,8 @@ from ...system.errors import VersionError
 from ...system.untrusted import Json, quoted_value
 from .. import quantize
 from ..formats import MANIFEST
-from ..json_trees import nodes_of, parse_manifest, place_of
 from ..reader import FileNote, read_note
+from ..rules import nodes_of, parse_manifest, place_of
 
 #: The version that is read and written. A manifest from before versions has none.
 VERSION = 1

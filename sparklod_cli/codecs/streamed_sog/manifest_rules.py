@@ -18,13 +18,12 @@ from ...system.progress import Progress, silent
 from ...system.units import count_of
 from ...system.untrusted import quoted_value
 from ..formats import MANIFEST, ZIP
-from ..json_trees import leads_away
 from ..merging import Chunk, SceneFiles, not_finite
 from ..reader import OpenCompanion, code_of
+from ..rules import RuleViolation, count_outside, leads_away
 from ..sog import codec as sog
 from ..sog import texel_codings
 from ..sog.sog_container import MAX_META, image_names, parse_meta
-from ..validation import RuleViolation, count_outside
 from .manifest import MAX_MANIFEST, Bound, Manifest, ManifestNode, Run, parse
 
 #: Meaning of each code; the text of a violation has the values. Values of the wrong kind, which

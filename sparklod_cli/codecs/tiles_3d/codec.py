@@ -31,7 +31,7 @@ from ..glb.glb_container import transform_of
 from ..merging import Chunk, SceneFiles
 from ..options import CESIUM, WriteOptions
 from ..reader import Note, OpenCompanion, OpenFile, Reader, note_of
-from ..validation import check_rules, error_of
+from ..rules import check_rules, error_of
 from .tileset import (
     CONTENT_GLTF,
     LARGEST,

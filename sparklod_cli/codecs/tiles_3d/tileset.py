@@ -22,9 +22,8 @@ from ...system.errors import FormatError, VersionError
 from ...system.untrusted import Json, quoted_value
 from ..formats import TILESET
 from ..glb.glb_container import rotation_of_up
-from ..json_trees import nodes_of, parse_manifest, place_of
 from ..reader import FileNote, OpenCompanion, read_note
-from ..validation import error_of
+from ..rules import error_of, nodes_of, parse_manifest, place_of
 
 #: The version that is written, and the one before it, which is read, too.
 VERSION, OLD_VERSION = "1.1", "1.0"

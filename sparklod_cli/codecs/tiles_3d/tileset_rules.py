@@ -16,9 +16,8 @@ from ...system.units import count_of
 from ...system.untrusted import quoted_value
 from ..glb.attributes import COMPRESSION, EXTENSION
 from ..glb.glb_container import product
-from ..json_trees import leads_away
 from ..merging import Chunk, SceneFiles, not_finite
-from ..validation import LOOSE_BOUND, RuleViolation, count_outside, error_of
+from ..rules import LOOSE_BOUND, RuleViolation, count_outside, error_of, leads_away
 from .tileset import (
     CONTENT_GLTF,
     OLD_VERSION,

@@ -1,22 +1,19 @@
-"""Validation of splats and trees where they are read or passed to the API, and of the rules of formats."""
+"""Rules of formats and how they are broken, bounds of splats, and manifests in JSON whose nodes have "children"."""
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Iterable
+import bisect
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..model.gaussian import covariance
-from ..model.lod_tree import LodTree
-from ..model.scene import Scene
-from ..model.selection import EXAMINED
-from ..model.splats import COLUMNS, UNIT_TOLERANCE, Splats, describe_invalid
-from ..system.errors import FormatError, InvalidSplatsError, TreeError
-from ..system.threads import blocks_of, ordered_map
-from .kernels.drawable import count_doubtful
+from ..model.splats import Splats
+from ..system.errors import FormatError
+from ..system.threads import blocks_of
+from ..system.untrusted import Json, Origin
 
 
 @dataclass(frozen=True)
@@ -46,46 +43,6 @@ def error_of(code: str, text: str) -> FormatError:
     error = FormatError(text)
     error.code = code
     return error
-
-
-def with_valid_tree(scene: Scene) -> Scene:
-    """Return a scene whose tree, if it has one, is valid; its leaves have a `child_start` of 0.
-
-    Raises:
-        FormatError: its tree is broken.
-    """
-    if scene.tree is None:
-        return scene
-    try:
-        scene.tree.validate()
-    except TreeError as error:
-        raise FormatError(f"its Level-of-Detail tree is broken: {error}") from error
-    start = scene.tree.first_child()
-    if np.array_equal(start, scene.tree.child_start):
-        return scene  # whose tree knows that it is valid
-    return dataclasses.replace(scene, tree=LodTree(scene.tree.child_count, start))
-
-
-def is_valid_and_visible(splats: Splats, threads: int) -> tuple[bool, bool]:
-    """Return whether all splats are certainly valid, and visible; otherwise `Splats.invalid` and `Selection` decide.
-
-    Rounding differs from theirs, so a rotation has to be nearer to a unit one.
-    """
-    tolerance = np.float32(UNIT_TOLERANCE / 2)
-
-    def counts(part: slice) -> tuple[int, int]:
-        columns = (getattr(splats, name)[part].reshape(-1) for name in COLUMNS)
-        doubtful, invisible = count_doubtful(*columns, tolerance)
-        return int(doubtful), int(invisible)
-
-    tallies = list(ordered_map(counts, blocks_of(len(splats), EXAMINED), threads))
-    return not any(doubtful for doubtful, _ in tallies), not any(invisible for _, invisible in tallies)
-
-
-def check_valid(splats: Splats, threads: int) -> None:
-    """Check splats where they enter: from a file or from the API; `InvalidSplatsError` if one is invalid."""
-    if not is_valid_and_visible(splats, threads)[0] and (invalid := splats.invalid()):
-        raise InvalidSplatsError(f"{describe_invalid(invalid)}; such splats are not written, leave them out")
 
 
 #: By how much a splat may lie outside of its bound: a share of its own extent, by which codes of 8 bits change it; of
@@ -122,3 +79,60 @@ def count_outside(
         reach = (1 - LOOSE_EXTENT) * np.sqrt(variance) - turned - loose - step * (1 + np.abs(center))
         count += int(np.count_nonzero(np.any((center - reach < bound[0]) | (center + reach > bound[1]), axis=1)))
     return count
+
+
+#: Deepest nesting of a manifest; a node of a tree takes two.
+MAX_NESTING = 512
+
+
+def parse_manifest(data: bytes, called: str, most: int) -> Json:
+    """Parse a manifest of at most `most` bytes, called so in messages; raises `FormatError` if it is no object."""
+    root = Json.parse(data, Origin(called, FormatError), most=most, depth=MAX_NESTING)
+    if not isinstance(root.value, dict):
+        raise root.unexpected("an object")
+    return root
+
+
+def place_of(
+    root: str, number: int, parent_of: Callable[[int], int], children_of: Callable[[int], Sequence[int]]
+) -> str:
+    """Return the place of a node in a file, such as "tree.children[0]", where "tree" is `root`.
+
+    Args:
+        parent_of: number of the parent of a node, -1 of the root.
+        children_of: numbers of the children, ascending.
+    """
+    way = list[str]()
+    while (parent := parent_of(number)) >= 0:
+        way.append(f".children[{bisect.bisect_left(children_of(parent), number)}]")
+        number = parent
+    return root + "".join(reversed(way))
+
+
+def nodes_of(tree: Json, most: int) -> list[tuple[Json, int, list[int]]]:
+    """Return the nodes of a tree, however deep, root first and depth first.
+
+    A node is its object, the number of its parent, -1 of the root, and the numbers of its children.
+    """
+    nodes = list[tuple[Json, int, list[int]]]()
+    waiting = [(tree, -1)]
+    while waiting:
+        node, parent = waiting.pop()
+        number = len(nodes)
+        if number == most:
+            raise tree.error(f"it has more than {most:,} nodes")
+        if not isinstance(node.value, dict):
+            raise node.unexpected("an object")
+        nodes.append((node, parent, []))
+        if parent >= 0:
+            nodes[parent][2].append(number)
+        below = node.value.get("children")
+        missing = below is None or below == "" or below is False  # as for viewers, which test for truth
+        items = [] if missing else list(node.items("children"))
+        waiting.extend((each, number) for each in reversed(items))
+    return nodes
+
+
+def leads_away(name: str) -> bool:
+    """Return True if a name means something else than a file in the manifest's folder or in one below."""
+    return any(part in ("", ".", "..") for part in name.split("/")) or any(mark in name for mark in "\\:\0?#")
