@@ -134,7 +134,7 @@ def simplify(
         check_valid(scene.splats, thread_count(threads))
     with on_threads(threads) as count, progress_callback(progress) as callback, memory_errors_translated():
         simplifier = Simplifier(goal, fitting, None if path is None else path.cameras)
-        chosen = simplifier.choose(scene, bytes_of=len, threads=count, progress=callback).scene
+        chosen, *_ = simplifier.choose(scene, bytes_of=len, threads=count, progress=callback)
         return Scene(chosen.splats, antialiased=scene.antialiased, up=scene.up)
 
 

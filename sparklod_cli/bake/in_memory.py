@@ -56,7 +56,7 @@ class InMemory:
         antialiased, up = scene.antialiased, settings.up or scene.up
         up = rotated_axis(up, settings.transform.rotation) if up else None
         if scene.tree is not None:
-            tree.output, tree.is_ordered = output_of_existing_tree(tree.output, self.source, scene, settings)
+            tree.output, tree.is_ordered = output_of_existing_tree(tree.output, self.source, scene)
             check_valid(scene.splats, threads)
             baked.splats = int(np.count_nonzero(scene.tree.is_leaf))
             tree.nodes = Scene(scene.splats, scene.tree, antialiased, up=up)

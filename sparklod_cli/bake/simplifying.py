@@ -49,15 +49,12 @@ MOST_TRIALS = 16
 
 @dataclass(frozen=True)
 class SimplifyGoal:
-    """Size or fidelity of a simplified scene. One of the three is not None.
+    """Size or fidelity of a simplified scene, one of the three; raises `ValueError` if it is out of its range.
 
     Attributes:
         to: number of splats, or a share of all.
         max_bytes: size of a file that as many splats as possible shall fill.
         psnr: least PSNR against full detail, dB, of as few splats as possible.
-
-    Raises:
-        ValueError: not exactly one is given, or it is out of its range.
     """
 
     to: Budget | None = None
@@ -73,18 +70,14 @@ class SimplifyGoal:
             raise ValueError(f"psnr is {self.psnr}; give more than 0 and less than {MOST_PSNR:g} dB")
 
 
-#: Measures a number of a cut of so many splats.
+#: Measures the file or the pictures of a cut of this many splats.
 Measure = Callable[[int], float]
 
 
 def count_for(
     goal: SimplifyGoal, leaves: int, *, bytes_of: Measure, psnr_of: Measure, progress: Progress
 ) -> tuple[int, float | None]:
-    """Return the number of splats that meets a goal, and their PSNR if the goal is a PSNR.
-
-    Args:
-        leaves: of full detail.
-        bytes_of, psnr_of: of the cut of a number of splats.
+    """Return the number of splats that meets a goal, of so many leaves, and their PSNR if the goal is a PSNR.
 
     Raises:
         FormatError: not even one splat fits.
@@ -174,29 +167,12 @@ class Fidelity:
 
 
 @dataclass(frozen=True)
-class Chosen:
-    """A simplified scene.
-
-    Attributes:
-        faint: number of merged splats that no viewer draws: they stand for splats far apart, and what these cover
-            leaves hardly any opacity to one as large as all of them and the gaps between.
-        psnr, refine: PSNR and how the scene was fitted, where either was asked for.
-    """
-
-    scene: Scene
-    faint: int
-    psnr: float | None
-    refine: Refined | None
-
-
-@dataclass(frozen=True)
 class Simplifier:
     """Simplification of trees to a goal.
 
     Attributes:
         refine: how the cut is fitted to pictures of full detail, for all cameras; None for not at all.
-        cameras: for a PSNR; None for cameras that are placed around and inside the scene.
-        say: called with a line after each stage of fitting.
+        cameras: for a PSNR; None for cameras around and inside the scene.
     """
 
     goal: SimplifyGoal
@@ -206,11 +182,7 @@ class Simplifier:
 
     @classmethod
     def of(cls, settings: BakeSettings, say: Callable[[str], None]) -> Simplifier:
-        """Return the simplifier for the settings of a bake.
-
-        Raises:
-            CameraPathError: the cameras that they name cannot be read.
-        """
+        """Return the simplifier for a bake; raise `CameraPathError` if its cameras cannot be read."""
         assert settings.simplify is not None
         refine, cameras = fit_settings(settings), None
         if refine is not None and refine.path is not None:
@@ -221,15 +193,21 @@ class Simplifier:
             cameras = read_path(settings.camera_path).cameras
         return cls(settings.simplify, refine, cameras, say)
 
-    def choose(self, tree: Scene, *, bytes_of: Callable[[Scene], float], threads: int, progress: Progress) -> Chosen:
-        """Find the cut of a tree that meets the goal, and fit it if requested; return it as a scene without a tree.
+    def choose(
+        self, tree: Scene, *, bytes_of: Callable[[Scene], float], threads: int, progress: Progress
+    ) -> tuple[Scene, int, float | None, Refined | None]:
+        """Find the cut of a tree that meets the goal, and fit it if requested.
 
         Args:
             bytes_of: size of the file of a scene.
 
+        Returns:
+            the cut as a scene without a tree, `WrittenSet.faint`, and its PSNR and the result of fitting it, if
+            requested.
+
         Raises:
             FormatError, SparklodError: see `count_for` and `Fidelity`; or nothing could be seen of the cut.
-            KeyboardInterrupt: see `refining.refined`.
+            KeyboardInterrupt: see `refined`.
         """
         assert tree.tree is not None
         progress("simplifying", 0, 1, "cut")
@@ -256,11 +234,11 @@ class Simplifier:
                 f" below {MIN_ALPHA:.1g}; keep more splats"
             )
         if self.refine is None:
-            return Chosen(cut(count), faint, measured, None)
+            return cut(count), faint, measured, None
         fitted, report = refined(tree, self.refine, fixed=fixed, threads=threads, progress=progress, say=self.say)
         measured = None if fidelity is None else fidelity.fitted(fixed, fitted.splats)
         scene = dataclasses.replace(fitted, splats=fitted.splats.take(fixed), tree=None)
-        return Chosen(scene, faint, measured, report)
+        return scene, faint, measured, report
 
 
 @dataclass(frozen=True)
@@ -269,7 +247,8 @@ class WrittenSet(Losses):
 
     Attributes:
         splats, share: how many, and their share of full detail.
-        faint: number of merged splats whose opacity is too low to be drawn.
+        faint: number of merged splats that no viewer draws: they stand for splats far apart, and what these cover
+            leaves hardly any opacity to one as large as all of them and the gaps between.
         psnr: mean over the cameras and a black and a white background, dB; None where it was not measured.
         refine: result of fitting it; None without `--refine`.
     """
@@ -292,30 +271,21 @@ def write_simplified(tree: BuiltTree, simplifier: Simplifier, clock: Clock, thre
         return sum(sum(map(len, pieces)) for _, pieces in files)
 
     with on_threads(threads):
-        chosen = simplifier.choose(tree.scene, bytes_of=bytes_of, threads=threads, progress=progress)
-    settled, losses = settled_with_losses(chosen.scene, form, options, threads)
+        scene, faint, psnr, refine = simplifier.choose(
+            tree.scene, bytes_of=bytes_of, threads=threads, progress=progress
+        )
+    settled, losses = settled_with_losses(scene, form, options, threads)
     clock.end("simplify")
     baked = tree.baked
-    baked.bytes = write_scene(out, form, chosen.scene, settled, threads=threads, progress=progress)
+    baked.bytes = write_scene(out, form, scene, settled, threads=threads, progress=progress)
     clock.end("write")
-    count = len(chosen.scene)
-    share = round(count / baked.splats, 6)
-    baked.output_format, baked.simplified = (
-        form.name,
-        WrittenSet(
-            **vars(losses), splats=count, share=share, faint=chosen.faint, psnr=chosen.psnr, refine=chosen.refine
-        ),
-    )
+    baked.output_format, share = form.name, round(len(scene) / baked.splats, 6)
+    baked.simplified = WrittenSet(**vars(losses), splats=len(scene), share=share, faint=faint, psnr=psnr, refine=refine)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Refined(FitReport):
-    """Result of fitting merged splats, as reported by `--json`.
-
-    Attributes:
-        seed: of the random cameras and budgets.
-        seconds: duration.
-    """
+    """Result of fitting merged splats, as reported by `--json`; the seed is that of random cameras and budgets."""
 
     seed: int
     seconds: float
@@ -349,7 +319,6 @@ def refined(
 
     Args:
         fixed: see `fitting.fit.fit`.
-        say: receives one-line messages for the user.
 
     Raises:
         KeyboardInterrupt: the fitting was interrupted before it improved anything.
@@ -375,19 +344,11 @@ def refined(
             say("Stopped before --refine improved anything; no file written.")
             raise KeyboardInterrupt
         say("Interrupted: writing the improvements of the finished stages; another Ctrl-C ends without an output.")
-    seconds = round(time.perf_counter() - start, 4)
-    return dataclasses.replace(scene, splats=_within(nodes, scene)), Refined(
-        **vars(report), seed=settings.seed, seconds=seconds
-    )
-
-
-def _within(nodes: Splats, scene: Scene) -> Splats:
-    """Return nodes whose centres stay in their former box, so that a format needs no other number of bits for them.
-
-    With another number, leaves would move.
-    """
+    # Centres stay in their former box: with another one, a format may need another number of bits, and leaves move.
     before = scene.splats.center
-    return dataclasses.replace(nodes, center=nodes.center.clip(before.min(axis=0), before.max(axis=0)))
+    nodes = dataclasses.replace(nodes, center=nodes.center.clip(before.min(axis=0), before.max(axis=0)))
+    seconds = round(time.perf_counter() - start, 4)
+    return dataclasses.replace(scene, splats=nodes), Refined(**vars(report), seed=settings.seed, seconds=seconds)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -396,7 +357,7 @@ class Extracted(Losses):
 
     Attributes:
         format: of the input, for display.
-        nodes, splats: of its tree, and those of them that are leaves, which were written.
+        nodes, splats: number of all nodes, and of the leaves.
         seconds: by stage (read, write).
     """
 
@@ -433,11 +394,10 @@ def extract_leaves(
     threads: int = 1,
     progress: Progress = silent,
 ) -> Extracted:
-    """Read the tree of a Level-of-Detail file and writes its leaves, in their order, as a file of plain splats.
+    """Read the tree of a Level-of-Detail file and write its leaves, in their order, as a file of plain splats.
 
     Args:
-        source: a Level-of-Detail file; - is standard input.
-        options: how to write; what is None is taken from the input, which keeps its values as they are.
+        options: None is taken from the input, which keeps its values as they are.
         suffix: of the format, one of `WRITABLE`.
 
     Raises:
@@ -448,23 +408,23 @@ def extract_leaves(
     with memory_errors_translated():
         form = WRITABLE[suffix]
         out = scene_output(target, form, chunked=options.rad.chunked, overwrite=overwrite)
-        start = time.perf_counter()
+        clock = Clock()
         scene = read_scene(source, threads=threads, progress=progress)
         leaves = leaves_of(scene)
         check_valid(leaves.splats, threads)
-        read_done = time.perf_counter()
+        clock.end("read")
         # As they are: their opacities make up for nothing.
         chosen = dataclasses.replace(like(scene.header, options), covering=False)
         chosen, losses = settled_with_losses(leaves, form, chosen, threads)
         size = write_scene(out, form, leaves, chosen, threads=threads, progress=progress)
-        seconds = {"read": read_done - start, "write": time.perf_counter() - read_done}
+        clock.end("write")
     return Extracted(
         format=scene.format,
         nodes=len(scene.splats),
         splats=len(leaves.splats),
         sh_degree=leaves.splats.sh_degree,
         bytes=size,
-        seconds={stage: round(value, 4) for stage, value in seconds.items()},
+        seconds=clock.seconds,
         output_format=form.name,
         **vars(losses),
     )

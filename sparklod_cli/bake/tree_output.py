@@ -67,12 +67,7 @@ class BakeOutput:
 def output_of(
     target: Place, settings: BakeSettings, *, overwrite: bool, say: Callable[[str], None] = lambda text: None
 ) -> BakeOutput:
-    """Return the output of a bake; raise now if it cannot be written later.
-
-    Raises:
-        OutputError: see `system.output.Output`.
-        CameraPathError: see `Simplifier.of`.
-    """
+    """Return the output of a bake; raise `OutputError` or `CameraPathError` now, before the work."""
     options = settings.options
     if settings.detail is not None or settings.tiles is not None:
         return BakeOutput(parts_output(target, overwrite=overwrite), settings, options)
@@ -87,22 +82,18 @@ def output_of(
     return BakeOutput(out, settings, options, simplifier=Simplifier.of(settings, say))
 
 
-def output_of_existing_tree(
-    output: BakeOutput, source: Source, scene: Scene, settings: BakeSettings
-) -> tuple[BakeOutput, bool]:
+def output_of_existing_tree(output: BakeOutput, source: Source, scene: Scene) -> tuple[BakeOutput, bool]:
     """Return the output of an input whose tree is kept, and whether its nodes are in order already.
 
     Nodes keep their opacities. In the same format, options that were not given are those of the file, and the codes of
     unchanged nodes are copied. Chunks of a RAD file that gets its other container are copied unless an option changes
     the encoding.
 
-    Args:
-        output: of an input without a tree.
-
     Raises:
         FormatError: the settings neither change the format or container of the tree nor fit its merged splats; or they
             have options that only splats without a tree take.
     """
+    settings = output.settings
     held = scene.format.split()[0]
     others = settings.detail, settings.tiles, settings.encoding, settings.simplify
     plain = all(other is None for other in others)
