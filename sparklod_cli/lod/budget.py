@@ -33,7 +33,7 @@ class Budget:
         share: share of the leaves of all instances together; None for a count.
         count: number of splats; None for a share.
         scale: factor for the budget, Spark's `lodSplatScale`.
-        by_default: nobody chose it; viewers of another format have another default.
+        by_default: not chosen by the user; viewers of another format have another default.
     """
 
     text: str

@@ -28,7 +28,7 @@ class SplatBytes(NamedTuple):
     coefficient: int
 
     def of(self, splats: int, sh_degree: int) -> int:
-        """Return the bytes of so many splats."""
+        """Return the bytes of `splats` splats of an SH degree."""
         return splats * (self.fixed + self.coefficient * COEFFICIENTS[sh_degree])
 
 

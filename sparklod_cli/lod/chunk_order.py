@@ -50,7 +50,7 @@ PRIMES = (2, 3, 5, 7, 11, 13, 17)
 #: Families that a bake out of core puts in order at a time: those of some 15 million splats. Chosen: 0.7 GB.
 MOST_FAMILIES = 1 << 22
 
-#: Bytes that a family takes while it is put in order, without those that each thread takes. Measured.
+#: Bytes of a family while it is put in order, besides the bytes of each thread. Measured.
 FAMILY_BYTES = 124
 
 #: Sign bit of a float32.
@@ -70,9 +70,6 @@ def arrange(splats: Splats, tree: LodTree, *, progress: Progress = silent) -> tu
     The root is node 0, siblings are consecutive and come after their parent. No siblings lie in two chunks, unless
     families are so large that chunks cannot be filled with whole ones. The result does not depend on the number of
     threads.
-
-    Args:
-        tree: their children; `LodTree.validate` accepts it.
     """
     order, child_start = chunk_order(splats, tree, progress=progress)
     return reordered([(splats, tree)], order, child_start)
@@ -99,15 +96,13 @@ def family_order(
     most: int | None = None,
     progress: Progress = silent,
 ) -> Index:
-    """Return the order of families of which `arrange` speaks.
+    """Return the order of families of `arrange`.
 
     Args:
         parent: (F,) for each node that has children, in any order in which parents come first, the place here of its
             parent; -1 for the root.
-        count: (F,) number of its children.
-        center: (F, 3) its centre, world units.
-        size: (F,) its feature size, world units.
-        most: how many families are put in order at a time, see `family_bytes`; None for all. Parts, see
+        count, center, size: of each, number of children, centre and feature size, world units.
+        most: number of families that are put in order at a time, see `family_bytes`; None for all. Parts, see
             `parts_of`, are each put in order as if they were a tree, one after the other.
 
     Returns:
@@ -136,7 +131,7 @@ def family_bytes(threads: int) -> int:
 
 
 def _part(parent: Index, members: Index) -> Index:
-    """Return for each member the place among members, which are ascending, of its parent; -1 where that is none."""
+    """Return the place of the parent of each member among the ascending members; -1 for other parents."""
     if len(members) == len(parent):
         return parent
     place = np.full(len(parent) + 1, -1, np.int32)
@@ -187,13 +182,7 @@ def _ranks(center: FloatArray, threads: int) -> NDArray[np.int32]:
 
 
 def _sequence(families: Families, filled: int, total: int, progress: Progress) -> Index:
-    """Return the (F,) families in the order in which they are written.
-
-    Args:
-        families: of a part, F at least 1.
-        filled: number of nodes that come before.
-        total: number of nodes of the tree.
-    """
+    """Return the (F,) families of a part in the order in which they are written, after `filled` of `total` nodes."""
     length, own = len(families.count), int(families.count.sum(dtype=np.int64))
     sequence = np.arange(length, dtype=np.int32)
     set_of, root, spare = (np.full(length, -1, np.int32) for _ in range(3))
@@ -225,11 +214,7 @@ def _sequence(families: Families, filled: int, total: int, progress: Progress) -
 
 
 def viewpoints(centers: FloatArray) -> NDArray[np.void]:
-    """Return (VIEWPOINTS,) `pixel_scale.VIEW` with Spark's foveation, spread evenly by Halton sequences.
-
-    Args:
-        centers: (F, 3) of the nodes that viewers may look at, F at least 1.
-    """
+    """Return (VIEWPOINTS,) `pixel_scale.VIEW` with Spark's foveation, spread over centres by Halton sequences."""
     low, high = np.percentile(centers, [100 * OUTLIERS, 100 - 100 * OUTLIERS], axis=0).astype(np.float64)
     middle, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
     u = [_halton(base) for base in PRIMES]
@@ -281,18 +266,14 @@ def parts_of(
 ) -> Iterator[Index]:
     """Yield all families in parts of at most `most`, of which none comes before the one that has its parent.
 
-    The largest families are the first part. What is left are subtrees below them: those that are near each other are
-    parts together, and one that is too large is divided like the tree. It takes some 50 bytes a family at its peak.
+    The largest families are the first part. The rest is subtrees below them: neighbouring subtrees are parts together,
+    and one that is too large is divided like the tree. The peak is about 50 bytes a family.
 
     Args:
-        parent: (F,) int32 the family that has each one's parent, which comes before it; -1 for that of the root.
+        parent: (F,) int32 family of each family's parent, which comes before it; -1 for the root.
         center: (F, 3) of the parents.
         limit: (F,) the least size from the root to the parent.
-        most: at least 1.
         members: (N,) families of a subtree, ascending; all unless given.
-
-    Yields:
-        (n,) int32 families, ascending.
     """
     if members is None:
         members = np.arange(len(parent), dtype=np.int32)

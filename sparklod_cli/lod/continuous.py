@@ -97,13 +97,7 @@ class ContinuousCuts:
 
 
 def shares(limit: NDArray[np.float32], threshold: float, width: float) -> Shares:
-    """Return the (M,) shares by which nodes are refined, 0..1: t(n) above.
-
-    Args:
-        limit: (M,) float32 of nodes with children; at least 0.
-        threshold: at least 0; at 0, all nodes with a limit above 0 are refined.
-        width: above 1.
-    """
+    """Return the (M,) shares, 0..1, by which nodes of (M,) limits are refined: t(n) above; 1 at a threshold of 0."""
     share = np.zeros(len(limit))
     above = np.flatnonzero(limit > threshold)
     share[above] = (
@@ -159,11 +153,7 @@ def _first_over(limit: NDArray[np.float32], more: NDArray[np.int64], room: int) 
 
 
 class _Inner:
-    """The M inner nodes of a tree, by depth.
-
-    Attributes:
-        more: (M,) number of children minus 1.
-    """
+    """The M inner nodes of a tree, by depth; `more` (M,) is the number of their children minus 1."""
 
     def __init__(self, nodes: NDArray[np.void]) -> None:
         children, start = nodes["child_count"].astype(np.uint16), nodes["child_start"].copy()

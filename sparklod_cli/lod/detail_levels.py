@@ -69,12 +69,7 @@ def make(nodes: Splats, tree: LodTree, settings: DetailSettings, *, progress: Pr
     Level 0 has the leaves, bit for bit if their opacity is at most 1. Each further level is a cut of the tree that the
     finer levels refine. A region is a set of nodes of the coarsest level, and all that is below them: at every level it
     stands for the same leaves, and no leaf is in two regions. The result does not depend on the number of threads.
-
-    Args:
-        nodes: M splats, those of a tree in final order.
-
-    Returns:
-        the scene, without errors; within a run, splats are in the order of the tree.
+    The scene has no errors yet; within a run, splats are in the order of the tree.
     """
     leaves = int(np.count_nonzero(tree.is_leaf))
     shares = shares_of(settings.levels, leaves)
@@ -98,12 +93,7 @@ def make(nodes: Splats, tree: LodTree, settings: DetailSettings, *, progress: Pr
 
 
 def owners_of(parent: NDArray[np.int32], cut: Nodes) -> NDArray[np.int64]:
-    """Return the (M,) place in a cut of each node or its ancestor that is there; -1 above the cut.
-
-    Args:
-        parent: (M,) of each node, -1 of the root.
-        cut: (n,) int64 nodes.
-    """
+    """Return the (M,) place in a cut of each node or its ancestor there, from (M,) parents; -1 above the cut."""
     above = np.maximum(parent, 0).astype(np.int64)
     above[cut] = cut
     while True:  # each round doubles the number of edges that are gone up
@@ -118,7 +108,7 @@ def owners_of(parent: NDArray[np.int32], cut: Nodes) -> NDArray[np.int64]:
 
 
 def shares_of(levels: Sequence[float] | None, leaves: int) -> list[float]:
-    """Return the shares of the levels after full detail: those given, or such that suit a scene of so many splats."""
+    """Return the shares of the levels after full detail: the given ones, or defaults for a number of leaves."""
     if levels is not None:
         return list(levels)
     shares = [STEP]
@@ -131,9 +121,6 @@ class RefinementOrder:
     """The order of losses in which nodes are refined, one for all cuts, so that each refines the coarser ones.
 
     Losses (see `losses`) do not grow from a node to its children, which are refined after it.
-
-    Args:
-        nodes: M splats, final order.
 
     Attributes:
         parent: (M,) int32 parent of each node, -1 of the root.
@@ -163,10 +150,6 @@ class RefinementOrder:
 def detail_cuts(nodes: Splats, tree: LodTree, shares: Sequence[float]) -> tuple[list[Nodes], NDArray[np.int32]]:
     """Return cuts of a tree with shares of its leaves, rounded, never more and less by at most the children of a node.
 
-    Args:
-        nodes: M splats, final order.
-        shares: of each level after full detail, descending, between 0 and 1.
-
     Returns:
         (n,) ascending nodes of each level, the leaves first; and (M,) int32 parent of each node, -1 of the root.
     """
@@ -177,18 +160,13 @@ def detail_cuts(nodes: Splats, tree: LodTree, shares: Sequence[float]) -> tuple[
 
 @np.errstate(over="ignore", invalid="ignore")  # where splats are as large as numbers are
 def losses(nodes: Splats, tree: LodTree, parent: NDArray[np.int32]) -> Column:
-    """Return the (M,) float64 loss of each node drawn instead of what is below it; no less than that of any below.
+    """Return the (M,) float64 loss of each node drawn instead of its subtree, not less than the losses in that.
 
     The loss of a node is the root of its picture error, times its feature size, times its leaves (to a power of at most
     1). The picture error is the squared difference between the picture of the node and that of its children, over red,
-    green, blue and opacity, on the planes of the three axes; like the size squared, an area. The number of leaves is
-    what says how much detail was here: where a scene has small splats close together, training put them there because
-    pictures showed the need. Where all leaves have one size, as in a point cloud, it says nothing but how densely was
-    sampled: the power is 0.
-
-    Args:
-        nodes: M splats of a tree in final order.
-        parent: (M,) of each node, -1 of the root.
+    green, blue and opacity, on the planes of the three axes; like the size squared, an area. The number of leaves
+    measures detail: training puts small splats close together where pictures need them. Where all leaves have one size,
+    as in a point cloud, it measures only the density of samples: the power is 0.
     """
     size = spark_size(nodes).astype(np.float64)
     loss = np.sqrt(picture_errors(with_plain_opacity(nodes), parent)) * size
@@ -207,10 +185,7 @@ def picture_errors(splats: Splats, parent: NDArray[np.int32]) -> Column:
 
     With Gaussians G of opacity times colour, it is the integral of (G - sum of G_c)^2 over each of three planes; the
     mean of them, divided by pi. Children more than SIBLINGS apart are taken for ones that do not overlap.
-
-    Args:
-        splats: M splats, opacities of at most 1.
-        parent: (M,) of each, whose children are consecutive; -1 of the root.
+    Opacities are at most 1, and siblings are consecutive.
     """
     count = len(splats)
     shape = np.empty((count, 6))
@@ -358,10 +333,6 @@ def middle_of(splats: Splats) -> NDArray[np.float64]:
 
 def beyond(splats: Splats, radius: float) -> NDArray[np.bool_]:
     """Return a (N,) mask of the splats whose centres are farther than a radius from the middle of the scene.
-
-    Args:
-        splats: of the whole scene, finite.
-        radius: world units.
 
     Raises:
         InvalidSplatsError: all are.

@@ -42,7 +42,7 @@ REFERENCE_TANGENT = math.tan(math.radians(22.5))
 NO_BEHIND = 1e-4
 
 #: Priorities of files, whole numbers: for regions of which nothing is drawn, for those at another level, and for what
-#: comes next. The environment is asked for before all others.
+#: comes next. The environment is requested before all others.
 ENVIRONMENT, NOTHING_DRAWN, ANOTHER_LEVEL, NEXT = 4, 2, 1, 0
 
 
@@ -84,12 +84,7 @@ class Chains:
 
 @dataclass(frozen=True, eq=False)
 class Distant:
-    """An instance of regions, as far as their levels depend on a camera.
-
-    Attributes:
-        squared_distance: (R,) of `RegionBounds.squared_distances`.
-        base_distance: `DetailRule.base_distance`, of this instance.
-    """
+    """An instance as a camera sees it, with (R,) `RegionBounds.squared_distances` and its own base distance."""
 
     chains: Chains
     squared_distance: Distances
@@ -113,12 +108,7 @@ class DetailChoice:
 
 
 def choose(instances: Sequence[Distant], budget: int, rule: DetailRule) -> DetailChoice:
-    """Return the levels that a viewer shows of some instances, all within one budget.
-
-    Args:
-        instances: at least one.
-        budget: maximum number of splats, all instances together.
-    """
+    """Return the levels that a viewer shows of one or more instances, within a budget of splats of all together."""
     limit = rule.mode == "limit"
     coarsest = sum(int(each.chains.count[:, -1].sum()) for each in instances)
     finest = sum(int(each.chains.count[:, 0].sum()) for each in instances)
@@ -151,9 +141,8 @@ def _threshold(instances: Sequence[Distant], keys: Sequence[Levels], room: int, 
     """Return the least key of a step that is taken: the highest at which the budget suffices, to a part.
 
     Args:
-        keys: for each instance (R, S - 1).
         room: splats by which all regions together may exceed their coarsest levels.
-        bins: how many bins the threshold may be above.
+        bins: highest bin of the threshold.
     """
     key = np.concatenate([each.ravel() for each in keys])
     saved = np.concatenate([-np.diff(each.chains.count, axis=1).ravel() for each in instances])
@@ -231,14 +220,10 @@ class RegionBounds:
 
 
 class DetailForest(SplatForest):
-    """Scenes at several detail levels in the memory layout of traversals; see `SplatForest`.
+    """One or more scenes at several detail levels in the memory layout of traversals; see `SplatForest`.
 
-    Splats of level 0 and of the environment count as leaves. Chunks are chunk files.
-
-    Args:
-        scenes: at least one.
-        splats: of each, those of all levels, then of the environment.
-        files: of each, where its splats are.
+    Splats are those of all levels, then of the environment; level 0 and the environment count as leaves. Chunks are
+    chunk files.
     """
 
     def __init__(self, scenes: Sequence[DetailScene], splats: Sequence[Splats], files: Sequence[DetailFiles]) -> None:
@@ -278,9 +263,9 @@ class DetailTraversal:
         """Return the cut that a viewer draws: the splats of the levels of all regions, and the environments.
 
         Args:
-            budget: maximum number of splats, all instances together; those of environments do not count.
-            smallest: has no meaning here; traversals of trees have it.
-            resident: (chunks,) bool, which chunk files of all scenes are there; all are unless given.
+            budget: maximum number of splats, all instances together; environments do not count.
+            smallest: has no effect; traversals of trees have it.
+            resident: (chunks,) bool, of the chunk files of all scenes; all are resident unless given.
         """
         start = time.perf_counter()
         forest, rule = self.forest, self._rule
@@ -351,18 +336,17 @@ def loading(
     before: Levels | None,
     underfill: int,
 ) -> tuple[Levels, NDArray[np.float64]]:
-    """Return what is drawn of the regions of an instance, and what is asked for.
+    """Return the levels of an instance's regions that are drawn, and the files that are requested.
 
     Args:
-        chosen: (R,) the level that is chosen for each region; -1 for one without splats.
-        squared_distance: (R,) by which it was chosen.
-        resident: (F,) which files are there.
-        before: (R,) what was drawn before, -1 where nothing was; None for nothing at all.
-        underfill: levels by which a region may be coarser as long as a file is missing; see `DetailRule`.
+        chosen: (R,) levels, -1 for a region without splats.
+        resident: (F,) files.
+        before: (R,) levels that were drawn before, -1 for none; None for none at all.
+        underfill: levels by which a region may be coarser while a file is missing; see `DetailRule`.
 
     Returns:
-        (R,) the drawn level of each region, -1 where nothing is; and (F,) priorities of the files that are in use or
-        asked for, above 0, and 0 for others.
+        (R,) the drawn level of each region, -1 for none; and (F,) priorities, above 0 for files that are in use or
+        requested, 0 for others.
     """
     levels = files.of_run.shape[1]
     before = np.full(len(chosen), -1) if before is None else before
@@ -422,7 +406,7 @@ def _file(files: DetailFiles, level: Levels) -> NDArray[np.int64]:
 
 
 def _finer(chains: Chains, level: Levels) -> Levels:
-    """Return the (R,) next finer levels of chains; -1 where there is none."""
+    """Return the (R,) next finer levels of chains; -1 without one."""
     below = (chains.level < level[:, None]) & (chains.level >= 0)
     last = below.shape[1] - 1 - np.argmax(below[:, ::-1], axis=1)
     return np.where(below.any(axis=1), chains.level[np.arange(len(level)), last], -1)

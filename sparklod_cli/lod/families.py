@@ -27,11 +27,7 @@ Index = NDArray[np.int32]
 
 
 def families_of(tree: LodTree) -> tuple[NDArray[np.uint32], NDArray[np.int32]]:
-    """Return the nodes that have children, and the parents of these.
-
-    Returns:
-        (F,) uint32 nodes, ascending, and (F,) int32 for each the place here of its parent; -1 for the root.
-    """
+    """Return (F,) uint32 nodes with children, ascending, and (F,) int32 places of their parents, -1 for the root."""
     nodes = np.flatnonzero(tree.child_count).astype(np.uint32)
     number = np.full(len(tree), -1, np.int32)
     number[nodes] = np.arange(len(nodes), dtype=np.int32)
@@ -40,11 +36,7 @@ def families_of(tree: LodTree) -> tuple[NDArray[np.uint32], NDArray[np.int32]]:
 
 
 def node_order(tree: LodTree, parents: NDArray[np.uint32]) -> tuple[NDArray[np.uint32], NDArray[np.uint32]]:
-    """Return the order of nodes in which the root comes first, and then families.
-
-    Args:
-        tree: of M nodes.
-        parents: (F,) the nodes that have children, in the order of these, each after the family that it is in.
+    """Return the order in which the root comes first, and then the families of (F,) `parents`.
 
     Returns:
         (M,) uint32 the node at each place, and (M,) uint32 the `child_start` of each place.
@@ -65,11 +57,7 @@ def node_order(tree: LodTree, parents: NDArray[np.uint32]) -> tuple[NDArray[np.u
 def reordered(
     built: list[tuple[Splats, LodTree]], order: NDArray[np.uint32], child_start: NDArray[np.uint32]
 ) -> tuple[Splats, LodTree]:
-    """Return a tree in the order of `node_order`.
-
-    Args:
-        built: the tree; the list is emptied, so that columns are freed one by one where nobody else holds them.
-    """
+    """Return a tree in the order of `node_order`; `built` is emptied, so that columns are freed one by one."""
     nodes, tree = built.pop()
     columns = dict(vars(nodes))
     del nodes
@@ -94,10 +82,7 @@ def banded(built: list[tuple[Splats, LodTree]]) -> tuple[Splats, LodTree]:
     """Return the same tree with its nodes in bands.
 
     The root is node 0, siblings are consecutive, in the order that they had, and come after their parent. The result
-    does not depend on the number of threads.
-
-    Args:
-        built: M nodes, a parent before its children, and their tree; the list is emptied, see `reordered`.
+    does not depend on the number of threads. `built` is emptied, see `reordered`.
     """
     nodes, tree = built[0]
     families, parent = families_of(tree)
@@ -107,16 +92,12 @@ def banded(built: list[tuple[Splats, LodTree]]) -> tuple[Splats, LodTree]:
 
 
 def band_order(parent: Index, count: NDArray[np.uint16], size: FloatArray) -> Index:
-    """Return the order of families of which `banded` speaks.
+    """Return the order of families of `banded`: (F,) int32 places, in the order in which the children are written.
 
     Args:
         parent: (F,) for each node that has children, in the order of the nodes, the place here of its parent; -1 for
             the root.
-        count: (F,) number of its children.
-        size: (F,) its feature size, world units.
-
-    Returns:
-        (F,) int32 places here, in the order in which the children are written.
+        count, size: (F,) number of children and feature size of each.
     """
     if not len(parent):
         return np.empty(0, np.int32)

@@ -17,7 +17,7 @@ from .kernels.node_rows import fill_leaves, merge_colors
 from .kernels.sort import Keys, Nodes, sort_by_key
 from .pair_tree import BinaryTree, Curve
 
-#: Columns of splats that merged ones have of their node rows, and those that they have of their children.
+#: Columns of merged splats that come from their node rows, and columns that are merged from their children.
 GEOMETRY = ("center", "scale", "quat_xyzw", "opacity")
 COLORS = tuple(name for name in COLUMNS if name not in GEOMETRY)
 
@@ -79,12 +79,11 @@ def in_final_order(
     curve: Curve,
     progress: Progress,
 ) -> FinalTree:
-    """Prune a tree, and writes its nodes and their colours in final order. The binary tree is of no use afterwards.
+    """Prune a tree, and write its nodes and their colours in final order. The binary tree is of no use afterwards.
 
     Args:
         index: (N,) splat of each of its leaves.
-        columns: of the splats as the leaves are drawn; emptied, so that they are freed one by one where nobody else
-            holds them.
+        columns: of the splats as the leaves are drawn; emptied, so that each is freed if there is no other reference.
     """
     n, hidden = binary.leaves, 0 if goal.is_whole else 1
     parent, saved, rank = _prune(binary, goal, progress)
@@ -223,7 +222,7 @@ def drop_nodes(
         leaves, log_size, lost, weight, blocks: of `fill_usefulness_terms`; `lost` of a dropped node is added to its
             parent's.
         saved: (T - leaves,) int32, on entry 1 for each merged node; what is less for the root allows it that many more
-            children. Updated: the number of children minus 1 of those that are kept, -1 for dropped nodes.
+            children. Updated: the number of children minus 1 of kept nodes, -1 for dropped nodes.
     """
     slots = len(saved) - 1
     # Merged nodes but the root, less `leaves`, parents first.

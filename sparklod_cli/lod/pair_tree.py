@@ -114,12 +114,9 @@ class Curve:
         return rows, size
 
     def sort(self, rows: FloatArray, at: Nodes, turn: int, threads: int) -> Nodes:
-        """Return the order, (n,) uint32, of some rows along the curve of a round.
+        """Return the order, (n,) uint32, of (n,) rows along the curve of round `turn`; rows of one cell keep theirs.
 
-        Args:
-            rows: node rows, or any whose first columns are the centre, in units.
-            at: (n,) uint32 indices of rows; those in one place stay in their order.
-            turn: number of the round.
+        `rows` are node rows, or any whose first columns are the centre, in units.
         """
         bits = 3 * node_rows.CURVE_BITS
         return sort_by_key(self.keys(rows, at, turn), np.arange(len(at), dtype=np.uint32), bits, threads)[1]
@@ -187,7 +184,7 @@ class BinaryTree:
     def keep_rows(self, slots: Nodes) -> None:
         """Drop all rows but those of some merged nodes, which are numbered from the first.
 
-        In place: those that are kept would be a large part of the memory that a build takes.
+        In place: a copy would be a large part of the memory of a build.
         """
         rows = self.row[slots]
         is_kept = np.zeros(len(self.rows), np.bool_)
@@ -219,11 +216,10 @@ def merge_levels(
 
     Args:
         levels: (N,) that its leaves join at.
-        region: that the leaves are in, None for the whole scene.
+        region: of the leaves; None for the whole scene.
 
     Returns:
-        nodes: (n,) uint32, without a parent.
-        levels: (n,) at which they would have merged next.
+        (n,) uint32 nodes without a parent, and (n,) levels at which they would have merged next.
     """
     lowest = int(levels.min())
     keys = (levels - np.int32(lowest)).astype(np.uint64)
@@ -260,12 +256,9 @@ def merge_levels(
 def _merge(
     binary: BinaryTree, active: Nodes, curve: Curve, largest: float, rounds: int | None, progress: Progress
 ) -> Nodes:
-    """Merge active nodes in rounds; returns those that are left, which is one if `rounds` is None.
+    """Merge nodes without a parent in at most `rounds` rounds; return the remaining ones, the root if it is None.
 
-    Args:
-        active: (n,) uint32 nodes without a parent.
-        largest: largest trace of the covariance of a merged node, units squared.
-        rounds: maximum number of rounds; None for no limit.
+    `largest` is the largest trace of the covariance of a merged node, units squared.
     """
     done, leaves = 0, binary.leaves
     while len(active) > 1 and (rounds is None or done < rounds):
@@ -295,15 +288,7 @@ def _merge(
 
 
 def partners(rows: FloatArray, nodes: Nodes, window: int, largest: np.float32) -> tuple[NDArray[np.int32], FloatArray]:
-    """Return the cheapest partner of each node among its neighbours in a list, and its cost.
-
-    Args:
-        rows, nodes, window, largest: as for `pair_cost.find_partners`.
-
-    Returns:
-        partner: (n,) int32 index into `nodes`, -1 for none.
-        cost: (n,) float32, of merging with it.
-    """
+    """Return (n,) places of the cheapest partners of nodes, -1 for none, and costs; see `pair_cost.find_partners`."""
     partner, cost = np.empty(len(nodes), np.int32), np.empty(len(nodes), np.float32)
     pair_cost.find_partners(len(nodes), rows, nodes, window, largest, partner, cost)
     return partner, cost
@@ -315,8 +300,6 @@ def matched(
     """Return pairs of nodes that are each other's cheapest partner, and the list in which merged nodes replace them.
 
     Args:
-        nodes: (n,) uint32.
-        partner, cost: of `partners`.
         limit: largest cost of a pair.
         made: the node that the first pair is merged into; the next pair's is one more.
         blocks: ranges of nodes to process in parallel; the result does not depend on it.

@@ -86,12 +86,7 @@ def build(splats: Splats, growth: float = DEFAULT_GROWTH, *, progress: Progress 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """Parameters that all stages of a build share.
-
-    Attributes:
-        growth: maximum ratio of nodes to leaves of the whole tree.
-        lowest: first level that nodes merge at.
-    """
+    """Parameters that all stages of a build share: maximum ratio of nodes to leaves, curve, first level of merging."""
 
     growth: float
     curve: Curve
@@ -181,7 +176,7 @@ def advance(
 
 
 def _pruning_goal(nodes: _Nodes, handed: int, region: Region | None, plan: Plan) -> PruningGoal:
-    """Return the goal of a stage that hands on so many nodes."""
+    """Return the goal of a stage that hands on `handed` nodes."""
     splats = int(nodes.leaves.sum())
     most = int(plan.growth * splats) - splats - int(nodes.merged.sum())
     if region is None:

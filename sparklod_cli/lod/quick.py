@@ -259,8 +259,8 @@ class VoxelTree:
 
         Args:
             leaves: given nodes with a number from here on are merged ones.
-            index: (given,) splat of each given node; those that join at the level of their size come first, each level
-                along the curve.
+            index: (given,) splat of each given node; splats that join at the level of their size come first, each
+                level along the curve.
             ends: where each level ends in `index`.
             fill: of the splats that join.
             waiting: rows of all other nodes by the level that they wait for; all nodes in a cell of the level below

@@ -31,10 +31,10 @@ BLEND = 1.25
 FACTOR = Range(0, 10**12)
 
 
-#: What a viewer makes of a budget: it spends all of it, or only keeps within it what distances ask for.
+#: Uses of a budget: spend all of it, or only limit the levels that follow from distances.
 BUDGET_MODES = ("target", "limit")
 
-#: PlayCanvas's budget of splats, and the chunk files that it loads at a time, unless it is told otherwise.
+#: PlayCanvas's budget of splats, and the chunk files that it loads at a time, by default.
 PLAYCANVAS_BUDGET, PLAYCANVAS_FETCHERS = 1_000_000, 2
 
 #: Requests to a host that browsers have under way at a time, by HTTP/1.1; a chunk file takes seven or eight.
@@ -55,7 +55,7 @@ class DetailRule(CheckedSettings):
     `lodMultiplier`, `lodBehindPenalty`, `lodDistanceShrink`, `lodRangeMin`, `lodRangeMax` and `lodUnderfillLimit`.
 
     Attributes:
-        shrink: 0..1, by how much of what it has more than the median the bound of a region is smaller when its distance
+        shrink: 0..1, share of its excess over the median size by which the bound of a region shrinks when its distance
             is measured.
         finest, coarsest: the levels that may be chosen.
 
@@ -112,7 +112,7 @@ class LodSettings(CheckedSettings):
         foveation: weight of nodes by direction, for instances without their own foveation; by default Spark 2's.
         continuous: width of continuous cuts, the ratio of the pixel scales between which a node fades into its
             children, above 1 (see `continuous`); None for ordinary cuts.
-        detail: how detail levels of Streamed SOG are chosen; all but this and the budget is of trees.
+        detail: choice of the detail levels of Streamed SOG; all but this and the budget applies to trees only.
     """
 
     budget: int = PRESETS["desktop"]

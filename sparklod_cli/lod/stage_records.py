@@ -1,8 +1,8 @@
 """Records of builds in stages, which make a tree block by block where a scene does not fit into memory.
 
-A stage takes the nodes of a region that have no parent yet, gives as many of them parents as it can know without the
-rest of the scene, and hands on what is left: first for each block of splats, then for regions that join several, and
-at last for the whole scene.
+A stage takes the nodes of a region that have no parent yet, gives parents to the nodes whose siblings cannot lie
+outside of it, and hands on the others: first for each block of splats, then for regions of several blocks, and at last
+for the whole scene.
 """
 
 from __future__ import annotations
@@ -37,11 +37,7 @@ INFINITY = np.float32(np.inf)
 
 @dataclass(frozen=True)
 class Region:
-    """A half-open box of centres, low <= centre < high; infinite where nothing of the scene lies beyond a face.
-
-    Attributes:
-        low, high: corners, world units.
-    """
+    """A half-open box of centres, low <= centre < high, world units; infinite at the borders of the scene."""
 
     low: tuple[float, float, float]
     high: tuple[float, float, float]
@@ -49,11 +45,7 @@ class Region:
 
 @dataclass(frozen=True, eq=False)
 class Pending:
-    """Nodes without a parent.
-
-    Attributes:
-        columns: (n, ...) arrays by name: those of `Splats` as the nodes are drawn, and others of their builder.
-    """
+    """Nodes without a parent: (n, ...) arrays by name, of `Splats` as nodes are drawn, and others of the builder."""
 
     columns: Mapping[str, NDArray[Any]]
 
@@ -116,11 +108,10 @@ class StagedBuilder(Protocol):
     """
 
     def plan(self, bounds: Bounds, sample: Splats, setting: float) -> Any:
-        """Return what all stages share.
+        """Return the values that all stages share.
 
         Args:
-            bounds: of the whole scene.
-            sample: an even sample of its splats, in their order.
+            sample: an even sample of the splats of the scene, in their order.
             setting: of the builder, base or growth.
 
         Raises:
@@ -128,21 +119,16 @@ class StagedBuilder(Protocol):
         """
 
     def leaves(self, splats: Splats, index: NDArray[np.int64], plan: Any) -> Pending:
-        """Return splats as nodes without a parent.
-
-        Args:
-            splats: n splats, valid and visible.
-            index: (n,) ascending place of each among all splats of the scene.
-        """
+        """Return valid, visible splats as nodes without a parent; `index` (n,) has their places in the scene."""
 
     def advance(
         self, pending: Pending, region: Region | None, stage: int, plan: Any, *, progress: Progress
     ) -> tuple[StageFamilies, Pending]:
-        """Give nodes parents as far as the rest of the scene cannot matter.
+        """Give parents to nodes whose siblings cannot be outside of the region.
 
         Args:
             pending: all nodes without a parent whose centres lie in the region, from blocks in ascending order.
-            region: of the scene; None for all of it, after which one node is left, the root.
+            region: None for the whole scene, after which only the root is left.
             stage: number of the stage, which is part of the numbers of its families.
         """
 

@@ -30,7 +30,7 @@ from .detail_levels import STEP, Nodes, RefinementOrder, extents, owners_of, uni
 from .part_settings import TileSettings
 from .traversal import CutView, SplatForest, TreeCut, TreeInstance
 
-#: Geometric error of a splat in its feature sizes: pixels of error that CesiumJS allows unless told otherwise
+#: Geometric error of a splat in its feature sizes: pixels of error that CesiumJS allows by default
 #: (`maximumScreenSpaceError`), so that a splat is refined where it is larger than a pixel.
 PIXEL_ERROR = 16.0
 
@@ -51,12 +51,7 @@ def make(nodes: Splats, tree: LodTree, settings: TileSettings, *, progress: Prog
     of about a quarter of the splats of the next finer one, up to the root tile, whose cut is one tile. The children of
     a tile have the nodes of a finer cut that are below those of the tile, or are those: no splat is lost or doubled.
     The result does not depend on the number of threads.
-
-    Args:
-        nodes: M splats, those of a tree in final order.
-
-    Returns:
-        the scene, level after level; within a tile, splats are in the order of the tree.
+    Tiles are in the order of their levels; within a tile, splats are in the order of the tree.
     """
     order = RefinementOrder(nodes, tree)
     cuts = tile_cuts(order, settings.tile_splats)
@@ -85,7 +80,7 @@ def make(nodes: Splats, tree: LodTree, settings: TileSettings, *, progress: Prog
 
 
 def tile_cuts(order: RefinementOrder, tile_splats: int) -> list[Nodes]:
-    """Return cuts, coarsest first, which is of at most so many splats; each has `STEP` of the next, the last all."""
+    """Return cuts, the coarsest, of at most `tile_splats`, first; each has `STEP` of the splats of the next one."""
     counts = [order.leaves]
     while counts[-1] > tile_splats:
         counts.append(round(counts[-1] * STEP))
@@ -93,7 +88,7 @@ def tile_cuts(order: RefinementOrder, tile_splats: int) -> list[Nodes]:
 
 
 def _groups(some: Nodes, center: FloatArray, count: int) -> list[Nodes]:
-    """Divide nodes into so many groups of about one size, along the longest side again and again; each ascending."""
+    """Divide nodes into `count` ascending groups of about one size, recursively along the longest side."""
     if count < 2:
         return [np.sort(some)]
     where = center[some]
@@ -135,12 +130,7 @@ def _measured(
 
 
 class TileForest(SplatForest):
-    """Scenes of tiles in the memory layout of traversals; see `SplatForest`.
-
-    Args:
-        scenes: at least one.
-        splats: of each, as they are drawn.
-    """
+    """One or more scenes of tiles, and their splats as drawn, in the memory layout of traversals; see `SplatForest`."""
 
     def __init__(self, scenes: Sequence[TileScene], splats: Sequence[Splats]) -> None:
         self.scenes = scenes
@@ -153,9 +143,9 @@ class TileChoice:
     """Tiles of an instance that a viewer draws and loads.
 
     Attributes:
-        drawn: (T,) bool, tiles that are drawn.
-        coarse: (T,) bool, those of them that would be refined if no child were missing.
-        wanted: (T,) bool, tiles that are drawn or refined, and children of those that are or should be refined.
+        drawn: (T,) bool.
+        coarse: (T,) bool, drawn tiles that would be refined if no child were missing.
+        wanted: (T,) bool, tiles that are drawn or refined, and children of tiles that are or should be refined.
         distance: (T,) from the camera to the boxes of all tiles, in units of the scene; 0 inside.
     """
 
@@ -175,9 +165,9 @@ class TileTraversal:
         """Return the cut that a viewer draws.
 
         Args:
-            budget: has no meaning here: CesiumJS draws as many splats as the error on the screen asks for.
-            smallest: pixel scale of a pixel, see `settings.pixel_limit`; 0 for full detail of what is in the picture.
-            resident: (chunks,) bool, the files of tiles that are there; all are unless given.
+            budget: has no effect: CesiumJS draws as many splats as the error on the screen requires.
+            smallest: pixel scale of a pixel, see `settings.pixel_limit`; 0 for full detail inside the picture.
+            resident: (chunks,) bool, of the files of tiles; all are resident unless given.
         """
         start = time.perf_counter()
         forest = self.forest
@@ -205,9 +195,8 @@ def choose(
     """Return the tiles of an instance that a viewer draws and loads.
 
     Args:
-        object_to_world: (4, 4) rotation, uniform scale and translation.
         limit: largest geometric error over distance of a tile that is not refined.
-        resident: (T,) bool, tiles whose files are there; a tile without splats needs none.
+        resident: (T,) bool; a tile without splats needs no file.
     """
     visible = in_picture(scene, view, object_to_world)
     present = resident | (scene.counts == 0)

@@ -45,14 +45,7 @@ REASONS = {
 
 @dataclass(frozen=True)
 class TreeInstance:
-    """An instance of a tree of a forest.
-
-    Attributes:
-        tree: index of the tree in its `Forest`.
-        object_to_world: (4, 4) rotation, uniform scale and translation.
-        lod_scale: factor for its pixel scales.
-        foveation: weights of its pixel scales by direction.
-    """
+    """An instance of tree number `tree` of a `Forest`; see `model.instances.Instance`."""
 
     tree: int = 0
     object_to_world: Matrix = field(default_factory=lambda: np.eye(4))
@@ -89,7 +82,6 @@ class Forest:
             fill_nodes(self.nodes[start : start + len(tree.size)], tree)
 
     def _make_room(self, counts: Sequence[int], make: Callable[..., NDArray[Any]]) -> None:
-        """Make arrays for trees of so many nodes."""
         self.node_base = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
         chunks = [-(-count // CHUNK_NODES) for count in counts]
         self.chunk_base = np.concatenate([[0], np.cumsum(chunks)]).astype(np.int64)
@@ -114,8 +106,7 @@ class Forest:
         """Read chunks that a cut wants; False if it lacked none.
 
         Args:
-            demand: (chunks,) float32, of a `TreeCut`.
-            present: (chunks,) bool that it was found with.
+            demand, present: (chunks,), of a `TreeCut`, and the chunks that it was found with.
         """
         return False
 
@@ -124,8 +115,7 @@ class SplatForest(Forest):
     """Scenes of which viewers draw whole runs of splats: splats as nodes, for statistics of cuts; chunks are files.
 
     Args:
-        splats: of each scene.
-        coarse: of each, (N,) bool, true for splats that finer ones replace; the others count as leaves.
+        coarse: of each scene, (N,) bool, true for splats that finer ones replace; the others count as leaves.
         files: number of files of each.
     """
 
@@ -225,11 +215,7 @@ class TreeCut:
 
 
 class Traversal:
-    """Finds cuts. Each thread has its own buffers, which are reused from one cut to the next.
-
-    Args:
-        instances: instances of them, at most 65,535.
-    """
+    """Finds cuts of at most 65,535 instances. Each thread has its own buffers, which are reused for the next cut."""
 
     def __init__(self, forest: Forest, instances: Sequence[TreeInstance]) -> None:
         self.forest, self.instances = forest, list(instances)
@@ -304,7 +290,6 @@ class _Memory(threading.local):
 
 
 def _slots(size: int) -> cut_arrays.Slots:
-    """Return buffers for so many visited nodes."""
     return cut_arrays.Slots(
         node=np.empty(size + 1, np.uint32),
         instance=np.empty(size + 1, np.uint16),
@@ -406,11 +391,10 @@ def measure(
     size: tuple[int, int],
     by_instance: bool = False,
 ) -> tuple[CutStatistics, list[CutStatistics]]:
-    """Return the statistics of a cut as a whole and, optionally, of each instance in it.
+    """Return the statistics of a cut found for `view` as a whole and, optionally, of each instance in it.
 
     Args:
         level: (nodes,) int32 depths, edges from the root, of all trees.
-        cut: a cut found for `view`.
         size: width and height of the picture, pixels.
     """
     width, height = size

@@ -93,8 +93,8 @@ class LodTree:
     def validate(self) -> None:
         """Check that this is a single tree with root 0, in linear time.
 
-        Each node but the root is the child of exactly one node, which comes before it. As in Spark, nothing is asked of
-        the `child_start` of a leaf. A tree of `frozen` is validated once.
+        Each node but the root is the child of exactly one node, which comes before it. As in Spark, the
+        `child_start` of a leaf is not checked. A tree of `frozen` is validated once.
 
         Raises:
             TreeError: an invariant is violated; names the first node that violates it.

@@ -26,13 +26,7 @@ _SPREADING = (
 def order(center: FloatArray) -> NDArray[np.intp]:
     """Return the order of points along the Morton curve of their box, which has 2 ** BITS cells along each axis.
 
-    Points of one cell keep their order.
-
-    Args:
-        center: (N, 3) finite coordinates.
-
-    Returns:
-        (N,) indices.
+    Points of one cell keep their order. `center` is (N, 3), finite.
     """
     cells = np.zeros(center.shape, np.uint32)
     for axis in range(3) if len(center) else ():
@@ -44,15 +38,9 @@ def order(center: FloatArray) -> NDArray[np.intp]:
 
 
 def order_of_cells(cells: NDArray[np.unsignedinteger[Any]]) -> NDArray[np.intp]:
-    """Return the order of points by the numbers of their cells along each axis.
+    """Return the order of points by (N, 3) numbers of their cells along each axis, below 2 ** BITS.
 
     The curve takes the bits of z, y and x in turns, z first. Points of one cell keep their order.
-
-    Args:
-        cells: (N, 3) numbers below 2 ** BITS.
-
-    Returns:
-        (N,) indices.
     """
     codes = np.zeros(len(cells), np.uint64)
     for axis in range(3):

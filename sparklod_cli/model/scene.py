@@ -44,10 +44,10 @@ ASSUMED = "-y"
 
 @dataclass(frozen=True)
 class ScaleCoding:
-    """The codes that some scales are decoded from.
+    """Coding of scales.
 
     Attributes:
-        name: "spz", or one of RAD's "ln_0r8" and "ln_f16"; empty for plain numbers, which all readers have alike.
+        name: "spz", or one of RAD's "ln_0r8" and "ln_f16"; empty for plain numbers, which all readers decode alike.
         low, high: ends of the range of the logarithms, where the codes have one.
     """
 
@@ -102,9 +102,9 @@ class Scene:
         notes: what the reader had to leave out, for display.
         header: numbers of the file's header that the splats do not tell, by name ("version", "fractional_bits").
         chunk_bytes: of each of its chunks in the file, where its format has chunks; None elsewhere.
-        coding: how the file holds its scales; `PLAIN` where it has the very numbers.
+        coding: of the scales in the file; `PLAIN` for float32.
         up: the axis that points up, one of `AXES` ("y", "-z"); None where it is unknown.
-        up_by: the format whose specification says so ("SPZ", "glTF"); empty where the file itself does, or nobody.
+        up_by: the format that specifies this axis ("SPZ", "glTF"); empty if the file names it, or it is unknown.
     """
 
     splats: Splats
@@ -129,7 +129,7 @@ class Scene:
         """Check that the tree, if there is one, is valid and has a node for each splat.
 
         Raises:
-            TreeError: it does not.
+            TreeError: it is invalid.
         """
         if self.tree is not None:
             if len(self.tree) != len(self.splats):
@@ -232,16 +232,16 @@ def _column(name: str, values: ArrayLike, shape: tuple[int, ...]) -> np.ndarray[
 
 
 def facts_of(source: Any) -> dict[str, Any]:
-    """Return what a scene of any kind says of its file, by the names of the attributes that all of them have."""
+    """Return the metadata that scenes of all kinds have of their files, by the names of its attributes."""
     return {name: getattr(source, name) for name in ("antialiased", "format", "notes", "header", "up", "up_by")}
 
 
 @dataclass(frozen=True, eq=False)
 class NodeStream:
-    """The nodes of a tree in their final order, made whenever they are asked for.
+    """The M nodes of a tree in their final order, read window by window.
 
     Attributes:
-        count: M nodes.
+        count: M.
         sh_degree: of all windows.
         antialiased, up: as in `Scene`.
         read: called with a range of nodes, returns them and their tree columns, whose `child_start` counts from the
@@ -256,11 +256,7 @@ class NodeStream:
 
 
 def up_notes(up: str | None, up_by: str) -> tuple[str, ...]:
-    """Return the message on an axis that a specification names, which a file may contradict; empty for other axes.
-
-    Args:
-        up, up_by: of a `Scene`.
-    """
+    """Return the message on an axis that a specification names, which a file may contradict; empty for other axes."""
     if up is None or not up_by:
         return ()
     return (f"{up} is up, as {up_by} specifies; if the scene is upside down, its converter kept y down: give --up -y",)

@@ -31,8 +31,8 @@ class SelectionTally:
 
     Attributes:
         count: N splats.
-        dropped: how many are not kept, by those of `REASONS` that occur.
-        first_invalid: place of the first invalid one; None without any.
+        dropped: number of dropped splats by the `REASONS` that occur.
+        first_invalid: place of the first invalid splat; None without any.
     """
 
     count: int = 0

@@ -237,18 +237,12 @@ def scale_of(matrix: Matrix, skew: float) -> float | None:
 
 
 def sh_rotations(rotation: Matrix, degree: int) -> list[Matrix]:
-    """Return what a rotation multiplies the SH coefficients of each degree from 1 to `degree` by.
+    """Return the matrices by which a rotation multiplies the SH coefficients of the degrees 1 to `degree`.
 
     A colour f(d) = Y(d) c becomes f(R^-1 d), so Y(d) c' = Y(R^-1 d) c for all d: c' = X c, where X is the solution of
     Y(d) X = Y(R^-1 d). It is exact, as the functions of a degree turn among themselves; least squares over more
     directions than coefficients find it to float64.
-
-    Args:
-        rotation: (3, 3).
-        degree: 0 to 3.
-
-    Returns:
-        (3, 3), (5, 5) and (7, 7) orthogonal float64, as far as `degree` goes.
+    They are (3, 3), (5, 5) and (7, 7) orthogonal float64.
     """
     # Spread evenly: a spiral from pole to pole by the golden angle.
     index = np.arange(SAMPLES)

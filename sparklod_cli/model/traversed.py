@@ -20,13 +20,7 @@ Counts = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Nodes:
-    """Node data that the traversal reads, N nodes.
-
-    Attributes:
-        center: (N, 3) float32 world units.
-        size: (N,) float32 feature sizes, world units.
-        tree: (N,) children; not validated.
-    """
+    """N nodes of a tree, which is not validated, with (N, 3) float32 centres and (N,) feature sizes, world units."""
 
     center: FloatArray
     size: FloatArray
@@ -51,9 +45,9 @@ class DetailScene:
         bounds: (R, 2, 3) float64 lowest and highest corner of each region, in world units.
         children: (R - 1, 2) int64 the binary tree over the regions: its inner nodes, root first and before their
             children. A number from 0 on is an inner node, -1 - r is region r.
-        errors: (R, L) float64 how far each level of a region is from its level 0, 0 there and not decreasing from level
-            to level; None where nobody measured it.
-        environment: splats far outside, which are drawn whatever the levels are; None without.
+        errors: (R, L) float64 differences of each level of a region from its level 0, not decreasing from level to
+            level; None if they were not measured.
+        environment: splats far outside, which are drawn at all levels; None without.
         antialiased: trained with the opacity compensation of Mip-Splatting.
         format, notes, header, up, up_by: as of `Scene`.
     """
