@@ -165,7 +165,15 @@ def camera_of(pose: Matrix, lens: Intrinsics, time: float, name: str, settings: 
     The text of a `ValueError` about the lens continues a sentence about the camera.
     """
     size = lens.size or settings.size or DEFAULT_SIZE
-    focal = lens.focal if lens.size and lens.focal else _focal_of(lens, size)
+    if lens.size and lens.focal:
+        focal = lens.focal
+    else:  # square pixels
+        fov = lens.fov if lens.fov is not None else DEFAULT_FOV_Y
+        if not 0 < fov < math.pi:
+            raise ValueError(f"has a field of view of {math.degrees(fov):g} degrees")
+        side = {"x": size[0], "y": size[1], "longer": max(size)}[lens.fov_along]
+        pixels = side / (2 * math.tan(fov / 2))
+        focal = pixels, pixels
     principal = lens.principal or (size[0] / 2, size[1] / 2)
     _check(focal, principal)
     if settings.fov_y is not None:
@@ -188,16 +196,6 @@ def _check(focal: tuple[float, float], principal: tuple[float, float]) -> None:
             f"has a focal length of {focal[0]:g}, {focal[1]:g} and a principal point at {principal[0]:g},"
             f" {principal[1]:g}, one of which is not positive or too large"
         )
-
-
-def _focal_of(lens: Intrinsics, size: tuple[int, int]) -> tuple[float, float]:
-    """fx, fy of square pixels for the field of view of a lens."""
-    fov = lens.fov if lens.fov is not None else DEFAULT_FOV_Y
-    if not 0 < fov < math.pi:
-        raise ValueError(f"has a field of view of {math.degrees(fov):g} degrees")
-    side = {"x": size[0], "y": size[1], "longer": max(size)}[lens.fov_along]
-    focal = side / (2 * math.tan(fov / 2))
-    return focal, focal
 
 
 #: Most pixels along a side of an image.

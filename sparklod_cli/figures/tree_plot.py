@@ -69,20 +69,13 @@ def color_by(by: str, splats: Splats, index: NDArray[np.int64], depth: NDArray[n
         chunk = index // CHUNK_NODES
         return whole_numbers("chunk", chunk, 0, (len(splats) - 1) // CHUNK_NODES)
     if by == "opacity":
-        return _opacity(lod_opacity(np.maximum(splats.opacity[index], 0)))
-    return _size(np.clip(spark_size(splats)[index], 1e-30, 1e30))
-
-
-def _opacity(values: FloatArray) -> Coloring:
-    top = top_opacity(values)
-    marks = [(tick / top, text) for tick, text in ticks(0, top, top / 6)]
-    if values.max() > top:
-        marks = with_ends(marks, None, f"{top:g} or more", APART)
-    return smooth("opacity" if values.max() <= 1 else "opacity (D)", values / top, MAGMA, marks)
-
-
-def _size(values: FloatArray) -> Coloring:
-    logs = np.log10(values.astype(np.float64))
+        values = lod_opacity(np.maximum(splats.opacity[index], 0))
+        top = top_opacity(values)
+        marks = [(tick / top, text) for tick, text in ticks(0, top, top / 6)]
+        if values.max() > top:
+            marks = with_ends(marks, None, f"{top:g} or more", APART)
+        return smooth("opacity" if values.max() <= 1 else "opacity (D)", values / top, MAGMA, marks)
+    logs = np.log10(np.clip(spark_size(splats)[index], 1e-30, 1e30).astype(np.float64))
     low, high = log_range(logs)
     marks = log_marks(low, high)
     less = f"{10**low:.2g} or less" if logs.min() < low else None

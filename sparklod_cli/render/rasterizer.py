@@ -162,7 +162,13 @@ def tiles_across(camera: Camera) -> tuple[int, int]:
 def project_splats(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> Projected:
     """Project splats onto the screen; `screen` and `boxes` are buffers, which the next call overwrites."""
     tiles_across(camera)
-    screen, boxes, keys = _buffers(len(splats))
+    count, memory = len(splats), _working_memory  # kept by each thread, as the first access to new memory is slow
+    if len(getattr(memory, "keys", ())) < count:
+        floats = np.empty((count + 1) * project.COLUMNS, np.float32)
+        first = -floats.ctypes.data % CACHE_LINE // floats.itemsize  # each row is one line of the processor's cache
+        memory.screen = floats[first : first + count * project.COLUMNS].reshape(count, project.COLUMNS)
+        memory.boxes, memory.keys = np.empty((count, 4), np.int16), np.empty(count, np.uint64)
+    screen, boxes, keys = memory.screen[:count], memory.boxes[:count], memory.keys[:count]
     is_radial = settings.sort == "radial"
     project.project(len(keys), *arguments(splats, camera, settings), is_radial, screen, keys, boxes)
     return Projected(screen, boxes, np.sort(keys[keys != project.NOT_DRAWN]))
@@ -177,21 +183,6 @@ def arguments(
     near, far, radius = settings.near, settings.far, settings.max_radius
     limits = ellipse.Limits(*map(np.float32, (near, far, CLIP, BLUR, MIN_ALPHA, MAX_STD_DEV, STD_DEV_PER_D, radius)))
     return columns, world_to_camera(camera), lens, limits
-
-
-def _buffers(count: int) -> tuple[NDArray[np.float32], NDArray[np.int16], NDArray[np.uint64]]:
-    """Return working memory for projected splats, kept by each thread, as the first access to new memory is slow."""
-    if len(getattr(_working_memory, "keys", ())) < count:
-        _working_memory.screen, _working_memory.boxes = _aligned(count), np.empty((count, 4), np.int16)
-        _working_memory.keys = np.empty(count, np.uint64)
-    return _working_memory.screen[:count], _working_memory.boxes[:count], _working_memory.keys[:count]
-
-
-def _aligned(count: int) -> NDArray[np.float32]:
-    """Return (count, `project.COLUMNS`) of which each row is one line of the processor's cache."""
-    floats = np.empty((count + 1) * project.COLUMNS, np.float32)
-    first = -floats.ctypes.data % CACHE_LINE // floats.itemsize
-    return floats[first : first + count * project.COLUMNS].reshape(count, project.COLUMNS)
 
 
 def world_to_camera(camera: Camera) -> NDArray[np.float32]:

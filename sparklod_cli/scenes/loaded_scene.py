@@ -316,18 +316,16 @@ class Pages:
         """Read the nodes of chunks that are not present; a `TreeError` if their children are not those of a tree."""
         for number in numbers:
             with self._lock:
-                if not self.present[number]:
-                    self._read(number)
-
-    def _read(self, number: int) -> None:
-        splats, tree, coding = self._decoded(number, TRAVERSED)
-        assert tree is not None
-        start = number << CHUNK_BITS
-        self._check(tree, start)
-        fill_nodes(self.nodes[start : start + len(tree)], self._nodes_of(splats, tree, coding))
-        self.present[number] = True
-        known = start + np.flatnonzero(self.depth[start : start + len(tree)])
-        self._descend(known if number else np.concatenate([np.zeros(1, np.int64), known]))
+                if self.present[number]:
+                    continue
+                splats, tree, coding = self._decoded(number, TRAVERSED)
+                assert tree is not None
+                start = number << CHUNK_BITS
+                self._check(tree, start)
+                fill_nodes(self.nodes[start : start + len(tree)], self._nodes_of(splats, tree, coding))
+                self.present[number] = True
+                known = start + np.flatnonzero(self.depth[start : start + len(tree)])
+                self._descend(known if number else np.concatenate([np.zeros(1, np.int64), known]))
 
     def _check(self, tree: LodTree, start: int) -> None:
         """Raise a `TreeError` for children that no tree has; `LodTree.validate` has the same texts."""

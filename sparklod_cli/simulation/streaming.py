@@ -108,9 +108,6 @@ class Chunks:
         """Return True if anything is drawn with (chunks,) bool resident chunks."""
         return bool((resident[self.roots] if self.roots else resident).any())
 
-    def bytes_of(self, chunks: Iterable[int]) -> int:
-        return sum(self.sizes[chunk] for chunk in chunks)
-
 
 class ChunkCache:
     """Holds chunks, and evicts the least recently used ones when it is full.

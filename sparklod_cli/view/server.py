@@ -144,19 +144,13 @@ class Handler(BaseHTTPRequestHandler):
             self._refuse(HTTPStatus.METHOD_NOT_ALLOWED, "nothing is posted here")
         elif not self._is_of_our_page():
             self._refuse(HTTPStatus.FORBIDDEN, "only the page of this server may post")
-        else:
-            body = self._body()
-            if body is not None:
-                self._answer_json(body)
-
-    def _answer_json(self, body: bytes) -> None:
-        status, answer = HTTPStatus.OK, {}
-        try:
-            answer = parse_drop(body, self.server.site.cameras)
-        except SparklodError as error:
-            status, answer = HTTPStatus.UNPROCESSABLE_ENTITY, {"error": str(error)}
-        data = json.dumps(answer).encode()
-        self._answer(status, {"Content-Type": "application/json"}, data)
+        elif (body := self._body()) is not None:
+            status = HTTPStatus.OK
+            try:
+                answer = parse_drop(body, self.server.site.cameras)
+            except SparklodError as error:
+                status, answer = HTTPStatus.UNPROCESSABLE_ENTITY, {"error": str(error)}
+            self._answer(status, {"Content-Type": "application/json"}, json.dumps(answer).encode())
 
     def _body(self) -> bytes | None:
         length = self.headers.get("Content-Length", "")

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras import DEFAULT_SIZE, ELEVATION, framing
-from ..cameras.camera import Camera, Matrix
+from ..cameras.camera import Matrix
 from ..cameras.frame import DEFAULT_FOV_Y, Settings
 from ..cameras.framing import Balls, balls_of
 from ..cameras.sources import SingleViews, WholeScene
@@ -182,15 +182,13 @@ def start_of(extents: Sequence[Extent], view: tuple[Point, Point] | None, up: Po
     source = WholeScene(ELEVATION) if view is None else SingleViews((view,))
     (camera,) = source.cameras(settings, lambda: balls).cameras
     sizes = min(extent.sizes[0] for extent in extents), max(extent.sizes[1] for extent in extents)
-    target = view[1] if view is not None else _ahead(camera, middle)
+    target: Sequence[float] | Matrix
+    if view is None:  # the point on the axis of the camera that is nearest to the middle
+        away = float((middle - camera.position) @ camera.forward)
+        target = camera.position + camera.forward * (away if away > 0 else 1.0)
+    else:
+        target = view[1]
     return Start(_point(camera.position), _point(target), fov, _point(middle), radius, sizes, chosen=view is None)
-
-
-def _ahead(camera: Camera, middle: Matrix) -> Matrix:
-    """Return the point on the axis of a camera that is nearest to the middle of the scene."""
-    away = float((middle - camera.position) @ camera.forward)
-    point: Matrix = camera.position + camera.forward * (away if away > 0 else 1.0)
-    return point
 
 
 def _point(values: Sequence[float] | Matrix) -> Point:

@@ -102,8 +102,6 @@ def test_chunks_are_numbered_across_trees() -> None:
     assert chunks.sizes == [5, 6, 7, 8, 9]
     assert chunks.roots == [0, 2, 3]
     assert len(chunks) == 5
-    assert chunks.bytes_of([1, 4]) == 15
-    assert chunks.bytes_of([]) == 0
 
 
 @pytest.mark.parametrize("sizes", [[[1], []], [[1], [2, -1]], [[1], [[2]]]])

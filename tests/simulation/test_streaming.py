@@ -140,7 +140,7 @@ def test_every_byte_comes_once_and_never_faster_than_the_link(
         start = stream.now
         stream.advance(start + data.draw(st.integers(1, 4000)) / 1000)
         arrived += stream.take_arrivals()
-        so_far = chunks.bytes_of(arrived)
+        so_far = sum(chunks.sizes[chunk] for chunk in arrived)
         assert so_far <= network.bandwidth * max(0.0, stream.now - network.latency) * (1 + 1e-9)
         under_way = network.fetchers * max(chunks.sizes)  # of which most may have come before
         assert so_far - before <= network.bandwidth * (stream.now - start) + under_way

@@ -49,7 +49,9 @@ class CardOptimiser(Optimiser):
     def step(self, picture: FullDetailPicture, index: Index, rates: adam.Rates) -> None:
         with self._errors():
             example = self._example(picture)
-            drawn = self._index(index)
+            drawn = self._now.memory.array("index", len(index), np.int32)
+            if len(index):
+                drawn.copy_to_device(index.astype(np.int32))
             seen = draw_on_card(self._now, drawn, example.view)
             gradients = gradients_on_card(self._now, seen, example.view, self._by_image(seen, example))
             moved = self._move(drawn, example.view, gradients, rates)
@@ -66,12 +68,6 @@ class CardOptimiser(Optimiser):
             view = CardView.of(picture.camera, self.nodes.raster)
             self._examples[id(picture)] = _CardExample(picture, view, to_card(picture.full))
         return self._examples[id(picture)]
-
-    def _index(self, index: Index) -> CardArray:
-        uploaded = self._now.memory.array("index", len(index), np.int32)
-        if len(index):
-            uploaded.copy_to_device(index.astype(np.int32))
-        return uploaded
 
     def _by_image(self, seen: CardPicture, example: _CardExample) -> CardArray:
         """Return the derivative of the mean logarithm of the errors; see `FullDetailPicture.gradient`."""

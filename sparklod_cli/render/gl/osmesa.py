@@ -55,7 +55,9 @@ class Order:
         if self._sorted is not None and self._close(camera, raster, *self._sorted):
             return None
         with np.errstate(over="ignore", invalid="ignore"):  # splats that far away are not drawn
-            u, v, depth = _into_camera(splats.center, camera)
+            x, y, z = splats.center.T
+            # Right, down and forward, rounded as in the rasterizer's kernel.
+            u, v, depth = (row[0] * x + row[1] * y + row[2] * z + row[3] for row in world_to_camera(camera))
             key = np.sqrt(u * u + v * v + depth * depth) if raster.sort == "radial" else depth
             if self.throttle:
                 # Splats that are invisible now may be visible when this order is reused.
@@ -76,14 +78,6 @@ class Order:
         if raster.sort != "radial":
             return True  # moving the camera adds the same to all depths
         return float(np.linalg.norm(camera.position - old.position)) < np.sqrt(2 * self.throttle) * middle
-
-
-def _into_camera(center: FloatArray, camera: Camera) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return camera coordinates right, down and forward, (N,) float32 each, rounded as in the rasterizer's kernel."""
-    m = world_to_camera(camera)
-    x, y, z = center.T
-    u, v, w = (row[0] * x + row[1] * y + row[2] * z + row[3] for row in m)
-    return u, v, w
 
 
 def _in_sight(

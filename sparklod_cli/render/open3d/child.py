@@ -193,24 +193,20 @@ def main() -> None:
         send(answers, {"error": str(error)})
     else:
         send(answers, {})
-        _answer(painter, requests, answers)
+        while True:
+            try:
+                request, splats = receive(requests)
+            except EOFError:
+                break
+            try:
+                assert splats is not None
+                pictures = painter.draw(request, splats)
+            except Exception as error:
+                send(answers, {"error": " ".join(str(error).split())})
+            else:
+                send(answers, {}, pictures)
     # Open3D's destructors may crash, and there is nothing left to write.
     os._exit(0)
-
-
-def _answer(painter: Painter, requests: IO[bytes], answers: IO[bytes]) -> None:
-    while True:
-        try:
-            request, splats = receive(requests)
-        except EOFError:
-            return
-        try:
-            assert splats is not None
-            pictures = painter.draw(request, splats)
-        except Exception as error:
-            send(answers, {"error": " ".join(str(error).split())})
-        else:
-            send(answers, {}, pictures)
 
 
 if __name__ == "__main__":
