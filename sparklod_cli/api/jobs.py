@@ -1,13 +1,13 @@
 """Whole-file jobs of the commands: pictures, comparisons and traversals of files, from reading to writing.
 
-Each reads files and cameras, asks its caller for the outputs as early as possible, and does the work.
+The outputs are checked before, so that no work is lost.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -44,13 +44,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ViewedFiles:
-    """Splat files, and the cameras that look at them.
+    """Splat files, and the cameras that look at them; both are read when they are first needed.
 
     Attributes:
         instances: at least one.
         cameras: the source of the cameras.
         settings: override those of a camera file.
         precision: one of `PRECISIONS`, of the nodes that cuts are found with.
+        trees_only: refuse files without a tree or detail levels.
+        through: one of `formats.ROUND_TRIPS`, after which splats are drawn.
+        plain: read all columns of splats.
+        paged: read splats as cuts need them.
     """
 
     instances: Sequence[Instance]
@@ -59,58 +63,47 @@ class ViewedFiles:
     precision: str
     threads: int
     progress: Progress = silent
+    trees_only: bool = False
+    through: str | None = None
+    plain: bool = True
+    paged: bool = False
 
-    def read(
-        self, *, trees_only: bool = False, through: str | None = None, plain: bool = True, paged: bool = False
-    ) -> Scenes:
-        """Return the scenes, with all columns if `plain`; as cuts need them if `paged`."""
+    @functools.cached_property
+    def scenes(self) -> Scenes:
         return read_scenes(
             self.instances,
-            columns=COLUMNS if plain else TRAVERSED,
-            trees_only=trees_only,
-            through=through,
+            columns=COLUMNS if self.plain else TRAVERSED,
+            trees_only=self.trees_only,
+            through=self.through,
             precision=self.precision,
-            paged=paged,
+            paged=self.paged,
             threads=self.threads,
             progress=self.progress,
         )
 
-    def path(self, scenes: Callable[[], Scenes]) -> CameraPath:
-        """Return the cameras; scenes are read only where cameras are chosen for them, or need their up axis."""
-        settings = dataclasses.replace(self.settings, up_of_scene=lambda: self._up_of(scenes()))
-        return self.cameras.cameras(settings, lambda: scenes().balls())
+    @functools.cached_property
+    def path(self) -> CameraPath:
+        """The cameras; scenes are read only where cameras are chosen for them, or need their up axis."""
+        settings = dataclasses.replace(self.settings, up_of_scene=self._up)
+        return self.cameras.cameras(settings, lambda: self.scenes.balls())
 
-    def _up_of(self, scenes: Scenes) -> Point:
-        up = direction_of(scenes.up)
-        if scenes.up is None or self.settings.world is None:
+    def _up(self) -> Point:
+        up = direction_of(self.scenes.up)
+        if self.scenes.up is None or self.settings.world is None:
             return up
         x, y, z = (np.asarray(up) @ self.settings.world[:3, :3]).tolist()  # the inverse rotation, of any length
         return x, y, z
 
-    def with_planes(self, render: RenderSettings, path: CameraPath, scenes: Callable[[], Scenes]) -> RenderSettings:
+    def with_planes(self, render: RenderSettings) -> RenderSettings:
         """Return settings whose near and far planes enclose the scenes, where the cameras are chosen for them."""
         if not self.cameras.fits_scene:
             return render
-        near, far = reach(render.raster.near, render.raster.far, path.cameras, scenes().balls())
+        near, far = reach(render.raster.near, render.raster.far, self.path.cameras, self.scenes.balls())
         return dataclasses.replace(render, raster=dataclasses.replace(render.raster, near=near, far=far))
-
-
-#: Colours whose scale spans the numbers that cameras see, rather than all numbers of the scenes.
-COLORS_OF_CUTS = ("level", "chunk", "overdraw")
 
 
 class UnfitError(ValueError):
     """Error for settings that do not fit the scenes: a budget, or a chunk cache, too small for their roots."""
-
-
-@dataclass(frozen=True)
-class DrawnPath:
-    """Result of rendering a camera path."""
-
-    pictures: WrittenPictures
-    path: CameraPath
-    output: PictureOutput
-    render: RenderSettings
 
 
 def draw_files(
@@ -118,26 +111,20 @@ def draw_files(
     budget: Budget | None,
     lod: LodSettings,
     render: RenderSettings,
-    place: Callable[[CameraPath], tuple[PictureOutput, PictureSettings]],
+    output: PictureOutput,
+    settings: PictureSettings,
     *,
-    fit_planes: bool,
-    through: str | None = None,
     loading: tuple[StreamingSettings, float] | None = None,
     reference: Path | None = None,
     overwrite: bool = False,
-    ready: Callable[[CameraPath, Scenes], None],
-) -> DrawnPath:
+) -> WrittenPictures:
     """Draw files and write the pictures.
 
     Args:
         budget: of the cuts; None draws full detail.
-        place: returns the output of the pictures of some cameras; called before a file is read if the cameras do not
-            depend on one.
-        through: one of `formats.ROUND_TRIPS`, after which splats are drawn.
-        loading: how chunks get to the viewer, and and the seconds since a visitor opened the page in front of
-            each camera; None where every chunk is resident.
+        loading: how chunks get to the viewer, and the seconds since a visitor opened the page in front of each camera;
+            None where every chunk is resident.
         reference: the file whose pictures are subtracted from these.
-        ready: called with the cameras and the scenes before the first picture is drawn.
 
     Raises:
         UnfitError: the budget is too small for the roots.
@@ -145,23 +132,13 @@ def draw_files(
     """
     from ..images.sequence import write_pictures
 
-    # What looks at more than cuts is read whole.
-    paged = budget is not None and lod.continuous is None and render.color_by in (None, *COLORS_OF_CUTS)
-    scenes = functools.cache(lambda: files.read(through=through, paged=paged))
-    path = files.path(scenes)
-    if fit_planes:
-        render = files.with_planes(render, path, scenes)
-    output, settings = place(path)
-    ready(path, scenes())
-    other = None
-    source = _source(scenes(), budget, lod, loading)
+    source, other = _source(files.scenes, budget, lod, loading), None
     if reference is not None:
-        plain = dataclasses.replace(files, instances=instances_of([reference]))
-        other = _source(plain.read(), budget, lod)
-    pictures = write_pictures(
-        source, path, output, render, settings, reference=other, overwrite=overwrite, progress=files.progress
+        plain = dataclasses.replace(files, instances=instances_of([reference]), through=None, paged=False)
+        other = _source(plain.scenes, budget, lod)
+    return write_pictures(
+        source, files.path, output, render, settings, reference=other, overwrite=overwrite, progress=files.progress
     )
-    return DrawnPath(pictures, path, output, render)
 
 
 def _source(
@@ -188,7 +165,6 @@ class Compared:
     """
 
     pictures: int
-    path: CameraPath
     leaves: int
     summary: list[BudgetSummary]
     outcomes: list[Outcome]
@@ -199,9 +175,16 @@ class Traversed:
     """Result of a traversal."""
 
     frames: WrittenFrames
-    path: CameraPath
     summary: Summary
     outcomes: list[Outcome]
+
+
+def check_chart(plot: Path, *, overwrite: bool) -> None:
+    """Raise a `SparklodError` where a chart cannot be written or drawn."""
+    from ..figures.charts import load_matplotlib
+
+    check_writable(plot, overwrite=overwrite)
+    load_matplotlib()
 
 
 def compare_files(
@@ -211,11 +194,9 @@ def compare_files(
     render: RenderSettings,
     table: TableOutput,
     *,
-    fit_planes: bool,
     asserts: Sequence[tuple[int | None, Assertion]] = (),
     plot: Path | None = None,
     overwrite: bool = False,
-    ready: Callable[[CameraPath, Scenes], None],
     passed: Filter | None = None,
 ) -> Compared:
     """Measure how far cuts of files are from full detail, and write the table and the charts.
@@ -233,33 +214,22 @@ def compare_files(
     from ..tables.comparison import EMPTY, rows_by_budget, summarize
     from .views import Comparison
 
-    table.check()
-    if plot is not None:
-        from ..figures.charts import load_matplotlib
-
-        check_writable(plot, overwrite=overwrite)
-        load_matplotlib()
-    scenes = files.read(trees_only=True)
-    path = files.path(lambda: scenes)
-    if fit_planes:
-        render = files.with_planes(render, path, lambda: scenes)
-    ready(path, scenes)
     with on_threads(files.threads):
         try:
-            comparison = Comparison(scenes, lod, budgets, render)
+            comparison = Comparison(files.scenes, lod, budgets, render)
         except ValueError as error:
             raise UnfitError(str(error)) from None
-        rows = list(comparison.run(path, threads=files.threads, progress=files.progress))
+        rows = list(comparison.run(files.path, threads=files.threads, progress=files.progress))
     table.write(rows, passed=passed)
     groups = rows_by_budget(rows, len(budgets))
     if plot is not None:
         from ..figures.charts import plot_comparison as chart
 
         series = list(zip((budget.text for budget in budgets), groups, strict=True))
-        write_file(plot, [chart(series, scenes.title)], overwrite=overwrite)
+        write_file(plot, [chart(series, files.scenes.title)], overwrite=overwrite)
     outcomes = [each for at, what in asserts for each in check([what], rows if at is None else groups[at], empty=EMPTY)]
     summary = summarize(rows, [budget.text for budget in budgets])
-    return Compared(len(rows), path, comparison.leaves, summary, outcomes)
+    return Compared(len(rows), comparison.leaves, summary, outcomes)
 
 
 def traverse_files(
@@ -271,7 +241,6 @@ def traverse_files(
     *,
     by_instance: bool = False,
     asserts: Sequence[Assertion] = (),
-    ready: Callable[[CameraPath, Scenes], None],
     passed: Filter | None = None,
     bar: bool = True,
 ) -> Traversed:
@@ -289,19 +258,16 @@ def traverse_files(
     from ..simulation.results import EMPTY, LOADING, summarize, write_frames
     from ..tables.assertions import check
 
-    outputs.check()
-    scenes = files.read(trees_only=True, plain=outputs.plot is not None, paged=True)
-    path = files.path(lambda: scenes)
+    scenes, path = files.scenes, files.path
     settings = dataclasses.replace(lod, budget=scenes.splats_of(budget))
     try:
         simulation = Simulation(scenes, settings, streaming, by_instance=by_instance)
     except ValueError as error:
         raise UnfitError(str(error)) from None
-    ready(path, scenes)
     outputs.check_frames(path.numbers, len(files.instances))
     progress = files.progress if bar else silent
     loading = None if streaming.network.instant else Loader(scenes, settings, streaming).load(path.cameras[0])
     frames = write_frames(simulation, path, outputs, threads=files.threads, progress=progress, passed=passed)
     nothing: Row = dict.fromkeys(column.name for column in LOADING)
     asserted = [row | (loading or nothing if not at else nothing) for at, row in enumerate(frames.rows)]
-    return Traversed(frames, path, summarize(frames.rows, loading), check(asserts, asserted, empty=EMPTY))
+    return Traversed(frames, summarize(frames.rows, loading), check(asserts, asserted, empty=EMPTY))

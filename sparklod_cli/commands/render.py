@@ -18,7 +18,6 @@ from ..model import MAX_SH_DEGREE
 from ..render.devices import uses_card
 from ..render.settings import OF_PIXELS, SORTINGS, RenderSettings
 from ..system.setting_fields import Range, setting, whole
-from ..system.stdio import DASH
 from ..system.units import format_size
 from .command import COLOR, COMMON, Command, check_declared, flag, flags_set, is_set, refuse, values_of
 from .console import Console, count_of, for_screen, is_terminal, print_json
@@ -27,27 +26,27 @@ from .options.common import (
     General,
     assert_errors,
     assert_option,
+    is_summary,
     output_option,
     overwrite_flag,
     plot_option,
     question_budgets,
     report_outcomes,
-    table_form,
+    table_output,
 )
 from .options.viewing import (
     Inputs,
     PictureCameras,
     PictureCut,
     PictureStreaming,
-    check_scenes,
     files_read,
-    notes_on_loading,
+    say_notes,
     viewed_files,
 )
 from .paths import Folder, InputPath, claim_stdout, keep_apart, name_outputs, require_suffix, stem_of
 
 if TYPE_CHECKING:
-    from ..api.jobs import Compared, DrawnPath
+    from ..api.jobs import Compared
     from ..cameras.camera import Camera
     from ..cameras.sources import CameraPath
     from ..images.output import PictureOutput
@@ -56,9 +55,7 @@ if TYPE_CHECKING:
     from ..lod.budget import Budget
     from ..lod.settings import LodSettings
     from ..model.instances import Instance
-    from ..scenes.loaded import Scenes
     from ..tables.assertions import Assertion
-    from ..tables.columns import TableOutput
     from ..tables.comparison import BudgetSummary
 
 #: Options without an effect on some styles and backends.
@@ -81,6 +78,13 @@ NO_THUMBNAIL = (
     *("size", "supersample", "camera_path", "orbit", "dolly", "look_at", "views", "keyframes", "center", "distance"),
     *("sheet", "fps", "every"),
 )
+
+#: Options of the near and the far plane. Without them, the planes move apart, so that a view of the whole scene clips
+#: nothing.
+PLANES = ("near", "far")
+
+#: Colours whose scale spans the numbers that cameras see, rather than all numbers of the scenes.
+COLORS_OF_CUTS = ("level", "chunk", "overdraw")
 
 #: Pixels that are drawn for a picture: the floats of more do not fit into the memory of most machines.
 MOST_PIXELS = 1 << 27
@@ -397,38 +401,33 @@ def _draw(ctx: click.Context, options: RenderOptions) -> None:
 
         question_budgets(console, budget)
         console.announce_compiling("pictures")
-
-        def place(path: CameraPath) -> tuple[PictureOutput, PictureSettings]:
-            return _place(ctx, options, instances, path)
-
-        def ready(path: CameraPath, scenes: Scenes) -> None:
-            check_scenes(ctx, scenes)
-            loading = notes_on_loading(scenes, options.streaming.streaming.network)
-            for note in (*path.notes, *scenes.notes, *options.cameras.axis_notes(scenes), *loading):
-                console.say(note)
-            console.detail(f"  read in {time.perf_counter() - start:.2f} s")
-
         with options.cameras.usage_errors():
-            drawn = draw_files(
-                viewed_files(options, instances, console),
+            lod, render = options.cut.settings(), look.settings(console.say)
+            # What looks at more than cuts is read whole.
+            paged = budget is not None and lod.continuous is None and render.color_by in (None, *COLORS_OF_CUTS)
+            files = viewed_files(options, instances, console, through=look.through, paged=paged)
+            render = render if flags_set(ctx, PLANES) else files.with_planes(render)
+            output, settings = _place(ctx, options, instances, files.path)
+            say_notes(ctx, console, options, files, options.streaming.streaming.network, files.scenes.notes)
+            console.detail(f"  read in {time.perf_counter() - start:.2f} s")
+            pictures = draw_files(
+                files,
                 budget,
-                options.cut.settings(),
-                look.settings(console.say),
-                place,
-                fit_planes=fit_planes(ctx),
-                through=look.through,
+                lod,
+                render,
+                output,
+                settings,
                 loading=options.streaming.loading(),
                 reference=options.comparison.diff,
                 overwrite=options.pictures.overwrite,
-                ready=ready,
             )
         console.clear()
-        _report(console, drawn, time.perf_counter() - start, as_json=general.as_json)
-
-
-def fit_planes(ctx: click.Context) -> bool:
-    """Return whether the near and the far plane may move apart, so that a view of the whole scene clips nothing."""
-    return not flags_set(ctx, ["near", "far"])
+        seconds = time.perf_counter() - start
+        _report(console, pictures, output, seconds, as_json=general.as_json)
+        console.detail(
+            f"  {files.path.format}, {format_size(pictures.bytes)} of {output.form}; {render.style} by"
+            f" {render.backend}, from {render.raster.near:g} to {render.raster.far:g} units away"
+        )
 
 
 def _output(ctx: click.Context, options: RenderOptions, cameras: int) -> PictureOutput:
@@ -470,8 +469,9 @@ def _place(
     return output, settings
 
 
-def _report(console: Console, drawn: DrawnPath, seconds: float, *, as_json: bool) -> None:
-    written, output, settings = drawn.pictures, drawn.output, drawn.render
+def _report(
+    console: Console, written: WrittenPictures, output: PictureOutput, seconds: float, *, as_json: bool
+) -> None:
     if not any(frame["splats"] for frame in written.frames):
         console.say("warning: the picture is empty, for the first chunk has not arrived yet (--after)")
     elif written.empty:
@@ -491,10 +491,6 @@ def _report(console: Console, drawn: DrawnPath, seconds: float, *, as_json: bool
         print_json(whole if written.gain is None else whole | {"gain": written.gain})
     name = "standard output" if output.name is None else output.name
     console.say(f"{name}  {_describe(written)}, {seconds:.2f} s")
-    console.detail(
-        f"  {drawn.path.format}, {format_size(written.bytes)} of {output.form}; {settings.style} by {settings.backend},"
-        f" from {settings.raster.near:g} to {settings.raster.far:g} units away"
-    )
 
 
 def _describe(written: WrittenPictures) -> str:
@@ -514,65 +510,48 @@ def _describe(written: WrittenPictures) -> str:
 
 
 def _compare(ctx: click.Context, options: RenderOptions) -> int:
-    """Compare, writes the table and the charts, and print the summary; returns the exit status."""
+    """Compare, write the table and the charts, and print the summary; return the exit status."""
     budgets = options.comparison.budgets(options.cut.budget)
     asserts = options.comparison.assertions(budgets)
-    table = _table(options)
-    instances = options.inputs.instances()
-    from ..api.jobs import compare_files
+    output, general, overwrite = options.pictures.output, options.general, options.pictures.overwrite
+    assert not isinstance(output, Folder)  # see `name_outputs`
+    from ..api.jobs import check_chart, compare_files
+    from ..tables.comparison import COLUMNS
 
+    table = table_output(output, None, COLUMNS, overwrite=overwrite, as_json=general.as_json)
+    instances = options.inputs.instances()
     keep_apart(ctx, files_read(options, instances))
-    with Console(quiet=options.general.quiet, verbose=options.general.verbose) as console:
+    with Console(quiet=general.quiet, verbose=general.verbose) as console:
         question_budgets(console, *budgets)
         console.announce_compiling("pictures")
         start = time.perf_counter()
-
-        def ready(path: CameraPath, scenes: Scenes) -> None:
-            for note in (*path.notes, *options.cameras.axis_notes(scenes)):
-                console.say(note)
-            check_scenes(ctx, scenes)
 
         def passed(pieces: Iterable[bytes]) -> Iterable[bytes]:
             console.clear()  # a bar and a table do not go together on one screen
             return for_screen(pieces) if is_terminal(sys.stdout) and table.form != "parquet" else pieces
 
+        table.check()
+        if options.comparison.plot is not None:
+            check_chart(options.comparison.plot, overwrite=overwrite)
         with options.cameras.usage_errors():
+            render = dataclasses.replace(options.appearance.settings(console.say), max_sh=options.comparison.max_sh)
+            files = viewed_files(options, instances, console, trees_only=True)
+            say_notes(ctx, console, options, files)
+            render = render if flags_set(ctx, PLANES) else files.with_planes(render)
             compared = compare_files(
-                viewed_files(options, instances, console),
+                files,
                 budgets,
                 _limited(options),
-                dataclasses.replace(options.appearance.settings(console.say), max_sh=options.comparison.max_sh),
+                render,
                 table,
-                fit_planes=fit_planes(ctx),
                 asserts=asserts,
                 plot=options.comparison.plot,
-                overwrite=options.pictures.overwrite,
-                ready=ready,
+                overwrite=overwrite,
                 passed=passed,
             )
         console.clear()
         console.detail(f"  {compared.pictures:,} pictures, {time.perf_counter() - start:.2f} s")
-        return _report_compared(console, options, compared, [at for at, _ in asserts])
-
-
-def _table(options: RenderOptions) -> TableOutput:
-    from ..tables.columns import TableOutput
-    from ..tables.comparison import COLUMNS
-
-    output = options.pictures.output
-    assert not isinstance(output, Folder)  # see `name_outputs`
-    nowhere = _on_screen(options) or (output is None and options.general.as_json)
-    return TableOutput(
-        path=None if output == DASH else output,
-        form=None if nowhere else table_form("--output", output),
-        columns=COLUMNS,
-        overwrite=options.pictures.overwrite,
-    )
-
-
-def _on_screen(options: RenderOptions) -> bool:
-    """Return whether the summary is printed instead of the table, which would scroll by on a terminal."""
-    return options.pictures.output is None and not options.general.as_json and is_terminal(sys.stdout)
+        return _report_compared(console, options, files.path, compared, [at for at, _ in asserts])
 
 
 def _limited(options: RenderOptions) -> LodSettings:
@@ -583,7 +562,9 @@ def _limited(options: RenderOptions) -> LodSettings:
     return settings
 
 
-def _report_compared(console: Console, options: RenderOptions, compared: Compared, about: Sequence[int | None]) -> int:
+def _report_compared(
+    console: Console, options: RenderOptions, path: CameraPath, compared: Compared, about: Sequence[int | None]
+) -> int:
     """Print the results of a comparison; return the exit status.
 
     Args:
@@ -593,11 +574,11 @@ def _report_compared(console: Console, options: RenderOptions, compared: Compare
     if options.general.as_json:
         asserts = [each.as_dict() for each in outcomes]
         figures = [each.as_dict() for each in summary]
-        frames = len(compared.path.cameras)
+        frames = len(path.cameras)
         whole = {"frames": frames, "leaves": compared.leaves, "budgets": figures, "asserts": asserts}
         print_json(whole)
-    texts = _lines(summary, compared.path, compared.leaves)
-    if _on_screen(options):
+    texts = _lines(summary, path, compared.leaves)
+    if is_summary(options.pictures.output, as_json=options.general.as_json):
         click.echo("\n".join(texts))
     else:
         for line in texts:

@@ -13,7 +13,6 @@ import click
 
 from ..simulation.streaming_settings import StreamingSettings
 from ..system.setting_fields import setting
-from ..system.stdio import DASH
 from ..system.units import format_size, percent_of
 from ..system.untrusted import printable
 from ..tables.columns import FORMS
@@ -24,20 +23,19 @@ from .options.common import (
     General,
     assert_errors,
     assert_option,
+    is_summary,
     output_option,
     overwrite_flag,
     plot_option,
     question_budgets,
     report_outcomes,
-    table_form,
+    table_output,
 )
-from .options.viewing import Cameras, CutOptions, Inputs, check_scenes, files_read, notes_on_loading, viewed_files
+from .options.viewing import Cameras, CutOptions, Inputs, files_read, say_notes, viewed_files
 from .paths import OutputPath, claim_stdout, keep_apart, name_outputs
 
 if TYPE_CHECKING:
     from ..api.jobs import Traversed
-    from ..cameras.sources import CameraPath
-    from ..scenes.loaded import Scenes
     from ..simulation.results import FrameOutputs, FrameStatistics, Moment, Summary
     from ..tables.assertions import Assertion
     from ..tables.columns import Row
@@ -100,24 +98,14 @@ class FrameTable:
     def check(self, ctx: click.Context, *, as_json: bool) -> None:
         if as_json and self.output is None:
             refuse(ctx, OF_TABLES, "cannot be used with --json without --output, which writes no table")
-        elif self.summary_on_stdout(as_json=as_json):
+        elif is_summary(self.output, as_json=as_json):
             refuse(ctx, OF_TABLES, "is of the table, and a terminal gets the summary; redirect it, or add --output")
-
-    def summary_on_stdout(self, *, as_json: bool) -> bool:
-        """Return whether the summary is printed instead of the table, which would scroll by on a terminal."""
-        return self.output is None and not as_json and is_terminal(sys.stdout)
 
     def outputs(self, *, as_json: bool) -> FrameOutputs:
         from ..simulation.results import COLUMNS, TIMING, FrameOutputs
-        from ..tables.columns import TableOutput
 
-        nowhere = self.output is None and (as_json or self.summary_on_stdout(as_json=as_json))
-        table = TableOutput(
-            path=None if self.output == DASH else self.output,
-            form=None if nowhere else table_form("--output", self.output, self.form),
-            columns=[each for each in COLUMNS if each.name not in TIMING or not self.no_timing],
-            overwrite=self.overwrite,
-        )
+        columns = [each for each in COLUMNS if each.name not in TIMING or not self.no_timing]
+        table = table_output(self.output, self.form, columns, overwrite=self.overwrite, as_json=as_json)
         return FrameOutputs(table, self.indices_out, self.padded, self.plot, self.overwrite)
 
     def assertions(self) -> list[Assertion]:
@@ -180,32 +168,29 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
     with Console(quiet=general.quiet, verbose=general.verbose) as console:
         from ..api.jobs import traverse_files
 
-        def ready(path: CameraPath, scenes: Scenes) -> None:
-            check_scenes(ctx, scenes)
-            loading = notes_on_loading(scenes, options.streaming.network)
-            for note in (*path.notes, *options.cameras.axis_notes(scenes), *loading):
-                console.say(note)
-            keep_apart(ctx, {**besides, "indices_out": outputs.index_files(path.numbers, len(instances))})
-
         question_budgets(console, budget)
         console.announce_compiling("cuts")
         screen = outputs.table.on_stdout and is_terminal(sys.stdout)
+        outputs.check()
         with options.cameras.usage_errors():
+            plain = outputs.plot is not None
+            files = viewed_files(options, instances, console, trees_only=True, plain=plain, paged=True)
+            say_notes(ctx, console, options, files, options.streaming.network)
+            keep_apart(ctx, {**besides, "indices_out": outputs.index_files(files.path.numbers, len(instances))})
             traversed = traverse_files(
-                viewed_files(options, instances, console),
+                files,
                 budget,
                 options.cut.settings(),
                 options.streaming,
                 outputs,
                 by_instance=table.per_instance,
                 asserts=asserts,
-                ready=ready,
                 passed=for_screen if screen and outputs.table.form != "parquet" else None,
                 bar=not screen,  # a bar and a table do not go together on one screen
             )
-        written, cameras_read = traversed.frames, len(traversed.path.cameras)
+        written, cameras_read = traversed.frames, len(files.path.cameras)
         console.clear()
-        console.detail(f"  {cameras_read:,} frames of {traversed.path.format}, {time.perf_counter() - start:.2f} s")
+        console.detail(f"  {cameras_read:,} frames of {files.path.format}, {time.perf_counter() - start:.2f} s")
         if outputs.table.path is not None:
             console.say(f"{outputs.table.path}  table of {count_of(cameras_read, 'frame')}")
         if written.note:
@@ -216,7 +201,7 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
                 f"warning: only {share} of the splats lie in front of the cameras; path and scene may"
                 " not share their axes (--camera-axes, --world-transform, --up)"
             )
-        on_stdout = table.summary_on_stdout(as_json=general.as_json)
+        on_stdout = is_summary(table.output, as_json=general.as_json)
         ctx.exit(_report(console, traversed, table.summary, as_json=general.as_json, on_stdout=on_stdout))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import sys
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,13 +13,15 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ...system.setting_fields import setting, whole
+from ...system.stdio import DASH
 from ..command import COMMON, DIRECTION, flag
-from ..console import Console, Verbosity
+from ..console import Console, Verbosity, is_terminal
 from ..paths import OutputPath, require_suffix
 
 if TYPE_CHECKING:
     from ...lod.budget import Budget
     from ...tables.assertions import Outcome
+    from ...tables.columns import Column, TableOutput
 
 #: Largest accepted number of threads.
 MAX_THREADS = 256
@@ -117,6 +120,22 @@ def table_form(flag: str, output: Path | None, form: str | None = None) -> str:
     if suffix[1:] not in FORMS:
         raise click.UsageError(f"{flag} {output}: tables are written as {', '.join(f'.{form}' for form in FORMS)}")
     return suffix[1:]
+
+
+def is_summary(output: Any, *, as_json: bool) -> bool:
+    """Return whether the summary is printed instead of the table, which would scroll by on a terminal."""
+    return output is None and not as_json and is_terminal(sys.stdout)
+
+
+def table_output(
+    output: Path | None, form: str | None, columns: Sequence[Column], *, overwrite: bool, as_json: bool
+) -> TableOutput:
+    """Return where a table goes: nowhere if --output does not name it and something else is printed."""
+    from ...tables.columns import TableOutput
+
+    nowhere = is_summary(output, as_json=as_json) or (output is None and as_json)
+    form = None if nowhere else table_form("--output", output, form)
+    return TableOutput(None if output == DASH else output, form, columns, overwrite=overwrite)
 
 
 def report_outcomes(console: Console, outcomes: Sequence[Outcome], places: Iterable[str] = itertools.repeat("")) -> int:

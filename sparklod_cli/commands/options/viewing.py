@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -470,13 +470,36 @@ def files_read(options: RenderOptions | TraverseOptions, instances: list[Instanc
     return {"scene": splats, "world_transform": options.cameras.files()}
 
 
-def viewed_files(options: RenderOptions | TraverseOptions, instances: list[Instance], console: Console) -> ViewedFiles:
-    """Return the files and the cameras that look at them."""
+def viewed_files(
+    options: RenderOptions | TraverseOptions, instances: list[Instance], console: Console, **how: Any
+) -> ViewedFiles:
+    """Return the files and the cameras that look at them; the other arguments are attributes of `ViewedFiles`."""
     from ...api.jobs import ViewedFiles
 
     cameras, general = options.cameras, options.general
     source, settings = cameras.camera_source(), cameras.settings()
-    return ViewedFiles(instances, source, settings, options.cut.precision, general.threads, console.progress)
+    return ViewedFiles(instances, source, settings, options.cut.precision, general.threads, console.progress, **how)
+
+
+def say_notes(
+    ctx: click.Context,
+    console: Console,
+    options: RenderOptions | TraverseOptions,
+    files: ViewedFiles,
+    network: Network | None = None,
+    notes: Iterable[str] = (),
+) -> None:
+    """Print notes on the cameras, further ones, and those on scenes; raise a `click.UsageError` as `check_scenes`."""
+    scenes, path = files.scenes, files.path
+    check_scenes(ctx, scenes)
+    for note in (*path.notes, *notes, *options.cameras.axis_notes(scenes)):
+        console.say(note)
+    whole = dict.fromkeys(printable(loaded.name) for loaded in scenes.trees if not loaded.has_chunks)
+    if network is not None and not network.instant and whole:
+        names = ", ".join(whole)
+        console.say(
+            f"{names}: loaded whole by viewers before they draw; the waits are those of a RAD with the same nodes"
+        )
 
 
 def check_scenes(ctx: click.Context, scenes: Scenes) -> None:
@@ -495,12 +518,3 @@ def check_scenes(ctx: click.Context, scenes: Scenes) -> None:
             "is for Level-of-Detail files, and no file is one, so that all splats are drawn; bake one with build-lod"
         )
         refuse(ctx, (*CUTS, *LOADING, *DETAIL), plain)
-
-
-def notes_on_loading(scenes: Scenes, network: Network) -> list[str]:
-    """Return a note on trees that viewers load whole, if a network is simulated."""
-    whole = dict.fromkeys(printable(loaded.name) for loaded in scenes.trees if not loaded.has_chunks)
-    if network.instant or not whole:
-        return []
-    names = ", ".join(whole)
-    return [f"{names}: loaded whole by viewers before they draw; the waits are those of a RAD with the same nodes"]
