@@ -6,7 +6,6 @@ import contextlib
 import errno
 import math
 from collections.abc import Iterator
-from typing import Any
 
 
 class SparklodError(Exception):
@@ -158,14 +157,10 @@ def out_of_memory(error: BaseException) -> str | None:
     )
     if not is_out_of_memory:
         return None
-    return f"it does not fit into memory{_array_of(error)}; free some memory, or process less at a time"
-
-
-def _array_of(error: Any) -> str:
-    """Return shape and size of the array that numpy could not allocate, of its `MemoryError`; else empty."""
-    shape, dtype = getattr(error, "shape", None), getattr(error, "dtype", None)
-    if not shape or dtype is None:
-        return ""
-    size = math.prod(shape) * dtype.itemsize
-    amount = f"{size / 1e9:,.1f} GB" if size >= 1e9 else f"{size / 1e6:,.1f} MB"
-    return f": {' x '.join(f'{side:,}' for side in shape)} numbers ({dtype}) take {amount}"
+    array = ""
+    shape, dtype = getattr(error, "shape", None), getattr(error, "dtype", None)  # of the array that numpy asked for
+    if shape and dtype is not None:
+        size = math.prod(shape) * dtype.itemsize
+        amount = f"{size / 1e9:,.1f} GB" if size >= 1e9 else f"{size / 1e6:,.1f} MB"
+        array = f": {' x '.join(f'{side:,}' for side in shape)} numbers ({dtype}) take {amount}"
+    return f"it does not fit into memory{array}; free some memory, or process less at a time"

@@ -36,16 +36,11 @@ _came = threading.Event()
 
 
 class _Deferral:
-    """Whether a first Ctrl-C waits until the work ends by itself, see `deferred`.
+    """Whether a first Ctrl-C waits until the work ends by itself, see `deferred`."""
 
-    Attributes:
-        lasts: such work is running.
-        asked: the main thread has handled the first Ctrl-C.
-        seen: the watching thread has seen it, maybe before the main thread.
-    """
-
-    def __init__(self) -> None:
-        self.lasts = self.asked = self.seen = False
+    lasts = False  # such work is running
+    asked = False  # the main thread has handled the first Ctrl-C
+    seen = False  # the watching thread has seen it, maybe before the main thread
 
 
 _deferral = _Deferral()
@@ -60,9 +55,8 @@ def handle() -> None:
     Ending at once loses nothing: outputs and the kernel cache are consistent at all times.
     """
     _came.clear()
-    handled = [
-        number for number in ENDING if signal.getsignal(number) != signal.SIG_IGN
-    ]  # an ignored signal stays ignored, as under nohup
+    # An ignored signal stays ignored, as under nohup.
+    handled = [number for number in ENDING if signal.getsignal(number) != signal.SIG_IGN]
 
     def interrupt(signum: int, frame: FrameType | None) -> None:
         if signum == signal.SIGINT and _deferral.lasts and not _deferral.asked:
@@ -136,15 +130,11 @@ def _watch(reader: int, handled: list[signal.Signals]) -> None:
         if LOST in read:
             time.sleep(PATIENCE)  # until the callback that lost it has returned
             signal.pthread_kill(main, handled[0])
-        if any(number in handled and not _waits(number) for number in read):
-            _leave_if_compiling()
-
-
-def _waits(number: int) -> bool:
-    """Return whether a signal, seen by the watching thread, is a first Ctrl-C that is deferred."""
-    waits = number == signal.SIGINT and _deferral.lasts and not _deferral.seen
-    _deferral.seen |= waits
-    return waits
+        for number in read:
+            if number == signal.SIGINT and _deferral.lasts and not _deferral.seen:
+                _deferral.seen = True  # the first Ctrl-C is deferred
+            elif number in handled:
+                _leave_if_compiling()
 
 
 def _leave_if_compiling() -> None:

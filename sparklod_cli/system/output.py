@@ -69,7 +69,7 @@ class Siblings:
         if self.named is None:
             return existing
         names, known = dict[str, None](), set(existing)
-        with contextlib.suppress(OSError, FormatError):
+        with contextlib.suppress(OSError, FormatError):  # the names that were read before the error count
             for name in self.named(target):
                 names[name] = None
         return [name for name in names if name in known]
@@ -134,7 +134,13 @@ class Output(contextlib.AbstractContextManager["Output"]):
                     self._file = self._new.file
             return sum(map(self._file.write, pieces))
         if not self._written:
-            self._begin(self.siblings)
+            self._find_former(self.siblings)
+            if isinstance(self.target, Address):
+                check_free(self.target, overwrite=self._overwrite)
+                self.target.unlink(missing_ok=True)
+            else:
+                self._stack.enter_context(atomic.created(self.target.parent))
+                self._stage = self._stack.enter_context(atomic.staged(self.target.parent))
         name = name if self.siblings.is_member(name) else self.target.name
         self._check_folder(name.rpartition("/")[0])
         self._written[name] = None
@@ -142,15 +148,6 @@ class Output(contextlib.AbstractContextManager["Output"]):
             return (self.target.parent / name).write(pieces)
         assert self._stage is not None
         return atomic.add(self._stage, name, pieces)
-
-    def _begin(self, siblings: Siblings) -> None:
-        self._find_former(siblings)
-        if isinstance(self.target, Address):
-            check_free(self.target, overwrite=self._overwrite)
-            self.target.unlink(missing_ok=True)
-        else:
-            self._stack.enter_context(atomic.created(self.target.parent))
-            self._stage = self._stack.enter_context(atomic.staged(self.target.parent))
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
