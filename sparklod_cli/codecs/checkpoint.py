@@ -249,7 +249,7 @@ VALUES = {
 }
 CONSTANTS = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False, "EMPTY_TUPLE": (), "EMPTY_SET": None}
 
-#: Opcodes that make a tuple of so many values.
+#: Opcodes that make a tuple, and the number of its values.
 TUPLES = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
 
 IGNORED = {"PROTO", "FRAME"}

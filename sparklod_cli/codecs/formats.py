@@ -38,8 +38,8 @@ class Format:
         unbundled: the name of the first of the files as which a scene can also be written, all in one folder; None if
             there is no such way. Its module then has `encode_files(scene, options, *, threads, progress)`, too, which
             yields the name and the bytes of each, this one last.
-        trees: it can be written with a Level-of-Detail tree. Its `settled` then takes `Statistics`, too,
-            those that `needed(options)` names; `encoder(scene, options, ranges, *, threads, progress)` gives its
+        trees: it can be written with a Level-of-Detail tree. Its `settled` then takes the `Statistics`, too, that
+            `needed(options)` names; `encoder(scene, options, ranges, *, threads, progress)` gives its
             `encoder.Encoder`, and `stored(file)`, with `open_companion` where it has companions, the `encoder.Stored`
             of a file.
         suffixes: lower case, with the dot.
@@ -260,7 +260,7 @@ def is_pointer(head: bytes) -> bool:
     return re.match(POINTED, head) is not None
 
 
-# Names of files: those that Spark and PlayCanvas's tools give them.
+# Names of files, as Spark and PlayCanvas's tools choose them.
 
 #: Suffixes of a RAD file, and of a chunk that is a file of its own.
 RAD_SUFFIX, RAD_CHUNK_SUFFIX = ".rad", ".radc"
@@ -286,7 +286,7 @@ ENVIRONMENT_FILE = f"{ENVIRONMENT}/env.sog"
 #: The manifest of 3D Tiles, and the folder of its other files: tiles, by level and number, and nested tilesets.
 TILESET, TILES = "tileset.json", "tiles"
 
-#: Files that name all others of a scene in a folder, or in a zip, which stands for it.
+#: Files that name all other files of a scene, in a folder or in a zip.
 FIRST_FILES = (MANIFEST, TILESET, META)
 
 _ALL_IMAGES = [name for names in SOG_IMAGES.values() for name in names]
@@ -300,7 +300,7 @@ def rad_chunk_name(stem: str, number: int) -> str:
 
 
 def rad_chunk_number(name: str, stem: str) -> int | None:
-    """Return the number of the chunk whose file has this name; None if `rad_chunk_name` gives no such name."""
+    """Return the number of the chunk whose file has this name; None for other names."""
     match = re.fullmatch(r"(0|[1-9][0-9]{0,8})" + re.escape(RAD_CHUNK_SUFFIX), name.removeprefix(f"{stem}-"))
     return int(match[1]) if match and name.startswith(f"{stem}-") else None
 

@@ -25,7 +25,7 @@ from .reader import OpenFile, Reader, Target, rows_of
 #: Before the columns, the number of splats, negative where numbers are halves; before the nodes, their number.
 COUNT = np.dtype("<i4")
 
-#: A node: it has `leaves` splats of the scene from `start` on, and then `merged` ones that stand for its children.
+#: A node: it has `leaves` splats of the scene from `start` on, and then `merged` splats of its children.
 NODE = np.dtype([(name, "<i4") for name in ("depth", "parent", "start", "leaves", "merged", "first_child", "children")])
 HALF_NODE = np.dtype(
     [(name, "<i4") for name in ("parent", "start", "first_child")]

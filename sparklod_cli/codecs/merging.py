@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import bisect
 import contextlib
-import dataclasses
 import itertools
 import posixpath
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -14,7 +13,6 @@ from typing import BinaryIO
 import numpy as np
 
 from ..model.scene import common_axis, differing_axes, rotated_axis
-from ..model.sh import COEFFICIENTS
 from ..model.splats import COLUMNS, Splats
 from ..model.transforms import Transform
 from ..system.errors import FormatError, UnsupportedError, naming
@@ -54,7 +52,7 @@ def merged(parts: Sequence[Placed]) -> Reader:
         firsts[-1],
         degree,
         " and ".join(sorted({part.reader.format for part in parts})),
-        _FillMerged(tuple(parts), firsts, degree),
+        _FillMerged(tuple(parts), firsts),
         antialiased,
         tuple(dict.fromkeys(notes)),
         up=common_axis(axes),
@@ -82,7 +80,6 @@ class _FillMerged:
 
     parts: tuple[Placed, ...]
     firsts: tuple[int, ...]
-    sh_degree: int
 
     def __call__(self, target: Target, threads: int, progress: Progress) -> None:
         start, number = target.start, bisect.bisect_right(self.firsts, target.start) - 1
@@ -91,18 +88,9 @@ class _FillMerged:
             with naming(part.name):
                 for splats in part.reader.blocks(start - first, stop - first):
                     rows = target.rows(slice(start, start := start + len(splats)))
-                    copy_rows(part.transform.apply(_padded(splats, self.sh_degree)), rows)
+                    copy_rows(part.transform.apply(splats), rows)
                     progress("reading", start - target.start, len(target.splats), "splat")
             number += 1
-
-
-def _padded(splats: Splats, sh_degree: int) -> Splats:
-    """Return splats of at least this SH degree; coefficients that they lack are 0."""
-    if splats.sh_degree >= sh_degree:
-        return splats
-    sh = np.zeros((len(splats), COEFFICIENTS[sh_degree], 3), np.float32)
-    sh[:, : splats.sh.shape[1]] = splats.sh
-    return dataclasses.replace(splats, sh=sh)
 
 
 #: Run of splats of a file: the first, their number, and the row that the first of them gets.

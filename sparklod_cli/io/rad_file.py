@@ -26,7 +26,7 @@ from .reading import opened
 FORMAT = "RAD"
 
 #: Files whose decoded columns take more bytes than this, or than this share of the free memory, are read chunk by
-#: chunk: what is computed of them takes as much again, and chunk by chunk is no slower
+#: chunk: computed values take as much again, and chunk by chunk is no slower
 #: (docs/decisions/14-cuts.md).
 AT_ONCE, SHARE = 1 << 28, 0.25
 

@@ -13,13 +13,14 @@ import numpy as np
 from ..codecs.formats import PRECISIONS
 from ..codecs.losses import after
 from ..codecs.reader import OpenCompanion, decode_file, size_of
+from ..codecs.streamed_sog.codec import layout_of
 from ..codecs.streamed_sog.manifest import MAX_MANIFEST, parse
 from ..codecs.streamed_sog.manifest_rules import files_of_chunk
 from ..io import opened, size_of_input
 from ..io.rad_file import FORMAT as RAD
 from ..io.rad_file import RadFile
 from ..lod.detail_traversal import DetailFiles
-from ..model.instances import Instance, Source
+from ..model.instances import Instance
 from ..model.lod_tree import CHUNK_NODES, LodTree
 from ..model.scene import Scene
 from ..model.selection import Selection, describe
@@ -73,12 +74,13 @@ def read_scenes(
         OutOfMemoryError: a file does not fit into memory; names it.
     """
     loaded: dict[Path | int, LoadedScene] = {}
-    notes: list[str] = []
-    chunks = 0
+    notes, of_instance, chunks = list[str](), list[LoadedScene](), 0
     for source in (instance.source for instance in instances):
-        if _key(source) in loaded:
-            continue
         file = source if isinstance(source, Path) else None
+        key = file or id(source)
+        if key in loaded:
+            of_instance.append(loaded[key])
+            continue
         found: Pages | Scene | DetailScene | TileScene
         if isinstance(source, Path):
             to_read = columns if trees_only else COLUMNS
@@ -91,7 +93,10 @@ def read_scenes(
             entry: LoadedScene = PagedScene(file, size_of_input(file) or 0, empty, empty.splats, chunks, pages=found)
         elif isinstance(found, Scene):
             name, scene = file or UNNAMED, found
-            _check_tree(name, scene)
+            try:
+                scene.check_tree()
+            except TreeError as error:
+                raise TreeError(f"{name}: its tree is broken: {error}") from None
             if scene.tree is None and trees_only:
                 raise FormatError(
                     f"{name}: it is not a Level-of-Detail tree, Streamed SOG or 3D Tiles; bake it first with sparklod"
@@ -105,14 +110,10 @@ def read_scenes(
         else:
             entry = _loaded_runs(file, found, through, chunks, threads)
             notes += (f"{entry.name}: {note}" for note in found.notes)
-        loaded[_key(source)] = entry
+        loaded[key] = entry
+        of_instance.append(entry)
         chunks += entry.chunks
-    of_instance = [loaded[_key(instance.source)] for instance in instances]
     return Scenes(instances, list(loaded.values()), of_instance, notes, precision, threads)
-
-
-def _key(source: Source) -> Path | int:
-    return source if isinstance(source, Path) else id(source)
 
 
 def _loaded_runs(
@@ -135,11 +136,9 @@ def read_detail_files(path: Path) -> DetailFiles:
         data = file.read(MAX_MANIFEST + 1)
         manifest = parse(data)
         requests = tuple(_bytes_of_files(more["open_companion"], name) for name in manifest.names())
-    of_run = np.full((sum(1 for _ in manifest.regions()), manifest.levels), -1, np.int64)
-    for row, (_, node) in zip(of_run, manifest.regions(), strict=True):
-        for level, run in (node.runs or {}).items():
-            if run.count:
-                row[level] = run.file
+    layout = layout_of(manifest)
+    of_run = np.full(layout.counts.shape, -1, np.int64)
+    of_run[layout.region, layout.level] = layout.file
     environment = None if manifest.environment is None else len(manifest.filenames)
     return DetailFiles(of_run, np.array([*map(sum, requests)], np.int64), environment, len(data), requests)
 
@@ -177,13 +176,6 @@ def _read(
         return decode_file(
             form.codec(), file, threads=threads, progress=progress, columns=columns, validate=False, **more
         )
-
-
-def _check_tree(name: Path | str, scene: Scene) -> None:
-    try:
-        scene.check_tree()
-    except TreeError as error:
-        raise TreeError(f"{name}: its tree is broken: {error}") from None
 
 
 def _drawable(name: str, scene: Scene, notes: list[str]) -> Scene:
