@@ -125,10 +125,9 @@ def has_published(source: Source, target: Place, settings: BakeSettings, resourc
 
 
 def scratch_folder(source: Source, target: Place, settings: BakeSettings, parent: Place | None) -> Place:
-    """Return the scratch folder of a bake.
+    """Return the scratch folder of a bake; for standard output, a temporary one that is named after the input.
 
     Args:
-        target: - for standard output, whose folder is among the system's temporary files and named after the input.
         parent: folder for the scratch folders of several bakes; None for the folder of the output.
     """
     if target == DASH:

@@ -81,8 +81,8 @@ class BakeIdentity:
     """Inputs and settings of a bake.
 
     Attributes:
-        inputs: files in the order in which they are read; their names do not matter.
-        settings: numbers, texts and lists by name, as "selection.min_opacity"; the version of the program, too.
+        inputs: in the order in which they are read; their names do not matter.
+        settings: by name, as "selection.min_opacity"; the version of the program, too.
     """
 
     inputs: tuple[FileState, ...]

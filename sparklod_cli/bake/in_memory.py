@@ -120,8 +120,7 @@ def build_tree(
 ) -> tuple[Splats, LodTree]:
     """Build the tree of splats, which are taken out of a list so that the builder can free them.
 
-    Args:
-        in_chunks: the nodes are put into the order for streaming later.
+    With `in_chunks`, the nodes are put into the order for streaming later.
     """
     row = BUILDERS[settings.method]
     built = [row.load().build(leaves.pop(), getattr(settings, row.setting), progress=progress)]

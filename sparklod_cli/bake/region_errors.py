@@ -60,9 +60,6 @@ def measured(scene: DetailScene, *, threads: int | None = None, progress: Progre
 
     It is 0 at the first level of a region, does not decrease, and does not depend on the number of threads. A missing
     level has the error of the level before.
-
-    Args:
-        scene: its errors are not read.
     """
     order = np.argsort(scene.counts == 0, axis=1, kind="stable")  # levels that have splats come first
     runs = np.take_along_axis(np.stack([scene.starts, scene.counts], 2), order[:, :, None], 1)

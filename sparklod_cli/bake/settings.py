@@ -36,17 +36,15 @@ class BakeSettings:
     """Settings of a bake.
 
     Attributes:
-        method: of `lod.builders.BUILDERS`.
         base: of quick, growth of the voxel grid from level to level, 1.1 to 2.0.
         growth: of quality, the largest number of nodes for each leaf, 1.05 to 2.0.
         max_sh: the highest SH degree that is kept.
-        selection: which splats are kept; its coordinates are those of the input.
-        transform: turns, scales and moves the splats that are kept.
+        selection: its coordinates are those of the input.
+        transform: of the splats that are kept.
         up: axis of the input that points up, one of `scene.AXES`, which `transform` may have turned to another; None
             for that of the file.
         rgba: a file of colours and opacities that replace the splats' own, see `io.read_rgba`.
         suffix: of the format, one of `WRITABLE` that holds trees.
-        options: how to write it.
         encoding: of `codecs.formats.ENCODINGS`, to write arrays in that layout instead.
         raw: write their words alone, rather than as .npz.
         detail: of regions and detail levels, to write a Streamed SOG instead.

@@ -33,7 +33,7 @@ def bake_side_by_side(
     Args:
         pairs: inputs and outputs, which all workers see.
         resources: of a worker; a scene that fits into its memory is one task.
-        bake_large: bakes a scene too large for one worker, and returns the result.
+        bake_large: bakes a scene too large for one worker.
         make: function of a module that bakes a scene.
     """
     small = [_fits_in_memory(source, settings, resources.memory) for source, _ in pairs]

@@ -67,7 +67,7 @@ def bake_unless_there(
 
 
 def _read_note(path: Place) -> tuple[BakeIdentity | None, dict[str, Any]]:
-    """Read the identity of a bake and the records of its output files; None if missing or invalid."""
+    """Read the identity of a bake, None if missing or invalid, and the records of its output files."""
     try:
         if size_of(path) <= MAX_BYTES:
             with path.open("rb") as file:

@@ -72,10 +72,9 @@ LESS_MEMORY = (
 
 
 class Connection:
-    """Client of a cluster that reports lost workers. A context manager."""
+    """Context manager with the `distributed.Client` of a cluster; reports lost workers to the user by `say`."""
 
     def __init__(self, client: Any, say: Callable[[str], None]) -> None:
-        """Take a `distributed.Client`; `say` receives one-line messages for the user."""
         self.client, self.say = client, say
         self._losses: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
         self._starved = set[str]()
@@ -135,7 +134,8 @@ class Connection:
         with contextlib.suppress(queue.Empty):
             while True:
                 lost = self._losses.get_nowait()
-                names = sorted(_name_of(key) for key in lost.get("processing-tasks") or ())
+                keys = lost.get("processing-tasks") or ()
+                names = sorted(str(key[-1] if isinstance(key, tuple) else key) for key in keys)
                 again = f"; to be done again: {', '.join(names[:LISTED])}" if names else ""
                 again += f" and {len(names) - LISTED} more" if len(names) > LISTED else ""
                 why = "ran out of memory" if lost["worker"] in self._starved else "was lost"
@@ -149,7 +149,10 @@ class Connection:
             error: Exception = future.exception()
         if type(error).__name__ == "KilledWorker":
             worker = str(error.last_worker.address)  # type: ignore[attr-defined]
-            if self._was_starved(worker):
+            deadline = time.monotonic() + NANNY_DELAY
+            while worker not in self._starved and time.monotonic() < deadline:
+                time.sleep(TICK / 20)
+            if worker in self._starved:
                 return OutOfMemoryError(f"{name} does not fit into the memory of a worker; {LESS_MEMORY}")
             return SparklodError(
                 f"each worker that did {name} was lost, the last one {worker}. Its log may tell why; if the system"
@@ -158,12 +161,6 @@ class Connection:
         if isinstance(error, OutOfMemoryError):
             return OutOfMemoryError(f"{name}: {error}; {LESS_MEMORY}")
         return error
-
-    def _was_starved(self, worker: str) -> bool:
-        deadline = time.monotonic() + NANNY_DELAY
-        while worker not in self._starved and time.monotonic() < deadline:
-            time.sleep(TICK / 20)
-        return worker in self._starved
 
     def _keep(self, event: tuple[float, Any]) -> None:
         """Record a message of the scheduler; called on the client's thread."""
@@ -174,10 +171,6 @@ class Connection:
             self._starved.add(str(message.get("worker")))
         elif message.get("action") == "remove-worker" and not message.get("expected"):
             self._losses.put(message)
-
-
-def _name_of(key: Any) -> str:
-    return str(key[-1] if isinstance(key, tuple) else key)
 
 
 class Pool:
@@ -205,13 +198,7 @@ class Pool:
         return bool(self._calls)
 
     def submit(self, name: str, place: int, *call: Any) -> None:
-        """Submit a call.
-
-        Args:
-            name: unique in this pool.
-            place: calls with lower places come first.
-            call: function and arguments.
-        """
+        """Submit a call of a function with arguments, by a unique name; calls with lower places come first."""
         self._calls[name] = place, call
         key = (f"{self._prefix}-{self._tries.get(name, 0)}", name)
         with self._connection.guarded():
@@ -222,7 +209,11 @@ class Pool:
     def next(self) -> tuple[str, Any, Exception | None]:
         """Wait for a call that ends; return its name, its result and its error, if it failed."""
         while True:
-            self._submit_paused()
+            due = [name for when, name in self._paused if when <= time.monotonic()]
+            self._paused = [each for each in self._paused if each[1] not in due]
+            for name in due:
+                place, call = self._calls[name]
+                self.submit(name, place, *call)
             try:
                 name = self._ended.get(timeout=TICK)
             except queue.Empty:
@@ -230,7 +221,9 @@ class Pool:
                 continue
             status = self._futures[name].status
             if status not in ENDED:  # its worker was lost since; the scheduler repeats it
-                self._ask_again(name)
+                self._connection.look()
+                loop = self._connection.client.loop
+                loop.add_callback(loop.call_later, TICK, self._ended.put, name)
                 continue
             future = self._futures.pop(name)
             if status == "finished":
@@ -243,12 +236,6 @@ class Pool:
                 del self._calls[name]
                 return name, None, error
 
-    def _ask_again(self, name: str) -> None:
-        """Check a call again after a while."""
-        self._connection.look()
-        loop = self._connection.client.loop
-        loop.add_callback(loop.call_later, TICK, self._ended.put, name)
-
     def _is_worth_another(self, name: str, error: Exception) -> bool:
         """Return whether a failed call is repeated; it is, after a pause."""
         tried = self._tries.get(name, 0)
@@ -257,13 +244,6 @@ class Pool:
         self._tries[name] = tried + 1
         self._paused.append((time.monotonic() + PAUSES[tried], name))
         return True
-
-    def _submit_paused(self) -> None:
-        due = [name for when, name in self._paused if when <= time.monotonic()]
-        self._paused = [each for each in self._paused if each[1] not in due]
-        for name in due:
-            place, call = self._calls[name]
-            self.submit(name, place, *call)
 
 
 class ClusterEngine:
@@ -277,7 +257,6 @@ class ClusterEngine:
     """
 
     def __init__(self, connection: Connection, *, threads: int, memory: int | None = None) -> None:
-        """Take the connection to a cluster, the threads of a task, and `memory`."""
         self._connection, self.threads, self.memory = connection, threads, memory
         self._checked: tuple[str, frozenset[str]] | None = None
 

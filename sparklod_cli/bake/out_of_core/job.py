@@ -74,11 +74,7 @@ class BlockDivision:
         return tuple(range(start, stop) for start, stop in zip([0, *ends], ends, strict=False))
 
     def sort(self, center: FloatArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Sort splats by their blocks, stably.
-
-        Returns:
-            (N,) the splats, and (blocks + 1,) the first one of each block, and N.
-        """
+        """Return (N,) the splats, sorted stably by their blocks, and (blocks + 1,) the first of each block, and N."""
         parts: list[NDArray[np.int64]] = [np.empty(0, np.int64)] * self.count
         pending = [(0 if self.splits else ~0, np.arange(len(center)))]
         while pending:
@@ -265,7 +261,6 @@ class Task:
     Attributes:
         name: of the task and of its result in the store, which marks the task as done.
         run: function of a module, called as `run(job, *arguments, threads=, progress=)`; it puts the result.
-        arguments: small, and can be pickled.
         needs: names of tasks that must be done before.
         weight: amount of work, splats.
         together: number of such tasks that one process has memory for at once, if they do not need each other.
