@@ -65,9 +65,6 @@ class Encoder(ABC):
 
     Attributes:
         count: splats of the file, which are nodes where there is a tree.
-        sh_degree: of all splats.
-        tree: whether there is one.
-        antialiased, up: as in `Scene`.
         options: with nothing left open.
         ranges: values beyond them are counted, see `tally`; empty for no count.
     """
@@ -157,8 +154,6 @@ class Clamp:
     Attributes:
         column: of `Splats`: center, scale, rgb or sh.
         above: whether they lie above the upper end; otherwise below the lower one.
-        splats: number of splats with such a value.
-        end: the end of the range.
         farthest: the value farthest beyond the end.
         degree: as in `CodeRange`.
         both: the range is -end to end; the values lie beyond either, and `farthest` is a magnitude.

@@ -247,7 +247,7 @@ class Reader:
         splats, tree = self.read(0, self.count, columns, progress, once=True)
         coding = PLAIN if self.coding is None else self.coding()
         scene = Scene(splats, tree, chunk_bytes=self.chunk_bytes, coding=coding, **facts_of(self))
-        return with_valid_tree(scene) if validate else scene
+        return with_valid_tree(scene, scene.tree) if validate and scene.tree is not None else scene
 
     def blocks(self, start: int = 0, stop: int | None = None) -> Iterator[Splats]:
         """Read a range of splats, all by default, in blocks; raises as `check_plain` and `read`."""
@@ -398,22 +398,16 @@ def read_comment(comment: str | bytes | None) -> FileNote:
         return FileNote()
 
 
-def with_valid_tree(scene: Scene) -> Scene:
-    """Return a scene whose tree, if it has one, is valid; its leaves have a `child_start` of 0.
-
-    Raises:
-        FormatError: its tree is broken.
-    """
-    if scene.tree is None:
-        return scene
+def with_valid_tree(scene: Scene, tree: LodTree) -> Scene:
+    """Return a scene whose tree is valid and has leaves with a `child_start` of 0; raises `FormatError` if broken."""
     try:
-        scene.tree.validate()
+        tree.validate()
     except TreeError as error:
         raise FormatError(f"its Level-of-Detail tree is broken: {error}") from error
-    start = scene.tree.first_child()
-    if np.array_equal(start, scene.tree.child_start):
+    start = tree.first_child()
+    if np.array_equal(start, tree.child_start):
         return scene  # whose tree knows that it is valid
-    return dataclasses.replace(scene, tree=LodTree(scene.tree.child_count, start))
+    return dataclasses.replace(scene, tree=LodTree(tree.child_count, start))
 
 
 def is_valid_and_visible(splats: Splats, threads: int) -> tuple[bool, bool]:

@@ -221,9 +221,7 @@ class Statistics:
     """Statistics of splats; those that were not requested are missing.
 
     Attributes:
-        count: N splats, which are nodes where there is a tree.
-        sh_degree: of them.
-        tree: whether they are nodes of a tree.
+        tree: the splats are nodes of a tree.
         reach: the largest magnitude of a coordinate.
         values: distributions of "leaf_scale", "leaf_length", "rgb", "scale", "sh1", "sh2" and "sh3", see `ALL`.
         leaf_sh, sh_between: `sh_code_counts` of leaves, or of splats where there is no tree; None without SH.
@@ -296,7 +294,7 @@ class Statistics:
         )
 
     def array(self) -> NDArray[np.uint8]:
-        """Return the bytes of these statistics, tens of KB, from which `from_array` makes them again."""
+        """Return the bytes of these statistics, tens of KB, for `from_array`."""
         columns = {name: value for name, value in vars(self).items() if name != "values" and value is not None}
         columns |= {f"{name}.{key}": value for name, part in self.values.items() for key, value in vars(part).items()}
         file = io.BytesIO()

@@ -7,8 +7,9 @@ that is repeated here in the same arithmetic, for the columns that matter.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,13 +89,6 @@ _LEAST = np.finfo(np.float32).smallest_subnormal
 _SAME = np.float32(2**-20)
 
 
-class LoadedPrecision(NamedTuple):
-    """Rounding of splats loaded into a viewer's memory: of alphas, 0..2, and of linear scales."""
-
-    alpha: Recode
-    scale: Recode
-
-
 def nodes(splats: Splats, tree: LodTree, layout: str, coding: FileCoding = PLAIN, *, threads: int = 1) -> Nodes:
     """Return the nodes of a tree as Spark's traversal reads them.
 
@@ -104,15 +98,15 @@ def nodes(splats: Splats, tree: LodTree, layout: str, coding: FileCoding = PLAIN
         coding: of the file that they were read from. Scales that do not come from its codes, or of splats that were not
             read from a file, are taken to be those that Spark has.
     """
-    held = _layout(layout, coding.packed_range)
+    alpha_held, scale_held = _layout(layout, coding.packed_range)
     found = Nodes(np.empty((len(splats), 3), np.float32), np.empty(len(splats), np.float32), tree)
     for rows, scales in coding.parts(len(splats)):
-        recode = _recoded(scales, held.scale)
+        recode = _recoded(scales, scale_held)
 
         @np.errstate(over="ignore", invalid="ignore")
         def measure(part: slice, start: int = rows.start, recode: Recode = recode) -> None:
             part = slice(start + part.start, start + part.stop)
-            alpha = held.alpha(spark_codings.stored_lod_alpha(splats.opacity[part]))
+            alpha = alpha_held(spark_codings.stored_lod_alpha(splats.opacity[part]))
             x, y, z = recode(np.ascontiguousarray(splats.scale[part].T))
             factor = np.float32(2) * size_factor(spark_codings.lod_opacity_of_alpha(alpha))
             found.center[part] = splats.center[part].astype(np.float16)
@@ -122,11 +116,15 @@ def nodes(splats: Splats, tree: LodTree, layout: str, coding: FileCoding = PLAIN
     return found
 
 
-def _layout(name: str, packed_range: tuple[float, float] | None) -> LoadedPrecision:
-    """Return one of `formats.LOADED`, with the range of logarithms that a file sets for PackedSplats."""
+def _layout(name: str, packed_range: tuple[float, float] | None) -> tuple[Recode, Recode]:
+    """Return the rounding of alphas, 0..2, and of linear scales in one of `formats.LOADED`.
+
+    Args:
+        packed_range: range of logarithms that a file sets for PackedSplats; None for that of Spark.
+    """
     if name == "ext":
         scales = spark_codings.exp(_HALVES.astype(np.float32))
-        return LoadedPrecision(
+        return (
             lambda alpha: alpha.astype(np.float16).astype(np.float32),
             lambda scale: scales[spark_codings.log(scale).astype(np.float16).view(np.uint16)],
         )
@@ -144,32 +142,7 @@ def _layout(name: str, packed_range: tuple[float, float] | None) -> LoadedPrecis
         known = np.where(np.isnan(scale), _LEAST, scale)
         return table[spark_codings.encode_log_scale(known, low, high, log=spark_codings.log, least=_LEAST)]
 
-    return LoadedPrecision(alpha_held, scale_held)
-
-
-class _Codes(NamedTuple):
-    """Codes of a file's scales: whole numbers from 0 on, and the scale of each in `Splats` and in Spark."""
-
-    of: Callable[[FloatArray], NDArray[np.unsignedinteger[Any]]]
-    ours: FloatArray
-    theirs: FloatArray
-
-
-@np.errstate(over="ignore", invalid="ignore")
-def _codes(coding: ScaleCoding) -> _Codes | None:
-    """Return the codes of a coding; None for plain numbers."""
-    if coding.name == "ln_0r8":
-        low, high = coding.low, coding.high
-        ours = spark_codings.log_scale_table(low, high)
-        theirs = spark_codings.log_scale_table(low, high, exp=spark_codings.exp)
-        return _Codes(lambda scale: spark_codings.encode_log_scale(scale, low, high), ours, theirs)
-    if coding.name == "spz":
-        logs = np.arange(256, dtype=np.float32) / quantize.SCALE_STEPS - quantize.SCALE_OFFSET
-        return _Codes(quantize.encode_log_scale, np.exp(logs), spark_codings.exp(logs))
-    if coding.name == "ln_f16":
-        logs = _HALVES.astype(np.float32)
-        return _Codes(_half_log, np.exp(logs), spark_codings.exp(logs))
-    return None
+    return alpha_held, scale_held
 
 
 @np.errstate(divide="ignore", invalid="ignore")
@@ -177,16 +150,28 @@ def _half_log(scale: FloatArray) -> NDArray[np.uint16]:
     return np.log(scale).astype(np.float16).view(np.uint16)
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def _recoded(coding: ScaleCoding, held: Recode) -> Recode:
     """Return what a layout keeps (`held`) of scales that come from codes, whose last bits are others in Spark."""
-    codes = _codes(coding)
-    if codes is None:
+    code_of: Callable[[FloatArray], NDArray[Any]]
+    if coding.name == "ln_0r8":
+        code_of = functools.partial(spark_codings.encode_log_scale, low=coding.low, high=coding.high)
+        scale_of = spark_codings.log_scale_table(coding.low, coding.high)
+        theirs = spark_codings.log_scale_table(coding.low, coding.high, exp=spark_codings.exp)
+    elif coding.name in ("spz", "ln_f16"):
+        logs: NDArray[Any] = _HALVES.astype(np.float32)
+        code_of = _half_log
+        if coding.name == "spz":
+            logs = np.arange(256, dtype=np.float32) / quantize.SCALE_STEPS - quantize.SCALE_OFFSET
+            code_of = quantize.encode_log_scale
+        scale_of, theirs = np.exp(logs), spark_codings.exp(logs)
+    else:
         return held
-    of_code = held(codes.theirs)
+    of_code = held(theirs)
 
     def of_scale(scale: FloatArray) -> FloatArray:
-        code = codes.of(scale)
-        found, ours = of_code[code], codes.ours[code]
+        code = code_of(scale)
+        found, ours = of_code[code], scale_of[code]
         other = ~((ours == scale) | (np.abs(ours - scale) <= _SAME * scale))
         if other.any():
             found[other] = held(scale[other])
