@@ -64,13 +64,9 @@ def frame_looking(
 
 
 def orbit(count: int, center: ArrayLike, distance: float, elevation: float, up: ArrayLike) -> Sampled:
-    """Return `count` frames once around a point, counter-clockwise seen from above.
+    """Return `count` frames once around a point, (3,) `center`, counter-clockwise seen from above.
 
-    Args:
-        center: (3,) point that all look at.
-        distance: from it, world units.
-        elevation: angle above it, radians.
-        up: (3,) axis of the orbit.
+    `distance` is in world units, `elevation` an angle above the point, radians, `up` the (3,) axis of the orbit.
     """
     axis = normalized(up)
     front = _front(axis)
@@ -85,13 +81,10 @@ def orbit(count: int, center: ArrayLike, distance: float, elevation: float, up: 
 
 
 def dolly(count: float, center: ArrayLike, far: float, near: float, elevation: float, up: ArrayLike) -> Sampled:
-    """Return `count` frames, at least 2, straight towards a point; from frame to frame it grows by the same factor.
+    """Return `count` frames, at least 2, straight towards a point, which grows by the same factor from frame to frame.
 
-    Args:
-        center: (3,) point that all look at.
-        far, near: distances of the first and the last frame from it, world units.
-        elevation: angle above it, radians.
-        up: (3,) up axis.
+    `far` and `near` are distances of the first and the last frame, world units; `center`, `elevation` and `up` as in
+    `orbit`.
     """
     axis = normalized(up)
     offset = math.cos(elevation) * _front(axis) + math.sin(elevation) * axis

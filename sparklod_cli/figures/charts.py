@@ -378,11 +378,8 @@ def plot(
     """Return the PNG of charts of all columns that have numbers, and of the path; a note says why that is missing.
 
     Args:
-        rows: of all frames; those of single instances are left out.
+        rows: of all frames, at least one; those of single instances are left out.
         marked: numbers of notable frames, by the reason, a key of `CALLED`.
-
-    Raises:
-        SparklodError: matplotlib is not installed, or there is no frame.
     """
     frames = totals(rows)
     if not frames:

@@ -76,10 +76,8 @@ def rotation(quat_xyzw: FloatArray) -> FloatArray:
 def ellipsoids(splats: Splats, deviations: float, of: Mesh, thinnest: float) -> Mesh:
     """Return the surfaces of N splats at some number of standard deviations, in their order.
 
-    Points of the sphere are multiplied by the radii, its normals divided by them.
-
-    Args:
-        thinnest: smallest radius that is drawn, world units, so that no splat falls between pixels.
+    Points of the sphere are multiplied by the radii, its normals divided by them. No radius is below `thinnest`, world
+    units, so that no splat falls between pixels.
     """
     axes = rotation(splats.quat_xyzw)
     radii = np.maximum(splats.scale * np.float32(deviations), np.float32(thinnest))

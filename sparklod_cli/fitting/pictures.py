@@ -133,11 +133,7 @@ class FittedNodes:
 
 
 class FittedSet(FittedNodes):
-    """The nodes of one cut for all cameras while they change, leaves too; none has, or gets, an opacity above 1.
-
-    Args:
-        fixed: indices of the cut, ascending.
-    """
+    """The nodes of one cut, `fixed`, for all cameras while they change, leaves too; none gets an opacity above 1."""
 
     #: No camera chooses among the nodes by their sizes; single scales are limited, see `adam.MOST_CHANGE`.
     bounds, least_ratio = FitBounds(np.float32(1), np.float32(np.inf)), 0.0

@@ -56,11 +56,9 @@ class Tile:
 
 
 def check_covered(reference: Image, subject: str) -> None:
-    """Raise a `SparklodError` if the reference of a comparison is empty: its figures would mean nothing.
+    """Raise a `SparklodError` if a reference, (H, W, 4), is empty: figures of a comparison would mean nothing.
 
-    Args:
-        reference: (H, W, 4), the last channel alpha.
-        subject: what the picture shows, for the error.
+    `subject` is what the picture shows, for the error.
     """
     if not (reference[..., 3] > 0).any():
         raise SparklodError(
@@ -109,11 +107,8 @@ def edge_psnr(a: Image, b: Image, where: Mask) -> float | None:
 def popping(a: Image, b: Image, a_before: Image, b_before: Image) -> float:
     """Root mean square of how much the error of a picture changes from frame to frame, in steps of 8 bits.
 
-    The error is `a - b`; its change, (a - a_before) - (b - b_before), is what changes in `a` beyond what does in `b`.
-
-    Args:
-        a, b: (H, W, C) of the same shape, 0..1: a frame, and what it should be.
-        a_before, b_before: the same of the frame before.
+    The error is `a - b` of a frame and what it should be; its change, (a - a_before) - (b - b_before), is what changes
+    in `a` beyond what does in `b`.
     """
     change = np.subtract(a, b, dtype=np.float64)
     change -= a_before

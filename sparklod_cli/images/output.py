@@ -72,13 +72,9 @@ class PictureOutput:
 
 
 def output_for(name: Path | None, default: Path, cameras: int, *, sheet: bool) -> PictureOutput:
-    """Return the destination of the pictures of a number of cameras.
+    """Return the destination of the pictures of a number of cameras; `ValueError` if that or the name cannot be.
 
-    Args:
-        name: the requested path; "-" for standard output; None for a path derived from `default`, which has no suffix.
-
-    Raises:
-        ValueError: this destination cannot hold that many pictures, or its format is unknown.
+    `name` is the requested path; "-" for standard output; None for a path derived from `default`, which has no suffix.
     """
     several = cameras > 1 and not sheet
     if name is not None and str(name) == "-":

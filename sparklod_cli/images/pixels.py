@@ -308,14 +308,9 @@ def load_imageio(form: str) -> ModuleType:
 def animate(frames: Iterable[Pixels], count: int, form: str, fps: float) -> bytes:
     """Return the bytes of an animation in an endless loop ("gif", "webp") or of a video ("mp4", "webm").
 
-    Frames are taken as they are encoded; a GIF's are held, a byte a pixel, until the last.
-
-    Args:
-        frames: at least one, all of one size; with alpha for "webp" only.
-        form: one of `defaults.MOVING`.
-
-    Raises:
-        SparklodError: videos cannot be written here, or the animation is too large for its format.
+    Frames, all of one size, with alpha for "webp" only, are taken as they are encoded; a GIF's are held, a byte a
+    pixel, until the last. `SparklodError` if videos cannot be written here, or the animation is too large for its
+    format.
     """
     out = io.BytesIO()
     if form in VIDEOS:

@@ -99,7 +99,6 @@ def write_pictures(
     Args:
         path: the cameras; all of one size for an animation or a contact sheet.
         reference: cuts to compare with; the pictures are then differences from it.
-        progress: called with the number of frames scanned for the colour scale, compared and drawn.
 
     Raises:
         BackendError: the backend cannot draw here.

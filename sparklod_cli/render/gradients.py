@@ -57,11 +57,9 @@ class Drawing:
         """Return derivatives of a loss by each splat, the same for any number of threads.
 
         Where a splat ends (at a number of standard deviations, at the least alpha, behind opaque ones) is held
-        constant, and so is the shape of a splat whose axes are shortened to the largest radius.
-
-        Args:
-            by_image: (height, width, 4) float32 derivatives of the loss by the image's red, green and blue, which are
-                multiplied by alpha, and by alpha.
+        constant, and so is the shape of a splat whose axes are shortened to the largest radius. `by_image` are the
+        (height, width, 4) float32 derivatives of the loss by the image's red, green and blue, which are multiplied by
+        alpha, and by alpha.
         """
         across, _ = rasterizer.tiles_across(self.camera)
         screen, boxes = self.projected.screen, self.projected.boxes

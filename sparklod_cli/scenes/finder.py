@@ -39,13 +39,9 @@ class FixedCut:
 
 
 class CutFinder:
-    """Finds what a viewer draws of scenes; several threads may use it.
+    """Finds what a viewer draws of scenes; several threads may use it. Without settings it draws full detail.
 
-    Args:
-        settings: of the viewer; None draws full detail.
-
-    Raises:
-        ValueError: the budget is too small for the roots, or there are too many instances.
+    `ValueError` if the budget is too small for the roots, or there are too many instances.
     """
 
     def __init__(self, scenes: Scenes, settings: LodSettings | None) -> None:

@@ -114,7 +114,6 @@ class Loader(Viewer):
         return {column.name: column.rounded(figures[column.name]) for column in LOADING}
 
     def cut_after(self, camera: Camera, seconds: float) -> Cut:
-        """Return what is drawn for a camera so many seconds after the page was opened in front of it."""
         resident = np.zeros(len(self._chunks), np.bool_)
         for arrival in self.arrivals(camera):
             if arrival.seconds > seconds:
@@ -133,14 +132,7 @@ class Loader(Viewer):
 
 
 class LoadingCuts(Loader):
-    """Cuts of visitors some time after they opened the page, one visitor for each camera; a `CutSource`.
-
-    Args:
-        seconds: since then.
-
-    Raises:
-        ValueError: as `Loader`.
-    """
+    """Cuts of visitors so many seconds after they opened the page, one visitor for each camera; a `CutSource`."""
 
     def __init__(self, scenes: Scenes, settings: LodSettings, streaming: StreamingSettings, seconds: float) -> None:
         super().__init__(scenes, settings, streaming)

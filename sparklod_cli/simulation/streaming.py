@@ -115,13 +115,11 @@ class ChunkCache:
     A chunk is used when it arrives and as long as it is wanted; among wanted chunks the more important one counts as
     more recently used. Wanted chunks beyond the capacity are not fetched, since they would evict more important ones or
     be evicted by them. Spark's pager works the same way. Chunks with roots are always wanted, and come first.
+    `ValueError` if the capacity is less than the number of trees.
 
     Attributes:
         requested: the wanted chunks, each once, the most important first.
         admitted: the first of them, as many as fit; they are never evicted.
-
-    Raises:
-        ValueError: the capacity is less than the number of trees.
     """
 
     def __init__(self, chunks: Chunks, capacity: int | None = None) -> None:

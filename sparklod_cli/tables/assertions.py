@@ -42,11 +42,9 @@ def is_statistic(name: str) -> bool:
 
 
 def statistic(name: str, values: Sequence[Number]) -> Number:
-    """Return a statistic of the numbers of a column.
+    """Return a statistic of the numbers of a column, in the order of the frames; at least one, except for "count".
 
-    Args:
-        name: one of `STATISTICS`, or a percentile such as p95, interpolated linearly.
-        values: in the order of the frames; at least one, except for "count".
+    It is one of `STATISTICS`, or a percentile such as p95, interpolated linearly.
     """
     if name in STATISTICS:
         return STATISTICS[name](values)
@@ -209,13 +207,10 @@ class Outcome:
 
 
 def parse(text: str, columns: Sequence[Column]) -> Assertion:
-    """Return an assertion from `NAME[_STATISTIC] SIGN NUMBER`.
+    """Return an assertion from `NAME[_STATISTIC] SIGN NUMBER`; a `BadAssertionError` suggests similar names.
 
     NAME is that of a numeric column, the longest one that fits: `pixel_scale_min<1` is about every cell of the column
     pixel_scale_min, `pixel_scale_min_max<1` about the largest of them. NUMBER may end in k, M, G or %.
-
-    Raises:
-        BadAssertionError: it is not well formed; suggests similar names.
     """
     condition = parse_condition(text, example="churn_p95<0.2")
     column, name = _column(text, condition.name, columns)

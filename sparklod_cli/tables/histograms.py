@@ -40,15 +40,10 @@ class Histogram:
 
 
 def histogram(values: FloatArray, *, bins: int = 40, log: bool | None = None) -> Histogram:
-    """Return the histogram of some numbers.
+    """Return the histogram of (N,) numbers, finite or not; there is only one bin if all are the same.
 
-    Args:
-        values: (N,) numbers, finite or not.
-        bins: number of bins; there is only one if all numbers are the same.
-        log: use bins of equal ratios; None does so for positive numbers that span more than `LOG_SPAN`.
-
-    Raises:
-        ValueError: `bins` is less than 1, or `log` is set and a number is not positive.
+    `log` uses bins of equal ratios; None does so for positive numbers that span more than `LOG_SPAN`. `ValueError` if
+    `bins` is less than 1, or `log` is set and a number is not positive.
     """
     if bins < 1:
         raise ValueError(f"{bins} bins")

@@ -170,8 +170,7 @@ def _sizes(splats: Splats) -> tuple[float, float]:
 def start_of(extents: Sequence[Extent], view: tuple[Point, Point] | None, up: Point, fov: float) -> Start:
     """Return the first view of some files together; `CameraPathError` if the camera makes no sense.
 
-    Args:
-        view: eye and target, where they are given; else the whole scene is in view, from its front.
+    `view` has eye and target, where they are given; else the whole scene is in view, from its front.
     """
     balls = Balls.concat(extent.balls for extent in extents)
     settings = Settings(size=DEFAULT_SIZE, fov_y=math.radians(fov), up=up)
