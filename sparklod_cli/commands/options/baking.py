@@ -61,7 +61,7 @@ BY_DATE, VERIFY = "date", "verify"
 
 
 class OutputForm(NamedTuple):
-    """What build-lod writes.
+    """Format and files of an output of build-lod.
 
     Attributes:
         suffix: of the file.
@@ -351,7 +351,7 @@ class BuildLodOptions:
 
     @property
     def output_form(self) -> OutputForm:
-        """What is written, by --format, or else by the name of the output."""
+        """Format of the output, by --format, or else by the name of the output."""
         form = self.form
         if form is None and not (self.encoding or self.unlod):
             form = MANIFESTS.get(self.name)
