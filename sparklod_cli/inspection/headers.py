@@ -18,9 +18,9 @@ from ..codecs.rad.rad_reader import scan_chunks, scan_header
 from ..codecs.reader import OpenCompanion, size_of
 from ..codecs.rules import RuleViolation
 from ..codecs.spark_codings import log_scale_table
-from ..codecs.streamed_sog import manifest_rules
 from ..codecs.streamed_sog.codec import RegionLayout, layout_of
 from ..codecs.streamed_sog.manifest import VERSION as STREAMED_SOG_VERSION
+from ..codecs.streamed_sog.manifest import scan_files, scan_splats
 from ..codecs.tiles_3d import tileset_rules
 from ..codecs.tiles_3d.codec import tile_files
 from ..codecs.tiles_3d.tileset import MAX_TILESET, Tileset, read_whole
@@ -256,12 +256,12 @@ def survey_streamed_sog(
 ) -> HeaderScan:
     """Read a manifest and the headers of its chunk files, and to `check` them their splats."""
     size = size_of(file)
-    manifest, files, violations = manifest_rules.scan_files(file, open_companion)
+    manifest, files, violations = scan_files(file, open_companion)
     if any(each.fatal for each in violations):
         return HeaderScan("streamed_sog", violations)
     chunks = {name: chunk for name, chunk in files.items() if isinstance(chunk, Chunk)}
     if check:
-        violations += manifest_rules.scan_splats(open_companion, manifest, chunks, threads=threads, progress=progress)
+        violations += scan_splats(open_companion, manifest, chunks, threads=threads, progress=progress)
     layout = layout_of(manifest)
     facts = _detail_facts(layout, chunks, size)
     # What a reader of level 0 and the environment finds.

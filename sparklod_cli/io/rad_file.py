@@ -9,9 +9,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from ..codecs.rad import rad_rules
 from ..codecs.rad.codec import RadChunk, read_chunk
-from ..codecs.rad.rad_header import RadHeader, read_header
+from ..codecs.rad.rad_header import RadHeader, header_violations, read_header
 from ..codecs.rad.rad_reader import RadReader, decoded_bytes, file_of
 from ..codecs.rules import check_rules
 from ..model.lod_tree import LodTree
@@ -101,7 +100,7 @@ def read_rad_header(path: Path) -> RadHeader:
     """Read the header of a RAD file; its chunks need not be there.
 
     Raises:
-        FormatError: it cannot be read, is not RAD, or breaks a fatal rule of `rad_rules`.
+        FormatError: it cannot be read, is not RAD, or breaks a fatal rule of the format.
     """
     with _opened_plain(path) as file:
         return _header(file)
@@ -139,5 +138,5 @@ def _opened_plain(path: Path) -> Iterator[BinaryIO]:
 
 def _header(file: BinaryIO) -> RadHeader:
     header = read_header(file)
-    check_rules(rad_rules.violations(header))
+    check_rules(header_violations(header))
     return header

@@ -14,8 +14,7 @@ from ..codecs.formats import PRECISIONS
 from ..codecs.losses import after
 from ..codecs.reader import OpenCompanion, decode_file, size_of
 from ..codecs.streamed_sog.codec import layout_of
-from ..codecs.streamed_sog.manifest import MAX_MANIFEST, parse
-from ..codecs.streamed_sog.manifest_rules import files_of_chunk
+from ..codecs.streamed_sog.manifest import MAX_MANIFEST, files_of_chunk, parse
 from ..io import opened, size_of_input
 from ..io.rad_file import FORMAT as RAD
 from ..io.rad_file import RadFile

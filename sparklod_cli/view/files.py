@@ -18,8 +18,7 @@ from ..codecs.glb.codec import open_content as open_glb
 from ..codecs.glb.glb_container import MAGIC as GLB_MAGIC
 from ..codecs.rad.rad_header import CHUNK_MAGIC, MAGIC, RadHeader, read_header
 from ..codecs.reader import OpenFile
-from ..codecs.streamed_sog.manifest import MAX_MANIFEST, parse
-from ..codecs.streamed_sog.manifest_rules import files_of_chunk
+from ..codecs.streamed_sog.manifest import MAX_MANIFEST, files_of_chunk, parse
 from ..codecs.tiles_3d.codec import names_of
 from ..codecs.tiles_3d.tileset import MAX_TILESET
 from ..codecs.zip_folder import ZipFolder

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from sparklod_cli.cli import run
-from sparklod_cli.codecs.rad import rad_rules as rad_promises
+from sparklod_cli.codecs.rad import rad_header as rad_promises
 from sparklod_cli.inspection.findings import CODES
 from sparklod_cli.inspection.report import Report, ReportSettings, inspect
 from tests.conftest import FIXTURES, Capture, real_scene

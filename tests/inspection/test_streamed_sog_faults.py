@@ -18,7 +18,7 @@ from fixtures.by_hand_sog import sog_files
 from fixtures.by_hand_streamed_sog import joined
 from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.codecs.streamed_sog import codec
-from sparklod_cli.codecs.streamed_sog.manifest_rules import ERRORS, WARNINGS
+from sparklod_cli.codecs.streamed_sog.manifest import ERRORS, WARNINGS
 from sparklod_cli.inspection.report import Report, ReportSettings, inspect
 from sparklod_cli.io import parts_output, read_parts
 from sparklod_cli.lod import detail_levels, quick

@@ -25,7 +25,6 @@ from ..inflate import ERRORS, raw_unpacker
 from ..quantize import Bytes, quat_of_xyz
 from ..reader import OpenCompanion, OpenFile, Reader, Target, size_of
 from ..rules import RuleViolation, check_rules, error_of
-from . import rad_rules
 from .property_codings import BY_NAME, CODINGS, Row, encodings_of
 from .rad_header import (
     Files,
@@ -33,13 +32,15 @@ from .rad_header import (
     RadChunkEntry,
     RadChunkHeader,
     RadHeader,
+    broken,
+    chunk_violations,
+    header_violations,
     in_files,
     in_one_file,
     padding,
     read_chunk_header,
     read_header,
 )
-from .rad_rules import broken
 
 
 @contextlib.contextmanager
@@ -82,7 +83,7 @@ class RadReader:
         """Read the header of a file, and its palette.
 
         Raises:
-            FormatError: the file is not RAD, breaks a fatal rule of `rad_rules`, or its first chunk is damaged.
+            FormatError: the file is not RAD, breaks a fatal rule, or its first chunk is damaged.
         """
         size = size_of(file)
         header = read_header(file)
@@ -90,7 +91,7 @@ class RadReader:
         for name in header.filenames:
             with _open_companion(name, open_companion) as own:
                 sizes[name] = size_of(own)
-        check_rules(rad_rules.violations(header, size, sizes))
+        check_rules(header_violations(header, size, sizes))
         _check_promise(header.count, header, size + sum(sizes.values()))
         reader = cls(header, file, open_companion)
         first = reader.first()
@@ -252,7 +253,7 @@ def read_chunk(file: BinaryIO, entry: RadChunkEntry, header: RadHeader, palette:
     room = COEFFICIENTS[min(header.max_sh, MAX_SH_DEGREE)], 3
     if palette is not None and np.shape(palette)[1:] != room:
         raise ValueError(f"the palette has the shape {np.shape(palette)}; that of this file has (codes, {room[0]}, 3)")
-    check_rules(rad_rules.violations(header))
+    check_rules(header_violations(header))
     packed = PackedChunk.of(bytes_of(entry, header, file), header.chunks.index(entry), header)
     _check_promise(packed.header.count, header, entry.bytes)
     own = packed.palette(header)
@@ -270,7 +271,7 @@ def count_leaves(file: BinaryIO, header: RadHeader, open_companion: OpenCompanio
             start = entry.start(header)
             source.seek(start)
             chunk = read_chunk_header(source)
-            check_rules(rad_rules.chunk_violations(header, number, chunk, entry.bytes))
+            check_rules(chunk_violations(header, number, chunk, entry.bytes))
             leaves += chunk.count
             for each in chunk.properties:
                 if each.name == "child_count":
@@ -286,7 +287,7 @@ def scan_header(file: BinaryIO, open_companion: OpenCompanion) -> tuple[RadHeade
     size = size_of(file)
     header = read_header(file)
     sizes = {name: _size_or_reason(name, open_companion) for name in header.filenames}
-    return header, list(rad_rules.violations(header, size, sizes))
+    return header, list(header_violations(header, size, sizes))
 
 
 def _size_or_reason(name: str, open_companion: OpenCompanion) -> int | str:
@@ -311,7 +312,7 @@ def scan_chunks(
             except FormatError as error:
                 yield None, [broken("chunk-header", f"chunk {number:,}: {error}")]
                 continue
-            violations = list(rad_rules.chunk_violations(header, number, chunk, entry.bytes))
+            violations = list(chunk_violations(header, number, chunk, entry.bytes))
             if paddings and not any(each.fatal for each in violations):
                 for each in chunk.properties:
                     source.seek(start + chunk.bytes + each.offset + each.bytes)
@@ -346,9 +347,9 @@ class PackedChunk:
 
     @classmethod
     def of(cls, data: bytes, number: int, header: RadHeader) -> PackedChunk:
-        """Parse the header of a chunk; `FormatError` if it breaks a fatal rule of `rad_rules`."""
+        """Parse the header of a chunk; `FormatError` if it breaks a fatal rule."""
         chunk = read_chunk_header(io.BytesIO(data))
-        check_rules(rad_rules.chunk_violations(header, number, chunk, len(data)))
+        check_rules(chunk_violations(header, number, chunk, len(data)))
         return cls(number, chunk, memoryview(data)[chunk.bytes :])
 
     def scale_coding(self) -> ScaleCoding:

@@ -30,8 +30,19 @@ from ..options import WriteOptions
 from ..reader import OpenCompanion, OpenFile, Reader, note_of, size_of
 from ..rules import check_rules, error_of
 from ..sog import codec as sog
-from .manifest import MAX_MANIFEST, VERSION, Bound, Manifest, ManifestNode, Run, parse, serialise
-from .manifest_rules import chunk_files, run_violations, violations
+from .manifest import (
+    MAX_MANIFEST,
+    VERSION,
+    Bound,
+    Manifest,
+    ManifestNode,
+    Run,
+    chunk_files,
+    parse,
+    run_violations,
+    serialise,
+    violations,
+)
 
 Index = NDArray[np.int64]
 

@@ -1,24 +1,38 @@
 """The manifest of Streamed SOG, lod-meta.json, as it is read and written.
 
-Parsing checks what reading needs; all other rules of the format are in `manifest_rules`, so that a file which breaks
-them can be reported on.
+Parsing checks what reading needs; all other rules, of the manifest, chunk files and their splats, are checked for
+reports and for the reader, so that a file which breaks them can be reported on.
 """
 
 from __future__ import annotations
 
 import decimal
 import functools
+import itertools
 import json
+import math
+import posixpath
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, BinaryIO
 
-from ...system.errors import VersionError
+import numpy as np
+
+from ...model.morton import order_of_cells
+from ...model.splats import FloatArray, Splats
+from ...system.errors import FormatError, VersionError
+from ...system.progress import Progress, silent
+from ...system.units import count_of
 from ...system.untrusted import Json, quoted_value
 from .. import quantize
-from ..formats import MANIFEST
-from ..reader import FileNote, read_note
-from ..rules import nodes_of, parse_manifest, place_of
+from ..formats import MANIFEST, ZIP
+from ..merging import Chunk, SceneFiles, not_finite
+from ..reader import FileNote, OpenCompanion, code_of, read_note
+from ..rules import RuleViolation, count_outside, leads_away, nodes_of, parse_manifest, place_of
+from ..sog import codec as sog
+from ..sog import texel_codings
+from ..sog.sog_container import MAX_META, image_names, parse_meta
 
 #: The version that is read and written. A manifest from before versions has none.
 VERSION = 1
@@ -216,3 +230,326 @@ def _json_list(texts: Any) -> str:
 
 def _json(value: Mapping[str, Any]) -> str:
     return json.dumps(value, separators=(",", ":"))
+
+
+#: Meaning of each code; the text of a violation has the values. Values of the wrong kind, which
+#: the parser refuses, have the codes "container.corrupt" and "container.version", as in other formats.
+ERRORS = {
+    "streamed-sog.nodes": "a node of the tree has neither two children nor runs, or it has both",
+    "streamed-sog.bounds": "a bound is missing, not finite, or begins beyond its end",
+    "streamed-sog.union": "the bound of an inner node is not the union of its children's",
+    "streamed-sog.extents": "splats of a region lie outside of its bound",
+    "streamed-sog.errors": "errors are not one a level, finite, from 0 on, 0 at level 0 and never decreasing",
+    "streamed-sog.counts": "count or counts is not the sum of the runs",
+    "streamed-sog.filenames": "the name of a chunk file leads elsewhere, or is there twice",
+    "streamed-sog.chunk-files": "a chunk file is missing, damaged or no SOG",
+    "streamed-sog.mixed": "a chunk file has runs of more than one detail level",
+    "streamed-sog.runs": "the runs in a chunk file overlap, leave a gap, or are not all of its splats",
+    "streamed-sog.environment": "the environment is missing, damaged or no SOG",
+}
+WARNINGS = {
+    "streamed-sog.old": "version, count or counts is missing, as in files from before version 1",
+    "streamed-sog.unused": "no region refers to a chunk file",
+    "streamed-sog.full-detail": "a region has no splats at level 0, so that it never has full detail",
+    "streamed-sog.coarsest": "a region has no splats at the coarsest level, and disappears where a viewer asks for it",
+    "streamed-sog.decreasing": "a detail level has no fewer splats than the level before",
+    "streamed-sog.lod-errors": "lodErrors does not say whether the regions have errors, or only some of them have",
+    "streamed-sog.kind": "SH degree or antialias of a chunk file is not that of the first one",
+    "streamed-sog.order": "the splats of a run are not in Morton order",
+}
+
+#: By how much two equal bounds may differ, as a share of their largest number: seven digits are written.
+ROUNDING = 1e-5
+
+
+def broken(code: str, text: str, *, fatal: bool = True) -> RuleViolation:
+    """Return a violation by the last part of its code."""
+    return RuleViolation(f"streamed-sog.{code}", text, fatal)
+
+
+def regions_of(manifest: Manifest) -> Iterator[tuple[int, Mapping[int, Run], ManifestNode]]:
+    """Return the number of each region, its runs, and its node; not the leaves of a broken tree that have no runs."""
+    return ((number, node.runs, node) for number, node in manifest.regions() if node.runs is not None)
+
+
+def is_box(bound: Bound) -> bool:
+    """Return True if no end of a bound is below its beginning."""
+    return all(low <= high for low, high in zip(*bound, strict=True))
+
+
+def violations(manifest: Manifest) -> Iterator[RuleViolation]:
+    """Yield the broken rules of a manifest."""
+    yield from _node_violations(manifest)
+    yield from _name_violations(manifest)
+    yield from run_violations(manifest)
+    yield from _count_violations(manifest)
+    yield from _level_violations(manifest)
+    yield from _union_violations(manifest)
+    yield from _error_violations(manifest)
+
+
+def file_violations(manifest: Manifest, files: Mapping[str, Chunk | str]) -> Iterator[RuleViolation]:
+    """Yield the broken rules about `files`: by name, what the meta.json of each says, or why it cannot be read."""
+    ends = [0] * len(manifest.filenames)
+    for _, runs, _ in regions_of(manifest):
+        for run in runs.values():
+            ends[run.file] = max(ends[run.file], run.offset + run.count)
+    first: Chunk | None = None
+    for name, end in zip(manifest.filenames, ends, strict=True):
+        found = files.get(name)
+        if isinstance(found, str):
+            yield broken("chunk-files", found)
+        elif found is not None:
+            yield from _about(found)
+            if end and found.count != end:
+                text = f"{quoted_value(name)} has {count_of(found.count, 'splat')}, but its runs end at {end:,}"
+                yield broken("runs", text)
+            first = first or found
+            if (found.sh_degree, found.antialiased) != (first.sh_degree, first.antialiased):
+                text = f"{quoted_value(name)} has {_kind_of(found)}; the first chunk file has {_kind_of(first)}"
+                yield broken("kind", text, fatal=False)
+    environment = None if manifest.environment is None else files.get(manifest.environment)
+    if isinstance(environment, str):
+        yield broken("environment", environment)
+    elif environment is not None:
+        yield from _about(environment)
+
+
+def _about(file: Chunk) -> Iterator[RuleViolation]:
+    """Yield the notes on a chunk file as violations."""
+    for note in file.notes:
+        if (code := code_of(note)) is not None:
+            yield RuleViolation(code, f"{quoted_value(file.name)}: {note}", fatal=False)
+
+
+def _kind_of(file: Chunk) -> str:
+    return f"SH degree {file.sh_degree} and {'' if file.antialiased else 'no '}antialias"
+
+
+def _node_violations(manifest: Manifest) -> Iterator[RuleViolation]:
+    for number, node in enumerate(manifest.nodes):
+        if len(node.children) not in (0, 2) or bool(node.children) == (node.runs is not None):
+            having = count_of(len(node.children), "child", "children")
+            place = manifest.place(number)  # not of every node: there may be many, and deep ones
+            text = f"{place} has {having} and {'no ' * (node.runs is None)}lods; a node has two children or lods"
+            yield broken("nodes", text)
+        if node.bound is None:
+            yield broken("bounds", f"{manifest.place(number)} has no bound of six numbers that are finite in float32")
+        elif not is_box(node.bound):
+            text = f"the bound of {manifest.place(number)} is {_text(node.bound)}, the wrong way round"
+            yield broken("bounds", text, fatal=False)
+
+
+def _name_violations(manifest: Manifest) -> Iterator[RuleViolation]:
+    for name, times in Counter(manifest.filenames).items():
+        if leads_away(name):
+            text = f"filenames has {quoted_value(name)}, which is not a file below the folder of the manifest"
+            yield broken("filenames", text)
+        if times > 1:
+            yield broken("filenames", f"filenames has {quoted_value(name)} {times:,} times")
+    if manifest.environment is not None and leads_away(manifest.environment):
+        text = f"environment is {quoted_value(manifest.environment)}, which is not below the folder of the manifest"
+        yield broken("environment", text)
+
+
+def run_violations(manifest: Manifest) -> Iterator[RuleViolation]:
+    """Check the runs in each chunk file, which hold one level and lie end to end."""
+    by_file: list[list[tuple[int, int, int, int]]] = [[] for _ in manifest.filenames]
+    for number, held, _ in regions_of(manifest):
+        for level, run in held.items():
+            if run.count:
+                by_file[run.file].append((run.offset, run.count, level, number))
+    for name, runs in zip(manifest.filenames, by_file, strict=True):
+        if not runs:
+            yield broken("unused", f"no region refers to {quoted_value(name)}", fatal=False)
+        levels = sorted({level for _, _, level, _ in runs})
+        if len(levels) > 1:
+            text = f"{quoted_value(name)} has runs of the levels {', '.join(map(str, levels))}"
+            yield broken("mixed", text, fatal=False)
+        at = 0
+        for offset, count, level, number in sorted(runs):
+            if offset != at:
+                where = f"{manifest.place(number)}.lods.{level} begins at splat {offset:,} of {quoted_value(name)}"
+                yield broken("runs", f"{where}, but the run before it ends at {at:,}")
+            at = max(at, offset + count)
+
+
+def _count_violations(manifest: Manifest) -> Iterator[RuleViolation]:
+    missing = [name for name in ("version", "count", "counts") if manifest.head.get(name) is None]
+    if missing:
+        yield broken("old", f"it has no {', '.join(missing)}, as before version 1", fatal=False)
+    held = [0] * manifest.levels
+    for _, runs, _ in regions_of(manifest):
+        for level, run in runs.items():
+            held[level] += run.count
+    counts = manifest.head.get("counts")
+    if counts is not None and counts != held:
+        text = f"counts is {quoted_value(counts)}, but the runs have {quoted_value(held)} splats"
+        yield broken("counts", text, fatal=False)
+    count = manifest.head.get("count")
+    if count is not None and count != sum(held):
+        text = f"count is {quoted_value(count)}, but the runs have {count_of(sum(held), 'splat')}"
+        yield broken("counts", text, fatal=False)
+    for level, (finer, coarser) in enumerate(itertools.pairwise(held), 1):
+        if coarser >= finer:
+            text = f"level {level} has {count_of(coarser, 'splat')}, level {level - 1} has {finer:,}"
+            yield broken("decreasing", text, fatal=False)
+
+
+def _level_violations(manifest: Manifest) -> Iterator[RuleViolation]:
+    """Check the levels that each region has."""
+    for number, runs, _ in regions_of(manifest):
+        held = {level for level, run in runs.items() if run.count}
+        if 0 not in held:
+            yield broken("full-detail", f"{manifest.place(number)} has no splats at level 0", fatal=False)
+        last = manifest.levels - 1
+        if last not in held:
+            yield broken("coarsest", f"{manifest.place(number)} has no splats at level {last}", fatal=False)
+
+
+def _union_violations(manifest: Manifest) -> Iterator[RuleViolation]:
+    for number, node in enumerate(manifest.nodes):
+        below = [bound for child in node.children if (bound := manifest.nodes[child].bound) is not None]
+        if node.bound is None or not below or len(below) != len(node.children) or not all(map(is_box, below)):
+            continue
+        low = [min(bound[0][axis] for bound in below) for axis in range(3)]
+        high = [max(bound[1][axis] for bound in below) for axis in range(3)]
+        size = max(map(abs, (*low, *high)))
+        given = (*node.bound[0], *node.bound[1])
+        if any(abs(a - b) > ROUNDING * size for a, b in zip(given, (*low, *high), strict=True)):
+            children = _text(((low[0], low[1], low[2]), (high[0], high[1], high[2])))
+            text = (
+                f"the bound of {manifest.place(number)} is {_text(node.bound)}, but that of its children is {children}"
+            )
+            yield broken("union", text, fatal=False)
+
+
+def _text(bound: Bound) -> str:
+    return " to ".join(" ".join(f"{x:.7g}" for x in corner) for corner in bound)
+
+
+def _error_violations(manifest: Manifest) -> Iterator[RuleViolation]:
+    regions = list(regions_of(manifest))
+    for number, runs, node in regions:
+        if node.errors is not None and (wrong := _wrong_errors(node.errors, runs, manifest.levels)) is not None:
+            text, fatal = wrong
+            place = f"{manifest.place(number)}.errors is {quoted_value(node.errors)}"
+            yield broken("errors", f"{place}, {text}", fatal=fatal)
+    having = sum(node.errors is not None for _, _, node in regions)
+    says = manifest.head.get("lodErrors")
+    if 0 < having < len(regions):
+        text = f"{having:,} of {count_of(len(regions), 'region')} have errors"
+        yield broken("lod-errors", text, fatal=False)
+    elif bool(having) != bool(says):
+        text = f"lodErrors is {quoted_value(says)}, but {'all' if having else 'no'} regions have errors"
+        yield broken("lod-errors", text, fatal=False)
+
+
+def _wrong_errors(errors: Any, runs: Mapping[int, Run], levels: int) -> tuple[str, bool] | None:
+    """Return what is wrong with the errors of a region, and if that is fatal. Levels without splats do not count."""
+    if not isinstance(errors, list) or len(errors) != levels:
+        return f"not one for each of {count_of(levels, 'level')}", True
+    if not all(type(each) in (int, float) and math.isfinite(each) and each >= 0 for each in errors):
+        return "not finite numbers from 0 on", True
+    if errors[0]:
+        return "not 0 at level 0", False
+    held = [errors[level] for level, run in sorted(runs.items()) if run.count]
+    return ("which decrease", False) if held != sorted(held) else None
+
+
+#: Cells along each axis in which the order of a run is looked at; writers sort by as many, or by more.
+CELLS = 1 << 10
+
+#: Share of a run's splats that may come after one that they precede, since codes move centres into the next cell: in
+#: files of splat-transform it is up to 0.009, in no order at all 0.5. And the least number of them that is told of.
+OUT_OF_ORDER, FEW = 0.05, 16
+
+
+def chunk_files(open_companion: OpenCompanion | None) -> SceneFiles:
+    """Return the SOG scenes beside a manifest, which names the meta.json of each."""
+    return SceneFiles(
+        open_companion, MANIFEST, "streamed-sog.chunk-files", lambda name, source: sog.open_content(source)
+    )
+
+
+def files_of_chunk(open_companion: OpenCompanion, name: str) -> list[str]:
+    """Return the files that a chunk is read from: its meta.json and then its images, or itself where it is bundled.
+
+    Raises:
+        FormatError: it cannot be opened, or is no meta.json.
+    """
+    with open_companion(name) as file:
+        data = file.read(MAX_META + 1)
+    if data.startswith(ZIP):
+        return [name]
+    return [name, *(posixpath.join(posixpath.dirname(name), image) for image in image_names(parse_meta(data)))]
+
+
+def scan_files(
+    file: BinaryIO, open_companion: OpenCompanion
+) -> tuple[Manifest, dict[str, Chunk | str], list[RuleViolation]]:
+    """Read the manifest, each file that it names, or why that cannot be read, and the rules that they break.
+
+    Raises:
+        FormatError: the manifest cannot be parsed.
+    """
+    manifest = parse(file.read(MAX_MANIFEST + 1))
+    found, beside = list(violations(manifest)), chunk_files(open_companion)
+    files: dict[str, Chunk | str] = {}
+    for name in manifest.names():
+        if leads_away(name):
+            continue  # a violation says so
+        try:
+            files[name] = beside.open(name)
+        except FormatError as error:
+            files[name] = str(error)
+    return manifest, files, [*found, *file_violations(manifest, files)]
+
+
+def scan_splats(
+    open_companion: OpenCompanion,
+    manifest: Manifest,
+    chunks: Mapping[str, Chunk],
+    *,
+    threads: int = 1,
+    progress: Progress = silent,
+) -> Iterator[RuleViolation]:
+    """Yield the rules about splats that chunk files break, see `SceneFiles.violations`."""
+    runs: dict[str, list[tuple[int, int, Run]]] = {name: [] for name in manifest.filenames}
+    for number, held, _ in regions_of(manifest):
+        for level, run in held.items():
+            runs[manifest.filenames[run.file]].append((number, level, run))
+
+    def broken_by(chunk: Chunk, splats: Splats) -> Iterator[RuleViolation]:
+        here = runs[chunk.name]
+        # Those of level 0 are found by the report on the scene, which they are.
+        if any(level for _, level, _ in here) and (violation := not_finite(chunk, splats)) is not None:
+            yield violation
+            return
+        steps = np.ptp(texel_codings.sign_log(splats.center), axis=0) / texel_codings.LAST_WORD if len(splats) else 0.0
+        for number, level, run in here:
+            part = splats.take(slice(run.offset, run.offset + run.count))
+            subject = f"{manifest.place(number)} at level {level}"
+            bound = manifest.nodes[number].bound
+            outside = count_outside(part, np.array(bound), steps) if bound is not None and is_box(bound) else 0
+            if outside:
+                text = f"{count_of(outside, 'splat')} of {subject} lie outside of its bound"
+                yield broken("extents", text, fatal=False)
+            descents = _descents(part.center)
+            if descents > max(FEW, OUT_OF_ORDER * run.count):
+                text = f"{descents:,} of {count_of(run.count, 'splat')} of {subject} come after one that they precede"
+                yield broken("order", text, fatal=False)
+
+    named = [chunks[name] for name in manifest.filenames if name in chunks]
+    return chunk_files(open_companion).violations(named, broken_by, threads, progress)
+
+
+def _descents(center: FloatArray) -> int:
+    """Return how many splats come after one that they precede on the Morton curve."""
+    wide = center.astype(np.float64)
+    low, extent = wide.min(axis=0, initial=np.inf), np.ptp(wide, axis=0) if len(wide) else 0
+    scaled = (wide - low) / np.where(extent > 0, extent, 1) * CELLS
+    order = order_of_cells(np.minimum(scaled, CELLS - 1).astype(np.uint32))
+    rank = np.empty(len(order), np.int64)
+    rank[order] = np.arange(len(order))
+    return int(np.count_nonzero(np.diff(rank) < 0))
