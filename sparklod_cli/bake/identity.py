@@ -19,6 +19,7 @@ from .. import __version__
 from ..cameras.formats.table import NAMES
 from ..io.local_files import companions
 from ..io.reading import Source, file_of, placement_of, places_of, readable
+from ..model.transforms import Transform
 from ..system.addresses import Address, Place
 from ..system.errors import UnreadableError
 from ..system.stdio import DASH, name_of
@@ -112,6 +113,7 @@ class BakeIdentity:
             except UnreadableError as error:  # the caller names the source
                 raise UnreadableError(f"{name}{error}") from None
             states.append(state)
+        settings = dataclasses.replace(settings, transform=settings.transform or Transform())
         values = {name: value for name, value in _flat("", settings) if name not in NO_PART}
         return cls(tuple(states), {PROGRAM: __version__, **values, **placement_of(source)})
 

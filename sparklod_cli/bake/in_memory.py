@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,12 +19,14 @@ from ..model.lod_tree import LodTree
 from ..model.scene import Scene, rotated_axis
 from ..model.selection import Selection, SelectionTally
 from ..model.splats import Splats
-from ..model.transforms import Transform
 from ..system.errors import FormatError, InvalidSplatsError, naming
 from ..system.progress import Progress
 from ..system.threads import on_threads
 from .settings import BakeSettings, BuiltTree, Clock
 from .tree_output import output_of_existing_tree
+
+if TYPE_CHECKING:
+    from ..model.transforms import Transform
 
 
 @dataclass
@@ -54,7 +57,8 @@ class InMemory:
         if settings.environment is not None:
             tree.environment = read_environment(settings, threads, progress)
         antialiased, up = scene.antialiased, settings.up or scene.up
-        up = rotated_axis(up, settings.transform.rotation) if up else None
+        if settings.transform is not None:
+            up = rotated_axis(up, settings.transform.rotation)
         if scene.tree is not None:
             tree.output, tree.is_ordered = output_of_existing_tree(tree.output, self.source, scene)
             check_valid(scene.splats, threads)
@@ -67,7 +71,8 @@ class InMemory:
         far = None
         if settings.environment_beyond is not None:
             splats, far = split_environment(splats, settings.environment_beyond)
-        splats = transformed(splats, settings.transform, threads)
+        if settings.transform is not None:
+            splats = transformed(splats, settings.transform, threads)
         if far is not None and tree.environment is None:
             tree.environment = transformed(far, settings.transform, threads)
         self.clock.end("read")
@@ -151,9 +156,9 @@ def select(
     return (splats if keep.all() else splats.take(keep)), tally
 
 
-def transform(splats: Splats, settings: Transform, threads: int = 1) -> tuple[Splats, int]:
+def transform(splats: Splats, settings: Transform | None, threads: int = 1) -> tuple[Splats, int]:
     """Turn, scale and move splats; return them and how many left the range of float32."""
-    turned = settings.apply(splats)
+    turned = splats if settings is None else settings.apply(splats)
     if turned is splats or is_valid_and_visible(turned, threads)[0]:
         return turned, 0
     return turned, int(np.count_nonzero(~turned.is_valid()))
@@ -167,10 +172,8 @@ def check_transformed(beyond: int) -> None:
         )
 
 
-def transformed(splats: Splats, settings: Transform, threads: int = 1) -> Splats:
+def transformed(splats: Splats, settings: Transform | None, threads: int = 1) -> Splats:
     """Turn, scale and move splats; fail where one leaves the range of float32."""
-    if settings.is_identity:
-        return splats
     turned, beyond = transform(splats, settings, threads)
     check_transformed(beyond)
     return turned

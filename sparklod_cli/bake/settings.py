@@ -14,7 +14,6 @@ from ..lod.builders import DEFAULT_BASE, DEFAULT_GROWTH, METHODS
 from ..model import MAX_SH_DEGREE
 from ..model.scene import NodeStream, Scene
 from ..model.selection import Selection
-from ..model.transforms import Transform
 
 if TYPE_CHECKING:
     from ..codecs.encoder import Clamp
@@ -22,6 +21,7 @@ if TYPE_CHECKING:
     from ..fitting.settings import FitSettings
     from ..lod.part_settings import DetailSettings, TileSettings
     from ..model.splats import Splats
+    from ..model.transforms import Transform
     from ..system.addresses import Place
     from .parts_output import WrittenDetail, WrittenTiles
     from .simplifying import Refined, SimplifyGoal, WrittenSet
@@ -40,7 +40,7 @@ class BakeSettings:
         growth: of quality, the largest number of nodes for each leaf, 1.05 to 2.0.
         max_sh: the highest SH degree that is kept.
         selection: its coordinates are those of the input.
-        transform: of the splats that are kept.
+        transform: of the splats that are kept; None for the identity.
         up: axis of the input that points up, one of `scene.AXES`, which `transform` may have turned to another; None
             for that of the file.
         rgba: a file of colours and opacities that replace the splats' own, see `io.read_rgba`.
@@ -65,7 +65,7 @@ class BakeSettings:
     growth: float = DEFAULT_GROWTH
     max_sh: int = MAX_SH_DEGREE
     selection: Selection = field(default_factory=Selection)
-    transform: Transform = field(default_factory=Transform)
+    transform: Transform | None = None
     up: str | None = None
     rgba: Path | None = None
     suffix: str = SPZ

@@ -19,7 +19,6 @@ from ..codecs.formats import FORMATS, NPZ, RAW_SUFFIXES, ZIP, Format, head_of, l
 from ..codecs.reader import OpenCompanion, OpenFile, Reader, Target
 from ..model.scene import Scene
 from ..model.splats import COLUMNS
-from ..model.transforms import Transform
 from ..system import atomic
 from ..system.addresses import Address, Place, absolute
 from ..system.errors import FormatError, OutputError, UnknownFormatError, UnreadableError, naming, reason_of
@@ -31,6 +30,7 @@ from .local_files import in_folder, open_named, reason_unreadable
 if TYPE_CHECKING:
     from ..codecs.gpu import dump
     from ..model.instances import Instance
+    from ..model.transforms import Transform
     from ..model.traversed import DetailScene, TileScene
 
 #: Files of one scene that stay open, and files that are opened again and stay open: each has a palette of up to 12 MB.
@@ -54,6 +54,8 @@ class Merged:
     @classmethod
     def of(cls, places: Sequence[Place]) -> Merged:
         """Return files where their own coordinates put them."""
+        from ..model.transforms import Transform
+
         return cls(tuple((place, Transform()) for place in places))
 
     @classmethod

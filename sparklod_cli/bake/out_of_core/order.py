@@ -264,7 +264,8 @@ def node_stream(job: Job, count: int) -> NodeStream:
     """Return the nodes of an ordered tree."""
     read = functools.partial(_read, job.store, width_of(job.sh_degree))
     up = job.settings.up or job.stream.up
-    up = rotated_axis(up, job.settings.transform.rotation) if up else None
+    if job.settings.transform is not None:
+        up = rotated_axis(up, job.settings.transform.rotation)
     return NodeStream(count, job.sh_degree, job.stream.antialiased, read, up)
 
 

@@ -144,14 +144,21 @@ class SceneOptions:
     def settings(self) -> dict[str, Any]:
         """Return the fields of `BakeSettings` for the scene; loads numpy."""
         from ...model.selection import Selection
-        from ...model.transforms import Transform
 
-        try:
-            transform = Transform.from_parts(
-                up=self.up or UP_AXES[0], rotate=self.rotate, scale=self.scale, translate=self.translate
-            )
-        except ValueError as error:
-            raise click.UsageError(str(error)) from None
+        parts: dict[str, Any] = {
+            "up": self.up or UP_AXES[0],
+            "rotate": self.rotate,
+            "scale": self.scale,
+            "translate": self.translate,
+        }
+        transform = None
+        if parts != {"up": UP_AXES[0], "rotate": (0, 0, 0), "scale": 1, "translate": (0, 0, 0)}:
+            from ...model.transforms import Transform
+
+            try:
+                transform = Transform.from_parts(**parts)
+            except ValueError as error:
+                raise click.UsageError(str(error)) from None
         selection = Selection(
             drop_invalid=self.on_invalid == "drop",
             min_opacity=self.min_opacity,
