@@ -20,7 +20,8 @@ from sparklod_cli.cameras.framing import framing
 from sparklod_cli.images.metrics import psnr
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.render.rasterizer import Image, ShadedSplats, shade
-from sparklod_cli.render.settings import BACKENDS, RasterSettings
+from sparklod_cli.render.renderer import MODULES
+from sparklod_cli.render.settings import RasterSettings
 from sparklod_cli.system.errors import SparklodError
 
 HEADINGS = (
@@ -56,8 +57,7 @@ def draw_function(spec: str) -> Draw:
             options[key] = float(value)
         except ValueError:
             options[key] = value
-    backend = BACKENDS[name]
-    return partial(import_module(backend.module, "sparklod_cli.render").draw, **options) if options else backend.draw
+    return partial(import_module(MODULES[name], "sparklod_cli.render").draw, **options)
 
 
 def orbit(splats: Splats, distance: float, size: tuple[int, int], frames: int) -> Iterator[Camera]:
@@ -135,8 +135,8 @@ def main() -> None:
     arguments = parser.parse_args()
     specs = [spec for spec in dict.fromkeys(arguments.backends) if spec != REFERENCE]
     for spec in specs:
-        if spec.partition(":")[0] not in BACKENDS:
-            parser.error(f"{spec} is not a backend; choose from {', '.join(BACKENDS)}")
+        if spec.partition(":")[0] not in MODULES:
+            parser.error(f"{spec} is not a backend; choose from {', '.join(MODULES)}")
     print(f"Machine: {machine()}. Paths of {arguments.frames} frames: the least PSNR, the median time.\n")
     print("| " + " | ".join(HEADINGS) + " |")
     print("|---" * len(HEADINGS) + "|")

@@ -18,8 +18,7 @@ from ..codecs.losses import Losses, settled_with_losses
 from ..codecs.options import WriteOptions
 from ..codecs.reader import check_valid
 from ..codecs.spz import like
-from ..fitting.report import FitReport
-from ..fitting.settings import FitSettings
+from ..fitting.settings import FitReport, FitSettings
 from ..images.metrics import MOST_PSNR
 from ..io import read_scene
 from ..io.writing import encoded, scene_output, write_scene

@@ -15,8 +15,7 @@ import click
 from ..codecs.formats import ROUND_TRIPS
 from ..images.output import JPEG_QUALITY, MOVING, STILL, THUMBNAIL_SIZE, THUMBNAIL_SUPERSAMPLE
 from ..model import MAX_SH_DEGREE
-from ..render.devices import uses_card
-from ..render.settings import OF_PIXELS, SORTINGS, RenderSettings
+from ..render.settings import OF_PIXELS, SORTINGS, RenderSettings, uses_card
 from ..system.setting_fields import Range, setting, whole
 from ..system.units import format_size
 from .command import COLOR, COMMON, Command, check_declared, flag, flags_set, is_set, refuse, values_of

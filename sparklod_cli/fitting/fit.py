@@ -7,22 +7,18 @@ import itertools
 import math
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..model.lod_tree import LodTree
 from ..model.splats import Splats
-from ..render import gradients
-from ..render.devices import uses_card
-from ..render.settings import RasterSettings
+from ..render.settings import RasterSettings, uses_card
 from ..system.errors import BackendError
 from ..system.progress import Progress, silent
 from ..system.threads import on_threads
 from ..system.units import percent_of
-from .kernels import adam
 from .kernels.adam import Rates
+from .optimiser import Optimiser
 from .pictures import (
     HELD_OUT,
     TRAINING,
@@ -40,8 +36,7 @@ from .pictures import (
     scores_of,
     split_path,
 )
-from .report import FitReport, FitStage
-from .settings import FitSettings
+from .settings import FitReport, FitSettings, FitStage
 
 #: Stages, after each of which held-out cameras decide.
 STAGES = 12
@@ -51,51 +46,6 @@ RATES, LAST = Rates(0.006, 0.012, 0.003, 0.006, 0.006, 0.0012), 0.02
 
 #: Steps unless given: the most, the least, and their number times that of the leaves. Chosen.
 MOST_BY_DEFAULT, LEAST_BY_DEFAULT, WORK = 12_000, 1000, 3_000_000_000
-
-
-class Optimiser:
-    """Adam for the merged splats of a tree, each with its own count of steps."""
-
-    def __init__(self, nodes: FittedNodes) -> None:
-        self.nodes = nodes
-        self._moved: list[Any] = []
-        count, terms = len(nodes.fitted), nodes.columns.sh.shape[1]
-        self._slots = slots_of(nodes)
-        self._moments = adam.Moments(
-            np.zeros((count, adam.FIRST), np.float32),
-            np.zeros((count, terms, 3), np.float32),
-            np.zeros((count, adam.SECOND), np.float32),
-            np.zeros(count, np.int32),
-        )
-
-    def step(self, picture: FullDetailPicture, index: Index, rates: adam.Rates) -> None:
-        nodes, camera = self.nodes, picture.camera
-        seen, shaded = nodes.visible(index, camera)
-        drawing = gradients.draw(shaded, camera, nodes.raster)
-        found = drawing.gradients(picture.gradient(drawing.image))
-        terms = nodes.columns.sh.shape[1]
-        rgb, sh = gradients.by_sh(shaded.center, camera.position, terms, shaded.rgb, found.rgb)
-        derivatives = found.center, found.log_scale, found.turn, found.lod_opacity, rgb, sh
-        columns = adam.Gradients(*map(np.ascontiguousarray, derivatives))
-        rates = adam.Rates(*map(np.float32, rates))
-        adam.step(len(seen), nodes.columns, nodes.old, seen, self._slots, columns, rates, self._moments, nodes.bounds)
-        self._moved.append(seen)
-
-    def place(self) -> None:
-        """Update the nodes that cuts are found with, by the steps since the last call."""
-        for seen in self._moved:
-            self.nodes.renew(seen)
-        self._moved.clear()
-
-    def synchronize(self) -> None:
-        """Update the columns of the nodes, which are always up to date here."""
-
-
-def slots_of(nodes: FittedNodes) -> NDArray[np.int32]:
-    """Return the row of each node in `Moments`, -1 for those that do not change."""
-    slots = np.full(len(nodes.tree), -1, np.int32)
-    slots[nodes.fitted] = np.arange(len(nodes.fitted), dtype=np.int32)
-    return slots
 
 
 class Schedule:
@@ -323,6 +273,6 @@ class _Fitting:
 def _optimiser_on(device: str, nodes: FittedNodes, say: Callable[[str], None]) -> Optimiser:
     if not uses_card(device, say):
         return Optimiser(nodes)
-    from .cuda.optimiser import CardOptimiser
+    from .cuda.card_optimiser import CardOptimiser
 
     return CardOptimiser(nodes)

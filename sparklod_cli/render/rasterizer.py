@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,21 +47,16 @@ def shade(parts: Sequence[tuple[Splats, Matrix]], camera: Camera) -> ShadedSplat
 
     Spherical harmonics are those of the direction from the camera to a splat's centre, in the space of its object.
     """
-    shaded = [_shade(splats, matrix, camera) for splats, matrix in parts]
-    return ShadedSplats(
-        **{field.name: np.concatenate([getattr(part, field.name) for part in shaded]) for field in fields(ShadedSplats)}
-    )
-
-
-def _shade(splats: Splats, matrix: Matrix, camera: Camera) -> ShadedSplats:
-    rgb = splats.rgb.copy()
-    if splats.sh.shape[1]:
-        eye = np.linalg.solve(matrix, np.append(camera.position, 1))[:3].astype(np.float32)
-        add_sh(len(rgb), splats.center, splats.sh, eye, COEFFICIENTS.index(splats.sh.shape[1]), rgb)
-    np.maximum(rgb, 0, out=rgb)
-    if not np.array_equal(matrix, np.eye(4)):
-        splats = placed(splats, matrix)
-    return ShadedSplats(splats.center, splats.scale, splats.quat_xyzw, lod_opacity(splats.opacity), rgb)
+    shaded = []
+    for splats, matrix in parts:
+        rgb = splats.rgb.copy()
+        if splats.sh.shape[1]:
+            eye = np.linalg.solve(matrix, np.append(camera.position, 1))[:3].astype(np.float32)
+            add_sh(len(rgb), splats.center, splats.sh, eye, COEFFICIENTS.index(splats.sh.shape[1]), rgb)
+        np.maximum(rgb, 0, out=rgb)
+        there = splats if np.array_equal(matrix, np.eye(4)) else placed(splats, matrix)
+        shaded.append((there.center, there.scale, there.quat_xyzw, lod_opacity(there.opacity), rgb))
+    return ShadedSplats(*map(np.concatenate, zip(*shaded, strict=True)))
 
 
 Image = NDArray[np.float32]
@@ -162,7 +157,8 @@ def tiles_across(camera: Camera) -> tuple[int, int]:
 def project_splats(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> Projected:
     """Project splats onto the screen; `screen` and `boxes` are buffers, which the next call overwrites."""
     tiles_across(camera)
-    count, memory = len(splats), _working_memory  # kept by each thread, as the first access to new memory is slow
+    count = len(splats.center)
+    memory = _working_memory  # kept by each thread, as the first access to new memory is slow
     if len(getattr(memory, "keys", ())) < count:
         floats = np.empty((count + 1) * project.COLUMNS, np.float32)
         first = -floats.ctypes.data % CACHE_LINE // floats.itemsize  # each row is one line of the processor's cache

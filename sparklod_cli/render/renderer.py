@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 import threading
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,12 +17,18 @@ from ..model.gaussian import size_factor
 from ..scenes.finder import CutSource
 from ..scenes.loaded import Cut
 from ..system.progress import Progress, silent
-from . import color_by, rasterizer
-from .color_by import Scale
-from .devices import uses_card
+from . import rasterizer
 from .kernels.raster import count_fragments, draw_discs
 from .rasterizer import Image, ShadedSplats, shade
-from .settings import BACKENDS, CLIP, ON_CARD, RasterSettings, RenderSettings
+from .settings import CLIP, RasterSettings, RenderSettings, uses_card
+
+if TYPE_CHECKING:
+    from .color_by import Scale
+
+#: The device that draws instead of the backend numba where a card is used, and modules of all that draw: each has a
+#: function `draw`.
+ON_CARD = "cuda"
+MODULES = {"numba": ".rasterizer", ON_CARD: ".cuda.rasterizer", "osmesa": ".gl.osmesa", "open3d": ".open3d.backend"}
 
 #: Held while kernels run on all threads: they do not share them, and not every layer of threads survives their trying.
 _KERNELS = threading.Lock()
@@ -64,14 +70,16 @@ class Renderer:
         self.source, self.settings = source, settings
         if settings.device == "cuda" and settings.backend != "numba":
             raise ValueError(f"device is 'cuda'; the backend numba draws on cards, not {settings.backend}")
-        on_card = settings.backend == "numba" and uses_card(settings.device)
+        on_card = settings.backend == "numba" and settings.device != "cpu" and uses_card(settings.device)
         self._backend = ON_CARD if on_card else settings.backend
-        self.scale = self._scale(cameras, progress)
+        # The largest radius counts in pixels of the finer picture, which is the one that is shaded.
+        self._raster = replace(settings.raster, max_radius=settings.raster.max_radius * settings.supersample)
+        by = settings.color_by
+        self.scale = None if by is None else self._scale(by, cameras, progress)
 
-    def _scale(self, cameras: Sequence[Camera], progress: Progress) -> Scale | None:
-        by = self.settings.color_by
-        if by is None:
-            return None
+    def _scale(self, by: str, cameras: Sequence[Camera], progress: Progress) -> Scale:
+        from . import color_by
+
         if by == "depth":
             return color_by.scale_of_depth(self.source, cameras, self.settings.raster)
         if by == "overdraw":
@@ -82,35 +90,35 @@ class Renderer:
     def draw(self, camera: Camera) -> DrawnPicture:
         """Draw the picture of a camera; raise `BackendError` if the backend cannot draw here."""
         cut = self.source.cut(camera)
-        by = self.settings.color_by
+        by, times, top = self.settings.color_by, self.settings.supersample, 1.0
         if by == "overdraw":
             values = self._overdraw(cut, camera)
             return DrawnPicture(self._colored(values, (values > 0).astype(np.float32)), values, len(cut))
-        if by == "depth":
-            values, alpha = self._depth(cut, camera)
-            return DrawnPicture(self._colored(values, alpha), values, len(cut))
-        fine = finer(camera, self.settings.supersample)
+        fine = finer(camera, times) if times > 1 else camera
         with _KERNELS:
             shaded = self._shaded(cut, fine)
-            if self.scale is not None and by is not None:
-                rgb = [self.scale.rgb(color_by.values_of(by, part)) for part in cut.parts]
-                shaded = dataclasses.replace(shaded, rgb=np.concatenate(rgb))
-            image = self._image(shaded, fine)
-        return DrawnPicture(averaged(image, self.settings.supersample), None, len(cut))
+            if by == "depth":
+                shaded, top = colored_by_depth(shaded, fine, self.settings.raster)
+            elif self.scale is not None and by is not None:
+                from .color_by import values_of
+
+                rgb = [self.scale.rgb(values_of(by, part)) for part in cut.parts]
+                shaded = replace(shaded, rgb=np.concatenate(rgb))
+            style, options = self.settings.style, self.settings.options
+            image = draw_styled(style, self._backend, shaded, fine, self._raster, options)
+        if times > 1:
+            image = averaged(image, times)
+        if by != "depth":
+            return DrawnPicture(image, None, len(cut))
+        alpha = image[..., 3]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            mean = np.where(alpha > 0, image[..., 0] / alpha * np.float32(top), np.float32(np.nan))
+        depth = mean.astype(np.float32)
+        return DrawnPicture(self._colored(depth, alpha), depth, len(cut))
 
     def _shaded(self, cut: Cut, camera: Camera) -> ShadedSplats:
         degree = self.settings.max_sh if self.settings.color_by is None else 0
         return shade([(part.splats.with_max_sh(degree), part.object_to_world) for part in cut.parts], camera)
-
-    def _image(self, shaded: ShadedSplats, camera: Camera) -> Image:
-        settings = self.settings
-        return draw_styled(settings.style, self._backend, shaded, camera, self._raster, settings.options)
-
-    @property
-    def _raster(self) -> RasterSettings:
-        """Raster settings of the finer picture: the largest radius counts in pixels of the one that is shaded."""
-        raster = self.settings.raster
-        return dataclasses.replace(raster, max_radius=raster.max_radius * self.settings.supersample)
 
     def _overdraw(self, cut: Cut, camera: Camera) -> NDArray[np.float32]:
         fine = finer(camera, self.settings.supersample)
@@ -118,35 +126,24 @@ class Renderer:
             counts = count_overdraw(self._shaded(cut, fine), fine, self._raster)
         return averaged(counts[..., None], self.settings.supersample)[..., 0]
 
-    def _depth(self, cut: Cut, camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return (H, W) mean depths of the visible splats, world units, NaN where there is none, and (H, W) alpha."""
-        raster, fine = self.settings.raster, finer(camera, self.settings.supersample)
-        with _KERNELS:
-            shaded = self._shaded(cut, fine)
-            depth = (shaded.center - camera.position.astype(np.float32)) @ camera.forward.astype(np.float32)
-            drawn = (depth > raster.near) & (depth < raster.far)
-            # Backends draw colours of 0..1.
-            top = float(depth[drawn].max(initial=raster.near))
-            rgb = np.clip(np.nan_to_num(depth) / np.float32(top), 0, 1)
-            image = self._image(
-                dataclasses.replace(shaded, rgb=np.repeat(rgb[:, None], 3, axis=1).astype(np.float32)), fine
-            )
-        image = averaged(image, self.settings.supersample)
-        alpha = image[..., 3]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            mean = np.where(alpha > 0, image[..., 0] / alpha * np.float32(top), np.float32(np.nan))
-        return mean.astype(np.float32), alpha
-
     def _colored(self, values: NDArray[np.float32], alpha: NDArray[np.float32]) -> Image:
         assert self.scale is not None
         return np.concatenate([self.scale.rgb(values) * alpha[..., None], alpha[..., None]], axis=2)
+
+
+def colored_by_depth(splats: ShadedSplats, camera: Camera, raster: RasterSettings) -> tuple[ShadedSplats, float]:
+    """Return splats with grays of their depths over the largest depth, as backends draw colours of 0..1; and that."""
+    depth = (splats.center - camera.position.astype(np.float32)) @ camera.forward.astype(np.float32)
+    top = float(depth[(depth > raster.near) & (depth < raster.far)].max(initial=raster.near))
+    gray = np.clip(np.nan_to_num(depth) / np.float32(top), 0, 1)
+    return replace(splats, rgb=np.repeat(gray[:, None], 3, axis=1).astype(np.float32)), top
 
 
 def finer(camera: Camera, times: int) -> Camera:
     """Return the same camera with `times` as many pixels along each side."""
     if times == 1:
         return camera
-    return dataclasses.replace(
+    return replace(
         camera,
         width=camera.width * times,
         height=camera.height * times,
@@ -186,7 +183,8 @@ def draw_styled(
     if not len(splats.center):  # no chunk has arrived yet
         return np.zeros((camera.height, camera.width, 4), np.float32)
     if style == "splats":
-        return BACKENDS[backend].draw(splats, camera, settings, **(options or {}))
+        drawn: Image = import_module(MODULES[backend], __package__).draw(splats, camera, settings, **(options or {}))
+        return drawn
     index, x, y, depth, distance = _on_screen(splats, camera, settings)
     image: Image = np.zeros((camera.height, camera.width, 4), np.float32)
     if style == "points":

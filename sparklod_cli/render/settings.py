@@ -1,57 +1,55 @@
-"""Backends, and settings of rasterization and rendering, whose defaults are those of Spark 2. Imports nothing heavy."""
+"""Settings of rasterization and rendering, defaults as in Spark 2; backends and devices. Imports nothing heavy."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import importlib.util
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from importlib import import_module
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any
 
 from ..model import FARTHEST, MAX_SH_DEGREE
+from ..system.errors import BackendError
 from ..system.setting_fields import CheckedSettings, Range, setting, whole
-from .devices import DEVICE_HELP, DEVICES
-
-if TYPE_CHECKING:
-    from ..cameras.camera import Camera
-    from .rasterizer import Image, ShadedSplats
 
 #: Largest supersampling factor: samples per pixel along each axis.
 MAX_SUPERSAMPLE = 4
 
 
-@dataclass(frozen=True)
-class Backend:
-    """One way to draw; its module has a function `draw`."""
+#: Backends; numba is the default, and draws on the processor or on a card.
+BACKENDS = ("numba", "osmesa", "open3d")
 
-    name: str
-    module: str
+#: Devices that can be requested: a card if there is one; the processor; a card.
+DEVICES = ("auto", "cpu", "cuda")
 
-    def draw(self, splats: ShadedSplats, camera: Camera, settings: RasterSettings, **options: Any) -> Image:
-        """Draw splats; options are those of the module's function.
-
-        Returns:
-            (height, width, 4) float32: red, green and blue, multiplied by alpha, and alpha, all 0..1.
-
-        Raises:
-            BackendError: it cannot draw here.
-        """
-        module = import_module(self.module, __package__)
-        return cast("Image", module.draw(splats, camera, settings, **options))
+#: Help of a setting of one of them; {} is what computes on it.
+DEVICE_HELP = (
+    "What {} computes with: an NVIDIA card if there is one (auto), the processor, or a card (cuda). Cards are tested in"
+    " a simulator only."
+)
 
 
-#: The backend that draws instead of numba where that is to use an NVIDIA card.
-ON_CARD = "cuda"
+def uses_card(device: str, say: Callable[[str], None] = lambda text: None) -> bool:
+    """Return True if a card is used for one of `DEVICES`; say so, or why not, in a line.
 
-#: Backends by name; adding one is a module and a row. The first is the default.
-BACKENDS = {
-    backend.name: backend
-    for backend in (
-        Backend("numba", ".rasterizer"),
-        Backend(ON_CARD, ".cuda.rasterizer"),
-        Backend("osmesa", ".gl.osmesa"),
-        Backend("open3d", ".open3d.backend"),
-    )
-}
+    "auto" does without a word where the extra is not installed.
+
+    Raises:
+        BackendError: a card is requested, and none is usable.
+    """
+    if device == "cpu" or (device == "auto" and importlib.util.find_spec("numba_cuda") is None):
+        return False
+    from .cuda.card import find_card  # loads numba
+
+    try:
+        card = find_card()
+    except BackendError as error:
+        if device == "cuda":
+            raise
+        say(f"uses the processor: {error}")
+        return False
+    slowly = "; sorts on the processor, which is slow, as cupy is not installed" if card.sorter == "numpy" else ""
+    say(f"uses the card {card}{slowly}")
+    return True
 
 
 #: Pixels squared that are added to the covariance on the screen, for which opacity makes up: Spark's `blurAmount`.
@@ -137,8 +135,8 @@ class RenderSettings(CheckedSettings):
     )
     backend: str = setting(
         "Renderer: numba is the reference, osmesa is OpenGL in software, open3d is a quick look.",
-        tuple(name for name in BACKENDS if name != ON_CARD),
-        "numba",
+        BACKENDS,
+        BACKENDS[0],
     )
     device: str = setting(DEVICE_HELP.format("the backend numba"), DEVICES, "cpu")
     color_by: str | None = setting(

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from sparklod_cli.fitting import fit as fit_module
-from sparklod_cli.fitting.fit import Optimiser, fit
+from sparklod_cli.fitting.fit import fit
 from sparklod_cli.fitting.kernels.adam import Rates
+from sparklod_cli.fitting.optimiser import Optimiser
 from sparklod_cli.fitting.pictures import FittedNodes, FullDetailPicture, Index
-from sparklod_cli.fitting.report import FitReport
-from sparklod_cli.fitting.settings import FitSettings
+from sparklod_cli.fitting.settings import FitReport, FitSettings
 from sparklod_cli.lod import quality
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.system.errors import BackendError

@@ -16,8 +16,7 @@ from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.fitting import fit as fit_module
 from sparklod_cli.fitting.fit import fit
 from sparklod_cli.fitting.pictures import FittedNodes, Place, pictures, scores_of
-from sparklod_cli.fitting.report import FitReport
-from sparklod_cli.fitting.settings import SHARES, FitSettings
+from sparklod_cli.fitting.settings import SHARES, FitReport, FitSettings
 from sparklod_cli.inspection.tree import examine
 from sparklod_cli.lod import quality, quick
 from sparklod_cli.model.lod_tree import LodTree

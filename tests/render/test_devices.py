@@ -13,7 +13,7 @@ import sparklod_cli as sparklod
 from sparklod_cli.cli import run
 from sparklod_cli.fitting.settings import FitSettings
 from sparklod_cli.render.cuda.card import card_errors, on_card
-from sparklod_cli.render.devices import DEVICES, uses_card
+from sparklod_cli.render.settings import DEVICES, uses_card
 from sparklod_cli.system.errors import BackendError
 from tests.cards import MISSING
 from tests.conftest import FIXTURES, Capture

@@ -8,9 +8,9 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from sparklod_cli.render.rasterizer import shade
+from sparklod_cli.render.rasterizer import draw, shade
 from sparklod_cli.render.renderer import BILLBOARD_ALPHA, DrawnPicture, Renderer
-from sparklod_cli.render.settings import BACKENDS, COLOR_BY, STYLES, RasterSettings, RenderSettings
+from sparklod_cli.render.settings import COLOR_BY, STYLES, RasterSettings, RenderSettings
 from sparklod_cli.scenes.finder import CutFinder
 from sparklod_cli.system.errors import SparklodError
 from tests.render.drawables import balls, camera, plain
@@ -27,7 +27,7 @@ def drawn(source: CutFinder, **how: object) -> DrawnPicture:
 def test_splats_are_what_the_backend_draws() -> None:
     splats, at = random_splats(300, sh_degree=2), camera()
     image = Renderer(plain(splats), RenderSettings(), [at]).draw(at).image
-    assert np.array_equal(image, BACKENDS["numba"].draw(shade([(splats, np.eye(4))], at), at, RasterSettings()))
+    assert np.array_equal(image, draw(shade([(splats, np.eye(4))], at), at, RasterSettings()))
 
 
 def test_several_threads_draw_the_same() -> None:

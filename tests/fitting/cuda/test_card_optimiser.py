@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sparklod_cli.fitting.fit import RATES, Optimiser, fit
+from sparklod_cli.fitting.fit import RATES, fit
+from sparklod_cli.fitting.optimiser import Optimiser
 from sparklod_cli.fitting.pictures import FittedNodes, FittedSet, Place, pictures, placed
 from sparklod_cli.fitting.settings import FitSettings
 from sparklod_cli.lod import quality
@@ -53,7 +54,7 @@ def after_steps(nodes: FittedNodes, optimiser: Optimiser) -> FittedNodes:
 
 @pytest.mark.parametrize("kind", ["cut", "set"])
 def test_steps_are_those_of_the_processor_and_the_same_twice(kind: str) -> None:
-    from sparklod_cli.fitting.cuda.optimiser import CardOptimiser
+    from sparklod_cli.fitting.cuda.card_optimiser import CardOptimiser
 
     reference = nodes_of(kind)
     after_steps(reference, Optimiser(reference))

@@ -14,7 +14,7 @@ from sparklod_cli.render import rasterizer
 from sparklod_cli.render.open3d import backend
 from sparklod_cli.render.open3d.child import PIECE
 from sparklod_cli.render.rasterizer import ShadedSplats
-from sparklod_cli.render.settings import BACKENDS, RasterSettings
+from sparklod_cli.render.settings import RasterSettings
 from sparklod_cli.system.errors import BackendError
 from tests.render.open3d.test_process import forget
 
@@ -126,7 +126,7 @@ def open3d() -> Iterator[None]:
     try:
         forget()
         seen = straight(32, 32)
-        BACKENDS["open3d"].draw(shown(in_front(seen, 0, 0, 1)), seen, RasterSettings())
+        backend.draw(shown(in_front(seen, 0, 0, 1)), seen, RasterSettings())
     except BackendError as error:
         pytest.skip(f"Open3D cannot draw here: {error}")
     yield
