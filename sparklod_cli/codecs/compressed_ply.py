@@ -15,7 +15,7 @@ from ..system.errors import FormatError
 from ..system.progress import Progress
 from ..system.units import count_of
 from . import quantize
-from .ply_header import PlyHeader, offset_of, read_header
+from .ply import PlyHeader, offset_of, read_header
 from .reader import HARMLESS, OpenFile, Reader, Rows, Target, decode_rows, left_out, rows_of
 
 #: Splats of a chunk, which share bounds.

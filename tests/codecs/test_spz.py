@@ -19,7 +19,7 @@ from sparklod_cli.codecs import quantize, spz
 from sparklod_cli.codecs.encoder import clamps_in
 from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.codecs.reader import decode_file
-from sparklod_cli.codecs.spz_reader import MOST_EXTENSION_BYTES
+from sparklod_cli.codecs.spz import MOST_EXTENSION_BYTES
 from sparklod_cli.codecs.statistics import Statistics
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
