@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import functools
 
-from ..lod.builders import BUILDERS, SplatBytes
+from ..lod.builders import BUILDERS, bytes_of
 from ..system import machine
 from ..system.errors import OutOfMemoryError
 from ..system.units import format_size
@@ -25,13 +25,13 @@ PROCESS = 200_000_000
 
 #: Bytes per splat of the input while its tree is refined, besides the tree, and bytes of the pictures. Measured with up
 #: to 700,000 nodes.
-OF_REFINED, PICTURES = SplatBytes(500, 40), 310_000_000
+OF_REFINED, PICTURES = (500, 40), 310_000_000
 
 #: Most and least splats of a block. More are no faster, and fewer make its margins too large a part of it.
 MOST_BLOCK_SPLATS, LEAST_BLOCK_SPLATS = 1 << 21, 1 << 16
 
 #: Out of core, bytes per node of a window, which is read, gathered or encoded at once, and its nodes.
-OF_WINDOW, WINDOW = SplatBytes(230, 50), 1 << 19
+OF_WINDOW, WINDOW = (230, 50), 1 << 19
 
 #: Out of core, bytes per splat of the whole scene while its nodes are ordered, other than for streaming.
 OF_ORDER = 20
@@ -49,8 +49,8 @@ def default_memory() -> int | None:
 
 def in_memory_bytes(settings: BakeSettings, splats: int, sh_degree: int) -> int:
     """Return the peak memory of a bake in memory, bytes."""
-    refining = 0 if settings.refine is None else PICTURES + OF_REFINED.of(splats, sh_degree)
-    return PROCESS + BUILDERS[settings.method].in_memory.of(splats, sh_degree) + refining
+    refining = 0 if settings.refine is None else PICTURES + bytes_of(OF_REFINED, splats, sh_degree)
+    return PROCESS + bytes_of(BUILDERS[settings.method].in_memory, splats, sh_degree) + refining
 
 
 def most_in_memory(memory: int, settings: BakeSettings, sh_degree: int) -> int:
@@ -65,8 +65,8 @@ def out_of_core_bytes(
     """Return the peak memory of a bake out of core, bytes; `in_chunks` if the output has the order for streaming."""
     from ..lod.chunk_order import MOST_FAMILIES, family_bytes  # takes long to load, and this is asked out of core only
 
-    window = OF_WINDOW.of(min(2 * splats, WINDOW), sh_degree)
-    block = BUILDERS[method].in_block.of(min(splats, block_splats), sh_degree)
+    window = bytes_of(OF_WINDOW, min(2 * splats, WINDOW), sh_degree)
+    block = bytes_of(BUILDERS[method].in_block, min(splats, block_splats), sh_degree)
     families = int(FAMILIES * splats) if in_chunks else 0
     part = family_bytes(threads) * min(families, MOST_FAMILIES)
     arranging = OF_FAMILY * families + max(part, OF_DIVIDED * families if families > MOST_FAMILIES else 0)
@@ -75,7 +75,7 @@ def out_of_core_bytes(
 
 def windows_within(memory: int | None, splats: int, sh_degree: int, threads: int) -> int:
     """Return the number of windows of nodes that fit into memory at once, from one to `threads`."""
-    window = OF_WINDOW.of(min(2 * splats, WINDOW), sh_degree)
+    window = bytes_of(OF_WINDOW, min(2 * splats, WINDOW), sh_degree)
     if memory is None or not window:
         return threads
     return max(1, min(threads, (memory - PROCESS) // window))
@@ -83,7 +83,7 @@ def windows_within(memory: int | None, splats: int, sh_degree: int, threads: int
 
 def scratch_bytes(method: str, splats: int, sh_degree: int) -> int:
     """Return the peak size of the scratch folder, bytes, without the unpacked input."""
-    return BUILDERS[method].in_scratch.of(splats, sh_degree)
+    return bytes_of(BUILDERS[method].in_scratch, splats, sh_degree)
 
 
 def block_splats_within(

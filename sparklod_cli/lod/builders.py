@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from importlib import import_module
-from typing import Any, NamedTuple
+from typing import Any
 
 from ..model.sh import COEFFICIENTS
 
@@ -18,18 +18,15 @@ MIN_GROWTH, MAX_GROWTH, DEFAULT_GROWTH = 1.05, 2.0, 1.4
 DETAIL_GROWTH = MAX_GROWTH
 
 
-class SplatBytes(NamedTuple):
-    """Bytes that a splat takes at the peak of a bake: without spherical harmonics, and for each of their coefficients.
+#: Bytes that a splat takes at the peak of a bake: without spherical harmonics, and for each of their coefficients.
+#: Peaks of processes (VmHWM), as `benchmarks/bench_memory.py` measures them, with some room to spare.
+SplatBytes = tuple[int, int]
 
-    Peaks of processes (VmHWM), as `benchmarks/bench_memory.py` measures them, with some room to spare.
-    """
 
-    fixed: int
-    coefficient: int
-
-    def of(self, splats: int, sh_degree: int) -> int:
-        """Return the bytes of `splats` splats of an SH degree."""
-        return splats * (self.fixed + self.coefficient * COEFFICIENTS[sh_degree])
+def bytes_of(each: SplatBytes, splats: int, sh_degree: int) -> int:
+    """Return the bytes of `splats` splats of an SH degree."""
+    fixed, coefficient = each
+    return splats * (fixed + coefficient * COEFFICIENTS[sh_degree])
 
 
 @dataclass(frozen=True)
@@ -40,13 +37,13 @@ class Builder:
         module: module of this package that has `build(splats, SETTING, *, progress) -> (nodes, tree)`, and is a
             `stage_records.StagedBuilder` of such trees.
         setting: name of its only parameter, a number.
-        summary: a phrase for help texts.
+        summary: phrase for help texts.
         in_bands: its trees are put in the order of `band_order` for files that are read whole. That saves 3 to 4 % of
             a file of quality, and 1 to 2 % of one of quick, which is not worth the time.
-        in_memory: bytes of a splat of the input, in memory.
-        in_block: bytes of a splat of a block, out of core.
-        in_scratch: bytes of a splat of the input in the scratch folder, out of core. Those of blocks are removed when
-            their nodes are made.
+        in_memory: of a splat of the input, in memory.
+        in_block: of a splat of a block, out of core.
+        in_scratch: of a splat of the input in the scratch folder, out of core. Those of blocks are removed when their
+            nodes are made.
     """
 
     module: str
@@ -58,7 +55,7 @@ class Builder:
     in_scratch: SplatBytes
 
     def load(self) -> Any:
-        """Import and return the module."""
+        """Import the module."""
         return import_module(f".{self.module}", __package__)
 
 
@@ -69,18 +66,18 @@ BUILDERS = {
         "base",
         "pairs in cells of a voxel grid, in seconds",
         in_bands=False,
-        in_memory=SplatBytes(220, 27),
-        in_block=SplatBytes(300, 50),
-        in_scratch=SplatBytes(190, 32),
+        in_memory=(220, 27),
+        in_block=(300, 50),
+        in_scratch=(190, 32),
     ),
     "quality": Builder(
         "quality",
         "growth",
         "the pairs that cost least, in all",
         in_bands=True,
-        in_memory=SplatBytes(250, 30),
-        in_block=SplatBytes(350, 50),
-        in_scratch=SplatBytes(200, 34),
+        in_memory=(250, 30),
+        in_block=(350, 50),
+        in_scratch=(200, 34),
     ),
 }
 METHODS = tuple(BUILDERS)

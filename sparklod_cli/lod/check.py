@@ -1,4 +1,4 @@
-"""Checks of the input of a builder, and of its setting."""
+"""Check and bounds of the input of a builder."""
 
 from __future__ import annotations
 
@@ -32,17 +32,11 @@ class Bounds:
 
     @classmethod
     def of(cls, splats: Splats) -> Bounds:
-        """Return the bounds of splats; of none, the box is from infinity to minus infinity."""
+        """Return the bounds of splats; without any, the box is from infinity to minus infinity."""
         low, high = np.empty((2, -(-len(splats) // BLOCK_ROWS), 4))
         find_bounds(len(low), splats.center, splats.scale, low, high)
         least, most = low.min(axis=0, initial=np.inf), high.max(axis=0, initial=-np.inf)
         return cls(least[:3], most[:3], 2 * float(least[3]), 2 * float(most[3]))
-
-
-def check_setting(name: str, value: float, least: float, most: float) -> None:
-    """Raise a `ValueError` where the setting of a builder is out of its range."""
-    if not least <= value <= most:
-        raise ValueError(f"{name} {value} is not within {least} to {most}")
 
 
 def check(splats: Splats) -> Bounds:

@@ -29,7 +29,7 @@ from ..model.splats import FloatArray, Splats
 from ..system.progress import Progress, silent
 from ..system.threads import threads_for
 from .builders import DEFAULT_GROWTH, MAX_GROWTH, MIN_GROWTH
-from .check import Bounds, check, check_setting
+from .check import Bounds, check
 from .final_tree import FinalTree, PruningGoal, in_final_order
 from .kernels import pair_cost
 from .kernels.sort import Nodes
@@ -65,7 +65,7 @@ def build(splats: Splats, growth: float = DEFAULT_GROWTH, *, progress: Progress 
         InvalidSplatsError: there are no splats, or one is invisible.
         ValueError: the growth is out of range.
     """
-    check_setting("growth", growth, MIN_GROWTH, MAX_GROWTH)
+    _check_growth(growth)
     bounds = check(splats)
     n = len(splats)
     if n == 1:
@@ -82,6 +82,11 @@ def build(splats: Splats, growth: float = DEFAULT_GROWTH, *, progress: Progress 
         del splats
         final = in_final_order(binary, index, columns, goal, curve, progress)
         return final.splats, final.tree
+
+
+def _check_growth(growth: float) -> None:
+    if not MIN_GROWTH <= growth <= MAX_GROWTH:
+        raise ValueError(f"growth {growth} is not within {MIN_GROWTH} to {MAX_GROWTH}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +138,7 @@ class _Nodes:
 
 def plan(bounds: Bounds, sample: Splats, setting: float) -> Plan:
     """See `StagedBuilder`; the setting is the growth, 1.05 to 2."""
-    check_setting("growth", setting, MIN_GROWTH, MAX_GROWTH)
+    _check_growth(setting)
     curve = Curve.of(sample, bounds)
     _, size = curve.leaf_rows(sample, np.arange(len(sample), dtype=np.uint32))
     return Plan(setting, curve, lowest_level(levels_of(size)))

@@ -18,11 +18,11 @@ at a level ends where the cells of the level below end that something unknown co
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -34,7 +34,7 @@ from ..model.splats import COLUMNS, FloatArray, Splats
 from ..system.progress import Progress, silent
 from ..system.threads import blocks_of, threads_for
 from .builders import DEFAULT_BASE, MAX_BASE, MIN_BASE
-from .check import Bounds, check, check_setting
+from .check import Bounds, check
 from .kernels.cell_pairs import SPAN, merge_in_cells, split_families
 from .kernels.geometry import SplatColumns
 from .kernels.node_rows import Space, fill_leaf_rows, fill_leaves, fill_merged_splats, merge_colors
@@ -83,9 +83,6 @@ MOVED = 1 << 14
 
 Offsets = NDArray[np.int64]
 
-#: Fills the node rows of splats, given their indices and the (n, WIDTH) rows.
-FillRows = Callable[[Nodes, FloatArray], None]
-
 
 def build(splats: Splats, base: float = DEFAULT_BASE, *, progress: Progress = silent) -> tuple[Splats, LodTree]:
     """Build a Level-of-Detail tree.
@@ -105,13 +102,11 @@ def build(splats: Splats, base: float = DEFAULT_BASE, *, progress: Progress = si
         InvalidSplatsError: there are no splats, or one is invisible.
         ValueError: the base is out of range.
     """
-    check_setting("base", base, MIN_BASE, MAX_BASE)
     n = len(splats)
-    bounds = check(splats)
+    grid = VoxelGrid.of(check(splats), base)
     with threads_for(n) as threads:
-        grid = VoxelGrid.of(bounds, base)
         index, ends = grid.sorted_leaves(splats.center, splats.scale, threads)
-        tree = VoxelTree(grid, n, index, ends, partial(fill_rows, splats, grid.space))
+        tree = VoxelTree(grid, n, index, ends, splats)
         ((_, root),) = tree.grow(None, progress)
         nodes, links, *_ = tree.finish(root, splats)
     return nodes, links
@@ -146,7 +141,9 @@ class VoxelGrid:
 
     @classmethod
     def of(cls, bounds: Bounds, base: float) -> VoxelGrid:
-        """Return the grid of a scene with these bounds."""
+        """Return the grid of a scene with these bounds; raise `ValueError` if the base is out of range."""
+        if not MIN_BASE <= base <= MAX_BASE:
+            raise ValueError(f"base {base} is not within {MIN_BASE} to {MAX_BASE}")
         corners = np.array([bounds.low, bounds.high])
         farthest = float(np.abs(corners).max())
         finest = math.floor(math.log(max(bounds.smallest, farthest / MAX_STEPS), base))
@@ -207,11 +204,6 @@ class NodeRows(NamedTuple):
     number: NDArray[np.uint32]
     children: NDArray[np.uint16]
 
-    @classmethod
-    def empty(cls, size: int) -> NodeRows:
-        """Return room for nodes."""
-        return cls(np.empty((size, WIDTH), np.float32), np.empty(size, np.uint32), np.empty(size, np.uint16))
-
     def take(self, nodes: Nodes | slice) -> NodeRows:
         """Return some of the nodes."""
         return NodeRows(self.node[nodes], self.number[nodes], self.children[nodes])
@@ -251,34 +243,35 @@ class VoxelTree:
         leaves: int,
         index: Nodes,
         ends: Offsets,
-        fill: FillRows,
+        source: Splats | FloatArray,
         waiting: dict[int, NodeRows] | None = None,
         keys: Callable[[int, FloatArray], Keys] | None = None,
     ) -> None:
         """Make a tree without nodes.
 
         Args:
-            leaves: given nodes with a number from here on are merged ones.
+            leaves: number of given leaves; given nodes with this number or a higher one are merged ones.
             index: (given,) splat of each given node; splats that join at the level of their size come first, each
                 level along the curve.
             ends: where each level ends in `index`.
-            fill: of the splats that join.
+            source: splats that join, or their (n, WIDTH) node rows, which are freed when all have joined.
             waiting: rows of all other nodes by the level that they wait for; all nodes in a cell of the level below
                 come from one stage, in their order. It is emptied, so that memory is freed.
             keys: returns the keys of a batch, by the level and the rows of the merged nodes; None in memory.
         """
         self.batches = list[Batch]()
         self._grid, self._leaves, self._index, self._waiting, self._keys = grid, leaves, index, waiting or {}, keys
-        # Emptied as splats join, so that what `fill` holds is freed.
         self._joining = {
-            level: (slice(begin, end), fill)
+            level: slice(begin, end)
             for level, (begin, end) in enumerate(itertools.pairwise([0, *ends.tolist()]))
             if begin < end
         }
+        self._source = source if self._joining else None
         # Twice the nodes are the most that there will be; memory that is not written to is not taken. So much room is
         # enough for the rows, too: half of them for what the others are merged into.
         size = 2 * len(index)
-        self.rows, self._used, self._awaited, self._total = NodeRows.empty(size), 0, len(index), 0
+        self.rows = NodeRows(np.empty((size, WIDTH), np.float32), np.empty(size, np.uint32), np.empty(size, np.uint16))
+        self._used, self._awaited, self._total = 0, len(index), 0
         self._center, self._scale = np.empty((size, 3), np.float32), np.empty((size, 3), np.float32)
         self._quat, self._opacity = np.empty((size, 4), np.float32), np.empty(size, np.float32)
         self._weight, self._number = np.empty(size, np.float64), np.empty(size, np.uint32)
@@ -294,7 +287,7 @@ class VoxelTree:
             the nodes without a parent, by the level that they wait for; only the root if there are no margins.
         """
         grid, active, level = self._grid, np.empty(0, np.uint32), 0
-        splats = max((numbers.stop for numbers, _ in self._joining.values()), default=0)
+        splats = max((numbers.stop for numbers in self._joining.values()), default=0)
         last = max(0, int(np.searchsorted(grid.steps, grid.largest)))  # a splat joins at its level at most
         left: list[tuple[int, NodeRows]] = []
         while True:
@@ -313,7 +306,7 @@ class VoxelTree:
                 if margins.are_closed:
                     break
             if level in self._joining:
-                numbers, _ = self._joining[level]
+                numbers = self._joining[level]
                 active, part = self._join(active, numbers.stop - numbers.start)
                 self._fill(level, self.rows.take(part))
                 progress("building", numbers.stop, splats, "splat")
@@ -324,8 +317,9 @@ class VoxelTree:
                 active = self._merge_cells(level, active)
             level += 1
         left.append((level, self.rows.take(active)))
-        for unjoined, (numbers, _) in list(self._joining.items()):
-            rows = NodeRows.empty(numbers.stop - numbers.start)
+        for unjoined, numbers in list(self._joining.items()):
+            n = numbers.stop - numbers.start
+            rows = NodeRows(np.empty((n, WIDTH), np.float32), np.empty(n, np.uint32), np.empty(n, np.uint16))
             self._fill(unjoined, rows)
             left.append((unjoined, rows))
         return left + list(self._waiting.items())
@@ -339,8 +333,16 @@ class VoxelTree:
 
     def _fill(self, level: int, rows: NodeRows) -> None:
         """Fill the rows of the splats that join at a level."""
-        numbers, fill = self._joining.pop(level)
-        fill(self._index[numbers], rows.node)
+        numbers, source = self._joining.pop(level), self._source
+        if not self._joining:
+            self._source = None
+        index = self._index[numbers]
+        if isinstance(source, Splats):
+            columns = SplatColumns(source.center, source.scale, source.quat_xyzw, source.opacity)
+            sizes = np.empty(len(index), np.float32)
+            fill_leaf_rows(len(index), index, columns, source.rgb, self._grid.space, rows.node, sizes)
+        elif source is not None:
+            np.take(source, index, axis=0, out=rows.node, mode="clip")
         rows.number[:] = np.arange(numbers.start, numbers.stop, dtype=np.uint32)
         rows.children[:] = 0
 
@@ -443,15 +445,8 @@ class VoxelTree:
         return out, LodTree(count, start), number, parents
 
 
-def fill_rows(splats: Splats, space: Space, index: Nodes, rows: FloatArray) -> None:
-    """Fill the node rows of some splats."""
-    columns = SplatColumns(splats.center, splats.scale, splats.quat_xyzw, splats.opacity)
-    fill_leaf_rows(len(index), index, columns, splats.rgb, space, rows, np.empty(len(index), np.float32))
-
-
 def plan(bounds: Bounds, sample: Splats, setting: float) -> VoxelGrid:
     """See `StagedBuilder`; the setting is the base."""
-    check_setting("base", setting, MIN_BASE, MAX_BASE)
     return VoxelGrid.of(bounds, setting)
 
 
@@ -460,8 +455,9 @@ def leaves(splats: Splats, index: NDArray[np.int64], plan: VoxelGrid) -> Pending
     from .stage_records import NO_FAMILY, Pending
 
     n = len(splats)
-    rows = np.empty((n, WIDTH), np.float32)
-    fill_rows(splats, plan.space, np.arange(n, dtype=np.uint32), rows)
+    rows, every = np.empty((n, WIDTH), np.float32), np.arange(n, dtype=np.uint32)
+    columns = SplatColumns(splats.center, splats.scale, splats.quat_xyzw, splats.opacity)
+    fill_leaf_rows(n, every, columns, splats.rgb, plan.space, rows, np.empty(n, np.float32))
     level, family = np.full(n, NEW, np.int32), np.full(n, NO_FAMILY, np.int64)
     return Pending.of(splats, rows=rows, level=level, index=index, family=family)
 
@@ -545,12 +541,8 @@ def _tree(given: dict[str, NDArray[Any]], grid: VoxelGrid, threads: int) -> tupl
     number[np.searchsorted(place, old)] = np.arange(len(old), dtype=np.uint32)
     levels = given["level"][place]
     waiting = {level: survivors.take(number[levels == level]) for level in np.unique(levels).tolist()}
-
-    def fill(some: Nodes, out: FloatArray) -> None:
-        np.take(rows, some, axis=0, out=out, mode="clip")
-
     pick = np.concatenate([new, old])
-    tree = VoxelTree(grid, len(new) + merged, pick, ends, fill, waiting, partial(_keys, grid))
+    tree = VoxelTree(grid, len(new) + merged, pick, ends, rows, waiting, functools.partial(_keys, grid))
     return tree, pick, ends
 
 
