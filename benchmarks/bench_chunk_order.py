@@ -20,19 +20,17 @@ from sparklod_cli.cameras.framing import framing
 from sparklod_cli.codecs.options import DEFAULTS
 from sparklod_cli.codecs.rad import codec as rad
 from sparklod_cli.lod.chunk_order import arrange
-from sparklod_cli.lod.settings import LodSettings, pixel_limit
-from sparklod_cli.lod.traversal import Traversal, TreeCut
 from sparklod_cli.model.instances import Instance
 from sparklod_cli.model.lod_tree import CHUNK_NODES, LodTree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
-from sparklod_cli.scenes.finder import view_of
-from sparklod_cli.scenes.loaded import Scenes
-from sparklod_cli.scenes.reading import read_scenes
 from sparklod_cli.simulation.frames import chunks_of
-from sparklod_cli.simulation.streaming import ChunkStream
-from sparklod_cli.simulation.streaming_settings import Network
 from sparklod_cli.system.threads import processors
+from sparklod_cli.viewers.network import ChunkStream
+from sparklod_cli.viewers.read_scenes import read_scenes
+from sparklod_cli.viewers.scenes import Scenes, view_of
+from sparklod_cli.viewers.spark import Traversal, TreeCut
+from sparklod_cli.viewers.viewer_settings import LodSettings, Network, pixel_limit
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from tests.references.chunk_orders import reordered, size_order, spark_order

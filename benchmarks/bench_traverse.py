@@ -24,13 +24,14 @@ import sparklod_cli as sparklod
 from sparklod_cli.cameras.camera import look_at
 from sparklod_cli.cameras.framing import framing
 from sparklod_cli.codecs.gpu import lod_tree
-from sparklod_cli.lod.continuous import ContinuousCuts
-from sparklod_cli.lod.traversal import Changes, CutView, Forest, Traversal, TreeInstance, measure
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.model.traversed import Nodes
-from sparklod_cli.scenes.finder import view_of
 from sparklod_cli.system.threads import on_threads, ordered_map, processors
+from sparklod_cli.viewers.continuous import ContinuousCuts
+from sparklod_cli.viewers.frame_statistics import Changes, measure
+from sparklod_cli.viewers.scenes import view_of
+from sparklod_cli.viewers.spark import CutView, Forest, Traversal, TreeInstance
 
 #: Nodes of the trees of tiled scenes in millions, budgets in nodes, and frames of their path.
 MILLIONS, BUDGETS, FRAMES = (0.5, 1, 2, 5, 10, 20), (50_000, 200_000, 500_000, 1_500_000), 24

@@ -43,8 +43,6 @@ if TYPE_CHECKING:  # mypy then resolves the modules first, which import this one
     from .fitting.settings import FitSettings as FitSettings
     from .inspection.report import Report as Report
     from .lod.part_settings import DetailSettings as DetailSettings
-    from .lod.settings import DetailRule as DetailRule
-    from .lod.settings import LodSettings as LodSettings
     from .model.foveation import Cones as Cones
     from .model.foveation import Frustum as Frustum
     from .model.instances import Instance as Instance
@@ -56,11 +54,6 @@ if TYPE_CHECKING:  # mypy then resolves the modules first, which import this one
     from .model.transforms import Transform as Transform
     from .render.settings import RasterSettings as RasterSettings
     from .render.settings import RenderSettings as RenderSettings
-    from .scenes.instances_file import InstancesFileError as InstancesFileError
-    from .scenes.instances_file import read_instances as read_instances
-    from .scenes.loaded import Cut as Cut
-    from .simulation.streaming_settings import Network as Network
-    from .simulation.streaming_settings import StreamingSettings as StreamingSettings
     from .system.errors import BackendError as BackendError
     from .system.errors import CameraPathError as CameraPathError
     from .system.errors import FormatError as FormatError
@@ -69,3 +62,10 @@ if TYPE_CHECKING:  # mypy then resolves the modules first, which import this one
     from .system.errors import OutputError as OutputError
     from .system.errors import SparklodError as SparklodError
     from .system.errors import TreeError as TreeError
+    from .viewers.instances_file import InstancesFileError as InstancesFileError
+    from .viewers.instances_file import read_instances as read_instances
+    from .viewers.scenes import Cut as Cut
+    from .viewers.viewer_settings import DetailRule as DetailRule
+    from .viewers.viewer_settings import LodSettings as LodSettings
+    from .viewers.viewer_settings import Network as Network
+    from .viewers.viewer_settings import StreamingSettings as StreamingSettings

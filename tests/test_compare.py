@@ -23,15 +23,15 @@ from sparklod_cli.cameras.sources import CameraPath
 from sparklod_cli.cli import run as program
 from sparklod_cli.images.metrics import MOST_PSNR, on_background
 from sparklod_cli.lod.budget import parse_budgets
-from sparklod_cli.lod.settings import LodSettings
 from sparklod_cli.model.foveation import Cones
 from sparklod_cli.model.instances import Instance
 from sparklod_cli.render.settings import RenderSettings
-from sparklod_cli.scenes.loaded import Scenes
-from sparklod_cli.scenes.reading import read_scenes
 from sparklod_cli.system.errors import SparklodError
 from sparklod_cli.tables.columns import Row
 from sparklod_cli.tables.comparison import COLUMNS, rows_by_budget, summarize
+from sparklod_cli.viewers.read_scenes import read_scenes
+from sparklod_cli.viewers.scenes import Scenes
+from sparklod_cli.viewers.viewer_settings import LodSettings
 from tests.conftest import FIXTURES
 
 pytestmark = pytest.mark.slow

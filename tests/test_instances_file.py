@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 
 from sparklod_cli.model.foveation import Cones, Frustum
 from sparklod_cli.model.instances import Instance
-from sparklod_cli.scenes.instances_file import KEYS, InstancesFileError, read_instances
 from sparklod_cli.system.errors import FormatError, SparklodError
+from sparklod_cli.viewers.instances_file import KEYS, InstancesFileError, read_instances
 
 
 def written(path: Path, *instances: object) -> list[Instance]:

@@ -14,17 +14,16 @@ from sparklod_cli.codecs.gpu import ext_splats, packed_splats
 from sparklod_cli.codecs.spark_codings import SplatEncoding
 from sparklod_cli.images.metrics import psnr
 from sparklod_cli.io import read_scene
-from sparklod_cli.lod.settings import LodSettings
 from sparklod_cli.model.gaussian import moved
 from sparklod_cli.model.instances import Instance
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.render.color_by import values_of
 from sparklod_cli.render.renderer import Renderer
 from sparklod_cli.render.settings import RenderSettings
-from sparklod_cli.scenes.finder import CutFinder, view_of
-from sparklod_cli.scenes.loaded import Scenes
-from sparklod_cli.scenes.reading import read_scenes
 from sparklod_cli.system.errors import FormatError, InvalidSplatsError
+from sparklod_cli.viewers.read_scenes import read_scenes
+from sparklod_cli.viewers.scenes import CutFinder, Scenes, view_of
+from sparklod_cli.viewers.viewer_settings import LodSettings
 from tests.conftest import FIXTURES
 from tests.render.drawables import camera
 from tests.scenes import random_splats

@@ -11,17 +11,16 @@ import pytest
 
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.lod.budget import Budget, parse_budget
-from sparklod_cli.lod.settings import PLAYCANVAS_BUDGET, DetailRule, LodSettings
 from sparklod_cli.model.foveation import Cones
 from sparklod_cli.model.instances import Instance
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.model.traversed import DetailScene
 from sparklod_cli.render.color_by import numbers_of, scale_of_splats
-from sparklod_cli.scenes.finder import CutFinder
-from sparklod_cli.scenes.loaded import Scenes
-from sparklod_cli.scenes.loaded_scene import LoadedDetail
-from sparklod_cli.scenes.reading import read_scenes
+from sparklod_cli.viewers.loaded_scene import LoadedDetail
+from sparklod_cli.viewers.read_scenes import read_scenes
+from sparklod_cli.viewers.scenes import CutFinder, Scenes
+from sparklod_cli.viewers.viewer_settings import PLAYCANVAS_BUDGET, DetailRule, LodSettings
 from tests.conftest import FIXTURES
 from tests.lod.details import row_of_regions
 from tests.scenes import random_splats

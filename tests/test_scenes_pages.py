@@ -15,19 +15,17 @@ from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.codecs.rad import codec as rad
 from sparklod_cli.lod import quick
 from sparklod_cli.lod.chunk_order import arrange
-from sparklod_cli.lod.settings import LodSettings
 from sparklod_cli.model.foveation import Frustum
 from sparklod_cli.model.instances import Instance
 from sparklod_cli.model.lod_tree import CHUNK_NODES, LodTree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS
-from sparklod_cli.scenes import loaded_scene
-from sparklod_cli.scenes.finder import CutFinder, view_of
-from sparklod_cli.scenes.loaded import Scenes
-from sparklod_cli.scenes.loaded_scene import PagedForest, PagedScene
-from sparklod_cli.scenes.reading import read_scenes
-from sparklod_cli.simulation.streaming_settings import Network, StreamingSettings
 from sparklod_cli.system.errors import FormatError, TreeError
+from sparklod_cli.viewers import loaded_scene
+from sparklod_cli.viewers.loaded_scene import PagedForest, PagedScene
+from sparklod_cli.viewers.read_scenes import read_scenes
+from sparklod_cli.viewers.scenes import CutFinder, Scenes, view_of
+from sparklod_cli.viewers.viewer_settings import LodSettings, Network, StreamingSettings
 from tests.conftest import FIXTURES
 from tests.lod.forests import transform
 from tests.scenes import random_splats
@@ -58,7 +56,7 @@ def file(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def little_memory(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """As if files did not fit into memory."""
     with pytest.MonkeyPatch.context() as patch:
-        for module in ("io.rad_file", "scenes.loaded_scene"):
+        for module in ("io.rad_file", "viewers.loaded_scene"):
             patch.setattr(f"sparklod_cli.{module}.available_memory", lambda: 1 << 20)
         yield
 

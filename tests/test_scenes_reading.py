@@ -21,11 +21,11 @@ from sparklod_cli.model.gaussian import moved, placed, spark_size
 from sparklod_cli.model.instances import Instance, names_of
 from sparklod_cli.model.lod_tree import CHUNK_NODES
 from sparklod_cli.model.splats import Splats
-from sparklod_cli.scenes import reading
-from sparklod_cli.scenes.loaded import Cut, Part
-from sparklod_cli.scenes.loaded_scene import TRAVERSED
-from sparklod_cli.scenes.reading import read_scenes
 from sparklod_cli.system.errors import FormatError, SparklodError, TreeError
+from sparklod_cli.viewers import read_scenes as reading
+from sparklod_cli.viewers.loaded_scene import TRAVERSED
+from sparklod_cli.viewers.read_scenes import read_scenes
+from sparklod_cli.viewers.scenes import Cut, Part
 from tests.conftest import FIXTURES
 from tests.lod.forests import transform
 from tests.references import gaussians

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sparklod_cli.scenes.instances_file import read_instances
+from sparklod_cli.viewers.instances_file import read_instances
 
 from ..case import Case, LawError, Rng
 from ..command import command

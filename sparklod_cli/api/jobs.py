@@ -18,12 +18,12 @@ from ..cameras.frame import Point, direction_of
 from ..cameras.framing import reach
 from ..model.instances import instances_of
 from ..model.splats import COLUMNS
-from ..scenes.finder import CutFinder, CutSource
-from ..scenes.loaded_scene import TRAVERSED
-from ..scenes.reading import read_scenes
 from ..system.output import check_writable, write_file
 from ..system.progress import Progress, silent
 from ..system.threads import on_threads
+from ..viewers.loaded_scene import TRAVERSED
+from ..viewers.read_scenes import read_scenes
+from ..viewers.scenes import CutFinder, CutSource
 
 if TYPE_CHECKING:
     from ..cameras.frame import Settings
@@ -31,15 +31,14 @@ if TYPE_CHECKING:
     from ..images.output import PictureOutput
     from ..images.sequence import PictureSettings, WrittenPictures
     from ..lod.budget import Budget
-    from ..lod.settings import LodSettings
     from ..model.instances import Instance
     from ..render.settings import RenderSettings
-    from ..scenes.loaded import Scenes
     from ..simulation.results import FrameOutputs, Summary, WrittenFrames
-    from ..simulation.streaming_settings import StreamingSettings
     from ..tables.assertions import Assertion, Outcome
     from ..tables.columns import Filter, Row, TableOutput
     from ..tables.comparison import BudgetSummary
+    from ..viewers.scenes import Scenes
+    from ..viewers.viewer_settings import LodSettings, StreamingSettings
 
 
 @dataclass(frozen=True)

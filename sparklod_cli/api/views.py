@@ -19,23 +19,22 @@ from ..cameras.sources import CameraPath, Orbit, read_path, similarity
 from ..codecs.formats import PRECISIONS
 from ..images import metrics
 from ..lod.budget import Budget
-from ..lod.settings import BLEND, PLAYCANVAS_BUDGET, LodSettings
 from ..model.instances import Instance, names_of
 from ..model.scene import Scene
 from ..model.traversed import DetailScene
 from ..render.rasterizer import Image
 from ..render.renderer import Renderer
 from ..render.settings import RenderSettings
-from ..scenes.finder import CutFinder, FixedCut
-from ..scenes.loaded import Cut, Scenes
-from ..scenes.loaded_scene import UNNAMED
-from ..scenes.reading import read_scenes
 from ..system.errors import CameraPathError, FormatError, SparklodError, memory_errors_translated
 from ..system.progress import Progress, silent
 from ..system.threads import on_threads, ordered_map, thread_count
 from ..tables.assertions import numbers
 from ..tables.columns import Row, Table
 from ..tables.comparison import COLUMNS as OF_COMPARISON
+from ..viewers.loaded_scene import UNNAMED
+from ..viewers.read_scenes import read_scenes
+from ..viewers.scenes import Cut, CutFinder, FixedCut, Scenes
+from ..viewers.viewer_settings import BLEND, PLAYCANVAS_BUDGET, LodSettings
 from .arguments import (
     BudgetLike,
     ProgressLike,
@@ -51,8 +50,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ..simulation.results import Summary
-    from ..simulation.streaming_settings import StreamingSettings
     from ..tables.comparison import BudgetSummary
+    from ..viewers.viewer_settings import StreamingSettings
 
 
 #: A scene, a tree or a scene at several detail levels, or several of them, each with where it stands.

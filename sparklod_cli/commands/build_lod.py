@@ -119,7 +119,7 @@ def build_lod(ctx: click.Context, /, **_: Any) -> None:
     check_inputs(ctx, options)
     instances: list[Instance] = []
     if options.scene is not None:
-        from ..scenes.instances_file import read_instances
+        from ..viewers.instances_file import read_instances
 
         instances = read_instances(options.scene)
     _check(ctx, options, [instance.file for instance in instances if instance.file is not None])

@@ -52,10 +52,10 @@ if TYPE_CHECKING:
     from ..images.pixels import Color
     from ..images.sequence import PictureSettings, WrittenPictures
     from ..lod.budget import Budget
-    from ..lod.settings import LodSettings
     from ..model.instances import Instance
     from ..tables.assertions import Assertion
     from ..tables.comparison import BudgetSummary
+    from ..viewers.viewer_settings import LodSettings
 
 #: Options without an effect on some styles and backends.
 UNSTYLED = {

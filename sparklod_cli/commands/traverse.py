@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import click
 
-from ..simulation.streaming_settings import StreamingSettings
 from ..system.setting_fields import setting
 from ..system.units import format_size, percent_of
 from ..system.untrusted import printable
 from ..tables.columns import FORMS
+from ..viewers.viewer_settings import StreamingSettings
 from .command import COMMON, Command, check_declared, flag, refuse, values_of
 from .console import WIDTH, Console, count_of, for_screen, is_terminal, print_json, rows
 from .options.common import (

@@ -15,7 +15,6 @@ from ..cameras.framing import framing
 from ..cameras.sources import CameraPath
 from ..images.metrics import on_background, psnr_of
 from ..lod.kernels.tree_links import add_weighted, fill_weights, find_parents
-from ..lod.traversal import CutView, Forest, Traversal, TreeInstance
 from ..model.foveation import Cones
 from ..model.gaussian import linear_opacity, lod_opacity, normalized_quat, size_factor
 from ..model.lod_tree import LodTree
@@ -26,7 +25,8 @@ from ..render import rasterizer
 from ..render.kernels.shade import add_sh
 from ..render.rasterizer import Image, ShadedSplats, draw
 from ..render.settings import RasterSettings
-from ..scenes.loaded_scene import nodes_of
+from ..viewers.loaded_scene import nodes_of
+from ..viewers.spark import CutView, Forest, Traversal, TreeInstance
 from .kernels.adam import MOST_D, Columns, FitBounds
 from .kernels.view import by_image, mark_seen, squared_differences
 from .settings import SHARES

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from ..cameras.sources import CameraPath
     from ..render.renderer import DrawnPicture
     from ..render.settings import RenderSettings
-    from ..scenes.finder import CutSource
+    from ..viewers.scenes import CutSource
     from .output import PictureOutput
     from .pixels import Color, Pixels
 

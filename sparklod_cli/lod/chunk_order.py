@@ -26,7 +26,7 @@ from .kernels.chunk_sets import DEMAND_BYTES, LANES, Families, fill_demand, sort
 from .kernels.pixel_scale import NODE, VIEW
 from .kernels.sort import sort_by_key
 from .kernels.tree_links import find_limits
-from .traversal import set_foveation
+from .view_foveation import set_foveation
 
 #: Viewpoints: half outside of the scene looking at it, a quarter anywhere inside, a quarter near a node. Chosen: 16
 #: are as good for large trees, not for those of four chunks (benchmarks/notes/cuts-and-chunks.md).

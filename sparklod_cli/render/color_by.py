@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 from ..cameras.camera import Camera
 from ..model.gaussian import lod_opacity, moved, spark_size
 from ..model.splats import FloatArray
-from ..scenes.finder import CutSource
-from ..scenes.loaded import Part
-from ..scenes.loaded_scene import Index, LoadedScene
 from ..system.errors import SparklodError
 from ..system.progress import Progress, silent
+from ..viewers.loaded_scene import Index, LoadedScene
+from ..viewers.scenes import CutSource, Part
 from .color_scales import (
     CLIPPED,
     MAGMA,

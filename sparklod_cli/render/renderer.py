@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from ..cameras.camera import Camera
 from ..model.falloff import MIN_ALPHA
 from ..model.gaussian import size_factor
-from ..scenes.finder import CutSource
-from ..scenes.loaded import Cut
 from ..system.progress import Progress, silent
+from ..viewers.scenes import Cut, CutSource
 from . import rasterizer
 from .kernels.raster import count_fragments, draw_discs
 from .rasterizer import Image, ShadedSplats, shade

@@ -10,17 +10,16 @@ from numpy.typing import NDArray
 
 from ..cameras.camera import Camera
 from ..cameras.sources import CameraPath
-from ..lod.settings import LodSettings
-from ..lod.traversal import Changes, CutStatistics, TreeCut, measure
 from ..model.instances import TOTAL
-from ..scenes.finder import CutFinder, view_of
-from ..scenes.loaded import Cut, Scenes
 from ..system.progress import Progress, silent
 from ..system.threads import ordered_map
 from ..tables.columns import Row
+from ..viewers.frame_statistics import Changes, CutStatistics, measure
+from ..viewers.network import Chunks, ChunkStream, header_answers
+from ..viewers.scenes import Cut, CutFinder, Scenes, view_of
+from ..viewers.spark import TreeCut
+from ..viewers.viewer_settings import LodSettings, StreamingSettings
 from .results import COLUMNS, LOADING, OF_BUDGETS, OF_TREES
-from .streaming import Chunks, ChunkStream, header_answers
-from .streaming_settings import StreamingSettings
 
 #: The share of a cut that makes a picture almost what it will be; chosen.
 MOST = 0.9

@@ -21,11 +21,11 @@ from sparklod_cli.fitting import fit, pictures
 from sparklod_cli.fitting.settings import SHARES, FitSettings
 from sparklod_cli.io import read_parts, read_scene
 from sparklod_cli.lod.part_settings import DetailSettings
-from sparklod_cli.lod.traversal import Forest, Traversal, TreeInstance
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import same_rows
-from sparklod_cli.scenes.finder import view_of
 from sparklod_cli.system.output import write_file
+from sparklod_cli.viewers.scenes import view_of
+from sparklod_cli.viewers.spark import Forest, Traversal, TreeInstance
 from tests.conftest import FIXTURES
 from tests.lod.trees import check_tree, sorted_rows
 

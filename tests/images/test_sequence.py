@@ -11,12 +11,12 @@ from sparklod_cli.cameras.sources import CameraPath, SingleViews
 from sparklod_cli.images import sequence
 from sparklod_cli.images.output import output_for
 from sparklod_cli.images.sequence import PictureSettings, WrittenPictures, write_pictures
-from sparklod_cli.lod.settings import LodSettings
 from sparklod_cli.model.instances import instances_of
 from sparklod_cli.render.renderer import DrawnPicture, Renderer
 from sparklod_cli.render.settings import RenderSettings
-from sparklod_cli.scenes.finder import CutFinder
-from sparklod_cli.scenes.reading import read_scenes
+from sparklod_cli.viewers.read_scenes import read_scenes
+from sparklod_cli.viewers.scenes import CutFinder
+from sparklod_cli.viewers.viewer_settings import LodSettings
 from tests.conftest import FIXTURES
 
 TOWN = FIXTURES / "traverse" / "town.spz"

@@ -14,12 +14,12 @@ from sparklod_cli.cameras.camera import Camera, look_at
 from sparklod_cli.cameras.framing import framing
 from sparklod_cli.codecs.gpu import ext_splats, lod_tree
 from sparklod_cli.io import read_scene
-from sparklod_cli.lod.settings import pixel_limit
-from sparklod_cli.lod.traversal import CutView, Forest, Traversal, TreeInstance
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.render.rasterizer import draw, shade
 from sparklod_cli.render.settings import RasterSettings
+from sparklod_cli.viewers.spark import CutView, Forest, Traversal, TreeInstance
+from sparklod_cli.viewers.viewer_settings import pixel_limit
 from tests.interop.page import Page
 
 FOV_Y = math.radians(50)

@@ -17,15 +17,15 @@ from sparklod_cli.codecs.rad.rad_options import HALF
 from sparklod_cli.codecs.spark_codings import SplatEncoding
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quick
-from sparklod_cli.lod.traversal import CutView, Traversal, TreeInstance
 from sparklod_cli.model.gaussian import linear_opacity
 from sparklod_cli.model.instances import Instance
 from sparklod_cli.model.lod_tree import CHUNK_NODES
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import FloatArray
 from sparklod_cli.model.traversed import Nodes
-from sparklod_cli.scenes.loaded_scene import nodes_of
-from sparklod_cli.scenes.reading import read_scenes
+from sparklod_cli.viewers.loaded_scene import nodes_of
+from sparklod_cli.viewers.read_scenes import read_scenes
+from sparklod_cli.viewers.spark import CutView, Traversal, TreeInstance
 from tests.conftest import FIXTURES, real_scene
 from tests.fittings import StandIn
 from tests.fittings import stand_in as stand_in

@@ -13,16 +13,15 @@ import pytest
 from sparklod_cli.codecs.gpu import lod_tree
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod.builders import BUILDERS
-from sparklod_cli.lod.settings import LodSettings
-from sparklod_cli.lod.traversal import CutView, Forest, Traversal, TreeCut, TreeInstance
 from sparklod_cli.model.foveation import Cones
 from sparklod_cli.model.instances import Instance
 from sparklod_cli.model.lod_tree import CHUNK_NODES
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.traversed import Nodes
-from sparklod_cli.scenes.reading import read_scenes
 from sparklod_cli.simulation.frames import Simulation
-from sparklod_cli.simulation.streaming_settings import Network, StreamingSettings
+from sparklod_cli.viewers.read_scenes import read_scenes
+from sparklod_cli.viewers.spark import CutView, Forest, Traversal, TreeCut, TreeInstance
+from sparklod_cli.viewers.viewer_settings import LodSettings, Network, StreamingSettings
 from tests.conftest import real_scene
 from tests.interop.spark import NODE, PageUpdate, Spark
 from tests.interop.test_traversal import FOV_Y, FOVEATIONS, LOD_SCALES, SPARKS_CONES, Tree, cameras, scene

@@ -15,11 +15,11 @@ import pytest
 from sparklod_cli.codecs.gpu import ext_splats, lod_tree
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod.builders import BUILDERS
-from sparklod_cli.lod.settings import pixel_limit
-from sparklod_cli.lod.traversal import CutView, Forest, Traversal, TreeCut, TreeInstance, views_of
 from sparklod_cli.model.foveation import Cones
 from sparklod_cli.model.lod_tree import CHUNK_NODES
 from sparklod_cli.model.traversed import Nodes
+from sparklod_cli.viewers.spark import CutView, Forest, Traversal, TreeCut, TreeInstance, views_of
+from sparklod_cli.viewers.viewer_settings import pixel_limit
 from tests.conftest import FIXTURES, real_scene
 from tests.interop.spark import NODE, Spark
 from tests.lod.forests import rotation, transform

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sparklod_cli.lod.traversal import CutView
 from sparklod_cli.model.traversed import DetailScene
+from sparklod_cli.viewers.spark import CutView
 from tests.scenes import random_splats
 
 

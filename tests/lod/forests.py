@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from hypothesis import strategies as st
 
-from sparklod_cli.lod.traversal import CutView, Forest, Traversal, TreeCut, TreeInstance
 from sparklod_cli.model.foveation import Cones, Frustum
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.traversed import Nodes
+from sparklod_cli.viewers.spark import CutView, Forest, Traversal, TreeCut, TreeInstance
 from tests.references import budgeted_cuts
 
 FOVEATIONS = (

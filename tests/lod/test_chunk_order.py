@@ -18,13 +18,13 @@ from sparklod_cli.lod.chunk_order import chunk_order as order_of
 from sparklod_cli.lod.kernels.chunk_sets import LANES, fill_demand
 from sparklod_cli.lod.kernels.pixel_scale import NODE
 from sparklod_cli.lod.kernels.tree_links import find_limits, find_parents
-from sparklod_cli.lod.settings import LodSettings
-from sparklod_cli.lod.traversal import CutView, Forest, Traversal, TreeCut, TreeInstance
 from sparklod_cli.model.gaussian import spark_size
 from sparklod_cli.model.lod_tree import CHUNK_NODES, LodTree
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.model.traversed import Nodes
 from sparklod_cli.system.threads import on_threads
+from sparklod_cli.viewers.spark import CutView, Forest, Traversal, TreeCut, TreeInstance
+from sparklod_cli.viewers.viewer_settings import LodSettings
 from tests.lod.forests import links
 from tests.lod.trees import check_threads
 from tests.references import chunk_splits

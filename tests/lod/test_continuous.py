@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sparklod_cli.lod.continuous import BlendedCut, ContinuousCuts, faded, find_threshold, shares
 from sparklod_cli.lod.kernels.pixel_scale import pixel_scales
-from sparklod_cli.lod.traversal import CutView, Forest, Traversal, TreeInstance
 from sparklod_cli.model.foveation import Cones
 from sparklod_cli.model.gaussian import lod_opacity
+from sparklod_cli.viewers.continuous import BlendedCut, ContinuousCuts, faded, find_threshold, shares
+from sparklod_cli.viewers.spark import CutView, Forest, Traversal, TreeInstance
 from tests.lod.forests import Case, cases, random_tree, transform
 from tests.references import budgeted_cuts, continuous_cuts
 

@@ -10,9 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sparklod_cli.lod.settings import pixel_limit
-from sparklod_cli.lod.traversal import Changes, CutStatistics, CutView, Traversal, TreeCut, TreeInstance, measure
 from sparklod_cli.model.traversed import Nodes
+from sparklod_cli.viewers.frame_statistics import Changes, CutStatistics, measure
+from sparklod_cli.viewers.spark import CutView, Traversal, TreeCut, TreeInstance
+from sparklod_cli.viewers.viewer_settings import pixel_limit
 from tests.lod.forests import Case, cases, drawn, expected_cut, links, views
 
 SIZE = (640, 480)

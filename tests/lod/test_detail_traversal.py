@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sparklod_cli.lod.detail_traversal import (
+from sparklod_cli.viewers.playcanvas import (
     ANOTHER_LEVEL,
     ENVIRONMENT,
     NEXT,
@@ -13,7 +13,7 @@ from sparklod_cli.lod.detail_traversal import (
     DetailFiles,
     loading,
 )
-from sparklod_cli.lod.settings import DetailRule
+from sparklod_cli.viewers.viewer_settings import DetailRule
 
 #: Three regions at three levels; the last has no level 1. Each level is a file, and the environment the fourth.
 COUNTS = np.array([[40, 20, 10], [40, 20, 10], [40, 0, 10]])

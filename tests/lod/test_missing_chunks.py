@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sparklod_cli.lod import traversal
-from sparklod_cli.lod.traversal import CutView, Forest, TreeInstance
+from sparklod_cli.viewers import spark as traversal
+from sparklod_cli.viewers.spark import CutView, Forest, TreeInstance
 from tests.lod.forests import Case, ancestors_drawn, cases, check, random_tree, transform
 
 #: Nodes of a chunk in tests of small trees, as a power of 2; so large that no node's children are in three.

@@ -23,14 +23,14 @@ from sparklod_cli.images.metrics import on_background, psnr
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quality, quick
 from sparklod_cli.lod.kernels.prune import MOST_CHILDREN, STEPS
-from sparklod_cli.lod.traversal import Forest, Traversal, TreeInstance
 from sparklod_cli.model.gaussian import spark_size
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.selection import Selection
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.render.rasterizer import Image, draw, shade
 from sparklod_cli.render.settings import RasterSettings
-from sparklod_cli.scenes.finder import view_of
+from sparklod_cli.viewers.scenes import view_of
+from sparklod_cli.viewers.spark import Forest, Traversal, TreeInstance
 from tests.conftest import real_scene
 from tests.lod.trees import check_tree, children, coincident, parents
 from tests.scenes import random_splats, single_layer

@@ -15,11 +15,11 @@ from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quality, tiles
 from sparklod_cli.lod.part_settings import TileSettings
-from sparklod_cli.lod.settings import pixel_limit
-from sparklod_cli.lod.tiles import TileForest, TileTraversal, choose
-from sparklod_cli.lod.traversal import CutView, TreeInstance
 from sparklod_cli.model.traversed import TileScene
-from sparklod_cli.scenes.finder import view_of
+from sparklod_cli.viewers.cesium import TileForest, TileTraversal, choose
+from sparklod_cli.viewers.scenes import view_of
+from sparklod_cli.viewers.spark import CutView, TreeInstance
+from sparklod_cli.viewers.viewer_settings import pixel_limit
 from tests.conftest import FIXTURES
 
 EYE = np.eye(4)

@@ -7,8 +7,8 @@ import math
 from dataclasses import dataclass, field
 from fractions import Fraction
 
-from sparklod_cli.simulation.streaming import Chunks
-from sparklod_cli.simulation.streaming_settings import Network
+from sparklod_cli.viewers.network import Chunks
+from sparklod_cli.viewers.viewer_settings import Network
 
 #: Seconds; of two events nearer than this, rounding decides which comes first.
 TIE = Fraction(1, 10**9)

@@ -11,8 +11,8 @@ import pytest
 from sparklod_cli.render.rasterizer import draw, shade
 from sparklod_cli.render.renderer import BILLBOARD_ALPHA, DrawnPicture, Renderer
 from sparklod_cli.render.settings import COLOR_BY, STYLES, RasterSettings, RenderSettings
-from sparklod_cli.scenes.finder import CutFinder
 from sparklod_cli.system.errors import SparklodError
+from sparklod_cli.viewers.scenes import CutFinder
 from tests.render.drawables import balls, camera, plain
 from tests.scenes import random_splats
 

@@ -9,9 +9,9 @@ from sparklod_cli.codecs.rad import codec as rad
 from sparklod_cli.io import read_scene
 from sparklod_cli.model.foveation import Frustum
 from sparklod_cli.model.instances import Instance
-from sparklod_cli.scenes.loaded import Scenes
-from sparklod_cli.scenes.loaded_scene import TRAVERSED
-from sparklod_cli.scenes.reading import read_scenes
+from sparklod_cli.viewers.loaded_scene import TRAVERSED
+from sparklod_cli.viewers.read_scenes import read_scenes
+from sparklod_cli.viewers.scenes import Scenes
 from tests.lod.forests import transform
 from tests.simulation.paths import HAND, TOWN
 

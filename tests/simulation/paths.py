@@ -9,12 +9,11 @@ import numpy as np
 
 from sparklod_cli.cameras.camera import Camera, look_at
 from sparklod_cli.cameras.sources import CameraPath
-from sparklod_cli.lod.settings import LodSettings
 from sparklod_cli.model.foveation import Cones, Frustum
-from sparklod_cli.scenes.loaded import Scenes
 from sparklod_cli.simulation.frames import Simulation
-from sparklod_cli.simulation.streaming_settings import Network, StreamingSettings
 from sparklod_cli.tables.columns import Row
+from sparklod_cli.viewers.scenes import Scenes
+from sparklod_cli.viewers.viewer_settings import LodSettings, Network, StreamingSettings
 from tests.conftest import FIXTURES
 
 TOWN, HAND = FIXTURES / "traverse" / "town.spz", FIXTURES / "golden" / "hand-tree-v3.spz"

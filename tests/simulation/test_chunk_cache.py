@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sparklod_cli.simulation.streaming import ChunkCache, Chunks, header_answers
+from sparklod_cli.viewers.network import ChunkCache, Chunks, header_answers
 from tests.references.streaming import NaiveCache, roots_first
 
 

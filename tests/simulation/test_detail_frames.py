@@ -12,15 +12,13 @@ import pytest
 
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.cameras.sources import CameraPath
-from sparklod_cli.lod.settings import DetailRule, LodSettings
 from sparklod_cli.model.instances import Instance
-from sparklod_cli.scenes.finder import CutFinder
-from sparklod_cli.scenes.loaded import Scenes
-from sparklod_cli.scenes.loaded_scene import LoadedDetail
-from sparklod_cli.scenes.reading import read_scenes
 from sparklod_cli.simulation.frames import Loader, Simulation
 from sparklod_cli.simulation.results import OF_TREES
-from sparklod_cli.simulation.streaming_settings import Network, StreamingSettings
+from sparklod_cli.viewers.loaded_scene import LoadedDetail
+from sparklod_cli.viewers.read_scenes import read_scenes
+from sparklod_cli.viewers.scenes import CutFinder, Scenes
+from sparklod_cli.viewers.viewer_settings import DetailRule, LodSettings, Network, StreamingSettings
 from tests.lod.details import row_of_regions
 from tests.streamed import write_streamed
 

@@ -10,13 +10,12 @@ import numpy as np
 import pytest
 
 from sparklod_cli.cameras.sources import CameraPath
-from sparklod_cli.lod.settings import LodSettings
 from sparklod_cli.model.instances import TOTAL
-from sparklod_cli.scenes.loaded import Scenes
 from sparklod_cli.simulation.frames import Simulation
 from sparklod_cli.simulation.results import COLUMNS
-from sparklod_cli.simulation.streaming_settings import StreamingSettings
 from sparklod_cli.tables.columns import Row
+from sparklod_cli.viewers.scenes import Scenes
+from sparklod_cli.viewers.viewer_settings import LodSettings, StreamingSettings
 from tests.simulation.paths import OF_THE_PAST, SPARK, around, camera, path_of, resting, rows_of, viewers, without
 
 #: Cells that only the row of all instances has.

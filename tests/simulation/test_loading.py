@@ -8,12 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sparklod_cli.lod.settings import LodSettings
-from sparklod_cli.scenes.finder import CutFinder, view_of
-from sparklod_cli.scenes.loaded import Scenes
 from sparklod_cli.simulation.frames import Loader
 from sparklod_cli.simulation.results import LOADING
-from sparklod_cli.simulation.streaming_settings import Network, StreamingSettings
+from sparklod_cli.viewers.scenes import CutFinder, Scenes, view_of
+from sparklod_cli.viewers.viewer_settings import LodSettings, Network, StreamingSettings
 from tests.simulation.paths import SPARK, resting, rows_of
 
 AT = resting(1).cameras[0]

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from sparklod_cli.simulation.streaming import Chunks, ChunkStream
-from sparklod_cli.simulation.streaming_settings import Network
+from sparklod_cli.viewers.network import Chunks, ChunkStream
+from sparklod_cli.viewers.viewer_settings import Network
 from tests.references.streaming import NaiveCache, Twin, roots_first
 
 MB = 1_000_000

@@ -14,13 +14,21 @@ import click
 from ...cameras import DEFAULT_SIZE, ELEVATION, ORBIT
 from ...cameras.formats.table import FORMATS, Axes
 from ...codecs.formats import PRECISIONS
-from ...lod.settings import BLEND, FACTOR, PLAYCANVAS_BUDGET, PRESETS, DetailRule, LodSettings
 from ...model.foveation import BEHIND_FOVEATE, CONE_FOV, CONE_FOV0, CONE_FOVEATE, Cones, Foveation, Frustum
-from ...simulation.streaming_settings import Network, StreamingSettings
 from ...system.errors import CameraPathError, TooManyCamerasError
 from ...system.setting_fields import Quantity, Range, setting, whole
 from ...system.units import check_grouping, parse_time
 from ...system.untrusted import printable
+from ...viewers.viewer_settings import (
+    BLEND,
+    FACTOR,
+    PLAYCANVAS_BUDGET,
+    PRESETS,
+    DetailRule,
+    LodSettings,
+    Network,
+    StreamingSettings,
+)
 from ..command import COMMON, POINT, SIZE, VIEW, VIEWS, flag, flag_of, is_set, parameters_of, refuse
 from ..paths import InputPath, file_of
 from .common import up_option
@@ -32,7 +40,7 @@ if TYPE_CHECKING:
     from ...cameras.sources import CameraSource
     from ...lod.budget import Budget
     from ...model.instances import Instance
-    from ...scenes.loaded import Scenes
+    from ...viewers.scenes import Scenes
     from ..console import Console
     from ..render import RenderOptions
     from ..traverse import TraverseOptions
@@ -318,7 +326,7 @@ class Inputs:
             InstancesFileError: the instances file cannot be read.
         """
         from ...model.instances import instances_of
-        from ...scenes.instances_file import read_instances
+        from ...viewers.instances_file import read_instances
 
         if not self.files and self.scene is None:
             raise click.UsageError("a FILE is missing; name one, or an instances file with --scene")

@@ -157,7 +157,7 @@ print(*sorted(sys.modules))
         "bake.out_of_core.cluster",
         "bake.out_of_core.in_blocks",
         "bake.skipping",
-        "scenes.instances_file",
+        "viewers.instances_file",
     )
     assert {f"sparklod_cli.{name}" for name in others}.intersection(loaded) == set()
     assert "PIL" not in loaded

@@ -17,10 +17,11 @@ from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.codecs.formats import TILESET
 from sparklod_cli.io import read_parts, read_scene
 from sparklod_cli.lod.part_settings import TileSettings
-from sparklod_cli.lod.settings import pixel_limit
-from sparklod_cli.lod.tiles import PIXEL_ERROR, choose
+from sparklod_cli.lod.tiles import PIXEL_ERROR
 from sparklod_cli.model.splats import Splats
-from sparklod_cli.scenes.finder import view_of
+from sparklod_cli.viewers.cesium import choose
+from sparklod_cli.viewers.scenes import view_of
+from sparklod_cli.viewers.viewer_settings import pixel_limit
 from tests.conftest import FIXTURES, ROOT
 from tests.interop.engines import PACKAGES, recipes
 from tests.interop.engines.browser import Browser, Shown

@@ -1,4 +1,4 @@
-"""The detail levels that PlayCanvas's engine chooses, by its own modules, and those of `lod.detail_traversal`."""
+"""The detail levels that PlayCanvas's engine chooses, by its own modules, and those of `viewers.playcanvas`."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sparklod_cli.lod.detail_traversal import Chains, Distant, RegionBounds, choose
-from sparklod_cli.lod.settings import DetailRule
-from sparklod_cli.lod.traversal import CutView
+from sparklod_cli.viewers.playcanvas import Chains, Distant, RegionBounds, choose
+from sparklod_cli.viewers.spark import CutView
+from sparklod_cli.viewers.viewer_settings import DetailRule
 from tests.interop.node import Node
 from tests.lod.details import Regions, random_regions, random_view
 

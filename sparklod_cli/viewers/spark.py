@@ -1,9 +1,8 @@
-"""Budgeted cuts through Level-of-Detail trees: the nodes that a viewer draws for a camera."""
+"""Spark: budgeted cuts through Level-of-Detail trees, the nodes that it draws for a camera."""
 
 from __future__ import annotations
 
 import functools
-import math
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -13,16 +12,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..model.foveation import Cones, Foveation, Frustum
+from ..lod.kernels import cut_arrays, pixel_scale
+from ..lod.kernels.cut import find_cut
+from ..lod.view_foveation import set_foveation
+from ..model.foveation import Cones, Foveation
 from ..model.gaussian import spark_size
 from ..model.lod_tree import CHUNK_BITS, CHUNK_NODES
 from ..model.splats import Splats
 from ..model.traversed import Nodes
-from .kernels import cut_arrays, pixel_scale
-from .kernels import cut_statistics as kernels
-from .kernels.cut import find_cut
-from .kernels.cut_arrays import CutNodes
-from .settings import pixel_limit
 
 #: Initial size of the buffers, in visited nodes per node of a cut: enough if every refined node has two or more
 #: children; for other trees the buffers grow.
@@ -329,157 +326,3 @@ def _unit(vector: NDArray[np.float32]) -> NDArray[np.float32]:
     x, y, z = vector
     unit: NDArray[np.float32] = vector / np.sqrt((x * x + y * y) + z * z)
     return unit
-
-
-def set_foveation(row: np.void, foveation: Foveation, fov_x: float, fov_y: float) -> None:
-    """Fill the foveation fields of a `kernels.pixel_scale.VIEW`; fields of view in radians."""
-    row["behind"] = foveation.behind
-    if isinstance(foveation, Frustum):
-        row["kind"] = pixel_scale.FRUSTUM
-        row["side"] = foveation.outside
-        row["inner"], row["outer"] = math.tan(fov_x / 2), math.tan(fov_y / 2)
-    else:
-        row["kind"] = pixel_scale.CONE
-        row["side"] = foveation.foveate
-        row["inner"] = _half_angle_cosine(foveation.fov0)
-        row["outer"] = min(row["inner"], _half_angle_cosine(foveation.fov))
-    if row["behind"] == row["side"] == 1:
-        row["kind"] = pixel_scale.NO_FOVEATION
-
-
-def _half_angle_cosine(degrees: float) -> np.float32:
-    """Return the cosine of half an angle, of 0 to 180 degrees at most; rounded to float32 where Spark rounds."""
-    if degrees <= 0:
-        return np.float32(1)
-    radians = np.float32(0.5) * np.float32(min(degrees, 180)) * np.float32(math.pi / 180)
-    return np.float32(math.cos(float(radians)))
-
-
-@dataclass(frozen=True)
-class CutStatistics:
-    """Statistics of a cut, or of one instance's nodes in it; names are those of `simulation.results`.
-
-    Attributes:
-        selected, leaves: numbers of nodes, and of those without children.
-        frontier: number of nodes left in the queue when it stops.
-        in_frustum, outside, behind: numbers of nodes by their centres: inside the frustum, outside, behind the camera.
-        level_min, level_mean, level_max: depth, edges from the root; None if no node is selected.
-        projected_px_p50, projected_px_p95: percentiles of the feature sizes inside the frustum, pixels; None without.
-        overdraw_estimate: mean number of nodes inside the frustum that cover a pixel.
-    """
-
-    selected: int
-    leaves: int
-    frontier: int
-    in_frustum: int
-    outside: int
-    behind: int
-    level_min: int | None
-    level_mean: float | None
-    level_max: int | None
-    projected_px_p50: float | None
-    projected_px_p95: float | None
-    overdraw_estimate: float
-
-
-def measure(
-    forest: Forest,
-    level: NDArray[np.int32],
-    cut: TreeCut,
-    view: CutView,
-    *,
-    size: tuple[int, int],
-    by_instance: bool = False,
-) -> tuple[CutStatistics, list[CutStatistics]]:
-    """Return the statistics of a cut found for `view` as a whole and, optionally, of each instance in it.
-
-    Args:
-        level: (nodes,) int32 depths, edges from the root, of all trees.
-        size: width and height of the picture, pixels.
-    """
-    width, height = size
-    counts = np.empty((len(cut.views), kernels.COUNTS), np.int64)
-    sizes, owners = np.empty(len(cut), np.float32), np.empty(len(cut), np.uint16)
-    screen = kernels.Screen(
-        np.float32(math.tan(view.fov_x / 2)),
-        np.float32(math.tan(view.fov_y / 2)),
-        np.float32(pixel_limit(view.fov_y, height)),
-        float(width * height),
-    )
-    nodes = CutNodes(cut.node, cut.limit.view(np.int32), cut.instance)
-    found = kernels.measure_cut(forest.nodes, level, cut.views, nodes, screen, counts, sizes, owners)
-    sizes, owners = sizes[:found], owners[:found]
-    total = counts.sum(axis=0)
-    total[kernels.DEPTH_MIN] = counts[:, kernels.DEPTH_MIN].min()
-    total[kernels.DEPTH_MAX] = counts[:, kernels.DEPTH_MAX].max()
-    whole = _measured(total, sizes, width * height)
-    if not by_instance:
-        return whole, []
-    order = np.argsort(owners, kind="stable")
-    parts = np.split(sizes[order], np.cumsum(np.bincount(owners, minlength=len(cut.views)))[:-1])
-    return whole, [_measured(row, part, width * height) for row, part in zip(counts, parts, strict=True)]
-
-
-def _measured(row: NDArray[np.int64], sizes: NDArray[np.float32], pixels: int) -> CutStatistics:
-    count = [int(value) for value in row]
-    selected = count[kernels.SELECTED]
-    median, high = _percentiles(sizes, (0.50, 0.95))
-    return CutStatistics(
-        selected=selected,
-        leaves=count[kernels.LEAVES],
-        frontier=count[kernels.FRONTIER],
-        in_frustum=count[kernels.IN_FRUSTUM],
-        outside=count[kernels.OUTSIDE],
-        behind=count[kernels.BEHIND],
-        level_min=count[kernels.DEPTH_MIN] if selected else None,
-        level_mean=count[kernels.DEPTH_SUM] / selected if selected else None,
-        level_max=count[kernels.DEPTH_MAX] if selected else None,
-        projected_px_p50=median,
-        projected_px_p95=high,
-        overdraw_estimate=count[kernels.AREA] / kernels.AREA_PARTS / pixels,
-    )
-
-
-def _percentiles(values: NDArray[np.float32], shares: Sequence[float]) -> list[float | None]:
-    """Return percentiles of numbers >= 0, by ascending shares, interpolated linearly; None without numbers."""
-    if not len(values):
-        return [None] * len(shares)
-    places = [share * (len(values) - 1) for share in shares]
-    pairs = [(int(at), min(int(at) + 1, len(values) - 1)) for at in places]
-    found = np.empty((len(pairs), 2), np.float32)
-    kernels.select(values, np.array(pairs, np.int64).ravel(), found.ravel())
-    return [
-        below + (at - int(at)) * (above - below) if above > below else below  # both may be infinite
-        for at, (below, above) in zip(places, found.tolist(), strict=True)
-    ]
-
-
-class Changes:
-    """Compares each cut with the one before it."""
-
-    def __init__(self, forest: Forest, instances: Sequence[TreeInstance]) -> None:
-        sizes = np.diff(forest.node_base)
-        bits = [int(sizes[instance.tree]) for instance in instances]
-        # Each instance begins with a new word.
-        ends = np.cumsum([-(-count // 32) * 32 for count in bits])
-        self._base = np.concatenate([[0], ends[:-1]]).astype(np.int64)
-        self._drawn, self._before = (np.zeros(int(ends[-1]) // 32, np.uint32) for _ in range(2))
-        self._last: tuple[NDArray[np.uint32], NDArray[np.uint16]] | None = None
-        self._counts = [0] * len(bits)
-
-    def next(self, cut: TreeCut) -> list[tuple[int, int | None, int]]:
-        """Return for each instance: nodes in this cut, nodes in both this and the last cut, and nodes in the last cut.
-
-        The second is None for the first cut.
-        """
-        found = np.empty((len(self._base), 2), np.int64)
-        old = self._last or (cut.node[:0], cut.instance[:0])
-        kernels.replace_drawn(self._drawn, self._before, self._base, cut.node, cut.instance, *old, found)
-        first = self._last is None
-        result = [
-            (new, None if first else same, before)
-            for (new, same), before in zip(found.tolist(), self._counts, strict=True)
-        ]
-        self._drawn, self._before = self._before, self._drawn
-        self._last, self._counts = (cut.node, cut.instance), found[:, 0].tolist()
-        return result

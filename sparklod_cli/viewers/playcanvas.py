@@ -1,4 +1,4 @@
-"""Cuts of scenes at several detail levels: what a viewer of Streamed SOG shows, also while chunk files load.
+"""PlayCanvas: the detail levels of Streamed SOG that it draws for a camera, also while chunk files load.
 
 A region is drawn at the level that is chosen for it as soon as the file of that level is there, and until then as it
 was. PlayCanvas 2.23 does so in `GSplatOctreeInstance.applyLodChanges`; priorities are those of its `requestFile`.
@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from ..model.splats import Splats
 from ..model.traversed import DetailScene
-from .settings import LEAST_BASE_DISTANCE, DetailRule
-from .traversal import CutView, SplatForest, TreeCut, TreeInstance
+from .spark import CutView, SplatForest, TreeCut, TreeInstance
+from .viewer_settings import LEAST_BASE_DISTANCE, DetailRule
 
 Levels = NDArray[np.int64]
 

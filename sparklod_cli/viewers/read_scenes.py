@@ -18,7 +18,6 @@ from ..codecs.streamed_sog.manifest import MAX_MANIFEST, files_of_chunk, parse
 from ..io import opened, size_of_input
 from ..io.rad_file import FORMAT as RAD
 from ..io.rad_file import RadFile
-from ..lod.detail_traversal import DetailFiles
 from ..model.instances import Instance
 from ..model.lod_tree import CHUNK_NODES, LodTree
 from ..model.scene import Scene
@@ -28,7 +27,6 @@ from ..model.traversed import DetailScene, TileScene
 from ..system.errors import FormatError, InvalidSplatsError, TreeError, memory_errors_translated, naming
 from ..system.progress import Progress, silent
 from ..system.stdio import DASH
-from .loaded import Scenes
 from .loaded_scene import (
     UNNAMED,
     LoadedDetail,
@@ -42,6 +40,8 @@ from .loaded_scene import (
     nodes_of,
     whole_scene,
 )
+from .playcanvas import DetailFiles
+from .scenes import Scenes
 
 
 def read_scenes(

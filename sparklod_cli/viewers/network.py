@@ -13,8 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..lod.settings import FETCHERS
-from .streaming_settings import Network
+from .viewer_settings import FETCHERS, Network
 
 #: How many bytes Spark's pager asks for at first, then if they do not hold the whole header of a file.
 HEADER_REQUESTS = (64 << 10, 256 << 10, 1 << 20)
@@ -37,7 +36,7 @@ def header_answers(header_bytes: int, file_bytes: int) -> tuple[int, ...]:
 
 
 class Chunks:
-    """The chunks of all trees, numbered consecutively, tree by tree, as in `lod.traversal.Forest.chunk_base`.
+    """The chunks of all trees, numbered consecutively, tree by tree, as in `spark.Forest.chunk_base`.
 
     Args:
         sizes: for each tree the sizes of its chunks in the file, bytes.
@@ -142,7 +141,7 @@ class ChunkCache:
         return chunk in self._resident
 
     def resident(self) -> NDArray[np.bool_]:
-        """Return the resident chunks, (chunks,) bool, for `lod.traversal.Traversal.cut`."""
+        """Return the resident chunks, (chunks,) bool, for `spark.Traversal.cut`."""
         present = np.zeros(len(self._chunks), np.bool_)
         present[list(self._resident)] = True
         return present

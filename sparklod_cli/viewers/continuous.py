@@ -28,13 +28,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..lod.kernels.cut_arrays import BUCKET_BITS, BUCKETS
+from ..lod.kernels.pixel_scale import pixel_scales
+from ..lod.kernels.tree_links import find_depths, find_limits, find_parents
 from ..model.gaussian import linear_opacity, lod_opacity
 from ..model.splats import FloatArray
-from .kernels.cut_arrays import BUCKET_BITS, BUCKETS
-from .kernels.pixel_scale import pixel_scales
-from .kernels.tree_links import find_depths, find_limits, find_parents
-from .settings import BLEND
-from .traversal import CutView, Traversal, views_of
+from .spark import CutView, Traversal, views_of
+from .viewer_settings import BLEND
 
 #: Bisections of the threshold's interval, whose ends differ by a factor of the width; 40 leave a share of 1e-12 of it.
 HALVINGS = 40

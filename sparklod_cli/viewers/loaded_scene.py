@@ -17,10 +17,7 @@ from numpy.typing import NDArray
 from ..cameras.framing import SAMPLE, USED, Balls, balls_of
 from ..codecs.gpu import lod_tree
 from ..io.rad_file import RadFile
-from ..lod.detail_traversal import DetailFiles
 from ..lod.kernels.pixel_scale import NODE
-from ..lod.settings import CESIUM_FETCHERS, CONNECTIONS, PLAYCANVAS_FETCHERS
-from ..lod.traversal import Forest, fill_nodes
 from ..model.instances import Instance
 from ..model.lod_tree import CHUNK_BITS, CHUNK_NODES, LodTree
 from ..model.scene import FileCoding, Scene, facts_of
@@ -29,6 +26,9 @@ from ..model.traversed import DetailScene, Nodes, TileScene
 from ..system.errors import TreeError, naming
 from ..system.machine import available_memory
 from ..system.threads import ordered_map
+from .playcanvas import DetailFiles
+from .spark import Forest, fill_nodes
+from .viewer_settings import CESIUM_FETCHERS, CONNECTIONS, PLAYCANVAS_FETCHERS
 
 Index = NDArray[np.signedinteger]
 
