@@ -81,26 +81,26 @@ class Meter:
 def bake(arguments: list[str]) -> None:
     """Bake in this process and print what its stages and compiled loops took, as JSON."""
     meter = Meter()
-    from sparklod_cli.bake.settings import Clock
+    from sparklod_cli.bake.tree_output import BuiltTree
     from sparklod_cli.cli import main
     from sparklod_cli.system.jit import Kernel
 
-    called, ended = Kernel.__call__, Clock.end
+    called, ended = Kernel.__call__, BuiltTree.end
 
     def call(kernel: Kernel, *values: Any) -> Any:
         module = kernel.py_func.__module__.rpartition(".")[2]
         return meter.kernel(f"{module}.{kernel.py_func.__name__}", lambda: called(kernel, *values))
 
-    def end(clock: Clock, stage: str) -> None:
+    def end(tree: BuiltTree, stage: str) -> None:
         meter.end_stage(stage)
-        ended(clock, stage)
+        ended(tree, stage)
 
-    def begin(clock: Clock) -> None:
+    def begin(tree: BuiltTree, **values: Any) -> None:
         meter.end_stage("start")
-        prepared(clock)
+        prepared(tree, **values)
 
-    prepared = Clock.__init__
-    Kernel.__call__, Clock.end, Clock.__init__ = call, end, begin  # type: ignore[method-assign,assignment]
+    prepared = BuiltTree.__init__
+    Kernel.__call__, BuiltTree.end, BuiltTree.__init__ = call, end, begin  # type: ignore[method-assign,assignment]
     sys.argv = ["sparklod", *arguments]
     try:
         main()

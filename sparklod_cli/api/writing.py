@@ -151,7 +151,6 @@ def _write_levels(
     progress: Progress,
 ) -> Written:
     from ..bake.parts_output import write_levels
-    from ..bake.settings import Clock
 
     path = out.place
     assert isinstance(path, Path)
@@ -162,7 +161,7 @@ def _write_levels(
     if environment is not None and not len(environment.splats):
         raise InvalidSplatsError(f"{path}: the environment has no splats to write")
     always = None if environment is None else environment.splats
-    size, _ = write_levels(scene, always, out, settings, options, Clock(), threads, progress)
+    size, _ = write_levels(scene, always, out, settings, options, lambda stage: None, threads, progress)
     return Written(path, "Streamed SOG", size)
 
 

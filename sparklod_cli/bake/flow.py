@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import hashlib
 import os
 import tempfile
@@ -14,15 +15,15 @@ from ..codecs.formats import META, RAD_SUFFIX
 from ..codecs.reader import Reader
 from ..io.reading import Source, open_reader
 from ..lod.builders import METHODS
-from ..model.scene import up_notes
+from ..model.scene import Scene, up_notes
 from ..system.addresses import Place
 from ..system.errors import memory_errors_translated
 from ..system.progress import Progress, silent
 from ..system.stdio import DASH
 from . import estimate
-from .in_memory import InMemory
-from .settings import Baked, BakeSettings, BuiltTree, Clock, Resources
-from .tree_output import output_of, write_tree
+from .in_memory import build, put_in_order
+from .settings import Baked, BakeSettings, Resources
+from .tree_output import output_of, write_whole, write_windows
 
 if TYPE_CHECKING:
     from .out_of_core.job import Engine
@@ -67,15 +68,16 @@ def bake(
         KeyboardInterrupt: see `refined`.
     """
     with memory_errors_translated(), contextlib.ExitStack() as stack:
-        resources, fitting = resources or Resources(), None
-        if settings.refine is not None:
-            from .simplifying import fit_settings, refined
+        resources, fitting, blocks = resources or Resources(), None, None
+        if settings.refine is not None and settings.simplify is None:  # of a simplified scene, its one cut is fitted
+            fitting = settings.refine
+            if settings.camera_path is not None:
+                from ..cameras.sources import read_path
 
-            fitting = fit_settings(settings)
+                fitting = dataclasses.replace(fitting, path=read_path(settings.camera_path))
         overwrite = overwrite or (resources.resume and has_published(source, target, settings, resources))
-        output, clock = output_of(target, settings, overwrite=overwrite, say=say), Clock()
-        opened, blocks = contextlib.ExitStack(), None
-        stack.enter_context(opened)
+        tree = output_of(target, settings, overwrite=overwrite, say=say)
+        opened = stack.enter_context(contextlib.ExitStack())
         reader = opened.enter_context(open_reader(source, threads=threads))
         if not reader.has_tree and _may_need_blocks(reader, source, target, settings, resources, engine):
             from .out_of_core.planning import blocks_for
@@ -83,9 +85,7 @@ def bake(
             blocks = stack.enter_context(
                 blocks_for(
                     source,
-                    settings,
-                    output,
-                    clock,
+                    tree,
                     header=reader,
                     folder=scratch_folder(source, target, settings, resources.scratch_dir),
                     overwrite=overwrite,
@@ -96,20 +96,30 @@ def bake(
                     say=say,
                 )
             )
-        if blocks is not None:
-            opened.close()
-        baked = Baked(format=reader.format, notes=reader.notes, read=reader.count, seconds=clock.seconds)
+        baked = tree.baked
+        baked.format, baked.notes, baked.read = reader.format, reader.notes, reader.count
         if settings.up is None and reader.up:
             baked.notes += up_notes(reader.up, reader.up_by)
-        tree = BuiltTree(output=output, baked=baked)
-        work = blocks or InMemory(source, reader, opened, settings, clock, threads, progress)
-        del reader  # which may hold much memory until the last splat was read
-        work.build(tree)
-        if fitting is not None and settings.simplify is None:  # which fits its one cut
-            tree.nodes, baked.refine = refined(tree.scene, fitting, threads=threads, progress=progress, say=say)
-            clock.end("refine")
-        work.order(tree)
-        write_tree(tree, work.encode, clock, threads, progress)
+        if blocks is None:
+            tree.nodes = reader.scene(progress=progress)
+        opened.close()
+        del reader  # which may hold much memory
+        if blocks is None:
+            build(tree, source, threads, progress)
+            if fitting is not None:
+                from .simplifying import refined
+
+                assert isinstance(tree.nodes, Scene)
+                tree.nodes, baked.refine = refined(tree.nodes, fitting, threads=threads, progress=progress, say=say)
+                tree.end("refine")
+            put_in_order(tree, threads, progress)
+        else:
+            blocks.build(tree)
+            blocks.order(tree)
+        if tree.form is None:
+            write_whole(tree, threads, progress)
+        else:
+            write_windows(tree, None if blocks is None else blocks.encode, threads, progress)
         if blocks is not None:
             traffic = blocks.job.store.traffic
             baked.scratch_bytes_written, baked.scratch_bytes_read = traffic.written, traffic.read

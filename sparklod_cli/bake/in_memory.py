@@ -1,16 +1,13 @@
-"""A bake in memory: selected and transformed splats of an input are one block."""
+"""Steps of a bake in memory: selected and transformed splats of an input are one block."""
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..codecs.encoder import Encoder, Windows, results
-from ..codecs.reader import Reader, check_valid, is_valid_and_visible
+from ..codecs.reader import check_valid, is_valid_and_visible
 from ..codecs.statistics import Statistics
 from ..io import read_rgba, read_scene
 from ..io.reading import Source
@@ -22,102 +19,80 @@ from ..model.splats import Splats
 from ..system.errors import FormatError, InvalidSplatsError, naming
 from ..system.progress import Progress
 from ..system.threads import on_threads
-from .settings import BakeSettings, BuiltTree, Clock
-from .tree_output import output_of_existing_tree
+from .settings import BakeSettings
+from .tree_output import BuiltTree, keep_tree
 
 if TYPE_CHECKING:
     from ..model.transforms import Transform
 
 
-@dataclass
-class InMemory:
-    """Workspace in memory; that of a bake out of core, `in_blocks.InBlocks`, has the same three steps.
+def build(tree: BuiltTree, source: Source, threads: int, progress: Progress) -> None:
+    """Select and transform the splats of an input, and build their tree, or keep the one that it has."""
+    settings, baked, scene = tree.settings, tree.baked, tree.nodes
+    assert isinstance(scene, Scene)
+    tree.nodes = None
+    if settings.environment is not None:
+        tree.environment = read_environment(settings, threads, progress)
+    antialiased, up = scene.antialiased, settings.up or scene.up
+    if settings.transform is not None:
+        up = rotated_axis(up, settings.transform.rotation)
+    if scene.tree is not None:
+        keep_tree(tree, source, scene)
+        check_valid(scene.splats, threads)
+        baked.splats = int(np.count_nonzero(scene.tree.is_leaf))
+        tree.nodes = Scene(scene.splats, scene.tree, antialiased, up=up)
+        tree.end("read")
+        return
+    splats, tally = select(scene.splats, settings, threads=threads)
+    settings.selection.check(tally)
+    far = None
+    if settings.environment_beyond is not None:
+        splats, far = split_environment(splats, settings.environment_beyond)
+    if settings.transform is not None:
+        splats = transformed(splats, settings.transform, threads)
+    if far is not None and tree.environment is None:
+        tree.environment = transformed(far, settings.transform, threads)
+    tree.end("read")
+    if tree.form is not None:
+        codec = tree.form.codec()
+        tree.statistics = Statistics.of(splats, np.ones(len(splats), np.bool_), codec.needed(tree.options), threads)
+        codec.settled(tree.statistics, tree.options)  # reports a tree that the output cannot hold before it is built
+    baked.splats, baked.dropped, baked.method = len(splats), tally.dropped, settings.method
+    leaves = [splats]
+    del scene, splats, far  # the builder frees its input as it goes, if nobody else holds it: a third of the peak
+    with on_threads(threads):
+        built = build_tree(leaves, settings, in_chunks=tree.in_chunks, progress=progress)
+    tree.nodes = Scene(*built, antialiased, up=up)
+    tree.end("build")
 
-    Attributes:
-        source, settings, threads, progress: as for `flow.bake`.
-        reader: of the source; None after it was read.
-        opened: closes the reader.
-    """
 
-    source: Source
-    reader: Reader | None
-    opened: contextlib.ExitStack
-    settings: BakeSettings
-    clock: Clock
-    threads: int
-    progress: Progress
-    _leaves: Statistics | None = None
-
-    def build(self, tree: BuiltTree) -> None:
-        """Read the input, select and transform its splats, and build their tree, or keep the one that it has."""
-        settings, threads, progress, baked = self.settings, self.threads, self.progress, tree.baked
-        assert self.reader is not None
-        with self.opened:
-            scene, self.reader = self.reader.scene(progress=progress), None
-        if settings.environment is not None:
-            tree.environment = read_environment(settings, threads, progress)
-        antialiased, up = scene.antialiased, settings.up or scene.up
-        if settings.transform is not None:
-            up = rotated_axis(up, settings.transform.rotation)
-        if scene.tree is not None:
-            tree.output, tree.is_ordered = output_of_existing_tree(tree.output, self.source, scene)
-            check_valid(scene.splats, threads)
-            baked.splats = int(np.count_nonzero(scene.tree.is_leaf))
-            tree.nodes = Scene(scene.splats, scene.tree, antialiased, up=up)
-            self.clock.end("read")
-            return
-        splats, tally = select(scene.splats, settings, threads=threads)
-        settings.selection.check(tally)
-        far = None
-        if settings.environment_beyond is not None:
-            splats, far = split_environment(splats, settings.environment_beyond)
-        if settings.transform is not None:
-            splats = transformed(splats, settings.transform, threads)
-        if far is not None and tree.environment is None:
-            tree.environment = transformed(far, settings.transform, threads)
-        self.clock.end("read")
-        output = tree.output
-        if output.form is not None:
-            self._leaves = Statistics.of(splats, np.ones(len(splats), np.bool_), output.needed, threads)
-            # An output that cannot hold the tree is reported before the tree is built.
-            output.form.codec().settled(self._leaves, output.options)
-        baked.splats, baked.dropped, baked.method = len(splats), tally.dropped, settings.method
-        leaves = [splats]
-        del scene, splats, far  # the builder frees its input as it goes, if nobody else holds it: a third of the peak
+def put_in_order(tree: BuiltTree, threads: int, progress: Progress) -> None:
+    """Put the nodes of a tree into the order of its output, and count them."""
+    scene, baked = tree.nodes, tree.baked
+    assert isinstance(scene, Scene) and scene.tree is not None
+    baked.nodes, baked.sh_degree = len(scene), scene.splats.sh_degree
+    baked.levels = int(scene.tree.depths().max()) + 1
+    if tree.in_chunks and not tree.is_ordered:
         with on_threads(threads):
-            built = build_tree(leaves, settings, in_chunks=output.in_chunks, progress=progress)
-        tree.nodes = Scene(*built, antialiased, up=up)
-        self.clock.end("build")
+            from ..lod.chunk_order import chunk_order
+            from ..lod.families import reordered
 
-    def order(self, tree: BuiltTree) -> None:
-        """Put the nodes of a tree into the order of its output, and count them."""
-        scene, output = tree.scene, tree.output
+            order, child_start = chunk_order(scene.splats, scene.tree, progress=progress)
+            built, antialiased, up = [(scene.splats, scene.tree)], scene.antialiased, scene.up
+            tree.nodes = None
+            del scene  # `reordered` frees the nodes as it goes
+            tree.nodes = scene = Scene(*reordered(built, order, child_start), antialiased=antialiased, up=up)
+        tree.end("arrange")
+    if tree.form is None:
+        return
+    needed = tree.form.codec().needed(tree.options)
+    if tree.statistics is None:
+        tree.statistics = Statistics.of_scene(scene, needed, threads=threads)
+    else:
         assert scene.tree is not None
-        tree.baked.nodes, tree.baked.sh_degree = len(scene), scene.splats.sh_degree
-        tree.baked.levels = int(scene.tree.depths().max()) + 1
-        if output.in_chunks and not tree.is_ordered:
-            with on_threads(self.threads):
-                from ..lod.chunk_order import chunk_order
-                from ..lod.families import reordered
-
-                order, child_start = chunk_order(scene.splats, scene.tree, progress=self.progress)
-                built, antialiased, up = [(scene.splats, scene.tree)], scene.antialiased, scene.up
-                tree.nodes = None
-                del scene  # `reordered` frees the nodes as it goes
-                tree.nodes = scene = Scene(*reordered(built, order, child_start), antialiased=antialiased, up=up)
-            self.clock.end("arrange")
-        if output.form is not None and self._leaves is not None:
-            assert scene.tree is not None
-            inner = scene.splats.take(~scene.tree.is_leaf)
-            merged = Statistics.of(inner, np.zeros(len(inner), np.bool_), output.needed, self.threads)
-            tree.statistics = Statistics.merged([self._leaves, merged])
-        elif output.form is not None:
-            tree.statistics = Statistics.of_scene(scene, output.needed, threads=self.threads)
-
-    def encode(self, tree: BuiltTree, encoder: Encoder) -> Windows:
-        """Encode the windows of a tree that is in order."""
-        windows = list(results(encoder, tree.scene, self.threads, self.progress, "encoding"))
-        return lambda number, name: windows[number][name]
+        inner = scene.splats.take(~scene.tree.is_leaf)
+        merged = Statistics.of(inner, np.zeros(len(inner), np.bool_), needed, threads)
+        tree.statistics = Statistics.merged([tree.statistics, merged])
 
 
 def build_tree(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +16,6 @@ from ..model.splats import Splats
 from ..system.output import Output
 from ..system.progress import Progress
 from ..system.threads import on_threads
-from .settings import Clock
 
 
 @dataclass(frozen=True)
@@ -66,11 +66,15 @@ def write_levels(
     out: Output,
     settings: DetailSettings,
     options: WriteOptions,
-    clock: Clock,
+    end: Callable[[str], None],
     threads: int,
     progress: Progress,
 ) -> tuple[int, WrittenDetail]:
-    """Make the levels of a tree and write them as a Streamed SOG; return the bytes of its files."""
+    """Make the levels of a tree and write them as a Streamed SOG; return the bytes of its files, and their record.
+
+    Args:
+        end: called with the name of each stage before the last one, when it is done.
+    """
     from ..codecs.streamed_sog.codec import encode_files
     from ..lod.detail_levels import make
     from .region_errors import measured
@@ -78,9 +82,9 @@ def write_levels(
     assert scene.tree is not None
     with on_threads(threads):
         made = make(scene.splats, scene.tree, settings, progress=progress)
-    clock.end("levels")
+    end("levels")
     errors = measured(made, threads=threads, progress=progress)
-    clock.end("errors")
+    end("errors")
     antialiased, up = scene.antialiased, scene.up
     made = dataclasses.replace(made, errors=errors, environment=environment, antialiased=antialiased, up=up)
     size, names = 0, list[str]()
@@ -88,7 +92,6 @@ def write_levels(
         for name, pieces in encode_files(made, options, settings, threads=threads, progress=progress):
             size += out.write(name, pieces)
             names.append(name)
-    clock.end("write")
     splats, worst = made.counts.sum(axis=0).tolist(), errors.max(axis=0).tolist()
     levels = tuple(
         WrittenLevel(count, round(count / splats[0], 6), error) for count, error in zip(splats, worst, strict=True)
@@ -102,11 +105,11 @@ def write_tiles(
     out: Output,
     settings: TileSettings,
     options: WriteOptions,
-    clock: Clock,
+    end: Callable[[str], None],
     threads: int,
     progress: Progress,
 ) -> tuple[int, WrittenTiles]:
-    """Make the tiles of a tree and write them as 3D Tiles; return the bytes of their files."""
+    """Make the tiles of a tree and write them as 3D Tiles; see `write_levels`."""
     from ..codecs.tiles_3d.codec import encode_files
     from ..lod.tiles import make
 
@@ -114,11 +117,10 @@ def write_tiles(
     with on_threads(threads):
         made = make(scene.splats, scene.tree, settings, progress=progress)
     made = dataclasses.replace(made, antialiased=scene.antialiased, up=scene.up)
-    clock.end("tiles")
+    end("tiles")
     with out:
         files = encode_files(made, options, threads=threads, progress=progress)
         size = sum(out.write(*file) for file in files)
-    clock.end("write")
     levels = int(made.level.max()) + 1
     splats = tuple(int(made.counts[made.at_level(level)].sum()) for level in range(levels))
     georeferenced = not np.array_equal(made.transform, np.eye(4))

@@ -1,8 +1,7 @@
-"""Settings and resources of a bake, and its records: the tree in work and the result."""
+"""Settings, resources and result of a bake."""
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,20 +11,16 @@ from ..io.reading import Merged as Merged
 from ..io.reading import Source as Source
 from ..lod.builders import DEFAULT_BASE, DEFAULT_GROWTH, METHODS
 from ..model import MAX_SH_DEGREE
-from ..model.scene import NodeStream, Scene
 from ..model.selection import Selection
 
 if TYPE_CHECKING:
     from ..codecs.encoder import Clamp
-    from ..codecs.statistics import Statistics
     from ..fitting.settings import FitSettings
     from ..lod.part_settings import DetailSettings, TileSettings
-    from ..model.splats import Splats
     from ..model.transforms import Transform
     from ..system.addresses import Place
     from .parts_output import WrittenDetail, WrittenTiles
     from .simplifying import Refined, SimplifyGoal, WrittenSet
-    from .tree_output import BakeOutput
 
 #: Suffix of the format that is written unless another one is chosen.
 SPZ = ".spz"
@@ -107,20 +102,6 @@ class Resources:
     block_splats: int | None = None
 
 
-@dataclass
-class Clock:
-    """Seconds by stage."""
-
-    seconds: dict[str, float] = field(default_factory=dict)
-    _start: float = field(default_factory=time.perf_counter)
-
-    def end(self, stage: str) -> None:
-        """End a stage; the next one begins."""
-        now = time.perf_counter()
-        self.seconds[stage] = round(now - self._start, 4)
-        self._start = now
-
-
 @dataclass(kw_only=True)
 class Baked:
     """Result of a bake, which its steps fill in.
@@ -177,29 +158,3 @@ class Baked:
     blocks: int | None = None
     scratch_bytes_written: int | None = None
     scratch_bytes_read: int | None = None
-
-
-@dataclass(kw_only=True, eq=False)
-class BuiltTree:
-    """Tree on its way from the splats of an input to a file.
-
-    Attributes:
-        nodes: in memory or in a store; None before the tree is built, and while a step replaces them.
-        baked: what the steps report.
-        environment: splats that are always drawn; None without.
-        statistics: those of all nodes that `output.needed` names; None for an output that needs none.
-        is_ordered: the nodes have the order of the output.
-    """
-
-    output: BakeOutput
-    nodes: Scene | NodeStream | None = None
-    baked: Baked = field(default_factory=Baked)
-    environment: Splats | None = None
-    statistics: Statistics | None = None
-    is_ordered: bool = False
-
-    @property
-    def scene(self) -> Scene:
-        """The tree in memory."""
-        assert isinstance(self.nodes, Scene)
-        return self.nodes

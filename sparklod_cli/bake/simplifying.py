@@ -8,12 +8,13 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras.camera import Camera
-from ..codecs.formats import WRITABLE
+from ..codecs.formats import WRITABLE, Format
 from ..codecs.losses import Losses, settled_with_losses
 from ..codecs.options import WriteOptions
 from ..codecs.reader import check_valid
@@ -30,10 +31,10 @@ from ..model.splats import Splats
 from ..system import interrupts
 from ..system.addresses import Place
 from ..system.errors import FormatError, SparklodError, memory_errors_translated
+from ..system.output import Output
 from ..system.progress import Progress, silent
 from ..system.threads import on_threads
 from ..system.units import count_of
-from .settings import BakeSettings, BuiltTree, Clock
 
 #: Number of cameras for a PSNR unless cameras are given, and their seed; a fitted tree is judged by as many.
 CAMERAS, SEED = 16, 0
@@ -180,17 +181,20 @@ class Simplifier:
     say: Callable[[str], None] = lambda text: None
 
     @classmethod
-    def of(cls, settings: BakeSettings, say: Callable[[str], None]) -> Simplifier:
-        """Return the simplifier for a bake; raise `CameraPathError` if its cameras cannot be read."""
-        assert settings.simplify is not None
-        refine, cameras = fit_settings(settings), None
-        if refine is not None and refine.path is not None:
-            cameras = refine.path.cameras
-        elif settings.camera_path is not None:
-            from ..cameras.sources import read_path
+    def of(
+        cls,
+        goal: SimplifyGoal,
+        refine: FitSettings | None,
+        camera_path: Path | None,
+        say: Callable[[str], None],
+    ) -> Simplifier:
+        """Return a simplifier with the cameras of a file, if one is given; raise `CameraPathError` for a bad one."""
+        if camera_path is None:
+            return cls(goal, refine, None, say)
+        from ..cameras.sources import read_path
 
-            cameras = read_path(settings.camera_path).cameras
-        return cls(settings.simplify, refine, cameras, say)
+        path = read_path(camera_path)
+        return cls(goal, refine and dataclasses.replace(refine, path=path), path.cameras, say)
 
     def choose(
         self, tree: Scene, *, bytes_of: Callable[[Scene], float], threads: int, progress: Progress
@@ -239,6 +243,37 @@ class Simplifier:
         scene = dataclasses.replace(fitted, splats=fitted.splats.take(fixed), tree=None)
         return scene, faint, measured, report
 
+    def write(
+        self,
+        tree: Scene,
+        out: Output,
+        form: Format,
+        options: WriteOptions,
+        leaves: int,
+        end: Callable[[str], None],
+        threads: int,
+        progress: Progress,
+    ) -> tuple[int, WrittenSet]:
+        """Cut a tree and write the cut, a scene without a tree; return the bytes of its files, and their record.
+
+        Args:
+            leaves: number of splats at full detail.
+            end: called with the name of each stage before the last one, when it is done.
+        """
+
+        def bytes_of(scene: Scene) -> int:
+            files = encoded(out, form, scene, form.codec().settled(scene, options), threads=threads)
+            return sum(sum(map(len, pieces)) for _, pieces in files)
+
+        with on_threads(threads):
+            scene, faint, psnr, refine = self.choose(tree, bytes_of=bytes_of, threads=threads, progress=progress)
+        settled, losses = settled_with_losses(scene, form, options, threads)
+        end("simplify")
+        size = write_scene(out, form, scene, settled, threads=threads, progress=progress)
+        count = len(scene)
+        share = round(count / leaves, 6)
+        return size, WrittenSet(**vars(losses), splats=count, share=share, faint=faint, psnr=psnr, refine=refine)
+
 
 @dataclass(frozen=True)
 class WrittenSet(Losses):
@@ -259,48 +294,12 @@ class WrittenSet(Losses):
     refine: Refined | None
 
 
-def write_simplified(tree: BuiltTree, simplifier: Simplifier, clock: Clock, threads: int, progress: Progress) -> None:
-    """Cut a tree and write the cut, a scene without a tree."""
-    out, form = tree.output.out, WRITABLE[tree.output.settings.suffix]
-    # The opacities of a tree that was read make up for the rounding of its scales already.
-    options = dataclasses.replace(tree.output.options, covering=tree.baked.method is not None)
-
-    def bytes_of(scene: Scene) -> int:
-        files = encoded(out, form, scene, form.codec().settled(scene, options), threads=threads)
-        return sum(sum(map(len, pieces)) for _, pieces in files)
-
-    with on_threads(threads):
-        scene, faint, psnr, refine = simplifier.choose(
-            tree.scene, bytes_of=bytes_of, threads=threads, progress=progress
-        )
-    settled, losses = settled_with_losses(scene, form, options, threads)
-    clock.end("simplify")
-    baked = tree.baked
-    baked.bytes = write_scene(out, form, scene, settled, threads=threads, progress=progress)
-    clock.end("write")
-    baked.output_format, share = form.name, round(len(scene) / baked.splats, 6)
-    baked.simplified = WrittenSet(**vars(losses), splats=len(scene), share=share, faint=faint, psnr=psnr, refine=refine)
-
-
 @dataclass(frozen=True, kw_only=True)
 class Refined(FitReport):
     """Result of fitting merged splats, as reported by `--json`; the seed is that of random cameras and budgets."""
 
     seed: int
     seconds: float
-
-
-def fit_settings(settings: BakeSettings) -> FitSettings | None:
-    """Return the settings of fitting, with the cameras of the file they name; None without `--refine`.
-
-    Raises:
-        CameraPathError: the file cannot be read, or has no cameras; names it.
-    """
-    if settings.refine is None or settings.camera_path is None:
-        return settings.refine
-    from ..cameras.sources import read_path  # most bakes read no cameras
-
-    return dataclasses.replace(settings.refine, path=read_path(settings.camera_path))
 
 
 def refined(
@@ -407,23 +406,23 @@ def extract_leaves(
     with memory_errors_translated():
         form = WRITABLE[suffix]
         out = scene_output(target, form, chunked=options.rad.chunked, overwrite=overwrite)
-        clock = Clock()
+        start = time.perf_counter()
         scene = read_scene(source, threads=threads, progress=progress)
         leaves = leaves_of(scene)
         check_valid(leaves.splats, threads)
-        clock.end("read")
+        begun = time.perf_counter()
         # As they are: their opacities make up for nothing.
         chosen = dataclasses.replace(like(scene.header, options), covering=False)
         chosen, losses = settled_with_losses(leaves, form, chosen, threads)
         size = write_scene(out, form, leaves, chosen, threads=threads, progress=progress)
-        clock.end("write")
+        seconds = {"read": round(begun - start, 4), "write": round(time.perf_counter() - begun, 4)}
     return Extracted(
         format=scene.format,
         nodes=len(scene.splats),
         splats=len(leaves.splats),
         sh_degree=leaves.splats.sh_degree,
         bytes=size,
-        seconds=clock.seconds,
+        seconds=seconds,
         output_format=form.name,
         **vars(losses),
     )

@@ -1,89 +1,100 @@
-"""Output of a bake: its files and options, which are known before the tree is built, and writing the tree."""
+"""Outputs of a bake: their files and options, which are known before the tree is built, and writing the tree."""
 
 from __future__ import annotations
 
 import dataclasses
+import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import PurePath
 from typing import TYPE_CHECKING, Any
 
-from ..codecs.encoder import CLAMPED, Encoder, Stored, Windows, clamps_of, windows_of
+from ..codecs.encoder import CLAMPED, Encoder, Stored, Windows, clamps_of, results, windows_of
 from ..codecs.formats import RAD_SUFFIX as RAD
 from ..codecs.formats import WRITABLE, Format
 from ..codecs.options import DEFAULTS, RAD_ENCODINGS, WriteOptions
 from ..io.reading import Merged, Source, opened, read_stored
 from ..io.writing import parts_output, scene_output
-from ..model.scene import Scene
+from ..model.scene import NodeStream, Scene
 from ..model.splats import Splats, same_rows
 from ..system.addresses import Place
 from ..system.errors import FormatError
 from ..system.output import Output
 from ..system.progress import Progress
-from .settings import SPZ, Baked, BakeSettings, BuiltTree, Clock
+from .settings import SPZ, Baked, BakeSettings
 
 if TYPE_CHECKING:
+    from ..codecs.statistics import Statistics
     from .simplifying import Simplifier
 
-#: Encodes the windows of a tree.
-Encode = Callable[[BuiltTree, Encoder], Windows]
 
-
-@dataclass(frozen=True)
-class BakeOutput:
-    """Destination of a tree.
+@dataclass(kw_only=True, eq=False)
+class BuiltTree:
+    """Tree on its way from the splats of an input to the files of an output.
 
     Attributes:
-        out: its files.
-        options: of its format.
+        out, options: files of the output, and the options of its format.
         form: format of an SPZ or RAD file, which is written in windows; None for an output that is made of all nodes at
             once, in memory, and takes any tree.
+        in_chunks: viewers read the output in chunks, for which nodes are ordered first.
         simplifier: of a simplified scene, else None.
         stored: codes of unchanged nodes, which keep them; None for none.
         before: (N,) nodes with these codes.
         repacked: RAD file whose chunks are copied; None for none.
+        nodes: in memory or in a store; before the tree is built, the splats of an input in memory; None while a step
+            replaces them.
+        baked: the result, which the steps fill in.
+        environment: splats that are always drawn; None without.
+        statistics: of all nodes, those by which the codec settles options; of the leaves alone before the nodes are in
+            order; None for an output that needs none.
+        is_ordered: the nodes have the order of the output.
+        started: when the current stage began, seconds of `time.perf_counter`.
     """
 
-    out: Output
     settings: BakeSettings
+    out: Output
     options: WriteOptions
     form: Format | None = None
+    in_chunks: bool = False
     simplifier: Simplifier | None = None
     stored: Stored | None = None
     before: Splats | None = None
     repacked: Place | None = None
+    nodes: Scene | NodeStream | None = None
+    baked: Baked = field(default_factory=Baked)
+    environment: Splats | None = None
+    statistics: Statistics | None = None
+    is_ordered: bool = False
+    started: float = field(default_factory=time.perf_counter)
 
-    @property
-    def in_chunks(self) -> bool:
-        """Whether viewers read it in chunks, for which nodes are ordered first."""
-        return self.form is not None and self.form is WRITABLE[RAD]
-
-    @property
-    def needed(self) -> frozenset[str]:
-        """Statistics of all nodes by which the codec settles options, see `codecs.statistics`."""
-        return frozenset() if self.form is None else self.form.codec().needed(self.options)
+    def end(self, stage: str) -> None:
+        """End a stage; the next one begins."""
+        now = time.perf_counter()
+        self.baked.seconds[stage] = round(now - self.started, 4)
+        self.started = now
 
 
 def output_of(
     target: Place, settings: BakeSettings, *, overwrite: bool, say: Callable[[str], None] = lambda text: None
-) -> BakeOutput:
-    """Return the output of a bake; raise `OutputError` or `CameraPathError` now, before the work."""
-    options = settings.options
+) -> BuiltTree:
+    """Return a tree to be built, with its output; raise `OutputError` or `CameraPathError` now, before the work."""
+    options, simplify = settings.options, settings.simplify
     if settings.detail is not None or settings.tiles is not None:
-        return BakeOutput(parts_output(target, overwrite=overwrite), settings, options)
-    if settings.encoding is not None and settings.simplify is None:
-        return BakeOutput(Output(target, overwrite=overwrite), settings, options)
+        return BuiltTree(settings=settings, out=parts_output(target, overwrite=overwrite), options=options)
+    if settings.encoding is not None and simplify is None:
+        return BuiltTree(settings=settings, out=Output(target, overwrite=overwrite), options=options)
     form = WRITABLE[settings.suffix]
     out = scene_output(target, form, chunked=options.rad.chunked, overwrite=overwrite)
-    if settings.simplify is None:
-        return BakeOutput(out, settings, options, form)
+    if simplify is None:
+        return BuiltTree(settings=settings, out=out, options=options, form=form, in_chunks=form is WRITABLE[RAD])
     from .simplifying import Simplifier
 
-    return BakeOutput(out, settings, options, simplifier=Simplifier.of(settings, say))
+    simplifier = Simplifier.of(simplify, settings.refine, settings.camera_path, say)
+    return BuiltTree(settings=settings, out=out, options=options, simplifier=simplifier)
 
 
-def output_of_existing_tree(output: BakeOutput, source: Source, scene: Scene) -> tuple[BakeOutput, bool]:
-    """Return the output of an input whose tree is kept, and whether its nodes are in order already.
+def keep_tree(tree: BuiltTree, source: Source, scene: Scene) -> None:
+    """Adapt an output to an input whose tree is kept.
 
     Nodes keep their opacities. In the same format, options that were not given are those of the file, and the codes of
     unchanged nodes are copied. Chunks of a RAD file that gets its other container are copied unless an option changes
@@ -93,12 +104,11 @@ def output_of_existing_tree(output: BakeOutput, source: Source, scene: Scene) ->
         FormatError: the settings neither change the format or container of the tree nor fit its merged splats; or they
             have options that only splats without a tree take.
     """
-    settings = output.settings
+    settings, options = tree.settings, tree.options
     held = scene.format.split()[0]
-    others = settings.detail, settings.tiles, settings.encoding, settings.simplify
-    plain = all(other is None for other in others)
-    is_same = plain and WRITABLE[settings.suffix].name == held
-    is_same_container = bool(scene.header.get("chunked")) == settings.options.rad.chunked
+    rest = settings.detail, settings.tiles, settings.encoding, settings.simplify
+    is_same = all(setting is None for setting in rest) and WRITABLE[settings.suffix].name == held
+    is_same_container = bool(scene.header.get("chunked")) == options.rad.chunked
     converts = settings.converts and settings.encoding is None and not (is_same and is_same_container)
     if settings.refine is None and not converts:
         other = next(each for each in (WRITABLE[RAD], WRITABLE[SPZ]) if each.name != held)
@@ -112,69 +122,39 @@ def output_of_existing_tree(output: BakeOutput, source: Source, scene: Scene) ->
             f"it has a tree, which {kept}; leave out {', '.join(settings.unused)}, or give the splats that"
             " the tree was built from"
         )
-    if output.form is None:
-        return output, False
-    options = output.options
+    if tree.form is None:
+        return
     if is_same and settings.refine is not None:
         assert not isinstance(source, Merged)  # of which no part is a tree
-        stored = read_stored(source)
-        return dataclasses.replace(output, options=stored.like(options), stored=stored, before=scene.splats), True
-    if is_same and dataclasses.replace(options, rad=dataclasses.replace(options.rad, chunked=False)) == DEFAULTS:
+        tree.stored, tree.before, tree.is_ordered = read_stored(source), scene.splats, True
+        tree.options = tree.stored.like(options)
+    elif is_same and dataclasses.replace(options, rad=dataclasses.replace(options.rad, chunked=False)) == DEFAULTS:
         assert not isinstance(source, Merged)
-        return dataclasses.replace(output, form=None, repacked=source), False
-    return dataclasses.replace(output, options=dataclasses.replace(options, covering=False)), False
-
-
-def write_tree(tree: BuiltTree, encode: Encode, clock: Clock, threads: int, progress: Progress) -> None:
-    """Write a tree whose nodes are in order to its output; all but SPZ and RAD files need its nodes in memory."""
-    output, baked = tree.output, tree.baked
-    out, settings, options = output.out, output.settings, output.options
-    if output.form is not None:
-        _write_windows(tree, output.form, encode, clock, threads, progress)
-    elif output.repacked is not None:
-        _repack(output.repacked, out, baked)
-        clock.end("write")
-    elif settings.tiles is not None:
-        from .parts_output import write_tiles
-
-        baked.output_format = "3d-tiles"
-        baked.bytes, baked.tiles = write_tiles(tree.scene, out, settings.tiles, options, clock, threads, progress)
-    elif settings.detail is not None:
-        from .parts_output import write_levels
-
-        baked.output_format = "streamed-sog"
-        baked.bytes, baked.detail = write_levels(
-            tree.scene, tree.environment, out, settings.detail, options, clock, threads, progress
-        )
-    elif output.simplifier is not None:
-        from .simplifying import write_simplified
-
-        write_simplified(tree, output.simplifier, clock, threads, progress)
+        tree.form, tree.in_chunks, tree.repacked = None, False, source
     else:
-        assert settings.encoding is not None
-        from ..codecs.gpu import dump
-
-        arrays = dump.pack(tree.scene, settings.encoding, threads)
-        pieces = dump.encode(arrays, raw=settings.raw)
-        with out:
-            baked.bytes = out.write(out.target.name, pieces)
-        baked.output_format, baked.arrays = settings.encoding, {name: words.shape for name, words in arrays.items()}
-        clock.end("write")
+        tree.options = dataclasses.replace(options, covering=False)
 
 
-def _write_windows(
-    tree: BuiltTree, form: Format, encode: Encode, clock: Clock, threads: int, progress: Progress
+def write_windows(
+    tree: BuiltTree, encode: Callable[[BuiltTree, Encoder], Windows] | None, threads: int, progress: Progress
 ) -> None:
-    """Encode the windows of an SPZ or RAD file and write them."""
-    output, baked, codec = tree.output, tree.baked, form.codec()
-    settled: WriteOptions = codec.settled(tree.statistics, output.options)
+    """Encode the windows of a tree whose nodes are in order, and write them as an SPZ or RAD file.
+
+    Args:
+        encode: encodes the windows of nodes in a store; None for nodes in memory.
+    """
+    baked, form = tree.baked, tree.form
+    assert form is not None
+    codec = form.codec()
+    settled: WriteOptions = codec.settled(tree.statistics, tree.options)
     ranges = tuple(codec.held(settled, baked.sh_degree))
     encoder: Any = codec.encoder(tree.nodes, settled, ranges, threads=threads, progress=progress)
-    if output.stored is not None and output.before is not None:
-        encoder = output.stored.keeping(encoder, same_rows(tree.scene.splats, output.before))
-    windows, options, count = encode(tree, encoder), encoder.options, encoder.count
-    numbers = range(len(windows_of(count)))
-    with output.out as out:
+    if tree.stored is not None and tree.before is not None:
+        assert isinstance(tree.nodes, Scene)
+        encoder = tree.stored.keeping(encoder, same_rows(tree.nodes.splats, tree.before))
+    windows = _encoded(tree, encoder, threads, progress) if encode is None else encode(tree, encoder)
+    options, numbers = encoder.options, range(len(windows_of(encoder.count)))
+    with tree.out as out:
         name = out.target.name
         if out.siblings is None:
             for piece in encoder.pieces(windows, threads=threads, progress=progress):
@@ -185,15 +165,60 @@ def _write_windows(
                 baked.bytes += out.write(each, pieces)
     if ranges:
         baked.clamped, baked.clamps = clamps_of([windows(number, CLAMPED) for number in numbers], ranges)
-    clock.end("write")
-    if not output.in_chunks:
+    tree.end("write")
+    if not tree.in_chunks:
         baked.output_format, baked.version, baked.fractional_bits = "spz", options.spz_version, options.fractional_bits
         return
     baked.output_format = "rad-chunked" if options.rad.chunked else "rad"
     baked.chunks = len(numbers)
     baked.encodings = {name: getattr(options.rad, name) for name in RAD_ENCODINGS if encoder.sh_degree or name != "sh"}
     if options.rad.sh_codes and encoder.sh_degree:
-        baked.sh_codes = min(options.rad.sh_codes, count)
+        baked.sh_codes = min(options.rad.sh_codes, encoder.count)
+
+
+def _encoded(tree: BuiltTree, encoder: Encoder, threads: int, progress: Progress) -> Windows:
+    """Encode the windows of nodes in memory."""
+    assert isinstance(tree.nodes, Scene)
+    windows = list(results(encoder, tree.nodes, threads, progress, "encoding"))
+    return lambda number, name: windows[number][name]
+
+
+def write_whole(tree: BuiltTree, threads: int, progress: Progress) -> None:
+    """Write an output that is made of all nodes of a tree at once."""
+    baked, out, settings, options, scene = tree.baked, tree.out, tree.settings, tree.options, tree.nodes
+    assert isinstance(scene, Scene)
+    if tree.repacked is not None:
+        _repack(tree.repacked, out, baked)
+    elif settings.tiles is not None:
+        from .parts_output import write_tiles
+
+        baked.output_format = "3d-tiles"
+        baked.bytes, baked.tiles = write_tiles(scene, out, settings.tiles, options, tree.end, threads, progress)
+    elif settings.detail is not None:
+        from .parts_output import write_levels
+
+        baked.output_format, above = "streamed-sog", tree.environment
+        baked.bytes, baked.detail = write_levels(
+            scene, above, out, settings.detail, options, tree.end, threads, progress
+        )
+    elif tree.simplifier is not None:
+        form = WRITABLE[settings.suffix]
+        baked.output_format = form.name
+        # The opacities of a tree that was read make up for the rounding of its scales already.
+        options = dataclasses.replace(options, covering=baked.method is not None)
+        baked.bytes, baked.simplified = tree.simplifier.write(
+            scene, out, form, options, baked.splats, tree.end, threads, progress
+        )
+    else:
+        assert settings.encoding is not None
+        from ..codecs.gpu import dump
+
+        arrays = dump.pack(scene, settings.encoding, threads)
+        pieces = dump.encode(arrays, raw=settings.raw)
+        with out:
+            baked.bytes = out.write(out.target.name, pieces)
+        baked.output_format, baked.arrays = settings.encoding, {name: words.shape for name, words in arrays.items()}
+    tree.end("write")
 
 
 def _repack(source: Place, out: Output, baked: Baked) -> None:

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sparklod_cli.bake.settings import Baked, BakeSettings, BuiltTree, Clock
-from sparklod_cli.bake.tree_output import BakeOutput, output_of, write_tree
+from sparklod_cli.bake.settings import Baked, BakeSettings
+from sparklod_cli.bake.tree_output import BuiltTree, output_of, write_windows
 from sparklod_cli.codecs import encoder
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
 from sparklod_cli.codecs.statistics import Statistics
@@ -38,7 +38,7 @@ def files_of(folder: Path) -> dict[str, bytes]:
     return {each.name: each.read_bytes() for each in folder.iterdir()}
 
 
-def written(output: BakeOutput, nodes: Scene | NodeStream, found: Statistics) -> Baked:
+def written(tree: BuiltTree, nodes: Scene | NodeStream, found: Statistics) -> Baked:
     """Writes a tree window by window."""
 
     def encode(tree: BuiltTree, made: encoder.Encoder) -> encoder.Windows:
@@ -47,8 +47,9 @@ def written(output: BakeOutput, nodes: Scene | NodeStream, found: Statistics) ->
         windows = [made.encode(*read(part.start, part.stop), part.start) for part in parts]
         return lambda number, name: windows[number][name]
 
-    tree = BuiltTree(nodes=nodes, output=output, baked=Baked(sh_degree=1), statistics=found)
-    write_tree(tree, encode, Clock(), 2, silent)
+    tree.nodes, tree.baked.sh_degree, tree.statistics = nodes, 1, found
+    write_windows(tree, encode, 2, silent)
+    tree.baked.seconds.clear()
     return tree.baked
 
 
@@ -61,11 +62,12 @@ def test_a_stream_is_written_as_the_scene(
     for folder, nodes in (("scene", scene), ("stream", node_stream(scene))):
         target = tmp_path / folder / f"town{settings.suffix}"
         target.parent.mkdir()
-        output = output_of(target, settings, overwrite=False)
+        tree = output_of(target, settings, overwrite=False)
+        needed = tree.form.codec().needed(tree.options)
         parts = np.array_split(np.arange(len(scene)), 3)
         leaf = scene.tree.is_leaf
-        found = Statistics.merged([Statistics.of(scene.splats.take(at), leaf[at], output.needed) for at in parts])
-        said.append(written(output, nodes, found))
+        found = Statistics.merged([Statistics.of(scene.splats.take(at), leaf[at], needed) for at in parts])
+        said.append(written(tree, nodes, found))
     assert said[0] == said[1] and said[0].clamped
     whole = files_of(tmp_path / "scene")
     assert len(whole) == (1 if name != "rad-chunked" else 1 + -(-len(scene) // 900))
@@ -74,8 +76,9 @@ def test_a_stream_is_written_as_the_scene(
 
 def test_windows_that_cannot_be_read_leave_no_output(scene: Scene, tmp_path: Path) -> None:
     for name in ("spz", "rad", "rad-chunked"):
-        output = output_of(tmp_path / f"{name}{SETTINGS[name].suffix}", SETTINGS[name], overwrite=False)
-        nodes, found = node_stream(scene), Statistics.of_scene(scene, output.needed)
+        tree = output_of(tmp_path / f"{name}{SETTINGS[name].suffix}", SETTINGS[name], overwrite=False)
+        tree.nodes, tree.baked.sh_degree = node_stream(scene), 1
+        tree.statistics = Statistics.of_scene(scene, tree.form.codec().needed(tree.options))
 
         def encode(tree: BuiltTree, made: encoder.Encoder) -> encoder.Windows:
             encoded = made.encode(*tree.nodes.read(0, len(scene)), 0)
@@ -87,8 +90,7 @@ def test_windows_that_cannot_be_read_leave_no_output(scene: Scene, tmp_path: Pat
 
             return read
 
-        tree = BuiltTree(nodes=nodes, output=output, baked=Baked(sh_degree=1), statistics=found)
         with pytest.MonkeyPatch.context() as patch, pytest.raises(OutputError, match="gone"):
             patch.setattr(encoder, "CHUNK_NODES", 900)
-            write_tree(tree, encode, Clock(), 1, silent)
+            write_windows(tree, encode, 1, silent)
     assert not list(tmp_path.iterdir())

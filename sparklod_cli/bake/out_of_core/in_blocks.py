@@ -25,7 +25,8 @@ from ...system.errors import InvalidSplatsError
 from ...system.progress import Progress
 from ...system.threads import blocks_of, on_threads
 from ..in_memory import check_transformed, select, transform
-from ..settings import BakeSettings, BuiltTree, Clock
+from ..settings import BakeSettings
+from ..tree_output import BuiltTree
 from .job import (
     ORDER,
     PUBLISHED,
@@ -67,7 +68,7 @@ SAMPLE_SPLATS = 1 << 18
 
 @dataclass
 class InBlocks:
-    """Workspace in a scratch folder, with the steps of `in_memory.InMemory`.
+    """Workspace of a bake in a scratch folder, and its steps.
 
     Attributes:
         job: of all tasks; `build` and `order` fill it in.
@@ -76,7 +77,6 @@ class InBlocks:
     """
 
     job: Job
-    clock: Clock
     engine: Engine
     block_splats: int
     windows: int
@@ -88,14 +88,14 @@ class InBlocks:
         if not stream.count:
             settings.selection.check(SelectionTally())
         summary = self._scatter()
-        self.clock.end("read")
-        if (form := tree.output.form) is not None:  # one that cannot hold the tree is reported now
-            form.codec().settled(summary.statistics, tree.output.options)
+        tree.end("read")
+        if (form := tree.form) is not None:  # one that cannot hold the tree is reported now
+            form.codec().settled(summary.statistics, tree.options)
         setting = getattr(settings, BUILDERS[settings.method].setting)
         plan = self.job.builder().plan(summary.bounds, splats_of(summary.sample), setting)
         self.job = job = dataclasses.replace(self.job, plan=plan)
         self.engine.run("building", list(_stages(job)), job, self.progress)
-        self.clock.end("build")
+        tree.end("build")
         baked = tree.baked
         baked.splats, baked.dropped, baked.method = summary.tally.selected, summary.tally.dropped, settings.method
         baked.blocks = job.blocks.count
@@ -111,7 +111,7 @@ class InBlocks:
             job,
             self.progress,
         )
-        self.clock.end("order")
+        tree.end("order")
         tree.baked.nodes, tree.baked.levels = job.store.get(ORDER, ["counts"])["counts"].tolist()
         tree.baked.sh_degree = job.sh_degree
         tree.statistics = Statistics.merged([Statistics.from_array(stage["statistics"]) for stage in stages])
@@ -125,7 +125,7 @@ class InBlocks:
             for window, part in enumerate(blocks_of(encoder.count, WINDOW_NODES))
         ]
         self.engine.run("encoding", tasks, job, self.progress)
-        self.clock.end("encode")
+        tree.end("encode")
         job.store.put(PUBLISHED, {})
         return functools.partial(encoded_array, job.store)
 

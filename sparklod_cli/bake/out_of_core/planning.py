@@ -27,8 +27,8 @@ from ...system.units import count_of, format_size
 from ...system.untrusted import parse_json
 from .. import estimate
 from ..identity import BakeIdentity
-from ..settings import BakeSettings, Clock, Resources
-from ..tree_output import BakeOutput
+from ..settings import BakeSettings, Resources
+from ..tree_output import BuiltTree
 from .in_blocks import InBlocks
 from .job import Engine, Job, LocalEngine, forget
 from .store import Store
@@ -40,9 +40,7 @@ UNPACKED = "input"
 @contextlib.contextmanager
 def blocks_for(
     source: Source,
-    settings: BakeSettings,
-    output: BakeOutput,
-    clock: Clock,
+    tree: BuiltTree,
     *,
     header: Reader,
     folder: Place,
@@ -63,7 +61,7 @@ def blocks_for(
         ScratchError: the scratch folder cannot be used, or has too little room.
         FormatError, OutOfMemoryError: as `flow.bake`.
     """
-    name = name_of(source)
+    name, settings = name_of(source), tree.settings
     if settings.files:
         BakeIdentity.of(source, settings)  # reports a missing one before the bake begins
     memory = estimate.default_memory() if resources.memory is None else resources.memory
@@ -82,7 +80,7 @@ def blocks_for(
         return
     splats, degree = header.count, min(header.sh_degree, settings.max_sh)
     block_splats = resources.block_splats or estimate.block_splats_within(
-        memory, settings.method, splats, degree, in_chunks=output.in_chunks, threads=threads
+        memory, settings.method, splats, degree, in_chunks=tree.in_chunks, threads=threads
     )
     scratch = estimate.scratch_bytes(settings.method, splats, degree)
     _check_room(store.folder, scratch)
@@ -95,9 +93,10 @@ def blocks_for(
         _opened(source, store.folder, threads, engine) as stream,
     ):
         settings = dataclasses.replace(settings, rgba=settings.rgba and settings.rgba.absolute())
-        job = Job(store, stream, settings, output.needed, output.in_chunks)
+        assert tree.form is not None  # others need the whole tree
+        job = Job(store, stream, settings, tree.form.codec().needed(tree.options), tree.in_chunks)
         windows = estimate.windows_within(memory, splats, degree, threads)
-        yield InBlocks(job, clock, engine or LocalEngine(threads), block_splats, windows, progress)
+        yield InBlocks(job, engine or LocalEngine(threads), block_splats, windows, progress)
 
 
 def _reason(

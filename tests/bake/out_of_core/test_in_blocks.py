@@ -15,8 +15,8 @@ from sparklod_cli.bake.out_of_core import order, store
 from sparklod_cli.bake.out_of_core.in_blocks import InBlocks
 from sparklod_cli.bake.out_of_core.job import Job
 from sparklod_cli.bake.out_of_core.store import Store
-from sparklod_cli.bake.settings import BakeSettings, BuiltTree, Clock
-from sparklod_cli.bake.tree_output import BakeOutput
+from sparklod_cli.bake.settings import BakeSettings
+from sparklod_cli.bake.tree_output import BuiltTree
 from sparklod_cli.codecs.statistics import ALL
 from sparklod_cli.lod import families, quick
 from sparklod_cli.lod.chunk_order import arrange
@@ -49,8 +49,8 @@ def _small_windows() -> Iterator[None]:
 def built(folder: str, splats: Splats, how: BakeSettings, block: int, engine: Loop, *, in_chunks: bool) -> BuiltTree:
     """A tree in a store, of blocks of about so many splats."""
     job = Job(Store(Path(folder)), reader_of(Scene(splats)), how, ALL, in_chunks)
-    output = BakeOutput(Output(Path(folder) / "out", overwrite=False), how, how.options)
-    blocks, tree = InBlocks(job, Clock(), engine, block, 1, silent), BuiltTree(output=output)
+    tree = BuiltTree(settings=how, out=Output(Path(folder) / "out", overwrite=False), options=how.options)
+    blocks = InBlocks(job, engine, block, 1, silent)
     blocks.build(tree)
     blocks.order(tree)
     return tree
