@@ -15,7 +15,7 @@ from sparklod_cli.commands import doctor
 from sparklod_cli.commands.doctor import Check, check_all
 from sparklod_cli.render.gl import context
 from sparklod_cli.system import jit, machine
-from sparklod_cli.system.optional import Required, install_hint, pip_install
+from sparklod_cli.system.packages import Required, install_hint, pip_install
 
 HEALTHY = {"folder": "/nowhere/kernels-1", "distrusted": [], "wanted": 35, "missing": 0}
 

@@ -16,7 +16,7 @@ from sparklod_cli.bake.identity import files_of
 from sparklod_cli.io import companions, parts_output, read_parts, read_scene
 from sparklod_cli.io.local_files import leads_away
 from sparklod_cli.io.writing import siblings_of
-from sparklod_cli.system import atomic
+from sparklod_cli.system import output as outputs
 from sparklod_cli.system.addresses import Address
 from sparklod_cli.system.errors import OutputError
 from tests.conftest import FIXTURES
@@ -294,4 +294,4 @@ def test_names_that_lead_away_with_folders_too(name: str) -> None:
 
 @pytest.fixture(autouse=True)
 def first_run() -> None:
-    atomic.sweep.cache_clear()
+    outputs.sweep.cache_clear()

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from sparklod_cli.io import parts_output
-from sparklod_cli.system import atomic
+from sparklod_cli.system import output as outputs
 from sparklod_cli.system.addresses import Address
 from sparklod_cli.system.errors import FormatError, OutputError
 from sparklod_cli.system.output import Output, check_writable, write_file
@@ -104,7 +104,7 @@ def test_no_file_has_the_final_name_before_it_is_whole(
     named: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if named:
-        monkeypatch.setattr(atomic, "UNNAMED", None)
+        monkeypatch.setattr(outputs, "UNNAMED", None)
     elif not has_unnamed_files(tmp_path):
         pytest.skip("no files without names here")
     target = tmp_path / "out.spz"

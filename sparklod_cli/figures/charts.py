@@ -17,7 +17,7 @@ from ..images.pixels import BACKGROUND, FAINT, INK, LINE, write_title
 from ..model.splats import Splats
 from ..render.color_scales import range_of, whole_numbers
 from ..system.errors import SparklodError
-from ..system.optional import optional_import
+from ..system.packages import optional_import
 from ..system.units import count_of, percent_of
 from ..tables.assertions import numbers, totals
 from ..tables.columns import Row

@@ -20,7 +20,7 @@ from PIL import ImageDraw, ImageFont
 
 from ..render.color_scales import Coloring, smooth
 from ..system.errors import SparklodError
-from ..system.optional import optional_import
+from ..system.packages import optional_import
 from ..system.untrusted import printable
 from .output import JPEG_QUALITY
 

@@ -19,9 +19,9 @@ from ..codecs.formats import FORMATS, NPZ, RAW_SUFFIXES, ZIP, Format, head_of, l
 from ..codecs.reader import OpenCompanion, OpenFile, Reader, Target
 from ..model.scene import Scene
 from ..model.splats import COLUMNS
-from ..system import atomic
 from ..system.addresses import Address, Place, absolute
 from ..system.errors import FormatError, OutputError, UnknownFormatError, UnreadableError, naming, reason_of
+from ..system.output import write_atomically
 from ..system.progress import Progress, silent
 from ..system.stdio import DASH, name_of, spooled
 from ..system.units import count_of
@@ -298,7 +298,7 @@ def _kept(target: Path, pieces: Callable[[], Iterable[bytes]]) -> BinaryIO:
     """Write a file unless it exists; it appears whole or not at all."""
     if not target.exists():
         target.parent.mkdir(parents=True, exist_ok=True)
-        atomic.write(target, _readable(pieces), overwrite=True)
+        write_atomically(target, _readable(pieces), overwrite=True)
     return target.open("rb")
 
 

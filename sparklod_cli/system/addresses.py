@@ -234,7 +234,7 @@ def _cut(url: str) -> tuple[str, str]:
 @functools.lru_cache(maxsize=64)
 def _system(url: str) -> tuple[Any, str]:
     """Return the file system that opens an address, and the name of the address there."""
-    from .optional import optional_import  # which few commands need
+    from .packages import optional_import  # which few commands need
 
     with optional_import("addresses need fsspec and the package of their service", "cloud"):
         import fsspec

@@ -1,4 +1,4 @@
-"""Kernels: functions that numba compiles, and the threads that they run on. numba is loaded when one is called."""
+"""Kernels: functions that numba compiles. numba is loaded when one is called, as that takes half a second."""
 
 from __future__ import annotations
 
@@ -6,16 +6,17 @@ import functools
 import os
 import re
 import sys
+import threading
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import ModuleType
+from types import CellType, FunctionType, ModuleType
 from typing import Any
 
 import numpy as np
 
-from .kernel_cache import Trouble, cache_folders
+from .kernel_cache import KernelCache, Trouble, cache_folders
 from .threads import MOST_THREADS, run_ranges
 
 #: Called with the name of a kernel when its compilation begins, and with its duration in seconds when it ends.
@@ -24,13 +25,18 @@ Done = Callable[[float], None]
 
 #: The folder for compiled code, None if none can be written; folders of compiled code that is only read; and messages
 #: on folders that are not used.
-CACHE_FOLDER, READ_FOLDERS, DISTRUSTED = cache_folders(Path(__file__))
+CACHE_FOLDER, READ_FOLDERS, DISTRUSTED = cache_folders(Path(__file__), Path(__file__).with_name("jit_numba.py"))
 
 #: Whether the environment asks numba to compile nothing.
 DISABLED = bool(re.fullmatch("[+-]?0*[1-9][0-9]*", os.environ.get("NUMBA_DISABLE_JIT", "").strip()))
 
 #: File of settings that numba reads in the current folder.
 SETTINGS = Path(".numba_config.yaml")
+
+#: The name under which a module's globals have a copy of themselves, as numba has them.
+_NAMESPACE = "__globals_of_kernels__"
+
+_lock = threading.RLock()
 
 
 def prefetch(array: Any, index: int) -> None:
@@ -118,7 +124,7 @@ class Kernel:
         py_func, declared, ranges, options: as above.
         has_wrapper: numba's dispatcher that other kernels call also has the code that makes it callable from Python.
             That takes as long to compile as many a kernel, so kernels that Python does not call have none.
-        inner, built: numba's dispatchers that kernels and Python call, see `jit_numba`; None until they are needed.
+        inner, built: numba's dispatchers that kernels and Python call; None until they are needed.
     """
 
     def __init__(
@@ -151,7 +157,40 @@ class Kernel:
     @property
     def dispatcher(self) -> Any:
         """Numba's function, which may be called with arguments of any types that it can be compiled for."""
-        return self.built or load_numba().dispatcher_of(self)
+        if self.built is None:
+            numba = load_numba()
+            with _lock:
+                if self.built is None:
+                    inner = self._inner_on(numba)
+                    self.built = inner if self.has_wrapper else numba.calling(inner, self.py_func)
+                    if self.declared:
+                        _keep(self.built, self.py_func)
+                        if before_first_call is not None:
+                            before_first_call(self)
+        return self.built
+
+    def _inner_on(self, numba: ModuleType) -> Any:
+        """Return numba's dispatcher that other kernels call.
+
+        What it compiles is a copy of the function, in whose globals numba finds its own dispatchers.
+        Nothing is replaced in the modules themselves, since other threads may be calling their functions.
+
+        Args:
+            numba: the module `jit_numba`.
+        """
+        if self.inner is None:
+            function: Any = self.py_func
+            namespace = function.__globals__.setdefault(_NAMESPACE, {})
+            cells = tuple(CellType(_known(numba, cell.cell_contents)) for cell in function.__closure__ or ())
+            copy = FunctionType(function.__code__, namespace, function.__name__, function.__defaults__, cells)
+            copy.__module__, copy.__qualname__ = function.__module__, function.__qualname__
+            copy.__kwdefaults__ = function.__kwdefaults__
+            self.inner = numba.compiled(copy, self.options, is_apart=self.ranges, has_wrapper=self.has_wrapper)
+            if not self.declared:
+                _keep(self.inner, function)
+            for name, value in list(function.__globals__.items()):
+                namespace[name] = _known(numba, value)
+        return self.inner
 
     @functools.cached_property
     def signatures(self) -> list[tuple[Any, ...]]:
@@ -161,6 +200,19 @@ class Kernel:
 
         first = (numba.int64,) if self.ranges else ()  # a range has two ends, its number of rows is declared
         return [(*first, *(numba.typeof(example(each)) for each in types)) for types in self.declared]
+
+
+def _known(numba: ModuleType, value: Any) -> Any:
+    """Return what numba knows a global as: dispatchers instead of kernels."""
+    if value is prefetch:
+        return numba.prefetch
+    return value._inner_on(numba) if isinstance(value, Kernel) else value
+
+
+def _keep(dispatcher: Any, function: Callable[..., Any]) -> None:
+    """Have a dispatcher keep machine code in the cache."""
+    if CACHE_FOLDER is not None or READ_FOLDERS:
+        dispatcher._cache = KernelCache(function, CACHE_FOLDER, READ_FOLDERS, report_trouble)
 
 
 def kernel(
@@ -194,8 +246,6 @@ def kernel(
     """
     signatures = types if not types or isinstance(types[0], tuple) else (types,)
     if DISABLED:
-        from .interpreted import interpreted
-
         return functools.partial(interpreted, ranges=ranges) if signatures else lambda function: function
     options = {
         "nogil": nogil or ranges,
@@ -244,19 +294,19 @@ def load_numba() -> ModuleType:
         SparklodError: see `check_numba_settings`.
     """
     check_numba_settings()
-    from .python_process import safe_path  # here, so that no kernel depends on its source
+    from .packages import safe_path  # here, so that no kernel depends on its source
 
     try:
         # Where processes are not forked, numba starts one when it is imported.
         with safe_path(), warnings.catch_warnings(record=True) as caught:
             from . import jit_numba
-    except ImportError:
-        raise
     except Exception as error:
         reasons = f"{error} {error.__cause__} {error.__context__}"  # llvmlite: its library is not there
-        if "failed to map segment" in reasons or "annot allocate memory" in reasons:
+        is_memory = "failed to map segment" in reasons or "annot allocate memory" in reasons
+        if is_memory and not isinstance(error, ImportError):  # which has a message of its own
             raise MemoryError from error
         raise
+    jit_numba.compilations.begun, jit_numba.compilations.done = report_begun, report_done
     for warning in caught:
         if warning.category is RuntimeWarning:  # of a variable; a traceback follows
             report_trouble(" ".join(str(warning.message).partition("\n")[0].split()))
@@ -304,3 +354,59 @@ def listen(begun: Begun, done: Done, trouble: Trouble) -> Callable[[], None]:
     listener = begun, done, trouble
     _listeners.append(listener)
     return lambda: _listeners.remove(listener)
+
+
+#: Whether a kernel runs on a thread, as `in_python`: one that it calls gets its arguments as they are.
+_running = threading.local()
+
+
+class Record(np.void):  # type: ignore[misc] # final for type checkers only
+    """An element of an array of records with its fields as attributes, also "size", which `numpy.record` hides."""
+
+    def __getattribute__(self, name: str) -> Any:
+        fields = np.void.__getattribute__(self, "dtype").names or ()
+        return self[name] if name in fields else np.void.__getattribute__(self, name)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        self[name] = value
+
+
+def interpreted(function: Callable[..., Any], ranges: bool) -> Callable[..., Any]:
+    """Return a kernel as a function that Python runs.
+
+    As in machine code, fields of records are attributes, integers overflow without a warning, and results are numbers
+    of Python.
+
+    Args:
+        ranges: the function takes the ends of a range of rows; Python gives the second one only.
+    """
+
+    @functools.wraps(function)
+    def run(*arguments: Any) -> Any:
+        if getattr(_running, "in_python", False):
+            return function(*arguments)
+        _running.in_python = True
+        try:
+            with np.errstate(all="ignore"):
+                return _plain(function(*((0,) if ranges else ()), *map(_with_records, arguments)))
+        finally:
+            _running.in_python = False
+
+    return run
+
+
+def _with_records(argument: Any) -> Any:
+    """Return an argument whose arrays of records have elements of `Record`."""
+    if isinstance(argument, tuple) and hasattr(argument, "_fields"):
+        return type(argument)(*map(_with_records, argument))
+    if isinstance(argument, np.ndarray) and argument.dtype.names:
+        return argument.view((Record, argument.dtype))
+    return argument
+
+
+def _plain(result: Any) -> Any:
+    """Return a result with numbers of Python."""
+    if isinstance(result, tuple):
+        numbers = map(_plain, result)
+        return type(result)(*numbers) if hasattr(result, "_fields") else tuple(numbers)
+    return result.item() if isinstance(result, np.generic) else result

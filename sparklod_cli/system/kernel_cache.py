@@ -48,39 +48,41 @@ OTHERS = 0o022
 _IMPORT = re.compile(rb"^from (\.+)([\w.]*) import (\([^)]*\)|[^\n#]*)", re.MULTILINE)
 
 
-@functools.cache
-def sources_of(path: Path) -> Mapping[Path, bytes]:
-    """Return the sources that the kernels of a module depend on: its own, and those of all that it imports."""
-    content = path.read_bytes() if path.is_file() else b""
-    sources = {path: content}
-    for dots, module, names in _IMPORT.findall(content):
-        base = path.parents[len(dots) - 1].joinpath(*module.decode().split(".") if module else ())
-        modules = base.with_suffix(".py"), *(base / f"{name.decode()}.py" for name in re.findall(rb"\w+", names))
-        for imported in modules:
-            if imported.is_file():
-                sources |= sources_of(imported)
+def sources_of(*paths: Path) -> Mapping[Path, bytes]:
+    """Return the sources that the kernels of modules depend on: their own, and those of all that they import."""
+    sources, left = dict[Path, bytes](), [*paths]
+    while left:
+        path = left.pop()
+        if path in sources:
+            continue
+        sources[path] = content = path.read_bytes() if path.is_file() else b""
+        for dots, module, names in _IMPORT.findall(content):
+            base = path.parents[len(dots) - 1].joinpath(*module.decode().split(".") if module else ())
+            modules = base.with_suffix(".py"), *(base / f"{name.decode()}.py" for name in re.findall(rb"\w+", names))
+            left += [imported for imported in modules if imported.is_file()]
     return sources
 
 
-def digest_of(sources: Mapping[Path, bytes]) -> str:
-    """Return a digest of the content of some sources."""
-    return hashlib.sha256(b"".join(content for _, content in sorted(sources.items()))).hexdigest()[:16]
+@functools.cache
+def digest_of(*paths: Path) -> str:
+    """Return a digest of the `sources_of` modules."""
+    return hashlib.sha256(b"".join(content for _, content in sorted(sources_of(*paths).items()))).hexdigest()[:16]
 
 
-def cache_folders(source: Path) -> tuple[Path | None, tuple[Path, ...], tuple[str, ...]]:
+def cache_folders(*sources: Path) -> tuple[Path | None, tuple[Path, ...], tuple[str, ...]]:
     """Return the folders for compiled code, and create the one for new code.
 
     They are in NUMBA_CACHE_DIR or, where that is not set, in the package and in the user's cache directory.
 
     Args:
-        source: module that compiles. The name of the folders is a digest of it and of all that it imports.
+        sources: modules that compile. The name of the folders is a digest of them and of all that they import.
 
     Returns:
         the folder where new code is stored, which is read first; None if no folder can be written;
         folders that can be read only, such as those of a read-only image;
         a message for each folder that other users can write, which is not used.
     """
-    if not source.is_file():
+    if not all(source.is_file() for source in sources):
         return None, (), ()  # in a zip: there is no source to make a digest of
     given = os.environ.get("NUMBA_CACHE_DIR")
     places = [Path(given)] if given else [PACKAGE / "__pycache__"]
@@ -89,7 +91,7 @@ def cache_folders(source: Path) -> tuple[Path | None, tuple[Path, ...], tuple[st
             places.append(Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sparklod")
     read, distrusted = list[Path](), list[str]()
     for place in places:
-        folder = place / f"kernels-{digest_of(sources_of(source))}"
+        folder = place / f"kernels-{digest_of(*sources)}"
         with contextlib.suppress(OSError):
             place.mkdir(parents=True, exist_ok=True)
             is_superuser = hasattr(os, "geteuid") and os.geteuid() == 0
@@ -128,8 +130,7 @@ def stem_of(function: Callable[..., Any]) -> str:
 
 def start_of(function: Callable[..., Any]) -> str:
     """Return the start of the names of a function's files, which stands for its sources and for this machine."""
-    source = Path(function.__code__.co_filename)
-    return f"{stem_of(function)}-{digest_of(sources_of(source))}-{_machine()}"
+    return f"{stem_of(function)}-{digest_of(Path(function.__code__.co_filename))}-{_machine()}"
 
 
 @functools.cache
@@ -151,11 +152,6 @@ def _machine() -> str:
     host = binding.get_process_triple(), name, features
     described = repr((host, sorted(variables.items()), numba.__version__, sys.version))
     return hashlib.blake2b(described.encode(), digest_size=8).hexdigest()
-
-
-def is_whole(content: bytes) -> bool:
-    """Return True if the content of a file matches its checksum."""
-    return content[:CHECKSUM] == hashlib.blake2b(content[CHECKSUM:], digest_size=CHECKSUM).digest()
 
 
 class KernelCache:
@@ -186,8 +182,8 @@ class KernelCache:
         digest = hashlib.blake2b(repr((str(signature),)).encode(), digest_size=8).hexdigest()
         return f"{start_of(self._function)}-{digest}{SUFFIX}"
 
-    def _found(self, signature: Any) -> tuple[Path, bytes] | None:
-        """Return the first file for a signature that can be read and trusted, and its content."""
+    def _found(self, signature: Any) -> tuple[Path, bytes | None] | None:
+        """Return the first file for a signature that can be read and trusted, and its content; None if damaged."""
         name = self.name(signature)
         for folder in (*([] if self._folder is None else [self._folder]), *self._read):
             path = folder / name
@@ -196,7 +192,9 @@ class KernelCache:
                     with path.open("rb") as file:
                         is_closed = not folder.stat().st_mode & (stat.S_IXGRP | stat.S_IXOTH)
                         if is_closed or is_trusted(os.fstat(file.fileno())):
-                            return path, file.read()
+                            checksum, content = file.read(CHECKSUM), file.read()
+                            is_whole = checksum == hashlib.blake2b(content, digest_size=CHECKSUM).digest()
+                            return path, content if is_whole else None
                     self._trouble(_distrusting(folder))
         return None
 
@@ -212,8 +210,8 @@ class KernelCache:
         path, content = found
         target_context.refresh()
         try:
-            if is_whole(content):
-                return CompileResult._rebuild(target_context, *pickle.loads(content[CHECKSUM:]))
+            if content is not None:
+                return CompileResult._rebuild(target_context, *pickle.loads(content))
         except Exception as error:
             # An undamaged file may still be unusable, for example if it refers to types of another numpy.
             if out_of_memory(error):
@@ -229,13 +227,13 @@ class KernelCache:
             return
         from numba.core.serialize import dumps
 
-        from . import atomic  # here, so that no kernel depends on its source
+        from .output import write_atomically  # here, so that no kernel depends on its source
 
         path, content = self._folder / self.name(signature), dumps(compiled._reduce())
         try:
             path.parent.mkdir(OWN, parents=True, exist_ok=True)  # another process may have removed it
             checksum = hashlib.blake2b(content, digest_size=CHECKSUM).digest()
-            atomic.write(path, [checksum, content], overwrite=True)
+            write_atomically(path, [checksum, content], overwrite=True)
         except OSError as error:
             reason = (error.strerror or str(error)).lower()
             self._trouble(f"cannot cache compiled code in {path.parent} ({reason}); it is compiled in every run")
@@ -243,4 +241,4 @@ class KernelCache:
     def is_cached(self, signature: Any) -> bool:
         """Return True if there is a whole file for a signature."""
         found = self._found(signature)
-        return found is not None and is_whole(found[1])
+        return found is not None and found[1] is not None

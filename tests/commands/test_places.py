@@ -180,7 +180,7 @@ def test_a_place_that_can_be_written_is_as_it_was(tmp_path: Path) -> None:
 
 
 def test_a_place_is_tried_without_unnamed_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sparklod_cli.system.atomic.UNNAMED", None)
+    monkeypatch.setattr("sparklod_cli.system.output.UNNAMED", None)
     check_writable(tmp_path / "a.spz", overwrite=False)
     assert not any(tmp_path.iterdir())
     if Path("/proc/self").exists():

@@ -11,7 +11,7 @@ import pytest
 
 from sparklod_cli.figures import charts
 from sparklod_cli.system.errors import SparklodError
-from sparklod_cli.system.optional import install_hint
+from sparklod_cli.system.packages import install_hint
 from sparklod_cli.tables.columns import Row
 from tests.figures.flights import count_of, marked, path_scene, pixels, plotted
 from tests.tables.rows import flight, row

@@ -23,7 +23,7 @@ from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.render.color_scales import MAGMA, PLASMA, VIRIDIS, ramp
 from sparklod_cli.system.errors import SparklodError
-from sparklod_cli.system.optional import install_hint
+from sparklod_cli.system.packages import install_hint
 from tests.scenes import random_splats
 
 pytestmark = pytest.mark.slow

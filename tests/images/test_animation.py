@@ -14,7 +14,7 @@ from PIL import Image, ImageSequence
 
 from sparklod_cli.images import pixels as animation
 from sparklod_cli.system.errors import SparklodError
-from sparklod_cli.system.optional import install_hint
+from sparklod_cli.system.packages import install_hint
 
 pytestmark = pytest.mark.slow
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from sparklod_cli.system import atomic
+from sparklod_cli.system import output
 from tests.conftest import ROOT
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="POSIX only")
@@ -23,21 +23,21 @@ pytestmark = pytest.mark.skipif(os.name != "posix", reason="POSIX only")
 #: Writes for ever: new files, or one file again and again.
 WRITER = """
 import itertools, pathlib, sys
-from sparklod_cli.system import atomic
+from sparklod_cli.system import output
 folder, unnamed, overwrite = pathlib.Path(sys.argv[1]), sys.argv[2] == "True", sys.argv[3] == "True"
 if not unnamed:
-    atomic.UNNAMED = None
+    output.UNNAMED = None
 print("ready", flush=True)
 for number in itertools.count():
     name = "out" if overwrite else f"out-{number}"
-    atomic.write(folder / name, [bytes([number % 256]) * 100_000] * 4, overwrite=overwrite)
+    output.write_atomically(folder / name, [bytes([number % 256]) * 100_000] * 4, overwrite=overwrite)
 """
 SIZE = 400_000
 KILLS = 12
 
 
 def has_unnamed_files(folder: Path) -> bool:
-    with contextlib.closing(atomic.NewFile(folder / "out", overwrite=False)) as new:
+    with contextlib.closing(output.NewFile(folder / "out", overwrite=False)) as new:
         return new.part is None
 
 
@@ -45,10 +45,10 @@ def has_unnamed_files(folder: Path) -> bool:
 def unnamed(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> bool:
     """Whether files have no name before they are complete."""
     if not request.param:
-        monkeypatch.setattr(atomic, "UNNAMED", None)
+        monkeypatch.setattr(output, "UNNAMED", None)
     elif not has_unnamed_files(tmp_path):
         pytest.skip("no files without names here")
-    atomic.sweep.cache_clear()
+    output.sweep.cache_clear()
     return bool(request.param)
 
 
@@ -77,8 +77,8 @@ def test_a_writer_that_is_killed_leaves_whole_files_only(overwrite: bool, unname
             data = (folder / name).read_bytes()
             assert data == data[:1] * SIZE
             seen += 1
-        atomic.sweep.cache_clear()  # what another run begins with
-        atomic.write(folder / "out-last", [b"x"], overwrite=True)
+        output.sweep.cache_clear()  # what another run begins with
+        output.write_atomically(folder / "out-last", [b"x"], overwrite=True)
         assert [name for name in names(folder) if not name.startswith("out")] == []
         for path in folder.glob("out-*"):
             path.unlink()
@@ -86,39 +86,39 @@ def test_a_writer_that_is_killed_leaves_whole_files_only(overwrite: bool, unname
 
 
 def test_files_of_running_processes_are_left_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(atomic, "UNNAMED", None)
+    monkeypatch.setattr(output, "UNNAMED", None)
     target = tmp_path / "out"
 
     def pieces() -> Iterator[bytes]:
         yield b"outer"
         before = names(tmp_path)
         assert len(before) == 1
-        atomic.sweep.cache_clear()
-        atomic.write(tmp_path / "other", [b"inner"], overwrite=False)
+        output.sweep.cache_clear()
+        output.write_atomically(tmp_path / "other", [b"inner"], overwrite=False)
         assert names(tmp_path) == sorted([*before, "other"])
 
-    atomic.write(target, pieces(), overwrite=False)
+    output.write_atomically(target, pieces(), overwrite=False)
     assert names(tmp_path) == ["other", "out"]
     assert target.read_bytes() == b"outer"
 
 
 def test_only_files_of_dead_processes_are_removed(tmp_path: Path, unnamed: bool) -> None:
-    left = tmp_path / atomic.PARTS.format("0123456789abcdef")
+    left = tmp_path / output.PARTS.format("0123456789abcdef")
     left.write_bytes(b"half a")
     kept = [tmp_path / name for name in (".sparklod-notes.txt", "a.part", ".sparklod-link.part", ".sparklod-dir.part")]
     for path in kept[:2]:
         path.write_bytes(b"precious")
     kept[2].symlink_to(kept[1])
     kept[3].mkdir()
-    atomic.write(tmp_path / "out", [b"x"], overwrite=False)
+    output.write_atomically(tmp_path / "out", [b"x"], overwrite=False)
     assert names(tmp_path) == sorted(["out", *(path.name for path in kept)])
     assert kept[1].read_bytes() == b"precious"
 
 
 def modes_of_parts(folder: Path) -> list[int]:
     """Permissions of all files of a folder that are not complete, with names or without."""
-    modes = [stat.S_IMODE(path.stat().st_mode) for path in folder.glob(atomic.PARTS.format("*"))]
-    for number in atomic.OPEN_FILES.iterdir() if atomic.OPEN_FILES.exists() else ():
+    modes = [stat.S_IMODE(path.stat().st_mode) for path in folder.glob(output.PARTS.format("*"))]
+    for number in output.OPEN_FILES.iterdir() if output.OPEN_FILES.exists() else ():
         with contextlib.suppress(OSError):
             about = number.stat()
             if not about.st_nlink and str(number.readlink()).startswith(str(folder)):
@@ -144,7 +144,7 @@ def test_no_part_has_more_permissions_than_the_file(
 
     umask = os.umask(mask)
     try:
-        atomic.write(target, pieces(), overwrite=True)
+        output.write_atomically(target, pieces(), overwrite=True)
     finally:
         os.umask(umask)
     assert len(seen) == 1
@@ -164,22 +164,22 @@ def test_files_are_written_without_hard_links(
     target = tmp_path / "out"
     if overwrite:
         target.write_bytes(b"old")
-    assert atomic.write(target, [b"a" * 3_000_000, b"b"], overwrite=overwrite) == 3_000_001
+    assert output.write_atomically(target, [b"a" * 3_000_000, b"b"], overwrite=overwrite) == 3_000_001
     assert target.read_bytes() == b"a" * 3_000_000 + b"b"
     with pytest.raises(FileExistsError):
-        atomic.write(target, [b"c"], overwrite=False)
+        output.write_atomically(target, [b"c"], overwrite=False)
     assert names(tmp_path) == ["out"]
 
 
 def swept(folder: Path) -> None:
     """As another process that starts in a folder."""
-    for path in folder.glob(atomic.PARTS.format("*")):
+    for path in folder.glob(output.PARTS.format("*")):
         path.unlink()
 
 
 def test_a_part_swept_before_it_is_locked_is_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(atomic, "UNNAMED", None)
-    lock: Callable[[int], None] = atomic.lock
+    monkeypatch.setattr(output, "UNNAMED", None)
+    lock: Callable[[int], None] = output.lock
     rounds = []
 
     def late(descriptor: int) -> None:
@@ -188,8 +188,8 @@ def test_a_part_swept_before_it_is_locked_is_made_again(tmp_path: Path, monkeypa
         rounds.append(descriptor)
         lock(descriptor)
 
-    monkeypatch.setattr(atomic, "lock", late)
-    atomic.write(tmp_path / "out", [b"x"], overwrite=False)
+    monkeypatch.setattr(output, "lock", late)
+    output.write_atomically(tmp_path / "out", [b"x"], overwrite=False)
     assert len(rounds) == 2
     assert (tmp_path / "out").read_bytes() == b"x"
 
@@ -197,7 +197,7 @@ def test_a_part_swept_before_it_is_locked_is_made_again(tmp_path: Path, monkeypa
 #: Modules that write files, and what: outputs (whole, or to a device or an address), the cache of kernels, what the
 #: process of Open3D says, a line in the settings of a shell.
 WRITERS = {
-    *("system/output.py", "system/addresses.py", "system/atomic.py"),
+    *("system/output.py", "system/addresses.py"),
     *("render/open3d/backend.py", "commands/completion.py"),
 }
 

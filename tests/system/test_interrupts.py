@@ -11,9 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from sparklod_cli.system.kernel_cache import SUFFIX, is_whole
+from sparklod_cli.system.kernel_cache import SUFFIX
 from tests.conftest import FIXTURES, ROOT
 from tests.signals import heed_signals
+from tests.system.test_kernel_cache import is_whole
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
 

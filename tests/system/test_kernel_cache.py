@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import re
 import shutil
@@ -16,7 +17,7 @@ import pytest
 
 from sparklod_cli.system import jit, kernel_cache
 from sparklod_cli.system.jit import f8
-from sparklod_cli.system.kernel_cache import SUFFIX, cache_folders, is_trusted, is_whole, start_of
+from sparklod_cli.system.kernel_cache import CHECKSUM, SUFFIX, cache_folders, is_trusted, start_of
 from sparklod_cli.warmup import units
 from tests.conftest import ROOT
 
@@ -30,6 +31,11 @@ DAMAGE: dict[str, Callable[[bytes], bytes]] = {
     "a bit in the checksum": lambda content: bytes([content[0] ^ 1]) + content[1:],
     "another file": lambda content: b"\x80\x04N.",
 }
+
+
+def is_whole(content: bytes) -> bool:
+    """Whether the content of a file of the cache has its checksum."""
+    return content[:CHECKSUM] == hashlib.blake2b(content[CHECKSUM:], digest_size=CHECKSUM).digest()
 
 
 def twice(x: float) -> float:
@@ -181,7 +187,7 @@ def test_memory_that_runs_out_is_no_damage(cache: Cache, monkeypatch: pytest.Mon
     def starved(*arguments: object) -> None:
         raise MemoryError
 
-    monkeypatch.setattr("sparklod_cli.system.kernel_cache.is_whole", starved)
+    monkeypatch.setattr("sparklod_cli.system.kernel_cache.pickle.loads", starved)
     with pytest.raises(MemoryError):
         cache.compiles()
     assert cache.told == []

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from sparklod_cli.system import atomic
+from sparklod_cli.system import output
 from sparklod_cli.system.errors import OutputError
 from sparklod_cli.system.output import Output, Siblings
 from tests.conftest import ROOT
@@ -68,7 +68,7 @@ def held(folder: Path) -> dict[str, bytes]:
 
 @pytest.fixture(autouse=True)
 def first_run() -> None:
-    atomic.sweep.cache_clear()
+    output.sweep.cache_clear()
 
 
 def test_files_appear_together(tmp_path: Path) -> None:
@@ -105,7 +105,7 @@ def test_a_name_that_is_taken_meanwhile_is_not_replaced(
     def later(paths: Iterable[Path]) -> None:
         put(tmp_path, {taken: b"another's"})
 
-    monkeypatch.setattr(atomic, "_refuse_existing", later)
+    monkeypatch.setattr(output, "_refuse_existing", later)
     with pytest.raises(OutputError, match=f"^{tmp_path / taken} exists, add --overwrite"):
         write(tmp_path, files(NEW), overwrite=False)
     assert held(tmp_path) == {taken: b"another's"}
@@ -276,7 +276,7 @@ def test_permissions_are_those_of_what_is_replaced_or_of_the_umask(mask: int, tm
 
     def some() -> Iterator[tuple[str, Iterable[bytes]]]:
         for each in files(NEW):
-            seen.extend(stat.S_IMODE(path.stat().st_mode) for path in tmp_path.glob(atomic.STAGES.format("*")))
+            seen.extend(stat.S_IMODE(path.stat().st_mode) for path in tmp_path.glob(output.STAGES.format("*")))
             yield each
 
     before = os.umask(mask)
@@ -291,10 +291,10 @@ def test_permissions_are_those_of_what_is_replaced_or_of_the_umask(mask: int, tm
 
 def stage(folder: Path, name: str = "0123456789abcdef") -> Path:
     """A hidden folder as a killed writer leaves it."""
-    left = folder / atomic.STAGES.format(name)
-    (left / atomic.FORMER).mkdir(parents=True)
+    left = folder / output.STAGES.format(name)
+    (left / output.FORMER).mkdir(parents=True)
     put(left, NEW)
-    put(left / atomic.FORMER, OLD)
+    put(left / output.FORMER, OLD)
     return left
 
 
@@ -303,18 +303,18 @@ def test_the_next_run_removes_what_killed_writers_left(one: bool, tmp_path: Path
     stage(tmp_path)
     kept = stage(tmp_path, "precious")
     if one:
-        atomic.write(tmp_path / "a", [b"x"], overwrite=False)
+        output.write_atomically(tmp_path / "a", [b"x"], overwrite=False)
     else:
         write(tmp_path, files(NEW), overwrite=False)
     assert {path.name for path in tmp_path.iterdir()} == {kept.name, *(["a"] if one else NEW)}
-    assert (kept / atomic.FORMER / "a").exists()
+    assert (kept / output.FORMER / "a").exists()
 
 
 def test_the_folder_of_a_running_process_is_left_alone(tmp_path: Path) -> None:
     def some() -> Iterator[tuple[str, Iterable[bytes]]]:
         for each in files(NEW):
-            atomic.sweep.cache_clear()
-            atomic.write(tmp_path / "other", [b"inner"], overwrite=True)
+            output.sweep.cache_clear()
+            output.write_atomically(tmp_path / "other", [b"inner"], overwrite=True)
             yield each
 
     write(tmp_path, some(), overwrite=False)
@@ -322,7 +322,7 @@ def test_the_folder_of_a_running_process_is_left_alone(tmp_path: Path) -> None:
 
 
 def test_a_folder_swept_before_it_is_locked_is_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    lock = atomic.lock
+    lock = output.lock
     rounds: list[int] = []
 
     def late(descriptor: int) -> None:
@@ -331,7 +331,7 @@ def test_a_folder_swept_before_it_is_locked_is_made_again(tmp_path: Path, monkey
         rounds.append(descriptor)
         lock(descriptor)
 
-    monkeypatch.setattr(atomic, "lock", late)
+    monkeypatch.setattr(output, "lock", late)
     write(tmp_path, files(NEW), overwrite=False)
     assert len(rounds) == 2
     assert held(tmp_path) == NEW
@@ -363,7 +363,7 @@ def test_a_killed_writer_never_leaves_two_sets_under_one_header(tmp_path: Path) 
         if (tmp_path / "a").exists():
             whole += 1
             assert len({(tmp_path / name).read_bytes() for name in ("a-0", "a-1", "a-2", "a")}) == 1
-        atomic.sweep.cache_clear()
-        atomic.sweep(tmp_path)
+        output.sweep.cache_clear()
+        output.sweep(tmp_path)
         assert {path.name for path in tmp_path.iterdir()} <= {"a-0", "a-1", "a-2", "a"}
     assert whole

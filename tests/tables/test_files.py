@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from sparklod_cli.simulation.results import COLUMNS
 from sparklod_cli.system.errors import SparklodError
-from sparklod_cli.system.optional import install_hint
+from sparklod_cli.system.packages import install_hint
 from sparklod_cli.tables.columns import FORMS, TYPES, Cell, Column, Row, encode
 from tests.tables.rows import flight, row
 

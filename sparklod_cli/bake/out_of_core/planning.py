@@ -17,9 +17,9 @@ import numpy as np
 
 from ...codecs.reader import Reader
 from ...io.reading import Source, absolute_source, open_reader
-from ...system import atomic
 from ...system.addresses import Place, absolute
 from ...system.errors import FormatError, InvalidSplatsError, OutOfMemoryError, ScratchError, UnreadableError, reason_of
+from ...system.output import HAS_LOCKS, created, try_lock
 from ...system.progress import Progress
 from ...system.stdio import name_of
 from ...system.threads import ordered_map
@@ -281,7 +281,7 @@ def locked(folder: Path) -> Iterator[None]:
     path = folder / LOCK
     with contextlib.ExitStack() as stack:
         try:
-            stack.enter_context(atomic.created(folder.parent))
+            stack.enter_context(created(folder.parent))
             descriptor = _opened_lock(path)
         except OSError as error:
             raise ScratchError(
@@ -291,10 +291,10 @@ def locked(folder: Path) -> Iterator[None]:
         try:
             yield
         finally:
-            if atomic.HAS_LOCKS:
+            if HAS_LOCKS:
                 _remove_empty(path)
             os.close(descriptor)
-            if not atomic.HAS_LOCKS:  # Windows cannot remove a file that is open
+            if not HAS_LOCKS:  # Windows cannot remove a file that is open
                 _remove_empty(path)
 
 
@@ -307,7 +307,7 @@ def _opened_lock(path: Path) -> int:
     while True:
         folder.mkdir(parents=True, exist_ok=True)
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_CLOEXEC", 0), 0o666)
-        is_free = atomic.try_lock(descriptor)
+        is_free = try_lock(descriptor)
         with contextlib.suppress(FileNotFoundError):  # the run that had it was done, and removed it
             if os.path.samestat(os.fstat(descriptor), path.stat()):
                 if is_free:

@@ -24,9 +24,9 @@ import numpy as np
 from numpy.lib import format as npy_format
 from numpy.typing import NDArray
 
-from ...system import atomic
 from ...system.addresses import Address, Place
 from ...system.errors import ScratchError, reason_of
+from ...system.output import write_atomically
 
 #: Arrays of a result by name, empty or of any shape.
 Arrays = Mapping[str, NDArray[Any]]
@@ -205,7 +205,7 @@ class Store:
         if isinstance(place, Address):
             return place.write(pieces)
         place.parent.mkdir(parents=True, exist_ok=True)
-        return atomic.write(place, pieces, overwrite=True, sync=False)
+        return write_atomically(place, pieces, overwrite=True, sync=False)
 
     def has(self, name: str) -> bool:
         """Return whether a result exists; in a folder, also that it is not cut short."""

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ...system.errors import BackendError
 from ...system.jit import check_numba_settings
-from ...system.optional import optional_import
+from ...system.packages import optional_import
 
 #: An array on the card, as numba has it.
 CardArray = Any

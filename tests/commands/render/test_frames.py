@@ -12,7 +12,7 @@ from PIL import Image
 
 from sparklod_cli.images.pixels import cells
 from sparklod_cli.render.renderer import Renderer
-from sparklod_cli.system.optional import install_hint
+from sparklod_cli.system.packages import install_hint
 from tests.commands.render.runs import CAMERAS, DEMO, SIZE, TOWN, TREE, pixels, render
 from tests.conftest import Capture
 

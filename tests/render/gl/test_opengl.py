@@ -15,7 +15,7 @@ from sparklod_cli.figures.pyvista_scene import load_pyvista
 from sparklod_cli.render.gl import context, osmesa
 from sparklod_cli.render.settings import RasterSettings
 from sparklod_cli.system.errors import BackendError, SparklodError
-from sparklod_cli.system.optional import install_hint
+from sparklod_cli.system.packages import install_hint
 from tests.render.gl.test_osmesa import CAMERAS, SPLATS, needs_opengl, opengl
 
 pytestmark = pytest.mark.slow
