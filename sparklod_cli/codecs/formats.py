@@ -20,6 +20,9 @@ from ..system.untrusted import keys_of_object, printable
 HEAD, JSON_HEAD = 1 << 16, 1 << 22
 
 
+#: The name of the format that can be read chunk by chunk.
+RAD = "RAD"
+
 #: Beginning of a zip that is not empty.
 ZIP = b"PK\x03\x04"
 
@@ -98,7 +101,7 @@ FORMATS = (
     # Gzipped up to version 3.
     Format("SPZ", "spz", (".spz",), rb"\x1f\x8b\x08[\0-\x1f]|NGSP", writable=True, trees=True),
     # RADC begins a chunk, which the codec refuses with what to give instead.
-    Format("RAD", "rad.codec", (".rad",), rb"RAD[0C]", writable=True, trees=True, companions=True),
+    Format(RAD, "rad.codec", (".rad",), rb"RAD[0C]", writable=True, trees=True, companions=True),
     Format(
         "Streamed SOG",
         "streamed_sog.codec",

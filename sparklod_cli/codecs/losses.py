@@ -135,14 +135,12 @@ def settled_with_losses(scene: Scene, form: Format, options: WriteOptions, threa
     return settled, Losses(clamped, drops_sh, scene.up if form.bare else None)
 
 
-def after(through: str | None, file: Path, scene: Scene, threads: int = 1) -> Splats:
-    """Encode and decode the splats of a scene in one of `formats.ROUND_TRIPS`; None leaves them as they are.
+def after(through: str, file: Path, scene: Scene, threads: int = 1) -> Splats:
+    """Encode and decode the splats of a scene in one of `formats.ROUND_TRIPS`.
 
     Raises:
         FormatError: SPZ cannot hold the splats, or some are invalid; names the file.
     """
-    if through is None:
-        return scene.splats
     from .gpu import ext_splats, packed_splats
 
     invalid = scene.splats.invalid()

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..codecs.formats import RAD
 from ..codecs.gpu import data_texture, ext_splats, lod_tree, packed_splats
 from ..codecs.gpu.dump import Arrays
 from ..codecs.reader import code_of
 from ..codecs.spark_codings import SplatEncoding
 from ..codecs.spz import KNOWN_FLAGS
 from ..io import opened, read_arrays, read_scene, size_of_input
-from ..io.rad_file import FORMAT as RAD
 from ..io.rad_file import RadFile
 from ..model.scene import Scene
 from ..model.sh import width_of

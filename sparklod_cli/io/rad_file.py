@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from ..codecs.formats import RAD
 from ..codecs.rad.codec import RadChunk, read_chunk
 from ..codecs.rad.rad_header import RadHeader, header_violations, read_header
 from ..codecs.rad.rad_reader import RadReader, decoded_bytes, file_of
@@ -20,9 +21,6 @@ from ..system.errors import UnreadableError, reason_of
 from ..system.machine import available_memory
 from .local_files import open_named
 from .reading import opened
-
-#: Name of the format in `codecs.formats`.
-FORMAT = "RAD"
 
 #: Files whose decoded columns take more bytes than this, or than this share of the free memory, are read chunk by
 #: chunk: computed values take as much again, and chunk by chunk is no slower
@@ -46,7 +44,7 @@ class RadFile:
             FormatError: it cannot be read, or breaks a fatal rule of `rad_rules`.
         """
         with opened(path) as (file, form, more):
-            return cls.of(path, file, more["open_companion"]) if form.name == FORMAT else None
+            return cls.of(path, file, more["open_companion"]) if form.name == RAD else None
 
     @classmethod
     def of(cls, path: Path, file: BinaryIO, open_companion: Any) -> RadFile:

@@ -9,14 +9,12 @@ from collections import OrderedDict
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras.framing import SAMPLE, USED, Balls, balls_of
-from ..codecs.gpu import lod_tree
-from ..io.rad_file import RadFile
 from ..lod.kernels.pixel_scale import NODE
 from ..model.instances import Instance
 from ..model.lod_tree import CHUNK_BITS, CHUNK_NODES, LodTree
@@ -29,6 +27,9 @@ from ..system.threads import ordered_map
 from .playcanvas import DetailFiles
 from .spark import Forest, fill_nodes
 from .viewer_settings import CESIUM_FETCHERS, CONNECTIONS, PLAYCANVAS_FETCHERS
+
+if TYPE_CHECKING:
+    from ..io.rad_file import RadFile
 
 Index = NDArray[np.signedinteger]
 
@@ -130,6 +131,8 @@ def nodes_of(splats: Splats, tree: LodTree, coding: FileCoding, *, precision: st
     """Return nodes as a traversal reads them, in one of `codecs.formats.PRECISIONS`."""
     if precision == "float32":
         return Nodes.of(splats, tree)
+    from ..codecs.gpu import lod_tree
+
     if precision == "float16":
         return lod_tree.unpack(lod_tree.pack(splats, tree, threads=threads))
     return lod_tree.nodes(splats, tree, precision, coding, threads=threads)

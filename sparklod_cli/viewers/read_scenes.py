@@ -10,19 +10,14 @@ from pathlib import Path
 
 import numpy as np
 
-from ..codecs.formats import PRECISIONS
-from ..codecs.losses import after
+from ..codecs.formats import PRECISIONS, RAD
 from ..codecs.reader import OpenCompanion, decode_file, size_of
-from ..codecs.streamed_sog.codec import layout_of
-from ..codecs.streamed_sog.manifest import MAX_MANIFEST, files_of_chunk, parse
 from ..io import opened, size_of_input
-from ..io.rad_file import FORMAT as RAD
-from ..io.rad_file import RadFile
 from ..model.instances import Instance
 from ..model.lod_tree import CHUNK_NODES, LodTree
 from ..model.scene import Scene
 from ..model.selection import Selection, describe
-from ..model.splats import COLUMNS
+from ..model.splats import COLUMNS, Splats
 from ..model.traversed import DetailScene, TileScene
 from ..system.errors import FormatError, InvalidSplatsError, TreeError, memory_errors_translated, naming
 from ..system.progress import Progress, silent
@@ -105,7 +100,7 @@ def read_scenes(
             if scene.tree is None:
                 scene = _drawable(str(name), scene, notes)
             size = bytes_of(scene.splats) if file is None else size_of_input(file) or 0
-            entry = LoadedScene(file, size, scene, after(through, Path(name), scene, threads), chunks)
+            entry = LoadedScene(file, size, scene, _drawn(scene, through, file, threads), chunks)
         else:
             entry = _loaded_runs(file, found, through, chunks, threads)
             notes += (f"{entry.name}: {note}" for note in found.notes)
@@ -121,7 +116,7 @@ def _loaded_runs(
     scene = whole_scene(found)
     if not len(scene.splats):
         raise InvalidSplatsError(f"{file or UNNAMED}: it has no splats")
-    drawn = after(through, file or Path(UNNAMED), scene, threads)
+    drawn = _drawn(scene, through, file, threads)
     if isinstance(found, TileScene):
         size = found.header.get("bytes", bytes_of(scene.splats))
         return LoadedTiles(file, size, scene, drawn, chunks, tiles=found)
@@ -129,8 +124,20 @@ def _loaded_runs(
     return LoadedDetail(file, int(files.sizes.sum()) + files.manifest, scene, drawn, chunks, detail=found, files=files)
 
 
+def _drawn(scene: Scene, through: str | None, file: Path | None, threads: int) -> Splats:
+    """Return the splats of a scene as they are drawn: after a coding, if there is one."""
+    if through is None:
+        return scene.splats
+    from ..codecs.losses import after
+
+    return after(through, file or Path(UNNAMED), scene, threads)
+
+
 def read_detail_files(path: Path) -> DetailFiles:
     """Return the files of a lod-meta.json, or of the folder that holds it; regions are in the order of the manifest."""
+    from ..codecs.streamed_sog.codec import layout_of
+    from ..codecs.streamed_sog.manifest import MAX_MANIFEST, parse
+
     with opened(path) as (file, _, more):
         data = file.read(MAX_MANIFEST + 1)
         manifest = parse(data)
@@ -144,6 +151,8 @@ def read_detail_files(path: Path) -> DetailFiles:
 
 def _bytes_of_files(open_companion: OpenCompanion, name: str) -> tuple[int, ...]:
     """Return the bytes of the files of a chunk; () where one cannot be read, which reading its splats reports."""
+    from ..codecs.streamed_sog.manifest import files_of_chunk
+
     sizes = list[int]()
     try:
         for each in files_of_chunk(open_companion, name):
@@ -164,6 +173,8 @@ def _read(
     """
     with naming(path), memory_errors_translated(), opened(path) as (file, form, more):
         if paged is not None and form.name == RAD and path != DASH:
+            from ..io.rad_file import RadFile
+
             with contextlib.suppress(FormatError):  # which is raised below
                 rad = RadFile.of(path, file, more["open_companion"])
                 if not rad.fits and rad.header.lod_tree and rad.header.chunk_size == CHUNK_NODES:
