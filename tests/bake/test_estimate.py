@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from sparklod_cli.bake import estimate
 from sparklod_cli.bake.settings import BakeSettings
 from sparklod_cli.fitting.settings import FitSettings
-from sparklod_cli.lod.builders import METHODS
+from sparklod_cli.lod.builders import METHODS, bytes_of
 from sparklod_cli.model import MAX_SH_DEGREE
 from sparklod_cli.system import machine
 from sparklod_cli.system.errors import OutOfMemoryError
@@ -51,7 +51,7 @@ def test_the_most_splats_in_memory_fill_it(method: str, splats: int, degree: int
 @given(st.integers(0, 10**9), st.integers(0, MAX_SH_DEGREE), st.integers(0, 1 << 40), st.integers(1, 64))
 def test_windows_that_are_encoded_together_fit(splats: int, degree: int, memory: int, threads: int) -> None:
     windows = estimate.windows_within(memory, splats, degree, threads)
-    window = estimate.OF_WINDOW.of(min(2 * splats, estimate.WINDOW), degree)
+    window = bytes_of(estimate.OF_WINDOW, min(2 * splats, estimate.WINDOW), degree)
     assert 1 <= windows <= threads
     assert windows == 1 or estimate.PROCESS + windows * window <= memory
 
