@@ -79,7 +79,7 @@ def test_budgets_are_shares_of_full_detail_or_the_default_of_playcanvas(row: Det
     assert scenes.splats_of(parse_budget("50%")) == (6 * 64 + 5) // 2
     default = replace(Budget.of_count(7), by_default=True)
     assert scenes.splats_of(default) == PLAYCANVAS_BUDGET
-    assert scenes.splats_of(default.scaled(0.5)) == PLAYCANVAS_BUDGET // 2
+    assert scenes.splats_of(replace(default, scale=0.5)) == PLAYCANVAS_BUDGET // 2
     assert scenes_of(Scene(row.splats)).splats_of(default) == 7
 
 

@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 from .. import __version__
 from ..model.lod_tree import LodTree
 from ..model.scene import AXES, PLAIN, SPECIFIED, FileCoding, Scene, facts_of
-from ..model.selection import EXAMINED
 from ..model.splats import COLUMNS, UNIT_TOLERANCE, Splats, describe_invalid
 from ..system.errors import FormatError, HasTreeError, InvalidSplatsError, TreeError, TruncatedError
 from ..system.progress import Progress, silent
@@ -415,6 +414,8 @@ def is_valid_and_visible(splats: Splats, threads: int) -> tuple[bool, bool]:
 
     Rounding differs from theirs, so a rotation has to be nearer to a unit one.
     """
+    from ..model.selection import EXAMINED
+
     tolerance = np.float32(UNIT_TOLERANCE / 2)
 
     def counts(part: slice) -> tuple[int, int]:

@@ -138,7 +138,7 @@ def view(ctx: click.Context, /, **_: Any) -> None:
             files, served=place.export is None, threads=general.threads, progress=console.progress, **vars(page)
         )
         console.clear()
-        if page.budget is not None and (question := doubt(page.budget, shares=False)):
+        if question := doubt(page.budget, shares=False):
             console.say(question)
         for note in site.notes:
             console.say(note)

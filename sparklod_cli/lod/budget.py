@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from fractions import Fraction
 
 from ..system.units import check_grouping, count_of, parse_count
@@ -42,19 +42,10 @@ class Budget:
     scale: float = 1.0
     by_default: bool = False
 
-    @property
-    def question(self) -> str:
-        """Question about a count that is probably a mistake; empty for other budgets."""
-        return "" if self.count is None else doubt(self.count)
-
     @classmethod
     def of_count(cls, count: int) -> Budget:
         """Return a budget of this many splats."""
         return cls(f"{count}", None, count)
-
-    def scaled(self, scale: float) -> Budget:
-        """Return the budget times a factor."""
-        return replace(self, scale=self.scale * scale)
 
     def of(self, leaves: int) -> int:
         """Return the number of splats, at least 1, for instances with this many leaves in total."""
@@ -63,10 +54,14 @@ class Budget:
         return max(1, int(splats if self.scale == 1 else float(splats) * self.scale))
 
 
-def doubt(count: int, *, shares: bool = True) -> str:
-    """Return a question about a number of splats, see `Budget.question`; `shares` if a share is allowed, too."""
+def doubt(count: int | None, *, shares: bool = True) -> str:
+    """Return a question about a number of splats that is probably a mistake; empty for other numbers and None.
+
+    `shares`: a share is allowed, too.
+    """
     share = f" or {count}%" if shares else ""
-    return f"{count} means {count_of(count, 'splat')}; did you mean {count}k{share}?" if count < FEW else ""
+    few = count is not None and count < FEW
+    return f"{count} means {count_of(count or 0, 'splat')}; did you mean {count}k{share}?" if few else ""
 
 
 def parse_budget(text: str) -> Budget:

@@ -1,4 +1,4 @@
-"""`Instance`: a scene, where it stands, and how much its nodes count by their direction (foveation)."""
+"""`Instance`: a scene, its position in the world, and its foveation."""
 
 from __future__ import annotations
 
@@ -7,31 +7,34 @@ import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .foveation import Foveation
 from .scene import Scene
-from .transforms import LARGEST, SKEW, Transform, scale_of
 from .traversed import DetailScene, TileScene
+
+if TYPE_CHECKING:
+    from .transforms import Transform
 
 Matrix = NDArray[np.float64]
 
-#: What an instance is of.
+#: Source of the splats of an instance.
 Source = Path | Scene | DetailScene | TileScene
 
-#: What all instances together are called in tables.
+#: Name of all instances together in tables.
 TOTAL = "total"
 
 
 @dataclass(frozen=True, eq=False)
 class Instance:
-    """A scene and where it stands.
+    """A scene and its position in the world.
 
     Attributes:
-        source: a splat file (a path, which may be a string), or a scene in memory, of one level or more.
-        name: its name in messages and tables; unique among the instances of a run.
+        source: a splat file (a path, which may be a string), or a scene in memory.
+        name: in messages and tables; unique among the instances of a run.
         object_to_world: (4, 4) rotation, uniform scale and translation.
         lod_scale: multiplies the pixel scales of its nodes, or the distances at which its detail levels begin; above 1
             it gets more of the budget than others.
@@ -56,8 +59,11 @@ class Instance:
         matrix = np.asarray(self.object_to_world, np.float64)
         if matrix.shape != (4, 4):
             raise ValueError(f"object_to_world has the shape {matrix.shape}; give (4, 4)")
-        if scale_of(matrix, math.inf) is None:
-            raise ValueError("object_to_world is no rotation, uniform scale and translation of finite numbers")
+        if not np.array_equal(matrix, np.eye(4)):
+            from .transforms import scale_of
+
+            if scale_of(matrix, math.inf) is None:
+                raise ValueError("object_to_world is no rotation, uniform scale and translation of finite numbers")
         object.__setattr__(self, "object_to_world", matrix)
 
     @property
@@ -68,6 +74,8 @@ class Instance:
     @property
     def transform(self) -> Transform:
         """Similarity in `object_to_world`, with the nearest rotation if the axes are slightly skewed."""
+        from .transforms import LARGEST, SKEW, Transform
+
         axes = self.object_to_world[:3, :3]
         scale = min(max(float(np.cbrt(np.linalg.det(axes))), 1 / LARGEST), LARGEST)
         rotation = axes / scale
@@ -95,5 +103,5 @@ def names_of(files: Sequence[Path], taken: Collection[str] = ()) -> list[str]:
 
 
 def instances_of(files: Sequence[Path]) -> list[Instance]:
-    """Return one instance of each file, where the file has it."""
+    """Return one instance of each file, untransformed."""
     return [Instance(file, name) for file, name in zip(files, names_of(files), strict=True)]

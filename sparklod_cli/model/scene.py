@@ -282,13 +282,12 @@ def differing_axes(axes: Iterable[str | None]) -> tuple[str, ...]:
 
 
 def rotated_axis(axis: str | None, rotation: ArrayLike) -> str | None:
-    """Return the axis nearest to where a rotation takes an axis; None for None.
+    """Return the axis, one of `AXES`, nearest to where a rotation takes an axis; None for None.
 
     The nearest one, since a rotation by a few degrees levels a scene whose axis was only roughly up.
 
     Args:
-        axis: one of `AXES`.
-        rotation: (3, 3) matrix that multiplies column vectors.
+        rotation: (3, 3) matrix that multiplies column vectors; it may scale them, too.
     """
     if axis is None:
         return None

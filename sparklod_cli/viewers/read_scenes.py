@@ -16,7 +16,6 @@ from ..io import opened, size_of_input
 from ..model.instances import Instance
 from ..model.lod_tree import CHUNK_NODES, LodTree
 from ..model.scene import Scene
-from ..model.selection import Selection, describe
 from ..model.splats import COLUMNS, Splats
 from ..model.traversed import DetailScene, TileScene
 from ..system.errors import FormatError, InvalidSplatsError, TreeError, memory_errors_translated, naming
@@ -189,6 +188,8 @@ def _read(
 
 
 def _drawable(name: str, scene: Scene, notes: list[str]) -> Scene:
+    from ..model.selection import Selection, describe
+
     with naming(name, InvalidSplatsError):
         splats, dropped = Selection(drop_invalid=True).apply(scene.splats)
     if dropped:

@@ -153,7 +153,7 @@ class Scenes:
         """For each instance the name of its file, the axis of the world that is up, and which specification says so."""
         axes = list[tuple[str, str | None, str]]()
         for instance, loaded in zip(self.instances, self.of_instance, strict=True):
-            up = rotated_axis(loaded.scene.up, instance.transform.rotation)
+            up = rotated_axis(loaded.scene.up, instance.object_to_world[:3, :3])
             axes.append((loaded.name, up, loaded.scene.up_by if up == loaded.scene.up else ""))
         return axes
 

@@ -161,6 +161,8 @@ def assert_errors() -> Iterator[None]:
 
 def question_budgets(console: Console, *budgets: Budget | None) -> None:
     """Print a question about each count of splats that is too small to be meant."""
+    from ...lod.budget import doubt
+
     for budget in budgets:
-        if budget is not None and (question := budget.question):
+        if budget is not None and (question := doubt(budget.count)):
             console.say(question)

@@ -326,13 +326,16 @@ class Inputs:
             InstancesFileError: the instances file cannot be read.
         """
         from ...model.instances import instances_of
-        from ...viewers.instances_file import read_instances
 
         if not self.files and self.scene is None:
             raise click.UsageError("a FILE is missing; name one, or an instances file with --scene")
         if self.files and self.scene is not None:
             raise click.UsageError("FILE cannot be used with --scene, which names the files")
-        return instances_of(self.files) if self.scene is None else read_instances(self.scene)
+        if self.scene is None:
+            return instances_of(self.files)
+        from ...viewers.instances_file import read_instances
+
+        return read_instances(self.scene)
 
 
 def _parse_budgets(text: str) -> tuple[Budget, ...]:
@@ -407,7 +410,7 @@ class CutOptions:
         else:
             count = PRESETS[self.preset or DEFAULT_PRESET]
             budget = replace(Budget.of_count(count), by_default=self.preset is None)
-        scaled = budget.scaled(self.lod_splat_scale)
+        scaled = replace(budget, scale=self.lod_splat_scale)
         if scaled.count is not None and not scaled.count * scaled.scale <= LARGEST:
             raise click.UsageError(
                 f"the budget must be from 1 to 2^53, not {budget.text} times --lod-splat-scale {scaled.scale:g}"
