@@ -6,8 +6,8 @@ import functools
 from collections.abc import Sequence
 from pathlib import Path
 
+from ..cameras.camera_files import read_path
 from ..cameras.frame import Settings, direction_of
-from ..cameras.sources import read_path
 from ..model.scene import common_axis
 from ..system.errors import NotSplatsError, SparklodError, memory_errors_translated
 from ..system.progress import Progress, silent

@@ -13,9 +13,11 @@ import numpy as np
 
 from ..cameras import DEFAULT_SIZE, ELEVATION
 from ..cameras.camera import Camera
+from ..cameras.camera_files import read_path, similarity
 from ..cameras.formats.table import FORMATS, Axes
 from ..cameras.frame import MAX_FRAMES, Settings, direction_of
-from ..cameras.sources import CameraPath, Orbit, read_path, similarity
+from ..cameras.sources import CameraPath
+from ..cameras.sources import orbit as orbit_cameras
 from ..codecs.formats import PRECISIONS
 from ..images import metrics
 from ..lod.budget import Budget
@@ -584,5 +586,4 @@ def orbit(
         raise CameraPathError(f"count is {count}; give 1 to {MAX_FRAMES:,} cameras")
     scenes = functools.cache(lambda: scenes_of(viewed, None))
     settings = Settings(size=size, fov_y=math.radians(fov_y), up=up, up_of_scene=lambda: direction_of(scenes().up))
-    source = Orbit(count, center, distance, elevation)
-    return source.cameras(settings, lambda: scenes().balls())
+    return orbit_cameras(count, center, distance, elevation, settings, lambda: scenes().balls())

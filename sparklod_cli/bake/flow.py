@@ -72,7 +72,7 @@ def bake(
         if settings.refine is not None and settings.simplify is None:  # of a simplified scene, its one cut is fitted
             fitting = settings.refine
             if settings.camera_path is not None:
-                from ..cameras.sources import read_path
+                from ..cameras.camera_files import read_path
 
                 fitting = dataclasses.replace(fitting, path=read_path(settings.camera_path))
         overwrite = overwrite or (resources.resume and has_published(source, target, settings, resources))

@@ -191,7 +191,7 @@ class Simplifier:
         """Return a simplifier with the cameras of a file, if one is given; raise `CameraPathError` for a bad one."""
         if camera_path is None:
             return cls(goal, refine, None, say)
-        from ..cameras.sources import read_path
+        from ..cameras.camera_files import read_path
 
         path = read_path(camera_path)
         return cls(goal, refine and dataclasses.replace(refine, path=path), path.cameras, say)

@@ -120,13 +120,13 @@ def to_opengl(matrix: Matrix, axes: Axes) -> Matrix:
     The (4, 4) matrix has 0 0 0 1 as its last row, and may have a uniform scale. The text of the error, as of all errors
     of poses here, continues a sentence about the camera.
     """
-    if axes.from_world:
+    if axes in (Axes.OPENGL_W2C, Axes.OPENCV_W2C):
         try:
             with np.errstate(all="ignore"):
                 matrix = np.asarray(np.linalg.inv(matrix), np.float64)
         except np.linalg.LinAlgError:
             raise ValueError("has a matrix that cannot be inverted") from None
-    return matrix @ FLIP if axes.opencv else matrix
+    return matrix @ FLIP if axes in (Axes.OPENCV_C2W, Axes.OPENCV_W2C) else matrix
 
 
 def rigid(matrix: Matrix) -> Matrix:

@@ -1,27 +1,18 @@
-"""Input and output of parsers of camera paths.
-
-A parser reads `Files`, as text or as `CameraJson`, which checks values where they are used. It returns `Parsed` frames:
-poses in the axes of their format, and lenses as the file has them.
-"""
+"""Frames and lenses of a camera path before they become cameras, and the settings that override them."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
-from pathlib import Path
-from typing import Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..model.scene import ASSUMED, AXES
-from ..system import untrusted
-from ..system.errors import CameraPathError, TooManyCamerasError
-from ..system.untrusted import LARGEST, Origin, decoded_text, quoted_value
+from ..system.errors import TooManyCamerasError
 from . import DEFAULT_SIZE
-from .camera import Camera, Matrix, pose, rotation_of
+from .camera import Camera, Matrix
 from .formats.table import Axes
 
 #: x, y and z in world units, or of a direction.
@@ -93,7 +84,7 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class Sampled(Sequence[Frame]):
+class Sampled:
     """Frames that are computed when they are used, as a few keys can yield any number of them.
 
     Attributes:
@@ -102,24 +93,6 @@ class Sampled(Sequence[Frame]):
 
     length: int
     at: Callable[[NDArray[np.int64]], list[Frame]]
-
-    def __len__(self) -> int:
-        return self.length
-
-    @overload
-    def __getitem__(self, index: int) -> Frame: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> list[Frame]: ...
-
-    def __getitem__(self, index: int | slice) -> Frame | list[Frame]:
-        numbers = range(self.length)[index]
-        if isinstance(numbers, int):
-            return self.at(np.array([numbers]))[0]
-        return self.at(np.arange(numbers.start, numbers.stop, numbers.step))
-
-    def __iter__(self) -> Iterator[Frame]:
-        return iter(self[:])
 
 
 def sampled(count: float, at: Callable[[NDArray[np.int64]], list[Frame]]) -> Sampled:
@@ -196,151 +169,3 @@ def _check(focal: tuple[float, float], principal: tuple[float, float]) -> None:
             f"has a focal length of {focal[0]:g}, {focal[1]:g} and a principal point at {principal[0]:g},"
             f" {principal[1]:g}, one of which is not positive or too large"
         )
-
-
-#: Most pixels along a side of an image.
-MAX_SIDE = 1 << 16
-
-#: Errors are prefixed with the name of the file where it is known.
-ORIGIN = Origin("", CameraPathError)
-
-
-@dataclass(frozen=True)
-class Files:
-    """The file of a camera path and those that belong to it.
-
-    Attributes:
-        contents: bytes of each file by name; the requested one comes first.
-    """
-
-    path: Path
-    contents: Mapping[str, bytes]
-
-    @property
-    def data(self) -> bytes:
-        return next(iter(self.contents.values()), b"")
-
-    @cached_property
-    def text(self) -> str | None:
-        """The first file as text; None if it is not text."""
-        return decoded(self.data)
-
-    @cached_property
-    def json(self) -> CameraJson | None:
-        try:
-            return CameraJson.parse(self.text or "", ORIGIN)
-        except CameraPathError:
-            return None
-
-    def lines(self) -> list[str]:
-        if self.text is None:
-            raise CameraPathError("it is not a text file")
-        return self.text.splitlines()
-
-    def object(self) -> CameraJson:
-        if self.json is None:
-            raise CameraPathError("it is not JSON, or cut short")
-        return self.json
-
-
-@dataclass(frozen=True)
-class Parsed:
-    """The result of a parser.
-
-    Attributes:
-        frames: in order; those between keys are computed when they are used.
-        notes: what was ignored or assumed, one sentence each, for display.
-        fps: frames a second in the file; None if it gives none.
-        turned: every camera has its own up axis.
-    """
-
-    frames: Sequence[Frame]
-    notes: tuple[str, ...] = ()
-    fps: float | None = None
-    turned: bool = False
-
-
-class CameraJson(untrusted.Json):
-    """A value of a camera file, whose numbers may be written as texts; its errors are `CameraPathError`."""
-
-    __slots__ = ()
-
-    def __init__(self, value: Any, above: untrusted.Json | Origin = ORIGIN, key: str | int = "") -> None:
-        super().__init__(value, above, key)
-
-    def _number(self, value: Any) -> float | None:
-        return _finite(value)
-
-    def first_has(self, *keys: str) -> bool:
-        return isinstance(self.value, list) and bool(self.value) and self.get(0).has(*keys)
-
-    def pair(self) -> tuple[float, float]:
-        first, second = self.numbers(2)
-        return first, second
-
-    def positive(self) -> float:
-        if not (number := self.number()) > 0:
-            raise self.unexpected("a number above 0")
-        return number
-
-    def side(self) -> int:
-        number = self.number()
-        if not _is_side(number):
-            raise self.unexpected("a number of pixels")
-        return int(number)
-
-    def label(self, key: str) -> str:
-        """Return the text of a key that only names its object: of a number its digits, empty without the key."""
-        value = self.value.get(key) if isinstance(self.value, dict) else None
-        return value if isinstance(value, str) else "" if value is None else quoted_value(value)
-
-
-def decoded(data: bytes) -> str | None:
-    """Return the text of a file, see `decoded_text`; None if it is not text."""
-    try:
-        text = decoded_text(data)
-    except UnicodeDecodeError:
-        return None
-    return None if "\0" in text else text
-
-
-def posed(quat_wxyz: Sequence[float], position: Sequence[float], way: str) -> Matrix:
-    """Return the (4, 4) pose of a quaternion and a position; `CameraPathError`, naming the place, for length 0."""
-    try:
-        return pose(rotation_of(quat_wxyz), position)
-    except ValueError as error:
-        raise CameraPathError(f"{way} {error}") from None
-
-
-def finite(value: Any, way: str) -> float:
-    """Return a finite number from a number or its digits; `CameraPathError`, naming its place, for anything else."""
-    number = _finite(value)
-    if number is None:
-        raise CameraPathError(f"{way} has {repr(value)[:30]}, which is not a finite number")
-    return number
-
-
-def _finite(value: Any) -> float | None:
-    try:
-        number = float(value) if not isinstance(value, bool) else math.nan
-    except (TypeError, ValueError, OverflowError):
-        return None
-    return number if abs(number) < LARGEST else None
-
-
-def whole(number: float, way: str) -> int:
-    """Return a whole number; `CameraPathError`, naming its place, for a fraction."""
-    if not number.is_integer():
-        raise CameraPathError(f"{way} has {number:g}, which is not a whole number")
-    return int(number)
-
-
-def side(number: float, way: str) -> int:
-    """Return pixels along a side of an image; `CameraPathError`, naming its place, for an impossible number."""
-    if not _is_side(number):
-        raise CameraPathError(f"{way} of {number:g} is not a number of pixels")
-    return int(number)
-
-
-def _is_side(number: float) -> bool:
-    return 1 <= number <= MAX_SIDE and number == int(number)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,8 +53,6 @@ STEPS = 1e-6
 #: Sample size, in cameras of a path; those between them see nearly the same.
 CAMERAS = 64
 
-Item = TypeVar("Item")
-
 
 @dataclass(frozen=True)
 class Balls:
@@ -71,10 +69,6 @@ class Balls:
     radius: Matrix
     box: Matrix | None = None
     largest: float | None = None
-
-    def take(self, index: NDArray[np.bool_]) -> Balls:
-        """Return the balls of a mask (N,)."""
-        return Balls(self.center[index], self.radius[index])
 
     @classmethod
     def concat(cls, parts: Iterable[Balls]) -> Balls:
@@ -126,18 +120,19 @@ def covered(scene: Balls) -> Balls:
     """
     middle, radius = framing(scene.center)
     every = max(len(scene.center) // SAMPLE, 1)
-    scene = Balls(scene.center[::every], scene.radius[::every])
-    reach = np.linalg.norm(scene.center - middle, axis=1) + scene.radius
+    center, size = scene.center[::every], scene.radius[::every]
+    reach = np.linalg.norm(center - middle, axis=1) + size
     # The nearest is always kept, however large it is.
     near = reach <= max(OUTSIDE * radius, float(reach.min()))
-    scene, reach = scene.take(near), reach[near]
-    dense = _is_dense(Balls(scene.center - middle, scene.radius), radius)
+    center, size, reach = center[near], size[near], reach[near]
+    dense = _is_dense(Balls(center - middle, size), radius)
     most = float(np.quantile(reach[dense], COVERED, method="higher"))
-    framed = scene.take(dense & (reach <= most))
+    framed = dense & (reach <= most)
+    center, size = center[framed], size[framed]
     # Nothing is a point: a camera in line with all of them would be in their midst. Nor is anything, far out, smaller
     # than the steps of the numbers there.
-    least = max(SPECK * most, STEPS * float(np.abs(framed.center).max())) or radius
-    return Balls(framed.center, np.maximum(framed.radius, least))
+    least = max(SPECK * most, STEPS * float(np.abs(center).max())) or radius
+    return Balls(center, np.maximum(size, least))
 
 
 def _is_dense(scene: Balls, size: float) -> NDArray[np.bool_]:
@@ -200,15 +195,10 @@ def distance(cameras: Sequence[Camera], center: Matrix, scene: Balls) -> float:
     """
     local = Balls(scene.center - center, scene.radius)
     needed = []
-    for camera in sampled_cameras(cameras):
+    for camera in cameras:
         reach, _, back = _support(local, camera)
         needed.append(float((reach / np.repeat(back, 2)).max()))
     return max(needed)
-
-
-def sampled_cameras(cameras: Sequence[Item]) -> Sequence[Item]:
-    """Return at most `CAMERAS` of a path, evenly spaced."""
-    return cameras[:: -(-len(cameras) // CAMERAS)]
 
 
 def reach(near: float, far: float, cameras: Sequence[Camera], scene: Balls) -> tuple[float, float]:
@@ -219,7 +209,7 @@ def reach(near: float, far: float, cameras: Sequence[Camera], scene: Balls) -> t
     sample = scene.center[:: max(len(scene.center) // SAMPLE, 1)]
     corners = scene.box if scene.box is not None else np.stack([scene.center.min(axis=0), scene.center.max(axis=0)])
     largest = scene.largest if scene.largest is not None else float(scene.radius.max())
-    for camera in sampled_cameras(cameras):
+    for camera in cameras[:: -(-len(cameras) // CAMERAS)]:
         away = np.linalg.norm(sample - camera.position, axis=1)
         farthest = float(np.linalg.norm(np.abs(corners - camera.position).max(axis=0)))
         near, far = min(near, float(np.median(away)) / 100), max(far, 2 * (farthest + largest))

@@ -1,47 +1,25 @@
-"""Sources of cameras: a file, an orbit around a scene, a dolly towards it, single views, or keyframes.
-
-`read` and `cameras_of` turn the frames of a parser or a generator into a `CameraPath`.
-"""
+"""Cameras of a path, and their sources without a file: an orbit, a dolly, single views, keyframes, the whole scene."""
 
 from __future__ import annotations
 
 import dataclasses
-import functools
 import itertools
 import math
-import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from .. import io
-from ..system.errors import CameraPathError, SparklodError, TooManyCamerasError
-from ..system.untrusted import Origin, parse_json
-from . import ELEVATION, framing, generators
-from .camera import Camera, Matrix, rigid, to_opengl
-from .formats.table import FORMATS, NAMES, Axes, PathFormat
-from .frame import (
-    DEFAULT_FPS,
-    MAX_FRAMES,
-    MAX_GENERATED,
-    CameraJson,
-    Files,
-    Frame,
-    Parsed,
-    Sampled,
-    Settings,
-    camera_of,
-    finite,
-)
+from ..system.errors import CameraPathError, TooManyCamerasError
+from . import framing, generators
+from .camera import Camera, rigid, to_opengl
+from .formats.table import Axes
+from .frame import DEFAULT_FPS, MAX_FRAMES, MAX_GENERATED, Frame, Sampled, Settings, camera_of
 
 if TYPE_CHECKING:
     from .framing import Balls
-
-#: Bytes of a camera path's file. COLMAP's images.txt has all points that its images see.
-LARGEST = 1 << 31
 
 #: x, y and z in world units.
 Point = tuple[float, ...]
@@ -98,289 +76,159 @@ class CameraPath:
         return f"CameraPath({len(self.cameras):,} camera{'s' * (len(self.cameras) != 1)} of {self.format})"
 
 
-def read(files: Files, *, format: str | None = None, settings: Settings | None = None) -> CameraPath:
-    """Return the cameras of a file.
-
-    Args:
-        files: the file, and those that belong to it.
-        format: name of a row of `FORMATS`; None recognizes the format by the content.
-
-    Raises:
-        CameraPathError: the file has no known format or is broken, or a camera makes no sense.
-    """
-    settings = settings or Settings()
-    if not any(files.contents.values()):
-        raise CameraPathError("it is empty")
-    form = _known(files) if format is None else next(form for form in FORMATS if form.name == format)
-    if settings.axes and form.axes is None:
-        raise CameraPathError(f"{form.title} has targets instead of axes, so --camera-axes cannot be used with it")
-    parsed = form.parse(files, settings)
-    if settings.up is not None and (parsed.turned or not form.looking):
-        raise CameraPathError("its cameras have their own up axes, so --up cannot be used with them")
-    return cameras_of(parsed, form, settings)
-
-
-def _known(files: Files) -> PathFormat:
-    form = next((form for form in FORMATS if form.recognises(files)), None)
-    from .formats import own
-
-    if form is None and own.resembles_csv(files):
-        form = next(form for form in FORMATS if form.name == "csv")  # whose error names the missing columns
-    if form is None:
-        names = ", ".join(form.name for form in FORMATS)
-        raise CameraPathError(f"its content is of no known format; name the format with --camera-format ({names})")
-    return form
-
-
-def cameras_of(parsed: Parsed, form: PathFormat, settings: Settings) -> CameraPath:
+def cameras_of(
+    frames: Sequence[Frame] | Sampled,
+    settings: Settings,
+    title: str,
+    axes: Axes | None = Axes.OPENGL_C2W,
+    *,
+    fps: float | None = None,
+    notes: tuple[str, ...] = (),
+) -> CameraPath:
     """Return the cameras of frames from a file or a generator.
 
-    `CameraPathError` if there are none, or one makes no sense, which the text names; `TooManyCamerasError` if there are
-    too many.
+    Args:
+        title: origin of the frames, for display.
+        axes: of frames without their own, unless settings have some.
+        fps: frames a second of the file; None if it gives none.
+        notes: what was ignored or assumed.
+
+    Raises:
+        CameraPathError: there are no cameras, or one makes no sense, which the text names; its subclass
+            `TooManyCamerasError` if there are too many.
     """
-    numbers = range(0, len(parsed.frames), settings.every)
+    length = frames.length if isinstance(frames, Sampled) else len(frames)
+    numbers = range(0, length, settings.every)
     if not numbers:
         raise CameraPathError("it has no cameras")
-    most = MAX_GENERATED if isinstance(parsed.frames, Sampled) else MAX_FRAMES
+    most = MAX_GENERATED if isinstance(frames, Sampled) else MAX_FRAMES
     if len(numbers) > most:
         raise TooManyCamerasError(f"it has {len(numbers):,} cameras, more than {most:,}; leave some out with --every")
-    frames = parsed.frames[:: settings.every]
-    first = frames[0].time
+    every = settings.every
+    chosen = frames.at(np.arange(0, length, every)) if isinstance(frames, Sampled) else frames[::every]
+    first = chosen[0].time
     world = np.eye(4) if settings.world is None else settings.world
     cameras = []
-    for number, frame in zip(numbers, frames, strict=True):
+    for number, frame in zip(numbers, chosen, strict=True):
         if frame.time is None or first is None or settings.fps:
-            time = number / (settings.fps or parsed.fps or DEFAULT_FPS)
+            time = number / (settings.fps or fps or DEFAULT_FPS)
         else:
             time = frame.time - first
         try:
-            axes = frame.axes or settings.axes or form.axes
-            assert axes is not None
+            own = frame.axes or settings.axes or axes
+            assert own is not None
             with np.errstate(all="ignore"):
-                pose = rigid(world @ to_opengl(frame.matrix, axes))
+                matrix = frame.matrix if own is Axes.OPENGL_C2W else to_opengl(frame.matrix, own)
+                pose = rigid(world @ matrix)
             cameras.append(camera_of(pose, frame.lens, time, frame.name, settings))
         except ValueError as error:
             name = f" ({' '.join(frame.name.split())[:60]})" if frame.name else ""
             raise CameraPathError(f"the camera of frame {number}{name} {error}") from None
-    notes = parsed.notes
-    if form.world and settings.world is None:
-        notes += (form.world,)
     if not all(a.time <= b.time for a, b in itertools.pairwise(cameras)):
         notes += ("Its times do not increase; --fps replaces them.",)
     if not all(math.isfinite(camera.time) for camera in cameras):
         raise CameraPathError("its times are too far apart")
-    return CameraPath(tuple(cameras), form.title, notes, tuple(numbers))
+    return CameraPath(tuple(cameras), title, notes, tuple(numbers))
 
 
-@dataclass(frozen=True)
-class CameraFile:
-    """The cameras of a file, or of a folder that COLMAP wrote.
+class CameraSource(NamedTuple):
+    """Cameras that a user chose.
 
     Attributes:
-        format: its name in `formats.table.FORMATS`; None recognizes it by the content.
+        cameras: makes them, of settings and the scene. It raises a `CameraPathError` where a camera makes no sense, its
+            subclass `TooManyCamerasError` where there are too many, and an `InvalidSplatsError` where there is no scene
+            to fit.
+        fits_scene: they are as far away as the scene asks for.
     """
 
-    path: Path
-    format: str | None = None
-
-    fits_scene = False
-
-    def cameras(self, settings: Settings, scene: Scene) -> CameraPath:
-        return read_path(self.path, self.format, settings)
+    cameras: Callable[[Settings, Scene], CameraPath]
+    fits_scene: bool = False
 
 
-class _Aimed:
-    """Cameras that look at one point from a distance; both are chosen for the scene where they are None."""
+def orbit(
+    count: int, center: Point | None, distance: float | None, elevation: float, settings: Settings, scene: Scene
+) -> CameraPath:
+    """Return cameras once around a scene.
 
-    center: Point | None
-    distance: float | None
-    elevation: float
-
-    @property
-    def fits_scene(self) -> bool:
-        return self.distance is None
-
-    def _aim(
-        self, frames: Callable[[], Sequence[Frame]], settings: Settings, scene: Scene, times: float = 1
-    ) -> tuple[Any, float]:
-        """Return the target of the cameras, (3,), and their distance from there.
-
-        Args:
-            frames: makes cameras of their directions; called where something is chosen for the scene.
-            times: factor of a chosen distance over that at which the scene just fits the image.
-        """
-        if self.center is not None and self.distance is not None:
-            return self.center, self.distance
-        visible = framing.covered(scene())
-        center = framing.middle_of(visible) if self.center is None else np.asarray(self.center, np.float64)
-        some = framing.sampled_cameras(frames())
-        try:
-            cameras = [camera_of(frame.matrix, frame.lens, 0, "", settings) for frame in some]
-        except ValueError as error:
-            raise CameraPathError(f"the camera {error}") from None
-        return center, self.distance or times * framing.distance(cameras, center, visible)
-
-
-@dataclass(frozen=True)
-class Orbit(_Aimed):
-    """Cameras once around a scene.
-
-    Attributes:
+    Args:
         center: what they look at; None for the middle of the scene.
         distance: from there, world units; None for where the scene fits the image.
         elevation: above there, degrees.
     """
-
-    count: int
-    center: Point | None = None
-    distance: float | None = None
-    elevation: float = ELEVATION
-
-    def cameras(self, settings: Settings, scene: Scene) -> CameraPath:
-        up, tilt = settings.up_axis, math.radians(self.elevation)
-        around = functools.partial(generators.orbit, self.count, (0.0, 0.0, 0.0), 1, tilt, up)
-        center, distance = self._aim(around, settings, scene)
-        return _generated("an orbit", generators.orbit(self.count, center, distance, tilt, up), settings)
+    up, tilt = settings.up_axis, math.radians(elevation)
+    around = generators.orbit(count, (0.0, 0.0, 0.0), 1, tilt, up)
+    target, away = _aim(around, center, distance, settings, scene)
+    return cameras_of(generators.orbit(count, target, away, tilt, up), settings, "an orbit")
 
 
-@dataclass(frozen=True)
-class Dolly(_Aimed):
-    """Cameras straight towards a scene, from far to near.
+def dolly(
+    seconds: float, center: Point | None, distance: float | None, elevation: float, settings: Settings, scene: Scene
+) -> CameraPath:
+    """Return cameras straight towards a scene, from far to near.
 
-    Attributes:
+    Args:
         center: what they look at; None for the middle of the scene.
         distance: of the first camera from there, world units; None for 4 times where the scene fits the image.
         elevation: above there, degrees.
     """
-
-    seconds: float = generators.SECONDS
-    center: Point | None = None
-    distance: float | None = None
-    elevation: float = ELEVATION
-
-    def cameras(self, settings: Settings, scene: Scene) -> CameraPath:
-        up, tilt = settings.up_axis, math.radians(self.elevation)
-        count = max(2, round(self.seconds * (settings.fps or DEFAULT_FPS)))
-        ahead = functools.partial(generators.dolly, 2, (0.0, 0.0, 0.0), 1, 1, tilt, up)
-        center, distance = self._aim(ahead, settings, scene, generators.DOLLY_START)
-        last = distance / generators.DOLLY_ZOOM
-        return _generated("a dolly", generators.dolly(count, center, distance, last, tilt, up), settings)
+    up, tilt = settings.up_axis, math.radians(elevation)
+    count = max(2, round(seconds * (settings.fps or DEFAULT_FPS)))
+    ahead = generators.dolly(2, (0.0, 0.0, 0.0), 1, 1, tilt, up)
+    target, first = _aim(ahead, center, distance, settings, scene, generators.DOLLY_START)
+    last = first / generators.DOLLY_ZOOM
+    return cameras_of(generators.dolly(count, target, first, last, tilt, up), settings, "a dolly")
 
 
-@dataclass(frozen=True)
-class WholeScene:
-    """One camera in front of the middle of the scene, and above it, that has all of it just inside its picture."""
+def _aim(
+    directions: Sampled,
+    center: Point | None,
+    distance: float | None,
+    settings: Settings,
+    scene: Scene,
+    times: float = 1,
+) -> tuple[ArrayLike, float]:
+    """Return the target of cameras, (3,), and their distance from there; both are chosen for the scene where None.
 
-    elevation: float = ELEVATION
-
-    fits_scene = True
-
-    def cameras(self, settings: Settings, scene: Scene) -> CameraPath:
-        path = Orbit(1, (0.0, 0.0, 0.0), 1.0, self.elevation).cameras(settings, scene)
-        fitted = framing.fitted(path.cameras[0], framing.covered(scene()))
-        return dataclasses.replace(path, cameras=(fitted,))
-
-
-@dataclass(frozen=True)
-class SingleViews:
-    """A camera at time 0 for each pair of an eye and the target that it looks at.
-
-    Attributes:
-        views: at least one (eye, target).
-        named: each camera is called after its eye and target.
+    Args:
+        directions: the cameras, at any distance.
+        times: factor of a chosen distance over that at which the scene just fits the image.
     """
-
-    views: Sequence[tuple[Point, Point]]
-    named: bool = False
-
-    fits_scene = False
-
-    def cameras(self, settings: Settings, scene: Scene) -> CameraPath:
-        up = settings.up_axis
-        paths = [_generated("one view", [generators.frame_looking(*view, up)], settings) for view in self.views]
-        cameras = [path.cameras[0] for path in paths]
-        if self.named:
-            cameras = [
-                dataclasses.replace(camera, name=" to ".join(", ".join(f"{x:g}" for x in point) for point in view))
-                for camera, view in zip(cameras, self.views, strict=True)
-            ]
-        return dataclasses.replace(paths[0], cameras=tuple(cameras), numbers=tuple(range(len(cameras))))
+    if center is not None and distance is not None:
+        return center, distance
+    visible = framing.covered(scene())
+    target = framing.middle_of(visible) if center is None else np.asarray(center, np.float64)
+    if distance is None:
+        frames = directions.at(np.arange(0, directions.length, -(-directions.length // framing.CAMERAS)))
+        try:
+            cameras = [camera_of(frame.matrix, frame.lens, 0, "", settings) for frame in frames]
+        except ValueError as error:
+            raise CameraPathError(f"the camera {error}") from None
+        distance = times * framing.distance(cameras, target, visible)
+    return target, distance
 
 
-@dataclass(frozen=True)
-class Keyframes:
-    """Cameras that move smoothly from view to view.
+def whole_scene(elevation: float, settings: Settings, scene: Scene) -> CameraPath:
+    """Return one camera in front of the middle of the scene, and above it, that just has all of it in its picture."""
+    path = orbit(1, (0.0, 0.0, 0.0), 1.0, elevation, settings, scene)
+    fitted = framing.fitted(path.cameras[0], framing.covered(scene()))
+    return dataclasses.replace(path, cameras=(fitted,))
 
-    Attributes:
-        views: at least two (eye, target).
-        seconds: from one to the next, on average.
+
+def single_views(views: Sequence[tuple[Point, Point]], settings: Settings, *, named: bool = False) -> CameraPath:
+    """Return a camera at time 0 for each pair, at least one, of an eye and the target that it looks at.
+
+    `named` cameras are called after their eye and target.
     """
-
-    views: Sequence[tuple[Point, Point]]
-    seconds: float = generators.SECONDS
-
-    fits_scene = False
-
-    def cameras(self, settings: Settings, scene: Scene) -> CameraPath:
-        keys = [generators.Key(eye, target) for eye, target in self.views]
-        fps, up = settings.fps or DEFAULT_FPS, settings.up_axis
-        return _generated("keyframes", generators.between(keys, fps, up, seconds=self.seconds), settings)
+    cameras: list[Camera] = []
+    for view in views:
+        path = cameras_of([generators.frame_looking(*view, settings.up_axis)], settings, "one view")
+        name = " to ".join(", ".join(f"{x:g}" for x in point) for point in view) if named else ""
+        cameras.append(dataclasses.replace(path.cameras[0], name=name))
+    return dataclasses.replace(path, cameras=tuple(cameras), numbers=tuple(range(len(cameras))))
 
 
-#: Each has `fits_scene`, whether its cameras are as far away as the scene asks for, and
-#: `cameras(settings, scene) -> CameraPath`, which raises a `CameraPathError` where a camera makes no sense, its
-#: subclass `TooManyCamerasError` where there are too many, and an `InvalidSplatsError` where there is no scene to fit.
-CameraSource = CameraFile | Orbit | Dolly | WholeScene | SingleViews | Keyframes
-
-
-def read_path(path: Path, format: str | None = None, settings: Settings | None = None) -> CameraPath:
-    """Return the cameras of a file, or of a folder that COLMAP wrote; see `read`.
-
-    A `CameraPathError`, also where it cannot be read, names the file.
-    """
-    try:
-        contents = io.read_together(path, NAMES, LARGEST)
-    except SparklodError as error:
-        raise CameraPathError(str(error)) from None
-    try:
-        return read(Files(path, contents), format=format, settings=settings)
-    except CameraPathError as error:
-        raise CameraPathError(f"{path}: {error}") from None
-
-
-def similarity(text: str) -> Matrix:
-    """Return a (4, 4) matrix of a rotation, a uniform scale and a translation from 16 numbers, row by row.
-
-    The numbers are separated by commas or white space, or JSON: a list of them or of rows. The text of a
-    `CameraPathError` continues a sentence about them.
-    """
-    words = re.split(r"[\s,;]+", text.strip())
-    try:
-        if text.lstrip().startswith("["):
-            numbers = CameraJson(parse_json(text), Origin("matrix", CameraPathError)).matrix(4)
-        else:
-            numbers = [finite(word, "matrix") for word in words]
-    except ValueError:
-        raise CameraPathError("is not JSON") from None
-    if len(numbers) != 16:
-        raise CameraPathError(f"has {len(numbers)} numbers, not 16")
-    matrix = np.array(numbers).reshape(4, 4)
-    try:
-        rigid(matrix)
-    except ValueError as error:
-        raise CameraPathError(f"{error}") from None
-    return matrix
-
-
-def read_world_transform(path: Path) -> Matrix:
-    """Return the `similarity` in a file; a `CameraPathError` names the file."""
-    try:
-        return similarity(io.read_text(path))
-    except CameraPathError as error:
-        raise CameraPathError(f"{path}: --world-transform {error}") from None
-    except SparklodError as error:
-        raise CameraPathError(str(error)) from None
-
-
-def _generated(title: str, frames: Sequence[Frame], settings: Settings) -> CameraPath:
-    return cameras_of(Parsed(frames), PathFormat("", title, "", Axes.OPENGL_C2W), settings)
+def keyframes(views: Sequence[tuple[Point, Point]], seconds: float, settings: Settings) -> CameraPath:
+    """Return cameras that move smoothly along at least two views, eye and target, `seconds` each on average."""
+    keys = [generators.Key(eye, target) for eye, target in views]
+    fps, up = settings.fps or DEFAULT_FPS, settings.up_axis
+    return cameras_of(generators.between(keys, fps, up, seconds=seconds), settings, "keyframes")

@@ -15,7 +15,7 @@ from ..cameras import DEFAULT_SIZE, ELEVATION, framing
 from ..cameras.camera import Matrix
 from ..cameras.frame import DEFAULT_FOV_Y, Settings
 from ..cameras.framing import Balls, balls_of
-from ..cameras.sources import SingleViews, WholeScene
+from ..cameras.sources import single_views, whole_scene
 from ..codecs.losses import MOST_PAGED_DEGREE, sample_loss
 from ..codecs.rad.rad_header import RadHeader
 from ..codecs.rad.rad_reader import count_leaves, file_of, read_chunk
@@ -178,8 +178,8 @@ def start_of(extents: Sequence[Extent], view: tuple[Point, Point] | None, up: Po
         middle, radius = framing.framing(balls.center)
     except InvalidSplatsError:  # nothing that could be framed
         middle, radius, view = np.zeros(3), 1.0, view or ((0.0, 0.0, 3.0), (0.0, 0.0, 0.0))
-    source = WholeScene(ELEVATION) if view is None else SingleViews((view,))
-    (camera,) = source.cameras(settings, lambda: balls).cameras
+    path = whole_scene(ELEVATION, settings, lambda: balls) if view is None else single_views((view,), settings)
+    (camera,) = path.cameras
     sizes = min(extent.sizes[0] for extent in extents), max(extent.sizes[1] for extent in extents)
     target: Sequence[float] | Matrix
     if view is None:  # the point on the axis of the camera that is nearest to the middle

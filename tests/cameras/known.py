@@ -10,9 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sparklod_cli.cameras.camera import Camera
+from sparklod_cli.cameras.camera_files import read
+from sparklod_cli.cameras.formats.parsing import Files
 from sparklod_cli.cameras.formats.table import NAMES
-from sparklod_cli.cameras.frame import Files, Settings
-from sparklod_cli.cameras.sources import CameraPath, read
+from sparklod_cli.cameras.frame import Settings
+from sparklod_cli.cameras.sources import CameraPath
 from sparklod_cli.io import read_together
 from tests.conftest import FIXTURES
 

@@ -9,8 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sparklod_cli.cameras import generators
 from sparklod_cli.cameras.camera import Camera
-from sparklod_cli.cameras.frame import DEFAULT_UP, Settings, camera_of
+from sparklod_cli.cameras.frame import DEFAULT_UP, Frame, Settings, camera_of
 from sparklod_cli.cameras.framing import (
     FILLED,
     OUTSIDE,
@@ -23,7 +24,6 @@ from sparklod_cli.cameras.framing import (
     middle_of,
     reach,
 )
-from sparklod_cli.cameras.generators import orbit
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.render.settings import RasterSettings
 from sparklod_cli.system.errors import InvalidSplatsError
@@ -39,6 +39,10 @@ def scenes(draw: st.DrawFn) -> Balls:
     shift = np.array(draw(st.tuples(*[st.integers(-10, 10)] * 3)))
     center = size * (random.normal(size=(count, 3)) * stretch + shift)
     return Balls(center, size * draw(st.sampled_from([0.0, 0.01, 1.0])) * random.random(count))
+
+
+def orbited(count: int, center: object, distance: float, elevation: float, up: object) -> list[Frame]:
+    return generators.orbit(count, center, distance, elevation, up).at(np.arange(count))  # type: ignore[arg-type]
 
 
 def places(camera: Camera, scene: Balls) -> np.ndarray:
@@ -62,7 +66,7 @@ def test_a_fitted_camera_sees_the_whole_scene_and_fills_its_picture(
     scene: Balls, size: tuple[int, int], azimuth: float, tilt: float, fov: float
 ) -> None:
     scene = covered(scene)
-    start = orbit(360, (0, 0, 0), 1, math.radians(tilt), DEFAULT_UP)[int(azimuth) % 360]
+    start = orbited(360, (0, 0, 0), 1, math.radians(tilt), DEFAULT_UP)[int(azimuth) % 360]
     settings = Settings(size=size, fov_y=math.radians(fov))
     camera = fitted(camera_of(start.matrix, start.lens, 0, "", settings), scene)
     reach = places(camera, scene)
@@ -81,7 +85,7 @@ def test_every_camera_of_an_orbit_sees_the_whole_scene(
     settings = Settings(size=size)
 
     def around(away: float, at: np.ndarray) -> list[Camera]:
-        frames = orbit(count, at, away, math.radians(tilt), DEFAULT_UP)
+        frames = orbited(count, at, away, math.radians(tilt), DEFAULT_UP)
         return [camera_of(frame.matrix, frame.lens, 0, "", settings) for frame in frames]
 
     away = distance(around(1, np.zeros(3)), middle, scene)
@@ -166,7 +170,7 @@ def test_balls_have_the_places_of_finite_splats() -> None:
 @pytest.mark.parametrize("size", [1e-6, 1e-4, 1.0, 1e5, 1e30])
 def test_the_clip_planes_reach_around_a_scene_of_any_size(size: float) -> None:
     scene = covered(Balls(np.random.default_rng(0).normal(size=(500, 3)) * size, np.zeros(500)))
-    frames = orbit(5, (0, 0, 0), 1, 0, DEFAULT_UP)
+    frames = orbited(5, (0, 0, 0), 1, 0, DEFAULT_UP)
     cameras = [fitted(camera_of(frame.matrix, frame.lens, 0, "", Settings()), scene) for frame in frames]
     default = RasterSettings()
     near, far = reach(default.near, default.far, cameras, scene)

@@ -217,7 +217,7 @@ def test_wrong_camera_files_are_errors_that_name_them(tmp_path: Path) -> None:
 
 
 def test_a_file_of_gigabytes_is_not_read(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sparklod_cli.cameras.sources.LARGEST", 100)
+    monkeypatch.setattr("sparklod_cli.cameras.camera_files.LARGEST", 100)
     assert "inria.json is larger than 0 MiB" in file_error("--camera-path", FOLDER / "inria.json")
     assert "it is a pipe or a device" in file_error("--camera-path", "/dev/null")
 

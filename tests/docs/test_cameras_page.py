@@ -7,9 +7,9 @@ import re
 import numpy as np
 import pytest
 
+from sparklod_cli.cameras.camera_files import read
 from sparklod_cli.cameras.formats.colmap import MODELS
 from sparklod_cli.cameras.formats.table import FORMATS, PLAYCANVAS
-from sparklod_cli.cameras.sources import read
 from tests.cameras.known import text_file
 from tests.conftest import ROOT
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from sparklod_cli.cameras.frame import Settings
-from sparklod_cli.cameras.sources import CameraPath, SingleViews
+from sparklod_cli.cameras.sources import CameraPath, single_views
 from sparklod_cli.images import sequence
 from sparklod_cli.images.output import output_for
 from sparklod_cli.images.sequence import PictureSettings, WrittenPictures, write_pictures
@@ -24,7 +24,7 @@ TOWN = FIXTURES / "traverse" / "town.spz"
 
 def path_of(count: int) -> CameraPath:
     views = [((float(number), -3.0, 9.0), (0.0, 0.0, 0.0)) for number in range(count)]
-    return SingleViews(views).cameras(Settings(size=(48, 32)), lambda: pytest.fail("nobody needs to know the scene"))
+    return single_views(views, Settings(size=(48, 32)))
 
 
 def written(folder: Path, count: int, budget: int = 900) -> WrittenPictures:

@@ -13,8 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sparklod_cli.cameras.camera import Camera
-from sparklod_cli.cameras.formats.table import Axes, PathFormat
-from sparklod_cli.cameras.frame import DEFAULT_UP, Parsed, Settings
+from sparklod_cli.cameras.frame import DEFAULT_UP, Settings
 from sparklod_cli.cameras.framing import framing
 from sparklod_cli.cameras.generators import orbit
 from sparklod_cli.cameras.sources import cameras_of
@@ -143,7 +142,7 @@ def cameras_around(splats: Splats) -> tuple[Camera, ...]:
     middle, radius = framing(splats.center)
     frames = orbit(3, middle, 1.6 * radius, math.radians(15), DEFAULT_UP)
     settings = Settings(size=(240, 135), fov_y=math.radians(60))
-    return cameras_of(Parsed(frames), PathFormat("", "an orbit", "", Axes.OPENGL_C2W), settings).cameras
+    return cameras_of(frames, settings, "an orbit").cameras
 
 
 def picture(splats: Splats, camera: Camera) -> Image:

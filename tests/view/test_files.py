@@ -350,13 +350,13 @@ def test_only_buffers_that_a_tile_is_read_from_are_published(tmp_path: Path, pac
 
 def test_the_first_look_is_that_of_render() -> None:
     from sparklod_cli.cameras.frame import Settings
-    from sparklod_cli.cameras.sources import WholeScene
+    from sparklod_cli.cameras.sources import whole_scene
     from sparklod_cli.model.instances import instances_of
     from sparklod_cli.viewers.read_scenes import read_scenes
 
     start = settings_of(TREE)["start"]
     scenes = read_scenes(instances_of([TREE]))
-    (camera,) = WholeScene().cameras(Settings(size=(1280, 720)), scenes.balls).cameras
+    (camera,) = whole_scene(15.0, Settings(size=(1280, 720)), scenes.balls).cameras
     assert start["eye"] == pytest.approx(camera.position.tolist())
     ahead = np.subtract(start["target"], start["eye"])
     assert ahead / np.linalg.norm(ahead) == pytest.approx(camera.forward)

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from ...system.errors import CameraPathError
-from ..frame import NO_LENS, Files, Frame, Intrinsics, Parsed, Settings, decoded, finite, posed, side, whole
+from ..frame import NO_LENS, Frame, Intrinsics, Settings
+from .parsing import Files, Parsed, decoded, finite, posed, side, whole
 from .table import FORMATS
 
 #: An image of images.bin: number, rotation w x y z, translation x y z, and number of its camera; its name follows.

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from ...system.errors import CameraPathError
 from ...system.untrusted import quoted_value
 from ..camera import Matrix
-from ..frame import CameraJson, Files, Frame, Intrinsics, Parsed, Settings, sampled
+from ..frame import Frame, Intrinsics, Settings, sampled
 from ..generators import along, cardinal_tangents, frame_looking, hermite
+from .parsing import CameraJson, Files, Parsed
 
 UP = (0.0, 1.0, 0.0)
 FRAME_RATE = 30.0

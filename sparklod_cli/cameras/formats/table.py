@@ -5,13 +5,8 @@ Imports nothing heavy, for `--help`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import Enum
-from importlib import import_module
-from typing import TYPE_CHECKING, Any, cast
-
-if TYPE_CHECKING:
-    from ..frame import Files, Parsed, Settings
+from typing import NamedTuple
 
 
 class Axes(Enum):
@@ -27,14 +22,6 @@ class Axes(Enum):
     OPENGL_W2C = "opengl-w2c"
     OPENCV_W2C = "opencv-w2c"
 
-    @property
-    def opencv(self) -> bool:
-        return self in (Axes.OPENCV_C2W, Axes.OPENCV_W2C)
-
-    @property
-    def from_world(self) -> bool:
-        return self in (Axes.OPENGL_W2C, Axes.OPENCV_W2C)
-
 
 #: PlayCanvas rotates what it loads by 180 degrees about z, so that y points up.
 PLAYCANVAS = (
@@ -43,13 +30,12 @@ PLAYCANVAS = (
 )
 
 
-@dataclass(frozen=True)
-class PathFormat:
+class PathFormat(NamedTuple):
     """A format of camera paths.
 
     Attributes:
         name: value of `--camera-format`.
-        module: in this package; has the functions `recognises_NAME` and `parse_NAME`, see the methods.
+        module: in this package; has `recognises_NAME(files) -> bool` and `parse_NAME(files, settings) -> Parsed`.
         axes: of its matrices; None if it has eyes and targets instead.
         looking: its cameras have, or may have, an eye and a target, which need an up axis.
         world: note for a path without `--world-transform`: the world of its cameras may not be that of the splats.
@@ -63,15 +49,6 @@ class PathFormat:
     looking: bool = False
     world: str = ""
     names: tuple[tuple[str, ...], ...] = ()
-
-    def recognises(self, files: Files) -> bool:
-        return bool(self._function("recognises")(files))
-
-    def parse(self, files: Files, settings: Settings) -> Parsed:
-        return cast("Parsed", self._function("parse")(files, settings))
-
-    def _function(self, verb: str) -> Any:
-        return getattr(import_module(f".{self.module}", __package__), f"{verb}_{self.name.replace('-', '_')}")
 
 
 #: The formats, in the order in which they are tried.

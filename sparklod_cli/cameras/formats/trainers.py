@@ -13,7 +13,8 @@ import numpy as np
 
 from ...system.errors import CameraPathError
 from ..camera import pose
-from ..frame import NO_LENS, CameraJson, Files, Frame, Intrinsics, Parsed, Settings, finite, posed
+from ..frame import NO_LENS, Frame, Intrinsics, Settings
+from .parsing import CameraJson, Files, Parsed, finite, posed
 
 #: The camera types of nerfstudio's paths that are read as pinhole cameras.
 PINHOLES = ("perspective", "fisheye")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
@@ -199,18 +200,23 @@ class Cameras:
         elevation = ELEVATION if self.elevation is None else self.elevation
         seconds = self.seconds or generators.SECONDS
         if self.camera_path is not None:
-            return sources.CameraFile(
-                self.camera_path, None if self.camera_format in (None, "auto") else self.camera_format
-            )
+            from ...cameras.camera_files import read_path
+
+            path, form = self.camera_path, None if self.camera_format == "auto" else self.camera_format
+            return sources.CameraSource(lambda settings, scene: read_path(path, form, settings))
         if self.all_views or self.look_at:
-            return sources.SingleViews(self.all_views or (self.look_at,), named=bool(self.all_views))
+            views, named = self.all_views or (self.look_at,), bool(self.all_views)
+            return sources.CameraSource(lambda settings, scene: sources.single_views(views, settings, named=named))
         if self.keyframes:
-            return sources.Keyframes(self.keyframes, seconds)
+            return sources.CameraSource(lambda settings, scene: sources.keyframes(self.keyframes, seconds, settings))
         if self.dolly:
-            return sources.Dolly(seconds, self.center, self.distance, elevation)
+            dolly = functools.partial(sources.dolly, seconds, self.center, self.distance, elevation)
+            return sources.CameraSource(dolly, fits_scene=self.distance is None)
         if self.orbit is None and self.still and self.center is None and self.distance is None:
-            return sources.WholeScene(elevation)
-        return sources.Orbit(self.orbit or (1 if self.still else ORBIT), self.center, self.distance, elevation)
+            return sources.CameraSource(functools.partial(sources.whole_scene, elevation), fits_scene=True)
+        count = self.orbit or (1 if self.still else ORBIT)
+        orbit = functools.partial(sources.orbit, count, self.center, self.distance, elevation)
+        return sources.CameraSource(orbit, fits_scene=self.distance is None)
 
     def settings(self) -> Settings:
         """Return settings that override those of a camera file.
@@ -268,7 +274,7 @@ class PictureCameras(Cameras):
 
 def _world(value: str) -> Matrix:
     """Return the (4, 4) matrix of --world-transform, which is a text of numbers or names a file."""
-    from ...cameras.sources import read_world_transform, similarity
+    from ...cameras.camera_files import read_world_transform, similarity
 
     if "," in value and not set(value) - NUMERIC:
         try:

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from sparklod_cli.cameras.frame import Files
-from sparklod_cli.cameras.sources import read, read_path
+from sparklod_cli.cameras.camera_files import read, read_path
+from sparklod_cli.cameras.formats.parsing import Files
 from sparklod_cli.system.errors import CameraPathError
 from tests.cameras.known import FOLDER, KNOWN, check_pose, files_at, text_file
 

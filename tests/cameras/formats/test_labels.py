@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sparklod_cli.cameras.sources import CameraPath, read
+from sparklod_cli.cameras.camera_files import read
+from sparklod_cli.cameras.sources import CameraPath
 from sparklod_cli.system.errors import CameraPathError
 from tests.cameras.known import FOLDER, text_file
 
