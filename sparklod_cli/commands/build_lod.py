@@ -142,7 +142,7 @@ def build_lod(ctx: click.Context, /, **_: Any) -> None:
                 console.say(f"{name_of(source)}  ->  {target}  exists already")
             else:
                 report(console, source, target, outcome)
-            if general.as_json:
+            if options.as_json:
                 print_json(record_of(source, target, outcome))
             if interrupts.came():  # during fitting, which then ends early
                 console.clear()
@@ -205,7 +205,7 @@ def _check(ctx: click.Context, options: BuildLodOptions, named: list[Path]) -> N
     if form.chunked or unbundled or form.cuts:
         targets = with_chunks(targets)
     keep_apart(ctx, {"output" if options.output_dir is None else "output_dir": targets, "scene": named})
-    claim_stdout(ctx, "output", as_json=options.general.as_json, binary=True)
+    claim_stdout(ctx, "output", as_json=options.as_json, binary=True)
     if options.input_scene.rgba is not None and len(inputs) > 1:
         raise click.UsageError(f"--rgba takes one input, not {len(inputs)}")
     if options.skip_existing and output == DASH:

@@ -29,7 +29,7 @@ from ..system.threads import processors
 from ..system.untrusted import printable
 from .command import Command, flag, values_of
 from .console import Console, count_of, print_json
-from .options.common import QUIET, VERBOSE, Messages
+from .options.common import JSON, QUIET, VERBOSE
 
 #: Beginning of the names of checks of extras.
 EXTRA = "extra "
@@ -42,8 +42,9 @@ EXAMPLES = """\
 
 
 @dataclass(frozen=True)
-class _Messages(Messages):
-    quiet: bool = flag("Print problems only.", flags=QUIET)
+class _Messages:
+    as_json: bool = flag("Print one JSON object on standard output.", **JSON)
+    quiet: bool = flag("Print problems only.", **QUIET)
     verbose: bool = flag("Print what is being checked.", **VERBOSE)
 
 

@@ -23,7 +23,7 @@ from ..system.units import format_size, parse_size
 from ..system.untrusted import MOST, printable, shortened
 from .command import COMMON, Command, flag, refuse, values_of
 from .console import Console, count_of, rows
-from .options.common import QUIET, General, assert_errors, assert_option, overwrite_flag, plot_option, table_form
+from .options.common import ASSERT, EACH_AS_JSON, JSON, OVERWRITE, PNG, QUIET, General, assert_errors, table_form
 from .paths import InputPath, OutputPath, keep_apart, name_outputs
 
 if TYPE_CHECKING:
@@ -65,9 +65,10 @@ class Checks:
     check: bool = flag(
         "Look for everything that can be wrong, and print a line for each finding instead of a report.", heading=COMMON
     )
-    asserts: tuple[str, ...] = assert_option(
+    asserts: tuple[str, ...] = setting(
         "Expect this of every file, such as 'nodes<5M', 'bytes<=40MB' or 'tree.depth<24'; can be given several times."
         " The exit status is 3 if it does not hold.",
+        **ASSERT,
         heading=COMMON,
     )
     require_lod: bool = flag("Expect a Level-of-Detail tree.", heading=COMMON)
@@ -127,7 +128,7 @@ class InspectOutput:
 
     HEADING: ClassVar[str] = "Report"
 
-    overwrite: bool = overwrite_flag()
+    overwrite: bool = flag(**OVERWRITE)
     stats: bool = flag("Report statistics of all quantities, not only of the main ones.", heading=COMMON)
     field: str | None = setting(
         "Print one value of the JSON report, such as tree.leaves, instead of a report.", metavar="NAME", heading=COMMON
@@ -146,7 +147,7 @@ class InspectOutput:
         "Write the table of the chunks of a single file to FILE: .csv, .json or .parquet.", OutputPath()
     )
     json_schema: bool = flag("Print the JSON Schema of --json and exit.", is_eager=True, callback=_print_schema)
-    plot: Path | None = plot_option("Draw the structure of a single file as a .png, with pyvista.", heading=PICTURES)
+    plot: Path | None = setting("Draw the structure of a single file as a .png, with pyvista.", PNG, heading=PICTURES)
     plot_level: int | None = setting(
         "Draw the nodes at this depth of the tree.  [default: the leaves]", whole(0), heading=PICTURES
     )
@@ -194,7 +195,7 @@ def check_usage(ctx: click.Context, count: int, checks: Checks, output: InspectO
 
 @dataclass(frozen=True)
 class _InspectGeneral(General):
-    quiet: bool = flag("Print only what other options ask for, and errors.", flags=QUIET)
+    quiet: bool = flag("Print only what other options ask for, and errors.", **QUIET)
 
 
 @dataclass(frozen=True)
@@ -206,6 +207,7 @@ class InspectOptions:
     )
     checks: Checks = dataclasses.field(default_factory=Checks)
     output: InspectOutput = dataclasses.field(default_factory=InspectOutput)
+    as_json: bool = flag(EACH_AS_JSON, **JSON)
     general: _InspectGeneral = dataclasses.field(default_factory=_InspectGeneral)
 
 
@@ -224,7 +226,7 @@ def inspect(ctx: click.Context, /, **_: Any) -> None:
     options = values_of(ctx, InspectOptions)
     files, checks, output, general = options.files, options.checks, options.output, options.general
     keep_apart(ctx)
-    check_usage(ctx, len(files), checks, output, as_json=general.as_json)
+    check_usage(ctx, len(files), checks, output, as_json=options.as_json)
     with Console(quiet=general.quiet, verbose=general.verbose) as console:
         from ..api.inspect_jobs import InspectSettings, check_outputs, read_original
 
@@ -236,7 +238,7 @@ def inspect(ctx: click.Context, /, **_: Any) -> None:
         if checks.leaves_of is not None:
             original = read_original(checks.leaves_of, threads=general.threads, progress=console.progress)
         settings = InspectSettings(
-            report=_report_settings(checks, output, expected, as_json=general.as_json),
+            report=_report_settings(checks, output, expected, as_json=options.as_json),
             expected=expected,
             original=original,
             everything=checks.check,
@@ -342,7 +344,7 @@ class _Job:
         if report.chunks is None:
             self.console.error(f"{name}: its chunks are unknown, since it does not hold all of its splats")
             return 1
-        if self.options.output.chunks and not self.options.general.as_json:
+        if self.options.output.chunks and not self.options.as_json:
             click.echo("\n".join(chunk_lines(report.chunks)))
         if self.settings.chunks is not None:
             self.console.say(f"{self.settings.chunks.path}  table of {count_of(len(report.chunks), 'chunk')}")
@@ -350,7 +352,7 @@ class _Job:
 
     def _print(self, name: str, report: Report) -> None:
         plain, checks, output = report.as_dict(), self.options.checks, self.options.output
-        if self.options.general.as_json:
+        if self.options.as_json:
             click.echo(json.dumps(plain, allow_nan=False))
         elif output.field:
             if report.format is not None:

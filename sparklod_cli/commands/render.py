@@ -21,14 +21,14 @@ from ..system.units import format_size
 from .command import COLOR, COMMON, Command, check_declared, flag, flags_set, is_set, refuse, values_of
 from .console import Console, count_of, for_screen, is_terminal, print_json
 from .options.common import (
+    ASSERT,
     JSON,
+    OUTPUT,
+    OVERWRITE,
+    PNG,
     General,
     assert_errors,
-    assert_option,
     is_summary,
-    output_option,
-    overwrite_flag,
-    plot_option,
     question_budgets,
     report_outcomes,
     table_output,
@@ -42,7 +42,7 @@ from .options.viewing import (
     say_notes,
     viewed_files,
 )
-from .paths import Folder, InputPath, claim_stdout, keep_apart, name_outputs, require_suffix, stem_of
+from .paths import Folder, InputPath, OutputPath, claim_stdout, keep_apart, name_outputs, require_suffix, stem_of
 
 if TYPE_CHECKING:
     from ..api.jobs import Compared
@@ -179,12 +179,13 @@ class ComparisonOptions:
         "Measure how far the cuts of each --budget are from full detail, as a table instead of pictures.",
         excludes=NOT_COMPARED,
     )
-    asserts: tuple[str, ...] = assert_option(
+    asserts: tuple[str, ...] = setting(
         "With --compare: a condition that must hold, such as 'psnr_min>30', or '5%:psnr>30' for one of the budgets; the"
         " exit status is 3 if it does not.",
+        **ASSERT,
         needs="compare",
     )
-    plot: Path | None = plot_option("With --compare: draw charts of the table as a .png.", needs="compare")
+    plot: Path | None = setting("With --compare: draw charts of the table as a .png.", PNG, needs="compare")
     max_sh: int = setting(
         "With --compare: highest degree of spherical harmonics to draw.",
         whole(0, MAX_SH_DEGREE),
@@ -244,12 +245,14 @@ class PictureFiles:
 
     HEADING: ClassVar[str] = "Output"
 
-    output: Path | Folder | None = output_option(
+    output: Path | Folder | None = setting(
         "Write a .png, .jpg, .webp or .npy (floats), or with out.%04d.png one for each camera; a .mp4, .webm, .gif or"
         " .webp for an animation; with --compare a .csv, .json or .parquet; or into the folder FILE as NAME.png; - is"
-        " standard output.  [default: NAME.png beside the first FILE; with --compare standard output]"
+        " standard output.  [default: NAME.png beside the first FILE; with --compare standard output]",
+        OutputPath(),
+        **OUTPUT,
     )
-    overwrite: bool = overwrite_flag()
+    overwrite: bool = flag(**OVERWRITE)
     thumbnail: bool = flag(
         f"Draw a small picture of the whole scene: {THUMBNAIL_SIZE[0]}x{THUMBNAIL_SIZE[1]} pixels, each the mean of"
         f" {THUMBNAIL_SUPERSAMPLE} x {THUMBNAIL_SUPERSAMPLE} samples, to NAME-thumbnail.png.",
@@ -331,11 +334,6 @@ HEADINGS = (
 
 
 @dataclass(frozen=True)
-class _RenderGeneral(General):
-    as_json: bool = flag("Print what was drawn as one JSON object on standard output.", flags=JSON)
-
-
-@dataclass(frozen=True)
 class RenderOptions:
     """Options of the command, group by group."""
 
@@ -346,7 +344,8 @@ class RenderOptions:
     streaming: PictureStreaming = field(default_factory=PictureStreaming)
     appearance: Appearance = field(default_factory=Appearance)
     comparison: ComparisonOptions = field(default_factory=ComparisonOptions)
-    general: _RenderGeneral = field(default_factory=_RenderGeneral)
+    as_json: bool = flag("Print what was drawn as one JSON object on standard output.", **JSON)
+    general: General = field(default_factory=General)
 
     @classmethod
     def of(cls, ctx: click.Context) -> RenderOptions:
@@ -359,7 +358,7 @@ class RenderOptions:
         options.cameras.check(ctx)
         options.streaming.check(ctx)
         options.appearance.check(ctx)
-        claim_stdout(ctx, "output", as_json=options.general.as_json)
+        claim_stdout(ctx, "output", as_json=options.as_json)
         if not options.pictures.thumbnail:
             return options
         small = dataclasses.replace(options.cameras, size=THUMBNAIL_SIZE)
@@ -422,7 +421,7 @@ def _draw(ctx: click.Context, options: RenderOptions) -> None:
             )
         console.clear()
         seconds = time.perf_counter() - start
-        _report(console, pictures, output, seconds, as_json=general.as_json)
+        _report(console, pictures, output, seconds, as_json=options.as_json)
         console.detail(
             f"  {files.path.format}, {format_size(pictures.bytes)} of {output.form}; {render.style} by"
             f" {render.backend}, from {render.raster.near:g} to {render.raster.far:g} units away"
@@ -517,7 +516,7 @@ def _compare(ctx: click.Context, options: RenderOptions) -> int:
     from ..api.jobs import check_chart, compare_files
     from ..tables.comparison import COLUMNS
 
-    table = table_output(output, None, COLUMNS, overwrite=overwrite, as_json=general.as_json)
+    table = table_output(output, None, COLUMNS, overwrite=overwrite, as_json=options.as_json)
     instances = options.inputs.instances()
     keep_apart(ctx, files_read(options, instances))
     with Console(quiet=general.quiet, verbose=general.verbose) as console:
@@ -570,14 +569,14 @@ def _report_compared(
         about: for each assertion the index of its budget; None for all budgets.
     """
     summary, outcomes = compared.summary, compared.outcomes
-    if options.general.as_json:
+    if options.as_json:
         asserts = [each.as_dict() for each in outcomes]
         figures = [each.as_dict() for each in summary]
         frames = len(path.cameras)
         whole = {"frames": frames, "leaves": compared.leaves, "budgets": figures, "asserts": asserts}
         print_json(whole)
     texts = _lines(summary, path, compared.leaves)
-    if is_summary(options.pictures.output, as_json=options.general.as_json):
+    if is_summary(options.pictures.output, as_json=options.as_json):
         click.echo("\n".join(texts))
     else:
         for line in texts:

@@ -26,6 +26,7 @@ from .command import (
     Command,
     OptionalNumber,
     check_declared,
+    flag,
     flags_set,
     is_set,
     values_of,
@@ -46,7 +47,7 @@ from .options.baking import (
     refuse_others,
     write_options,
 )
-from .options.common import General, overwrite_flag, question_budgets
+from .options.common import EACH_AS_JSON, JSON, OVERWRITE, General, question_budgets
 from .paths import (
     NAMELESS,
     Folder,
@@ -126,7 +127,7 @@ class SimplifyOptions:
         heading=COMMON,
         required=True,
     )
-    overwrite: bool = overwrite_flag()
+    overwrite: bool = flag(**OVERWRITE)
     max_sh: int = setting_of(BuildLodOptions, "max_sh")
     memory: int | None = setting(
         "Memory that the tree may take, such as 4G; a scene that needs more is refused."
@@ -137,6 +138,7 @@ class SimplifyOptions:
     scene: SceneOptions = field(default_factory=SceneOptions)
     written: WriteOptions = field(default_factory=WriteOptions)
     cluster_sh: int | None = setting_of(BuildLodOptions, "cluster_sh")
+    as_json: bool = flag(EACH_AS_JSON, **JSON)
     general: General = field(default_factory=General)
 
     @property
@@ -206,7 +208,7 @@ def simplify(ctx: click.Context, /, **_: Any) -> None:
                 say=console.say,
             )
         report_simplified(console, source, options.output, baked)
-        if general.as_json:
+        if options.as_json:
             print_json(record_of(source, options.output, baked))
         if interrupts.came():  # during fitting, which then ends early
             console.clear()
@@ -228,7 +230,7 @@ def _check(ctx: click.Context, options: SimplifyOptions) -> None:
         raise click.UsageError("--camera-path can only be used with --psnr or --refine")
     form = WRITABLE[options.suffix]
     keep_apart(ctx, {"output": with_chunks([options.output]) if form.unbundled == options.suffix else [options.output]})
-    claim_stdout(ctx, "output", as_json=options.general.as_json, binary=True)
+    claim_stdout(ctx, "output", as_json=options.as_json, binary=True)
     if DASH in options.inputs and len(options.inputs) > 1:
         raise click.UsageError("standard input cannot be merged with files; save it to a file first")
     if is_set(ctx, "rgba") and len(options.inputs) > 1:

@@ -19,14 +19,14 @@ from ..viewers.viewer_settings import StreamingSettings
 from .command import COMMON, Command, check_declared, flag, refuse, values_of
 from .console import WIDTH, Console, count_of, for_screen, is_terminal, print_json, rows
 from .options.common import (
+    ASSERT,
     JSON,
+    OUTPUT,
+    OVERWRITE,
+    PNG,
     General,
     assert_errors,
-    assert_option,
     is_summary,
-    output_option,
-    overwrite_flag,
-    plot_option,
     question_budgets,
     report_outcomes,
     table_output,
@@ -66,20 +66,24 @@ class FrameTable:
 
     HEADING: ClassVar[str] = "Output"
 
-    output: Path | None = output_option(
+    output: Path | None = setting(
         "Write the table to FILE: .csv, .json or .parquet; - is standard output.  [default: standard output, but for a"
-        " terminal, which gets the summary]"
+        " terminal, which gets the summary]",
+        OutputPath(),
+        **OUTPUT,
     )
-    overwrite: bool = overwrite_flag()
+    overwrite: bool = flag(**OVERWRITE)
     summary: bool | None = setting(
         "Print a summary of the frames on standard error.  [default: if that is a terminal]",
         flags=("--summary/--no-summary",),
         heading=COMMON,
     )
-    asserts: tuple[str, ...] = assert_option(
-        "Condition that must hold, such as 'churn_p95<0.2'; the exit status is 3 if it does not.", heading=COMMON
+    asserts: tuple[str, ...] = setting(
+        "Condition that must hold, such as 'churn_p95<0.2'; the exit status is 3 if it does not.",
+        **ASSERT,
+        heading=COMMON,
     )
-    plot: Path | None = plot_option("Draw charts of the table and the path over the scene, as a .png.", heading=COMMON)
+    plot: Path | None = setting("Draw charts of the table and the path over the scene, as a .png.", PNG, heading=COMMON)
     form: str | None = setting(
         "Format of the table.  [default: by the suffix of --output, or csv]", tuple(FORMS), flags=("--format",)
     )
@@ -120,13 +124,6 @@ HEADINGS = (COMMON, "Inputs", "Cameras", "Cut", "Streamed SOG", "Streaming", "Ou
 
 
 @dataclass(frozen=True)
-class _TraverseGeneral(General):
-    as_json: bool = flag(
-        "Print the summary as one JSON object on standard output; write a table only to --output.", flags=JSON
-    )
-
-
-@dataclass(frozen=True)
 class TraverseOptions:
     """Options of the command, group by group."""
 
@@ -135,7 +132,10 @@ class TraverseOptions:
     cameras: Cameras = field(default_factory=Cameras)
     cut: CutOptions = field(default_factory=CutOptions)
     streaming: StreamingSettings = field(default_factory=StreamingSettings)
-    general: _TraverseGeneral = field(default_factory=_TraverseGeneral)
+    as_json: bool = flag(
+        "Print the summary as one JSON object on standard output; write a table only to --output.", **JSON
+    )
+    general: General = field(default_factory=General)
 
 
 @click.command("traverse", cls=Command, options=TraverseOptions, examples=EXAMPLES, headings=HEADINGS)
@@ -156,13 +156,13 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
     options = values_of(ctx, TraverseOptions)
     table, general = options.table, options.general
     options.cameras.check(ctx)
-    table.check(ctx, as_json=general.as_json)
-    claim_stdout(ctx, "output", as_json=general.as_json)
+    table.check(ctx, as_json=options.as_json)
+    claim_stdout(ctx, "output", as_json=options.as_json)
     budget = options.cut.one_budget()
     instances = options.inputs.instances()
     besides = files_read(options, instances)
     keep_apart(ctx, besides)
-    outputs = table.outputs(as_json=general.as_json)
+    outputs = table.outputs(as_json=options.as_json)
     asserts = table.assertions()
     start = time.perf_counter()
     with Console(quiet=general.quiet, verbose=general.verbose) as console:
@@ -201,8 +201,8 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
                 f"warning: only {share} of the splats lie in front of the cameras; path and scene may"
                 " not share their axes (--camera-axes, --world-transform, --up)"
             )
-        on_stdout = is_summary(table.output, as_json=general.as_json)
-        ctx.exit(_report(console, traversed, table.summary, as_json=general.as_json, on_stdout=on_stdout))
+        on_stdout = is_summary(table.output, as_json=options.as_json)
+        ctx.exit(_report(console, traversed, table.summary, as_json=options.as_json, on_stdout=on_stdout))
 
 
 def _report(console: Console, traversed: Traversed, summary: bool | None, *, as_json: bool, on_stdout: bool) -> int:

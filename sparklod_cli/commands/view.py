@@ -18,7 +18,7 @@ from ..system.units import format_size, parse_count
 from ..system.untrusted import printable
 from .command import COMMON, VIEW, Command, check_declared, flag, values_of
 from .console import Console, count_of, print_json
-from .options.common import JSON, QUIET, VERBOSE, General, overwrite_flag, up_option
+from .options.common import JSON, OVERWRITE, QUIET, VERBOSE, General, up_option
 from .paths import InputPath, OutputPath, keep_apart
 
 if TYPE_CHECKING:
@@ -80,7 +80,7 @@ class _Place:
         heading=COMMON,
         excludes=("host", "port", "cors", "no_open"),
     )
-    overwrite: bool = overwrite_flag(needs="export")
+    overwrite: bool = flag(**OVERWRITE, needs="export")
     port: int = setting("Port to listen on.", whole(0, 65_535), 0, show_default="any that is free")
     host: str = setting(
         "Address to listen on; 0.0.0.0 lets everybody on the network read the files.",
@@ -94,8 +94,7 @@ class _Place:
 
 @dataclass(frozen=True)
 class _ViewGeneral(General):
-    as_json: bool = flag("Print the address and the files as one JSON object on standard output.", flags=JSON)
-    quiet: bool = flag("Print nothing but the address, and errors.", flags=QUIET)
+    quiet: bool = flag("Print nothing but the address, and errors.", **QUIET)
     verbose: bool = flag("Print each request.", **VERBOSE)
 
 
@@ -106,6 +105,7 @@ class _ViewOptions:
     files: tuple[Path, ...] = setting("", InputPath(), (), argument=True, nargs=-1, metavar="FILE...", required=True)
     page: _Page = field(default_factory=_Page)
     place: _Place = field(default_factory=_Place)
+    as_json: bool = flag("Print the address and the files as one JSON object on standard output.", **JSON)
     general: _ViewGeneral = field(default_factory=_ViewGeneral)
 
 
@@ -145,10 +145,10 @@ def view(ctx: click.Context, /, **_: Any) -> None:
         if place.export is not None:
             size = viewing.export(site, place.export, overwrite=place.overwrite, progress=console.progress)
             console.clear()
-            _report_export(console, place.export, site, size, as_json=general.as_json)
+            _report_export(console, place.export, site, size, as_json=options.as_json)
         else:
             server = viewing.Server(site, host=place.host, port=place.port, cors=place.cors, log=console.detail)
-            _serve(console, server, opens=not place.no_open, as_json=general.as_json)
+            _serve(console, server, opens=not place.no_open, as_json=options.as_json)
 
 
 def _serve(console: Console, server: Server, *, opens: bool, as_json: bool) -> None:

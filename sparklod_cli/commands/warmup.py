@@ -11,7 +11,7 @@ import click
 from ..system.setting_fields import setting, whole
 from .command import Command, flag, values_of
 from .console import Console, count_of, print_json
-from .options.common import VERBOSE, Messages, processors_to_use
+from .options.common import JSON, QUIET, VERBOSE, processors_to_use
 
 EXAMPLES = """\
   sparklod warmup                                # once, after pip install
@@ -21,14 +21,16 @@ EXAMPLES = """\
 
 
 @dataclass(frozen=True)
-class _Options(Messages):
+class _Options:
+    as_json: bool = flag("Print one JSON object on standard output.", **JSON)
+    quiet: bool = flag("Print nothing but errors.", **QUIET)
+    verbose: bool = flag("Print which kernels are missing.", **VERBOSE)
     jobs: int = setting(
         "Number of processes to compile in.",
         whole(1, 64),
         lambda: min(processors_to_use(), 4),
         show_default="processors, up to 4",
     )
-    verbose: bool = flag("Print which kernels are missing.", **VERBOSE)
 
 
 @click.command("warmup", cls=Command, options=_Options, examples=EXAMPLES)

@@ -33,7 +33,7 @@ from ...system.stdio import DASH
 from ...system.units import parse_size
 from ..command import BALL, COMMON, POINT, OptionalNumber, flag, flags_set, parameters_of, refuse
 from ..paths import InputPath, OutputPath, stem_of
-from .common import General, output_option, overwrite_flag
+from .common import EACH_AS_JSON, JSON, OUTPUT, OVERWRITE, General
 
 if TYPE_CHECKING:
     from ...bake.settings import BakeSettings
@@ -210,19 +210,20 @@ class BuildLodOptions:
         InputPath(),
         heading=COMMON,
     )
-    output: Place | None = output_option(
+    output: Place | None = setting(
         "Output of a single input, or a folder for all outputs; - is standard output.  [default: NAME-lod.spz beside"
         f" the input; NAME-lod.rad with --format rad, NAME-lod/{MANIFEST} with --format {STREAMED_SOG},"
         f" NAME-lod/{TILESET} with --format {TILES_3D}, NAME-lod.npz with --encoding, NAME-unlod.spz with --unlod,"
         " NAME-lod-refined.spz of a NAME-lod.spz with --refine]",
-        addresses=True,
+        OutputPath(addresses=True),
+        **OUTPUT,
     )
     output_dir: Place | None = setting(
         "Folder for the outputs; created if it does not exist.",
         OutputPath(folder=True, addresses=True),
         heading=COMMON,
     )
-    overwrite: bool = overwrite_flag()
+    overwrite: bool = flag(**OVERWRITE)
     skip_existing: str | None = setting(
         "Skip inputs whose output exists already, made from the same inputs and settings, as a small file beside it,"
         " NAME.sparklod.json, records. Files whose size and date are unchanged are not read;"
@@ -345,6 +346,7 @@ class BuildLodOptions:
         metavar="ADDRESS",
         heading=CLUSTER,
     )
+    as_json: bool = flag(EACH_AS_JSON, **JSON)
     general: General = field(default_factory=General)
 
     @property

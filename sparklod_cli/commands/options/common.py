@@ -41,43 +41,34 @@ def processors_to_use() -> int:
     return min(processors(), MAX_THREADS)
 
 
-#: Flags of options of every command; `cli.run` reads the verbosity, too.
-JSON, QUIET = ("--json",), ("-q", "--quiet")
+#: Attributes of options that several commands have, see `setting`; `cli.run` reads the verbosity, too.
+JSON: dict[str, Any] = {"flags": ("--json",)}
+QUIET: dict[str, Any] = {"flags": ("-q", "--quiet")}
 VERBOSE: dict[str, Any] = {"flags": ("-v", "--verbose"), "callback": _note_verbosity}
+OUTPUT: dict[str, Any] = {"flags": ("-o", "--output"), "heading": COMMON}
+OVERWRITE: dict[str, Any] = {
+    "help": "Replace outputs that exist.",
+    "flags": ("-f", "--overwrite"),
+    "heading": COMMON,
+}
+ASSERT: dict[str, Any] = {"flags": ("--assert",), "metavar": "TEXT", "multiple": True}
+
+#: Type of a picture of a table or of a file.
+PNG = OutputPath(suffixes=[".png"])
+
+#: Help of `--json` of commands that print an object for each file.
+EACH_AS_JSON = "Print one JSON object for each file on standard output."
 
 
 @dataclass(frozen=True)
-class Messages:
-    """Options of every command. Commands override the fields whose help differs."""
-
-    as_json: bool = flag("Print one JSON object on standard output.", flags=JSON)
-    quiet: bool = flag("Print nothing but errors.", flags=QUIET)
-    verbose: bool = flag("Print how long each stage took, and which settings were chosen.", **VERBOSE)
-
-
-@dataclass(frozen=True)
-class General(Messages):
+class General:
     """General options of the commands that read splat files."""
 
+    quiet: bool = flag("Print nothing but errors.", **QUIET)
+    verbose: bool = flag("Print how long each stage took, and which settings were chosen.", **VERBOSE)
     threads: int = setting(
         "Number of threads to work on.", whole(1, MAX_THREADS), processors_to_use, show_default="all processors"
     )
-    as_json: bool = flag("Print one JSON object for each file on standard output.", flags=JSON)
-
-
-def overwrite_flag(**attributes: Any) -> Any:
-    """Return the field of `-f`, `--overwrite`."""
-    return flag("Replace outputs that exist.", flags=("-f", "--overwrite"), heading=COMMON, **attributes)
-
-
-def output_option(help: str, *, addresses: bool = False) -> Any:
-    """Return the field of `-o`, `--output`, whose help says the default; with `addresses` as of `OutputPath`."""
-    return setting(help, OutputPath(addresses=addresses), flags=("-o", "--output"), heading=COMMON)
-
-
-def assert_option(help: str, **attributes: Any) -> Any:
-    """Return the field of `--assert`, which can be given several times."""
-    return setting(help, flags=("--assert",), metavar="TEXT", multiple=True, **attributes)
 
 
 def up_option(about: str = "", besides: str = "") -> Any:
@@ -93,11 +84,6 @@ def up_option(about: str = "", besides: str = "") -> Any:
         DIRECTION,
         heading=COMMON,
     )
-
-
-def plot_option(help: str, **attributes: Any) -> Any:
-    """Return the field of `--plot`, a picture of a table or of a file."""
-    return setting(help, OutputPath(suffixes=[".png"]), **attributes)
 
 
 def table_form(flag: str, output: Path | None, form: str | None = None) -> str:
