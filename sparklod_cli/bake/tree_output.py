@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import PurePath
 from typing import TYPE_CHECKING, Any
 
-from ..codecs.encoder import CLAMPED, Encoder, Stored, Windows, clamps_of, results, windows_of
+from ..codecs.encoder import CLAMPED, Encoder, Windows, clamps_of, results, windows_of
 from ..codecs.formats import RAD_SUFFIX as RAD
 from ..codecs.formats import WRITABLE, Format
 from ..codecs.options import DEFAULTS, RAD_ENCODINGS, WriteOptions
@@ -24,6 +24,7 @@ from ..system.progress import Progress
 from .settings import SPZ, Baked, BakeSettings
 
 if TYPE_CHECKING:
+    from ..codecs.encoder import Stored
     from ..codecs.statistics import Statistics
     from .simplifying import Simplifier
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 from zlib_ng import zlib_ng
 
@@ -29,21 +29,17 @@ BLOCK = 1 << 19
 TRIED = 1 << 16
 
 
-class Way(NamedTuple):
-    """Deflate settings of a block: the level, None for the one that was chosen, and the strategy of zlib."""
-
-    level: int | None = None
-    strategy: int = zlib_ng.Z_DEFAULT_STRATEGY
-
+#: How a block is deflated: the level, None for the one that was chosen, and the strategy of zlib.
+Way = tuple[int | None, int]
 
 #: Ways by kind of data; the one that makes the beginning of a block smallest is taken, the first of those that are
 #: equal. Most bytes of splats are noise, of which codes of Huffman make as little as a search does, in a third of the
 #: time; colours repeat in three bytes, which only level 9 looks for.
-MIXED = (Way(),)
-NOISE = (Way(strategy=zlib_ng.Z_HUFFMAN_ONLY), Way())
-TRIPLES = (Way(9), Way())
-RUNS = (Way(strategy=zlib_ng.Z_RLE), Way())
-LINKS = (Way(6),)
+MIXED: tuple[Way, ...] = ((None, zlib_ng.Z_DEFAULT_STRATEGY),)
+NOISE: tuple[Way, ...] = ((None, zlib_ng.Z_HUFFMAN_ONLY), *MIXED)
+TRIPLES: tuple[Way, ...] = ((9, zlib_ng.Z_DEFAULT_STRATEGY), *MIXED)
+RUNS: tuple[Way, ...] = ((None, zlib_ng.Z_RLE), *MIXED)
+LINKS: tuple[Way, ...] = ((6, zlib_ng.Z_DEFAULT_STRATEGY),)
 
 #: Bytes up to which the size announced by a header is accepted; beyond, a file may expand by at most `MAX_RATIO`. Real
 #: scenes reach a ratio of 3; deflate's limit is 1000, which a scene of equal splats reaches.
@@ -74,7 +70,7 @@ def gzip_member(
         comment: of the header, without a zero byte; empty for none.
     """
     total = sum(size for size, _ in runs)
-    parts: list[tuple[int, tuple[Way, ...]]] = [(total, (Way(level),))]
+    parts: list[tuple[int, tuple[Way, ...]]] = [(total, ((level, zlib_ng.Z_DEFAULT_STRATEGY),))]
     if total > BLOCK:
         parts = []
         for size, ways in runs:
@@ -95,20 +91,20 @@ def gzip_member(
 
 def _at_level(way: Way, level: int) -> Way:
     """Return a way, with the level that it has where one was chosen."""
-    if way.strategy != zlib_ng.Z_DEFAULT_STRATEGY:
-        return way._replace(level=level)
-    return Way(level if way.level is None or level < DEFAULT_COMPRESSION else max(level, way.level))
+    least, strategy = way
+    if least is None or level < DEFAULT_COMPRESSION:
+        return level, strategy
+    return max(level, least), strategy
 
 
 def _deflated(block: memoryview, ways: tuple[Way, ...], last: bool) -> tuple[memoryview, bytes]:
-    """Return a block and its part of a deflate stream."""
     way = min(ways, key=lambda way: len(_packed(block[:TRIED], way, last=True))) if len(ways) > 1 else ways[0]
     return block, _packed(block, way, last=last)
 
 
 def _packed(block: memoryview, way: Way, *, last: bool) -> bytes:
-    memory = zlib_ng.DEF_MEM_LEVEL
-    packer = zlib_ng.compressobj(way.level, zlib_ng.DEFLATED, _RAW, memory, way.strategy)
+    level, strategy = way
+    packer = zlib_ng.compressobj(level, zlib_ng.DEFLATED, _RAW, zlib_ng.DEF_MEM_LEVEL, strategy)
     packed: bytes = packer.compress(block) + packer.flush(zlib_ng.Z_FINISH if last else zlib_ng.Z_SYNC_FLUSH)
     return packed
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +22,18 @@ from ..system.threads import blocks_of, ordered_map
 from . import quantize
 from .options import WriteOptions
 
-if TYPE_CHECKING:  # Python 3.10 has none
-    from typing import Self
+if TYPE_CHECKING:
+    from typing import Protocol, Self  # Python 3.10 has no Self
+
+    class Stored(Protocol):
+        """Codes of a tree's file as they stand in it, with which nodes can be written again bit for bit."""
+
+        def like(self, options: WriteOptions) -> WriteOptions:
+            """Return the options, and where they leave a choice open, that of the file."""
+
+        def keeping(self, encoder: Any, unchanged: NDArray[np.bool_]) -> Encoder:
+            """Return an encoder of as many nodes in the same order that gives (N,) `unchanged` ones their old codes."""
+
 
 #: The result of a window: arrays by name.
 Encoded = dict[str, NDArray[Any]]
@@ -105,16 +115,6 @@ class Encoder(ABC):
     @abstractmethod
     def pieces(self, windows: Windows, *, threads: int, progress: Progress) -> Iterator[bytes]:
         """Return the bytes of the file, piece by piece, made of the results of all windows."""
-
-
-class Stored(Protocol):
-    """Codes of a tree's file as they stand in it, with which nodes can be written again bit for bit."""
-
-    def like(self, options: WriteOptions) -> WriteOptions:
-        """Return the options, and where they leave a choice open, that of the file."""
-
-    def keeping(self, encoder: Any, unchanged: NDArray[np.bool_]) -> Encoder:
-        """Return an encoder of as many nodes in the same order that gives (N,) `unchanged` ones their old codes."""
 
 
 def windows_of(count: int) -> list[slice]:

@@ -42,20 +42,23 @@ class Inflate:
 
     Args:
         file: open for reading at the beginning of the member; nobody else may use it until the last read.
+
+    Attributes:
+        comment: of the head of the member, or empty; None if the head has other fields, or too long a comment.
+        end: position in the file behind the member; None until the member has been read to its end.
     """
 
     def __init__(self, file: BinaryIO) -> None:
-        self._file = file
-        self._start = file.tell()
-        self._comment = self._read_comment()
-        self._pieces = self._all_pieces()
-        self._rest = memoryview(b"")
-        self._end: int | None = None
-
-    @property
-    def comment(self) -> bytes:
-        """Comment of the head of the member; empty where it has none, or other fields besides."""
-        return self._comment or b""
+        self._file, self._start = file, file.tell()
+        self._pieces, self._rest = self._all_pieces(), memoryview(b"")
+        self.comment: bytes | None = None
+        self.end: int | None = None
+        head = file.read(_HEAD_SIZE)
+        if head.startswith(PLAIN_HEAD):
+            self.comment = b""
+        elif head.startswith(COMMENTED_HEAD):
+            comment, end, _ = file.read(MOST_COMMENT).partition(b"\0")
+            self.comment = comment if end else None
 
     def read(self, size: int) -> bytes | memoryview:
         """Return the next `size` bytes, or fewer where the data ends; raises `FormatError` where they are corrupt."""
@@ -70,40 +73,23 @@ class Inflate:
             size -= len(pieces[-1])
         return pieces[0] if len(pieces) == 1 else b"".join(pieces)
 
-    def finish(self, *, allow_more: bool) -> None:
-        """Raise `FormatError` unless the member ends here with a correct checksum, or `allow_more` leaves the rest."""
-        if allow_more:
-            return
+    def finish(self) -> None:
+        """Raise `FormatError` unless the member ends here with a correct checksum."""
         if self.read(1):
             raise TooLongError("it holds more data than its header announces")
-        if self._end is None:
+        if self.end is None:
             raise TruncatedError("cut short: the gzip checksum is missing")
 
     def behind(self) -> bytes:
         """Return the first two bytes after the member, or fewer at the end of the file; none before its end."""
-        if self._end is None:
+        if self.end is None:
             return b""
-        self._file.seek(self._end)
+        self._file.seek(self.end)
         return self._file.read(2)
-
-    def end(self) -> int:
-        """Return the position of the end of the member in the file, once it has been read."""
-        assert self._end is not None, "the member has not been read to its end"
-        return self._end
-
-    def _read_comment(self) -> bytes | None:
-        """Return the comment of the head; None of a head with other fields, or with too long a comment."""
-        head = self._file.read(_HEAD_SIZE)
-        if head.startswith(PLAIN_HEAD):
-            return b""
-        if not head.startswith(COMMENTED_HEAD):
-            return None
-        comment, end, _ = self._file.read(MOST_COMMENT).partition(b"\0")
-        return comment if end else None
 
     def _all_pieces(self) -> Iterator[bytes]:
         """Yield the data in pieces, none of them empty."""
-        library = zlib_ng if self._comment is None else _library  # ISA-L misreads heads of which a read ends in a field
+        library = zlib_ng if self.comment is None else _library  # ISA-L misreads heads of which a read ends in a field
         unpacker, packed = library.decompressobj(zlib_ng.MAX_WBITS + 16), b""
         self._file.seek(self._start)
         while not unpacker.eof:
@@ -119,7 +105,7 @@ class Inflate:
                 yield piece
             elif not packed and not unpacker.eof:
                 return
-        self._end = self._file.tell() - len(unpacker.unused_data)
+        self.end = self._file.tell() - len(unpacker.unused_data)
 
 
 class _Window:

@@ -391,8 +391,10 @@ def read_note(note: Any) -> FileNote:
 
 def read_comment(comment: str | bytes | None) -> FileNote:
     """Parse a comment; free text says nothing."""
+    if not comment:
+        return FileNote()
     try:
-        return read_note(parse_json(comment or "null"))
+        return read_note(parse_json(comment))
     except ValueError:
         return FileNote()
 

@@ -319,10 +319,11 @@ def _read_gzip(inflate: Inflate, size: int, header: dict[str, int]) -> tuple[Lay
                     f"{error}; its data continue in a second gzip member, which Spark does not read"
                 ) from None
             raise
-        inflate.finish(allow_more=bool(layout.flags & EXTENSIONS))
         if layout.flags & EXTENSIONS:  # the end of the member is not searched for
             return
-        header["trailing_bytes"] = size - inflate.end()
+        inflate.finish()
+        assert inflate.end is not None
+        header["trailing_bytes"] = size - inflate.end
         header["trailing_members"] = int(inflate.behind() == compression.GZIP_MAGIC)
 
     return layout, rows()

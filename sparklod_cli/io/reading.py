@@ -14,7 +14,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
-from ..codecs.encoder import Stored
 from ..codecs.formats import FORMATS, NPZ, RAW_SUFFIXES, ZIP, Format, head_of, lookalike_of, sniff
 from ..codecs.reader import OpenCompanion, OpenFile, Reader, Target
 from ..model.scene import Scene
@@ -28,6 +27,7 @@ from ..system.units import count_of
 from .local_files import in_folder, open_named, reason_unreadable
 
 if TYPE_CHECKING:
+    from ..codecs.encoder import Stored
     from ..codecs.gpu import dump
     from ..model.instances import Instance
     from ..model.transforms import Transform

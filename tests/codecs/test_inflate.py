@@ -127,8 +127,8 @@ def assert_reads(packed: bytes) -> None:
         reader = Inflate(io.BytesIO(packed + behind))
         found = b"".join(bytes(reader.read(size)) for size in [16, 0, 5, *[300_000] * (len(expected) // 300_000 + 1)])
         assert found == expected
-        reader.finish(allow_more=False)
-        assert reader.end() == len(packed)
+        reader.finish()
+        assert reader.end == len(packed)
         assert reader.behind() == behind[:2]
 
 
@@ -162,9 +162,9 @@ def test_a_scene_is_the_same_by_any_writer_and_on_any_number_of_threads(write: o
 @pytest.mark.parametrize("size", [1, inflate.MOST_COMMENT - 1, inflate.MOST_COMMENT, 1 << 17])
 def test_a_comment_is_read_up_to_a_size(size: int) -> None:
     reader = Inflate(io.BytesIO(ours(b"data", b"c" * size)))
-    assert reader.comment == (b"c" * size if size < inflate.MOST_COMMENT else b"")
+    assert reader.comment == (b"c" * size if size < inflate.MOST_COMMENT else None)
     assert reader.read(9) == b"data"
-    reader.finish(allow_more=False)
+    reader.finish()
 
 
 @pytest.mark.parametrize("cut", range(10, 20))
@@ -172,7 +172,7 @@ def test_a_member_that_ends_in_its_comment_is_cut_short(cut: int) -> None:
     reader = Inflate(io.BytesIO(ours(b"data", b"a comment")[:cut]))
     assert reader.read(9) == b""
     with pytest.raises(TruncatedError):
-        reader.finish(allow_more=False)
+        reader.finish()
 
 
 @pytest.mark.parametrize("kind", ["ours", "python", "go", "full flush", "named"])
@@ -201,7 +201,7 @@ def read_all(packed: bytes) -> None:
     reader = Inflate(io.BytesIO(packed))
     while reader.read(100_000):
         pass
-    reader.finish(allow_more=False)
+    reader.finish()
 
 
 @pytest.mark.parametrize("sizes", [[10], [1, 2, 3], [0, 10_000, 0, 1], [20_000]])
@@ -213,14 +213,13 @@ def test_inflating_gives_what_is_asked_for(sizes: list[int]) -> None:
         assert inflate.read(size) == data[at : at + size]
         at += size
     with pytest.raises(FormatError, match="more data"):
-        inflate.finish(allow_more=False)
-    inflate.finish(allow_more=True)
+        inflate.finish()
 
 
 def test_inflating_beyond_the_end_gives_less() -> None:
     inflate = Inflate(io.BytesIO(gzip.compress(b"some")))
     assert inflate.read(10) == b"some"
-    inflate.finish(allow_more=False)
+    inflate.finish()
 
 
 @pytest.mark.parametrize("cut", range(1, 9))
@@ -228,7 +227,7 @@ def test_a_truncated_checksum_is_refused(cut: int) -> None:
     inflate = Inflate(io.BytesIO(gzip.compress(b"some")[:-cut]))
     inflate.read(4)
     with pytest.raises(FormatError, match="checksum is missing"):
-        inflate.finish(allow_more=False)
+        inflate.finish()
 
 
 def test_a_bomb_is_never_inflated_whole() -> None:
@@ -238,7 +237,7 @@ def test_a_bomb_is_never_inflated_whole() -> None:
         inflate = Inflate(io.BytesIO(bomb))
         assert inflate.read(1000) == bytes(1000)
         with pytest.raises(FormatError, match="more data"):
-            inflate.finish(allow_more=False)
+            inflate.finish()
         assert tracemalloc.get_traced_memory()[1] < 1_000_000
     finally:
         tracemalloc.stop()
