@@ -23,7 +23,7 @@ from ..system.units import format_size, parse_size
 from ..system.untrusted import MOST, printable, shortened
 from .command import COMMON, Command, flag, refuse, values_of
 from .console import Console, count_of, rows
-from .options.common import ASSERT, EACH_AS_JSON, JSON, OVERWRITE, PNG, QUIET, General, assert_errors, table_form
+from .options.common import ASSERT, EACH_AS_JSON, JSON, OVERWRITE, PNG, QUIET, General, assert_errors, table_output
 from .paths import InputPath, OutputPath, keep_apart, name_outputs
 
 if TYPE_CHECKING:
@@ -155,13 +155,10 @@ class InspectOutput:
 
     def table(self) -> TableOutput | None:
         from ..inspection.blocks import CHUNK_COLUMNS
-        from ..tables.columns import TableOutput
 
         if self.chunks_out is None:
             return None
-        return TableOutput(
-            self.chunks_out, table_form("--chunks-out", self.chunks_out), CHUNK_COLUMNS, overwrite=self.overwrite
-        )
+        return table_output(self.chunks_out, CHUNK_COLUMNS, overwrite=self.overwrite, flag="--chunks-out")
 
 
 def check_usage(ctx: click.Context, count: int, checks: Checks, output: InspectOutput, *, as_json: bool) -> None:

@@ -26,7 +26,6 @@ from .options.common import (
     PNG,
     General,
     assert_errors,
-    is_summary,
     question_budgets,
     report_outcomes,
     table_output,
@@ -99,17 +98,15 @@ class FrameTable:
         needs="indices_out",
     )
 
-    def check(self, ctx: click.Context, *, as_json: bool) -> None:
-        if as_json and self.output is None:
-            refuse(ctx, OF_TABLES, "cannot be used with --json without --output, which writes no table")
-        elif is_summary(self.output, as_json=as_json):
-            refuse(ctx, OF_TABLES, "is of the table, and a terminal gets the summary; redirect it, or add --output")
-
-    def outputs(self, *, as_json: bool) -> FrameOutputs:
+    def outputs(self, ctx: click.Context, *, as_json: bool) -> FrameOutputs:
         from ..simulation.results import COLUMNS, TIMING, FrameOutputs
 
         columns = [each for each in COLUMNS if each.name not in TIMING or not self.no_timing]
-        table = table_output(self.output, self.form, columns, overwrite=self.overwrite, as_json=as_json)
+        table = table_output(self.output, columns, overwrite=self.overwrite, as_json=as_json, form=self.form)
+        if table.form is None:
+            none = "cannot be used with --json without --output, which writes no table"
+            summary = "is of the table, and a terminal gets the summary; redirect it, or add --output"
+            refuse(ctx, OF_TABLES, none if as_json else summary)
         return FrameOutputs(table, self.indices_out, self.padded, self.plot, self.overwrite)
 
     def assertions(self) -> list[Assertion]:
@@ -151,18 +148,17 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
 
     Coordinates are those of the files; --up, --world-transform and --camera-axes bring cameras into them.
     """
-    name_outputs(ctx, values_of(ctx, Inputs).first)
+    name_outputs(ctx, ctx.params["scene"] or next(iter(ctx.params["files"]), None))
     check_declared(ctx)
     options = values_of(ctx, TraverseOptions)
     table, general = options.table, options.general
     options.cameras.check(ctx)
-    table.check(ctx, as_json=options.as_json)
     claim_stdout(ctx, "output", as_json=options.as_json)
     budget = options.cut.one_budget()
     instances = options.inputs.instances()
     besides = files_read(options, instances)
     keep_apart(ctx, besides)
-    outputs = table.outputs(as_json=options.as_json)
+    outputs = table.outputs(ctx, as_json=options.as_json)
     asserts = table.assertions()
     start = time.perf_counter()
     with Console(quiet=general.quiet, verbose=general.verbose) as console:
@@ -201,7 +197,7 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
                 f"warning: only {share} of the splats lie in front of the cameras; path and scene may"
                 " not share their axes (--camera-axes, --world-transform, --up)"
             )
-        on_stdout = is_summary(table.output, as_json=options.as_json)
+        on_stdout = outputs.table.form is None and not options.as_json
         ctx.exit(_report(console, traversed, table.summary, as_json=options.as_json, on_stdout=on_stdout))
 
 

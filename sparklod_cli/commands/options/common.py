@@ -86,41 +86,37 @@ def up_option(about: str = "", besides: str = "") -> Any:
     )
 
 
-def table_form(flag: str, output: Path | None, form: str | None = None) -> str:
-    """Return the format of a table, by its option or by the name of the output; CSV on standard output."""
+def table_output(
+    output: Path | None,
+    columns: Sequence[Column],
+    *,
+    overwrite: bool,
+    as_json: bool = False,
+    flag: str = "--output",
+    form: str | None = None,
+) -> TableOutput:
+    """Return the destination of a table, with its format by --format, or else by the name of the output.
+
+    Without an output, the table is CSV on standard output. It is not written (form None) where an object goes there
+    with --json, and on a terminal, where it would scroll by and the summary is printed instead.
+    """
     from ...codecs.formats import FORMATS
     from ...images.output import MOVING, STILL, SUFFIXES
-    from ...tables.columns import FORMS
+    from ...tables.columns import FORMS, TableOutput
 
-    suffix = output.suffix.lower() if output is not None else ""
+    if output is None and (as_json or is_terminal(sys.stdout)):
+        return TableOutput(None, None, columns, overwrite=overwrite)
     if output is not None and form is None:
         require_suffix(flag, output, (f".{each}" for each in FORMS))
-    if not suffix:
-        return form or next(iter(FORMS))
-    if form is not None:
+    suffix = output.suffix.lower()[1:] if output is not None else ""
+    if suffix and form is None and suffix not in FORMS:
+        raise click.UsageError(f"{flag} {output}: tables are written as {', '.join(f'.{form}' for form in FORMS)}")
+    if suffix and form is not None:
         of_splats = (suffix for each in FORMATS for suffix in each.suffixes)
         others = {*FORMS, *STILL, *MOVING, *SUFFIXES, "html", "npz"}
-        if suffix[1:] != form and (suffix[1:] in others or suffix in of_splats):
+        if suffix != form and (suffix in others or f".{suffix}" in of_splats):
             raise click.UsageError(f"{flag} {output} does not end in .{form}, which --format asks for")
-        return form
-    if suffix[1:] not in FORMS:
-        raise click.UsageError(f"{flag} {output}: tables are written as {', '.join(f'.{form}' for form in FORMS)}")
-    return suffix[1:]
-
-
-def is_summary(output: Any, *, as_json: bool) -> bool:
-    """Return whether the summary is printed instead of the table, which would scroll by on a terminal."""
-    return output is None and not as_json and is_terminal(sys.stdout)
-
-
-def table_output(
-    output: Path | None, form: str | None, columns: Sequence[Column], *, overwrite: bool, as_json: bool
-) -> TableOutput:
-    """Return where a table goes: nowhere if --output does not name it and something else is printed."""
-    from ...tables.columns import TableOutput
-
-    nowhere = is_summary(output, as_json=as_json) or (output is None and as_json)
-    form = None if nowhere else table_form("--output", output, form)
+    form = form or suffix or next(iter(FORMS))
     return TableOutput(None if output == DASH else output, form, columns, overwrite=overwrite)
 
 

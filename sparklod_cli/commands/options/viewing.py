@@ -15,20 +15,19 @@ import click
 from ...cameras import DEFAULT_SIZE, ELEVATION, ORBIT
 from ...cameras.formats.table import FORMATS, Axes
 from ...codecs.formats import PRECISIONS
+from ...lod.budget import LARGEST, Budget, parse_budgets
 from ...model.foveation import BEHIND_FOVEATE, CONE_FOV, CONE_FOV0, CONE_FOVEATE, Cones, Foveation, Frustum
 from ...system.errors import CameraPathError, TooManyCamerasError
 from ...system.setting_fields import Quantity, Range, setting, whole
-from ...system.units import check_grouping, parse_time
+from ...system.units import check_grouping
 from ...system.untrusted import printable
 from ...viewers.viewer_settings import (
-    BLEND,
     FACTOR,
     PLAYCANVAS_BUDGET,
     PRESETS,
     DetailRule,
     LodSettings,
     Network,
-    StreamingSettings,
 )
 from ..command import COMMON, POINT, SIZE, VIEW, VIEWS, flag, flag_of, is_set, parameters_of, refuse
 from ..paths import InputPath, file_of
@@ -39,7 +38,6 @@ if TYPE_CHECKING:
     from ...cameras.camera import Matrix
     from ...cameras.frame import Settings
     from ...cameras.sources import CameraSource
-    from ...lod.budget import Budget
     from ...model.instances import Instance
     from ...viewers.scenes import Scenes
     from ..console import Console
@@ -52,7 +50,7 @@ SOURCES = ("camera_path", "orbit", "dolly", "look_at", "keyframes", "views")
 #: Sources that are paths: their cameras follow each other in time.
 PATHS = ("camera_path", "orbit", "dolly", "keyframes")
 
-#: Name of the default source: cameras around the scene.
+#: Name of the default source of pictures: one camera that sees the whole scene.
 AROUND = "around"
 
 #: Sources with which these options have an effect, AROUND among them.
@@ -73,9 +71,9 @@ NUMERIC = set("0123456789+-.,eE ")
 SECONDS, RATE = Range(above=0, most=1e6, unit="S"), Range(above=0, most=1e6, unit="N")
 
 
-def _orbit_option(default: str) -> Any:
-    help = f"Place N cameras around the scene.  [default, without any source of cameras: {default}]"
-    return setting(help, whole(1, 1 << 20), heading=COMMON)
+#: Help and range of `--orbit`.
+AROUND_SCENE = "Place N cameras around the scene.  [default, without any source of cameras: "
+CAMERAS = whole(1, 1 << 20)
 
 
 @dataclass(frozen=True)
@@ -87,7 +85,7 @@ class Cameras:
     camera_path: Path | None = setting(
         "Read the cameras from a file, or from a folder written by COLMAP.", InputPath(), heading=COMMON
     )
-    orbit: int | None = _orbit_option(f"an orbit of {ORBIT}")
+    orbit: int | None = setting(f"{AROUND_SCENE}an orbit of {ORBIT}]", CAMERAS, heading=COMMON)
     look_at: Any = setting("Place one camera at EYE that looks at TARGET, each x,y,z.", VIEW, heading=COMMON)
     size: tuple[int, int] | None = setting(
         "Width and height of the images, in pixels; the vertical field of view is kept."
@@ -143,55 +141,40 @@ class Cameras:
         "Frames per second of the path; times are counted by it.  [default: the file's times, or 30]", RATE
     )
     every: int = setting("Take every K-th camera of the path.", whole(1, unit="K"), 1)
+    views: tuple[Any, ...] = ()  # an option of pictures alone
 
     #: Without a source there is one camera that sees the whole scene, in place of an orbit.
     still: ClassVar[bool] = False
 
     @property
     def source(self) -> str:
-        """The source of cameras: one of `SOURCES`, or `AROUND`."""
-        return next((name for name in SOURCES if getattr(self, name, None)), AROUND)
-
-    def axis_notes(self, scenes: Scenes) -> list[str]:
-        """Return the notes on the axes of splat files, if cameras are upright by these."""
-        return scenes.axis_notes if self.up is None and self.camera_path is None else []
-
-    @property
-    def all_views(self) -> tuple[Any, ...]:
-        return ()
+        """The source of cameras: one of `SOURCES`, or `AROUND` for one camera that sees the whole scene."""
+        default = AROUND if self.still else "orbit"
+        return next((name for name in SOURCES if getattr(self, name)), default)
 
     def check(self, ctx: click.Context) -> None:
-        sources = [flag_of(ctx, name) for name in SOURCES if getattr(self, name, None)]
+        sources = [flag_of(ctx, name) for name in SOURCES if getattr(self, name)]
         if len(sources) > 1:
             raise click.UsageError(f"{' and '.join(sources)} cannot be used together; give one source of cameras")
         for name, known in ONLY_WITH.items():
             if is_set(ctx, name) and self.source not in known:
                 named = [flag_of(ctx, each) for each in known if each in ctx.params]
                 refuse(ctx, [name], f"can only be used with {' or '.join(named)}")
-        if self.source not in PATHS and not self._orbits:
+        if self.source not in PATHS:
             still = "cannot be used with a camera that does not move; give a path, such as --orbit"
             refuse(ctx, ("fps", "every", "seconds"), still)
-        if self._orbits and self.seconds is not None:
+        if self.source == "orbit" and self.seconds is not None:
             refuse(ctx, ["fps"], "cannot be used with --seconds of an orbit, which decides it")
         if self.up is not None and not any(self.up):
             raise click.UsageError("--up 0,0,0 is no direction; give another one")
 
-    @property
-    def _orbits(self) -> bool:
-        return self.orbit is not None or (self.source == AROUND and not self.still)
-
     def least_count(self) -> int:
         """Return the least number of cameras known before a file is read."""
-        if self.all_views:
-            return len(self.all_views)
+        if self.views:
+            return len(self.views)
         if self.dolly or self.keyframes:
             return 2 if self.every == 1 else 1
         return -(-(self.orbit or 1) // self.every)
-
-    def files(self) -> list[Path]:
-        """Return the file that --world-transform names, if any."""
-        matrix = self.world_transform and file_of(self.world_transform)
-        return [matrix] if matrix else []
 
     def camera_source(self) -> CameraSource:
         """Return the source of the cameras, for the library."""
@@ -204,8 +187,8 @@ class Cameras:
 
             path, form = self.camera_path, None if self.camera_format == "auto" else self.camera_format
             return sources.CameraSource(lambda settings, scene: read_path(path, form, settings))
-        if self.all_views or self.look_at:
-            views, named = self.all_views or (self.look_at,), bool(self.all_views)
+        if self.views or self.look_at:
+            views, named = self.views or (self.look_at,), bool(self.views)
             return sources.CameraSource(lambda settings, scene: sources.single_views(views, settings, named=named))
         if self.keyframes:
             return sources.CameraSource(lambda settings, scene: sources.keyframes(self.keyframes, seconds, settings))
@@ -226,7 +209,9 @@ class Cameras:
         """
         from ...cameras.frame import Settings
 
-        fps = (self.orbit or ORBIT) / self.seconds if self._orbits and self.seconds is not None else self.fps
+        fps = self.fps
+        if self.source == "orbit" and self.seconds is not None:
+            fps = (self.orbit or ORBIT) / self.seconds
         return Settings(
             axes=Axes(self.camera_axes) if self.camera_axes else None,
             world=None if self.world_transform is None else _world(self.world_transform),
@@ -249,27 +234,7 @@ class Cameras:
         except TooManyCamerasError as error:
             if self.camera_path is not None:
                 raise
-            flag = "--orbit" if self.source == AROUND else f"--{self.source.replace('_', '-')}"
-            raise click.UsageError(f"{flag}: {error}") from None
-
-
-@dataclass(frozen=True)
-class PictureCameras(Cameras):
-    """Options of the cameras of pictures: without a source there is one camera, and there is `--view`."""
-
-    orbit: int | None = _orbit_option("one camera that sees the whole scene")
-    views: tuple[Any, ...] = setting(
-        "Place a camera as --look-at does; several --view make a contact sheet.",
-        VIEW,
-        flags=("--view",),
-        multiple=True,
-    )
-
-    still: ClassVar[bool] = True
-
-    @property
-    def all_views(self) -> tuple[Any, ...]:
-        return self.views
+            raise click.UsageError(f"--{self.source.replace('_', '-')}: {error}") from None
 
 
 def _world(value: str) -> Matrix:
@@ -320,11 +285,6 @@ class Inputs:
         "Read an instances file: JSON that lists splat files and where they stand (see docs/traverse.md).", InputPath()
     )
 
-    @property
-    def first(self) -> Path | None:
-        """The file that outputs are named after; None without an input."""
-        return self.scene or next(iter(self.files), None)
-
     def instances(self) -> list[Instance]:
         """Return the instances: each FILE once, untransformed, or those of the instances file.
 
@@ -344,20 +304,9 @@ class Inputs:
         return read_instances(self.scene)
 
 
-def _parse_budgets(text: str) -> tuple[Budget, ...]:
-    from ...lod.budget import parse_budgets
-
-    return parse_budgets(text)
-
-
-def _budget_option(unit: str, several: str = "") -> Any:
-    return setting(
-        f"Largest number of splats to draw, such as 500k, or a share of the leaves, such as 5%{several}."
-        "  [default: that of --preset]",
-        Quantity(unit, _parse_budgets),
-        heading=COMMON,
-        excludes=("preset",),
-    )
+#: Help of `--budget`, and further attributes.
+MOST_DRAWN = "Largest number of splats to draw, such as 500k, or a share of the leaves, such as 5%"
+BUDGET: dict[str, Any] = {"heading": COMMON, "excludes": ("preset",)}
 
 
 @dataclass(frozen=True)
@@ -366,7 +315,9 @@ class CutOptions:
 
     HEADING: ClassVar[str] = "Cut"
 
-    budget: tuple[Budget, ...] | None = _budget_option("N|P%")
+    budget: tuple[Budget, ...] | None = setting(
+        f"{MOST_DRAWN}.  [default: that of --preset]", Quantity("N|P%", parse_budgets), **BUDGET
+    )
     preset: str | None = setting(
         "Budget of a device: Spark 2's, or that of Spark's LoD design with preview-desktop and mobile."
         f"  [default: {DEFAULT_PRESET}; for Streamed SOG PlayCanvas's, {PLAYCANVAS_BUDGET:,} splats]",
@@ -402,8 +353,6 @@ class CutOptions:
 
     def one_budget(self) -> Budget:
         """Return the budget, or that of the preset, times --lod-splat-scale."""
-        from ...lod.budget import LARGEST, Budget
-
         if self.budget is not None and len(self.budget) > 1:
             texts = ",".join(budget.text for budget in self.budget)
             try:
@@ -424,67 +373,20 @@ class CutOptions:
         return scaled
 
     def settings(self) -> LodSettings:
-        return replace(self.lod, foveation=self._foveation())
-
-    def _foveation(self) -> Foveation:
         behind = self.behind_foveate
         if self.outside_foveate is not None:
-            return Frustum(self.outside_foveate, 1.0 if behind is None else behind)
-        behind = BEHIND_FOVEATE if behind is None else behind
-        return Cones(self.cone_fov0, self.cone_fov, self.cone_foveate, behind)
-
-
-@dataclass(frozen=True)
-class PictureCut(CutOptions):
-    """Options of the cuts that pictures show."""
-
-    budget: tuple[Budget, ...] | None = _budget_option("N|P%,...", "; with --compare several, such as 5%,500k")
-    full: bool = flag(
-        "Draw full detail: all leaves, however many there are.", heading=COMMON, excludes=(*CUTS, *DETAIL)
-    )
-    continuous: bool = flag(
-        "Blend nodes and their children where one replaces the other, so that nothing pops; draws 18 to 40 % more"
-        " splats than the budget."
-    )
-    blend: float | None = setting(
-        f"With --continuous: ratio of the pixel scales between which nodes blend.  [default: {BLEND:g}]",
-        Range(above=1),
-        needs="continuous",
-    )
-
-    def settings(self) -> LodSettings:
-        width = (self.blend or BLEND) if self.continuous else None
-        return replace(super().settings(), continuous=width)
-
-
-@dataclass(frozen=True)
-class PictureStreaming:
-    """Options of how chunks get to a viewer whose first pictures are drawn."""
-
-    HEADING: ClassVar[str] = "Streaming"
-
-    after: float | None = setting(
-        "Draw what a visitor sees this long after opening a page with the files, such as 500ms, who waits in front of"
-        " the camera; with --bandwidth.  [default: what is drawn once every chunk has arrived]",
-        Quantity("TIME", parse_time),
-        needs="bandwidth",
-        excludes=("full", "continuous", "compare"),
-    )
-    streaming: StreamingSettings = field(default_factory=StreamingSettings)
-
-    def check(self, ctx: click.Context) -> None:
-        if self.after is None:
-            refuse(ctx, LOADING, "can only be used with --after")
-
-    def loading(self) -> tuple[StreamingSettings, float] | None:
-        """Return how chunks are fetched and for how many seconds; None where all are resident."""
-        return None if self.after is None else (self.streaming, self.after)
+            foveation: Foveation = Frustum(self.outside_foveate, 1.0 if behind is None else behind)
+        else:
+            behind = BEHIND_FOVEATE if behind is None else behind
+            foveation = Cones(self.cone_fov0, self.cone_fov, self.cone_foveate, behind)
+        return replace(self.lod, foveation=foveation)
 
 
 def files_read(options: RenderOptions | TraverseOptions, instances: list[Instance]) -> dict[str, list[Path]]:
     """For `keep_apart`: by the name of an option, the files that it names without being one."""
     splats = [instance.file for instance in instances if instance.file is not None]
-    return {"scene": splats, "world_transform": options.cameras.files()}
+    matrix = options.cameras.world_transform and file_of(options.cameras.world_transform)
+    return {"scene": splats, "world_transform": [matrix] if matrix else []}
 
 
 def viewed_files(
@@ -509,7 +411,8 @@ def say_notes(
     """Print notes on the cameras, further ones, and those on scenes; raise a `click.UsageError` as `check_scenes`."""
     scenes, path = files.scenes, files.path
     check_scenes(ctx, scenes)
-    for note in (*path.notes, *notes, *options.cameras.axis_notes(scenes)):
+    upright = options.cameras.up is None and options.cameras.camera_path is None  # by the axes of the files
+    for note in (*path.notes, *notes, *(scenes.axis_notes if upright else ())):
         console.say(note)
     whole = dict.fromkeys(printable(loaded.name) for loaded in scenes.trees if not loaded.has_chunks)
     if network is not None and not network.instant and whole:
