@@ -16,7 +16,7 @@ from fidelity_views import FOV_Y
 from PIL import Image
 
 import sparklod_cli as sparklod
-from sparklod_cli.api.views import PicturePair, measured
+from sparklod_cli.api.comparison import PicturePair, measured
 from sparklod_cli.images.metrics import edges
 from sparklod_cli.images.pixels import eight_bits, over, sheet
 

@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 import sparklod_cli as sparklod
-from sparklod_cli.api.views import PicturePair, measured
+from sparklod_cli.api.comparison import PicturePair, measured, rows_by_budget
 from sparklod_cli.images.metrics import BACKGROUNDS, edges
 from sparklod_cli.tables.columns import Row
-from sparklod_cli.tables.comparison import rows_by_budget
 
 #: Width and height, pixels, and the vertical field of view, degrees.
 SIZE, FOV_Y = (960, 540), 60.0

@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING
 __version__: str
 
 if TYPE_CHECKING:  # mypy then resolves the modules first, which import this one
+    from .api.comparison import ComparisonTable as ComparisonTable
+    from .api.comparison import compare as compare
     from .api.files import inspect as inspect
     from .api.files import pack as pack
     from .api.files import read as read
@@ -16,10 +18,8 @@ if TYPE_CHECKING:  # mypy then resolves the modules first, which import this one
     from .api.trees import extract_leaves as extract_leaves
     from .api.trees import refine as refine
     from .api.trees import simplify as simplify
-    from .api.views import ComparisonTable as ComparisonTable
     from .api.views import Frames as Frames
     from .api.views import Picture as Picture
-    from .api.views import compare as compare
     from .api.views import cut as cut
     from .api.views import orbit as orbit
     from .api.views import psnr as psnr

@@ -15,7 +15,7 @@ import pytest
 from PIL import Image
 
 import sparklod_cli as sparklod
-from sparklod_cli.api.views import Comparison, measured
+from sparklod_cli.api.comparison import COLUMNS, Comparison, measured, rows_by_budget, summarize
 from sparklod_cli.bake.flow import bake
 from sparklod_cli.bake.settings import BakeSettings
 from sparklod_cli.cameras.camera import Camera, look_at
@@ -28,7 +28,6 @@ from sparklod_cli.model.instances import Instance
 from sparklod_cli.render.settings import RenderSettings
 from sparklod_cli.system.errors import SparklodError
 from sparklod_cli.tables.columns import Row
-from sparklod_cli.tables.comparison import COLUMNS, rows_by_budget, summarize
 from sparklod_cli.viewers.read_scenes import read_scenes
 from sparklod_cli.viewers.scenes import Scenes
 from sparklod_cli.viewers.viewer_settings import LodSettings

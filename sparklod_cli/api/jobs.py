@@ -18,9 +18,7 @@ from ..cameras.frame import Point, direction_of
 from ..cameras.framing import reach
 from ..model.instances import instances_of
 from ..model.splats import COLUMNS
-from ..system.output import check_writable, write_file
 from ..system.progress import Progress, silent
-from ..system.threads import on_threads
 from ..viewers.loaded_scene import TRAVERSED
 from ..viewers.read_scenes import read_scenes
 from ..viewers.scenes import CutFinder, CutSource
@@ -35,8 +33,7 @@ if TYPE_CHECKING:
     from ..render.settings import RenderSettings
     from ..simulation.results import FrameOutputs, Summary, WrittenFrames
     from ..tables.assertions import Assertion, Outcome
-    from ..tables.columns import Filter, Row, TableOutput
-    from ..tables.comparison import BudgetSummary
+    from ..tables.columns import Filter, Row
     from ..viewers.scenes import Scenes
     from ..viewers.viewer_settings import LodSettings, StreamingSettings
 
@@ -155,80 +152,12 @@ def _source(
 
 
 @dataclass(frozen=True)
-class Compared:
-    """Result of a comparison.
-
-    Attributes:
-        pictures: how many were compared.
-        leaves: splats of full detail, all instances together.
-    """
-
-    pictures: int
-    leaves: int
-    summary: list[BudgetSummary]
-    outcomes: list[Outcome]
-
-
-@dataclass(frozen=True)
 class Traversed:
     """Result of a traversal."""
 
     frames: WrittenFrames
     summary: Summary
     outcomes: list[Outcome]
-
-
-def check_chart(plot: Path, *, overwrite: bool) -> None:
-    """Raise a `SparklodError` where a chart cannot be written or drawn."""
-    from ..figures.charts import load_matplotlib
-
-    check_writable(plot, overwrite=overwrite)
-    load_matplotlib()
-
-
-def compare_files(
-    files: ViewedFiles,
-    budgets: Sequence[Budget],
-    lod: LodSettings,
-    render: RenderSettings,
-    table: TableOutput,
-    *,
-    asserts: Sequence[tuple[int | None, Assertion]] = (),
-    plot: Path | None = None,
-    overwrite: bool = False,
-    passed: Filter | None = None,
-) -> Compared:
-    """Measure how far cuts of files are from full detail, and write the table and the charts.
-
-    Args:
-        table: where the rows go, at once when all are known.
-        asserts: assertions, each with the index of its budget; None for all budgets.
-        passed: what the bytes of the table are passed through on their way to standard output.
-
-    Raises:
-        UnfitError: there are both trees and Streamed SOG, or too many instances.
-        SparklodError: a file cannot be read or written, has no levels, or a picture cannot be drawn.
-    """
-    from ..tables.assertions import check
-    from ..tables.comparison import EMPTY, rows_by_budget, summarize
-    from .views import Comparison
-
-    with on_threads(files.threads):
-        try:
-            comparison = Comparison(files.scenes, lod, budgets, render)
-        except ValueError as error:
-            raise UnfitError(str(error)) from None
-        rows = list(comparison.run(files.path, threads=files.threads, progress=files.progress))
-    table.write(rows, passed=passed)
-    groups = rows_by_budget(rows, len(budgets))
-    if plot is not None:
-        from ..figures.charts import plot_comparison as chart
-
-        series = list(zip((budget.text for budget in budgets), groups, strict=True))
-        write_file(plot, [chart(series, files.scenes.title)], overwrite=overwrite)
-    outcomes = [each for at, what in asserts for each in check([what], rows if at is None else groups[at], empty=EMPTY)]
-    summary = summarize(rows, [budget.text for budget in budgets])
-    return Compared(len(rows), comparison.leaves, summary, outcomes)
 
 
 def traverse_files(

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,19 +20,15 @@ from ..cameras.sources import CameraPath
 from ..cameras.sources import orbit as orbit_cameras
 from ..codecs.formats import PRECISIONS
 from ..images import metrics
-from ..lod.budget import Budget
 from ..model.instances import Instance, names_of
 from ..model.scene import Scene
 from ..model.traversed import DetailScene
 from ..render.rasterizer import Image
 from ..render.renderer import Renderer
 from ..render.settings import RenderSettings
-from ..system.errors import CameraPathError, FormatError, SparklodError, memory_errors_translated
-from ..system.progress import Progress, silent
-from ..system.threads import on_threads, ordered_map, thread_count
-from ..tables.assertions import numbers
-from ..tables.columns import Row, Table
-from ..tables.comparison import COLUMNS as OF_COMPARISON
+from ..system.errors import CameraPathError, FormatError, memory_errors_translated
+from ..system.threads import on_threads, thread_count
+from ..tables.columns import Table
 from ..viewers.loaded_scene import UNNAMED
 from ..viewers.read_scenes import read_scenes
 from ..viewers.scenes import Cut, CutFinder, FixedCut, Scenes
@@ -52,7 +48,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ..simulation.results import Summary
-    from ..tables.comparison import BudgetSummary
     from ..viewers.viewer_settings import StreamingSettings
 
 
@@ -166,170 +161,10 @@ def traverse(
     from ..simulation.results import COLUMNS
 
     with on_threads(threads) as count, progress_callback(progress) as callback, memory_errors_translated():
-        scenes = _trees(viewed, count, precision)
+        scenes = trees_of(viewed, count, precision)
         simulation = Simulation(scenes, _lod(scenes, budget, settings, False), streaming, by_instance=by_instance)
         frames = simulation.run(path_like(cameras), threads=count, progress=callback)
         return Frames([row for frame in frames for row in frame.rows], COLUMNS)
-
-
-def compare(
-    viewed: Viewed,
-    scene: Viewed | None,
-    cameras: CameraPath | Iterable[Camera],
-    *,
-    budgets: Sequence[BudgetLike],
-    settings: LodSettings | None = None,
-    render: RenderSettings | None = None,
-    precision: str = PRECISIONS[0],
-    threads: int | None = None,
-    progress: ProgressLike = None,
-) -> ComparisonTable:
-    """Return how far cuts of some budgets are from full detail: PSNR, SSIM and PSNR at edges, on black and on white.
-
-    Cameras that follow each other, with later times, have popping as well.
-
-    Args:
-        viewed: a tree, a scene at several detail levels, or instances of trees or of such scenes.
-        scene: what full detail is; None for the leaves of the trees, or level 0.
-        cameras: that both are seen by.
-        budgets: of the cuts.
-        settings: of the cuts; with Spark 2's foveation and without a pixel-scale limit unless given.
-        render: how pictures are drawn; as Spark 2 does unless given.
-        precision: see `cut`.
-        threads: to work on; None for all processors. The table does not depend on it.
-        progress: called with how much is done.
-
-    Raises:
-        FormatError: a scene to be cut has no tree.
-        SparklodError: a budget is less than one splat for each instance, or full detail covers no pixel.
-    """
-    if isinstance(budgets, (str, int, float, np.number)):
-        raise TypeError(f"budgets is {budgets!r}; give a list of budgets")
-    if not budgets:
-        raise ValueError("there are no budgets; give at least one")
-    with on_threads(threads) as count, progress_callback(progress) as callback, memory_errors_translated():
-        scenes = _trees(viewed, count, precision)
-        full = None if scene is None else scenes_of(scene, count)
-        given = [budget_like(budget) for budget in budgets]
-        lod = settings or LodSettings(pixel_scale_limit=0.0)
-        comparison = Comparison(scenes, lod, given, render or RenderSettings(), full=full)
-        rows = list(comparison.run(path_like(cameras), threads=count, progress=callback))
-    return ComparisonTable(rows, OF_COMPARISON, [budget.text for budget in given])
-
-
-#: Threads that measure pictures; each has a few that wait, which take memory.
-MEASURERS = 4
-
-
-@dataclass(frozen=True, eq=False)
-class PicturePair:
-    """A cut's picture and that of full detail, of one camera.
-
-    Attributes:
-        row: the cells known so far.
-        image, full: (H, W, 4) of the cut and of full detail.
-        edges: (H, W) where full detail has edges.
-        before: the pictures, of the same budget, that they follow in a movement; None for the first. Those have no
-            `before`, so that no more than two frames are kept.
-    """
-
-    row: Row
-    image: Image
-    full: Image
-    edges: metrics.Mask
-    before: PicturePair | None
-
-
-class Comparison:
-    """Scenes at several budgets, against full detail.
-
-    Args:
-        scenes: trees alone, read with all columns of their splats.
-        lod: settings of the cuts but for the budget.
-        full: full detail; None for the leaves of the trees.
-
-    Raises:
-        SparklodError: a budget is less than one splat for each instance.
-    """
-
-    def __init__(
-        self,
-        scenes: Scenes,
-        lod: LodSettings,
-        budgets: Sequence[Budget],
-        render: RenderSettings,
-        *,
-        full: Scenes | None = None,
-    ) -> None:
-        self._full = Renderer(CutFinder(full or scenes, None), render, [])
-        self.leaves = len((full or scenes).full())
-        self.counts = [budget.of(self.leaves) for budget in budgets]
-        for budget, count in zip(budgets, self.counts, strict=True):
-            if count < len(scenes.instances):
-                raise SparklodError(
-                    f"a budget of {budget.text} is less than one splat for each of {len(scenes.instances)} instances"
-                )
-        finder = CutFinder(scenes, replace(lod, budget=max(self.counts)))
-        self._cuts = [Renderer(finder.with_budget(count), render, []) for count in self.counts]
-
-    def run(self, path: CameraPath, *, threads: int = 1, progress: Progress = silent) -> Iterator[Row]:
-        """Yield rows of `tables.comparison.COLUMNS`: for each camera one for each budget.
-
-        Cells of `popping` are empty where a camera does not follow the one before it (`CameraPath.follows`).
-
-        Pictures are drawn one after the other, each on all the threads; meanwhile others are measured.
-
-        Raises:
-            SparklodError: full detail covers no pixel of a frame.
-        """
-        total = len(path.cameras) * len(self.counts)
-        for at, row in enumerate(ordered_map(measured, self._pictures(path, threads), min(threads, MEASURERS))):
-            progress("compare", at + 1, total, "picture")
-            yield row
-
-    def _pictures(self, path: CameraPath, threads: int) -> Iterator[PicturePair]:
-        last: list[PicturePair] = []
-        for at, (number, camera) in enumerate(zip(path.numbers, path.cameras, strict=True)):
-            with on_threads(threads):
-                full = self._full.draw(camera).image
-            metrics.check_covered(full, f"full detail in frame {number}")
-            where, follows, frame = metrics.edges(full), path.follows(at), []
-            for which, (count, renderer) in enumerate(zip(self.counts, self._cuts, strict=True)):
-                with on_threads(threads):
-                    drawn = renderer.draw(camera)
-                row: Row = {
-                    "frame": number,
-                    "time_s": camera.time,
-                    "name": camera.name,
-                    "budget": count,
-                    "share": count / self.leaves,
-                    "selected": drawn.splats,
-                }
-                before = replace(last[which], before=None) if follows else None
-                frame.append(PicturePair(row, drawn.image, full, where, before))
-                yield frame[-1]
-            last = frame
-
-
-def measured(pictures: PicturePair) -> Row:
-    """Return the complete row of a comparison, with the errors of the picture."""
-    row, before = pictures.row, pictures.before
-    tiles = []
-    for name, gray in metrics.BACKGROUNDS.items():
-        a, b = metrics.on_background(pictures.image, gray), metrics.on_background(pictures.full, gray)
-        row[f"psnr_{name}"], row[f"ssim_{name}"] = metrics.psnr(a, b), metrics.ssim(a, b)
-        row[f"edge_psnr_{name}"] = metrics.edge_psnr(a, b, pictures.edges)
-        row[f"popping_{name}"] = None
-        if before is not None:
-            earlier = metrics.on_background(before.image, gray), metrics.on_background(before.full, gray)
-            row[f"popping_{name}"] = metrics.popping(a, b, *earlier)
-        tiles.append(metrics.worst_tile(a, b))
-    for name in ("psnr", "ssim", "edge_psnr", "popping"):
-        values = numbers([row], f"{name}_black") + numbers([row], f"{name}_white")
-        row[name] = sum(values) / len(values) if values else None
-    worst = min(tiles, key=lambda tile: tile.psnr)
-    row |= {"worst_tile_psnr": worst.psnr, "worst_tile_x": worst.x, "worst_tile_y": worst.y}
-    return {column.name: column.rounded(row.get(column.name)) for column in OF_COMPARISON}
 
 
 def psnr(a: Image, b: Image, *, background: float = 0.0) -> float:
@@ -392,7 +227,8 @@ def _named(instances: Sequence[Instance]) -> list[Instance]:
     return [each if each.name else replace(each, name=next(names)) for each in instances]
 
 
-def _trees(viewed: Viewed, threads: int, precision: str) -> Scenes:
+def trees_of(viewed: Viewed, threads: int, precision: str) -> Scenes:
+    """Return scenes as `scenes_of`; raise a `FormatError` where one has neither a tree nor detail levels."""
     scenes = scenes_of(viewed, threads, precision)
     plain = next((loaded.name for loaded in scenes.loaded if not loaded.has_cuts), None)
     if plain is not None:
@@ -424,23 +260,6 @@ class Frames(Table):
         from ..simulation.results import summarize
 
         return summarize(self.rows)
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class ComparisonTable(Table):
-    """The rows of a comparison: for each camera one for each budget.
-
-    Attributes:
-        budgets: as they were given.
-    """
-
-    budgets: Sequence[str]
-
-    def summary(self) -> list[BudgetSummary]:
-        """Return means and extremes over the frames, for each budget."""
-        from ..tables.comparison import summarize
-
-        return summarize(self.rows, self.budgets)
 
 
 class Picture:

@@ -52,7 +52,7 @@ from .options.viewing import (
 from .paths import Folder, InputPath, OutputPath, claim_stdout, keep_apart, name_outputs, require_suffix, stem_of
 
 if TYPE_CHECKING:
-    from ..api.jobs import Compared
+    from ..api.comparison import BudgetSummary, Compared
     from ..cameras.camera import Camera
     from ..cameras.sources import CameraPath
     from ..images.output import PictureOutput
@@ -60,7 +60,6 @@ if TYPE_CHECKING:
     from ..images.sequence import PictureSettings, WrittenPictures
     from ..model.instances import Instance
     from ..tables.assertions import Assertion
-    from ..tables.comparison import BudgetSummary
 
 #: Options without an effect on some styles and backends.
 UNSTYLED = {
@@ -265,8 +264,8 @@ class ComparisonOptions:
 
     def assertions(self, budgets: Sequence[Budget]) -> list[tuple[int | None, Assertion]]:
         """Return the assertions, each with the index of the budget before its colon; None for all budgets."""
+        from ..api.comparison import COLUMNS
         from ..tables import assertions
-        from ..tables.comparison import COLUMNS
 
         parsed: list[tuple[int | None, Assertion]] = []
         texts = [budget.text for budget in budgets]
@@ -558,8 +557,7 @@ def _compare(ctx: click.Context, options: RenderOptions) -> int:
     asserts = options.comparison.assertions(budgets)
     output, general, overwrite = options.pictures.output, options.general, options.pictures.overwrite
     assert not isinstance(output, Folder)  # see `name_outputs`
-    from ..api.jobs import check_chart, compare_files
-    from ..tables.comparison import COLUMNS
+    from ..api.comparison import COLUMNS, check_chart, compare_files
 
     table = table_output(output, COLUMNS, overwrite=overwrite, as_json=options.as_json)
     instances = options.inputs.instances()

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sparklod_cli.api.comparison import COLUMNS
 from sparklod_cli.cli import run
-from sparklod_cli.tables.comparison import COLUMNS
 from tests.conftest import FIXTURES, ROOT, Capture
 
 TOWN = FIXTURES / "traverse" / "town.spz"
