@@ -29,7 +29,7 @@ INPUTS = {
 }
 
 #: Arguments to try as inputs.
-FILES = ("tree.spz", "tree.spz", "tree.spz", *INPUTS, "scene.json", "path.csv", "expect.toml", "absent.ply", ".", "-")
+FILES = ("tree.spz", "tree.spz", "tree.spz", *INPUTS, "scene.json", "path.csv", "expect.txt", "absent.ply", ".", "-")
 
 #: Arguments to try as outputs, of pages, of plots, and of folders.
 OUTPUTS = (
@@ -37,7 +37,7 @@ OUTPUTS = (
     *("out.json", "out.html", "out.%04d.png", "out", "new/out.spz", "-", "", ".", "/dev/null", "tree.spz", "scene.ply"),
     *("out\x1b[31m.spz", "out\n::error::.spz", "n" * 300, "scene.json", "out.parquet", "out.xlsx", "out.%d.%d.png"),
 )
-PAGES = ("out.html", "out.html", "-", "", ".", "new/out.html", "/dev/null", "tree.spz", "expect.toml", "out\n.html")
+PAGES = ("out.html", "out.html", "-", "", ".", "new/out.html", "/dev/null", "tree.spz", "expect.txt", "out\n.html")
 PLOTS = ("out.png", "out.png", "-", "", ".", "new/out.png", "/dev/null", "tree.spz", "path.csv", "out\x1b[31m.png")
 FOLDERS = ("new", "new/er", ".", "tree.spz", "")
 
@@ -65,7 +65,7 @@ VALUES: dict[str, Sequence[str]] = {
     "background": ("black", "white", "transparent", "#12345", "#123456", "red"),
     "camera_path": tuple(groups()),
     "scene": ("scene.json", "path.csv", "absent.json"),
-    "expect": ("expect.toml", "scene.json", "tree.spz"),
+    "expect": ("expect.txt", "scene.json", "tree.spz"),
     "leaves_of": FILES,
     "rgba": FILES,
     "diff": FILES,
@@ -86,7 +86,7 @@ NUMBERS = (
     *("1,2,3", "0,0,0", "0,0,0,5", "-1,-1,-1", "1e38,1e38,1e38", "1,2", "nan,0,0", "auto"),
 )
 SCENE = json.dumps({"instances": [{"file": "tree.spz"}, {"file": "tree.spz", "translation": [3, 0, 0]}]}).encode()
-EXPECT = b'lod = true\nmax_growth = 1.5\n[values]\n"tree.leaves" = 5\n'
+EXPECT = b"lod==true\ngrowth<=1.5\ntree.leaves==5\n"
 
 #: Options that name an output file.
 OUTPUT_OPTIONS = ("-o", "--output", "--html", "--plot")
@@ -115,7 +115,7 @@ def make(rng: Rng) -> Case:
     inputs = [pick(rng, FILES[: 3 if rng.integers(3) else None]) for _ in range(int(pick(rng, (1, 1, 1, 2, 0))))]
     line[1:1] = inputs
     files = {file: seeds()[seed] for file, seed in INPUTS.items()}
-    files |= {"tree.spz": tree(), "scene.json": SCENE, "expect.toml": EXPECT}
+    files |= {"tree.spz": tree(), "scene.json": SCENE, "expect.txt": EXPECT}
     files |= {path: data for group in groups().values() for path, data in group.items()}
     files["path.csv"] = (FIXTURES / "cameras" / "sparklod.csv").read_bytes()
     what = " ".join(word[:40] for word in line)[:300]

@@ -17,7 +17,7 @@ LOD = 0x80  # the flag of SPZ's header that says there is a tree
 #: Commands to run on a tree; T is replaced by its file.
 INSPECT = (
     *("T --check", "T --json --stats --check", "T --html page.html", "T --stats --histogram size", "T --field tree"),
-    *("T --check --fail-on warning --format github", "T --leaves-of T", "T --require-lod --max-growth 1.5"),
+    *("T --check --fail-on warning --format github", "T --leaves-of T", "T --assert lod==true --assert growth<=1.5"),
 )
 TRAVERSE = (
     *("T --orbit 3 --no-timing", "T --look-at 0,0,5:0,0,0 --budget 10", "T --dolly --every 20 --precision float16"),

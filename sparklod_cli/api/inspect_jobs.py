@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..inspection import expectations, leaves
-from ..inspection.expectations import Expectations
 from ..inspection.findings import Finding
 from ..inspection.report import Report, ReportSettings, inspect
 from ..io import read_scene
@@ -18,6 +17,7 @@ from ..system.errors import FormatError, SparklodError, memory_errors_translated
 from ..system.output import check_writable, write_file
 from ..system.progress import Progress
 from ..system.threads import on_threads
+from ..tables.assertions import Assertion
 from ..tables.columns import TableOutput
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ class InspectSettings:
     """Settings of reports and checks, and of their outputs: histograms, a picture, a page, a table of chunks.
 
     Attributes:
-        expected: expectations that a file must meet.
+        expected: assertions that must hold of a file.
         original: the scene whose splats the leaves must equal.
         everything: report findings of all severities; otherwise a file with expectations has errors only.
         histograms: quantities that are drawn as text.
@@ -47,7 +47,7 @@ class InspectSettings:
     """
 
     report: ReportSettings
-    expected: Expectations | None
+    expected: Sequence[Assertion] | None
     original: Scene | None
     everything: bool
     histograms: tuple[str, ...]

@@ -7,7 +7,7 @@ import json
 import time
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -15,11 +15,10 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import click
 
 from ..images.output import PLOT_BY
-from ..model import MAX_SH_DEGREE
 from ..system.errors import OutOfMemoryError, SparklodError, StdoutError
-from ..system.setting_fields import Quantity, Range, setting, whole
+from ..system.setting_fields import setting, whole
 from ..system.stdio import name_of
-from ..system.units import format_size, parse_size
+from ..system.units import format_size
 from ..system.untrusted import MOST, printable, shortened
 from .command import COMMON, Command, flag, refuse, values_of
 from .console import Console, count_of, rows
@@ -28,10 +27,10 @@ from .paths import InputPath, OutputPath, keep_apart, name_outputs
 
 if TYPE_CHECKING:
     from ..api.inspect_jobs import Inspected, InspectSettings
-    from ..inspection.expectations import Expectations
     from ..inspection.findings import Finding
     from ..inspection.html import FileSection
     from ..inspection.report import Report, ReportSettings
+    from ..tables.assertions import Assertion
     from ..tables.columns import TableOutput
 
 
@@ -66,18 +65,19 @@ class Checks:
         "Look for everything that can be wrong, and print a line for each finding instead of a report.", heading=COMMON
     )
     asserts: tuple[str, ...] = setting(
-        "Expect this of every file, such as 'nodes<5M', 'bytes<=40MB' or 'tree.depth<24'; can be given several times."
-        " The exit status is 3 if it does not hold.",
+        "Expect this of every file, such as 'lod==true', 'nodes<5M', 'bytes<=40MB' or 'tree.depth<24'; can be given"
+        " several times. The exit status is 3 if it does not hold.",
         **ASSERT,
         heading=COMMON,
     )
-    require_lod: bool = flag("Expect a Level-of-Detail tree.", heading=COMMON)
     leaves_of: Path | None = setting(
         "Expect the leaves to be exactly the splats of this file, within the rounding of the format.",
         InputPath(),
         heading=COMMON,
     )
-    expect: Path | None = setting("Take expectations from a .toml or .json file.", InputPath(), heading=COMMON)
+    expect: Path | None = setting(
+        "Expect what a text file says, with an assertion on each line.", InputPath(), heading=COMMON
+    )
     fail_on: str = setting("Lowest severity of a finding that makes the exit status 3.", ("error", "warning"), "error")
     style: str = setting(
         "How findings are printed; github prints annotations for GitHub Actions.",
@@ -85,41 +85,28 @@ class Checks:
         "text",
         flags=("--format",),
     )
-    max_bytes: int | None = setting("Expect files of at most this size, such as 3MB.", Quantity("SIZE", parse_size))
-    min_splats: int | None = setting("Expect at least N splats; in a tree, leaves.", whole(0))
-    max_splats: int | None = setting("Expect at most N splats; in a tree, leaves.", whole(0))
-    sh: int | None = setting("Expect this SH degree.", whole(0, MAX_SH_DEGREE))
-    max_growth: float | None = setting("Expect a tree with at most X nodes for each leaf.", Range(1))
-
-    @property
-    def has_expectations(self) -> bool:
-        numbers = (self.max_bytes, self.min_splats, self.max_splats, self.sh, self.max_growth)
-        return bool(self.asserts or self.require_lod or self.expect) or any(each is not None for each in numbers)
 
     @property
     def holds(self) -> bool:
         return self.check or self.has_expectations or self.leaves_of is not None
 
-    def expectations(self) -> Expectations | None:
-        """Return the expectations of the file, overridden by those of the options; None where there are none.
+    @property
+    def has_expectations(self) -> bool:
+        return bool(self.asserts or self.expect)
+
+    def expectations(self) -> list[Assertion] | None:
+        """Return the assertions of the file and of the options; None without either.
 
         Raises:
-            ExpectationError: the file cannot.
+            ExpectationError: the file cannot be understood.
         """
-        from ..inspection.expectations import KEYS, Expectations, parse_assertion, read
+        from ..inspection.expectations import parse, read
 
         if not self.has_expectations:
             return None
         with assert_errors():
-            for text in self.asserts:
-                parse_assertion(text)
-        values = {"lod": self.require_lod or None} | {key: getattr(self, key) for key in KEYS if key != "lod"}
-        expected = Expectations() if self.expect is None else read(self.expect)
-        return replace(
-            expected,
-            **{key: value for key, value in values.items() if value is not None},
-            asserts=expected.asserts + self.asserts,
-        )
+            given = [parse(text) for text in self.asserts]
+        return [*(read(self.expect) if self.expect is not None else ()), *given]
 
 
 @dataclass(frozen=True)
@@ -257,12 +244,12 @@ def inspect(ctx: click.Context, /, **_: Any) -> None:
 
 
 def _report_settings(
-    checks: Checks, output: InspectOutput, expected: Expectations | None, *, as_json: bool
+    checks: Checks, output: InspectOutput, expected: list[Assertion] | None, *, as_json: bool
 ) -> ReportSettings:
     from ..inspection.report import HEADER_FIELDS, ReportSettings
 
     field = output.field or ""
-    about = [condition.name for condition in expected.conditions()] if expected else []
+    about = [assertion.name for assertion in expected or ()]
     everything = (
         output.stats
         or bool(output.histogram)

@@ -1,24 +1,24 @@
-"""Expectations of a file, from options, assertions and files of expectations, and their check against a report."""
+"""Expectations of a file: assertions about its report, from options and files, and their check."""
 
 from __future__ import annotations
 
 import json
-import math
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, fields
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 from ..io import read_text
 from ..system.errors import SparklodError
-from ..system.untrusted import QUOTED, near, parse_json, parse_toml, printable, quoted, quoted_value
-from ..tables.assertions import BadAssertionError, Condition, is_number, number_text, parse_condition
+from ..system.untrusted import QUOTED, near, printable, quoted
+from ..tables.assertions import Assertion, BadAssertionError, is_number, number_text, parse_assertion
 from .findings import Finding
 from .report import NoFieldError, Report, value_at
 
 
 class ExpectationError(SparklodError):
-    """An expectation cannot be understood."""
+    """A file of expectations cannot be understood."""
 
 
 #: Short names for values of a report, besides its fields.
@@ -38,12 +38,12 @@ NAMES: dict[str, Callable[[dict[str, Any]], Any]] = {
     "tiles": lambda report: report["tiles"]["tiles"],
 }
 
-#: The formats that have the names which are not about a tree.
+#: Formats that have the names which are not about a tree.
 FORMATS = dict.fromkeys(("chunk_bytes", "first_bytes"), "RAD, Streamed SOG or 3D Tiles")
 FORMATS["tiles"] = "3D Tiles"
 FORMATS |= dict.fromkeys(("chunked", "palette"), "RAD") | dict.fromkeys(("levels", "regions"), "Streamed SOG")
 
-#: The codes of findings about names; all others have expect.value.
+#: Codes of findings by name; all other names have expect.value.
 CODES = {
     "bytes": "expect.bytes",
     "leaves": "expect.splats",
@@ -52,110 +52,69 @@ CODES = {
     "growth": "expect.growth",
 }
 
-#: Keys of a file of expectations, also options of inspect: the name and the sign of their conditions.
-KEYS = {
-    "max_bytes": ("bytes", "<="),
-    "min_splats": ("leaves", ">="),
-    "max_splats": ("leaves", "<="),
-    "sh": ("sh", "=="),
-    "lod": ("lod", "=="),
-    "max_growth": ("growth", "<="),
+#: Beginnings of the lines that replace the keys of files of expectations in TOML and JSON, which are no longer read.
+REPLACED = {
+    "max_bytes": "bytes<=",
+    "min_splats": "leaves>=",
+    "max_splats": "leaves<=",
+    "sh": "sh==",
+    "lod": "lod==",
+    "max_growth": "growth<=",
 }
+OLD_KEY = re.compile(rf"""(?<![.\w])({"|".join(REPLACED)})["']?\s*[=:]\s*([\w.]+)""")
 
 
-@dataclass(frozen=True)
-class Expectations:
-    """Expectations of a file; None means anything. Each is a condition, see `assertions.Condition`.
-
-    Attributes:
-        min_splats, max_splats: of a plain file, or leaves of a tree.
-        max_growth: nodes over leaves.
-        values: expected value, or a table of `min` and `max`, by the field of the report ("tree.depth").
-        asserts: texts such as "nodes<=5M"; they name `NAMES` and fields of the report.
-    """
-
-    max_bytes: int | None = None
-    min_splats: int | None = None
-    max_splats: int | None = None
-    sh: int | None = None
-    lod: bool | None = None
-    max_growth: float | None = None
-    values: dict[str, Any] = field(default_factory=dict)
-    asserts: tuple[str, ...] = ()
-
-    def conditions(self) -> list[Condition]:
-        found = [
-            Condition.of(name, sign, getattr(self, key))
-            for key, (name, sign) in KEYS.items()
-            if getattr(self, key) is not None
-        ]
-        for name, expected in self.values.items():
-            ranged = expected if isinstance(expected, dict) else {}
-            ends = [(sign, ranged[end]) for end, sign in (("min", ">="), ("max", "<=")) if end in ranged]
-            found += [Condition.of(name, sign, bound) for sign, bound in ends or [("==", expected)]]
-        return found + [parse_assertion(text) for text in self.asserts]
-
-
-def parse_assertion(text: str) -> Condition:
-    """Return a condition on a report; `BadAssertionError` if it names nothing that a report has."""
-    condition = parse_condition(text, example="nodes<=5M")
+def parse(text: str) -> Assertion:
+    """Return an assertion about a report; `BadAssertionError` if it names nothing that a report has."""
+    assertion = parse_assertion(text, example="nodes<=5M")
     known = [*NAMES, *(each.name for each in fields(Report))]
-    if condition.name.partition(".")[0] not in known:
-        name = printable(condition.name, QUOTED)
-        raise BadAssertionError(f"{text!r}: there is no {name!r} in a report{near(condition.name, known)}")
-    return condition
+    if assertion.name.partition(".")[0] not in known:
+        name = printable(assertion.name, QUOTED)
+        raise BadAssertionError(f"{text!r}: there is no {name!r} in a report{near(assertion.name, known)}")
+    return assertion
 
 
-def read(path: Path) -> Expectations:
-    """Return the expectations in a .json or .toml file: keys that are attributes of `Expectations`, and `assert`."""
-    try:
-        text = read_text(path)
-        data = parse_toml(text) if path.suffix.lower() == ".toml" else parse_json(text)
-    except ValueError as error:
-        raise ExpectationError(f"{path} is not what it is called: {quoted(error)}") from None
-    if not isinstance(data, dict):
-        raise ExpectationError(f"{path} is not a table of expectations")
-    types: dict[str, tuple[type, ...]] = dict.fromkeys(KEYS, (int,))
-    types |= {"lod": (bool,), "max_growth": (int, float), "values": (dict,), "assert": (list,)}
-    for name, value in data.items():
-        if name not in types:
-            raise ExpectationError(f"{path}: {printable(name, QUOTED)} is not one of {', '.join(types)}")
-        if not isinstance(value, types[name]) or (isinstance(value, bool) and name != "lod"):
-            raise ExpectationError(f"{path}: {name} cannot be {quoted_value(value)}")
-        if isinstance(value, (int, float)) and not 0 <= value < math.inf:
-            raise ExpectationError(f"{path}: {name} cannot be {quoted_value(value)}")
-    values = dict(_flat(data.pop("values", {}), str(path)))
-    asserts = data.pop("assert", [])
-    for each in asserts:
-        if not isinstance(each, str):
-            raise ExpectationError(f"{path}: assert cannot hold {quoted_value(each)}, only texts such as 'nodes<=5M'")
-        try:
-            parse_assertion(each)
-        except BadAssertionError as error:
-            raise ExpectationError(f"{path}: assert {quoted(error)}") from None
-    return Expectations(**data, values=values, asserts=tuple(asserts))
+def read(path: Path) -> list[Assertion]:
+    """Return the assertions in a text file, one a line; blank lines and lines that begin with # are left out.
 
-
-def _flat(table: dict[str, Any], path: str, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield expectations by the full names of their fields; in TOML `tree.depth = 2` is a table in a table."""
-    for key, expected in table.items():
-        name = prefix + key
-        if isinstance(expected, dict) and expected and not expected.keys() & {"min", "max"}:
-            yield from _flat(expected, path, f"{name}.")
+    Raises:
+        ExpectationError: a line is not an assertion about a report; for a file in TOML or JSON, with its new lines.
+    """
+    text = read_text(path)
+    found = []
+    for number, line in enumerate(map(str.strip, text.splitlines()), 1):
+        if not line or line.startswith("#"):
             continue
-        if isinstance(expected, dict) and not (expected and expected.keys() <= {"min", "max"}):
-            raise ExpectationError(f"{path}: {printable(name, QUOTED)} takes min and max, not {quoted_value(expected)}")
-        if isinstance(expected, dict) and not all(map(is_number, expected.values())):
-            raise ExpectationError(
-                f"{path}: min and max of {printable(name, QUOTED)} must be numbers, not {quoted_value(expected)}"
-            )
         try:
-            json.dumps(expected)
-        except TypeError:
+            found.append(parse(line))
+        except BadAssertionError as error:
+            if path.suffix.lower() not in (".toml", ".json"):
+                raise ExpectationError(f"{path}, line {number}: {quoted(error)}") from None
+            lines = [REPLACED[key] + value.replace("_", "") for key, value in OLD_KEY.findall(text)]
             raise ExpectationError(
-                f"{path}: {printable(name, QUOTED)} cannot be {quoted_value(expected)}, no report has such a value"
+                f"{path} has expectations as TOML or JSON, which are no longer read; write assertions, one a line: "
+                + printable(", ".join([*lines, "NAME==VALUE, NAME>=MIN and NAME<=MAX for values"]), 2 * QUOTED)
             ) from None
-        yield name, expected
+    return found
+
+
+def check(report: Report, expected: Sequence[Assertion]) -> list[Finding]:
+    """Return findings for the assertions that do not hold; none for a file that could not be read."""
+    if report.format is None:
+        return []
+    plain = report.as_dict()
+    found = []
+    for assertion in expected:
+        code, text = CODES.get(assertion.name, "expect.value"), printable(assertion.text, QUOTED)
+        try:
+            value = _value(plain, assertion.name)
+        except NoFieldError as error:
+            found.append(Finding(code, f"{text}: {error}"))
+            continue
+        if not assertion.holds(value):
+            shown = number_text(value) if is_number(value) else printable(json.dumps(value), QUOTED)
+            found.append(Finding(code, f"{text}: {printable(assertion.name, QUOTED)} is {shown}"))
+    return found
 
 
 def _value(plain: dict[str, Any], name: str) -> Any:
@@ -170,26 +129,3 @@ def _value(plain: dict[str, Any], name: str) -> Any:
 
 def _streamed(report: dict[str, Any]) -> Any:
     return report["rad"] or report["streamed_sog"] or report["tiles"]
-
-
-def check(report: Report, expected: Expectations) -> list[Finding]:
-    """Return findings for the expectations that a report does not meet; none for a file that could not be read."""
-    if report.format is None:
-        return []
-    plain = report.as_dict()
-    found = []
-    for condition in expected.conditions():
-        code = CODES.get(condition.name, "expect.value")
-        text = printable(condition.text, QUOTED)
-        try:
-            value = _value(plain, condition.name)
-        except NoFieldError as error:
-            found.append(Finding(code, f"{text}: {error}"))
-            continue
-        if not condition.holds(value):
-            found.append(Finding(code, f"{text}: {printable(condition.name, QUOTED)} is {_text(value)}"))
-    return found
-
-
-def _text(value: Any) -> str:
-    return number_text(value) if is_number(value) else printable(json.dumps(value), QUOTED)

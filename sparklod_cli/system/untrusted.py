@@ -1,4 +1,4 @@
-"""Untrusted text: bounded JSON and TOML, typed access to JSON, and text that is safe for terminals and CI logs.
+"""Untrusted text: bounded JSON, typed access to JSON, and text that is safe for terminals and CI logs.
 
 Imports nothing heavy: `--help` needs the table of formats, some of which are recognized by keys.
 """
@@ -65,19 +65,6 @@ def parse_json(data: str | bytes, *, keep_surrogates: bool = False, depth: int =
         raise _too_deep(depth) from None
     replace_surrogates = not keep_surrogates and (_ESCAPED_SURROGATE.search(text) or _SURROGATE.search(text))
     return _checked(value, depth, replace_surrogates=bool(replace_surrogates))
-
-
-def parse_toml(text: str) -> dict[str, Any]:
-    """Parse a TOML text as `parse_json` does, but integers must fit 64 bits, as TOML requires."""
-    if sys.version_info >= (3, 11):
-        import tomllib
-    else:
-        import tomli as tomllib
-    try:
-        table: dict[str, Any] = _checked(tomllib.loads(text), MAX_DEPTH, replace_surrogates=False)
-    except RecursionError:
-        raise _too_deep(MAX_DEPTH) from None
-    return table
 
 
 def _whole(digits: str) -> int | float:

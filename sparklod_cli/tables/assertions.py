@@ -1,13 +1,12 @@
-"""Conditions, `NAME SIGN VALUE` such as `nodes<=5M`, of tables of frames and reports on files; outcomes for tables."""
+"""Assertions, `NAME SIGN VALUE` such as `nodes<=5M`, on tables of frames and reports on files; outcomes for tables."""
 
 from __future__ import annotations
 
-import json
 import math
 import operator
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from decimal import Decimal
 from types import MappingProxyType
 from typing import Any
@@ -17,12 +16,12 @@ import numpy as np
 from ..model.instances import TOTAL
 from ..system.errors import SparklodError
 from ..system.units import PREFIXES
-from ..system.untrusted import near
+from ..system.untrusted import near, parse_json
 from .columns import Column, Row
 
 Number = int | float
 
-#: Statistics by name; percentiles, p0 to p100, come besides.
+#: Statistics by name, besides the percentiles p0 to p100.
 STATISTICS: dict[str, Callable[[Sequence[Number]], Number]] = {
     "min": min,
     "mean": lambda values: math.fsum(values) / len(values),
@@ -70,13 +69,10 @@ SIGNS: dict[str, Callable[[Any, Any], bool]] = {
     ">": operator.gt,
 }
 
-TEXT = re.compile(r"([^<>=!]*)([<>=!]+)([^<>=!]*)")
+TEXT = re.compile(r'([^<>=!]*)([<>=!]+)(\s*["[{].*|[^<>=!]*)', re.DOTALL)
 NUMBER = re.compile(
     r"(?P<number>[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,3})?)\s*(?P<unit>%|[kKMG]?(?:i?B)?)"
 )
-
-#: Values that are no numbers, as JSON spells them. A text is put in quotes, as there.
-WORDS: dict[str, Any] = {"true": True, "false": False, "null": None}
 
 
 class BadAssertionError(SparklodError):
@@ -84,25 +80,23 @@ class BadAssertionError(SparklodError):
 
 
 @dataclass(frozen=True)
-class Condition:
-    """Condition on a named value.
+class Assertion:
+    """Comparison of a value of a report, of a column, or of a statistic of a column.
 
     Attributes:
         sign: one of `SIGNS`.
-        bound: a number, or for == and != anything that JSON has.
+        bound: a number, or for == and != any value of JSON; a number for columns.
+        statistic: of a column, see `statistic`; empty for reports, and if every frame must hold by itself.
     """
 
     text: str
     name: str
     sign: str
     bound: Any
-
-    @classmethod
-    def of(cls, name: str, sign: str, bound: Any) -> Condition:
-        return cls(f"{name}{sign}{json.dumps(bound)}", name, sign, bound)
+    statistic: str = ""
 
     def holds(self, value: Any) -> bool:
-        """Whether a value satisfies the condition. Only numbers have an order; true is not 1."""
+        """Whether a value satisfies the assertion. Only numbers have an order; true is not 1."""
         if self.sign in ("==", "!="):
             same = bool(value == self.bound) and isinstance(value, bool) == isinstance(self.bound, bool)
             return same == (self.sign == "==")
@@ -115,28 +109,25 @@ def is_number(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool) and value == value
 
 
-def parse_condition(text: str, *, example: str) -> Condition:
-    """Return a condition from `NAME SIGN VALUE`.
+def parse_assertion(text: str, *, example: str) -> Assertion:
+    """Return an assertion about any name from `NAME SIGN VALUE`.
 
-    VALUE is a number, which may end in k, M, G, % or a unit of bytes (3MB, 3MiB); or true, false, null or a text in
-    double quotes.
+    VALUE is a number, which may end in k, M, G, % or a unit of bytes (3MB, 3MiB); or true, false, null, or a text in
+    double quotes, a list or an object as in JSON.
     """
     match = TEXT.fullmatch(text)
-    left, sign, right = (part.strip() for part in match.groups()) if match else ("", "", "")
-    if not left or not right:
+    name, sign, right = (part.strip() for part in match.groups()) if match else ("", "", "")
+    if not name or not right:
         raise BadAssertionError(f"{text!r} is not an assertion like {example!r}")
     if sign not in SIGNS:
         raise BadAssertionError(f"{text!r}: {sign} is not one of {' '.join(SIGNS)}")
-    if right in WORDS:
-        bound = WORDS[right]
-    elif right.startswith('"'):
-        try:
-            bound = json.loads(right)
-        except ValueError:
-            raise BadAssertionError(f"{text!r}: {right} is not a text in double quotes") from None
-    else:
-        bound = _number(text, right)
-    return Condition(text.strip(), left, sign, bound)
+    if right not in ("true", "false", "null") and not right.startswith(('"', "[", "{")):
+        return Assertion(text.strip(), name, sign, _number(text, right))
+    try:
+        return Assertion(text.strip(), name, sign, parse_json(right))
+    except ValueError:
+        what = "a text in double quotes" if right.startswith('"') else "a list or an object of JSON"
+        raise BadAssertionError(f"{text!r}: {right} is not {what}") from None
 
 
 def _number(text: str, right: str) -> Number:
@@ -156,19 +147,6 @@ def _number(text: str, right: str) -> Number:
 def number_text(value: Number) -> str:
     """Return a number as exact as a comparison needs it: "1,234,567", "0.2", "0.123457"."""
     return f"{int(value):,}" if float(value).is_integer() and abs(value) < 1e15 else f"{value:.9g}"
-
-
-@dataclass(frozen=True)
-class Assertion(Condition):
-    """Comparison of a column, or of a statistic of it, with a number.
-
-    Attributes:
-        column: a numeric column.
-        statistic: of its cells, see `statistics`; empty if every frame must hold by itself.
-    """
-
-    column: Column
-    statistic: str
 
 
 @dataclass(frozen=True)
@@ -197,12 +175,12 @@ class Outcome:
         if not assertion.statistic:
             some = f"fails in {self.failed:,} of {self.frames:,}" if self.failed else f"holds in all {self.frames:,}"
             return f"{assertion.text}: {some} frames; the worst is {where} with {number_text(self.value)}"
-        found = f"{assertion.text}: {assertion.column.name}_{assertion.statistic} is {number_text(self.value)}"
+        found = f"{assertion.text}: {assertion.name}_{assertion.statistic} is {number_text(self.value)}"
         if self.worst is None:
             return found
         if assertion.statistic in ("first", "last"):
             return f"{found}, in {where}"
-        (cell,) = numbers([self.worst], assertion.column.name)
+        (cell,) = numbers([self.worst], assertion.name)
         return f"{found}; the worst is {where} with {number_text(cell)}"
 
 
@@ -212,24 +190,19 @@ def parse(text: str, columns: Sequence[Column]) -> Assertion:
     NAME is that of a numeric column, the longest one that fits: `pixel_scale_min<1` is about every cell of the column
     pixel_scale_min, `pixel_scale_min_max<1` about the largest of them. NUMBER may end in k, M, G or %.
     """
-    condition = parse_condition(text, example="churn_p95<0.2")
-    column, name = _column(text, condition.name, columns)
-    if not is_number(condition.bound):
-        raise BadAssertionError(f"{text!r}: {condition.bound!r} is not a number such as 0.2, 500k, 2M or 20%")
-    return Assertion(**vars(condition), column=column, statistic=name)
-
-
-def _column(text: str, left: str, columns: Sequence[Column]) -> tuple[Column, str]:
-    every = {column.name: column for column in columns}
+    assertion = parse_assertion(text, example="churn_p95<0.2")
+    left, kinds = assertion.name, {column.name: column.kind for column in columns}
     fitting = [
-        name for name in every if left == name or (left.startswith(f"{name}_") and is_statistic(left[len(name) + 1 :]))
+        name for name in kinds if left == name or (left.startswith(f"{name}_") and is_statistic(left[len(name) + 1 :]))
     ]
     if not fitting:
         raise BadAssertionError(f"{text!r}: {_unknown(left, columns)}")
     name = max(fitting, key=len)
-    if every[name].kind is str:
+    if kinds[name] is str:
         raise BadAssertionError(f"{text!r}: {name} is a text, only numbers can be compared")
-    return every[name], left[len(name) + 1 :]
+    if not is_number(assertion.bound):
+        raise BadAssertionError(f"{text!r}: {assertion.bound!r} is not a number such as 0.2, 500k, 2M or 20%")
+    return replace(assertion, name=name, statistic=left[len(name) + 1 :])
 
 
 def _unknown(left: str, columns: Sequence[Column]) -> str:
@@ -263,7 +236,7 @@ def check(
 
 
 def _outcome(assertion: Assertion, rows: Sequence[Row], empty: Mapping[str, str]) -> Outcome:
-    name = assertion.column.name
+    name = assertion.name
     filled = [row for row in rows if row[name] is not None]
     values = numbers(filled, name)
     if assertion.statistic == "count":

@@ -95,9 +95,9 @@ def test_texts_of_users_may_have_a_byte_order_mark(encoding: str, tmp_path: Path
     instances = tmp_path / "instances.json"
     instances.write_text(json.dumps({"instances": [{"file": str(TREE)}]}), encoding)
     assert read_text(instances).startswith("{")
-    expect = tmp_path / "expect.json"
-    expect.write_text(json.dumps({"max_bytes": 10}), encoding)
-    assert read_text(expect).startswith("{")
+    expect = tmp_path / "expect.txt"
+    expect.write_text("bytes<=10", encoding)
+    assert read_text(expect) == "bytes<=10"
 
 
 @pytest.mark.parametrize("manifest", MANIFESTS)

@@ -54,13 +54,13 @@ def test_a_wrong_picture_size_is_quoted(size: str, said: str, capsys: Capture) -
 
 
 @pytest.mark.parametrize(("size", "status"), [("3MB", 0), ("3MiB", 0), ("10", 3), ("0.01kB", 3), ("1GiB", 0)])
-def test_max_bytes_takes_units(size: str, status: int) -> None:
-    assert run(["inspect", str(TREE), "--max-bytes", size]) == status
+def test_sizes_in_assertions_have_units(size: str, status: int) -> None:
+    assert run(["inspect", str(TREE), "--assert", f"bytes<={size}"]) == status
 
 
 @pytest.mark.parametrize("size", ["-1", "3Mbit", "3 apples", "1.5", "3iB"])
 def test_a_text_that_is_not_a_size_is_wrong_usage(size: str, capsys: Capture) -> None:
-    assert run(["inspect", str(TREE), f"--max-bytes={size}"]) == 2
+    assert run(["simplify", str(TREE), f"--max-bytes={size}"]) == 2
     assert f"{size!r} is not a size: whole bytes, such as 3000000, 3MB or 3MiB" in capsys.readouterr().err
 
 
@@ -157,8 +157,8 @@ def test_counts_of_one_have_a_singular_noun(tmp_path: Path, capsys: Capture) -> 
         ["build-lod", lod, "--unlod", "-o", tmp_path / "back.ply"],
         ["inspect", PLAIN],
         ["inspect", lod],
-        ["inspect", lod, "--min-splats", 2],
-        ["inspect", PLAIN, "--min-splats", 2],
+        ["inspect", lod, "--assert", "leaves>=2"],
+        ["inspect", PLAIN, "--assert", "leaves>=2"],
         ["inspect", lod, "--leaves-of", FIXTURES / "sh1.ply"],
         ["inspect", TREE, "--leaves-of", PLAIN],
         ["traverse", lod, *look, "--summary"],

@@ -11,7 +11,7 @@ TREE, PLAIN = FIXTURES / "golden" / "hand-tree-v3.spz", FIXTURES / "golden" / "s
 NODES, LEAVES, DEPTH = 9, 6, 2
 
 
-def written(folder: Path, text: str, name: str = "expect.json") -> Path:
+def written(folder: Path, text: str, name: str = "expect.txt") -> Path:
     path = folder / name
     path.write_text(text)
     return path

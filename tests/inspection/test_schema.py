@@ -144,7 +144,8 @@ def test_reports_of_unreadable_files_follow_the_schema(tmp_path: Path, path: str
 
 def test_reports_that_the_command_prints_follow_the_schema(lod: Path, capsys: Capture) -> None:
     """With findings of expectations, too; many files give JSON lines."""
-    options = ["--json", "--stats", "--check", "--sh", "0", "--max-bytes", "1", "--max-growth", "1"]
+    options = ["--json", "--stats", "--check"]
+    options += [part for text in ("bytes<=1", "sh==0", "growth<=1") for part in ("--assert", text)]
     assert run(["inspect", str(lod), "missing.spz", str(FIXTURES / "sh2.ply"), *options]) == 3
     reports = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert [faults(report) for report in reports] == [[], [], []]

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sparklod_cli.system.untrusted import MAX_DEPTH, parse_json, parse_toml, quoted_value, well_formed
+from sparklod_cli.system.untrusted import MAX_DEPTH, parse_json, quoted_value, well_formed
 
 VALUES = st.recursive(
     st.none() | st.booleans() | st.integers(-(10**18), 10**18) | st.floats(allow_nan=False) | st.text(),
@@ -39,22 +39,11 @@ def test_json_nested_more_than_64_deep_is_refused(opening: str, closing: str) ->
             parse_json(nested(depth, opening, closing))
 
 
-def test_toml_nested_too_deep_is_refused() -> None:
-    assert parse_toml(".".join("a" * (MAX_DEPTH - 1)) + " = 1")
-    for text in (".".join("a" * 3000) + " = 1", f"[{'.'.join('a' * 3000)}]", f"a = {nested(3000, '[', ']')}"):
-        with pytest.raises(ValueError, match="it is nested more than 64 deep"):
-            parse_toml(text)
-
-
 @pytest.mark.parametrize("digits", ["9" * 20, "9" * 5000, "-" + "9" * 5000, "1" + "0" * 4000])
-def test_numbers_of_too_many_digits_are_floats_or_refused(digits: str) -> None:
-    """Of a whole number beyond 64 bits there is a float, with which nothing can go on for long, or that fails."""
+def test_numbers_of_too_many_digits_are_floats(digits: str) -> None:
+    """Arithmetic with whole numbers of thousands of digits would take long."""
     for value in parse_json(f'[{digits}, {{"a": {digits}}}]'):
         assert isinstance(value["a"] if isinstance(value, dict) else value, float)
-    with pytest.raises(ValueError, match=r"64 bits|limit"):
-        parse_toml(f"a = {digits}")
-    with pytest.raises(ValueError, match="64 bits"):
-        parse_toml(f"a = [{{ b = 0x{'f' * 5000} }}]")
 
 
 @given(st.recursive(ANY_TEXT, lambda inner: st.lists(inner) | st.dictionaries(ANY_TEXT, inner), max_leaves=9))

@@ -33,9 +33,7 @@ def test_every_assertion_is_understood(name: str, statistic: str | None, sign: s
     for text in (f"{left}{sign}{bound!r}", f" {left} {sign}  {bound!r} "):
         assertion = parse(text, COLUMNS)
         # A column of that name is meant, where there is one, and not a statistic of a shorter one.
-        assert (assertion.column.name, assertion.statistic) == (
-            (left, "") if left in NUMERIC else (name, statistic or "")
-        )
+        assert (assertion.name, assertion.statistic) == ((left, "") if left in NUMERIC else (name, statistic or ""))
         assert (assertion.sign, assertion.bound) == (sign, bound)
 
 
@@ -108,7 +106,7 @@ def test_bounds_may_have_units_and_shares(text: str, bound: float) -> None:
 )
 def test_the_longest_column_name_is_taken(text: str, column: str, statistic: str) -> None:
     assertion = parse(text, COLUMNS)
-    assert (assertion.column.name, assertion.statistic) == (column, statistic)
+    assert (assertion.name, assertion.statistic) == (column, statistic)
 
 
 @pytest.mark.parametrize(

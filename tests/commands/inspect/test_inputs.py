@@ -29,8 +29,8 @@ def test_an_unpacked_sog_counts_as_one_file(tmp_path: Path, capsys: Capture) -> 
     size = sum(path.stat().st_size for path in FOLDER.iterdir())
     assert (folder["bytes"], folder["splats"], folder["format"]) == (size, 60, "SOG 2")
     assert folder | {"file": ""} == meta | {"file": ""}
-    assert inspect(FOLDER, "--check", "--max-bytes", size) == 0
-    assert inspect(FOLDER, "--max-bytes", size - 1) == 3
+    assert inspect(FOLDER, "--check", "--assert", f"bytes<={size}") == 0
+    assert inspect(FOLDER, "--assert", f"bytes<={size - 1}") == 3
     broken = tmp_path / "sog"
     shutil.copytree(FOLDER, broken)
     (broken / "quats.webp").unlink()
@@ -172,8 +172,8 @@ def test_what_cannot_be_understood_is_wrong_usage(text: str, message: str, capsy
 
 
 def test_assertions_of_a_file_and_of_options_all_count(tmp_path: Path, capsys: Capture) -> None:
-    path = tmp_path / "expect.toml"
-    path.write_text('assert = ["nodes<9"]\nmax_bytes = 1_000_000\n')
+    path = tmp_path / "expect.txt"
+    path.write_text("nodes<9\nbytes<=1MB\n")
     assert inspect(TREE, "--expect", path, "--assert", "leaves<6") == 3
     assert [line.split(": ")[3] for line in capsys.readouterr().out.splitlines()] == ["nodes<9", "leaves<6"]
 

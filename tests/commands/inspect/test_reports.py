@@ -82,19 +82,15 @@ def test_the_exit_code_says_whether_a_file_was_read_and_checked(
         ([TREE, "--json", "--histogram", "scale"], "--histogram cannot be used with --"),
         ([TREE, "--field", "splats", "--histogram", "scale"], "--histogram cannot be used with --"),
         ([TREE, "--check", "--stats"], "--stats cannot be used with --check unless --json is given"),
-        ([TREE, "--sh", "0", "--stats"], "--stats cannot be used with expectations unless --json is given"),
+        ([TREE, "--assert", "sh==0", "--stats"], "--stats cannot be used with expectations unless --json is given"),
         ([TREE, "--check", "--json", "--format", "github"], "--format cannot be used with --"),
         ([TREE, "--check", "--field", "splats", "--format", "text"], "--format cannot be used with --"),
         ([TREE, "--plot-level", "3"], "--plot-level needs --plot or --html"),
         ([TREE, "--plot-by", "size"], "--plot-by needs --plot or --html"),
         ([TREE, "--plot-by", "taste"], "--plot-by"),
         ([TREE, "--plot-level", "-1"], "--plot-level"),
-        ([TREE, "--max-bytes", "-1"], "--max-bytes"),
-        ([TREE, "--max-bytes", "1 mile"], "--max-bytes"),
-        ([TREE, "--min-splats", "few"], "--min-splats"),
-        ([TREE, "--sh", "4"], "--sh"),
-        ([TREE, "--max-growth", "0.9"], "--max-growth"),
-        ([TREE, "--max-growth", "nan"], "--max-growth"),
+        ([TREE, "--assert", "bytes<1 mile"], "--assert 'bytes<1 mile': '1 mile' is not a number"),
+        ([TREE, "--assert", "growth<nan"], "--assert 'growth<nan': 'nan' is not a number"),
         ([TREE, "--threads", "0"], "--threads"),
         ([TREE, "--histogram", "beauty"], "--histogram: there is no quantity"),
     ],
@@ -165,7 +161,7 @@ def test_a_process_prints_findings_and_exits_3() -> None:
     done = sparklod(BROKEN, TREE, "--check")
     assert (done.returncode, done.stdout.count("\n"), done.stderr.count("\n")) == (3, 1, 1)
     assert "Traceback" not in done.stderr
-    done = sparklod(TREE, "--field", "tree.leaves", "--check", "--require-lod")
+    done = sparklod(TREE, "--field", "tree.leaves", "--check", "--assert", "lod==true")
     assert (done.returncode, done.stdout, done.stderr) == (0, "6\n", "")
 
 
@@ -249,7 +245,7 @@ def test_json_is_one_object_and_one_line_a_file(capsys: Capture) -> None:
 
 
 def test_json_has_the_parts_that_options_ask_for(capsys: Capture) -> None:
-    assert inspect("--json", "--stats", "--check", "--sh", "1", BROKEN) == 3
+    assert inspect("--json", "--stats", "--check", "--assert", "sh==1", BROKEN) == 3
     out, err = capsys.readouterr()
     (record,) = records(out)
     assert err == ""
