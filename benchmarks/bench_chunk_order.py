@@ -26,10 +26,11 @@ from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.simulation.frames import chunks_of
 from sparklod_cli.system.threads import processors
+from sparklod_cli.viewers import cut as viewer_cut
+from sparklod_cli.viewers.cut import TreeCut
 from sparklod_cli.viewers.network import ChunkStream
 from sparklod_cli.viewers.read_scenes import read_scenes
-from sparklod_cli.viewers.scenes import Scenes, view_of
-from sparklod_cli.viewers.spark import Traversal, TreeCut
+from sparklod_cli.viewers.scenes import Scenes
 from sparklod_cli.viewers.viewer_settings import LodSettings, Network, pixel_limit
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -116,19 +117,19 @@ class Viewer:
     """A viewer of a file: Spark's cuts, and a stream of its chunks."""
 
     scenes: Scenes
-    traversal: Traversal
+    traversal: viewer_cut.Viewer
 
     @classmethod
     def of(cls, path: Path) -> Viewer:
         """A viewer with Spark's foveation."""
         scenes = read_scenes([Instance(path, "scene")], threads=processors())
-        return cls(scenes, scenes.traversal(LodSettings()))
+        return cls(scenes, scenes.viewer(LodSettings()))
 
     def cut(self, at: Camera, share: float, resident: np.ndarray | None = None) -> TreeCut:
         """The cut with a budget of a share of the leaves."""
         smallest = pixel_limit(at.fov_y, at.height)
         budget = max(1, round(share * self.scenes.leaves))
-        return self.traversal.cut(view_of(at), budget=budget, smallest=smallest, resident=resident)
+        return self.traversal.cut(at, budget=budget, smallest=smallest, resident=resident)
 
     def per_chunk(self, at: Camera, share: float) -> np.ndarray:
         """The share of the whole cut's nodes that each chunk has."""
@@ -145,7 +146,7 @@ class Viewer:
         """Bytes and seconds until `MOST` of the cut is resident, from a cold start."""
         stream, per_chunk = self.stream(), self.per_chunk(at, share)
         while per_chunk[stream.cache.resident()].sum() < MOST:
-            stream.want(self.cut(at, share, stream.cache.resident()).chunks())
+            stream.want(self.cut(at, share, stream.cache.resident()).wanted())
             while not stream.take_arrivals() and stream.step():
                 pass
         return stream.received, stream.now
@@ -156,7 +157,7 @@ class Viewer:
         for at in path:
             stream.advance(at.time)
             resident = stream.cache.resident()
-            stream.want(self.cut(at, share, resident).chunks())
+            stream.want(self.cut(at, share, resident).wanted())
             shares.append(float(self.per_chunk(at, share)[resident].sum()))
         return stream.received, float(np.mean(shares)), float(np.mean(np.array(shares) >= MOST))
 
@@ -208,7 +209,7 @@ def main() -> None:
         row(*["---"] * 8)
         for order, seconds, size, viewer in made:
             budgets = [SHARES[number % len(SHARES)] for number in range(len(around))]
-            touched = [len(viewer.cut(at, share).chunks()) for at, share in zip(around, budgets, strict=True)]
+            touched = [len(viewer.cut(at, share).wanted()) for at, share in zip(around, budgets, strict=True)]
             cold = np.array([viewer.cold(at, share) for at, share in zip(around, budgets, strict=True)])
             megabytes = cold[:, 0] / 1e6
             row(

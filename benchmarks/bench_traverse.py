@@ -29,9 +29,9 @@ from sparklod_cli.model.splats import Splats
 from sparklod_cli.model.traversed import Nodes
 from sparklod_cli.system.threads import on_threads, ordered_map, processors
 from sparklod_cli.viewers.continuous import ContinuousCuts
+from sparklod_cli.viewers.cut import CutView, Forest, TreeInstance
 from sparklod_cli.viewers.frame_statistics import Changes, measure
-from sparklod_cli.viewers.scenes import view_of
-from sparklod_cli.viewers.spark import CutView, Forest, Traversal, TreeInstance
+from sparklod_cli.viewers.spark import SparkViewer
 
 #: Nodes of the trees of tiled scenes in millions, budgets in nodes, and frames of their path.
 MILLIONS, BUDGETS, FRAMES = (0.5, 1, 2, 5, 10, 20), (50_000, 200_000, 500_000, 1_500_000), 24
@@ -152,7 +152,7 @@ class Measured:
     def __init__(self, flight: Flight) -> None:
         self._labels, self._views = flight.labels, flight.views
         self._forest = Forest([flight.nodes])
-        self._traversal = Traversal(self._forest, [TreeInstance()])
+        self._traversal = SparkViewer(self._forest, [TreeInstance()])
         self._depths = flight.nodes.tree.depths()
         small = len(flight.nodes.size) <= CONTINUOUS_UP_TO
         self._continuous = ContinuousCuts(self._traversal) if small else None
@@ -213,7 +213,7 @@ class Measured:
             for view in self._views:
                 cut = self._traversal.cut(view, budget=budget)
                 seconds.append(
-                    _seconds(lambda cut=cut, view=view: measure(self._forest, self._depths, cut, view, size=SIZE))
+                    _seconds(lambda cut=cut, view=view: measure(self._forest, cut, view, size=SIZE))
                     + _seconds(lambda cut=cut: changes.next(cut))
                 )
         return statistics.mean(seconds)
@@ -254,7 +254,7 @@ def real_flights(paths: Iterable[Path], method: str = "quality") -> Iterator[Fli
     """Trees of scenes, from the twelve cameras around them."""
     for path in paths:
         scene = Scene(load(path).with_max_sh(0))
-        views = [view_of(camera) for camera in cameras_of("around", scene, SIZE)]
+        views = list(cameras_of("around", scene, SIZE))
         yield Flight({"tree": path.name}, _as_stored(sparklod.build_lod(scene, method=method)), views)
 
 

@@ -22,7 +22,7 @@ from sparklod_cli.render.renderer import Renderer
 from sparklod_cli.render.settings import RenderSettings
 from sparklod_cli.system.errors import FormatError, InvalidSplatsError
 from sparklod_cli.viewers.read_scenes import read_scenes
-from sparklod_cli.viewers.scenes import CutFinder, Scenes, view_of
+from sparklod_cli.viewers.scenes import CutFinder, Scenes
 from sparklod_cli.viewers.viewer_settings import LodSettings
 from tests.conftest import FIXTURES
 from tests.render.drawables import camera
@@ -46,9 +46,9 @@ def test_a_cut_is_that_of_the_traversal() -> None:
     view = seen(scenes)
     cut = CutFinder(scenes, settings).cut(view)
     town, plain, tree = cut.parts
-    traversal = read_scenes(at(TOWN, TREE), trees_only=True).traversal(settings)
+    traversal = read_scenes(at(TOWN, TREE), trees_only=True).viewer(settings)
     limit = settings.limit(view.fov_y, view.height)
-    found = traversal.cut(view_of(view), budget=3000, smallest=limit)
+    found = traversal.cut(view, budget=3000, smallest=limit)
     expected = found.indices()
     assert (cut.reason, cut.pixel_scale) == (found.reason, found.least)
     assert len(cut) == len(found) + len(plain.index) == len(cut.splats)

@@ -17,7 +17,7 @@ from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.model.traversed import DetailScene
 from sparklod_cli.render.color_by import numbers_of, scale_of_splats
-from sparklod_cli.viewers.loaded_scene import LoadedDetail
+from sparklod_cli.viewers.playcanvas import LoadedDetail
 from sparklod_cli.viewers.read_scenes import read_scenes
 from sparklod_cli.viewers.scenes import CutFinder, Scenes
 from sparklod_cli.viewers.viewer_settings import PLAYCANVAS_BUDGET, DetailRule, LodSettings

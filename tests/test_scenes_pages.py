@@ -21,10 +21,10 @@ from sparklod_cli.model.lod_tree import CHUNK_NODES, LodTree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS
 from sparklod_cli.system.errors import FormatError, TreeError
-from sparklod_cli.viewers import loaded_scene
-from sparklod_cli.viewers.loaded_scene import PagedForest, PagedScene
+from sparklod_cli.viewers import paging
+from sparklod_cli.viewers.paging import PagedScene
 from sparklod_cli.viewers.read_scenes import read_scenes
-from sparklod_cli.viewers.scenes import CutFinder, Scenes, view_of
+from sparklod_cli.viewers.scenes import CutFinder, Scenes
 from sparklod_cli.viewers.viewer_settings import LodSettings, Network, StreamingSettings
 from tests.conftest import FIXTURES
 from tests.lod.forests import transform
@@ -56,7 +56,7 @@ def file(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def little_memory(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """As if files did not fit into memory."""
     with pytest.MonkeyPatch.context() as patch:
-        for module in ("io.rad_file", "viewers.loaded_scene"):
+        for module in ("io.rad_file", "viewers.paging"):
             patch.setattr(f"sparklod_cli.{module}.available_memory", lambda: 1 << 20)
         yield
 
@@ -76,8 +76,8 @@ def both(chosen: list[Instance], **settings: str) -> tuple[Scenes, Scenes]:
 
 
 def chunks_read(scenes: Scenes) -> int:
-    assert isinstance(scenes.forest, PagedForest)
-    return int(scenes.forest.present().sum())
+    assert scenes.forest.pager is not None
+    return int(scenes.forest.pager.present().sum())
 
 
 @pytest.mark.usefixtures("little_memory")
@@ -114,9 +114,7 @@ def test_cuts_are_those_of_a_tree_read_whole(file: Path, budget: int, limit: flo
     settings = LodSettings(budget, SPARK, pixel_scale_limit=limit)
     for at in (NEAR, *around(2).cameras):
         smallest = settings.limit(at.fov_y, at.height)
-        one, other = (
-            scenes.traversal(settings).cut(view_of(at), budget=budget, smallest=smallest) for scenes in (whole, paged)
-        )
+        one, other = (scenes.viewer(settings).cut(at, budget=budget, smallest=smallest) for scenes in (whole, paged))
         for name in ("views", "reason", "missing", "least", "stop", "demand"):
             assert np.array_equal(getattr(one, name), getattr(other, name)), name
         for name in ("node", "limit"):  # whose order is that of the search
@@ -131,10 +129,10 @@ def test_cuts_are_those_of_a_tree_read_whole(file: Path, budget: int, limit: flo
 def test_only_chunks_are_read_that_cuts_need(file: Path) -> None:
     _, paged = both([Instance(file, "a")])
     assert chunks_read(paged) == 1  # the root's
-    traversal = paged.traversal(LodSettings(3_000))
-    demand = np.zeros(len(paged.forest.present()), np.bool_)
+    traversal = paged.viewer(LodSettings(3_000))
+    demand = np.zeros(paged.forest.chunks, np.bool_)
     for at in (NEAR, NEAR, *around(3).cameras):
-        demand |= traversal.cut(view_of(at), budget=3_000).demand > 0
+        demand |= traversal.cut(at, budget=3_000).demand > 0
     assert demand.sum() <= chunks_read(paged) < len(demand)
 
 
@@ -168,7 +166,7 @@ def test_cameras_see_what_they_see_of_scenes_read_whole(
         spoiled = Scene(dataclasses.replace(scene.splats, center=center), scene.tree)
         file = tmp_path / "b.rad"
         file.write_bytes(b"".join(rad.encode(spoiled, WriteOptions(compression_level=1), threads=2)))
-    for module in (framing, loaded_scene):
+    for module in (framing, paging):
         monkeypatch.setattr(module, "SAMPLE", 50_000)
     whole, paged = (scenes.balls() for scenes in both(instances(file)))
     assert len(paged.radius) < len(whole.radius) / 4

@@ -108,10 +108,10 @@ def test_splats_of_an_instance_are_placed() -> None:
 def test_the_forest_has_the_nodes_of_the_files() -> None:
     made = read_scenes(five())
     instances = made.tree_instances(Cones())
-    assert [tree.file for tree in made.trees] == [TREE, TOWN, HAND]
+    assert [tree.file for tree in made.with_cuts] == [TREE, TOWN, HAND]
     assert [instance.tree for instance in instances] == [0, 1, 0, 2, 2]
     assert [instance.lod_scale for instance in instances] == [1, 2, 3, 4, 5]
-    for tree, (start, end) in zip(made.trees, itertools.pairwise(made.forest.node_base), strict=True):
+    for tree, (start, end) in zip(made.with_cuts, itertools.pairwise(made.forest.node_base), strict=True):
         scene = read_scene(tree.file)
         assert scene.tree is not None
         part = made.forest.nodes[start:end]
@@ -147,13 +147,13 @@ def test_a_file_is_opened_once(monkeypatch: pytest.MonkeyPatch) -> None:
         return original(file)
 
     monkeypatch.setattr(reading, "opened", counted)
-    assert len(read_scenes(five()).trees) == 3
+    assert len(read_scenes(five()).with_cuts) == 3
     assert read == [TREE, TOWN, HAND]
 
 
 def test_chunks_share_the_bytes_of_a_file() -> None:
     made = read_scenes(five())
-    for tree in made.trees:
+    for tree in made.with_cuts:
         sizes = tree.chunk_bytes()
         assert tree.file is not None
         assert sizes.sum() == tree.bytes == tree.file.stat().st_size
@@ -172,25 +172,25 @@ def test_chunks_of_rad_have_the_sizes_that_they_have_in_the_file(tmp_path: Path)
     whole, parts, town = read_scenes(
         [Instance(path) for path in (tmp_path / "whole.rad", tmp_path / "parts.rad", TOWN)]
     ).loaded
-    assert whole.header_bytes + whole.chunk_bytes().sum() == (tmp_path / "whole.rad").stat().st_size
-    assert parts.header_bytes == (tmp_path / "parts.rad").stat().st_size
+    assert whole.scene.header["header_bytes"] + whole.chunk_bytes().sum() == (tmp_path / "whole.rad").stat().st_size
+    assert parts.scene.header["header_bytes"] == (tmp_path / "parts.rad").stat().st_size
     files = [(tmp_path / f"parts-{number}.radc").stat().st_size for number in range(3)]
     assert parts.chunk_bytes().tolist() == whole.chunk_bytes().tolist() == files
-    assert town.header_bytes == 0
+    assert town.headers == ()
 
 
 def test_chunks_of_another_size_than_sparks_are_not_those_that_it_streams() -> None:
     """Spark's pages have 65,536 nodes; a file of smaller chunks counts as if it were cut evenly."""
-    (tree,) = read_scenes([Instance(FIXTURES / "golden" / "sh1-tree.rad")]).trees
+    (tree,) = read_scenes([Instance(FIXTURES / "golden" / "sh1-tree.rad")]).with_cuts
     assert tree.scene.chunk_bytes is not None
     assert tree.scene.header["chunk_size"] != CHUNK_NODES
     assert tree.chunk_bytes().tolist() == [tree.bytes]
-    assert tree.header_bytes == 0
+    assert tree.headers == ()
 
 
 @pytest.mark.parametrize("nodes", [1, CHUNK_NODES - 1, CHUNK_NODES, CHUNK_NODES + 1, 3 * CHUNK_NODES])
 def test_chunks_end_where_nodes_do(nodes: int) -> None:
-    (tree,) = read_scenes([Instance(TREE, "tree")]).trees
+    (tree,) = read_scenes([Instance(TREE, "tree")]).with_cuts
     sizes = dataclasses.replace(tree, splats=Splats.zeros(nodes, 0), bytes=10**12 + 7).chunk_bytes()
     assert len(sizes) == -(-nodes // CHUNK_NODES)
     assert sizes.sum() == 10**12 + 7
@@ -243,7 +243,7 @@ def test_faulty_trees_are_refused_or_traversed(file: Path) -> None:
     except SparklodError as error:
         assert str(error).startswith(f"{file}: ")
     else:
-        assert made.trees[0].depth.max() < len(made.forest.nodes)
+        assert made.with_cuts[0].depth.max() < len(made.forest.nodes)
 
 
 def test_names_are_those_of_files() -> None:

@@ -21,7 +21,7 @@ from ..model.splats import COLUMNS
 from ..system.progress import Progress, silent
 from ..viewers.loaded_scene import TRAVERSED
 from ..viewers.read_scenes import read_scenes
-from ..viewers.scenes import CutFinder, CutSource
+from ..viewers.scenes import CutFinder
 
 if TYPE_CHECKING:
     from ..cameras.frame import Settings
@@ -139,14 +139,14 @@ def draw_files(
 
 def _source(
     scenes: Scenes, budget: Budget | None, lod: LodSettings, loading: tuple[StreamingSettings, float] | None = None
-) -> CutSource:
+) -> CutFinder:
     settings = None if budget is None else dataclasses.replace(lod, budget=scenes.splats_of(budget))
     try:
         if loading is None or settings is None or not scenes.with_cuts:
             return CutFinder(scenes, settings)
-        from ..simulation.frames import LoadingCuts
+        from ..simulation.frames import Loader
 
-        return LoadingCuts(scenes, settings, *loading)
+        return Loader(scenes, settings, *loading)
     except ValueError as error:
         raise UnfitError(str(error)) from None
 

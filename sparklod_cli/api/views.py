@@ -29,7 +29,7 @@ from ..render.settings import RenderSettings
 from ..system.errors import CameraPathError, FormatError, memory_errors_translated
 from ..system.threads import on_threads, thread_count
 from ..tables.columns import Table
-from ..viewers.loaded_scene import UNNAMED
+from ..viewers.loaded_scene import STREAMED_SOG, TILES, UNNAMED
 from ..viewers.read_scenes import read_scenes
 from ..viewers.scenes import Cut, CutFinder, FixedCut, Scenes
 from ..viewers.viewer_settings import BLEND, PLAYCANVAS_BUDGET, LodSettings
@@ -230,7 +230,7 @@ def _named(instances: Sequence[Instance]) -> list[Instance]:
 def trees_of(viewed: Viewed, threads: int, precision: str) -> Scenes:
     """Return scenes as `scenes_of`; raise a `FormatError` where one has neither a tree nor detail levels."""
     scenes = scenes_of(viewed, threads, precision)
-    plain = next((loaded.name for loaded in scenes.loaded if not loaded.has_cuts), None)
+    plain = next((loaded.name for loaded in scenes.loaded if loaded.kind is None), None)
     if plain is not None:
         raise FormatError(f"{plain}: it is not a Level-of-Detail tree; build_lod makes one of it")
     return scenes
@@ -240,10 +240,12 @@ def _lod(
     scenes: Scenes, budget: BudgetLike | None, settings: LodSettings | None, continuous: bool | float
 ) -> LodSettings:
     if settings is None:
-        settings = LodSettings(PLAYCANVAS_BUDGET) if scenes.details else LodSettings()
+        settings = LodSettings(PLAYCANVAS_BUDGET) if scenes.kind == STREAMED_SOG else LodSettings()
     if budget is not None:
-        if scenes.tiled:
-            raise ValueError(f"{scenes.tiled[0].name} is 3D Tiles, which CesiumJS draws without a budget; leave it out")
+        if scenes.kind == TILES:
+            raise ValueError(
+                f"{scenes.with_cuts[0].name} is 3D Tiles, which CesiumJS draws without a budget; leave it out"
+            )
         settings = replace(settings, budget=budget_like(budget).of(scenes.leaves))
     if continuous:
         if continuous is not True and not continuous > 1:

@@ -25,8 +25,9 @@ from ..render import rasterizer
 from ..render.kernels.shade import add_sh
 from ..render.rasterizer import Image, ShadedSplats, draw
 from ..render.settings import RasterSettings
+from ..viewers.cut import Forest, TreeInstance
 from ..viewers.loaded_scene import nodes_of
-from ..viewers.spark import CutView, Forest, Traversal, TreeInstance
+from ..viewers.spark import SparkViewer
 from .kernels.adam import MOST_D, Columns, FitBounds
 from .kernels.view import by_image, mark_seen, squared_differences
 from .settings import SHARES
@@ -62,13 +63,12 @@ class FittedNodes:
         self.leaves: Index = np.flatnonzero(tree.is_leaf)
         self.fitted: Index = np.flatnonzero(~tree.is_leaf)
         self._forest = Forest([nodes_of(nodes, tree, PLAIN, precision="float16", threads=threads)])
-        self._traversal = Traversal(self._forest, [TreeInstance(foveation=Cones())])
+        self._viewer = SparkViewer(self._forest, [TreeInstance(foveation=Cones())])
 
     def cut(self, camera: Camera, share: float) -> Index:
         """Return the nodes, ascending, of a cut of a share of the leaves, without pixel-scale limit or foveation."""
         budget = max(1, int(share * len(self.leaves)))
-        view = CutView(camera.camera_to_world, camera.fov_x, camera.fov_y)
-        return self._traversal.cut(view, budget=budget).indices()[0].astype(np.int64)
+        return self._viewer.cut(camera, budget=budget).indices()[0].astype(np.int64)
 
     def visible(self, index: Index, camera: Camera) -> tuple[Index, ShadedSplats]:
         """Return the nodes of `index` that a camera may see, and how it sees them."""

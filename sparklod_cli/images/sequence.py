@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from ..cameras.sources import CameraPath
     from ..render.renderer import DrawnPicture
     from ..render.settings import RenderSettings
-    from ..viewers.scenes import CutSource
+    from ..viewers.scenes import CutFinder
     from .output import PictureOutput
     from .pixels import Color, Pixels
 
@@ -84,13 +84,13 @@ class _Frame:
 
 
 def write_pictures(
-    source: CutSource,
+    source: CutFinder,
     path: CameraPath,
     output: PictureOutput,
     render: RenderSettings,
     settings: PictureSettings,
     *,
-    reference: CutSource | None = None,
+    reference: CutFinder | None = None,
     overwrite: bool = False,
     progress: Progress = silent,
 ) -> WrittenPictures:

@@ -5,12 +5,13 @@ from __future__ import annotations
 import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .gaussian import spark_size
-from .lod_tree import LodTree
+from .lod_tree import CHUNK_NODES, LodTree
 from .scene import Scene, facts_of
 from .splats import FloatArray, Splats
 
@@ -26,10 +27,31 @@ class Nodes:
     size: FloatArray
     tree: LodTree
 
+    #: Whether nodes are read as cuts need them.
+    paged: ClassVar[bool] = False
+
     @classmethod
     def of(cls, splats: Splats, tree: LodTree) -> Nodes:
         """Return the nodes of a tree in full precision, with Spark's feature sizes."""
         return cls(splats.center, spark_size(splats), tree)
+
+    @property
+    def count(self) -> int:
+        return len(self.size)
+
+    @property
+    def chunks(self) -> int:
+        return -(-self.count // CHUNK_NODES)
+
+    @property
+    def depth(self) -> NDArray[np.int32]:
+        return self.tree.depths()
+
+    def fill(self, rows: NDArray[np.void]) -> None:
+        """Fill (N,) `pixel_scale.NODE`."""
+        rows["x"], rows["y"], rows["z"] = self.center.T
+        rows["size"] = self.size
+        rows["child_start"], rows["child_count"] = self.tree.first_child(), self.tree.child_count
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,8 +14,8 @@ from ..model.gaussian import lod_opacity, moved, spark_size
 from ..model.splats import FloatArray
 from ..system.errors import SparklodError
 from ..system.progress import Progress, silent
-from ..viewers.loaded_scene import Index, LoadedScene
-from ..viewers.scenes import CutSource, Part
+from ..viewers.loaded_scene import TREE, Index, LoadedScene
+from ..viewers.scenes import CutFinder, Part
 from .color_scales import (
     CLIPPED,
     MAGMA,
@@ -79,16 +79,16 @@ def values_of(by: str, part: Part) -> FloatArray:
     return spark_size(part.splats) * np.float32(np.cbrt(np.linalg.det(part.object_to_world[:3, :3])))
 
 
-def scale_of_splats(by: str, source: CutSource, cameras: Sequence[Camera], progress: Progress = silent) -> Scale:
+def scale_of_splats(by: str, source: CutFinder, cameras: Sequence[Camera], progress: Progress = silent) -> Scale:
     """Return the scale of a quantity of `values_of`, for all splats that cameras may see; of whole numbers, do see.
 
     `SparklodError` by level, where no file has any.
     """
     candidates = source.candidates().parts
-    if by == "level" and not any(part.scene.has_cuts for part in candidates):
+    if by == "level" and not any(part.scene.kind for part in candidates):
         raise SparklodError("there are no levels to colour by: no file is a Level-of-Detail tree, or Streamed SOG")
     if by == "level":
-        detail = not any(part.scene.is_tree for part in candidates)
+        detail = not any(part.scene.kind == TREE for part in candidates)
         return _whole(by, "detail level" if detail else "tree depth", source, cameras, progress)
     if by == "chunk":
         return _whole(by, by, source, cameras, progress)
@@ -103,7 +103,7 @@ def scale_of_splats(by: str, source: CutSource, cameras: Sequence[Camera], progr
     return Scale(smooth("feature size", np.empty(0), PLASMA, marks), low, high, log=True)
 
 
-def scale_of_depth(source: CutSource, cameras: Sequence[Camera], settings: RasterSettings) -> Scale:
+def scale_of_depth(source: CutFinder, cameras: Sequence[Camera], settings: RasterSettings) -> Scale:
     """Return the scale from the nearest splats to the farthest that cameras see, but for a few."""
     parts = source.candidates().parts
     every = max(1, sum(len(part.index) for part in parts) // SAMPLE)
@@ -130,7 +130,7 @@ def scale_of_overdraw(counts: Sequence[FloatArray]) -> Scale:
     return _linear("overdraw", 0.0, max(1.0, float(math.ceil(most))), MAGMA, ends=True)
 
 
-def _whole(by: str, title: str, source: CutSource, cameras: Sequence[Camera], progress: Progress) -> Scale:
+def _whole(by: str, title: str, source: CutFinder, cameras: Sequence[Camera], progress: Progress) -> Scale:
     """Return the scale from the least to the most that some cameras see; others may see less, or more."""
     every = -(-len(cameras) // CUTS)
     some = cameras[::every]

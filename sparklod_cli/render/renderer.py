@@ -15,7 +15,7 @@ from ..cameras.camera import Camera
 from ..model.falloff import MIN_ALPHA
 from ..model.gaussian import size_factor
 from ..system.progress import Progress, silent
-from ..viewers.scenes import Cut, CutSource
+from ..viewers.scenes import Cut, CutFinder
 from . import rasterizer
 from .kernels.raster import count_fragments, draw_discs
 from .rasterizer import Image, ShadedSplats, shade
@@ -64,7 +64,7 @@ class Renderer:
     """
 
     def __init__(
-        self, source: CutSource, settings: RenderSettings, cameras: Sequence[Camera], *, progress: Progress = silent
+        self, source: CutFinder, settings: RenderSettings, cameras: Sequence[Camera], *, progress: Progress = silent
     ) -> None:
         self.source, self.settings = source, settings
         if settings.device == "cuda" and settings.backend != "numba":

@@ -14,10 +14,11 @@ from ..model.instances import TOTAL
 from ..system.progress import Progress, silent
 from ..system.threads import ordered_map
 from ..tables.columns import Row
+from ..viewers.cut import TreeCut, Viewer
 from ..viewers.frame_statistics import Changes, CutStatistics, measure
-from ..viewers.network import Chunks, ChunkStream, header_answers
-from ..viewers.scenes import Cut, CutFinder, Scenes, view_of
-from ..viewers.spark import TreeCut
+from ..viewers.loaded_scene import STREAMED_SOG, TILES, TREE
+from ..viewers.network import Chunks, ChunkStream
+from ..viewers.scenes import Cut, CutFinder, Scenes
 from ..viewers.viewer_settings import LodSettings, StreamingSettings
 from .results import COLUMNS, LOADING, OF_BUDGETS, OF_TREES
 
@@ -42,44 +43,44 @@ class Arrival:
     resident: NDArray[np.bool_]
 
 
-class Viewer:
-    """A viewer that fetches the chunks of scenes, for one camera after another.
+class StreamedCuts(CutFinder):
+    """What a viewer that fetches the chunks of scenes draws, for one camera after another.
 
     Args:
         scenes: with trees or detail levels; others are there from the beginning.
         settings: of the cuts; continuous cuts are not simulated.
         streaming: network and cache; everything is resident unless given.
-        remembers: cuts are found one after the other, along a path; see `Scenes.traversal`.
 
     Raises:
         ValueError: the budget, or the cache, is too small for the roots; or there are too many instances.
     """
 
+    settings: LodSettings
+    viewer: Viewer
+    remembers = False
+
+    def __init__(self, scenes: Scenes, settings: LodSettings, streaming: StreamingSettings | None = None) -> None:
+        self.streaming = streaming or StreamingSettings()
+        super().__init__(scenes, settings, remembers=self.remembers and not self.streaming.network.instant)
+        self.chunks = chunks_of(scenes)
+        self.stream()  # raises what would fail later
+
+    def stream(self, start: float = 0.0) -> ChunkStream:
+        return ChunkStream(self.chunks, self.streaming.network, capacity=self.streaming.chunk_cache, start=start)
+
+
+class Loader(StreamedCuts):
+    """Visitors who open a page with scenes, each in front of a camera, and wait; see `StreamedCuts`.
+
+    Args:
+        seconds: since they opened the page, for `cut`.
+    """
+
     def __init__(
-        self,
-        scenes: Scenes,
-        settings: LodSettings,
-        streaming: StreamingSettings | None = None,
-        *,
-        remembers: bool = False,
+        self, scenes: Scenes, settings: LodSettings, streaming: StreamingSettings | None = None, seconds: float = 0.0
     ) -> None:
-        self.scenes, self.settings = scenes, settings
-        self._streaming = streaming or StreamingSettings()
-        self._traversal = scenes.traversal(settings, remembers=remembers and not self._streaming.network.instant)
-        self._chunks = chunks_of(scenes)
-        self._stream()  # raises what would fail later
-
-    def _stream(self, start: float = 0.0) -> ChunkStream:
-        return ChunkStream(self._chunks, self._streaming.network, capacity=self._streaming.chunk_cache, start=start)
-
-    def _cut(self, camera: Camera, resident: NDArray[np.bool_] | None = None) -> TreeCut:
-        """Return the cut with the resident chunks, all unless given."""
-        limit = self.settings.limit(camera.fov_y, camera.height)
-        return self._traversal.cut(view_of(camera), budget=self.settings.budget, smallest=limit, resident=resident)
-
-
-class Loader(Viewer):
-    """A visitor who opens a page with scenes and waits in front of a camera; see `Viewer`."""
+        super().__init__(scenes, settings, streaming)
+        self.seconds = seconds
 
     def arrivals(self, camera: Camera) -> Iterator[Arrival]:
         """Yield the state at the beginning and after each arrival of a chunk, as long as any are wanted.
@@ -87,14 +88,14 @@ class Loader(Viewer):
         The camera rests. As soon as a chunk has arrived, the viewer looks for the chunks that the cut needs, as far as
         it can tell from those that it has; Spark does so with the next picture that it draws.
         """
-        per_chunk = self._splats_of(self._cut(camera))
+        per_chunk = self._splats_of(self.find(camera))
         total = max(1, int(per_chunk.sum()))
-        stream = self._stream()
+        stream = self.stream()
         stream.want([])
         while True:
             resident = stream.cache.resident()
             yield Arrival(stream.now, stream.received, float(per_chunk[resident].sum()) / total, resident)
-            stream.want(self._cut(camera, resident).chunks())
+            stream.want(self.find(camera, resident).wanted())
             while not stream.take_arrivals():
                 if not stream.step():
                     return
@@ -103,7 +104,7 @@ class Loader(Viewer):
         """Return the waits, `LOADING`, of a visitor who stays at a camera; None for what never fits into the cache."""
         figures: Row = dict.fromkeys(column.name for column in LOADING)
         for arrival in self.arrivals(camera):
-            if figures["first_picture_s"] is None and self._chunks.shows(arrival.resident):
+            if figures["first_picture_s"] is None and self.chunks.shows(arrival.resident):
                 figures["first_picture_s"] = arrival.seconds
             for name, share in (("resident_90", MOST), ("resident_all", 1)):
                 if figures[f"{name}_s"] is None and arrival.share >= share:
@@ -112,48 +113,34 @@ class Loader(Viewer):
                 break
         return {column.name: column.rounded(figures[column.name]) for column in LOADING}
 
-    def cut_after(self, camera: Camera, seconds: float) -> Cut:
-        resident = np.zeros(len(self._chunks), np.bool_)
+    def cut(self, camera: Camera) -> Cut:
+        """Return what a visitor sees after `seconds`."""
+        resident = np.zeros(len(self.chunks), np.bool_)
         for arrival in self.arrivals(camera):
-            if arrival.seconds > seconds:
+            if arrival.seconds > self.seconds:
                 break
             resident = arrival.resident
-        return self.scenes.cut_of(self._cut(camera, resident))
+        return self.scenes.cut_of(self.find(camera, resident))
 
     def _splats_of(self, cut: TreeCut) -> NDArray[np.int64]:
         """Return the (chunks,) numbers of splats of a cut in each chunk of all trees."""
-        counts = np.zeros(len(self._chunks), np.int64)
-        scenes = [loaded for loaded in self.scenes.of_instance if loaded.has_cuts]
+        counts = np.zeros(len(self.chunks), np.int64)
+        scenes = [loaded for loaded in self.scenes.of_instance if loaded.kind is not None]
         for loaded, view, nodes in zip(scenes, cut.views, cut.indices(), strict=True):
             chunks, splats = np.unique(loaded.chunk_of(nodes.astype(np.int64)) - loaded.first_chunk, return_counts=True)
             counts[int(view["chunk_base"]) + chunks] += splats
         return counts
 
 
-class LoadingCuts(Loader):
-    """Cuts of visitors so many seconds after they opened the page, one visitor for each camera; a `CutSource`."""
-
-    def __init__(self, scenes: Scenes, settings: LodSettings, streaming: StreamingSettings, seconds: float) -> None:
-        super().__init__(scenes, settings, streaming)
-        self._seconds = seconds
-
-    def cut(self, camera: Camera) -> Cut:
-        return self.cut_after(camera, self._seconds)
-
-    def candidates(self) -> Cut:
-        return CutFinder(self.scenes, self.settings).candidates()
-
-
 def chunks_of(scenes: Scenes) -> Chunks:
     """Return the chunks of scenes with cuts, and what a viewer needs before it can ask for them."""
-    if scenes.in_runs:
-        manifests = [[loaded.manifest_bytes] if loaded.manifest_bytes else [] for loaded in scenes.in_runs]
-        requests = [loaded.requests for loaded in scenes.in_runs]
-        kind = type(scenes.in_runs[0])
-        return Chunks.of_requests(requests, manifests, fetchers=kind.fetchers, connections=kind.connections)
+    held = scenes.with_cuts
     return Chunks(
-        [tree.chunk_bytes() for tree in scenes.trees],
-        [header_answers(tree.header_bytes, tree.bytes) for tree in scenes.trees],
+        [loaded.requests for loaded in held],
+        [loaded.headers for loaded in held],
+        rooted=scenes.kind == TREE,
+        fetchers=held[0].fetchers,
+        connections=held[0].connections,
     )
 
 
@@ -185,8 +172,10 @@ class _MeasuredCut:
     parts: list[CutStatistics]
 
 
-class Simulation(Viewer):
+class Simulation(StreamedCuts):
     """A viewer that moves along a camera path through scenes that all have cuts."""
+
+    remembers = True
 
     def __init__(
         self,
@@ -196,8 +185,8 @@ class Simulation(Viewer):
         *,
         by_instance: bool = False,
     ) -> None:
-        super().__init__(scenes, settings, streaming, remembers=True)
-        self._by_instance, self._depth = by_instance, scenes.depth
+        super().__init__(scenes, settings, streaming)
+        self._by_instance = by_instance
         self._names = [instance.name for instance in scenes.instances]
 
     def run(self, path: CameraPath, *, threads: int = 1, progress: Progress = silent) -> Iterator[SimulatedFrame]:
@@ -206,10 +195,10 @@ class Simulation(Viewer):
         Cuts are found on several threads, some frames ahead; anything that depends on the previous frame is done in
         order. If chunks are missing, the cut is found again with the resident ones.
         """
-        stream = self._stream(path.cameras[0].time)
-        changes = Changes(self.scenes.forest, self._traversal.instances)
+        stream = self.stream(path.cameras[0].time)
+        changes = Changes(self.viewer.forest, self.viewer.instances)
         # Loads or compiles the kernels, so that the time of the first frame does not include it.
-        self._traversal.cut(view_of(path.cameras[0]), budget=len(self._traversal.instances))
+        self.viewer.cut(path.cameras[0], budget=len(self.viewer.instances))
         found = ordered_map(self._find, path.cameras, threads)
         for at, (number, camera, ideal) in enumerate(zip(path.numbers, path.cameras, found, strict=True)):
             stream.advance(max(camera.time, stream.now))
@@ -218,32 +207,31 @@ class Simulation(Viewer):
             rows[0] |= chunks
             whole = drawn.whole
             in_front = 1 - whole.behind / whole.selected if whole.selected else 1.0
-            if self.scenes.in_runs:
-                none = (*OF_TREES, *(OF_BUDGETS if self.scenes.tiled else ()))
+            if self.scenes.kind != TREE:
+                none = (*OF_TREES, *(OF_BUDGETS if self.scenes.kind == TILES else ()))
                 rows = [row | dict.fromkeys(none) for row in rows]
             rows = [{column.name: column.rounded(row.get(column.name)) for column in COLUMNS} for row in rows]
             yield SimulatedFrame(number, camera, drawn.cut, resident, rows, in_front)
             progress("traverse", at + 1, len(path.cameras), "frame")
 
     def _find(self, camera: Camera, resident: NDArray[np.bool_] | None = None) -> _MeasuredCut:
-        cut, size = self._cut(camera, resident), (camera.width, camera.height)
-        forest, view = self.scenes.forest, view_of(camera)
-        return _MeasuredCut(cut, *measure(forest, self._depth, cut, view, size=size, by_instance=self._by_instance))
+        cut, size = self.find(camera, resident), (camera.width, camera.height)
+        return _MeasuredCut(cut, *measure(self.viewer.forest, cut, camera, size=size, by_instance=self._by_instance))
 
     def _fetched(
         self, camera: Camera, ideal: _MeasuredCut, stream: ChunkStream
     ) -> tuple[_MeasuredCut, NDArray[np.bool_], Row]:
         """Return the cut with the resident chunks, these chunks, and the cells of the row that describe chunks."""
-        requested = ideal.cut.chunks()
-        instant = self._streaming.network.instant
+        requested = ideal.cut.wanted()
+        instant = self.streaming.network.instant
         if instant:
             stream.want(requested)
         drawn, resident = ideal, stream.cache.resident()
         # What is drawn of detail levels depends on what was drawn before, as long as files are missing.
-        if not all(chunk in stream.cache for chunk in requested) or (self.scenes.details and not instant):
+        if not all(chunk in stream.cache for chunk in requested) or (self.scenes.kind == STREAMED_SOG and not instant):
             drawn = self._find(camera, resident)
         if not instant:
-            stream.want(drawn.cut.chunks())  # a viewer discovers chunks through those that it has
+            stream.want(drawn.cut.wanted())  # a viewer discovers chunks through those that it has
         arrived = stream.take_arrivals()
         cells: Row = {
             "chunks_touched": len(stream.cache.requested),

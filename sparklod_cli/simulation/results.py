@@ -438,6 +438,7 @@ def _charts(
 ) -> tuple[bytes, str | None]:
     """Return the charts, with the path over the cut of an extreme frame, and why that picture is missing, if it is."""
     from ..figures import charts
+    from ..viewers.loaded_scene import TREE
 
     frames = [extremes[criterion] for criterion in (*(moment.criterion for moment in moments), "first")]
     # The first that draws anything, as none does before the first chunk has arrived.
@@ -448,7 +449,7 @@ def _charts(
         cut.splats,
         np.concatenate([part.depth for part in cut.parts]),
         path.numbers.index(frame.number),
-        "level" if simulation.scenes.in_runs else "tree depth",
+        "tree depth" if simulation.scenes.kind == TREE else "level",
     )
     marked = {moment.criterion: moment.frame for moment in moments}
     return charts.plot(rows, marked, simulation.scenes.title, scene)

@@ -8,17 +8,22 @@ which takes coarser tiles far away in views along the horizon of the Earth.
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..cameras.camera import Camera
 from ..lod.tiles import PIXEL_ERROR
-from ..model.splats import Splats
 from ..model.traversed import TileScene
-from .spark import CutView, SplatForest, TreeCut, TreeInstance
+from .cut import CutView, Forest, TreeCut, TreeInstance, Viewer
+from .loaded_scene import TILES, Index, bytes_of
+from .runs import LoadedRuns, cut_of_runs
+from .viewer_settings import CESIUM_FETCHERS, LodSettings
 
 #: Corners of a box, as shares of its extent.
 CORNERS = np.stack(np.meshgrid(*[(0.0, 1.0)] * 3, indexing="ij"), axis=-1).reshape(8, 3)
@@ -26,13 +31,48 @@ CORNERS = np.stack(np.meshgrid(*[(0.0, 1.0)] * 3, indexing="ij"), axis=-1).resha
 Mask = NDArray[np.bool_]
 
 
-class TileForest(SplatForest):
-    """One or more scenes of tiles, and their splats as drawn, in the memory layout of traversals; see `SplatForest`."""
+@dataclass(frozen=True, eq=False)
+class LoadedTiles(LoadedRuns):
+    """A scene of tiles; `scene` and `splats` have those of all tiles."""
 
-    def __init__(self, scenes: Sequence[TileScene], splats: Sequence[Splats]) -> None:
-        self.scenes = scenes
-        coarse = [np.repeat(~scene.is_leaf, scene.counts) for scene in scenes]
-        super().__init__(splats, coarse, [scene.tiles for scene in scenes])
+    fetchers = CESIUM_FETCHERS
+
+    kind = TILES
+
+    tiles: TileScene = field(kw_only=True)
+
+    def viewer(
+        self,
+        forest: Forest[Any],
+        instances: Sequence[TreeInstance],
+        settings: LodSettings,
+        *,
+        fixed: int,
+        remembers: bool,
+    ) -> Viewer:
+        return CesiumViewer(forest, instances)
+
+    @property
+    def manifest_bytes(self) -> int:
+        return 0 if self.tiles.sizes is None else self.bytes - int(self.tiles.sizes.sum())
+
+    @functools.cached_property
+    def depth(self) -> NDArray[np.int32]:
+        """(N,) the level of the tile of each splat, 0 of the root."""
+        return np.repeat(self.tiles.level, self.tiles.counts)
+
+    @functools.cached_property
+    def leaves(self) -> Index:
+        """(M,) indices of the splats of tiles without children."""
+        return np.flatnonzero(np.repeat(self.tiles.is_leaf, self.tiles.counts))
+
+    def chunk_of(self, index: Index) -> NDArray[np.int64]:
+        return self.first_chunk + np.searchsorted(np.cumsum(self.tiles.counts), index, side="right")
+
+    def chunk_bytes(self) -> NDArray[np.int64]:
+        if self.tiles.sizes is not None:
+            return self.tiles.sizes
+        return bytes_of(self.splats) * self.tiles.counts // max(1, self.count)
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,28 +92,30 @@ class TileChoice:
     distance: NDArray[np.float64]
 
 
-class TileTraversal:
+class CesiumViewer:
     """Finds cuts of scenes of tiles; several threads may ask it."""
 
-    def __init__(self, forest: TileForest, instances: Sequence[TreeInstance]) -> None:
+    def __init__(self, forest: Forest[LoadedTiles], instances: Sequence[TreeInstance]) -> None:
         self.forest, self.instances = forest, list(instances)
 
-    def cut(self, view: CutView, *, budget: int, smallest: float = 0.0, resident: Mask | None = None) -> TreeCut:
-        """Return the cut that a viewer draws.
+    def cut(
+        self, camera: Camera | CutView, *, budget: int, smallest: float = 0.0, resident: Mask | None = None
+    ) -> TreeCut:
+        """Return the cut that CesiumJS draws; see `Viewer.cut`.
 
         Args:
             budget: has no effect: CesiumJS draws as many splats as the error on the screen requires.
-            smallest: pixel scale of a pixel, see `settings.pixel_limit`; 0 for full detail inside the picture.
-            resident: (chunks,) bool, of the files of tiles; all are resident unless given.
+            smallest: pixel scale of a pixel, see `viewer_settings.pixel_limit`; 0 for full detail inside the picture.
         """
         start = time.perf_counter()
         forest = self.forest
         there = np.ones(forest.chunks, np.bool_) if resident is None else resident
         demand, nodes, missing, limited = np.zeros(forest.chunks, np.float32), [], 0, False
         for instance in self.instances:
-            scene, own = forest.scenes[instance.tree], slice(*forest.chunk_base[instance.tree : instance.tree + 2])
+            scene = forest.scenes[instance.tree].tiles
+            own = slice(*forest.chunk_base[instance.tree : instance.tree + 2])
             limit = PIXEL_ERROR * smallest / instance.lod_scale
-            choice = choose(scene, view, instance.object_to_world, limit, there[own])
+            choice = choose(scene, camera, instance.object_to_world, limit, there[own])
             drawn = choice.drawn & there[own]
             nodes.append(np.flatnonzero(np.repeat(drawn, scene.counts)).astype(np.uint32))
             missing += int(scene.counts[choice.coarse | (choice.drawn & ~there[own])].sum())
@@ -83,11 +125,11 @@ class TileTraversal:
             priority = (scene.level.max() + 1 - scene.level + rank).astype(np.float32)
             demand[own] = np.maximum(demand[own], np.where(choice.wanted & (scene.counts > 0), priority, 0))
         reason = "missing" if missing else "distance" if limited else "exhausted"
-        return forest.cut_of(self.instances, view, nodes, reason, missing, demand, start)
+        return cut_of_runs(forest, self.instances, camera, nodes, reason, missing, demand, start)
 
 
 def choose(
-    scene: TileScene, view: CutView, object_to_world: NDArray[np.float64], limit: float, resident: Mask
+    scene: TileScene, view: Camera | CutView, object_to_world: NDArray[np.float64], limit: float, resident: Mask
 ) -> TileChoice:
     """Return the tiles of an instance that a viewer draws and loads.
 
@@ -113,7 +155,7 @@ def choose(
     return TileChoice(drawn, drawn & desired, wanted, distance)
 
 
-def distances(scene: TileScene, view: CutView, object_to_world: NDArray[np.float64]) -> NDArray[np.float64]:
+def distances(scene: TileScene, view: Camera | CutView, object_to_world: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return (T,) distances from the camera to the boxes of tiles, in units of the scene; 0 inside."""
     eye = np.linalg.solve(object_to_world, view.camera_to_world[:, 3])[:3]
     nearest = np.clip(eye, scene.bounds[:, 0], scene.bounds[:, 1])
@@ -121,7 +163,7 @@ def distances(scene: TileScene, view: CutView, object_to_world: NDArray[np.float
     return found
 
 
-def in_picture(scene: TileScene, view: CutView, object_to_world: NDArray[np.float64]) -> Mask:
+def in_picture(scene: TileScene, view: Camera | CutView, object_to_world: NDArray[np.float64]) -> Mask:
     """Return (T,) bool, false for tiles whose box lies behind the camera or beyond one side of the picture."""
     to_camera = np.linalg.solve(view.camera_to_world, object_to_world)
     low, high = scene.bounds[:, None, 0], scene.bounds[:, None, 1]

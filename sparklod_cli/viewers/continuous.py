@@ -28,12 +28,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..cameras.camera import Camera
 from ..lod.kernels.cut_arrays import BUCKET_BITS, BUCKETS
 from ..lod.kernels.pixel_scale import pixel_scales
 from ..lod.kernels.tree_links import find_depths, find_limits, find_parents
 from ..model.gaussian import linear_opacity, lod_opacity
 from ..model.splats import FloatArray
-from .spark import CutView, Traversal, views_of
+from .cut import CutView, Viewer, views_of
 from .viewer_settings import BLEND
 
 #: Bisections of the threshold's interval, whose ends differ by a factor of the width; 40 leave a share of 1e-12 of it.
@@ -68,12 +69,12 @@ class BlendedCut:
 class ContinuousCuts:
     """Finds continuous cuts."""
 
-    def __init__(self, traversal: Traversal) -> None:
-        self._forest, self._instances = traversal.forest, traversal.instances
+    def __init__(self, viewer: Viewer) -> None:
+        self._forest, self._instances = viewer.forest, viewer.instances
         bases = self._forest.node_base
-        self._inner = [_Inner(self._forest.nodes[bases[i] : bases[i + 1]]) for i in range(len(self._forest))]
+        self._inner = [_Inner(self._forest.nodes[bases[i] : bases[i + 1]]) for i in range(len(bases) - 1)]
 
-    def cut(self, view: CutView, *, budget: int, smallest: float = 0.0, width: float = BLEND) -> BlendedCut:
+    def cut(self, view: Camera | CutView, *, budget: int, smallest: float = 0.0, width: float = BLEND) -> BlendedCut:
         """Return the continuous cut.
 
         Args:

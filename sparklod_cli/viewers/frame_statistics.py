@@ -5,13 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..cameras.camera import Camera
 from ..lod.kernels import cut_statistics as kernels
 from ..lod.kernels.cut_arrays import CutNodes
-from .spark import CutView, Forest, TreeCut, TreeInstance
+from .cut import CutView, Forest, TreeCut, TreeInstance
 from .viewer_settings import pixel_limit
 
 
@@ -43,10 +45,9 @@ class CutStatistics:
 
 
 def measure(
-    forest: Forest,
-    level: NDArray[np.int32],
+    forest: Forest[Any],
     cut: TreeCut,
-    view: CutView,
+    view: Camera | CutView,
     *,
     size: tuple[int, int],
     by_instance: bool = False,
@@ -54,7 +55,6 @@ def measure(
     """Return the statistics of a cut found for `view` as a whole and, optionally, of each instance in it.
 
     Args:
-        level: (nodes,) int32 depths, edges from the root, of all trees.
         size: width and height of the picture, pixels.
     """
     width, height = size
@@ -67,7 +67,7 @@ def measure(
         float(width * height),
     )
     nodes = CutNodes(cut.node, cut.limit.view(np.int32), cut.instance)
-    found = kernels.measure_cut(forest.nodes, level, cut.views, nodes, screen, counts, sizes, owners)
+    found = kernels.measure_cut(forest.nodes, forest.depth, cut.views, nodes, screen, counts, sizes, owners)
     sizes, owners = sizes[:found], owners[:found]
     total = counts.sum(axis=0)
     total[kernels.DEPTH_MIN] = counts[:, kernels.DEPTH_MIN].min()
@@ -117,7 +117,7 @@ def _percentiles(values: NDArray[np.float32], shares: Sequence[float]) -> list[f
 class Changes:
     """Compares each cut with the one before it."""
 
-    def __init__(self, forest: Forest, instances: Sequence[TreeInstance]) -> None:
+    def __init__(self, forest: Forest[Any], instances: Sequence[TreeInstance]) -> None:
         sizes = np.diff(forest.node_base)
         bits = [int(sizes[instance.tree]) for instance in instances]
         # Each instance begins with a new word.

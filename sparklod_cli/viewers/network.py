@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import itertools
 import math
 from bisect import bisect_right
 from collections import OrderedDict, deque
@@ -11,55 +12,36 @@ from heapq import heappop, heappush
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from .viewer_settings import FETCHERS, Network
 
-#: How many bytes Spark's pager asks for at first, then if they do not hold the whole header of a file.
-HEADER_REQUESTS = (64 << 10, 256 << 10, 1 << 20)
-
-
-def header_answers(header_bytes: int, file_bytes: int) -> tuple[int, ...]:
-    """Return the sizes of the answers that Spark's pager waits for before it can ask for a chunk of a file.
-
-    It does not know how long the header is, so it asks for the beginning of the file, and for more of it as long as the
-    header is not whole. What it gets of the first chunk along with it is thrown away.
-
-    Args:
-        header_bytes: of the header; 0 where the format has none that a viewer would need.
-    """
-    answers: list[int] = []
-    for request in HEADER_REQUESTS:
-        if (answers[-1] if answers else 0) < header_bytes:
-            answers.append(min(request, file_bytes))
-    return tuple(answers)
-
 
 class Chunks:
-    """The chunks of all trees, numbered consecutively, tree by tree, as in `spark.Forest.chunk_base`.
+    """The chunks of all scenes, numbered consecutively, scene by scene, as in `cut.Forest.chunk_base`.
 
     Args:
-        sizes: for each tree the sizes of its chunks in the file, bytes.
-        headers: for each tree the sizes of the answers that a viewer waits for, one after the other, before it can ask
-            for a chunk, see `header_answers`; none unless given.
-        rooted: whether trees are drawn from their first chunks on, which hold their roots; chunk files of Streamed SOG
+        requests: for each scene and chunk, bytes of the answers that it takes: to a first request, and to those that
+            follow it together.
+        headers: for each scene the sizes of the answers that a viewer waits for, one after the other, before it can ask
+            for a chunk; none unless given.
+        rooted: whether scenes are drawn from their first chunks on, which hold their roots; chunk files of Streamed SOG
             are drawn each for itself.
         fetchers: default number of chunks that a viewer fetches at a time.
         connections: largest number of concurrent requests; None for any number.
 
     Attributes:
-        requests: for each chunk, bytes of the answers that it takes: to a first request, and to those that follow it
-            together.
-        firsts: the first chunk of each tree.
-        roots: the chunks that are always wanted: the first of each tree if `rooted`.
+        sizes: bytes of each chunk.
+        firsts: the first chunk of each scene.
+        roots: the chunks that are always wanted: the first of each scene if `rooted`.
 
     Raises:
-        ValueError: a tree has no chunks, or a size is negative; or there are not as many headers as trees.
+        ValueError: a scene has no chunks, or a size is negative; or there are not as many headers as scenes.
     """
 
     def __init__(
         self,
-        sizes: Sequence[ArrayLike],
+        requests: Sequence[Sequence[tuple[int, ...]]],
         headers: Sequence[Sequence[int]] | None = None,
         *,
         rooted: bool = True,
@@ -68,34 +50,16 @@ class Chunks:
     ) -> None:
         self.fetchers = fetchers
         self.connections = connections
-        self.sizes: list[int] = []
-        self.firsts: list[int] = []
-        self.headers = [tuple(each) for each in headers or [()] * len(sizes)]
-        if len(self.headers) != len(sizes):
-            raise ValueError(f"there are {len(self.headers)} headers of {len(sizes)} trees")
-        for tree, of_tree in enumerate(sizes):
-            column = np.asarray(of_tree, np.int64)
-            if column.ndim != 1 or not len(column) or column.min() < 0:
+        self.requests = [parts or (0,) for of_scene in requests for parts in of_scene]
+        self.sizes = list(map(sum, self.requests))
+        self.headers = [tuple(each) for each in headers or [()] * len(requests)]
+        if len(self.headers) != len(requests):
+            raise ValueError(f"there are {len(self.headers)} headers of {len(requests)} trees")
+        for tree, of_tree in enumerate(requests):
+            if not len(of_tree) or min(map(min, filter(None, of_tree)), default=0) < 0:
                 raise ValueError(f"the chunks of tree {tree} must be a list of sizes, each 0 or more")
-            self.firsts.append(len(self.sizes))
-            self.sizes += column.tolist()
+        self.firsts = [0, *itertools.accumulate(map(len, requests))][:-1]
         self.roots = self.firsts if rooted else []
-        self.requests: list[tuple[int, ...]] = [(size,) for size in self.sizes]
-
-    @classmethod
-    def of_requests(
-        cls,
-        requests: Sequence[Sequence[tuple[int, ...]]],
-        headers: Sequence[Sequence[int]],
-        *,
-        fetchers: int,
-        connections: int | None,
-    ) -> Chunks:
-        """Return chunk files, for each scene, that take several requests each, and are drawn each for itself."""
-        sizes = [[sum(parts) for parts in of_scene] for of_scene in requests]
-        chunks = cls(sizes, headers, rooted=False, fetchers=fetchers, connections=connections)
-        chunks.requests = [parts or (0,) for of_scene in requests for parts in of_scene]
-        return chunks
 
     def __len__(self) -> int:
         return len(self.sizes)
@@ -141,7 +105,7 @@ class ChunkCache:
         return chunk in self._resident
 
     def resident(self) -> NDArray[np.bool_]:
-        """Return the resident chunks, (chunks,) bool, for `spark.Traversal.cut`."""
+        """Return the resident chunks, (chunks,) bool, for `Viewer.cut`."""
         present = np.zeros(len(self._chunks), np.bool_)
         present[list(self._resident)] = True
         return present

@@ -6,18 +6,28 @@ was. PlayCanvas 2.23 does so in `GSplatOctreeInstance.applyLodChanges`; prioriti
 
 from __future__ import annotations
 
+import functools
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..model.splats import Splats
+from ..cameras.camera import Camera
+from ..codecs.reader import OpenCompanion, size_of
+from ..codecs.streamed_sog.codec import layout_of
+from ..codecs.streamed_sog.manifest import MAX_MANIFEST, files_of_chunk, parse
+from ..io import opened
 from ..model.traversed import DetailScene
-from .spark import CutView, SplatForest, TreeCut, TreeInstance
-from .viewer_settings import LEAST_BASE_DISTANCE, DetailRule
+from ..system.errors import FormatError
+from .cut import CutView, Forest, TreeCut, TreeInstance, Viewer
+from .loaded_scene import STREAMED_SOG, Index, bytes_of
+from .runs import LoadedRuns, cut_of_runs
+from .viewer_settings import CONNECTIONS, LEAST_BASE_DISTANCE, PLAYCANVAS_FETCHERS, DetailRule, LodSettings
 
 Levels = NDArray[np.int64]
 
@@ -190,7 +200,7 @@ class RegionBounds:
         median = np.sort(half32, axis=0)[len(half32) // 2].astype(np.float64)
         self.excess = np.maximum(half32 - median, 0).astype(np.float32).astype(np.float64)
 
-    def squared_distances(self, view: CutView, object_to_world: Matrix, rule: DetailRule) -> Distances:
+    def squared_distances(self, view: Camera | CutView, object_to_world: Matrix, rule: DetailRule) -> Distances:
         """Return (R,) squared distances by which levels are chosen, world units at a field of view of 45 degrees.
 
         The distance is that from the camera to the nearest point of the bound, shrunk by `rule.shrink` of its excess;
@@ -219,94 +229,6 @@ class RegionBounds:
         return squared * factor * factor * (scale * scale)
 
 
-class DetailForest(SplatForest):
-    """One or more scenes at several detail levels in the memory layout of traversals; see `SplatForest`.
-
-    Splats are those of all levels, then of the environment; level 0 and the environment count as leaves. Chunks are
-    chunk files.
-    """
-
-    def __init__(self, scenes: Sequence[DetailScene], splats: Sequence[Splats], files: Sequence[DetailFiles]) -> None:
-        self.scenes, self.files = scenes, files
-        coarse = [np.zeros(len(each), np.bool_) for each in splats]
-        for scene, mask in zip(scenes, coarse, strict=True):
-            mask[scene.level(0).stop : len(scene.splats)] = True
-        super().__init__(splats, coarse, [len(each.sizes) for each in files])
-
-
-class DetailTraversal:
-    """Finds cuts of scenes at several detail levels; several threads may ask it, unless it remembers.
-
-    Args:
-        fixed: splats that are drawn besides, and count against the budget.
-        remembers: while files are missing, regions stay as the cut before had them; without, nothing was drawn before.
-    """
-
-    def __init__(
-        self,
-        forest: DetailForest,
-        instances: Sequence[TreeInstance],
-        rule: DetailRule,
-        *,
-        fixed: int = 0,
-        remembers: bool = False,
-    ) -> None:
-        self.forest, self.instances, self._rule, self._fixed = forest, list(instances), rule, fixed
-        self.remembers = remembers
-        self._bounds = [RegionBounds(scene.bounds) for scene in forest.scenes]
-        self._chains = [Chains.of(scene.counts, rule) for scene in forest.scenes]
-        self._before: list[Levels | None] = [None] * len(self.instances)
-
-    def cut(
-        self, view: CutView, *, budget: int, smallest: float = 0.0, resident: NDArray[np.bool_] | None = None
-    ) -> TreeCut:
-        """Return the cut that a viewer draws: the splats of the levels of all regions, and the environments.
-
-        Args:
-            budget: maximum number of splats, all instances together; environments do not count.
-            smallest: has no effect; traversals of trees have it.
-            resident: (chunks,) bool, of the chunk files of all scenes; all are resident unless given.
-        """
-        start = time.perf_counter()
-        forest, rule = self.forest, self._rule
-        distances = [
-            self._bounds[each.tree].squared_distances(view, each.object_to_world, rule) for each in self.instances
-        ]
-        distant = [
-            Distant(self._chains[each.tree], distance, max(LEAST_BASE_DISTANCE, rule.base_distance * each.lod_scale))
-            for each, distance in zip(self.instances, distances, strict=True)
-        ]
-        choice = choose(distant, max(1, budget - self._fixed), rule)
-        there = np.ones(forest.chunks, np.bool_) if resident is None else resident
-        demand, nodes, missing = np.zeros(forest.chunks, np.float32), [], 0
-        for at, (instance, levels, distance) in enumerate(zip(self.instances, choice.levels, distances, strict=True)):
-            tree = instance.tree
-            scene, files, own = forest.scenes[tree], forest.files[tree], slice(*forest.chunk_base[tree : tree + 2])
-            before = self._before[at] if self.remembers else None
-            drawn, priority = loading(self._chains[tree], files, levels, distance, there[own], before, rule.underfill)
-            if self.remembers and resident is not None:
-                self._before[at] = drawn
-            around = files.environment is not None and bool(there[own][files.environment])
-            nodes.append(_splats_of(scene, drawn, environment=around))
-            wrong = (drawn != levels) & (levels >= 0)
-            missing += int(scene.counts[wrong, levels[wrong]].sum())
-            demand[own] = np.maximum(demand[own], np.maximum(priority, np.where(priority > 0, 1e-30, 0)))
-        reason = "missing" if missing else choice.reason
-        return forest.cut_of(self.instances, view, nodes, reason, missing, demand, start)
-
-
-def _splats_of(scene: DetailScene, levels: Levels, *, environment: bool) -> NDArray[np.uint32]:
-    """Return the splats of regions at some levels, ascending, and those of the environment."""
-    regions = np.flatnonzero(levels >= 0)
-    starts, counts = scene.starts[regions, levels[regions]], scene.counts[regions, levels[regions]]
-    order = np.argsort(starts, kind="stable")
-    starts, counts = starts[order], counts[order]
-    before = np.cumsum(counts) - counts
-    found = np.repeat(starts - before, counts) + np.arange(int(counts.sum()))
-    around = 0 if scene.environment is None or not environment else len(scene.environment)
-    return np.concatenate([found, len(scene.splats) + np.arange(around)]).astype(np.uint32)
-
-
 @dataclass(frozen=True, eq=False)
 class DetailFiles:
     """Chunk files of a scene at several detail levels.
@@ -325,6 +247,175 @@ class DetailFiles:
     environment: int | None = None
     manifest: int = 0
     requests: tuple[tuple[int, ...], ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class LoadedDetail(LoadedRuns):
+    """A scene at several detail levels; `scene` and `splats` have those of all levels, then the environment.
+
+    Attributes:
+        detail: its regions.
+        files: where its splats are.
+    """
+
+    fetchers = PLAYCANVAS_FETCHERS
+    connections = CONNECTIONS
+
+    kind = STREAMED_SOG
+
+    detail: DetailScene = field(kw_only=True)
+    files: DetailFiles = field(kw_only=True)
+
+    def viewer(
+        self,
+        forest: Forest[Any],
+        instances: Sequence[TreeInstance],
+        settings: LodSettings,
+        *,
+        fixed: int,
+        remembers: bool,
+    ) -> Viewer:
+        return PlayCanvasViewer(forest, instances, settings.detail, fixed=fixed, remembers=remembers)
+
+    @property
+    def manifest_bytes(self) -> int:
+        return self.files.manifest
+
+    @property
+    def requests(self) -> Sequence[tuple[int, ...]]:
+        return self.files.requests or super().requests
+
+    @functools.cached_property
+    def depth(self) -> NDArray[np.int32]:
+        """(N,) the detail level of each splat; 0 of the environment."""
+        levels = np.repeat(np.arange(self.detail.levels, dtype=np.int32), self.detail.counts.sum(axis=0))
+        return np.concatenate([levels, np.zeros(self.count - len(levels), np.int32)])
+
+    @functools.cached_property
+    def leaves(self) -> Index:
+        """(M,) indices of level 0 and of the environment."""
+        return np.flatnonzero(self.depth == 0)
+
+    def chunk_of(self, index: Index) -> NDArray[np.int64]:
+        return self.first_chunk + self._file[index]
+
+    @functools.cached_property
+    def _file(self) -> NDArray[np.int64]:
+        file = np.repeat(self.files.of_run.T.ravel(), self.detail.counts.T.ravel())
+        return np.concatenate([file, np.full(self.count - len(file), self.files.environment or 0)])
+
+    def chunk_bytes(self) -> NDArray[np.int64]:
+        return self.files.sizes
+
+
+def read_detail_files(path: Path) -> DetailFiles:
+    """Return the files of a lod-meta.json, or of the folder that holds it; regions are in the order of the manifest."""
+    with opened(path) as (file, _, more):
+        data = file.read(MAX_MANIFEST + 1)
+        manifest = parse(data)
+        requests = tuple(_bytes_of_files(more["open_companion"], name) for name in manifest.names())
+    layout = layout_of(manifest)
+    of_run = np.full(layout.counts.shape, -1, np.int64)
+    of_run[layout.region, layout.level] = layout.file
+    environment = None if manifest.environment is None else len(manifest.filenames)
+    return DetailFiles(of_run, np.array([*map(sum, requests)], np.int64), environment, len(data), requests)
+
+
+def _bytes_of_files(open_companion: OpenCompanion, name: str) -> tuple[int, ...]:
+    """Return the bytes of the files of a chunk; () where one cannot be read, which reading its splats reports."""
+    sizes = list[int]()
+    try:
+        for each in files_of_chunk(open_companion, name):
+            with open_companion(each) as file:
+                sizes.append(size_of(file))
+    except FormatError:
+        return ()
+    return tuple(sizes)
+
+
+def files_in_memory(detail: DetailScene) -> DetailFiles:
+    """Return files for a scene in memory: one for each level, of the bytes of its columns, and the environment."""
+    of_run = np.where(detail.counts > 0, np.arange(detail.levels), -1)
+    sizes = [bytes_of(detail.splats) * int(count) // max(1, len(detail.splats)) for count in detail.counts.sum(axis=0)]
+    if detail.environment is None:
+        return DetailFiles(of_run, np.array(sizes, np.int64))
+    return DetailFiles(of_run, np.array([*sizes, bytes_of(detail.environment)], np.int64), detail.levels)
+
+
+class PlayCanvasViewer:
+    """Finds cuts of scenes at several detail levels; several threads may ask it, unless it remembers.
+
+    Args:
+        fixed: splats that are drawn besides, and count against the budget.
+        remembers: while files are missing, regions stay as the cut before had them; without, nothing was drawn before.
+    """
+
+    def __init__(
+        self,
+        forest: Forest[LoadedDetail],
+        instances: Sequence[TreeInstance],
+        rule: DetailRule,
+        *,
+        fixed: int = 0,
+        remembers: bool = False,
+    ) -> None:
+        self.forest, self.instances, self._rule, self._fixed = forest, list(instances), rule, fixed
+        self.remembers = remembers
+        self._bounds = [RegionBounds(scene.detail.bounds) for scene in forest.scenes]
+        self._chains = [Chains.of(scene.detail.counts, rule) for scene in forest.scenes]
+        self._before: list[Levels | None] = [None] * len(self.instances)
+
+    def cut(
+        self,
+        camera: Camera | CutView,
+        *,
+        budget: int,
+        smallest: float = 0.0,
+        resident: NDArray[np.bool_] | None = None,
+    ) -> TreeCut:
+        """Return the cut that PlayCanvas draws: the splats of the levels of all regions, and the environments.
+
+        Environments do not count against the budget, and `smallest` has no effect; see `Viewer.cut`.
+        """
+        start = time.perf_counter()
+        forest, rule = self.forest, self._rule
+        distances = [
+            self._bounds[each.tree].squared_distances(camera, each.object_to_world, rule) for each in self.instances
+        ]
+        distant = [
+            Distant(self._chains[each.tree], distance, max(LEAST_BASE_DISTANCE, rule.base_distance * each.lod_scale))
+            for each, distance in zip(self.instances, distances, strict=True)
+        ]
+        choice = choose(distant, max(1, budget - self._fixed), rule)
+        there = np.ones(forest.chunks, np.bool_) if resident is None else resident
+        demand, nodes, missing = np.zeros(forest.chunks, np.float32), [], 0
+        for at, (instance, levels, distance) in enumerate(zip(self.instances, choice.levels, distances, strict=True)):
+            tree = instance.tree
+            scene, files = forest.scenes[tree].detail, forest.scenes[tree].files
+            own = slice(*forest.chunk_base[tree : tree + 2])
+            before = self._before[at] if self.remembers else None
+            drawn, priority = loading(self._chains[tree], files, levels, distance, there[own], before, rule.underfill)
+            if self.remembers and resident is not None:
+                self._before[at] = drawn
+            around = files.environment is not None and bool(there[own][files.environment])
+            nodes.append(_splats_of(scene, drawn, environment=around))
+            wrong = (drawn != levels) & (levels >= 0)
+            missing += int(scene.counts[wrong, levels[wrong]].sum())
+            demand[own] = np.maximum(demand[own], np.maximum(priority, np.where(priority > 0, 1e-30, 0)))
+        reason = "missing" if missing else choice.reason
+        return cut_of_runs(forest, self.instances, camera, nodes, reason, missing, demand, start)
+
+
+def _splats_of(scene: DetailScene, levels: Levels, *, environment: bool) -> NDArray[np.uint32]:
+    """Return the splats of regions at some levels, ascending, and those of the environment."""
+    regions = np.flatnonzero(levels >= 0)
+    starts, counts = scene.starts[regions, levels[regions]], scene.counts[regions, levels[regions]]
+    order = np.argsort(starts, kind="stable")
+    starts, counts = starts[order], counts[order]
+    before = np.cumsum(counts) - counts
+    found = np.repeat(starts - before, counts) + np.arange(int(counts.sum()))
+    around = 0 if scene.environment is None or not environment else len(scene.environment)
+    return np.concatenate([found, len(scene.splats) + np.arange(around)]).astype(np.uint32)
 
 
 def loading(

@@ -7,35 +7,26 @@ import functools
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..codecs.formats import PRECISIONS, RAD
-from ..codecs.reader import OpenCompanion, decode_file, size_of
+from ..codecs.reader import decode_file
 from ..io import opened, size_of_input
 from ..model.instances import Instance
 from ..model.lod_tree import CHUNK_NODES, LodTree
-from ..model.scene import Scene
+from ..model.scene import Scene, facts_of
 from ..model.splats import COLUMNS, Splats
 from ..model.traversed import DetailScene, TileScene
 from ..system.errors import FormatError, InvalidSplatsError, TreeError, memory_errors_translated, naming
 from ..system.progress import Progress, silent
 from ..system.stdio import DASH
-from .loaded_scene import (
-    UNNAMED,
-    LoadedDetail,
-    LoadedRuns,
-    LoadedScene,
-    LoadedTiles,
-    PagedScene,
-    Pages,
-    bytes_of,
-    files_in_memory,
-    nodes_of,
-    whole_scene,
-)
-from .playcanvas import DetailFiles
+from .loaded_scene import UNNAMED, LoadedScene, bytes_of, nodes_of
 from .scenes import Scenes
+
+if TYPE_CHECKING:
+    from .paging import Pages
 
 
 def read_scenes(
@@ -80,11 +71,7 @@ def read_scenes(
             found = _read(source, to_read, precision if paged and through is None else None, threads, progress)
         else:
             found = source
-        if isinstance(found, Pages):
-            assert file is not None
-            empty = replace(found.file.scene, tree=LodTree(np.zeros(0, np.uint16), np.zeros(0, np.uint32)))
-            entry: LoadedScene = PagedScene(file, size_of_input(file) or 0, empty, empty.splats, chunks, pages=found)
-        elif isinstance(found, Scene):
+        if isinstance(found, Scene):
             name, scene = file or UNNAMED, found
             try:
                 scene.check_tree()
@@ -99,26 +86,42 @@ def read_scenes(
             if scene.tree is None:
                 scene = _drawable(str(name), scene, notes)
             size = bytes_of(scene.splats) if file is None else size_of_input(file) or 0
-            entry = LoadedScene(file, size, scene, _drawn(scene, through, file, threads), chunks)
-        else:
+            drawn = _drawn(scene, through, file, threads)
+            entry: LoadedScene = LoadedScene(file, size, scene, drawn, chunks, precision, threads)
+        elif isinstance(found, (DetailScene, TileScene)):
             entry = _loaded_runs(file, found, through, chunks, threads)
             notes += (f"{entry.name}: {note}" for note in found.notes)
+        else:
+            from .paging import PagedScene
+
+            assert file is not None
+            empty = replace(found.file.scene, tree=LodTree(np.zeros(0, np.uint16), np.zeros(0, np.uint32)))
+            entry = PagedScene(file, size_of_input(file) or 0, empty, empty.splats, chunks, pages=found)
         loaded[key] = entry
         of_instance.append(entry)
         chunks += entry.chunks
-    return Scenes(instances, list(loaded.values()), of_instance, notes, precision, threads)
+    return Scenes(instances, list(loaded.values()), of_instance, notes)
 
 
 def _loaded_runs(
     file: Path | None, found: DetailScene | TileScene, through: str | None, chunks: int, threads: int
-) -> LoadedRuns:
-    scene = whole_scene(found)
-    if not len(scene.splats):
+) -> LoadedScene:
+    """Return all tiles, or all levels and the environment, as one scene with its files."""
+    splats = found.splats
+    if isinstance(found, DetailScene) and found.environment is not None:
+        degree = min(splats.sh_degree, found.environment.sh_degree)
+        splats = Splats.concat([part.with_max_sh(degree) for part in (splats, found.environment)])
+    if not len(splats):
         raise InvalidSplatsError(f"{file or UNNAMED}: it has no splats")
+    scene = Scene(splats, **facts_of(found))
     drawn = _drawn(scene, through, file, threads)
     if isinstance(found, TileScene):
-        size = found.header.get("bytes", bytes_of(scene.splats))
+        from .cesium import LoadedTiles
+
+        size = found.header.get("bytes", bytes_of(splats))
         return LoadedTiles(file, size, scene, drawn, chunks, tiles=found)
+    from .playcanvas import LoadedDetail, files_in_memory, read_detail_files
+
     files = files_in_memory(found) if file is None else read_detail_files(file)
     return LoadedDetail(file, int(files.sizes.sum()) + files.manifest, scene, drawn, chunks, detail=found, files=files)
 
@@ -132,36 +135,6 @@ def _drawn(scene: Scene, through: str | None, file: Path | None, threads: int) -
     return after(through, file or Path(UNNAMED), scene, threads)
 
 
-def read_detail_files(path: Path) -> DetailFiles:
-    """Return the files of a lod-meta.json, or of the folder that holds it; regions are in the order of the manifest."""
-    from ..codecs.streamed_sog.codec import layout_of
-    from ..codecs.streamed_sog.manifest import MAX_MANIFEST, parse
-
-    with opened(path) as (file, _, more):
-        data = file.read(MAX_MANIFEST + 1)
-        manifest = parse(data)
-        requests = tuple(_bytes_of_files(more["open_companion"], name) for name in manifest.names())
-    layout = layout_of(manifest)
-    of_run = np.full(layout.counts.shape, -1, np.int64)
-    of_run[layout.region, layout.level] = layout.file
-    environment = None if manifest.environment is None else len(manifest.filenames)
-    return DetailFiles(of_run, np.array([*map(sum, requests)], np.int64), environment, len(data), requests)
-
-
-def _bytes_of_files(open_companion: OpenCompanion, name: str) -> tuple[int, ...]:
-    """Return the bytes of the files of a chunk; () where one cannot be read, which reading its splats reports."""
-    from ..codecs.streamed_sog.manifest import files_of_chunk
-
-    sizes = list[int]()
-    try:
-        for each in files_of_chunk(open_companion, name):
-            with open_companion(each) as file:
-                sizes.append(size_of(file))
-    except FormatError:
-        return ()
-    return tuple(sizes)
-
-
 def _read(
     path: Path, columns: Collection[str], paged: str | None, threads: int, progress: Progress
 ) -> Pages | Scene | DetailScene | TileScene:
@@ -173,6 +146,7 @@ def _read(
     with naming(path), memory_errors_translated(), opened(path) as (file, form, more):
         if paged is not None and form.name == RAD and path != DASH:
             from ..io.rad_file import RadFile
+            from .paging import Pages
 
             with contextlib.suppress(FormatError):  # which is raised below
                 rad = RadFile.of(path, file, more["open_companion"])

@@ -1,4 +1,4 @@
-"""`Scenes`, the scenes of instances, and `Cut`, the splats of them that are drawn."""
+"""`Scenes`, the scenes of instances, `Cut`, the splats of them that are drawn, and `CutFinder`, which finds cuts."""
 
 from __future__ import annotations
 
@@ -6,40 +6,31 @@ import copy
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras.camera import Camera
 from ..cameras.framing import Balls, balls_of
-from ..codecs.formats import PRECISIONS
 from ..lod.budget import Budget
 from ..model.foveation import Foveation
 from ..model.gaussian import placed
 from ..model.instances import Instance, Matrix
-from ..model.scene import Scene, common_axis, rotated_axis, up_notes_of
+from ..model.scene import common_axis, rotated_axis, up_notes_of
 from ..model.splats import Splats
-from ..model.traversed import Nodes
 from ..system.units import count_of
-from .cesium import TileForest, TileTraversal
-from .continuous import ContinuousCuts, faded
-from .loaded_scene import (
-    Index,
-    LoadedDetail,
-    LoadedRuns,
-    LoadedScene,
-    LoadedTiles,
-    PagedForest,
-    PagedScene,
-    nodes_of,
-    sampled_balls,
-)
-from .playcanvas import DetailForest, DetailTraversal
-from .spark import CutView, Forest, Traversal, TreeCut, TreeInstance
+from .cut import Forest, TreeCut, TreeInstance, Viewer
+from .loaded_scene import STREAMED_SOG, TILES, TREE, Index, LoadedScene
 from .viewer_settings import PLAYCANVAS_BUDGET, LodSettings
 
+if TYPE_CHECKING:
+    from .continuous import ContinuousCuts
+
 Weights = NDArray[np.float64]
+
+#: Kinds of scenes, `LoadedScene.kind`.
+KINDS = (None, TREE, STREAMED_SOG, TILES)
 
 #: A cut holds the number of an instance as a uint16.
 MAX_INSTANCES = 65_535
@@ -66,7 +57,11 @@ class Part:
         if self.index is self.scene.leaves:
             return self.scene.full
         splats = self.scene.rows(self.index)
-        return splats if self.weight is None else replace(splats, opacity=faded(splats.opacity, self.weight))
+        if self.weight is None:
+            return splats
+        from .continuous import faded
+
+        return replace(splats, opacity=faded(splats.opacity, self.weight))
 
     @property
     def depth(self) -> NDArray[np.int32]:
@@ -123,16 +118,12 @@ class Scenes:
         loaded: each scene once.
         of_instance: of each instance, its scene.
         notes: what a person should know of the files.
-        precision: one of `PRECISIONS`, of the nodes that cuts are found with.
-        threads: to prepare nodes on.
     """
 
     instances: Sequence[Instance]
     loaded: Sequence[LoadedScene]
     of_instance: Sequence[LoadedScene]
     notes: Sequence[str] = ()
-    precision: str = PRECISIONS[0]
-    threads: int = 1
 
     @property
     def title(self) -> str:
@@ -158,84 +149,41 @@ class Scenes:
         return axes
 
     @functools.cached_property
-    def trees(self) -> list[LoadedScene]:
-        """The scenes that have trees, in the order of `forest`."""
-        return [loaded for loaded in self.loaded if loaded.is_tree]
+    def kind(self) -> str | None:
+        """What viewers draw cuts of, `LoadedScene.kind`; the last of several, with which `viewer` fails."""
+        return max((loaded.kind for loaded in self.loaded), key=KINDS.index)
 
     @functools.cached_property
-    def details(self) -> list[LoadedDetail]:
-        """The scenes at several detail levels, in the order of `forest`."""
-        return [loaded for loaded in self.loaded if isinstance(loaded, LoadedDetail)]
-
-    @functools.cached_property
-    def tiled(self) -> list[LoadedTiles]:
-        """The scenes of tiles, in the order of `forest`."""
-        return [loaded for loaded in self.loaded if isinstance(loaded, LoadedTiles)]
-
-    @property
-    def in_runs(self) -> Sequence[LoadedRuns]:
-        """The scenes of which viewers draw whole runs of splats, in the order of `forest`."""
-        return self.details or self.tiled
-
-    @property
     def with_cuts(self) -> Sequence[LoadedScene]:
         """The scenes of which viewers draw cuts, in the order of `forest`: trees, detail levels or tiles.
 
         `ValueError` for two kinds of them, which no viewer draws.
         """
-        kinds: dict[str, Sequence[LoadedScene]] = {
-            "a Level-of-Detail tree": self.trees,
-            "Streamed SOG": self.details,
-            "3D Tiles": self.tiled,
-        }
-        found = [(kind, scenes[0]) for kind, scenes in kinds.items() if scenes]
-        if len(found) > 1:
-            (kind, first), (other, second) = found[:2]
+        scenes = [loaded for loaded in self.loaded if loaded.kind is not None]
+        kinds = {kind: loaded for kind in KINDS for loaded in reversed(scenes) if loaded.kind == kind}
+        if len(kinds) > 1:
+            (kind, first), (other, second), *_ = kinds.items()
             raise ValueError(
                 f"{first.name} is {kind} and {second.name} is {other}, whose viewers choose splats in different ways;"
                 " look at one of them at a time, or at full detail"
             )
-        return self.in_runs or self.trees
+        return scenes
 
     @functools.cached_property
     def leaves(self) -> int:
         """Splats of full detail of all instances of which cuts are drawn: what budgets are shares of."""
-        return sum(loaded.leaf_count for loaded in self.of_instance if loaded.has_cuts)
+        return sum(loaded.leaf_count for loaded in self.of_instance if loaded.kind is not None)
 
     def splats_of(self, budget: Budget) -> int:
-        if budget.by_default and self.details:
+        if budget.by_default and self.kind == STREAMED_SOG:
             budget = replace(budget, count=PLAYCANVAS_BUDGET)
-        if self.tiled:  # CesiumJS has no budget
+        if self.kind == TILES:  # CesiumJS has no budget
             return max(1, self.leaves)
         return budget.of(self.leaves if budget.share is not None else 0)
 
     @functools.cached_property
-    def forest(self) -> Forest:
-        if self.details:
-            return DetailForest(
-                *zip(*((each.detail, each.scene.splats, each.files) for each in self.details), strict=True)
-            )
-        if self.tiled:
-            return TileForest([each.tiles for each in self.tiled], [each.scene.splats for each in self.tiled])
-        if not any(isinstance(loaded, PagedScene) for loaded in self.trees):
-            return Forest([self._nodes(loaded.scene) for loaded in self.trees])
-        return PagedForest(
-            [
-                loaded.pages if isinstance(loaded, PagedScene) else (self._nodes(loaded.scene), loaded.depth)
-                for loaded in self.trees
-            ]
-        )
-
-    @functools.cached_property
-    def depth(self) -> NDArray[np.int32]:
-        """(nodes,) edges from the root to each node of `forest` that was read, or the detail level of each."""
-        if isinstance(self.forest, PagedForest):
-            return self.forest.depth
-        return np.concatenate([loaded.depth for loaded in self.with_cuts])
-
-    def _nodes(self, scene: Scene) -> Nodes:
-        assert scene.tree is not None
-        return nodes_of(scene.splats, scene.tree, scene.coding, precision=self.precision, threads=self.threads)
+    def forest(self) -> Forest[Any]:
+        return Forest(self.with_cuts)
 
     def tree_instances(self, foveation: Foveation) -> list[TreeInstance]:
         """Return the instances of which cuts are drawn; those without a foveation of their own have this one."""
@@ -243,20 +191,18 @@ class Scenes:
         return [
             TreeInstance(numbers[id(loaded)], at.object_to_world, at.lod_scale, at.foveation or foveation)
             for at, loaded in zip(self.instances, self.of_instance, strict=True)
-            if loaded.has_cuts
+            if loaded.kind is not None
         ]
 
-    def traversal(
-        self, settings: LodSettings, *, remembers: bool = False
-    ) -> Traversal | DetailTraversal | TileTraversal:
-        """Find the cuts of the instances of trees, of scenes at several detail levels, or of tiles.
+    def viewer(self, settings: LodSettings, *, remembers: bool = False) -> Viewer:
+        """Return the viewer of the instances of which cuts are drawn.
 
         Args:
-            remembers: of `DetailTraversal`: cuts are found one after the other, along a path.
+            remembers: of `PlayCanvasViewer`: cuts are found one after the other, along a path.
 
         Raises:
-            ValueError: the budget is too small for the roots, there are too many instances, or trees as well as scenes
-                at several detail levels; or the settings are for trees alone.
+            ValueError: the budget is too small for the roots, there are too many instances, or scenes for several
+                viewers; or the settings are for trees alone.
         """
         instances = self.tree_instances(settings.foveation)
         if settings.budget < len(instances):
@@ -264,19 +210,17 @@ class Scenes:
             raise ValueError(f"a budget of {budget} is less than one for each of {len(instances)} instances")
         if len(instances) > MAX_INSTANCES:
             raise ValueError(f"{len(instances):,} instances are more than {MAX_INSTANCES:,}")
-        if not self.in_runs:
-            return Traversal(self.forest, instances)
-        kind = "Streamed SOG" if self.details else "3D Tiles"
-        if settings.continuous is not None:
-            raise ValueError(f"{self.in_runs[0].name} is {kind}; continuous cuts are of trees alone")
-        for at, loaded in zip(self.instances, self.of_instance, strict=True):
-            if loaded.has_cuts and at.foveation is not None:
-                raise ValueError(f"{at.name} is {kind}, and has a foveation, which is for trees alone; leave it out")
-        if isinstance(self.forest, TileForest):
-            return TileTraversal(self.forest, instances)
-        assert isinstance(self.forest, DetailForest)
-        fixed = sum(loaded.leaf_count for loaded in self.of_instance if not loaded.has_cuts)
-        return DetailTraversal(self.forest, instances, settings.detail, fixed=fixed, remembers=remembers)
+        first = self.with_cuts[0]
+        if self.kind != TREE:
+            if settings.continuous is not None:
+                raise ValueError(f"{first.name} is {self.kind}; continuous cuts are of trees alone")
+            for at, loaded in zip(self.instances, self.of_instance, strict=True):
+                if loaded.kind is not None and at.foveation is not None:
+                    raise ValueError(
+                        f"{at.name} is {self.kind}, and has a foveation, which is for trees alone; leave it out"
+                    )
+        fixed = sum(loaded.leaf_count for loaded in self.of_instance if loaded.kind is None)
+        return first.viewer(self.forest, instances, settings, fixed=fixed, remembers=remembers)
 
     def full(self) -> Cut:
         """Full detail: all leaves, and all splats of scenes without trees."""
@@ -291,7 +235,7 @@ class Scenes:
         found = iter(of_trees)
         parts = []
         for number, (at, loaded) in enumerate(zip(self.instances, self.of_instance, strict=True)):
-            if loaded.has_cuts:
+            if loaded.kind is not None:
                 nodes, weight = next(found)
                 parts.append(Part(loaded, nodes.astype(np.int64), weight, at.object_to_world))
             else:
@@ -303,7 +247,9 @@ class Scenes:
         return Part(loaded, loaded.leaves, None, self.instances[number].object_to_world)
 
     def balls(self) -> Balls:
-        if any(isinstance(loaded, PagedScene) for loaded in self.loaded):
+        if any(loaded.paged for loaded in self.loaded):
+            from .paging import sampled_balls
+
             return sampled_balls(self.instances, self.of_instance)
         return Balls.concat(
             balls_of(loaded.splats, loaded.leaves, at.object_to_world)
@@ -311,70 +257,58 @@ class Scenes:
         )
 
 
-class CutSource(Protocol):
-    """Source of the cuts that pictures show: a `CutFinder`, or a `FixedCut`."""
-
-    def cut(self, camera: Camera) -> Cut:
-        """Return what a camera sees."""
-
-    def candidates(self) -> Cut:
-        """Return all that some camera may see."""
-
-
-@dataclass(frozen=True)
-class FixedCut:
-    """One cut for all cameras."""
-
-    whole: Cut
-
-    def cut(self, camera: Camera) -> Cut:
-        return self.whole
-
-    def candidates(self) -> Cut:
-        return self.whole
-
-
 class CutFinder:
     """Finds what a viewer draws of scenes; several threads may use it. Without settings it draws full detail.
+
+    Args:
+        remembers: see `Scenes.viewer`.
 
     `ValueError` if the budget is too small for the roots, or there are too many instances.
     """
 
-    def __init__(self, scenes: Scenes, settings: LodSettings | None) -> None:
+    def __init__(self, scenes: Scenes, settings: LodSettings | None, *, remembers: bool = False) -> None:
         self.scenes, self.settings = scenes, settings
-        self._traversal: Traversal | DetailTraversal | TileTraversal | None = None
+        cuts = settings is not None and scenes.with_cuts
+        self.viewer = scenes.viewer(settings, remembers=remembers) if settings is not None and cuts else None
         self._continuous: ContinuousCuts | None = None
-        if settings is not None and scenes.with_cuts:
-            self._traversal = scenes.traversal(settings)
-            if settings.continuous is not None and isinstance(self._traversal, Traversal):
-                self._continuous = ContinuousCuts(self._traversal)
+        if self.viewer is not None and settings is not None and settings.continuous is not None:
+            from .continuous import ContinuousCuts
+
+            self._continuous = ContinuousCuts(self.viewer)
 
     def with_budget(self, budget: int) -> CutFinder:
-        """Return a finder with another budget and its own traversal, as a traversal begins where its last cut ended."""
+        """Return a finder with another budget and its own viewer, as a viewer begins where its last cut ended."""
         twin = copy.copy(self)
-        if self.settings is not None and self._traversal is not None:
+        if self.settings is not None and self.viewer is not None:
             twin.settings = replace(self.settings, budget=budget)
-            twin._traversal = self.scenes.traversal(twin.settings)
+            twin.viewer = self.scenes.viewer(twin.settings)
         return twin
+
+    def find(self, camera: Camera, resident: NDArray[np.bool_] | None = None) -> TreeCut:
+        """Return the cut of trees, detail levels or tiles with (chunks,) bool resident chunks, all unless given."""
+        assert self.viewer is not None and self.settings is not None
+        limit = self.settings.limit(camera.fov_y, camera.height)
+        return self.viewer.cut(camera, budget=self.settings.budget, smallest=limit, resident=resident)
 
     def cut(self, camera: Camera) -> Cut:
         """Return the cut of the trees or detail levels, and all splats of scenes that have none."""
-        if self._traversal is None or self.settings is None:
+        if self.viewer is None or self.settings is None:
             return self.scenes.full()
-        view, limit = view_of(camera), self.settings.limit(camera.fov_y, camera.height)
         if self._continuous is None or self.settings.continuous is None:
-            found = self._traversal.cut(view, budget=self.settings.budget, smallest=limit)
-            return self.scenes.cut_of(found)
+            return self.scenes.cut_of(self.find(camera))
         blended = self._continuous.cut(
-            view, budget=self.settings.budget, smallest=limit, width=self.settings.continuous
+            camera,
+            budget=self.settings.budget,
+            smallest=self.settings.limit(camera.fov_y, camera.height),
+            width=self.settings.continuous,
         )
-        masks = [blended.instance == number for number in range(len(self._traversal.instances))]
+        masks = [blended.instance == number for number in range(len(self.viewer.instances))]
         nodes = [(blended.node[mask], blended.weight[mask]) for mask in masks]
         return Cut(self.scenes.parts_of(nodes), blended.threshold)
 
     def candidates(self) -> Cut:
         """Return all that some camera may see: whole trees and all levels where cuts are drawn, else full detail."""
-        if self._traversal is None:
+        if self.viewer is None:
             return self.scenes.full()
         return Cut(
             tuple(
@@ -384,6 +318,14 @@ class CutFinder:
         )
 
 
-def view_of(camera: Camera) -> CutView:
-    """Return a camera as the traversal sees it."""
-    return CutView(camera.camera_to_world, camera.fov_x, camera.fov_y)
+class FixedCut(CutFinder):
+    """One cut for all cameras."""
+
+    def __init__(self, whole: Cut) -> None:
+        self.whole = whole
+
+    def cut(self, camera: Camera) -> Cut:
+        return self.whole
+
+    def candidates(self) -> Cut:
+        return self.whole

@@ -24,8 +24,8 @@ from sparklod_cli.lod.part_settings import DetailSettings
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import same_rows
 from sparklod_cli.system.output import write_file
-from sparklod_cli.viewers.scenes import view_of
-from sparklod_cli.viewers.spark import Forest, Traversal, TreeInstance
+from sparklod_cli.viewers.cut import Forest, TreeInstance
+from sparklod_cli.viewers.spark import SparkViewer
 from tests.conftest import FIXTURES
 from tests.lod.trees import check_tree, sorted_rows
 
@@ -109,12 +109,12 @@ def test_every_format_holds_it_and_a_check_finds_no_fault(folder: Path, fitted: 
 @pytest.mark.parametrize("share", SHARES)
 def test_cuts_spend_their_budget(fitted: Scene, share: float) -> None:
     assert fitted.tree is not None
-    traversal = Traversal(
+    traversal = SparkViewer(
         Forest([lod_tree.unpack(lod_tree.pack(fitted.splats, fitted.tree, threads=1))]), [TreeInstance()]
     )
     budget = int(share * COUNT)
     for eye in ((0.0, 0.0, -6.0), (3.0, -1.0, 2.0)):
-        cut = traversal.cut(view_of(Camera.look_at(eye, (0, 0, 0))), budget=budget)
+        cut = traversal.cut(Camera.look_at(eye, (0, 0, 0)), budget=budget)
         drawn = sum(map(len, cut.indices()))
         assert budget - int(fitted.tree.child_count.max()) < drawn <= budget
 

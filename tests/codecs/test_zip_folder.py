@@ -18,7 +18,7 @@ from sparklod_cli.io.reading import open_reader
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS
 from sparklod_cli.system.errors import FormatError, NotSplatsError
-from sparklod_cli.viewers.read_scenes import read_detail_files
+from sparklod_cli.viewers.playcanvas import read_detail_files
 from tests.conftest import FIXTURES, Capture
 
 GOLDEN = FIXTURES / "golden"

@@ -18,7 +18,8 @@ from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.render.rasterizer import draw, shade
 from sparklod_cli.render.settings import RasterSettings
-from sparklod_cli.viewers.spark import CutView, Forest, Traversal, TreeInstance
+from sparklod_cli.viewers.cut import CutView, Forest, TreeInstance
+from sparklod_cli.viewers.spark import SparkViewer
 from sparklod_cli.viewers.viewer_settings import pixel_limit
 from tests.interop.page import Page
 
@@ -74,7 +75,7 @@ def cut_of(held: Scene, camera: Camera, budget: int) -> NDArray[np.uint32]:
     nodes = lod_tree.unpack(lod_tree.pack(held.splats, held.tree))
     view = CutView(camera.camera_to_world, camera.fov_x, camera.fov_y)
     smallest = pixel_limit(camera.fov_y, camera.height)
-    return Traversal(Forest([nodes]), [TreeInstance()]).cut(view, budget=budget, smallest=smallest).indices()[0]
+    return SparkViewer(Forest([nodes]), [TreeInstance()]).cut(view, budget=budget, smallest=smallest).indices()[0]
 
 
 def compare(

@@ -23,9 +23,10 @@ from sparklod_cli.model.lod_tree import CHUNK_NODES
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import FloatArray
 from sparklod_cli.model.traversed import Nodes
+from sparklod_cli.viewers.cut import CutView, TreeInstance
 from sparklod_cli.viewers.loaded_scene import nodes_of
 from sparklod_cli.viewers.read_scenes import read_scenes
-from sparklod_cli.viewers.spark import CutView, Traversal, TreeInstance
+from sparklod_cli.viewers.spark import SparkViewer
 from tests.conftest import FIXTURES, real_scene
 from tests.fittings import StandIn
 from tests.fittings import stand_in as stand_in
@@ -84,7 +85,7 @@ def check_pages(spark: Spark, path: Path, tmp_path: Path) -> int:
 def check_cuts(spark: Spark, path: Path, precision: str, views: int) -> None:
     """Asserts that cuts of a file are those of Spark, which loads it itself."""
     scenes = read_scenes([Instance(path, "tree")], precision=precision, threads=2)
-    (loaded,) = scenes.trees
+    (loaded,) = scenes.with_cuts
     assert loaded.scene.tree is not None
     tree = spark.keep_tree(spark.load_words(LAYOUTS[precision], path)["lodTree"])
     splats = loaded.scene.splats
@@ -92,7 +93,7 @@ def check_cuts(spark: Spark, path: Path, precision: str, views: int) -> None:
         cones, lod_scale = FOVEATIONS[number % len(FOVEATIONS)], LOD_SCALES[number % 5]
         budget = BUDGETS[number % len(BUDGETS)]
         smallest = LIMITS[number // 2 % len(LIMITS)] if number % 4 else 0.0
-        found = Traversal(scenes.forest, [TreeInstance(0, np.eye(4), lod_scale, cones)])
+        found = SparkViewer(scenes.forest, [TreeInstance(0, np.eye(4), lod_scale, cones)])
         ours = found.cut(CutView(camera, FOV_Y, FOV_Y), budget=budget, smallest=smallest)
         asked = {"lodId": tree, "viewToObjectCols": camera.T.ravel().tolist(), "lodScale": lod_scale}
         asked |= {"coneFov0": cones.fov0, "coneFov": cones.fov, "coneFoveate": cones.foveate}
@@ -125,12 +126,12 @@ def check_paged_cuts(spark: Spark, path: Path, tmp_path: Path, precision: str, f
 def check_dynamic_cuts(spark: Spark, path: Path, precision: str, views: int) -> None:
     """Asserts that a dynamic cut of Spark is the cut of all nodes above the pixel scale at which it ends."""
     scenes = read_scenes([Instance(path, "tree")], precision=precision, threads=2)
-    (loaded,) = scenes.trees
+    (loaded,) = scenes.with_cuts
     assert loaded.scene.tree is not None
     tree = spark.keep_tree(spark.load_words(LAYOUTS[precision], path)["lodTree"])
     splats, count = loaded.scene.splats, loaded.count
     cones, limit = SPARKS_CONES, LIMITS[2]
-    found = Traversal(scenes.forest, [TreeInstance(0, foveation=cones)])
+    found = SparkViewer(scenes.forest, [TreeInstance(0, foveation=cones)])
     for number, camera in enumerate(cameras(Nodes.of(splats, loaded.scene.tree), views, seed=count)):
         budget, view = BUDGETS[1 + number % 4], CutView(camera, FOV_Y, FOV_Y)
 

@@ -19,8 +19,9 @@ from sparklod_cli.model.lod_tree import CHUNK_NODES
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.traversed import Nodes
 from sparklod_cli.simulation.frames import Simulation
+from sparklod_cli.viewers.cut import CutView, Forest, TreeCut, TreeInstance
 from sparklod_cli.viewers.read_scenes import read_scenes
-from sparklod_cli.viewers.spark import CutView, Forest, Traversal, TreeCut, TreeInstance
+from sparklod_cli.viewers.spark import SparkViewer
 from sparklod_cli.viewers.viewer_settings import LodSettings, Network, StreamingSettings
 from tests.conftest import real_scene
 from tests.interop.spark import NODE, PageUpdate, Spark
@@ -113,7 +114,7 @@ class Paged:
 
     def check(self, instances: Sequence[TreeInstance], camera: np.ndarray, budget: int, smallest: float) -> TreeCut:
         """Asserts that both draw the same nodes and want the same chunks, in the same order."""
-        cut = Traversal(self.forest, instances).cut(
+        cut = SparkViewer(self.forest, instances).cut(
             CutView(camera, FOV_Y, FOV_Y), budget=budget, smallest=smallest, resident=self.resident
         )
         base = self.forest.chunk_base
@@ -125,7 +126,7 @@ class Paged:
         assert sum(map(len, ours)) == sum(map(len, theirs.indices))  # nothing of trees without a root
         roots = {int(base[instances[number].tree]) for number in drawn}
         touched = [int(base[self.ids.index(tree)]) + chunk for tree, chunk in theirs.chunks]
-        assert set(touched) == roots | set(cut.chunks())
+        assert set(touched) == roots | set(cut.wanted())
         # Of chunks with the same limit, ours come by number, Spark's as its queue finds them.
         beyond = [chunk for chunk in touched if chunk not in roots]
         limits = cut.demand[beyond]
@@ -253,7 +254,7 @@ def test_a_simulated_flight_is_that_of_spark(spark: Spark, capacity: int | None)
     settings = LodSettings(60_000, SPARKS_CONES)
     rng = np.random.default_rng(3)
     counts = set()
-    chunks = scenes.trees[0].chunk_bytes()
+    chunks = scenes.with_cuts[0].chunk_bytes()
     network = Network(bandwidth=3.0 * float(chunks[0]), latency=0.05)  # three chunks a second
     for frame in Simulation(scenes, settings, StreamingSettings(network, capacity)).run(around(24, 2.0, seconds=4.0)):
         paged.keep(frame.resident, rng)
@@ -264,5 +265,5 @@ def test_a_simulated_flight_is_that_of_spark(spark: Spark, capacity: int | None)
         at, limit = frame.camera, settings.limit(frame.camera.fov_y, frame.camera.height)
         cut = paged.check([TreeInstance(0, foveation=SPARKS_CONES)], at.camera_to_world, 60_000, limit)
         assert [nodes.tolist() for nodes in cut.indices()] == [nodes.tolist() for nodes in frame.cut.indices()]
-        assert cut.chunks() == frame.cut.chunks()
+        assert cut.wanted() == frame.cut.wanted()
     assert len(counts) > 3

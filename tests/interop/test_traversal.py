@@ -18,7 +18,8 @@ from sparklod_cli.lod.builders import BUILDERS
 from sparklod_cli.model.foveation import Cones
 from sparklod_cli.model.lod_tree import CHUNK_NODES
 from sparklod_cli.model.traversed import Nodes
-from sparklod_cli.viewers.spark import CutView, Forest, Traversal, TreeCut, TreeInstance, views_of
+from sparklod_cli.viewers.cut import CutView, Forest, TreeCut, TreeInstance, views_of
+from sparklod_cli.viewers.spark import SparkViewer
 from sparklod_cli.viewers.viewer_settings import pixel_limit
 from tests.conftest import FIXTURES, real_scene
 from tests.interop.spark import NODE, Spark
@@ -86,7 +87,7 @@ class Both:
         Chunks of the roots are left out of the order, since Spark always visits them.
         """
         view = CutView(camera, FOV_Y, FOV_Y)
-        found = Traversal(self._forest, instances)
+        found = SparkViewer(self._forest, instances)
         cut = found.cut(view, budget=budget, smallest=smallest)
         theirs = self._spark.traverse(budget, smallest, [self._instance(each, camera) for each in instances])
         for ours, indices in zip(cut.indices(), theirs.indices, strict=True):
@@ -94,10 +95,10 @@ class Both:
         base = self._forest.chunk_base
         roots = {int(base[each.tree]) for each in instances}
         touched = [int(base[self._ids.index(tree)]) + chunk for tree, chunk in theirs.chunks]
-        assert set(touched) == roots | set(cut.chunks())
+        assert set(touched) == roots | set(cut.wanted())
         beyond = [chunk for chunk in touched if chunk not in roots]
         if len(set(cut.demand[beyond])) == len(beyond):
-            assert beyond == [chunk for chunk in cut.chunks() if chunk not in roots]
+            assert beyond == [chunk for chunk in cut.wanted() if chunk not in roots]
         if cut.stop:  # Spark returns the least pixel scale from the root to the node that did not fit
             _, instance, node = cut.stop
             assert [theirs.pixel_limit] == cut.limit[(cut.instance == instance) & (cut.node == node)].tolist()
@@ -248,7 +249,7 @@ def test_the_chunks_that_are_wanted_are_those_of_spark(spark: Spark) -> None:
     chunks = -(-len(tree.words) // CHUNK_NODES)
     assert chunks > 2
     touched = {
-        len(both.check([TreeInstance()], camera, budget, 0.0).chunks())
+        len(both.check([TreeInstance()], camera, budget, 0.0).wanted())
         for camera in cameras(tree.nodes, 15, seed=7)
         for budget in (1_000, 30_000, 200_000)
     }

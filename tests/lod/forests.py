@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from sparklod_cli.model.foveation import Cones, Frustum
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.traversed import Nodes
-from sparklod_cli.viewers.spark import CutView, Forest, Traversal, TreeCut, TreeInstance
+from sparklod_cli.viewers.cut import CutView, Forest, TreeCut, TreeInstance
+from sparklod_cli.viewers.spark import SparkViewer
 from tests.references import budgeted_cuts
 
 FOVEATIONS = (
@@ -40,10 +41,10 @@ class Case:
     budget: int
     smallest: float
 
-    def traversal(self) -> Traversal:
-        return Traversal(Forest(self.trees), self.instances)
+    def traversal(self) -> SparkViewer:
+        return SparkViewer(Forest(self.trees), self.instances)
 
-    def find(self, found: Traversal | None = None, resident: np.ndarray | None = None) -> TreeCut:
+    def find(self, found: SparkViewer | None = None, resident: np.ndarray | None = None) -> TreeCut:
         found = found or self.traversal()
         return found.cut(self.view, budget=self.budget, smallest=self.smallest, resident=resident)
 
@@ -81,7 +82,7 @@ def check(case: Case, cut: TreeCut, resident: np.ndarray | None = None, bits: in
     assert {node for node, wait in zip(nodes, waits, strict=True) if wait} == expected.waiting
     demand = [expected.demand[chunk] for chunk in range(len(cut.demand))]
     assert cut.demand.tolist() == demand
-    assert [demand[chunk] for chunk in cut.chunks()] == sorted(filter(None, demand), reverse=True)
+    assert [demand[chunk] for chunk in cut.wanted()] == sorted(filter(None, demand), reverse=True)
     of_each = [sorted(node for number, node in nodes if number == each) for each in range(len(case.instances))]
     assert [indices.tolist() for indices in cut.indices()] == of_each
 

@@ -23,7 +23,8 @@ from sparklod_cli.model.lod_tree import CHUNK_NODES, LodTree
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.model.traversed import Nodes
 from sparklod_cli.system.threads import on_threads
-from sparklod_cli.viewers.spark import CutView, Forest, Traversal, TreeCut, TreeInstance
+from sparklod_cli.viewers.cut import CutView, Forest, TreeCut, TreeInstance
+from sparklod_cli.viewers.spark import SparkViewer
 from sparklod_cli.viewers.viewer_settings import LodSettings
 from tests.lod.forests import links
 from tests.lod.trees import check_threads
@@ -205,7 +206,7 @@ def test_views_touch_fewer_chunks_than_in_spark_s_order() -> None:
     spread = np.exp(rng.normal(0, 1, (len(angle), 1)))
     tree = quality.build(dataclasses.replace(splats, scale=(splats.scale * spread).astype(np.float32)))
     touched = [
-        sum(len(cut_at(nodes, np.radians(turn)).chunks()) for turn in range(0, 360, 15))
+        sum(len(cut_at(nodes, np.radians(turn)).wanted()) for turn in range(0, 360, 15))
         for nodes in (arrange(*tree), reordered(*tree, spark_order(*tree)))
     ]
     assert touched[0] < 0.95 * touched[1]
@@ -218,7 +219,7 @@ def cut_at(tree: tuple[Splats, LodTree], turn: float) -> TreeCut:
     pose = np.eye(4)
     pose[:3, 0], pose[:3, 1], pose[:3, 2], pose[:3, 3] = across, [0, 1, 0], -along, 9 * across
     foveation = LodSettings().foveation
-    found = Traversal(Forest([Nodes.of(*tree)]), [TreeInstance(foveation=foveation)])
+    found = SparkViewer(Forest([Nodes.of(*tree)]), [TreeInstance(foveation=foveation)])
     return found.cut(CutView(pose, 1.5, 1.0), budget=40_000)
 
 

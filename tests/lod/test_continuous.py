@@ -14,7 +14,8 @@ from sparklod_cli.lod.kernels.pixel_scale import pixel_scales
 from sparklod_cli.model.foveation import Cones
 from sparklod_cli.model.gaussian import lod_opacity
 from sparklod_cli.viewers.continuous import BlendedCut, ContinuousCuts, faded, find_threshold, shares
-from sparklod_cli.viewers.spark import CutView, Forest, Traversal, TreeInstance
+from sparklod_cli.viewers.cut import CutView, Forest, TreeInstance
+from sparklod_cli.viewers.spark import SparkViewer
 from tests.lod.forests import Case, cases, random_tree, transform
 from tests.references import budgeted_cuts, continuous_cuts
 
@@ -157,7 +158,7 @@ def log_scales(case: Case, view: CutView) -> np.ndarray:
     scales = []
     for instance in case.instances:
         nodes = case.trees[instance.tree]
-        place = Traversal(Forest(case.trees), [instance])
+        place = SparkViewer(Forest(case.trees), [instance])
         inner = np.flatnonzero(nodes.tree.child_count)
         found = np.empty(len(inner), np.float32)
         first = place.forest.node_base[instance.tree]

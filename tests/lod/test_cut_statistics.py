@@ -11,8 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sparklod_cli.model.traversed import Nodes
+from sparklod_cli.viewers.cut import CutView, TreeCut, TreeInstance
 from sparklod_cli.viewers.frame_statistics import Changes, CutStatistics, measure
-from sparklod_cli.viewers.spark import CutView, Traversal, TreeCut, TreeInstance
+from sparklod_cli.viewers.spark import SparkViewer
 from sparklod_cli.viewers.viewer_settings import pixel_limit
 from tests.lod.forests import Case, cases, drawn, expected_cut, links, views
 
@@ -25,7 +26,7 @@ def levels(case: Case) -> np.ndarray:
 
 def told(case: Case, cut: TreeCut, *, size: tuple[int, int] = SIZE) -> tuple[CutStatistics, list[CutStatistics]]:
     found = case.traversal()
-    return measure(found.forest, levels(case), cut, case.view, size=size, by_instance=True)
+    return measure(found.forest, cut, case.view, size=size, by_instance=True)
 
 
 def expected(case: Case, cut: TreeCut, instances: list[int], waiting: set[tuple[int, int]]) -> dict:
@@ -119,7 +120,7 @@ def at_distance(center: list[float], size: float) -> CutStatistics:
     """Of one splat, seen from the origin."""
     tree = Nodes(np.array([center], np.float32), np.array([size], np.float32), links([]))
     case = Case([tree], [TreeInstance()], CutView(np.eye(4), math.radians(90), math.radians(90)), 1, 0.0)
-    found = Traversal(case.traversal().forest, case.instances)
+    found = SparkViewer(case.traversal().forest, case.instances)
     whole, parts = told(case, case.find(found), size=(100, 100))
     assert parts == [whole]
     return whole

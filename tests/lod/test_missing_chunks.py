@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sparklod_cli.viewers import spark as traversal
-from sparklod_cli.viewers.spark import CutView, Forest, TreeInstance
+from sparklod_cli.viewers.cut import CutView, Forest, TreeInstance
 from tests.lod.forests import Case, ancestors_drawn, cases, check, random_tree, transform
 
 #: Nodes of a chunk in tests of small trees, as a power of 2; so large that no node's children are in three.
@@ -70,8 +70,8 @@ class TestSmallChunks:
         there[found.forest.chunk_base[[instance.tree for instance in case.instances]]] = True
         for _ in range(len(there) + 1):
             cut = case.find(found, there)
-            assert set(cut.chunks()) >= set(np.flatnonzero(cut.demand > 0))
-            lacking = [chunk for chunk in cut.chunks() if not there[chunk]]
+            assert set(cut.wanted()) >= set(np.flatnonzero(cut.demand > 0))
+            lacking = [chunk for chunk in cut.wanted() if not there[chunk]]
             assert (cut.missing > 0) == bool(lacking)
             if not lacking:
                 break
@@ -97,4 +97,4 @@ def test_the_cut_of_large_trees_with_missing_chunks_is_that_of_one_queue(seed: i
         assert cut.missing >= 1 - seed % 2
     nobody = case.find(found, np.zeros_like(there))
     assert (len(nobody), nobody.missing, nobody.reason) == (0, 3, "missing")
-    assert nobody.chunks() == []
+    assert nobody.wanted() == []

@@ -28,8 +28,8 @@ from sparklod_cli.model.selection import Selection
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.render.rasterizer import Image, draw, shade
 from sparklod_cli.render.settings import RasterSettings
-from sparklod_cli.viewers.scenes import view_of
-from sparklod_cli.viewers.spark import Forest, Traversal, TreeInstance
+from sparklod_cli.viewers.cut import Forest, TreeInstance
+from sparklod_cli.viewers.spark import SparkViewer
 from tests.conftest import real_scene
 from tests.lod.trees import check_tree, children, coincident, parents
 from tests.scenes import random_splats, single_layer
@@ -153,11 +153,11 @@ def fidelity(splats: Splats, built: tuple[Splats, LodTree], share: float) -> flo
     """Mean PSNR of cuts of so many of the leaves, in dB."""
     nodes, tree = built
     forest = Forest([lod_tree.unpack(lod_tree.pack(nodes, tree, threads=2))])
-    traversal = Traversal(forest, [TreeInstance()])
+    traversal = SparkViewer(forest, [TreeInstance()])
     found = []
     for camera in cameras_around(splats):
         full = picture(splats, camera)
-        cut = traversal.cut(view_of(camera), budget=int(share * len(splats))).indices()[0]
+        cut = traversal.cut(camera, budget=int(share * len(splats))).indices()[0]
         image = picture(nodes.take(cut), camera)
         found += [psnr(on_background(image, gray), on_background(full, gray)) for gray in (0.0, 1.0)]
     return statistics.mean(found)
@@ -174,9 +174,9 @@ def test_cuts_of_a_real_scene_are_closer_to_full_detail_than_those_of_the_quick_
 def test_coarse_cuts_of_a_single_layer_have_no_cracks(share: float) -> None:
     splats = single_layer(70)
     nodes, tree = quality.build(splats)
-    traversal = Traversal(Forest([lod_tree.unpack(lod_tree.pack(nodes, tree, threads=2))]), [TreeInstance()])
+    traversal = SparkViewer(Forest([lod_tree.unpack(lod_tree.pack(nodes, tree, threads=2))]), [TreeInstance()])
     camera = Camera.look_at((0, -1.2, -0.6), (0, 0, 0), fov_y=40, size=(160, 120))
-    cut = traversal.cut(view_of(camera), budget=int(share * len(splats))).indices()[0]
+    cut = traversal.cut(camera, budget=int(share * len(splats))).indices()[0]
     middle = np.s_[30:90, 40:120, 3]
     full, coarse = picture(splats, camera)[middle], picture(nodes.take(cut), camera)[middle]
     assert full.mean() > 0.95

@@ -15,10 +15,10 @@ from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quality, tiles
 from sparklod_cli.lod.part_settings import TileSettings
+from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.traversed import TileScene
-from sparklod_cli.viewers.cesium import TileForest, TileTraversal, choose
-from sparklod_cli.viewers.scenes import view_of
-from sparklod_cli.viewers.spark import CutView, TreeInstance
+from sparklod_cli.viewers.cesium import CesiumViewer, LoadedTiles, choose
+from sparklod_cli.viewers.cut import CutView, Forest, TreeInstance
 from sparklod_cli.viewers.viewer_settings import pixel_limit
 from tests.conftest import FIXTURES
 
@@ -91,38 +91,42 @@ def test_it_is_what_a_walk_down_the_tiles_finds(
         pose[:3, [0, 2]] *= -1
         at = dataclasses.replace(at, camera_to_world=pose)
     there = np.random.default_rng(seed).random(scene.tiles) >= missing
-    view, pixel = view_of(at), pixel_limit(at.fov_y, at.height, scale)
+    view, pixel = at, pixel_limit(at.fov_y, at.height, scale)
     found = choose(scene, view, EYE, 16 * pixel, there)
     drawn, wanted = walk(scene, view, pixel, there)
     assert set(np.flatnonzero(found.drawn).tolist()) == drawn
     assert set(np.flatnonzero(found.wanted).tolist()) == wanted
 
 
+def forest_of(scene: TileScene) -> Forest[LoadedTiles]:
+    return Forest([LoadedTiles(None, 0, Scene(scene.splats), scene.splats, 0, tiles=scene)])
+
+
 def test_cuts_go_from_the_root_tile_to_full_detail(scene: TileScene) -> None:
-    traversal = TileTraversal(TileForest([scene], [scene.splats]), [TreeInstance()])
+    traversal = CesiumViewer(forest_of(scene), [TreeInstance()])
     counts, reasons = [], []
     for away in (200.0, 60.0, 20.0, 8.0):
         at = camera(3, away)
-        cut = traversal.cut(view_of(at), budget=1, smallest=pixel_limit(at.fov_y, at.height))
+        cut = traversal.cut(at, budget=1, smallest=pixel_limit(at.fov_y, at.height))
         counts.append(len(cut))
         reasons.append(cut.reason)
         assert not cut.missing
     assert counts == sorted(counts) and counts[0] == scene.counts[0] and counts[-1] > 2 * counts[0], counts
     assert reasons[0] == "distance"
-    every = traversal.cut(view_of(camera(3, 8.0)), budget=1)
+    every = traversal.cut(camera(3, 8.0), budget=1)
     assert len(every) == scene.counts[scene.is_leaf].sum() and every.reason == "exhausted"
 
 
 def test_nothing_is_drawn_of_a_tile_that_is_missing(scene: TileScene) -> None:
-    traversal = TileTraversal(TileForest([scene], [scene.splats]), [TreeInstance()])
-    view, there = view_of(camera(3, 4.0)), np.zeros(scene.tiles, np.bool_)
+    traversal = CesiumViewer(forest_of(scene), [TreeInstance()])
+    view, there = camera(3, 4.0), np.zeros(scene.tiles, np.bool_)
     nothing = traversal.cut(view, budget=1, resident=there)
-    assert not len(nothing) and nothing.reason == "missing" and nothing.chunks()[0] == 0
+    assert not len(nothing) and nothing.reason == "missing" and nothing.wanted()[0] == 0
     there[0] = True
     root = traversal.cut(view, budget=1, resident=there)
     assert len(root) == scene.counts[0] == root.missing and root.reason == "missing"
     children = np.flatnonzero(scene.parent == 0)
-    assert sorted(root.chunks()) == [0, *children]
+    assert sorted(root.wanted()) == [0, *children]
     there[children[:-1]] = True  # all but one of them
     assert len(traversal.cut(view, budget=1, resident=there)) == scene.counts[0]
 
@@ -132,8 +136,8 @@ def test_a_scene_that_is_twice_as_large_and_as_far_away_has_the_same_cut(scene: 
     pose = at.camera_to_world.copy()
     pose[:3, 3] *= 2
     far = dataclasses.replace(at, camera_to_world=pose)
-    forest, limit = TileForest([scene], [scene.splats]), pixel_limit(at.fov_y, at.height)
-    one = TileTraversal(forest, [TreeInstance()]).cut(view_of(at), budget=1, smallest=limit)
+    forest, limit = forest_of(scene), pixel_limit(at.fov_y, at.height)
+    one = CesiumViewer(forest, [TreeInstance()]).cut(at, budget=1, smallest=limit)
     large = TreeInstance(object_to_world=np.diag([2.0, 2.0, 2.0, 1.0]))
-    two = TileTraversal(forest, [large]).cut(view_of(far), budget=1, smallest=limit)
+    two = CesiumViewer(forest, [large]).cut(far, budget=1, smallest=limit)
     assert np.array_equal(one.node, two.node)

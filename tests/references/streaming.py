@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 
@@ -41,6 +42,11 @@ class NaiveCache:
         for place, chunk in enumerate(self.requested):
             if chunk in self.used:
                 self.used[chunk] = (self.clock, -place)
+
+
+def sized(sizes: Sequence[Sequence[int]], headers: Sequence[Sequence[int]] | None = None) -> Chunks:
+    """Chunks of trees, each of one request."""
+    return Chunks([[(size,) for size in of_tree] for of_tree in sizes], headers)
 
 
 def roots_first(chunks: Chunks, requested: list[int]) -> list[int]:

@@ -15,11 +15,12 @@ from sparklod_cli.cameras.sources import CameraPath
 from sparklod_cli.model.instances import Instance
 from sparklod_cli.simulation.frames import Loader, Simulation
 from sparklod_cli.simulation.results import OF_TREES
-from sparklod_cli.viewers.loaded_scene import LoadedDetail
+from sparklod_cli.viewers.playcanvas import LoadedDetail
 from sparklod_cli.viewers.read_scenes import read_scenes
 from sparklod_cli.viewers.scenes import CutFinder, Scenes
 from sparklod_cli.viewers.viewer_settings import DetailRule, LodSettings, Network, StreamingSettings
 from tests.lod.details import row_of_regions
+from tests.simulation.test_loading import cut_after
 from tests.streamed import write_streamed
 
 CUT = LodSettings(200)
@@ -49,7 +50,8 @@ def rows_of(
 
 
 def loaded(scenes: Scenes) -> LoadedDetail:
-    (found,) = scenes.details
+    (found,) = scenes.with_cuts
+    assert isinstance(found, LoadedDetail)
     return found
 
 
@@ -132,8 +134,8 @@ def test_underfill_shows_all_regions_sooner_and_comes_to_the_same(row: Scenes) -
         loader = Loader(row, cut, StreamingSettings(Network(1e6, 0.0, 1)))
         last = loader.load(camera)["resident_all_s"]
         assert isinstance(last, float)
-        drawn[cut] = [len(loader.cut_after(camera, share * last)) for share in (0.0, 0.55, 1.01)]
-        (index,) = loader.cut_after(camera, 1.01 * last).nodes
+        drawn[cut] = [len(cut_after(loader, camera, share * last)) for share in (0.0, 0.55, 1.01)]
+        (index,) = cut_after(loader, camera, 1.01 * last).nodes
         assert index.tolist() == CutFinder(row, cut).cut(camera).nodes[0].tolist()
     assert drawn[CUT][0] == drawn[under][0] == 0
 

@@ -11,9 +11,9 @@ import pytest
 from sparklod_cli.model.foveation import Frustum
 from sparklod_cli.model.instances import Instance
 from sparklod_cli.model.scene import Scene
+from sparklod_cli.viewers.cut import Forest
 from sparklod_cli.viewers.loaded_scene import LoadedScene
 from sparklod_cli.viewers.scenes import CutFinder, Scenes
-from sparklod_cli.viewers.spark import Forest
 from sparklod_cli.viewers.viewer_settings import LodSettings
 from tests.lod.forests import random_tree, transform
 from tests.references import frames as twin

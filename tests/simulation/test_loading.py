@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.simulation.frames import Loader
 from sparklod_cli.simulation.results import LOADING
-from sparklod_cli.viewers.scenes import CutFinder, Scenes, view_of
+from sparklod_cli.viewers.scenes import Cut, CutFinder, Scenes
 from sparklod_cli.viewers.viewer_settings import LodSettings, Network, StreamingSettings
 from tests.simulation.paths import SPARK, resting, rows_of
 
@@ -19,8 +20,13 @@ SLOW = StreamingSettings(Network(1e6, 0.1))
 CUT = LodSettings(20_000, SPARK)
 
 
+def cut_after(loader: Loader, camera: Camera, seconds: float) -> Cut:
+    loader.seconds = seconds
+    return loader.cut(camera)
+
+
 def test_the_first_picture_takes_a_header_and_a_chunk(rad_town: Scenes) -> None:
-    (tree,) = rad_town.trees
+    (tree,) = rad_town.with_cuts
     header, first = min(65_536, tree.bytes), int(tree.chunk_bytes()[0])
     found: Any = Loader(rad_town, CUT, SLOW).load(AT)
     assert found["first_picture_s"] == pytest.approx(0.1 + header / 1e6 + 0.1 + first / 1e6, abs=1e-4)
@@ -29,8 +35,8 @@ def test_the_first_picture_takes_a_header_and_a_chunk(rad_town: Scenes) -> None:
 
 def test_the_whole_cut_takes_the_bytes_of_its_chunks(rad_town: Scenes, town: Scenes) -> None:
     """The town's cut is in all three chunks; of SPZ there is no header to wait for."""
-    for scenes, header in ((town, 0), (rad_town, min(65_536, rad_town.trees[0].bytes))):
-        (tree,) = scenes.trees
+    for scenes, header in ((town, 0), (rad_town, min(65_536, rad_town.with_cuts[0].bytes))):
+        (tree,) = scenes.with_cuts
         found: Any = Loader(scenes, CUT, SLOW).load(AT)
         assert found["resident_all_bytes"] == header + tree.chunk_bytes().sum()
         least = found["resident_all_bytes"] / 1e6 + 0.1 * (2 + (header > 0))  # chunk 0 is what the others are known by
@@ -54,7 +60,7 @@ def test_the_frames_of_a_resting_camera_say_the_same(rad_town: Scenes, budget: i
 
 def test_shares_are_of_the_splats_of_the_cut(rad_town: Scenes) -> None:
     limit = CUT.limit(AT.fov_y, AT.height)
-    whole = rad_town.traversal(CUT).cut(view_of(AT), budget=CUT.budget, smallest=limit)
+    whole = rad_town.viewer(CUT).cut(AT, budget=CUT.budget, smallest=limit)
     chunk = whole.indices()[0] >> 16
     shares = []
     for arrival in Loader(rad_town, CUT, SLOW).arrivals(AT):
@@ -68,12 +74,12 @@ def test_shares_are_of_the_splats_of_the_cut(rad_town: Scenes) -> None:
 def test_the_picture_after_some_seconds_is_that_of_the_resident_chunks(rad_town: Scenes) -> None:
     loader = Loader(rad_town, CUT, SLOW)
     found: Any = loader.load(AT)
-    assert len(loader.cut_after(AT, 0.0)) == 0
-    assert len(loader.cut_after(AT, found["first_picture_s"] - 1e-3)) == 0
-    sizes = [len(loader.cut_after(AT, found["first_picture_s"] + wait)) for wait in (1e-3, 1e6)]
+    assert len(cut_after(loader, AT, 0.0)) == 0
+    assert len(cut_after(loader, AT, found["first_picture_s"] - 1e-3)) == 0
+    sizes = [len(cut_after(loader, AT, found["first_picture_s"] + wait)) for wait in (1e-3, 1e6)]
     assert 0 < sizes[0] < sizes[1]
     whole = CutFinder(rad_town, CUT).cut(AT)
-    last = loader.cut_after(AT, found["resident_all_s"] + 1e-3)
+    last = cut_after(loader, AT, found["resident_all_s"] + 1e-3)
     assert [nodes.tolist() for nodes in last.nodes] == [nodes.tolist() for nodes in whole.nodes]
 
 

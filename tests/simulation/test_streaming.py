@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from sparklod_cli.viewers.network import Chunks, ChunkStream
 from sparklod_cli.viewers.viewer_settings import Network
-from tests.references.streaming import NaiveCache, Twin, roots_first
+from tests.references.streaming import NaiveCache, Twin, roots_first, sized
 
 MB = 1_000_000
 networks = st.builds(
@@ -56,7 +56,7 @@ file_requests = st.lists(
 def test_a_stream_does_what_its_twin_does(
     data: st.DataObject, sizes: list[list[int]], headers: list[list[int]], network: Network
 ) -> None:
-    check_twin(data, Chunks(sizes, headers[: len(sizes)]), network)
+    check_twin(data, sized(sizes, headers[: len(sizes)]), network)
 
 
 @settings(max_examples=400)
@@ -69,7 +69,7 @@ def test_a_stream_of_files_of_several_requests_does_what_its_twin_does(
     network: Network,
     connections: int | None,
 ) -> None:
-    chunks = Chunks.of_requests(requests, headers[: len(requests)], fetchers=2, connections=connections)
+    chunks = Chunks(requests, headers[: len(requests)], rooted=False, fetchers=2, connections=connections)
     check_twin(data, chunks, network)
 
 
@@ -105,19 +105,19 @@ def check_twin(data: st.DataObject, chunks: Chunks, network: Network) -> None:
 
 def test_a_file_waits_for_its_first_request_then_for_the_others_and_for_connections() -> None:
     """Three answers of 300 bytes at 100 bytes/s by two connections, each after half a second."""
-    chunks = Chunks.of_requests([[(100, 300, 300, 300)]], [()], fetchers=1, connections=2)
+    chunks = Chunks([[(100, 300, 300, 300)]], [()], rooted=False, fetchers=1, connections=2)
     stream = ChunkStream(chunks, Network(100.0, 0.5))
     # The first until 1.5 s, two more from 2 s to 8 s, both at once, the last from 8.5 s to 11.5 s.
     assert stream.complete_in([0]) == pytest.approx(11.5)
-    free = Chunks.of_requests([[(100, 300, 300, 300)]], [()], fetchers=1, connections=None)
+    free = Chunks([[(100, 300, 300, 300)]], [()], rooted=False, fetchers=1, connections=None)
     assert ChunkStream(free, Network(100.0, 0.5)).complete_in([0]) == pytest.approx(11.0)
 
 
 def test_images_of_a_second_file_slow_down_those_of_the_first() -> None:
     """Two files at a time: the large image of the first shares the bandwidth with all of the second."""
     small, large = (10, 100, 1000), (10, 1000, 1000)
-    alone = Chunks.of_requests([[small]], [()], fetchers=2, connections=6)
-    both = Chunks.of_requests([[small, large]], [()], fetchers=2, connections=6)
+    alone = Chunks([[small]], [()], rooted=False, fetchers=2, connections=6)
+    both = Chunks([[small, large]], [()], rooted=False, fetchers=2, connections=6)
     one, two = ChunkStream(alone, Network(1000.0)), ChunkStream(both, Network(1000.0))
     assert one.complete_in([0]) == pytest.approx(1.11)
     two.want([0, 1])
@@ -131,7 +131,7 @@ def test_images_of_a_second_file_slow_down_those_of_the_first() -> None:
 def test_every_byte_comes_once_and_never_faster_than_the_link(
     data: st.DataObject, sizes: list[list[int]], network: Network
 ) -> None:
-    chunks = Chunks(sizes)
+    chunks = sized(sizes)
     stream = ChunkStream(chunks, network)
     stream.want(data.draw(st.permutations(range(len(chunks)))))
     arrived: list[int] = []
@@ -155,7 +155,7 @@ def test_every_byte_comes_once_and_never_faster_than_the_link(
 def test_the_number_of_time_steps_does_not_matter(
     data: st.DataObject, sizes: list[list[int]], network: Network
 ) -> None:
-    chunks = Chunks(sizes)
+    chunks = sized(sizes)
     one, many = (ChunkStream(chunks, network, capacity=len(sizes) + 2) for _ in range(2))
     for _ in range(3):
         requested = data.draw(st.lists(st.integers(0, len(chunks) - 1), max_size=12))
@@ -174,7 +174,7 @@ def test_the_number_of_time_steps_does_not_matter(
 
 @given(tree_sizes, networks)
 def test_the_predicted_completion_is_when_all_is_there(sizes: list[list[int]], network: Network) -> None:
-    chunks = Chunks(sizes)
+    chunks = sized(sizes)
     stream = ChunkStream(chunks, network, start=5.0)
     requested = list(range(len(chunks)))
     stream.want(requested)
@@ -192,8 +192,8 @@ def test_with_more_bandwidth_a_resting_camera_waits_no_longer(
     sizes: list[list[int]], network: Network, factor: float
 ) -> None:
     """One fetcher, or one for each chunk, or no latency, or chunks of one size."""
-    chunks = Chunks(sizes)
-    even = Chunks([[sizes[0][0]] * len(tree) for tree in sizes])
+    chunks = sized(sizes)
+    even = sized([[sizes[0][0]] * len(tree) for tree in sizes])
     requested = list(range(len(chunks)))
     for case, latency, fetchers in (
         (chunks, network.latency, 1),
@@ -209,7 +209,7 @@ def test_with_more_bandwidth_a_resting_camera_waits_no_longer(
 
 def test_a_wider_link_can_be_the_slower_one_by_a_little() -> None:
     """Fetchers that fall into step wait together while the link is idle; the twin agrees."""
-    chunks = Chunks([[2, 50, 2, 5, 10, 2]])
+    chunks = sized([[2, 50, 2, 5, 10, 2]])
     for bandwidth, expected in ((2.0, 87.5), (2.2, 88.1818)):
         network = Network(bandwidth, 20, 2)
         twin = Twin(chunks, network, NaiveCache(None))
@@ -223,7 +223,7 @@ def test_a_wider_link_can_be_the_slower_one_by_a_little() -> None:
 def test_one_fetcher_brings_them_in_order_one_after_the_other(
     data: st.DataObject, sizes: list[list[int]], network: Network
 ) -> None:
-    chunks = Chunks(sizes)
+    chunks = sized(sizes)
     stream = ChunkStream(chunks, Network(network.bandwidth, network.latency, 1))
     requested = data.draw(st.permutations(range(len(chunks))))
     stream.want(requested)
@@ -235,7 +235,7 @@ def test_one_fetcher_brings_them_in_order_one_after_the_other(
 
 
 def test_one_chunk_takes_the_latency_and_its_bytes() -> None:
-    stream = ChunkStream(Chunks([[MB]]), Network(2.5 * MB, 0.06))
+    stream = ChunkStream(sized([[MB]]), Network(2.5 * MB, 0.06))
     assert stream.complete_in([0]) == pytest.approx(0.06 + 0.4)
     stream.want([])  # a root is always wanted
     stream.advance(0.459)
@@ -247,7 +247,7 @@ def test_one_chunk_takes_the_latency_and_its_bytes() -> None:
 
 def test_no_chunk_is_asked_for_before_the_header_is_there() -> None:
     """The header takes no fetcher, and what it brings of the first chunk is not counted as the chunk."""
-    stream = ChunkStream(Chunks([[MB, MB]], [[MB // 2]]), Network(MB, 0.1, 1))
+    stream = ChunkStream(sized([[MB, MB]], [[MB // 2]]), Network(MB, 0.1, 1))
     stream.want([])
     stream.advance(0.599)
     assert stream.take_bytes() == 0
@@ -260,7 +260,7 @@ def test_no_chunk_is_asked_for_before_the_header_is_there() -> None:
 
 def test_headers_of_several_trees_come_at_once() -> None:
     """Each with half of the bandwidth; the second one has to be asked for twice."""
-    chunks = Chunks([[MB], [MB]], [[MB], [MB, 2 * MB]])
+    chunks = sized([[MB], [MB]], [[MB], [MB, 2 * MB]])
     assert rest(ChunkStream(chunks, Network(2 * MB, 0.5, 1)), []) == [
         (pytest.approx(0.5 + 1 + 0.5 + 1), 0),  # while half of the longer answer arrives
         (pytest.approx(3.0 + 0.5 + 0.5 + 0.5), 1),
@@ -272,18 +272,18 @@ def test_headers_of_several_trees_come_at_once() -> None:
 def test_equal_chunks_come_in_rounds(count: int, fetchers: int) -> None:
     rounds, remainder = divmod(count, fetchers)
     expected = rounds * (0.1 + fetchers * 0.5) + (0.1 + remainder * 0.5 if remainder else 0)
-    stream = ChunkStream(Chunks([[MB] * count]), Network(2 * MB, 0.1, fetchers))
+    stream = ChunkStream(sized([[MB] * count]), Network(2 * MB, 0.1, fetchers))
     assert stream.complete_in(list(range(count))) == pytest.approx(expected)
 
 
 def test_transfers_share_the_link() -> None:
     # 1 and 3 MB together at 1 MB/s: the small one has half of it and ends after 2 s, the large one after 4 s.
-    stream = ChunkStream(Chunks([[1 * MB], [3 * MB]]), Network(1 * MB, 1.0))
+    stream = ChunkStream(sized([[1 * MB], [3 * MB]]), Network(1 * MB, 1.0))
     assert [(pytest.approx(3.0), 0), (pytest.approx(5.0), 1)] == rest(stream, [])
 
 
 def test_fetches_are_not_cancelled_when_the_camera_turns() -> None:
-    stream = ChunkStream(Chunks([[MB] * 5]), Network(MB, 0.5, 1))
+    stream = ChunkStream(sized([[MB] * 5]), Network(MB, 0.5, 1))
     stream.want([])
     stream.advance(1.5)
     stream.want([1, 2])
@@ -295,7 +295,7 @@ def test_fetches_are_not_cancelled_when_the_camera_turns() -> None:
 
 
 def test_a_late_chunk_evicts_no_wanted_one() -> None:
-    stream = ChunkStream(Chunks([[MB] * 4]), Network(MB, 0.25, 1), capacity=2)
+    stream = ChunkStream(sized([[MB] * 4]), Network(MB, 0.25, 1), capacity=2)
     stream.want([1])
     stream.advance(3.0)
     stream.want([2])
@@ -310,7 +310,7 @@ def test_a_late_chunk_evicts_no_wanted_one() -> None:
 @given(st.data(), tree_sizes)
 def test_the_default_network_brings_at_once_what_fits(data: st.DataObject, sizes: list[list[int]]) -> None:
     sizes = [[0 if size % 3 else size for size in tree] for tree in sizes]  # some of no bytes
-    chunks = Chunks(sizes)
+    chunks = sized(sizes)
     capacity = data.draw(st.none() | st.integers(len(sizes), len(chunks)))
     stream = ChunkStream(chunks, capacity=capacity)
     for time in range(data.draw(st.integers(1, 6))):
@@ -331,7 +331,7 @@ def test_the_default_network_brings_at_once_what_fits(data: st.DataObject, sizes
 
 
 def test_a_stream_refuses_to_go_back_in_time() -> None:
-    stream = ChunkStream(Chunks([[1]]), start=1.0)
+    stream = ChunkStream(sized([[1]]), start=1.0)
     for time in (0.5, math.nan, math.inf):
         with pytest.raises(ValueError, match="it must increase"):
             stream.advance(time)

@@ -409,13 +409,17 @@ def say_notes(
     notes: Iterable[str] = (),
 ) -> None:
     """Print notes on the cameras, further ones, and those on scenes; raise a `click.UsageError` as `check_scenes`."""
+    from ...viewers.loaded_scene import TREE
+
     scenes, path = files.scenes, files.path
     check_scenes(ctx, scenes)
     upright = options.cameras.up is None and options.cameras.camera_path is None  # by the axes of the files
     for note in (*path.notes, *notes, *(scenes.axis_notes if upright else ())):
         console.say(note)
-    whole = dict.fromkeys(printable(loaded.name) for loaded in scenes.trees if not loaded.has_chunks)
-    if network is not None and not network.instant and whole:
+    if network is None or network.instant:
+        return
+    trees = [loaded for loaded in scenes.loaded if loaded.kind == TREE]
+    if whole := dict.fromkeys(printable(loaded.name) for loaded in trees if not loaded.has_chunks):
         names = ", ".join(whole)
         console.say(
             f"{names}: loaded whole by viewers before they draw; the waits are those of a RAD with the same nodes"
@@ -424,14 +428,16 @@ def say_notes(
 
 def check_scenes(ctx: click.Context, scenes: Scenes) -> None:
     """Raise a `click.UsageError` where an option is for trees or Streamed SOG, and the files are something else."""
-    if scenes.details:
+    from ...viewers.loaded_scene import STREAMED_SOG, TILES, TREE
+
+    if scenes.kind == STREAMED_SOG:
         streamed = "is for trees; use --budget, --budget-mode and --lod-multiplier for Streamed SOG"
         refuse(ctx, (*NODES, "chunk_cache", "indices_out", "padded"), streamed)
-    elif scenes.tiled:
+    elif scenes.kind == TILES:
         tiled = "is not for 3D Tiles, which CesiumJS draws without a budget; --lod-render-scale 2 halves their detail"
         others = (each for each in (*CUTS, *DETAIL, "indices_out", "padded") if each not in OF_PIXELS)
         refuse(ctx, (*others, "chunk_cache"), tiled)
-    elif scenes.trees:
+    elif scenes.kind == TREE:
         refuse(ctx, DETAIL, "is for Streamed SOG, and no file is; --budget and --preset are for trees, too")
     else:
         plain = (

@@ -20,7 +20,6 @@ from sparklod_cli.lod.part_settings import TileSettings
 from sparklod_cli.lod.tiles import PIXEL_ERROR
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.viewers.cesium import choose
-from sparklod_cli.viewers.scenes import view_of
 from sparklod_cli.viewers.viewer_settings import pixel_limit
 from tests.conftest import FIXTURES, ROOT
 from tests.interop.engines import PACKAGES, recipes
@@ -98,7 +97,7 @@ def chosen(file: Path, camera: Camera) -> list[str]:
         names += (tile["content"]["uri"] for tile in frontier)
         frontier = [child for tile in frontier for child in tile.get("children", ())]
     scene, limit = read_parts(file), PIXEL_ERROR * pixel_limit(camera.fov_y, camera.height)
-    found = choose(scene, view_of(camera), np.eye(4), limit, np.ones(scene.tiles, np.bool_))
+    found = choose(scene, camera, np.eye(4), limit, np.ones(scene.tiles, np.bool_))
     return sorted(names[tile] for tile in np.flatnonzero(found.drawn))
 
 

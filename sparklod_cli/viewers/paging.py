@@ -1,0 +1,281 @@
+"""Pages of RAD files that are larger than memory: chunks are read as cuts need them."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cameras.framing import SAMPLE, USED, Balls, balls_of
+from ..io.rad_file import RadFile
+from ..lod.kernels.pixel_scale import NODE
+from ..model.instances import Instance
+from ..model.lod_tree import CHUNK_BITS, CHUNK_NODES, LodTree
+from ..model.scene import FileCoding
+from ..model.splats import COLUMNS, Splats
+from ..model.traversed import Nodes
+from ..system.errors import TreeError, naming
+from ..system.machine import available_memory
+from ..system.threads import ordered_map
+from .cut import Forest
+from .loaded_scene import TRAVERSED, Index, LoadedScene, bytes_of
+
+#: Makes nodes of the splats, the tree and the coding of a chunk.
+NodesOf = Callable[[Splats, LodTree, FileCoding], Nodes]
+
+#: Decoded chunks that are kept for the splats of the next cut: they take at most this share of the free memory, but
+#: there are at least so many. Chosen.
+KEPT_SHARE, LEAST_KEPT = 0.25, 8
+
+#: Share of the chunks that a cut lacks that is read before the cut is found again, the most important ones first. With
+#: fewer, it is found more often; with more, chunks are read that it turns out not to need. Chosen.
+READ_SHARE = 0.5
+
+
+class Pages:
+    """The nodes and splats of a RAD file that were needed so far.
+
+    Nodes of chunks that were read stay in memory, 28 bytes each; of decoded splats, only those of some chunks. Several
+    threads may use it. Where a chunk is damaged, a `FormatError` names the file.
+
+    Args:
+        file: of a tree in chunks of `CHUNK_NODES`.
+        name: of the file, for errors.
+        threads: to decode splats with.
+
+    Attributes:
+        present: (chunks,) bool, those whose nodes are in memory.
+        depth: (N,) int32 edges from the root, of the nodes that the present chunks lead to; 0 of others.
+    """
+
+    def __init__(self, file: RadFile, name: str, nodes_of: NodesOf, threads: int) -> None:
+        self.file, self._name, self._nodes_of, self._threads = file, name, nodes_of, threads
+        self.count = file.header.count
+        self.present = np.zeros(len(file.header.chunks), np.bool_)
+        self.nodes, self.depth = np.zeros(0, NODE), np.zeros(self.count, np.int32)
+        self._lock = threading.Lock()
+        self._cache: OrderedDict[int, Splats] = OrderedDict()
+        self._kept = LEAST_KEPT
+        free = available_memory()
+        if free is not None:
+            size = CHUNK_NODES * bytes_of(Splats.empty(1, file.header.max_sh))
+            self._kept = max(LEAST_KEPT, int(KEPT_SHARE * free / size))
+
+    def place(self, nodes: NDArray[np.void], depth: NDArray[np.int32]) -> None:
+        """Set the arrays of zeros, (N,) `NODE` and (N,) int32, that nodes are read into, and read the root."""
+        self.nodes, self.depth = nodes, depth
+        self.read([0])
+
+    def read(self, numbers: Sequence[int]) -> None:
+        """Read the nodes of chunks that are not present; a `TreeError` if their children are not those of a tree."""
+        for number in numbers:
+            with self._lock:
+                if self.present[number]:
+                    continue
+                splats, tree, coding = self._decoded(number, TRAVERSED)
+                assert tree is not None
+                start = number << CHUNK_BITS
+                self._check(tree, start)
+                self._nodes_of(splats, tree, coding).fill(self.nodes[start : start + len(tree)])
+                self.present[number] = True
+                known = start + np.flatnonzero(self.depth[start : start + len(tree)])
+                self._descend(known if number else np.concatenate([np.zeros(1, np.int64), known]))
+
+    def _check(self, tree: LodTree, start: int) -> None:
+        """Raise a `TreeError` for children that no tree has; `LodTree.validate` has the same texts."""
+        first, node = tree.child_start.astype(np.int64), start + np.arange(len(tree))
+        for mask, what in (
+            (~tree.is_leaf & (first <= node), "comes after one of its children"),
+            (~tree.is_leaf & (first + tree.child_count > self.count), "has children past the last node"),
+        ):
+            if mask.any():
+                raise TreeError(f"{self._name}: its tree is broken: node {node[np.argmax(mask)]} {what}")
+
+    def _descend(self, frontier: NDArray[np.int64]) -> None:
+        """Set the depths of the nodes below some whose depth is known, in the chunks that are present."""
+        while len(frontier):
+            count = self.nodes["child_count"][frontier].astype(np.int64)
+            inner, count = frontier[count > 0], count[count > 0]
+            first = self.nodes["child_start"][inner].astype(np.int64)
+            children = np.repeat(first - (np.cumsum(count) - count), count) + np.arange(count.sum())
+            twice = self.depth[children] > 0
+            if twice.any() or len(np.unique(children)) < len(children):
+                node = np.repeat(inner, count)[np.argmax(twice)]
+                raise TreeError(f"{self._name}: its tree is broken: node {node} shares children with another node")
+            self.depth[children] = np.repeat(self.depth[inner] + 1, count)
+            frontier = children[self.present[children >> CHUNK_BITS]]
+
+    def splats(self, index: NDArray[np.integer]) -> Splats:
+        """Return some splats by their indices, (M,) ascending; decoded chunks are cached for the next ones."""
+        rows = Splats.empty(len(index), self.file.header.max_sh)
+        numbers, begins = np.unique(index >> CHUNK_BITS, return_index=True)
+        ends = itertools.pairwise([*begins.tolist(), len(index)])
+        parts = {int(number): slice(*each) for number, each in zip(numbers, ends, strict=True)}
+
+        def put(number: int, splats: Splats) -> None:
+            part = parts[number]
+            for name in COLUMNS:
+                getattr(rows, name)[part] = getattr(splats, name)[index[part] - (number << CHUNK_BITS)]
+
+        def decoded(number: int) -> tuple[int, Splats]:
+            return number, self._decoded(number, COLUMNS)[0]
+
+        with self._lock:
+            kept = [number for number in parts if number in self._cache]
+            for number in kept:
+                put(number, self._cache[number])
+                self._cache.move_to_end(number)
+            missing = [number for number in parts if number not in self._cache]
+            for number, splats in ordered_map(decoded, missing, self._threads):
+                put(number, splats)
+                self._cache[number] = splats
+                if len(self._cache) > self._kept:
+                    self._cache.popitem(last=False)
+        return rows
+
+    def blocks(self, columns: Collection[str]) -> Iterator[tuple[Splats, LodTree]]:
+        """Yield all chunks in order, with these columns; none of them is cached."""
+        with naming(self._name):
+            for _, splats, tree in self.file.chunks(columns, thorough=False, threads=self._threads):
+                assert tree is not None
+                yield splats, tree
+
+    def leaf_count(self) -> int:
+        return sum(int(np.count_nonzero(tree.is_leaf)) for _, tree in self.blocks(()))
+
+    def leaves(self) -> NDArray[np.int64]:
+        found = [np.flatnonzero(tree.is_leaf) for _, tree in self.blocks(())]
+        return np.concatenate([number * CHUNK_NODES + leaves for number, leaves in enumerate(found)])
+
+    def _decoded(self, number: int, columns: Collection[str]) -> tuple[Splats, LodTree | None, FileCoding]:
+        with naming(self._name):
+            return self.file.chunk(number, columns)
+
+
+@dataclass(frozen=True, eq=False)
+class PagedScene(LoadedScene):
+    """A tree that may be larger than memory; `scene` and `splats` have no rows."""
+
+    paged = True
+
+    pages: Pages = field(kw_only=True)
+
+    def fill(self, rows: NDArray[np.void]) -> None:
+        """Leave the rows to the `Pager`."""
+
+    @property
+    def depth(self) -> NDArray[np.int32]:
+        """(N,) edges from the root to each node that was read, and to their children."""
+        return self.pages.depth
+
+    @property
+    def count(self) -> int:
+        return self.pages.count
+
+    @functools.cached_property
+    def leaves(self) -> Index:
+        """(M,) indices of full detail, for which the children of all nodes are read."""
+        return self.pages.leaves()
+
+    @functools.cached_property
+    def leaf_count(self) -> int:
+        return self.pages.leaf_count()
+
+    def rows(self, index: Index) -> Splats:
+        return self.pages.splats(index)
+
+
+class Pager:
+    """Reads the nodes of a forest as cuts need them."""
+
+    def __init__(self, forest: Forest[Any]) -> None:
+        self._forest = forest
+        self._pages: list[tuple[slice, Pages]] = []
+        bases = (itertools.pairwise(base.tolist()) for base in (forest.node_base, forest.chunk_base))
+        for scene, nodes, chunks in zip(forest.scenes, *bases, strict=True):
+            if isinstance(scene, PagedScene):
+                scene.pages.place(forest.nodes[slice(*nodes)], forest.depth[slice(*nodes)])
+                self._pages.append((slice(*chunks), scene.pages))
+
+    def present(self) -> NDArray[np.bool_]:
+        """Return the (chunks,) bool, those whose nodes are in memory; not changed later."""
+        present = np.ones(self._forest.chunks, np.bool_)
+        for chunks, pages in self._pages:
+            present[chunks] = pages.present
+        return present
+
+    def read(self, wanted: NDArray[np.bool_]) -> None:
+        """Read those of these chunks, (chunks,) bool, that are not in memory; errors are those of `Pages.read`."""
+        for chunks, pages in self._pages:
+            pages.read(np.flatnonzero(wanted[chunks] & ~pages.present).tolist())
+
+    def read_some(self, demand: NDArray[np.float32], present: NDArray[np.bool_]) -> bool:
+        """Read the more important half of the chunks that a cut lacked; False if it lacked none.
+
+        The most important one is needed for certain, as a cut takes nodes by their importance; others may turn out not
+        to be, once the nodes in that one take their share of the budget.
+
+        Args:
+            demand, present: (chunks,), of a `TreeCut`, and the chunks that it was found with.
+        """
+        missing = np.flatnonzero((demand > 0) & ~present)
+        missing = missing[np.argsort(-demand[missing], kind="stable")]
+        now = np.zeros(len(present), np.bool_)
+        now[missing[: int(np.ceil(READ_SHARE * len(missing)))]] = True
+        self.read(now)
+        return len(missing) > 0
+
+
+def sampled_balls(instances: Sequence[Instance], scenes: Sequence[LoadedScene]) -> Balls:
+    """Return the sample of what the splats of instances cover that cameras are framed by."""
+    counts = [loaded.leaf_count for loaded in scenes]
+    while True:
+        every = max(sum(counts) // SAMPLE, 1)
+        starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+        samples = [_Sample(int(start), every) for start in starts[:-1]]
+        for loaded in dict.fromkeys(scenes):
+            of_loaded = [at for at, each in enumerate(scenes) if each is loaded]
+            for splats, leaves in _leaves_of(loaded):
+                for at in of_loaded:
+                    samples[at].add(balls_of(splats, leaves, instances[at].object_to_world))
+        found = [sample.count for sample in samples]
+        if found == counts:
+            break
+        counts = found  # some are not finite, and do not count
+    whole = Balls.concat(part for sample in samples for part in sample.parts)
+    low = np.min([sample.low for sample in samples], axis=0)
+    high = np.max([sample.high for sample in samples], axis=0)
+    return Balls(whole.center, whole.radius, np.stack([low, high]), max(sample.largest for sample in samples))
+
+
+class _Sample:
+    """Every n-th ball of an instance, and the bounds of all of them; the first one has the number `start` of all."""
+
+    def __init__(self, start: int, every: int) -> None:
+        self._start, self._every = start, every
+        self.count, self.largest = 0, 0.0
+        self.low, self.high = np.full(3, np.inf), np.full(3, -np.inf)
+        self.parts: list[Balls] = [Balls(np.empty((0, 3)), np.empty(0))]
+
+    def add(self, balls: Balls) -> None:
+        first = -(self._start + self.count) % self._every
+        self.parts.append(Balls(balls.center[first :: self._every].copy(), balls.radius[first :: self._every].copy()))
+        self.count += len(balls.radius)
+        self.largest = max(self.largest, float(balls.radius.max(initial=0)))
+        self.low = np.minimum(self.low, balls.center.min(axis=0, initial=np.inf))
+        self.high = np.maximum(self.high, balls.center.max(axis=0, initial=-np.inf))
+
+
+def _leaves_of(loaded: LoadedScene) -> Iterator[tuple[Splats, Index]]:
+    if not isinstance(loaded, PagedScene):
+        yield loaded.splats, loaded.leaves
+        return
+    for splats, tree in loaded.pages.blocks(USED):
+        yield splats, np.flatnonzero(tree.is_leaf)
