@@ -44,7 +44,7 @@ class Arrival:
 
 
 class StreamedCuts(CutFinder):
-    """What a viewer that fetches the chunks of scenes draws, for one camera after another.
+    """Cuts of a viewer that fetches the chunks of scenes, for one camera after another.
 
     Args:
         scenes: with trees or detail levels; others are there from the beginning.

@@ -48,7 +48,7 @@ class Viewer(Protocol):
 
 
 class Held(Protocol):
-    """What a viewer holds of a scene: splats as nodes, in chunks."""
+    """A scene in a viewer: splats as nodes, in chunks."""
 
     paged: ClassVar[bool]
 

@@ -67,7 +67,7 @@ class LoadedScene:
 
     @property
     def kind(self) -> str | None:
-        """What a viewer draws cuts of: `TREE`, `STREAMED_SOG` or `TILES`; None for a plain scene."""
+        """Kind of scene that cuts are drawn of: `TREE`, `STREAMED_SOG` or `TILES`; None for a plain scene."""
         return None if self.scene.tree is None else TREE
 
     def viewer(

@@ -150,7 +150,7 @@ class Scenes:
 
     @functools.cached_property
     def kind(self) -> str | None:
-        """What viewers draw cuts of, `LoadedScene.kind`; the last of several, with which `viewer` fails."""
+        """`LoadedScene.kind` of the scenes that have one; the last of several, with which `viewer` fails."""
         return max((loaded.kind for loaded in self.loaded), key=KINDS.index)
 
     @functools.cached_property

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sparklod_cli.model import traversed
 from sparklod_cli.viewers import spark as traversal
 from sparklod_cli.viewers.cut import CutView, Forest, TreeInstance
 from tests.lod.forests import Case, ancestors_drawn, cases, check, random_tree, transform
@@ -24,7 +25,8 @@ def small_chunks() -> Iterator[None]:
     """Small chunks, so that small trees have many."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(traversal, "CHUNK_BITS", SMALL)
-        patch.setattr(traversal, "CHUNK_NODES", 1 << SMALL)
+        for module in (traversal, traversed):
+            patch.setattr(module, "CHUNK_NODES", 1 << SMALL)
         yield
 
 
