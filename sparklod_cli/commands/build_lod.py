@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import functools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -37,7 +36,6 @@ from .options.baking import (
     TILED,
     TREE,
     TREES,
-    VERIFY,
     BuildLodOptions,
     refuse_others,
     write_options,
@@ -45,15 +43,12 @@ from .options.baking import (
 from .paths import NAMELESS, Folder, claim_stdout, is_same_place, keep_apart, require_suffix, with_chunks
 
 if TYPE_CHECKING:
-    from ..bake.out_of_core.cluster import ClusterEngine
+    from ..api.bake_jobs import Outcome, Pair
     from ..bake.parts_output import WrittenDetail
     from ..bake.settings import Baked, Source
     from ..bake.simplifying import Extracted, Refined, WrittenSet
     from ..codecs.encoder import Clamp
     from ..model.instances import Instance
-
-    #: Result for an input; None where the output exists already.
-    Outcome = Baked | Extracted | SparklodError | None
 
 EXAMPLES = """\
   sparklod build-lod scene.ply                     # writes scene-lod.spz
@@ -124,17 +119,11 @@ def build_lod(ctx: click.Context, /, **_: Any) -> None:
         instances = read_instances(options.scene)
     _check(ctx, options, [instance.file for instance in instances if instance.file is not None])
     failed, console = False, Console(quiet=general.quiet, verbose=general.verbose)
-    engines: contextlib.AbstractContextManager[ClusterEngine | None] = contextlib.nullcontext()
-    if options.workers is not None or options.scheduler is not None:
-        from ..bake.out_of_core.cluster import ClusterSettings, cluster
-
-        threads = general.threads if options.scheduler is None or is_set(ctx, "threads") else None
-        settings = ClusterSettings(options.scheduler, options.workers or 1, threads)
-        engines = cluster(settings, memory=options.memory, say=console.say)
-    with console, engines as engine:
-        report: Callable[..., None] = report_extracted if options.unlod else report_baked
+    report: Callable[..., None] = report_extracted if options.unlod else report_baked
+    with console, contextlib.ExitStack() as stack:
         pairs = _pairs(options, instances, console)
-        for (source, target), outcome in zip(pairs, _outcomes(ctx, options, pairs, console, engine), strict=True):
+        outcomes = stack.enter_context(contextlib.closing(_outcomes(ctx, options, pairs, console)))
+        for (source, target), outcome in zip(pairs, outcomes, strict=True):
             if isinstance(outcome, SparklodError):
                 failed = True
                 console.error(f"{name_of(source)}: {outcome}")
@@ -152,17 +141,16 @@ def build_lod(ctx: click.Context, /, **_: Any) -> None:
         ctx.exit(1)
 
 
-def _pairs(options: BuildLodOptions, instances: Sequence[Instance], console: Console) -> Sequence[tuple[Source, Place]]:
+def _pairs(options: BuildLodOptions, instances: Sequence[Instance], console: Console) -> Sequence[Pair]:
     """Return the inputs, each with its output."""
     if not options.is_merged:
         return [(source, options.target(source)) for source in options.inputs]
-    from ..bake.settings import Merged
+    from ..api.bake_jobs import merged_source
 
     assert options.output is not None  # see `check_inputs`
     if any(each.lod_scale != 1 or each.foveation is not None for each in instances):
         console.say(f"{options.scene}: lod_scale and foveation of instances are for viewers, and no part of a tree")
-    merged = Merged.of(options.inputs) if options.scene is None else Merged.of_instances(instances)
-    return [(merged, options.output)]
+    return [(merged_source(options.inputs, instances), options.output)]
 
 
 def check_inputs(ctx: click.Context, options: BuildLodOptions) -> None:
@@ -290,64 +278,46 @@ def _check_cuts(ctx: click.Context, options: BuildLodOptions) -> None:
 
 
 def _outcomes(
-    ctx: click.Context,
-    options: BuildLodOptions,
-    pairs: Sequence[tuple[Source, Place]],
-    console: Console,
-    engine: ClusterEngine | None,
-) -> Iterator[Outcome]:
-    """Make the output of each input, and return the results in order; loads numpy.
-
-    An error is the result of its input, so that it does not stop the others.
-    """
-    threads = options.general.threads
-    shared: dict[str, Any] = {"overwrite": options.overwrite, "progress": console.progress}
-    job: Callable[[], contextlib.AbstractContextManager[None]] = contextlib.nullcontext
-    make: Callable[..., Any]
-
-    def outcome(source: Source, target: Place) -> Outcome:
-        try:
-            with job():
-                result: Baked | Extracted | None = make(source, target)
-                return result
-        except SparklodError as error:
-            return error
-
+    ctx: click.Context, options: BuildLodOptions, pairs: Sequence[Pair], console: Console
+) -> Generator[Outcome, None, None]:
+    """Yield the result of each input, in order; loads numpy."""
+    how: dict[str, Any] = {
+        "overwrite": options.overwrite,
+        "threads": options.general.threads,
+        "progress": console.progress,
+    }
     if options.unlod:
-        console.announce_compiling()
-        from ..bake.simplifying import extract_leaves
+        from ..api.bake_jobs import extract_files
 
+        console.announce_compiling()
         form = options.output_form
         written = write_options(options.written, options.cluster_sh, chunked=form.chunked)
-        make = functools.partial(extract_leaves, suffix=form.suffix, options=written, threads=threads, **shared)
-        return (outcome(*pair) for pair in pairs)
-    from ..bake.flow import bake, stage_shares
-    from ..bake.settings import Resources
+        return extract_files(pairs, written, form.suffix, **how)
+    from ..api.bake_jobs import bake_files
 
     settings = options.bake_settings(ctx)
     console.announce_compiling(settings)
-    bake_one: Callable[..., Baked | None] = bake
-    if options.skip_existing is not None:
-        from ..bake.skipping import bake_unless_there
-
-        bake_one = functools.partial(bake_unless_there, verify=options.skip_existing == VERIFY)
-    resources = Resources(options.memory if engine is None else engine.memory, options.scratch_dir, options.resume)
-    how: dict[str, Any] = {"settings": settings, "resources": resources, "engine": engine}
-    job = functools.partial(console.job, stage_shares(settings))
-    make = functools.partial(bake_one, **how, threads=threads, say=console.say, **shared)
-    if engine is None or len(pairs) < 2:
-        return (outcome(*pair) for pair in pairs)
-    from ..bake.side_by_side import bake_side_by_side
-
-    return bake_side_by_side(pairs, make=bake_one, bake_large=outcome, **how, **shared)
+    return bake_files(
+        pairs,
+        settings,
+        **how,
+        job=console.job,
+        say=console.say,
+        skip=options.skip_existing,
+        memory=options.memory,
+        scratch_dir=options.scratch_dir,
+        resume=options.resume,
+        scheduler=options.scheduler,
+        workers=options.workers,
+        cluster_threads=options.general.threads if options.scheduler is None or is_set(ctx, "threads") else None,
+    )
 
 
 def record_of(source: Source, target: Place, outcome: Outcome) -> dict[str, Any]:
     """Return the JSON of a result; several inputs that are one scene are "inputs"."""
-    from ..bake.settings import Merged
-
-    record: dict[str, Any] = {"input": str(source)}
-    if isinstance(source, Merged):
+    if isinstance(source, (Path, Address)):
+        record: dict[str, Any] = {"input": str(source)}
+    else:
         record = {"inputs": [str(file) for file, _ in source.files]}
     if isinstance(outcome, SparklodError):
         return {**record, "error": shortened(str(outcome), MOST)}

@@ -16,7 +16,7 @@ from ..lod.budget import Budget, parse_budget
 from ..lod.builders import DETAIL_GROWTH
 from ..system import interrupts
 from ..system.addresses import Place
-from ..system.errors import FormatError, naming
+from ..system.errors import FormatError, SparklodError, naming
 from ..system.setting_fields import Quantity, Range, setting, setting_of, whole
 from ..system.stdio import DASH, name_of
 from ..system.units import parse_size
@@ -61,7 +61,7 @@ from .paths import (
 )
 
 if TYPE_CHECKING:
-    from ..bake.settings import BakeSettings
+    from ..api.bake_jobs import BakeSettings
 
 EXAMPLES = """\
   sparklod simplify scene.ply --to 10% -o small.ply
@@ -148,7 +148,7 @@ class SimplifyOptions:
 
     def settings(self, ctx: click.Context) -> BakeSettings:
         """Return the settings of the bake whose tree is cut; loads numpy."""
-        from ..bake.settings import BakeSettings
+        from ..api.bake_jobs import BakeSettings
         from ..bake.simplifying import SimplifyGoal
 
         return BakeSettings(
@@ -187,26 +187,27 @@ def simplify(ctx: click.Context, /, **_: Any) -> None:
     general, inputs = options.general, options.inputs
     _check(ctx, options)
     with Console(quiet=general.quiet, verbose=general.verbose) as console:
-        from ..bake.flow import bake, stage_shares
-        from ..bake.settings import Merged, Resources, Source
+        from ..api.bake_jobs import Baked, bake_files, merged_source
 
         settings = options.settings(ctx)
         question_budgets(console, options.to)
         console.announce_compiling(settings)
-        source: Source = inputs[0] if len(inputs) == 1 else Merged.of(inputs)
-        # Errors about one of several inputs name it already.
-        named = naming(name_of(source), FormatError) if len(inputs) == 1 else contextlib.nullcontext()
-        with console.job(stage_shares(settings)), named:
-            baked = bake(
-                source,
-                options.output,
-                settings,
-                overwrite=options.overwrite,
-                threads=general.threads,
-                progress=console.progress,
-                resources=Resources(memory=options.memory),
-                say=console.say,
-            )
+        source = inputs[0] if len(inputs) == 1 else merged_source(inputs)
+        (baked,) = bake_files(
+            [(source, options.output)],
+            settings,
+            overwrite=options.overwrite,
+            threads=general.threads,
+            progress=console.progress,
+            memory=options.memory,
+            job=console.job,
+            say=console.say,
+        )
+        if isinstance(baked, SparklodError):
+            # Errors about one of several inputs name it already.
+            with naming(name_of(source), FormatError) if len(inputs) == 1 else contextlib.nullcontext():
+                raise baked
+        assert isinstance(baked, Baked)
         report_simplified(console, source, options.output, baked)
         if options.as_json:
             print_json(record_of(source, options.output, baked))

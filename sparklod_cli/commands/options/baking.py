@@ -36,7 +36,7 @@ from ..paths import InputPath, OutputPath, stem_of
 from .common import EACH_AS_JSON, JSON, OUTPUT, OVERWRITE, General
 
 if TYPE_CHECKING:
-    from ...bake.settings import BakeSettings
+    from ...api.bake_jobs import BakeSettings
 
 #: Headings of `--help`.
 TREE, SELECTION, POSITION, FILE_FORMAT = "Tree", "Selection", "Rotation, scale and position", "File format"
@@ -393,7 +393,7 @@ class BuildLodOptions:
 
     def bake_settings(self, ctx: click.Context) -> BakeSettings:
         """Return the settings of bakes; loads numpy."""
-        from ...bake.settings import BakeSettings
+        from ...api.bake_jobs import BakeSettings
 
         form = self.output_form
         growth = DETAIL_GROWTH if form.cuts else DEFAULT_GROWTH

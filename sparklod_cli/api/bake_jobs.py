@@ -1,0 +1,122 @@
+"""The jobs of `build-lod` and `simplify`: inputs become files, one after the other or on a cluster."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+from collections.abc import Callable, Generator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Union
+
+from ..bake.flow import bake, stage_shares
+from ..bake.settings import Baked as Baked
+from ..bake.settings import BakeSettings as BakeSettings
+from ..bake.settings import Merged, Resources, Source
+from ..codecs.options import WriteOptions
+from ..model.instances import Instance
+from ..system.addresses import Place
+from ..system.errors import SparklodError
+from ..system.progress import Progress, silent
+
+if TYPE_CHECKING:
+    from ..bake.simplifying import Extracted
+
+#: Shows stages of work, by name with their relative times, as one job.
+Job = Callable[[Mapping[str, float]], contextlib.AbstractContextManager[None]]
+
+#: An input and its output.
+Pair = tuple[Source, Place]
+
+#: Result for an input; None where the output exists already.
+Outcome = Union[Baked, "Extracted", SparklodError, None]
+
+
+def merged_source(files: Sequence[Place], instances: Sequence[Instance] = ()) -> Source:
+    """Return the source that is one scene of files, or else of instances, each where it stands."""
+    return Merged.of_instances(instances) if instances else Merged.of(files)
+
+
+def bake_files(
+    pairs: Sequence[Pair],
+    settings: BakeSettings,
+    *,
+    job: Job,
+    say: Callable[[str], None],
+    progress: Progress = silent,
+    threads: int = 1,
+    overwrite: bool = False,
+    skip: str | None = None,
+    memory: int | None = None,
+    scratch_dir: Place | None = None,
+    resume: bool = False,
+    scheduler: str | None = None,
+    workers: int | None = None,
+    cluster_threads: int | None = None,
+) -> Generator[Outcome, None, None]:
+    """Bake each input into its output, and yield the results in order.
+
+    An error is the result of its input, so that it does not stop the others.
+
+    Args:
+        say: receives one-line messages for the user.
+        skip: skip outputs of the same inputs and settings: "date" compares sizes and dates, "verify" contents; None
+            bakes all.
+        scheduler, workers, cluster_threads: see `ClusterSettings`; a cluster is used if one of the first two is given.
+
+    Raises:
+        SparklodError: there is no such cluster.
+    """
+    make: Callable[..., Baked | None] = bake
+    if skip is not None:
+        from ..bake.skipping import bake_unless_there
+
+        make = functools.partial(bake_unless_there, verify=skip == "verify")
+    resources = Resources(memory, scratch_dir, resume)
+    how: dict[str, Any] = {"settings": settings, "overwrite": overwrite, "progress": progress}
+
+    def outcome(source: Source, target: Place) -> Outcome:
+        try:
+            with job(stage_shares(settings)):
+                return make(source, target, **how, resources=resources, engine=engine, threads=threads, say=say)
+        except SparklodError as error:
+            return error
+
+    if scheduler is None and workers is None:
+        engine = None
+        for pair in pairs:
+            yield outcome(*pair)
+        return
+    from ..bake.out_of_core.cluster import ClusterSettings, cluster
+    from ..bake.side_by_side import bake_side_by_side
+
+    with cluster(ClusterSettings(scheduler, workers or 1, cluster_threads), memory=memory, say=say) as engine:
+        resources = dataclasses.replace(resources, memory=engine.memory)
+        if len(pairs) > 1:
+            yield from bake_side_by_side(
+                pairs, **how, engine=engine, resources=resources, make=make, bake_large=outcome
+            )
+        for pair in pairs if len(pairs) == 1 else ():
+            yield outcome(*pair)
+
+
+def extract_files(
+    pairs: Sequence[Pair],
+    options: WriteOptions,
+    suffix: str,
+    *,
+    overwrite: bool = False,
+    threads: int = 1,
+    progress: Progress = silent,
+) -> Generator[Outcome, None, None]:
+    """Write the leaves of each tree as a file of plain splats, and yield the results as `bake_files`."""
+    from ..bake.simplifying import extract_leaves
+
+    for source, target in pairs:
+        assert not isinstance(source, Merged)
+        try:
+            outcome: Outcome = extract_leaves(
+                source, target, options, suffix=suffix, overwrite=overwrite, threads=threads, progress=progress
+            )
+        except SparklodError as error:
+            outcome = error
+        yield outcome
