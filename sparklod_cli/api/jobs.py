@@ -151,15 +151,6 @@ def _source(
         raise UnfitError(str(error)) from None
 
 
-@dataclass(frozen=True)
-class Traversed:
-    """Result of a traversal."""
-
-    frames: WrittenFrames
-    summary: Summary
-    outcomes: list[Outcome]
-
-
 def traverse_files(
     files: ViewedFiles,
     budget: Budget,
@@ -171,12 +162,15 @@ def traverse_files(
     asserts: Sequence[Assertion] = (),
     passed: Filter | None = None,
     bar: bool = True,
-) -> Traversed:
+) -> tuple[WrittenFrames, Summary, list[Outcome]]:
     """Simulate what a viewer draws of files along a path, and write tables and charts of the frames.
 
     Args:
         by_instance: make rows of single instances, too.
         bar: report the number of frames done.
+
+    Returns:
+        the frames written, their summary, and the outcomes of `asserts`.
 
     Raises:
         UnfitError: the budget, or the chunk cache, is too small for the roots.
@@ -198,4 +192,4 @@ def traverse_files(
     frames = write_frames(simulation, path, outputs, threads=files.threads, progress=progress, passed=passed)
     nothing: Row = dict.fromkeys(column.name for column in LOADING)
     asserted = [row | (loading or nothing if not at else nothing) for at, row in enumerate(frames.rows)]
-    return Traversed(frames, summarize(frames.rows, loading), check(asserts, asserted, empty=EMPTY))
+    return frames, summarize(frames.rows, loading), check(asserts, asserted, empty=EMPTY)

@@ -139,22 +139,6 @@ class PictureCut(CutOptions):
 
 
 @dataclass(frozen=True)
-class PictureStreaming:
-    """Options of how chunks get to a viewer whose first pictures are drawn."""
-
-    HEADING: ClassVar[str] = "Streaming"
-
-    after: float | None = setting(
-        "Draw what a visitor sees this long after opening a page with the files, such as 500ms, who waits in front of"
-        " the camera; with --bandwidth.  [default: what is drawn once every chunk has arrived]",
-        Quantity("TIME", parse_time),
-        needs="bandwidth",
-        excludes=("full", "continuous", "compare"),
-    )
-    streaming: StreamingSettings = field(default_factory=StreamingSettings)
-
-
-@dataclass(frozen=True)
 class Appearance:
     """Options of the look of pictures."""
 
@@ -364,31 +348,19 @@ class RenderOptions:
     inputs: Inputs = field(default_factory=Inputs)
     cameras: PictureCameras = field(default_factory=PictureCameras)
     cut: PictureCut = field(default_factory=PictureCut)
-    streaming: PictureStreaming = field(default_factory=PictureStreaming)
+    after: float | None = setting(
+        "Draw what a visitor sees this long after opening a page with the files, such as 500ms, who waits in front of"
+        " the camera; with --bandwidth.  [default: what is drawn once every chunk has arrived]",
+        Quantity("TIME", parse_time),
+        heading=StreamingSettings.HEADING,
+        needs="bandwidth",
+        excludes=("full", "continuous", "compare"),
+    )
+    streaming: StreamingSettings = field(default_factory=StreamingSettings)
     appearance: Appearance = field(default_factory=Appearance)
     comparison: ComparisonOptions = field(default_factory=ComparisonOptions)
     as_json: bool = flag("Print what was drawn as one JSON object on standard output.", **JSON)
     general: General = field(default_factory=General)
-
-    @classmethod
-    def of(cls, ctx: click.Context) -> RenderOptions:
-        """Return the options of a command line, checked."""
-        if ctx.params["compare"]:
-            name_outputs(ctx, ctx.params["scene"] or next(iter(ctx.params["files"]), None))
-        check_declared(ctx)
-        options = values_of(ctx, cls)
-        options.comparison.check(ctx, options.appearance)
-        options.cameras.check(ctx)
-        if options.streaming.after is None:
-            refuse(ctx, LOADING, "can only be used with --after")
-        options.appearance.check(ctx)
-        claim_stdout(ctx, "output", as_json=options.as_json)
-        if not options.pictures.thumbnail:
-            return options
-        small = dataclasses.replace(options.cameras, size=THUMBNAIL_SIZE)
-        fine = dataclasses.replace(options.appearance.render, supersample=THUMBNAIL_SUPERSAMPLE)
-        look = dataclasses.replace(options.appearance, render=fine)
-        return dataclasses.replace(options, cameras=small, appearance=look)
 
 
 @click.command("render", cls=Command, options=RenderOptions, examples=EXAMPLES, headings=HEADINGS)
@@ -405,15 +377,29 @@ def render(ctx: click.Context, /, **_: Any) -> None:
 
     Coordinates are those of the files; --up, --world-transform and --camera-axes bring cameras into them.
     """
-    options = RenderOptions.of(ctx)
+    if ctx.params["compare"]:
+        name_outputs(ctx, ctx.params["scene"] or next(iter(ctx.params["files"]), None))
+    check_declared(ctx)
+    options = values_of(ctx, RenderOptions)
+    options.comparison.check(ctx, options.appearance)
+    options.cameras.check(ctx)
+    if options.after is None:
+        refuse(ctx, LOADING, "can only be used with --after")
+    options.appearance.check(ctx)
+    claim_stdout(ctx, "output", as_json=options.as_json)
     if options.comparison.compare:
         ctx.exit(_compare(ctx, options))
+    if options.pictures.thumbnail:
+        small = dataclasses.replace(options.cameras, size=THUMBNAIL_SIZE)
+        fine = dataclasses.replace(options.appearance.render, supersample=THUMBNAIL_SUPERSAMPLE)
+        look = dataclasses.replace(options.appearance, render=fine)
+        options = dataclasses.replace(options, cameras=small, appearance=look)
     _draw(ctx, options)
 
 
 def _draw(ctx: click.Context, options: RenderOptions) -> None:
     start = time.perf_counter()
-    look, general, streaming = options.appearance, options.general, options.streaming
+    look, general = options.appearance, options.general
     budget = None if options.cut.full else options.cut.one_budget()
     instances = options.inputs.instances()
     # What is wrong with the output is said before much is read.
@@ -430,7 +416,7 @@ def _draw(ctx: click.Context, options: RenderOptions) -> None:
             files = viewed_files(options, instances, console, through=look.through, paged=paged)
             render = render if flags_set(ctx, PLANES) else files.with_planes(render)
             output, settings = _place(ctx, options, instances, files.path)
-            say_notes(ctx, console, options, files, streaming.streaming.network, files.scenes.notes)
+            say_notes(ctx, console, options, files, options.streaming.network, files.scenes.notes)
             console.detail(f"  read in {time.perf_counter() - start:.2f} s")
             pictures = draw_files(
                 files,
@@ -439,7 +425,7 @@ def _draw(ctx: click.Context, options: RenderOptions) -> None:
                 render,
                 output,
                 settings,
-                loading=None if streaming.after is None else (streaming.streaming, streaming.after),
+                loading=None if options.after is None else (options.streaming, options.after),
                 reference=options.comparison.diff,
                 overwrite=options.pictures.overwrite,
             )

@@ -34,7 +34,6 @@ from .options.viewing import Cameras, CutOptions, Inputs, files_read, say_notes,
 from .paths import OutputPath, claim_stdout, keep_apart, name_outputs
 
 if TYPE_CHECKING:
-    from ..api.jobs import Traversed
     from ..simulation.results import FrameOutputs, FrameStatistics, Moment, Summary
     from ..tables.assertions import Assertion
     from ..tables.columns import Row
@@ -173,7 +172,7 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
             files = viewed_files(options, instances, console, trees_only=True, plain=plain, paged=True)
             say_notes(ctx, console, options, files, options.streaming.network)
             keep_apart(ctx, {**besides, "indices_out": outputs.index_files(files.path.numbers, len(instances))})
-            traversed = traverse_files(
+            written, whole, outcomes = traverse_files(
                 files,
                 budget,
                 options.cut.settings(),
@@ -184,7 +183,7 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
                 passed=for_screen if screen and outputs.table.form != "parquet" else None,
                 bar=not screen,  # a bar and a table do not go together on one screen
             )
-        written, cameras_read = traversed.frames, len(files.path.cameras)
+        cameras_read = len(files.path.cameras)
         console.clear()
         console.detail(f"  {cameras_read:,} frames of {files.path.format}, {time.perf_counter() - start:.2f} s")
         if outputs.table.path is not None:
@@ -198,26 +197,14 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
                 " not share their axes (--camera-axes, --world-transform, --up)"
             )
         on_stdout = outputs.table.form is None and not options.as_json
-        ctx.exit(_report(console, traversed, table.summary, as_json=options.as_json, on_stdout=on_stdout))
-
-
-def _report(console: Console, traversed: Traversed, summary: bool | None, *, as_json: bool, on_stdout: bool) -> int:
-    """Print the results of a traversal; return the exit status.
-
-    Args:
-        summary: print the summary; None prints it if standard error is a terminal.
-        on_stdout: print it on standard output, instead of the table.
-    """
-    whole, outcomes = traversed.summary, traversed.outcomes
-    if as_json:
-        asserts = [each.as_dict() for each in outcomes]
-        print_json(whole.as_dict() | {"asserts": asserts})
-    if on_stdout and summary is not False:
-        click.echo("\n".join(lines(whole)))
-    elif summary or (summary is None and is_terminal(sys.stderr)):
-        for line in lines(whole):
-            console.say(line)
-    return report_outcomes(console, outcomes)
+        if options.as_json:
+            print_json(whole.as_dict() | {"asserts": [each.as_dict() for each in outcomes]})
+        if on_stdout and table.summary is not False:
+            click.echo("\n".join(lines(whole)))
+        elif table.summary or (table.summary is None and is_terminal(sys.stderr)):
+            for line in lines(whole):
+                console.say(line)
+        ctx.exit(report_outcomes(console, outcomes))
 
 
 #: Names of the quantities, and how a number of each is printed.

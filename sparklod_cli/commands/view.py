@@ -16,9 +16,9 @@ from ..lod.budget import doubt
 from ..system.setting_fields import Quantity, Range, setting, whole
 from ..system.units import format_size, parse_count
 from ..system.untrusted import printable
-from .command import COMMON, VIEW, Command, check_declared, flag, values_of
+from .command import COMMON, DIRECTION, VIEW, Command, check_declared, flag, values_of
 from .console import Console, count_of, print_json
-from .options.common import JSON, OVERWRITE, QUIET, VERBOSE, General, up_option
+from .options.common import DEFAULT_UP, JSON, OVERWRITE, QUIET, UP, VERBOSE, General
 from .paths import InputPath, OutputPath, keep_apart
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ class _Page:
         "Most splats of trees that are drawn, such as 500k.  [default: as Spark chooses for the device]",
         Quantity("N", parse_count, whole(1)),
     )
-    up: tuple[float, float, float] | None = up_option()
+    up: tuple[float, float, float] | None = setting(f"{UP}{DEFAULT_UP}]", DIRECTION, heading=COMMON)
     fov: float | None = setting(
         "Vertical field of view, in degrees.  [default: 60]", Range(above=0, below=180, unit="DEGREES")
     )

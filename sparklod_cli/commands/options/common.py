@@ -14,7 +14,7 @@ import click
 
 from ...system.setting_fields import setting, whole
 from ...system.stdio import DASH
-from ..command import COMMON, DIRECTION, flag
+from ..command import COMMON, flag
 from ..console import Console, Verbosity, is_terminal
 from ..paths import OutputPath, require_suffix
 
@@ -56,6 +56,10 @@ ASSERT: dict[str, Any] = {"flags": ("--assert",), "metavar": "TEXT", "multiple":
 #: Type of a picture of a table or of a file.
 PNG = OutputPath(suffixes=[".png"])
 
+#: Help of `--up` of cameras, and its default.
+UP = "Axis that is up, such as -y, or a direction x,y,z."
+DEFAULT_UP = "  [default: what the files or their formats say, or -y, as training leaves scenes"
+
 #: Help of `--json` of commands that print an object for each file.
 EACH_AS_JSON = "Print one JSON object for each file on standard output."
 
@@ -68,21 +72,6 @@ class General:
     verbose: bool = flag("Print how long each stage took, and which settings were chosen.", **VERBOSE)
     threads: int = setting(
         "Number of threads to work on.", whole(1, MAX_THREADS), processors_to_use, show_default="all processors"
-    )
-
-
-def up_option(about: str = "", besides: str = "") -> Any:
-    """Return the field of `--up` of cameras.
-
-    Args:
-        about: sentence of the help on the cameras that it applies to.
-        besides: phrase on another default, such as that of a camera format.
-    """
-    return setting(
-        f"Axis that is up, such as -y, or a direction x,y,z.{about}  [default: what the files or their formats say, or"
-        f" -y, as training leaves scenes{besides}]",
-        DIRECTION,
-        heading=COMMON,
     )
 
 

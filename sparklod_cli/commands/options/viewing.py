@@ -29,9 +29,9 @@ from ...viewers.viewer_settings import (
     LodSettings,
     Network,
 )
-from ..command import COMMON, POINT, SIZE, VIEW, VIEWS, flag, flag_of, is_set, parameters_of, refuse
+from ..command import COMMON, DIRECTION, POINT, SIZE, VIEW, VIEWS, flag, flag_of, is_set, parameters_of, refuse
 from ..paths import InputPath, file_of
-from .common import up_option
+from .common import DEFAULT_UP, UP
 
 if TYPE_CHECKING:
     from ...api.jobs import ViewedFiles
@@ -120,8 +120,10 @@ class Cameras:
         f"Angle of --orbit and --dolly above that point, in degrees.  [default: {ELEVATION:g}]",
         Range(-89, 89, unit="DEGREES"),
     )
-    up: tuple[float, float, float] | None = up_option(
-        " For cameras of which only eye and target are known.", "; y in SuperSplat's camera files"
+    up: tuple[float, float, float] | None = setting(
+        f"{UP} For cameras of which only eye and target are known.{DEFAULT_UP}; y in SuperSplat's camera files]",
+        DIRECTION,
+        heading=COMMON,
     )
     world_transform: str | None = setting(
         "Transform from the world of the cameras to that of the splats: 16 numbers with commas between, row by row, or"
