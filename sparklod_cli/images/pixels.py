@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 from PIL import Image as Pillow
 from PIL import ImageDraw, ImageFont
 
-from ..render.color_scales import Coloring, smooth
 from ..system.errors import SparklodError
 from ..system.packages import optional_import
 from ..system.untrusted import printable
 from .output import JPEG_QUALITY
 
 if TYPE_CHECKING:
+    from ..render.color_scales import Coloring
     from ..render.rasterizer import Image
 
 #: Colours of all pictures with text: the ground, titles, other text, and thin lines.
@@ -171,6 +171,8 @@ def gain_for(differences: Sequence[Image]) -> float:
 
 def difference_bar(gain: float) -> Coloring:
     """Return the colour scale of `difference`: absolute difference of a channel, 0..1."""
+    from ..render.color_scales import smooth  # most pictures have no scale
+
     marks = [(0.0, "0"), (0.5, f"{0.5 / gain:.3g}"), (1.0, f"{1 / gain:.3g}" + " or more" * (gain > 1))]
     return smooth("difference", np.empty(0), GRAYS, marks)
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,12 +16,10 @@ from ..system.progress import Progress, silent
 from ..system.stdio import DASH
 from ..system.threads import on_threads, ordered_map
 from . import pixels as codes
-from .metrics import check_covered, psnr
 from .output import JPEG_QUALITY
-from .pixels import animate, sheet
+from .pixels import animate
 
 if TYPE_CHECKING:
-    from ..cameras.camera import Camera
     from ..cameras.sources import CameraPath
     from ..render.renderer import DrawnPicture
     from ..render.settings import RenderSettings
@@ -73,16 +70,6 @@ class WrittenPictures:
     empty: bool
 
 
-@dataclass(frozen=True)
-class _Frame:
-    """A finished picture: its pixels, or the bytes of its file if each frame has one."""
-
-    facts: dict[str, Any]
-    pixels: Pixels | None
-    data: bytes
-    empty: bool
-
-
 def write_pictures(
     source: CutFinder,
     path: CameraPath,
@@ -106,10 +93,38 @@ def write_pictures(
         SparklodError: the quantity to colour by is missing, the reference covers no pixel of a frame, or an animation
             cannot be encoded here.
     """
+    facts: list[dict[str, Any]] = []
+    count, size, empty = len(path.cameras), 0, True
+
+    def drawn() -> Iterator[Any]:
+        nonlocal empty
+        finished = ordered_map(drawing.finish, range(count), min(settings.jobs, count))
+        for done, (fact, is_empty, result) in enumerate(finished, 1):
+            progress("drawing", done, count, "frame")
+            facts.append(fact)
+            empty &= is_empty
+            yield result
+
     with on_threads(settings.threads):
         renderer = Renderer(source, render, path.cameras, progress=progress)
         other = None if reference is None else Renderer(reference, render, path.cameras, progress=progress)
-        return _Writer(renderer, path, output, settings, other, overwrite, progress).run()
+        drawing = _Drawing(renderer, other, path, output, settings)
+        if other is not None:
+            drawing.gain = settings.gain or drawing.fitting_gain(other, progress)
+        if output.kind == "frames":
+            for target, data in zip(output.paths(path.numbers), drawn(), strict=True):
+                size += write_file(target, [data], overwrite=overwrite)
+        else:
+            if output.kind == "picture":
+                (data,) = drawn()
+            elif output.kind == "animation":
+                data = animate(drawn(), count, output.form, frame_rate(path))
+            else:
+                cameras = zip(path.numbers, path.cameras, strict=True)
+                captions = [camera.name or f"frame {number}" for number, camera in cameras]
+                data = codes.encode(codes.sheet(list(drawn()), captions), output.form, settings.jpeg_quality)
+            size = write_file(output.name or DASH, [data], overwrite=overwrite)
+    return WrittenPictures(facts, size, drawing.gain if other is not None else None, empty)
 
 
 def frame_rate(path: CameraPath) -> float:
@@ -118,111 +133,74 @@ def frame_rate(path: CameraPath) -> float:
     return (len(path.cameras) - 1) / span if span > 0 else DEFAULT_FPS
 
 
-class _Writer:
-    """One run of `write_pictures`; see there for the arguments."""
+@dataclass
+class _Drawing:
+    """Pictures of `write_pictures`; see there for the first attributes.
 
-    def __init__(
-        self,
-        renderer: Renderer,
-        path: CameraPath,
-        output: PictureOutput,
-        settings: PictureSettings,
-        reference: Renderer | None,
-        overwrite: bool,
-        progress: Progress,
-    ) -> None:
-        self._renderer, self._path, self._output, self._settings = renderer, path, output, settings
-        self._reference, self._overwrite, self._progress = reference, overwrite, progress
-        # By camera index, pictures that were drawn to find the gain.
-        self._drawn: dict[int, tuple[DrawnPicture, DrawnPicture]] = {}
-        self._gain = 1.0 if reference is None else settings.gain or self._fitting_gain(reference)
-        self._bytes = 0
+    Attributes:
+        gain: factor of differences.
+        cached: by camera index, pictures that were drawn to find the gain.
+    """
 
-    def run(self) -> WrittenPictures:
-        output, facts, empty = self._output, [], True
+    renderer: Renderer
+    reference: Renderer | None
+    path: CameraPath
+    output: PictureOutput
+    settings: PictureSettings
+    gain: float = 1.0
+    cached: dict[int, tuple[DrawnPicture, DrawnPicture]] = field(default_factory=dict)
 
-        def drawn() -> Iterator[_Frame]:
-            nonlocal empty
-            count = len(self._path.cameras)
-            frames = ordered_map(self._frame, range(count), min(self._settings.jobs, count))
-            for done, frame in enumerate(frames, 1):
-                self._progress("drawing", done, count, "frame")
-                facts.append(frame.facts)
-                empty &= frame.empty
-                yield frame
+    def finish(self, at: int) -> tuple[dict[str, Any], bool, Pixels | bytes]:
+        """Draw the picture of a camera.
 
-        if output.kind == "frames":
-            for number, frame in zip(self._path.numbers, drawn(), strict=True):
-                self._write(output.path(number), [frame.data])
-        elif output.kind == "picture":
-            (frame,) = drawn()
-            self._write(output.name, [frame.data])
-        elif output.kind == "animation":
-            pictures = (_pixels(frame) for frame in drawn())
-            count = len(self._path.cameras)
-            self._write(output.name, [animate(pictures, count, output.form, frame_rate(self._path))])
-        else:
-            cameras = zip(self._path.numbers, self._path.cameras, strict=True)
-            captions = [camera.name or f"frame {number}" for number, camera in cameras]
-            self._write(output.name, [self._encode(sheet([_pixels(frame) for frame in drawn()], captions))])
-        return WrittenPictures(facts, self._bytes, self._gain if self._reference is not None else None, empty)
-
-    def _frame(self, at: int) -> _Frame:
-        camera, number = self._path.cameras[at], self._path.numbers[at]
-        with on_threads(self._settings.threads):  # the setting is per Python thread
-            both = self._drawn.pop(at, None)
-            drawn, other = both or self._both(camera)
+        Returns:
+            Facts for the report, whether no splat is in view, and the bytes of its file, or its pixels where several
+            pictures share a file.
+        """
+        output, settings, reference = self.output, self.settings, self.reference
+        camera, number = self.path.cameras[at], self.path.numbers[at]
+        with on_threads(settings.threads):  # the setting is per Python thread
+            drawn, other = self.cached.pop(at, (None, None))
+            drawn = drawn or self.renderer.draw(camera)
+            other = other or (None if reference is None else reference.draw(camera))
         facts = {"frame": number, "time_s": camera.time, "name": camera.name, "splats": drawn.splats}
         facts |= {"width": camera.width, "height": camera.height}
-        if self._output.kind == "frames":
-            facts["file"] = str(self._output.path(number))
-        image = codes.over(drawn.image, self._settings.background)
+        if output.kind == "frames":
+            facts["file"] = str(output.path(number))
+        image = codes.over(drawn.image, settings.background)
         if other is not None:
+            from .metrics import check_covered, psnr
+
             check_covered(other.image, f"what --diff names, in frame {number},")
-            reference = codes.over(other.image, self._settings.background)
-            facts["psnr_db"] = round(psnr(*(np.clip(each[..., :3], 0, 1) for each in (image, reference))), 3)
-            image = codes.difference(image, reference, self._gain)
+            expected = codes.over(other.image, settings.background)
+            facts["psnr_db"] = round(psnr(*(np.clip(each[..., :3], 0, 1) for each in (image, expected))), 3)
+            image = codes.difference(image, expected, self.gain)
         empty = not drawn.image[..., 3].any()
-        if self._output.form == "npy":
+        if output.form == "npy":
             # The values behind the colours if they are per pixel, else the colours.
-            by = self._renderer.settings.color_by
+            by = self.renderer.settings.color_by
             values = drawn.values if by in OF_PIXELS and drawn.values is not None else image
-            return _Frame(facts, None, codes.encode_floats(values), empty)
+            return facts, empty, codes.encode_floats(values)
         pixels = codes.eight_bits(image)
-        bar = self._renderer.scale.bar if self._renderer.scale is not None else None
-        if self._reference is not None:
-            bar = codes.difference_bar(self._gain)
-        if self._settings.bar and bar is not None:
+        bar = self.renderer.scale.bar if self.renderer.scale is not None else None
+        if reference is not None:
+            bar = codes.difference_bar(self.gain)
+        if settings.bar and bar is not None:
             pixels = codes.with_scale(pixels, bar)
             facts["width"] = pixels.shape[1]
-        if self._output.kind in ("picture", "frames"):
-            return _Frame(facts, None, self._encode(pixels), empty)
-        return _Frame(facts, pixels, b"", empty)
+        alone = output.kind in ("picture", "frames")
+        return facts, empty, codes.encode(pixels, output.form, settings.jpeg_quality) if alone else pixels
 
-    def _both(self, camera: Camera) -> tuple[DrawnPicture, DrawnPicture | None]:
-        return self._renderer.draw(camera), None if self._reference is None else self._reference.draw(camera)
-
-    def _fitting_gain(self, reference: Renderer) -> float:
+    def fitting_gain(self, reference: Renderer, progress: Progress) -> float:
         """Return the gain for all pictures, chosen from the first, the middle and the last one."""
-        cameras, background = self._path.cameras, self._settings.background
+        cameras, background = self.path.cameras, self.settings.background
         some = sorted({0, len(cameras) // 2, len(cameras) - 1}, reverse=True)
         keep = 2 * sum(cameras[at].width * cameras[at].height for at in some) <= CACHED_PIXELS
         differences = []
         for done, at in enumerate(some, 1):
-            both = self._renderer.draw(cameras[at]), reference.draw(cameras[at])
+            both = self.renderer.draw(cameras[at]), reference.draw(cameras[at])
             differences.append(codes.apart(*(codes.over(drawn.image, background) for drawn in both)))
             if keep:
-                self._drawn[at] = both
-            self._progress("comparing", done, len(some), "frame")
+                self.cached[at] = both
+            progress("comparing", done, len(some), "frame")
         return codes.gain_for(differences)
-
-    def _encode(self, pixels: Pixels) -> bytes:
-        return codes.encode(pixels, self._output.form, self._settings.jpeg_quality)
-
-    def _write(self, target: Path | None, pieces: Iterable[bytes]) -> None:
-        self._bytes += write_file(target or DASH, pieces, overwrite=self._overwrite)
-
-
-def _pixels(frame: _Frame) -> Pixels:
-    assert frame.pixels is not None
-    return frame.pixels
