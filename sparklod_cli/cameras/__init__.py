@@ -1,4 +1,4 @@
-"""Cameras: poses, paths, generators, and framing."""
+"""Cameras: poses, paths and their sources, and framing."""
 
 #: Elevation in degrees, above their target, of the cameras of an orbit, a dolly and the overview; cameras of an orbit.
 ELEVATION, ORBIT = 15.0, 60

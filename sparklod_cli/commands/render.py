@@ -199,7 +199,7 @@ class Appearance:
         """
         options = {"sorting": self.sorting, "throttle": self.sort_throttle}
         known = {name: value for name, value in options.items() if value is not None}
-        device = "cuda" if uses_card(self.render.device, say) else "cpu"
+        device = "cuda" if self.render.device != "cpu" and uses_card(self.render.device, say) else "cpu"
         return dataclasses.replace(self.render, device=device, options=known)
 
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sparklod_cli.cameras import generators
+from sparklod_cli.cameras import sources
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.cameras.frame import DEFAULT_UP, Frame, Settings, camera_of
 from sparklod_cli.cameras.framing import (
@@ -42,7 +42,7 @@ def scenes(draw: st.DrawFn) -> Balls:
 
 
 def orbited(count: int, center: object, distance: float, elevation: float, up: object) -> list[Frame]:
-    return generators.orbit(count, center, distance, elevation, up).at(np.arange(count))  # type: ignore[arg-type]
+    return sources.orbit_frames(count, center, distance, elevation, up).at(np.arange(count))  # type: ignore[arg-type]
 
 
 def places(camera: Camera, scene: Balls) -> np.ndarray:

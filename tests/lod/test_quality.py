@@ -15,8 +15,7 @@ from hypothesis import strategies as st
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.cameras.frame import DEFAULT_UP, Settings
 from sparklod_cli.cameras.framing import framing
-from sparklod_cli.cameras.generators import orbit
-from sparklod_cli.cameras.sources import cameras_of
+from sparklod_cli.cameras.sources import cameras_of, orbit_frames
 from sparklod_cli.codecs.gpu import lod_tree
 from sparklod_cli.images.metrics import on_background, psnr
 from sparklod_cli.io import read_scene
@@ -140,7 +139,7 @@ def test_splats_farther_apart_than_float32_holds_make_a_node_as_large_as_it_hold
 
 def cameras_around(splats: Splats) -> tuple[Camera, ...]:
     middle, radius = framing(splats.center)
-    frames = orbit(3, middle, 1.6 * radius, math.radians(15), DEFAULT_UP)
+    frames = orbit_frames(3, middle, 1.6 * radius, math.radians(15), DEFAULT_UP)
     settings = Settings(size=(240, 135), fov_y=math.radians(60))
     return cameras_of(frames, settings, "an orbit").cameras
 

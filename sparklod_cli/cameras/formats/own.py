@@ -12,7 +12,7 @@ import numpy as np
 from ...system.errors import CameraPathError
 from ...system.untrusted import quoted_value
 from ..frame import NO_LENS, Frame, Intrinsics, Settings
-from ..generators import Key, between, frame_looking
+from ..sources import Key, between, frame_looking
 from .parsing import CameraJson, Files, Parsed, finite, posed, side
 from .table import Axes
 

@@ -17,7 +17,7 @@ from ...system.errors import CameraPathError
 from ...system.untrusted import quoted_value
 from ..camera import Matrix
 from ..frame import Frame, Intrinsics, Settings, sampled
-from ..generators import along, cardinal_tangents, frame_looking, hermite
+from ..sources import along, cardinal_tangents, frame_looking, hermite
 from .parsing import CameraJson, Files, Parsed
 
 UP = (0.0, 1.0, 0.0)

@@ -180,10 +180,10 @@ class Cameras:
 
     def camera_source(self) -> CameraSource:
         """Return the source of the cameras, for the library."""
-        from ...cameras import generators, sources
+        from ...cameras import sources
 
         elevation = ELEVATION if self.elevation is None else self.elevation
-        seconds = self.seconds or generators.SECONDS
+        seconds = self.seconds or sources.SECONDS
         if self.camera_path is not None:
             from ...cameras.camera_files import read_path
 
