@@ -111,17 +111,19 @@ def build_lod(ctx: click.Context, /, **_: Any) -> None:
         ctx.params.update(output=None, output_dir=output.path)
     options = values_of(ctx, BuildLodOptions)
     general = options.general
-    check_inputs(ctx, options)
-    instances: list[Instance] = []
-    if options.scene is not None:
-        from ..viewers.instances_file import read_instances
-
-        instances = read_instances(options.scene)
-    _check(ctx, options, [instance.file for instance in instances if instance.file is not None])
+    instances = _check(ctx, options)
     failed, console = False, Console(quiet=general.quiet, verbose=general.verbose)
     report: Callable[..., None] = report_extracted if options.unlod else report_baked
     with console, contextlib.ExitStack() as stack:
-        pairs = _pairs(options, instances, console)
+        if options.output is not None and (options.merge or options.scene is not None):
+            from ..api.bake_jobs import merged_source
+
+            if any(each.lod_scale != 1 or each.foveation is not None for each in instances):
+                viewers = "lod_scale and foveation of instances are for viewers, and no part of a tree"
+                console.say(f"{options.scene}: {viewers}")
+            pairs: Sequence[Pair] = [(merged_source(options.inputs, instances), options.output)]
+        else:
+            pairs = [(source, options.target(source)) for source in options.inputs]
         outcomes = stack.enter_context(contextlib.closing(_outcomes(ctx, options, pairs, console)))
         for (source, target), outcome in zip(pairs, outcomes, strict=True):
             if isinstance(outcome, SparklodError):
@@ -130,7 +132,7 @@ def build_lod(ctx: click.Context, /, **_: Any) -> None:
             elif outcome is None:
                 console.say(f"{name_of(source)}  ->  {target}  exists already")
             else:
-                report(console, source, target, outcome)
+                report(console, source, "standard output" if target == DASH else str(target), outcome)
             if options.as_json:
                 print_json(record_of(source, target, outcome))
             if interrupts.came():  # during fitting, which then ends early
@@ -141,35 +143,23 @@ def build_lod(ctx: click.Context, /, **_: Any) -> None:
         ctx.exit(1)
 
 
-def _pairs(options: BuildLodOptions, instances: Sequence[Instance], console: Console) -> Sequence[Pair]:
-    """Return the inputs, each with its output."""
-    if not options.is_merged:
-        return [(source, options.target(source)) for source in options.inputs]
-    from ..api.bake_jobs import merged_source
-
-    assert options.output is not None  # see `check_inputs`
-    if any(each.lod_scale != 1 or each.foveation is not None for each in instances):
-        console.say(f"{options.scene}: lod_scale and foveation of instances are for viewers, and no part of a tree")
-    return [(merged_source(options.inputs, instances), options.output)]
-
-
-def check_inputs(ctx: click.Context, options: BuildLodOptions) -> None:
-    """Raise a `click.UsageError` where there are no inputs, or merging them contradicts other options."""
+def _check(ctx: click.Context, options: BuildLodOptions) -> list[Instance]:
+    """Return the instances of --scene; raise a `click.UsageError` where options or names of files contradict."""
     if not options.inputs and options.scene is None:
         raise click.MissingParameter(ctx=ctx, param=next(each for each in ctx.command.params if each.name == "inputs"))
     if options.inputs and options.scene is not None:
         raise click.UsageError("INPUT cannot be used with --scene, which names the files")
-    if not options.is_merged:
-        return
-    flag = "--merge" if options.merge else "--scene"
-    refuse(ctx, ("output_dir", "unlod", "rgba"), f"cannot be used with {flag}")
-    if options.output is None:
-        raise click.UsageError(f"{flag} makes one file of all inputs; name it with --output")
+    inputs, output, form, merging = options.inputs, options.output, options.output_form, ""
+    if options.merge or options.scene is not None:
+        merging = "--merge" if options.merge else "--scene"
+        refuse(ctx, ("output_dir", "unlod", "rgba"), f"cannot be used with {merging}")
+        if output is None:
+            raise click.UsageError(f"{merging} makes one file of all inputs; name it with --output")
+    instances: list[Instance] = []
+    if options.scene is not None:
+        from ..viewers.instances_file import read_instances
 
-
-def _check(ctx: click.Context, options: BuildLodOptions, named: list[Path]) -> None:
-    """Raise a `click.UsageError` where options contradict each other, or the names of files; `named` by --scene."""
-    inputs, output, form = options.inputs, options.output, options.output_form
+        instances = read_instances(options.scene)
     if output is not None:
         if options.output_dir is not None:
             raise click.UsageError(BOTH)
@@ -186,12 +176,13 @@ def _check(ctx: click.Context, options: BuildLodOptions, named: list[Path]) -> N
                     f"nothing can be written beside {source}; name the output with -o or --output-dir"
                 )
     targets = [output] if output is not None else [options.target(source) for source in inputs]
-    refines = options.refine is not None and not options.skip_existing and not options.is_merged
+    refines = options.refine is not None and not options.skip_existing and not merging
     if refines and options.overwrite:  # a tree may replace itself, for its leaves and links stay
         targets = [target for source, target in zip(inputs, targets, strict=True) if not is_same_place(source, target)]
     unbundled = form.suffix in WRITABLE and form.suffix == WRITABLE[form.suffix].unbundled
     if form.chunked or unbundled or form.cuts:
         targets = with_chunks(targets)
+    named = [instance.file for instance in instances if instance.file is not None]
     keep_apart(ctx, {"output" if options.output_dir is None else "output_dir": targets, "scene": named})
     claim_stdout(ctx, "output", as_json=options.as_json, binary=True)
     if options.input_scene.rgba is not None and len(inputs) > 1:
@@ -214,6 +205,7 @@ def _check(ctx: click.Context, options: BuildLodOptions, named: list[Path]) -> N
         refuse(
             ctx, OF_CLUSTERS, "cannot be used with standard input, which workers cannot read; save it to a file first"
         )
+    return instances
 
 
 def check_formats(ctx: click.Context, options: BuildLodOptions) -> None:
@@ -362,10 +354,10 @@ COLUMNS = {"center": "centres", "scale": "scales", "rgb": "colours", "sh": "refl
 LEAST_SHARE = 0.001
 
 
-def report_baked(console: Console, source: Place, target: Place, baked: Baked) -> None:
+def report_baked(console: Console, source: Place, target: str, baked: Baked) -> None:
     """Print a line about the file, and one for each thing that a person should know."""
     console.say(
-        f"{name_of(source)}  {count_of(baked.splats, 'splat')}, SH {baked.sh_degree}  ->  {_name(target)} "
+        f"{name_of(source)}  {count_of(baked.splats, 'splat')}, SH {baked.sh_degree}  ->  {target} "
         f" {_contents(baked)}, {format_size(baked.bytes)}, {sum(baked.seconds.values()):.1f} s"
     )
     if baked.detail is not None and len(baked.detail.levels) > 1:
@@ -484,10 +476,10 @@ def _clamped(clamp: Clamp, baked: Baked) -> str:
     )
 
 
-def report_extracted(console: Console, source: Place, target: Place, extracted: Extracted) -> None:
+def report_extracted(console: Console, source: Place, target: str, extracted: Extracted) -> None:
     """Print a line about the file."""
     console.say(
-        f"{name_of(source)}  {count_of(extracted.nodes, 'node')}  ->  {_name(target)} "
+        f"{name_of(source)}  {count_of(extracted.nodes, 'node')}  ->  {target} "
         f" {count_of(extracted.splats, 'splat')}, SH {extracted.sh_degree}, {format_size(extracted.bytes)},"
         f" {sum(extracted.seconds.values()):.1f} s"
     )
@@ -495,13 +487,13 @@ def report_extracted(console: Console, source: Place, target: Place, extracted: 
     console.detail(f"  {extracted.format}; {_stages(extracted.seconds)}")
 
 
-def report_simplified(console: Console, source: Source, target: Place, baked: Baked) -> None:
+def report_simplified(console: Console, source: Source, target: str, baked: Baked) -> None:
     """Print a line about the file of a simplified scene, and what it does not hold."""
     made = baked.simplified
     assert made is not None
     measured = "" if made.psnr is None else f", PSNR {made.psnr:.2f} dB"
     console.say(
-        f"{name_of(source)}  {count_of(baked.splats, 'splat')}, SH {baked.sh_degree}  ->  {_name(target)} "
+        f"{name_of(source)}  {count_of(baked.splats, 'splat')}, SH {baked.sh_degree}  ->  {target} "
         f" {count_of(made.splats, 'splat')} ({percent_of(made.share)}){measured}, {format_size(baked.bytes)},"
         f" {sum(baked.seconds.values()):.1f} s"
     )
@@ -525,10 +517,6 @@ def _report_losses(console: Console, losses: Extracted | WrittenSet, splats: int
     if losses.up_lost is not None:
         up = losses.up_lost
         console.say(f"  {up} is up, which this format cannot note; give --up={up} to render, traverse and view")
-
-
-def _name(target: Place) -> str:
-    return "standard output" if target == DASH else str(target)
 
 
 def _stages(seconds: dict[str, float]) -> str:

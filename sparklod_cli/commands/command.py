@@ -131,7 +131,10 @@ class Command(click.Command):
         options = [param for param in self.params if isinstance(param, Option) and param.bare is not None]
         bare = {name: f"{name}={param.bare}" for param in options for name in param.opts}
         end = args.index("--") if "--" in args else len(args)
-        refuse_lone_units(args[:end], ctx)
+        for before, unit in itertools.pairwise(args[:end]):
+            number = re.fullmatch(r"(?:-{1,2}[\w-]+=)?([0-9]+(?:\.[0-9]*)?)", before)
+            if number and UNIT.fullmatch(unit) and not os.path.exists(unit):  # noqa: PTH110  # an input, otherwise
+                raise click.UsageError(f"{before} {unit} has a blank before its unit; write {before}{unit}", ctx)
         try:
             rest = super().parse_args(ctx, [*(bare.get(arg, arg) for arg in args[:end]), *args[end:]])
         except click.MissingParameter as error:
@@ -193,14 +196,6 @@ def _print_help_all(ctx: click.Context, param: click.Parameter, value: bool) -> 
         assert isinstance(ctx.command, Command)
         click.echo(ctx.command.get_help(ctx, whole=True))
         ctx.exit()
-
-
-def refuse_lone_units(args: Sequence[str], ctx: click.Context) -> None:
-    """Raise a `click.UsageError` for a unit apart from its number, as in --to 10 %: it would be taken for an input."""
-    for before, unit in itertools.pairwise(args):
-        number = re.fullmatch(r"(?:-{1,2}[\w-]+=)?([0-9]+(?:\.[0-9]*)?)", before)
-        if number and UNIT.fullmatch(unit) and not os.path.exists(unit):  # noqa: PTH110
-            raise click.UsageError(f"{before} {unit} has a blank before its unit; write {before}{unit}", ctx)
 
 
 def refuse_output_among_inputs(ctx: click.Context, *, missing: bool = False) -> None:
@@ -390,8 +385,9 @@ def flags_set(ctx: click.Context, names: Iterable[str]) -> list[str]:
 
 def refuse(ctx: click.Context, names: Iterable[str], why: str) -> None:
     """Raise a `click.UsageError`, "--flag WHY", where one of some parameters was given."""
-    for flag in flags_set(ctx, names):
-        raise click.UsageError(f"{flag} {why}", ctx)
+    for name in names:
+        if is_set(ctx, name):
+            raise click.UsageError(f"{flag_of(ctx, name)} {why}", ctx)
 
 
 COLORS: dict[str, tuple[float, ...] | None] = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "transparent": None}

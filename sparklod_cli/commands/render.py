@@ -517,12 +517,7 @@ def _report(
             "seconds": round(seconds, 3),
         }
         print_json(whole if written.gain is None else whole | {"gain": written.gain})
-    name = "standard output" if output.name is None else output.name
-    console.say(f"{name}  {_describe(written)}, {seconds:.2f} s")
-
-
-def _describe(written: WrittenPictures) -> str:
-    """Return what was drawn, such as "60 frames, 1280 x 720, 499,102 to 500,000 splats"."""
+    # What was drawn, such as "60 frames, 1280 x 720, 499,102 to 500,000 splats".
     frames = written.frames
     sizes = dict.fromkeys(f"{frame['width']} x {frame['height']}" for frame in frames)
     splats = sorted({frame["splats"] for frame in frames})
@@ -534,7 +529,8 @@ def _describe(written: WrittenPictures) -> str:
         worst = min(frame["psnr_db"] for frame in frames)
         parts.append(f"PSNR {worst:.2f} dB" + (" or more" if len(frames) > 1 else ""))
         parts.append(f"differences times {written.gain:g}" if written.gain != 1 else "differences as they are")
-    return ", ".join(parts)
+    name = "standard output" if output.name is None else output.name
+    console.say(f"{name}  {', '.join(parts)}, {seconds:.2f} s")
 
 
 def _compare(ctx: click.Context, options: RenderOptions) -> int:

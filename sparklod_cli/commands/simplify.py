@@ -208,7 +208,7 @@ def simplify(ctx: click.Context, /, **_: Any) -> None:
             with naming(name_of(source), FormatError) if len(inputs) == 1 else contextlib.nullcontext():
                 raise baked
         assert isinstance(baked, Baked)
-        report_simplified(console, source, options.output, baked)
+        report_simplified(console, source, "standard output" if options.output == DASH else str(options.output), baked)
         if options.as_json:
             print_json(record_of(source, options.output, baked))
         if interrupts.came():  # during fitting, which then ends early

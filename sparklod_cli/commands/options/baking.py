@@ -350,10 +350,6 @@ class BuildLodOptions:
     general: General = field(default_factory=General)
 
     @property
-    def is_merged(self) -> bool:
-        return self.merge or self.scene is not None
-
-    @property
     def name(self) -> str:
         """Name of the output; empty if none is given, and for standard output."""
         return self.output.name if self.output is not None and self.output != DASH else ""
