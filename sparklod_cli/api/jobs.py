@@ -31,7 +31,8 @@ if TYPE_CHECKING:
     from ..lod.budget import Budget
     from ..model.instances import Instance
     from ..render.settings import RenderSettings
-    from ..simulation.results import FrameOutputs, Summary, WrittenFrames
+    from ..simulation.frames import WrittenFrames
+    from ..simulation.results import FrameOutputs, Summary
     from ..tables.assertions import Assertion, Outcome
     from ..tables.columns import Filter, Row
     from ..viewers.scenes import Scenes
@@ -144,7 +145,7 @@ def _source(
     try:
         if loading is None or settings is None or not scenes.with_cuts:
             return CutFinder(scenes, settings)
-        from ..simulation.frames import Loader
+        from ..simulation.loading import Loader
 
         return Loader(scenes, settings, *loading)
     except ValueError as error:
@@ -176,8 +177,9 @@ def traverse_files(
         UnfitError: the budget, or the chunk cache, is too small for the roots.
         SparklodError: a file cannot be read or written, or is no tree.
     """
-    from ..simulation.frames import Loader, Simulation
-    from ..simulation.results import EMPTY, LOADING, summarize, write_frames
+    from ..simulation.frames import Simulation, write_frames
+    from ..simulation.loading import Loader
+    from ..simulation.results import EMPTY, LOADING, summarize
     from ..tables.assertions import check
 
     scenes, path = files.scenes, files.path

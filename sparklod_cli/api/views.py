@@ -31,7 +31,7 @@ from ..system.threads import on_threads, thread_count
 from ..tables.columns import Table
 from ..viewers.loaded_scene import STREAMED_SOG, TILES, UNNAMED
 from ..viewers.read_scenes import read_scenes
-from ..viewers.scenes import Cut, CutFinder, FixedCut, Scenes
+from ..viewers.scenes import Cut, CutFinder, Scenes
 from ..viewers.viewer_settings import BLEND, PLAYCANVAS_BUDGET, LodSettings
 from .arguments import (
     BudgetLike,
@@ -199,6 +199,19 @@ def _opaque(a: Image, b: Image, background: float) -> list[Image]:
         if not each.size or not np.isfinite(each).all():
             raise ValueError("a picture has no pixels" if not each.size else "a picture holds NaN or infinity")
     return [metrics.on_background(each, background) if each.shape[2] == 4 else each for each in (a, b)]
+
+
+class FixedCut(CutFinder):
+    """One cut for all cameras."""
+
+    def __init__(self, whole: Cut) -> None:
+        self.whole = whole
+
+    def cut(self, camera: Camera) -> Cut:
+        return self.whole
+
+    def candidates(self) -> Cut:
+        return self.whole
 
 
 def scenes_of(viewed: Viewed, threads: int | None, precision: str = PRECISIONS[0]) -> Scenes:

@@ -1,8 +1,9 @@
-"""`Viewer`: fetches the chunks of scenes, `Loader`: while a page loads, `Simulation`: along a camera path."""
+"""`Simulation`: the frames of a viewer along a camera path, and their outputs."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import io
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,36 +12,17 @@ from numpy.typing import NDArray
 from ..cameras.camera import Camera
 from ..cameras.sources import CameraPath
 from ..model.instances import TOTAL
+from ..system.output import write_file
 from ..system.progress import Progress, silent
 from ..system.threads import ordered_map
-from ..tables.columns import Row
+from ..tables.columns import Filter, Row
 from ..viewers.cut import TreeCut, Viewer
 from ..viewers.frame_statistics import Changes, CutStatistics, measure
 from ..viewers.loaded_scene import STREAMED_SOG, TILES, TREE
 from ..viewers.network import Chunks, ChunkStream
-from ..viewers.scenes import Cut, CutFinder, Scenes
+from ..viewers.scenes import CutFinder, Scenes
 from ..viewers.viewer_settings import LodSettings, StreamingSettings
-from .results import COLUMNS, LOADING, OF_BUDGETS, OF_TREES
-
-#: The share of a cut that makes a picture almost what it will be; chosen.
-MOST = 0.9
-
-
-@dataclass(frozen=True)
-class Arrival:
-    """State when a chunk has arrived.
-
-    Attributes:
-        seconds: since the page was opened.
-        bytes: that have arrived so far, of headers too.
-        share: 0..1 of the splats of the whole cut that are resident.
-        resident: (chunks,) bool, of all trees.
-    """
-
-    seconds: float
-    bytes: int
-    share: float
-    resident: NDArray[np.bool_]
+from .results import COLUMNS, OF_BUDGETS, OF_TREES, FrameOutputs, Lookout, Moment
 
 
 class StreamedCuts(CutFinder):
@@ -67,69 +49,6 @@ class StreamedCuts(CutFinder):
 
     def stream(self, start: float = 0.0) -> ChunkStream:
         return ChunkStream(self.chunks, self.streaming.network, capacity=self.streaming.chunk_cache, start=start)
-
-
-class Loader(StreamedCuts):
-    """Visitors who open a page with scenes, each in front of a camera, and wait; see `StreamedCuts`.
-
-    Args:
-        seconds: since they opened the page, for `cut`.
-    """
-
-    def __init__(
-        self, scenes: Scenes, settings: LodSettings, streaming: StreamingSettings | None = None, seconds: float = 0.0
-    ) -> None:
-        super().__init__(scenes, settings, streaming)
-        self.seconds = seconds
-
-    def arrivals(self, camera: Camera) -> Iterator[Arrival]:
-        """Yield the state at the beginning and after each arrival of a chunk, as long as any are wanted.
-
-        The camera rests. As soon as a chunk has arrived, the viewer looks for the chunks that the cut needs, as far as
-        it can tell from those that it has; Spark does so with the next picture that it draws.
-        """
-        per_chunk = self._splats_of(self.find(camera))
-        total = max(1, int(per_chunk.sum()))
-        stream = self.stream()
-        stream.want([])
-        while True:
-            resident = stream.cache.resident()
-            yield Arrival(stream.now, stream.received, float(per_chunk[resident].sum()) / total, resident)
-            stream.want(self.find(camera, resident).wanted())
-            while not stream.take_arrivals():
-                if not stream.step():
-                    return
-
-    def load(self, camera: Camera) -> Row:
-        """Return the waits, `LOADING`, of a visitor who stays at a camera; None for what never fits into the cache."""
-        figures: Row = dict.fromkeys(column.name for column in LOADING)
-        for arrival in self.arrivals(camera):
-            if figures["first_picture_s"] is None and self.chunks.shows(arrival.resident):
-                figures["first_picture_s"] = arrival.seconds
-            for name, share in (("resident_90", MOST), ("resident_all", 1)):
-                if figures[f"{name}_s"] is None and arrival.share >= share:
-                    figures[f"{name}_s"], figures[f"{name}_bytes"] = arrival.seconds, arrival.bytes
-            if arrival.share == 1:
-                break
-        return {column.name: column.rounded(figures[column.name]) for column in LOADING}
-
-    def cut(self, camera: Camera) -> Cut:
-        """Return what a visitor sees after `seconds`."""
-        resident = np.zeros(len(self.chunks), np.bool_)
-        for arrival in self.arrivals(camera):
-            if arrival.seconds > self.seconds:
-                break
-            resident = arrival.resident
-        return self.scenes.cut_of(self.find(camera, resident))
-
-    def _splats_of(self, cut: TreeCut) -> NDArray[np.int64]:
-        """Return the (chunks,) numbers of splats of a cut in each chunk of all trees."""
-        counts = np.zeros(len(self.chunks), np.int64)
-        scenes = [loaded for loaded in self.scenes.of_instance if loaded.kind is not None]
-        for loaded, view, nodes in zip(scenes, cut.views, cut.indices(), strict=True):
-            chunks, splats = np.unique(loaded.chunk_of(nodes.astype(np.int64)) - loaded.first_chunk, return_counts=True)
-            counts[int(view["chunk_base"]) + chunks] += splats
-        return counts
 
 
 def chunks_of(scenes: Scenes) -> Chunks:
@@ -163,13 +82,11 @@ class SimulatedFrame:
     in_front: float
 
 
-@dataclass(frozen=True)
-class _MeasuredCut:
-    """A cut with its statistics, as a whole and by instance."""
+#: Nodes per row of Spark's index texture.
+ROW = 16_384
 
-    cut: TreeCut
-    whole: CutStatistics
-    parts: list[CutStatistics]
+#: A cut with its statistics, as a whole and by instance.
+MeasuredCut = tuple[TreeCut, CutStatistics, list[CutStatistics]]
 
 
 class Simulation(StreamedCuts):
@@ -203,26 +120,26 @@ class Simulation(StreamedCuts):
         for at, (number, camera, ideal) in enumerate(zip(path.numbers, path.cameras, found, strict=True)):
             stream.advance(max(camera.time, stream.now))
             drawn, resident, chunks = self._fetched(camera, ideal, stream)
-            rows = self._rows(number, camera, drawn, changes.next(drawn.cut))
+            rows = self._rows(number, camera, drawn, changes.next(drawn[0]))
             rows[0] |= chunks
-            whole = drawn.whole
+            whole = drawn[1]
             in_front = 1 - whole.behind / whole.selected if whole.selected else 1.0
             if self.scenes.kind != TREE:
                 none = (*OF_TREES, *(OF_BUDGETS if self.scenes.kind == TILES else ()))
                 rows = [row | dict.fromkeys(none) for row in rows]
             rows = [{column.name: column.rounded(row.get(column.name)) for column in COLUMNS} for row in rows]
-            yield SimulatedFrame(number, camera, drawn.cut, resident, rows, in_front)
+            yield SimulatedFrame(number, camera, drawn[0], resident, rows, in_front)
             progress("traverse", at + 1, len(path.cameras), "frame")
 
-    def _find(self, camera: Camera, resident: NDArray[np.bool_] | None = None) -> _MeasuredCut:
+    def _find(self, camera: Camera, resident: NDArray[np.bool_] | None = None) -> MeasuredCut:
         cut, size = self.find(camera, resident), (camera.width, camera.height)
-        return _MeasuredCut(cut, *measure(self.viewer.forest, cut, camera, size=size, by_instance=self._by_instance))
+        return cut, *measure(self.viewer.forest, cut, camera, size=size, by_instance=self._by_instance)
 
     def _fetched(
-        self, camera: Camera, ideal: _MeasuredCut, stream: ChunkStream
-    ) -> tuple[_MeasuredCut, NDArray[np.bool_], Row]:
+        self, camera: Camera, ideal: MeasuredCut, stream: ChunkStream
+    ) -> tuple[MeasuredCut, NDArray[np.bool_], Row]:
         """Return the cut with the resident chunks, these chunks, and the cells of the row that describe chunks."""
-        requested = ideal.cut.wanted()
+        requested = ideal[0].wanted()
         instant = self.streaming.network.instant
         if instant:
             stream.want(requested)
@@ -231,7 +148,7 @@ class Simulation(StreamedCuts):
         if not all(chunk in stream.cache for chunk in requested) or (self.scenes.kind == STREAMED_SOG and not instant):
             drawn = self._find(camera, resident)
         if not instant:
-            stream.want(drawn.cut.wanted())  # a viewer discovers chunks through those that it has
+            stream.want(drawn[0].wanted())  # a viewer discovers chunks through those that it has
         arrived = stream.take_arrivals()
         cells: Row = {
             "chunks_touched": len(stream.cache.requested),
@@ -243,10 +160,10 @@ class Simulation(StreamedCuts):
         return drawn, resident, cells
 
     def _rows(
-        self, number: int, camera: Camera, drawn: _MeasuredCut, changes: Sequence[tuple[int, int | None, int]]
+        self, number: int, camera: Camera, drawn: MeasuredCut, changes: Sequence[tuple[int, int | None, int]]
     ) -> list[Row]:
         """Return the row of all instances, without the chunk cells, then one per instance, if requested."""
-        cut, settings = drawn.cut, self.settings
+        (cut, whole, parts), settings = drawn, self.settings
         where: Row = {"frame": number, "time_s": camera.time, "name": camera.name}
         for name, vector in (("position", camera.position), ("forward", camera.forward)):
             where |= {f"{name}_{axis}": float(value) for axis, value in zip("xyz", vector, strict=True)}
@@ -259,7 +176,7 @@ class Simulation(StreamedCuts):
         }
         selected, retained, before = (None if None in column else sum(column) for column in zip(*changes, strict=True))
         assert selected is not None and before is not None
-        total = where | {"instance": TOTAL} | _shape(drawn.whole, settings.budget) | _change(selected, retained, before)
+        total = where | {"instance": TOTAL} | _cells(whole, settings.budget, selected, retained, before)
         total |= {
             "stop_reason": cut.reason,
             "pixel_scale_min": cut.least,
@@ -271,20 +188,103 @@ class Simulation(StreamedCuts):
         return [
             total,
             *(
-                where | {"instance": name} | _shape(part, settings.budget) | _change(*change)
-                for name, part, change in zip(self._names, drawn.parts, changes, strict=True)
+                where | {"instance": name} | _cells(part, settings.budget, *change)
+                for name, part, change in zip(self._names, parts, changes, strict=True)
             ),
         ]
 
 
-def _shape(measured: CutStatistics, budget: int) -> Row:
-    shares: Row = {"interior": measured.selected - measured.leaves, "budget_used": measured.selected / budget}
-    return shares | vars(measured)
-
-
-def _change(selected: int, retained: int | None, before: int) -> Row:
+def _cells(measured: CutStatistics, budget: int, selected: int, retained: int | None, before: int) -> Row:
+    """Return the cells of a cut, and of its changes since the last one; `retained` is None for the first cut."""
+    cells: Row = {"interior": measured.selected - measured.leaves, "budget_used": measured.selected / budget}
+    cells |= vars(measured)
     if retained is None:
-        return {"added": selected, "removed": 0, "churn": None}
+        return cells | {"added": selected, "removed": 0, "churn": None}
     added, removed = selected - retained, before - retained
     churn = (added + removed) / (selected + before) if selected + before else 0.0
-    return {"added": added, "removed": removed, "churn": churn}
+    return cells | {"added": added, "removed": removed, "churn": churn}
+
+
+@dataclass(frozen=True)
+class WrittenFrames:
+    """Results of `write_frames`.
+
+    Attributes:
+        rows: the row of all instances together for each frame.
+        in_front: mean share of the drawn splats in front of the camera.
+        note: why the charts have no picture of the path; None if they have one, or if there are no charts.
+    """
+
+    rows: list[Row]
+    in_front: float
+    note: str | None
+
+
+def write_frames(
+    simulation: Simulation,
+    path: CameraPath,
+    outputs: FrameOutputs,
+    *,
+    threads: int = 1,
+    progress: Progress = silent,
+    passed: Filter | None = None,
+) -> WrittenFrames:
+    """Simulate a camera path and write the outputs: table and index files frame by frame, then the charts.
+
+    `passed` filters the bytes of a table on standard output. `OutputError` if a file cannot be written.
+    """
+    together, in_front, lookout = list[Row](), list[float](), Lookout()
+    extremes: dict[str, SimulatedFrame] = {}  # by criterion, and the first frame
+
+    def rows() -> Iterator[Row]:
+        for frame in simulation.run(path, threads=threads, progress=progress):
+            in_front.append(frame.in_front)
+            together.append(frame.rows[0])
+            _write_indices(frame, outputs)
+            if outputs.plot is not None:
+                extremes.update(dict.fromkeys(lookout.add(frame.rows[0]), frame))
+                extremes.setdefault("first", frame)
+            yield from frame.rows
+
+    outputs.table.write(rows(), passed=passed)
+    note = None
+    if outputs.plot is not None:
+        png, note = _charts(simulation, path, together, lookout.moments(), extremes)
+        write_file(outputs.plot, [png], overwrite=outputs.overwrite)
+    return WrittenFrames(together, float(np.mean(in_front)), note)
+
+
+def _write_indices(frame: SimulatedFrame, outputs: FrameOutputs) -> None:
+    parts = frame.cut.indices() if outputs.indices is not None else []
+    for nodes, file in zip(parts, outputs.index_files([frame.number], len(parts)), strict=True):
+        if outputs.padded:
+            nodes = np.concatenate([nodes, np.zeros(-len(nodes) % ROW, np.uint32)]).reshape(-1, ROW)
+        out = io.BytesIO()
+        np.save(out, nodes)
+        write_file(file, [out.getvalue()], overwrite=outputs.overwrite)
+
+
+def _charts(
+    simulation: Simulation,
+    path: CameraPath,
+    rows: Sequence[Row],
+    moments: Sequence[Moment],
+    extremes: Mapping[str, SimulatedFrame],
+) -> tuple[bytes, str | None]:
+    """Return the charts, with the path over the cut of an extreme frame, and why that picture is missing, if it is."""
+    from ..figures import charts
+    from ..viewers.loaded_scene import TREE
+
+    frames = [extremes[criterion] for criterion in (*(moment.criterion for moment in moments), "first")]
+    # The first that draws anything, as none does before the first chunk has arrived.
+    frame = next((each for each in frames if len(each.cut)), frames[0])
+    cut = simulation.scenes.cut_of(frame.cut)
+    scene = charts.PathScene(
+        path.cameras,
+        cut.splats,
+        np.concatenate([part.depth for part in cut.parts]),
+        path.numbers.index(frame.number),
+        "tree depth" if simulation.scenes.kind == TREE else "level",
+    )
+    marked = {moment.criterion: moment.frame for moment in moments}
+    return charts.plot(rows, marked, simulation.scenes.title, scene)

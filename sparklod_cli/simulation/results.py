@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import io
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
-import numpy as np
-
-from ..system.output import check_free, check_writable, write_file
-from ..system.progress import Progress, silent
+from ..system.output import check_free, check_writable
 from ..tables.assertions import Number, numbers, statistic, totals
-from ..tables.columns import FRAME, Column, Filter, Row, TableOutput
+from ..tables.columns import FRAME, Column, Row, TableOutput
 
 COLUMNS = (
     *FRAME,
@@ -251,18 +247,15 @@ def summarize(rows: Iterable[Row], loading: Row | None = None) -> Summary:
 
 
 def _quantity(name: str, frames: Sequence[Row]) -> FrameStatistics | None:
-    values = [share for row in frames if (share := _share(row)) is not None]
-    if name != IN_FRUSTUM:
+    if name == IN_FRUSTUM:
+        counts = ((row["in_frustum"], row["selected"]) for row in frames)
+        values = [seen / drawn for seen, drawn in counts if isinstance(seen, int) and isinstance(drawn, int) and drawn]
+    else:
         values = numbers(frames, name)
     if not values:
         return None
     found = {each: _rounded(statistic(each, values)) for each in STATISTICS}
     return FrameStatistics(name, UNITS.get(name, "share"), len(values), **found)
-
-
-def _share(row: Row) -> Number | None:
-    seen, selected = row["in_frustum"], row["selected"]
-    return seen / selected if isinstance(seen, int) and isinstance(selected, int) and selected else None
 
 
 def _rounded(value: Number) -> Number:
@@ -323,15 +316,6 @@ class Lookout:
         return moments
 
 
-if TYPE_CHECKING:
-    from ..cameras.sources import CameraPath
-    from ..tables.columns import Row
-    from .frames import SimulatedFrame, Simulation
-
-#: Nodes per row of Spark's index texture.
-ROW = 16_384
-
-
 @dataclass(frozen=True)
 class FrameOutputs:
     """Destinations of the frames of a simulation.
@@ -368,88 +352,3 @@ class FrameOutputs:
             names = [""] if instances == 1 else [f".{instance}" for instance in range(instances)]
             for number in numbers:
                 yield from (self.indices / f"{number:06d}{name}.npy" for name in names)
-
-
-@dataclass(frozen=True)
-class WrittenFrames:
-    """Results of `write_frames`.
-
-    Attributes:
-        rows: the row of all instances together for each frame.
-        in_front: mean share of the drawn splats in front of the camera.
-        note: why the charts have no picture of the path; None if they have one, or if there are no charts.
-    """
-
-    rows: list[Row]
-    in_front: float
-    note: str | None
-
-
-def write_frames(
-    simulation: Simulation,
-    path: CameraPath,
-    outputs: FrameOutputs,
-    *,
-    threads: int = 1,
-    progress: Progress = silent,
-    passed: Filter | None = None,
-) -> WrittenFrames:
-    """Simulate a camera path and write the outputs: table and index files frame by frame, then the charts.
-
-    `passed` filters the bytes of a table on standard output. `OutputError` if a file cannot be written.
-    """
-    together, in_front, lookout = list[Row](), list[float](), Lookout()
-    extremes: dict[str, SimulatedFrame] = {}  # by criterion, and the first frame
-
-    def rows() -> Iterator[Row]:
-        for frame in simulation.run(path, threads=threads, progress=progress):
-            in_front.append(frame.in_front)
-            together.append(frame.rows[0])
-            _write_indices(frame, outputs)
-            if outputs.plot is not None:
-                extremes.update(dict.fromkeys(lookout.add(frame.rows[0]), frame))
-                extremes.setdefault("first", frame)
-            yield from frame.rows
-
-    outputs.table.write(rows(), passed=passed)
-    note = None
-    if outputs.plot is not None:
-        png, note = _charts(simulation, path, together, lookout.moments(), extremes)
-        write_file(outputs.plot, [png], overwrite=outputs.overwrite)
-    return WrittenFrames(together, float(np.mean(in_front)), note)
-
-
-def _write_indices(frame: SimulatedFrame, outputs: FrameOutputs) -> None:
-    parts = frame.cut.indices() if outputs.indices is not None else []
-    for nodes, file in zip(parts, outputs.index_files([frame.number], len(parts)), strict=True):
-        if outputs.padded:
-            nodes = np.concatenate([nodes, np.zeros(-len(nodes) % ROW, np.uint32)]).reshape(-1, ROW)
-        out = io.BytesIO()
-        np.save(out, nodes)
-        write_file(file, [out.getvalue()], overwrite=outputs.overwrite)
-
-
-def _charts(
-    simulation: Simulation,
-    path: CameraPath,
-    rows: Sequence[Row],
-    moments: Sequence[Moment],
-    extremes: Mapping[str, SimulatedFrame],
-) -> tuple[bytes, str | None]:
-    """Return the charts, with the path over the cut of an extreme frame, and why that picture is missing, if it is."""
-    from ..figures import charts
-    from ..viewers.loaded_scene import TREE
-
-    frames = [extremes[criterion] for criterion in (*(moment.criterion for moment in moments), "first")]
-    # The first that draws anything, as none does before the first chunk has arrived.
-    frame = next((each for each in frames if len(each.cut)), frames[0])
-    cut = simulation.scenes.cut_of(frame.cut)
-    scene = charts.PathScene(
-        path.cameras,
-        cut.splats,
-        np.concatenate([part.depth for part in cut.parts]),
-        path.numbers.index(frame.number),
-        "tree depth" if simulation.scenes.kind == TREE else "level",
-    )
-    marked = {moment.criterion: moment.frame for moment in moments}
-    return charts.plot(rows, marked, simulation.scenes.title, scene)

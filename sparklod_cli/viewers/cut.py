@@ -16,7 +16,6 @@ from ..model.foveation import Cones, Foveation
 
 if TYPE_CHECKING:
     from ..cameras.camera import Camera
-    from .paging import Pager
 
 Matrix = NDArray[np.float64]
 
@@ -95,15 +94,6 @@ class Forest(Generic[Scene]):
         """(N,) edges from the root to each node that was read, or its detail level."""
         depths = [scene.depth for scene in self.scenes]
         return depths[0] if len(depths) == 1 else np.concatenate(depths)
-
-    @functools.cached_property
-    def pager(self) -> Pager | None:
-        """Reads chunks of scenes that are too large for memory; None where all are in memory."""
-        if not any(scene.paged for scene in self.scenes):
-            return None
-        from .paging import Pager
-
-        return Pager(self)
 
 
 @dataclass(frozen=True)

@@ -310,45 +310,36 @@ class ChunkStream:
             end = self._since + (self._transfers[0][0] - self._served) * len(self._transfers) / self._network.bandwidth
         if min(begin, end) > until:
             return False
-        if end <= begin:
-            self._end(end)
-        else:
-            self._begin(begin)
-        return True
-
-    def _begin(self, time: float) -> None:
-        """Process the first byte of the oldest request."""
-        if self._transfers:
-            served = self._served + (time - self._since) * self._network.bandwidth / len(self._transfers)
-            self._served = min(served, self._transfers[0][0])  # rounding must not exceed the next end
-        self._since = time
-        _, request = self._requested.popleft()
-        self._begun += 1
-        heappush(self._transfers, (self._served + self._size(request), self._begun, request))
-
-    def _end(self, time: float) -> None:
-        """Process the last byte of the transfer that ends next; its connection is free for another request."""
-        self._served, _, request = heappop(self._transfers)
+        if begin < end:  # the first byte of the oldest request
+            if self._transfers:
+                served = self._served + (begin - self._since) * self._network.bandwidth / len(self._transfers)
+                self._served = min(served, self._transfers[0][0])  # rounding must not exceed the next end
+            self._since = begin
+            _, request = self._requested.popleft()
+            self._begun += 1
+            heappush(self._transfers, (self._served + self._size(request), self._begun, request))
+            return True
+        self._served, _, request = heappop(self._transfers)  # the last byte of a transfer
         if not self._transfers:
             self._served = 0.0  # keeps the numbers small, for precision
-        self._since = time
+        self._since = end
         if self._queue:
-            self._ask(time, self._queue.popleft())
+            self._ask(end, self._queue.popleft())
         self.received += self._size(request)
         chunk, part = request
         if chunk < 0:
-            self._end_header(-1 - chunk, time)
-            return
+            self._end_header(-1 - chunk, end)
+            return True
         self._missing[chunk] -= 1
         if part == 0:
             for other in range(1, len(self._chunks.requests[chunk])):
-                self._ask(time, _Request(chunk, other))
-        if self._missing[chunk]:
-            return
-        del self._missing[chunk]
-        self._arrived.append(chunk)
-        self.cache.arrive(chunk)
-        self._request(time)
+                self._ask(end, _Request(chunk, other))
+        if not self._missing[chunk]:
+            del self._missing[chunk]
+            self._arrived.append(chunk)
+            self.cache.arrive(chunk)
+            self._request(end)
+        return True
 
     def _end_header(self, tree: int, time: float) -> None:
         """Process an answer with the beginning of a file: request the next one, or the chunks that wait."""

@@ -8,7 +8,6 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +23,6 @@ from ..model.traversed import Nodes
 from ..system.errors import TreeError, naming
 from ..system.machine import available_memory
 from ..system.threads import ordered_map
-from .cut import Forest
 from .loaded_scene import TRAVERSED, Index, LoadedScene, bytes_of
 
 #: Makes nodes of the splats, the tree and the coding of a chunk.
@@ -33,10 +31,6 @@ NodesOf = Callable[[Splats, LodTree, FileCoding], Nodes]
 #: Decoded chunks that are kept for the splats of the next cut: they take at most this share of the free memory, but
 #: there are at least so many. Chosen.
 KEPT_SHARE, LEAST_KEPT = 0.25, 8
-
-#: Share of the chunks that a cut lacks that is read before the cut is found again, the most important ones first. With
-#: fewer, it is found more often; with more, chunks are read that it turns out not to need. Chosen.
-READ_SHARE = 0.5
 
 
 class Pages:
@@ -69,7 +63,9 @@ class Pages:
             self._kept = max(LEAST_KEPT, int(KEPT_SHARE * free / size))
 
     def place(self, nodes: NDArray[np.void], depth: NDArray[np.int32]) -> None:
-        """Set the arrays of zeros, (N,) `NODE` and (N,) int32, that nodes are read into, and read the root."""
+        """Set the arrays of zeros, (N,) `NODE` and (N,) int32, that nodes are read into, and read the root; once."""
+        if self.present.any():
+            return
         self.nodes, self.depth = nodes, depth
         self.read([0])
 
@@ -168,7 +164,7 @@ class PagedScene(LoadedScene):
     pages: Pages = field(kw_only=True)
 
     def fill(self, rows: NDArray[np.void]) -> None:
-        """Leave the rows to the `Pager`."""
+        """Leave the rows to `Pages.place`."""
 
     @property
     def depth(self) -> NDArray[np.int32]:
@@ -190,47 +186,6 @@ class PagedScene(LoadedScene):
 
     def rows(self, index: Index) -> Splats:
         return self.pages.splats(index)
-
-
-class Pager:
-    """Reads the nodes of a forest as cuts need them."""
-
-    def __init__(self, forest: Forest[Any]) -> None:
-        self._forest = forest
-        self._pages: list[tuple[slice, Pages]] = []
-        bases = (itertools.pairwise(base.tolist()) for base in (forest.node_base, forest.chunk_base))
-        for scene, nodes, chunks in zip(forest.scenes, *bases, strict=True):
-            if isinstance(scene, PagedScene):
-                scene.pages.place(forest.nodes[slice(*nodes)], forest.depth[slice(*nodes)])
-                self._pages.append((slice(*chunks), scene.pages))
-
-    def present(self) -> NDArray[np.bool_]:
-        """Return the (chunks,) bool, those whose nodes are in memory; not changed later."""
-        present = np.ones(self._forest.chunks, np.bool_)
-        for chunks, pages in self._pages:
-            present[chunks] = pages.present
-        return present
-
-    def read(self, wanted: NDArray[np.bool_]) -> None:
-        """Read those of these chunks, (chunks,) bool, that are not in memory; errors are those of `Pages.read`."""
-        for chunks, pages in self._pages:
-            pages.read(np.flatnonzero(wanted[chunks] & ~pages.present).tolist())
-
-    def read_some(self, demand: NDArray[np.float32], present: NDArray[np.bool_]) -> bool:
-        """Read the more important half of the chunks that a cut lacked; False if it lacked none.
-
-        The most important one is needed for certain, as a cut takes nodes by their importance; others may turn out not
-        to be, once the nodes in that one take their share of the budget.
-
-        Args:
-            demand, present: (chunks,), of a `TreeCut`, and the chunks that it was found with.
-        """
-        missing = np.flatnonzero((demand > 0) & ~present)
-        missing = missing[np.argsort(-demand[missing], kind="stable")]
-        now = np.zeros(len(present), np.bool_)
-        now[missing[: int(np.ceil(READ_SHARE * len(missing)))]] = True
-        self.read(now)
-        return len(missing) > 0
 
 
 def sampled_balls(instances: Sequence[Instance], scenes: Sequence[LoadedScene]) -> Balls:

@@ -316,16 +316,3 @@ class CutFinder:
                 for at, loaded in zip(self.scenes.instances, self.scenes.of_instance, strict=True)
             )
         )
-
-
-class FixedCut(CutFinder):
-    """One cut for all cameras."""
-
-    def __init__(self, whole: Cut) -> None:
-        self.whole = whole
-
-    def cut(self, camera: Camera) -> Cut:
-        return self.whole
-
-    def candidates(self) -> Cut:
-        return self.whole

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import threading
 import time
 from collections.abc import Sequence
@@ -26,6 +27,10 @@ VISITS = 2
 #: unnecessarily costs less than another round. Chosen; cuts do not depend on it.
 GUESS = 0.97
 
+#: Share of the chunks that a cut lacks that is read before the cut is found again, the most important ones first. With
+#: fewer, it is found more often; with more, chunks are read that it turns out not to need. Chosen.
+READ_SHARE = 0.5
+
 #: Why a cut is not finer, by the kernel's code.
 REASONS = {
     cut_arrays.BUDGET: "budget",
@@ -40,9 +45,16 @@ class SparkViewer:
 
     def __init__(self, forest: Forest[Any], instances: Sequence[TreeInstance]) -> None:
         self.forest, self.instances = forest, list(instances)
-        self._nodes, self._pager, self._memory = forest.nodes, forest.pager, _Memory()
+        self._nodes, self._memory = forest.nodes, _Memory()
         sizes = np.diff(forest.node_base)
         self._most = sum(int(sizes[instance.tree]) for instance in self.instances)
+        # Trees that are read as cuts need them, and the numbers of their chunks.
+        self._pages: list[tuple[slice, Any]] = []
+        bases = (itertools.pairwise(base.tolist()) for base in (forest.node_base, forest.chunk_base))
+        for scene, nodes, chunks in zip(forest.scenes, *bases, strict=True):
+            if scene.paged:
+                scene.pages.place(forest.nodes[slice(*nodes)], forest.depth[slice(*nodes)])
+                self._pages.append((slice(*chunks), scene.pages))
 
     def cut(
         self,
@@ -53,19 +65,29 @@ class SparkViewer:
         resident: NDArray[np.bool_] | None = None,
     ) -> TreeCut:
         """Return the cut that Spark draws; see `Viewer.cut`."""
-        pager = self._pager
-        if pager is None:
-            present = np.ones(self.forest.chunks, np.bool_) if resident is None else resident
-            return self._cut(camera, budget, smallest, present)
         if resident is not None:
-            pager.read(resident)
+            self._read(resident)
             return self._cut(camera, budget, smallest, resident)
         while True:
             # As long as chunks are not in memory that would be read next, the cut is one of a viewer that lacks them.
-            present = pager.present()
+            present = np.ones(self.forest.chunks, np.bool_)
+            for chunks, pages in self._pages:
+                present[chunks] = pages.present
             cut = self._cut(camera, budget, smallest, present)
-            if not pager.read_some(cut.demand, present):
+            missing = np.flatnonzero((cut.demand > 0) & ~present)
+            if not len(missing):
                 return cut
+            # The most important chunk is needed for certain, as a cut takes nodes by their importance; others may turn
+            # out not to be, once the nodes in that one take their share of the budget.
+            missing = missing[np.argsort(-cut.demand[missing], kind="stable")]
+            now = np.zeros(len(present), np.bool_)
+            now[missing[: int(np.ceil(READ_SHARE * len(missing)))]] = True
+            self._read(now)
+
+    def _read(self, wanted: NDArray[np.bool_]) -> None:
+        """Read those of these chunks, (chunks,) bool, that are not in memory; errors are those of `Pages.read`."""
+        for chunks, pages in self._pages:
+            pages.read(np.flatnonzero(wanted[chunks] & ~pages.present).tolist())
 
     def _cut(self, view: Camera | CutView, budget: int, smallest: float, present: NDArray[np.bool_]) -> TreeCut:
         """Return the cut with these chunks, which are in memory."""
@@ -80,7 +102,13 @@ class SparkViewer:
         while True:
             size = min(size, 2 * self._most)  # a node is visited by its threshold, and once more by the queue
             if memory.slots is None or len(memory.slots.node) <= size:
-                memory.slots = _slots(size)
+                memory.slots = cut_arrays.Slots(
+                    node=np.empty(size + 1, np.uint32),
+                    instance=np.empty(size + 1, np.uint16),
+                    sums=np.empty(cut_arrays.BUCKETS, np.int32),
+                    tally=np.empty(cut_arrays.TALLIES, np.int64),
+                    **{name: np.empty(size + 1, np.int32) for name in ("limit", "first", "queue", "pending", "heap")},
+                )
             slots, guess = memory.slots, np.float32(memory.guess)
             selected, reason, missing, least, last = find_cut(trees, stop, guess, slots, demand, nodes)
             if reason != cut_arrays.FULL:
@@ -88,6 +116,9 @@ class SparkViewer:
             size = 2 * len(slots.node)
         # The next cut is likely to be similar.
         memory.guess = GUESS * float(least) if reason == cut_arrays.BUDGET else smallest
+        at = None
+        if last >= 0:
+            at = float(slots.limit.view(np.float32)[last]), int(slots.instance[last]), int(slots.node[last])
         return TreeCut(
             views=views,
             node=nodes.node[:selected],
@@ -96,7 +127,7 @@ class SparkViewer:
             reason=REASONS[reason],
             missing=missing,
             least=float(least),
-            stop=None if last < 0 else _node_at(slots, last),
+            stop=at,
             demand=demand,
             seconds=time.perf_counter() - start,
         )
@@ -111,21 +142,6 @@ class _Memory(threading.local):
 
     slots: cut_arrays.Slots | None = None
     guess = 0.0
-
-
-def _slots(size: int) -> cut_arrays.Slots:
-    return cut_arrays.Slots(
-        node=np.empty(size + 1, np.uint32),
-        instance=np.empty(size + 1, np.uint16),
-        sums=np.empty(cut_arrays.BUCKETS, np.int32),
-        tally=np.empty(cut_arrays.TALLIES, np.int64),
-        **{name: np.empty(size + 1, np.int32) for name in ("limit", "first", "queue", "pending", "heap")},
-    )
-
-
-def _node_at(slots: cut_arrays.Slots, at: int) -> tuple[float, int, int]:
-    """Return the pixel scale, instance and index of the node in a slot."""
-    return float(slots.limit.view(np.float32)[at]), int(slots.instance[at]), int(slots.node[at])
 
 
 #: How many bytes Spark's pager asks for at first, then if they do not hold the whole header of a file.

@@ -13,7 +13,8 @@ import pytest
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.cameras.sources import CameraPath
 from sparklod_cli.model.instances import Instance
-from sparklod_cli.simulation.frames import Loader, Simulation
+from sparklod_cli.simulation.frames import Simulation
+from sparklod_cli.simulation.loading import Loader
 from sparklod_cli.simulation.results import OF_TREES
 from sparklod_cli.viewers.playcanvas import LoadedDetail
 from sparklod_cli.viewers.read_scenes import read_scenes

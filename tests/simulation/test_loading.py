@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli.cameras.camera import Camera
-from sparklod_cli.simulation.frames import Loader
+from sparklod_cli.simulation.loading import Loader
 from sparklod_cli.simulation.results import LOADING
 from sparklod_cli.viewers.scenes import Cut, CutFinder, Scenes
 from sparklod_cli.viewers.viewer_settings import LodSettings, Network, StreamingSettings
