@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -284,9 +284,6 @@ def _container_findings(scene: Scene) -> list[Finding]:
         findings.append(Finding("container.trailing", f"{header['trailing_bytes']:,} bytes follow the data"))
     return findings
 
-
-if TYPE_CHECKING:
-    from .report import ReportSettings
 
 #: The note on arrays with the nodes of a tree but without their children.
 NO_CHILDREN = "its splats are the nodes of a tree, but it has no child indices, so leaves cannot be told apart"

@@ -28,11 +28,9 @@ from ..options import AUTO, DEFAULTS, RAD_ENCODINGS, WriteOptions
 from ..quantize import Bytes
 from ..reader import OpenCompanion, comment_of
 from ..spark_codings import SplatEncoding
-from .property_codings import BLOCK, BY_NAME, CODINGS, PROPERTIES, Row, encodings_of
+from .property_codings import BLOCK, BY_NAME, CODINGS, GZ, PROPERTIES, Property, Row, encodings_of
 from .rad_header import (
-    GZ,
     Files,
-    Property,
     RadChunkHeader,
     RadHeader,
     in_files,

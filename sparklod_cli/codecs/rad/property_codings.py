@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +20,8 @@ from ..options import RAD_ENCODINGS
 from ..quantize import Bytes
 from ..spark_codings import STEPS_8_8_8
 
-if TYPE_CHECKING:
-    from .rad_header import Property
+#: The compression of properties: a raw deflate stream, whatever its name says.
+GZ = "gz"
 
 #: Largest finite float16. Larger values are clamped to it: rounded they would be infinite.
 LARGEST_F16 = np.float32(65504)
@@ -218,6 +219,26 @@ PROPERTIES = (
 )
 
 BY_NAME = {row.name: row for row in PROPERTIES}
+
+
+@dataclass(frozen=True)
+class Property:
+    """A column of a chunk.
+
+    Attributes:
+        offset: from the beginning of the payload.
+        name: one of `PROPERTIES`, or unknown.
+        encoding: one of `CODINGS`, or unknown.
+        min, max: ends of the range of the codes; None without a range.
+    """
+
+    offset: int
+    bytes: int
+    name: str
+    encoding: str
+    compression: str | None = GZ
+    min: float | None = None
+    max: float | None = None
 
 
 def encodings_of(properties: Iterable[Property]) -> dict[str, str]:

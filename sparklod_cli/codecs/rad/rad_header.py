@@ -26,7 +26,7 @@ from ..quantize import LARGEST
 from ..reader import FileNote, read_comment
 from ..rules import RuleViolation
 from ..spark_codings import SplatEncoding
-from .property_codings import BY_NAME, CODINGS, PROPERTIES, Row
+from .property_codings import BY_NAME, CODINGS, GZ, PROPERTIES, Property, Row
 
 #: The first bytes of a file, and of a chunk.
 MAGIC, CHUNK_MAGIC = b"RAD0", b"RADC"
@@ -55,10 +55,6 @@ ENCODING_KEYS = {
     "sh3Max": "sh3_max",
     "lodOpacity": "lod_opacity",
 }
-
-
-#: The compression of properties: a raw deflate stream, whatever its name says.
-GZ = "gz"
 
 
 @dataclass(frozen=True)
@@ -123,26 +119,6 @@ class RadHeader:
     def noted(self) -> FileNote:
         """Note of sparklod in the comment."""
         return read_comment(self.comment)
-
-
-@dataclass(frozen=True)
-class Property:
-    """A column of a chunk.
-
-    Attributes:
-        offset: from the beginning of the payload.
-        name: one of `property_codings.PROPERTIES`, or unknown.
-        encoding: one of `property_codings.CODINGS`, or unknown.
-        min, max: ends of the range of the codes; None without a range.
-    """
-
-    offset: int
-    bytes: int
-    name: str
-    encoding: str
-    compression: str | None = GZ
-    min: float | None = None
-    max: float | None = None
 
 
 @dataclass(frozen=True)

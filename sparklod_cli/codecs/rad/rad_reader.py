@@ -25,10 +25,9 @@ from ..inflate import ERRORS, raw_unpacker
 from ..quantize import Bytes, quat_of_xyz
 from ..reader import OpenCompanion, OpenFile, Reader, Target, size_of
 from ..rules import RuleViolation, check_rules, error_of
-from .property_codings import BY_NAME, CODINGS, Row, encodings_of
+from .property_codings import BY_NAME, CODINGS, Property, Row, encodings_of
 from .rad_header import (
     Files,
-    Property,
     RadChunkEntry,
     RadChunkHeader,
     RadHeader,
