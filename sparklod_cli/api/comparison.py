@@ -21,8 +21,9 @@ from ..system.errors import SparklodError, memory_errors_translated
 from ..system.output import check_writable, write_file
 from ..system.progress import Progress, silent
 from ..system.threads import on_threads, ordered_map
-from ..tables.assertions import check, numbers, statistic
+from ..tables.assertions import check
 from ..tables.columns import FRAME, Column, Row, Table
+from ..tables.row_statistics import numbers, statistic
 from ..viewers.scenes import CutFinder, Scenes
 from ..viewers.viewer_settings import LodSettings
 from .arguments import BudgetLike, ProgressLike, budget_like, path_like, progress_callback

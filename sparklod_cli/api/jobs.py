@@ -180,7 +180,6 @@ def traverse_files(
     from ..simulation.frames import Simulation, write_frames
     from ..simulation.loading import Loader
     from ..simulation.results import EMPTY, LOADING, summarize
-    from ..tables.assertions import check
 
     scenes, path = files.scenes, files.path
     settings = dataclasses.replace(lod, budget=scenes.splats_of(budget))
@@ -192,6 +191,11 @@ def traverse_files(
     progress = files.progress if bar else silent
     loading = None if streaming.network.instant else Loader(scenes, settings, streaming).load(path.cameras[0])
     frames = write_frames(simulation, path, outputs, threads=files.threads, progress=progress, passed=passed)
-    nothing: Row = dict.fromkeys(column.name for column in LOADING)
-    asserted = [row | (loading or nothing if not at else nothing) for at, row in enumerate(frames.rows)]
-    return frames, summarize(frames.rows, loading), check(asserts, asserted, empty=EMPTY)
+    outcomes: list[Outcome] = []
+    if asserts:
+        from ..tables.assertions import check
+
+        nothing: Row = dict.fromkeys(column.name for column in LOADING)
+        asserted = [row | (loading or nothing if not at else nothing) for at, row in enumerate(frames.rows)]
+        outcomes = check(asserts, asserted, empty=EMPTY)
+    return frames, summarize(frames.rows, loading), outcomes

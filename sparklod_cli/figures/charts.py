@@ -19,8 +19,8 @@ from ..render.color_scales import range_of, whole_numbers
 from ..system.errors import SparklodError
 from ..system.packages import optional_import
 from ..system.units import count_of, percent_of
-from ..tables.assertions import numbers, totals
 from ..tables.columns import Row
+from ..tables.row_statistics import numbers, totals
 from .pyvista_scene import Points, PyvistaStage, Viewpoint, bounds, box_lines, evenly, is_drawable, viewpoint, write_png
 
 #: Colours of the series: stops of the colour scales of `render.color_scales`, and pink for marks.

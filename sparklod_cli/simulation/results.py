@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any, cast
 
 from ..system.output import check_free, check_writable
-from ..tables.assertions import Number, numbers, statistic, totals
 from ..tables.columns import FRAME, Column, Row, TableOutput
+from ..tables.row_statistics import Number, numbers, statistic, totals
 
 COLUMNS = (
     *FRAME,
