@@ -1,4 +1,4 @@
-"""Compiling kernels in advance: all (`jit.kernel`), or those that a command will need, in a second process."""
+"""Compiling kernels in advance: all (`jit.kernel`), or the kernels of a command, in a second process."""
 
 from __future__ import annotations
 

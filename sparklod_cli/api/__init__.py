@@ -1,5 +1,4 @@
-"""The public functions of `sparklod_cli`, and `jobs`, the library calls of the commands.
+"""The public functions of `sparklod_cli`, and the jobs of its commands: `jobs`, `bake_jobs`, `inspect_jobs`, `viewing`.
 
-Every function takes `threads` (None for all processors) and `progress` (see `arguments.ProgressLike`) where that means
-something.
+Functions that do long work take `threads` (None for all processors) and `progress` (see `arguments.ProgressLike`).
 """

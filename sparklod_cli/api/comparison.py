@@ -73,7 +73,6 @@ class BudgetSummary:
     Attributes:
         text: the budget, as it was given.
         budget, share: see `COLUMNS`.
-        frames: how many.
         selected: mean.
         psnr, psnr_min, psnr_max, psnr_black, psnr_white: dB; means but for the least and the most.
         ssim, ssim_min: mean and least.
@@ -326,7 +325,6 @@ class Compared:
     """Result of a comparison.
 
     Attributes:
-        pictures: how many were compared.
         leaves: splats of full detail, all instances together.
     """
 

@@ -153,13 +153,13 @@ def inspect(
 
 
 def read_rad_header(path: Path | str) -> RadHeader:
-    """Read the header of a RAD file and nothing else; the chunks need not be there.
+    """Read the header of a RAD file alone; its chunks may be missing.
 
     Args:
         path: of a .rad file, whole or with chunks in files of their own.
 
     Raises:
-        FormatError: it cannot be read, is no such header, or promises what cannot be.
+        FormatError: it cannot be read, is not a RAD header, or contradicts itself.
     """
     path = Path(path)
     with naming(path, OF_FILES):

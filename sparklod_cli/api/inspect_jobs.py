@@ -13,7 +13,7 @@ from ..inspection.findings import Finding
 from ..inspection.report import Report, ReportSettings, inspect
 from ..io import read_scene
 from ..model.scene import Scene
-from ..system.errors import FormatError, SparklodError, memory_errors_translated
+from ..system.errors import FormatError, SparklodError, memory_errors_translated, naming
 from ..system.output import check_writable, write_file
 from ..system.progress import Progress
 from ..system.threads import on_threads
@@ -75,15 +75,9 @@ def check_outputs(plot: Path | None, html: Path | None, chunks: TableOutput | No
 
 
 def read_original(path: Path, *, threads: int, progress: Progress) -> Scene:
-    """Read the scene whose splats the leaves must equal.
-
-    Raises:
-        FormatError: the file cannot be read; names it.
-    """
-    try:
+    """Read the scene whose splats the leaves must equal; a `FormatError` names the file."""
+    with naming(path, FormatError):
         return read_scene(path, threads=threads, progress=progress)
-    except FormatError as error:
-        raise FormatError(f"{path}: {error}") from None
 
 
 @dataclass(frozen=True)
@@ -93,8 +87,8 @@ class Inspected:
     Attributes:
         histograms: as text, by quantity; only quantities that the file has.
         picture: in words, and the bytes of its file; None where none was written.
-        section: of the page; None where none is wanted.
-        problem: why there is no picture, where one is wanted.
+        section: of the page; None without a page.
+        problem: why a requested picture is missing.
     """
 
     report: Report

@@ -60,7 +60,7 @@ def write(
     """Write a scene, or a tree, whole or not at all. Nodes keep their order, see `arrange_chunks`.
 
     Args:
-        path: of the file, whose suffix tells the format: .spz or .rad; for a scene without a tree, .ply, .sog,
+        path: of the file, whose suffix chooses the format: .spz or .rad; for a scene without a tree, .ply, .sog,
             .glb or .splat, too. Of several files, it names the first, and all appear or none: meta.json has the images
             of an unpacked SOG beside it; for a tree, lod-meta.json has the folders of a Streamed SOG.
         scene: what is written.

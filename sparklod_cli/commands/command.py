@@ -410,7 +410,7 @@ def click_type(kind: Any) -> click.ParamType | None:
 
 
 class _Number(click.ParamType):
-    """A number; unlike click's it is none that arrays cannot hold, and not NaN, which is in no range."""
+    """A number of a range; unlike click's, it fits into arrays and is not NaN."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         number = super().convert(value, param, ctx)

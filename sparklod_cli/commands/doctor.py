@@ -114,7 +114,7 @@ PURPOSES = {
 #: Time limit of a child process, seconds; Open3D alone may load for a minute.
 PATIENCE = 120
 
-#: Below so many bytes of available memory, little can be baked.
+#: Available memory, bytes, below which only small scenes can be baked.
 LITTLE_MEMORY = 1 << 30
 
 #: Program of the child process that calls `_print_kernels`.
