@@ -187,7 +187,8 @@ def traverse_files(
         simulation = Simulation(scenes, settings, streaming, by_instance=by_instance)
     except ValueError as error:
         raise UnfitError(str(error)) from None
-    outputs.check_frames(path.numbers, len(files.instances))
+    if outputs.indices is not None:
+        outputs.check_frames(path.numbers, len(files.instances))
     progress = files.progress if bar else silent
     loading = None if streaming.network.instant else Loader(scenes, settings, streaming).load(path.cameras[0])
     frames = write_frames(simulation, path, outputs, threads=files.threads, progress=progress, passed=passed)

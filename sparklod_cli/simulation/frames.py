@@ -148,7 +148,7 @@ class Simulation(StreamedCuts):
         if not all(chunk in stream.cache for chunk in requested) or (self.scenes.kind == STREAMED_SOG and not instant):
             drawn = self._find(camera, resident)
         if not instant:
-            stream.want(drawn[0].wanted())  # a viewer discovers chunks through those that it has
+            stream.want(drawn[0].wanted())  # a viewer discovers chunks through resident ones
         arrived = stream.take_arrivals()
         cells: Row = {
             "chunks_touched": len(stream.cache.requested),
@@ -240,7 +240,8 @@ def write_frames(
         for frame in simulation.run(path, threads=threads, progress=progress):
             in_front.append(frame.in_front)
             together.append(frame.rows[0])
-            _write_indices(frame, outputs)
+            if outputs.indices is not None:
+                _write_indices(frame, outputs)
             if outputs.plot is not None:
                 extremes.update(dict.fromkeys(lookout.add(frame.rows[0]), frame))
                 extremes.setdefault("first", frame)
@@ -255,7 +256,7 @@ def write_frames(
 
 
 def _write_indices(frame: SimulatedFrame, outputs: FrameOutputs) -> None:
-    parts = frame.cut.indices() if outputs.indices is not None else []
+    parts = frame.cut.indices()
     for nodes, file in zip(parts, outputs.index_files([frame.number], len(parts)), strict=True):
         if outputs.padded:
             nodes = np.concatenate([nodes, np.zeros(-len(nodes) % ROW, np.uint32)]).reshape(-1, ROW)

@@ -53,8 +53,8 @@ class Loader(StreamedCuts):
     def arrivals(self, camera: Camera) -> Iterator[Arrival]:
         """Yield the state at the beginning and after each arrival of a chunk, as long as any are wanted.
 
-        The camera rests. As soon as a chunk has arrived, the viewer looks for the chunks that the cut needs, as far as
-        it can tell from those that it has; Spark does so with the next picture that it draws.
+        The camera rests. As soon as a chunk has arrived, the viewer finds the cut again, with the chunks that it has;
+        Spark does so with the next picture that it draws.
         """
         per_chunk = self._splats_of(self.find(camera))
         total = max(1, int(per_chunk.sum()))
@@ -69,7 +69,7 @@ class Loader(StreamedCuts):
                     return
 
     def load(self, camera: Camera) -> Row:
-        """Return the waits, `LOADING`, of a visitor who stays at a camera; None for what never fits into the cache."""
+        """Return the waits, `LOADING`, of a visitor who stays at a camera; None if a cut never fits the cache."""
         figures: Row = dict.fromkeys(column.name for column in LOADING)
         for arrival in self.arrivals(camera):
             if figures["first_picture_s"] is None and self.chunks.shows(arrival.resident):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -177,8 +177,6 @@ class Moment:
     """The frame with the largest value of one of the criteria `MOMENTS`.
 
     Attributes:
-        frame: its number.
-        time_s: seconds on the path.
         unit: of the value; "limit" is a multiple of the pixel scale limit.
     """
 
@@ -269,18 +267,14 @@ def coarseness(row: Row) -> Number | None:
     return scale / limit if isinstance(scale, (int, float)) and isinstance(limit, (int, float)) and limit else None
 
 
-def _cell(name: str) -> Callable[[Row], Number | None]:
-    return lambda row: next(iter(numbers([row], name)), None)
-
-
-#: Criteria for extreme frames: the value of a row, the threshold that it must exceed, and the unit.
-MOMENTS: dict[str, tuple[Callable[[Row], Number | None], Number, str]] = {
-    "churn": (_cell("churn"), 0, "share"),
-    "bytes": (_cell("bytes_new"), 0, "bytes"),
-    "coarsest": (coarseness, 1, "limit"),
-    "missing": (_cell("missing"), 0, "splats"),
-    "incomplete": (_cell("complete_in_s"), 0, "s"),
-    "overdraw": (_cell("overdraw_estimate"), 0, ""),
+#: Criteria for extreme frames: the column, None for `coarseness`, the threshold that it must exceed, and the unit.
+MOMENTS: dict[str, tuple[str | None, Number, str]] = {
+    "churn": ("churn", 0, "share"),
+    "bytes": ("bytes_new", 0, "bytes"),
+    "coarsest": (None, 1, "limit"),
+    "missing": ("missing", 0, "splats"),
+    "incomplete": ("complete_in_s", 0, "s"),
+    "overdraw": ("overdraw_estimate", 0, ""),
 }
 
 
@@ -297,8 +291,10 @@ class Lookout:
     def add(self, row: Row) -> list[str]:
         """Add the row of the next frame; returns the criteria in which it exceeds all earlier frames."""
         found = []
-        for criterion, (measure, above, _) in MOMENTS.items():
-            value = None if criterion == "bytes" and not self._frames else measure(row)
+        for criterion, (column, above, _) in MOMENTS.items():
+            if criterion == "bytes" and not self._frames:
+                continue
+            value = coarseness(row) if column is None else next(iter(numbers([row], column)), None)
             if value is not None and value > (self._most[criterion][0] if criterion in self._most else above):
                 self._most[criterion] = value, row
                 found.append(criterion)

@@ -143,7 +143,7 @@ class LoadedScene:
 
     @property
     def requests(self) -> Sequence[tuple[int, ...]]:
-        """For each chunk, bytes of the answer to a first request, and of those that follow it together."""
+        """For each chunk, bytes of the answer to its first request, and to the others, which are sent together."""
         return [(size,) for size in self.chunk_bytes().tolist()]
 
     @property

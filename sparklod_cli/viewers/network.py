@@ -21,8 +21,8 @@ class Chunks:
     """The chunks of all scenes, numbered consecutively, scene by scene, as in `cut.Forest.chunk_base`.
 
     Args:
-        requests: for each scene and chunk, bytes of the answers that it takes: to a first request, and to those that
-            follow it together.
+        requests: for each scene and chunk, bytes of the answer to its first request, and of the answers to the others,
+            which are asked for together.
         headers: for each scene the sizes of the answers that a viewer waits for, one after the other, before it can ask
             for a chunk; none unless given.
         rooted: whether scenes are drawn from their first chunks on, which hold their roots; chunk files of Streamed SOG
@@ -63,9 +63,6 @@ class Chunks:
 
     def __len__(self) -> int:
         return len(self.sizes)
-
-    def tree_of(self, chunk: int) -> int:
-        return bisect_right(self.firsts, chunk) - 1
 
     def shows(self, resident: NDArray[np.bool_]) -> bool:
         """Return True if anything is drawn with (chunks,) bool resident chunks."""
@@ -237,7 +234,7 @@ class ChunkStream:
         self.advance(self.now)  # with an instant network everything arrives now
 
     def take_arrivals(self) -> list[int]:
-        """Return the chunks that have arrived since the last call, in order; including those that have been evicted."""
+        """Return the chunks that arrived since the last call, in order; evicted ones, too."""
         arrived, self._arrived = self._arrived, []
         return arrived
 
@@ -247,7 +244,7 @@ class ChunkStream:
         return taken
 
     def step(self) -> bool:
-        """Go on to the next event, the start or end of a transfer; False if there is none."""
+        """Go on to the next event, the start or end of a transfer; False if nothing is under way."""
         going = self._step(math.inf)
         self.now = self._since if going else self.now
         return going
@@ -282,7 +279,7 @@ class ChunkStream:
             self._next += 1
             if chunk not in self.cache and chunk not in self._missing:
                 self._missing[chunk] = len(self._chunks.requests[chunk])
-                tree = self._chunks.tree_of(chunk)
+                tree = bisect_right(self._chunks.firsts, chunk) - 1
                 if tree in self._waiting:
                     self._waiting[tree] += (chunk,)
                 else:
@@ -301,7 +298,7 @@ class ChunkStream:
         return self._chunks.requests[request.chunk][request.part]
 
     def _step(self, until: float) -> bool:
-        """Process the next event, the start or end of a transfer; False if there is none until a time."""
+        """Process the next event, the start or end of a transfer; False if none is due until a time."""
         if not self._requested and not self._transfers:
             return False
         begin = self._requested[0][0] if self._requested else math.inf

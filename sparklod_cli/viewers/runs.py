@@ -33,7 +33,7 @@ class LoadedRuns(LoadedScene):
         return len(self.chunk_bytes())
 
     def fill(self, rows: NDArray[np.void]) -> None:
-        """Fill (N,) `NODE` with splats, for statistics of cuts; those that finer ones replace have a child."""
+        """Fill (N,) `NODE` with splats, for statistics of cuts; splats that finer ones replace have a child."""
         splats = self.scene.splats
         rows["x"], rows["y"], rows["z"] = splats.center.T
         rows["size"] = spark_size(splats)
