@@ -29,7 +29,7 @@ from sparklod_cli.model.splats import Splats
 from sparklod_cli.model.traversed import Nodes
 from sparklod_cli.system.threads import on_threads, ordered_map, processors
 from sparklod_cli.viewers.continuous import ContinuousCuts
-from sparklod_cli.viewers.cut import CutView, Forest, TreeInstance
+from sparklod_cli.viewers.cut import Forest, TreeInstance
 from sparklod_cli.viewers.frame_statistics import Changes, measure
 from sparklod_cli.viewers.spark import SparkViewer
 
@@ -68,6 +68,20 @@ def _table(*names: Column) -> Table:
 
 TILED = _table(label("tree", "million nodes"))
 REAL = _table(label("tree"), label("nodes"))
+
+
+@dataclass(frozen=True)
+class CutView:
+    """A camera for the traversal.
+
+    Attributes:
+        camera_to_world: (4, 4), axes of OpenGL: x to the right, y up, looking along -z.
+        fov_x, fov_y: radians.
+    """
+
+    camera_to_world: np.ndarray
+    fov_x: float
+    fov_y: float
 
 
 class Spark:

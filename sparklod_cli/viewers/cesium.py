@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ..cameras.camera import Camera
 from ..lod.tiles import PIXEL_ERROR
 from ..model.traversed import TileScene
-from .cut import CutView, Forest, TreeCut, TreeInstance, Viewer
+from .cut import Forest, TreeCut, TreeInstance, Viewer
 from .loaded_scene import TILES, Index, bytes_of
 from .runs import LoadedRuns, cut_of_runs
 from .viewer_settings import CESIUM_FETCHERS, LodSettings
@@ -98,9 +98,7 @@ class CesiumViewer:
     def __init__(self, forest: Forest[LoadedTiles], instances: Sequence[TreeInstance]) -> None:
         self.forest, self.instances = forest, list(instances)
 
-    def cut(
-        self, camera: Camera | CutView, *, budget: int, smallest: float = 0.0, resident: Mask | None = None
-    ) -> TreeCut:
+    def cut(self, camera: Camera, *, budget: int, smallest: float = 0.0, resident: Mask | None = None) -> TreeCut:
         """Return the cut that CesiumJS draws; see `Viewer.cut`.
 
         Args:
@@ -129,7 +127,7 @@ class CesiumViewer:
 
 
 def choose(
-    scene: TileScene, view: Camera | CutView, object_to_world: NDArray[np.float64], limit: float, resident: Mask
+    scene: TileScene, view: Camera, object_to_world: NDArray[np.float64], limit: float, resident: Mask
 ) -> TileChoice:
     """Return the tiles of an instance that a viewer draws and loads.
 
@@ -155,7 +153,7 @@ def choose(
     return TileChoice(drawn, drawn & desired, wanted, distance)
 
 
-def distances(scene: TileScene, view: Camera | CutView, object_to_world: NDArray[np.float64]) -> NDArray[np.float64]:
+def distances(scene: TileScene, view: Camera, object_to_world: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return (T,) distances from the camera to the boxes of tiles, in units of the scene; 0 inside."""
     eye = np.linalg.solve(object_to_world, view.camera_to_world[:, 3])[:3]
     nearest = np.clip(eye, scene.bounds[:, 0], scene.bounds[:, 1])
@@ -163,7 +161,7 @@ def distances(scene: TileScene, view: Camera | CutView, object_to_world: NDArray
     return found
 
 
-def in_picture(scene: TileScene, view: Camera | CutView, object_to_world: NDArray[np.float64]) -> Mask:
+def in_picture(scene: TileScene, view: Camera, object_to_world: NDArray[np.float64]) -> Mask:
     """Return (T,) bool, false for tiles whose box lies behind the camera or beyond one side of the picture."""
     to_camera = np.linalg.solve(view.camera_to_world, object_to_world)
     low, high = scene.bounds[:, None, 0], scene.bounds[:, None, 1]

@@ -34,7 +34,7 @@ from ..lod.kernels.pixel_scale import pixel_scales
 from ..lod.kernels.tree_links import find_depths, find_limits, find_parents
 from ..model.gaussian import linear_opacity, lod_opacity
 from ..model.splats import FloatArray
-from .cut import CutView, Viewer, views_of
+from .cut import Viewer, views_of
 from .viewer_settings import BLEND
 
 #: Bisections of the threshold's interval, whose ends differ by a factor of the width; 40 leave a share of 1e-12 of it.
@@ -74,7 +74,7 @@ class ContinuousCuts:
         bases = self._forest.node_base
         self._inner = [_Inner(self._forest.nodes[bases[i] : bases[i + 1]]) for i in range(len(bases) - 1)]
 
-    def cut(self, view: Camera | CutView, *, budget: int, smallest: float = 0.0, width: float = BLEND) -> BlendedCut:
+    def cut(self, view: Camera, *, budget: int, smallest: float = 0.0, width: float = BLEND) -> BlendedCut:
         """Return the continuous cut.
 
         Args:

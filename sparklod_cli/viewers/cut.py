@@ -31,7 +31,7 @@ class Viewer(Protocol):
 
     def cut(
         self,
-        camera: Camera | CutView,
+        camera: Camera,
         *,
         budget: int,
         smallest: float = 0.0,
@@ -107,20 +107,6 @@ class TreeInstance:
 
 
 @dataclass(frozen=True)
-class CutView:
-    """A camera for the traversal.
-
-    Attributes:
-        camera_to_world: (4, 4), axes of OpenGL: x to the right, y up, looking along -z.
-        fov_x, fov_y: radians.
-    """
-
-    camera_to_world: Matrix
-    fov_x: float
-    fov_y: float
-
-
-@dataclass(frozen=True)
 class TreeCut:
     """The S nodes of a cut, of all instances together.
 
@@ -167,7 +153,7 @@ class TreeCut:
         return order
 
 
-def views_of(forest: Forest[Any], instances: Sequence[TreeInstance], view: Camera | CutView) -> NDArray[np.void]:
+def views_of(forest: Forest[Any], instances: Sequence[TreeInstance], view: Camera) -> NDArray[np.void]:
     """Return (instances,) `pixel_scale.VIEW`: the camera in the space of each instance, in Spark's precision."""
     views = np.zeros(len(instances), pixel_scale.VIEW)
     for row, instance in zip(views, instances, strict=True):

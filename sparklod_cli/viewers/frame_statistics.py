@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..cameras.camera import Camera
 from ..lod.kernels import cut_statistics as kernels
 from ..lod.kernels.cut_arrays import CutNodes
-from .cut import CutView, Forest, TreeCut, TreeInstance
+from .cut import Forest, TreeCut, TreeInstance
 from .viewer_settings import pixel_limit
 
 
@@ -47,7 +47,7 @@ class CutStatistics:
 def measure(
     forest: Forest[Any],
     cut: TreeCut,
-    view: Camera | CutView,
+    view: Camera,
     *,
     size: tuple[int, int],
     by_instance: bool = False,

@@ -24,7 +24,7 @@ from ..codecs.streamed_sog.manifest import MAX_MANIFEST, files_of_chunk, parse
 from ..io import opened
 from ..model.traversed import DetailScene
 from ..system.errors import FormatError
-from .cut import CutView, Forest, TreeCut, TreeInstance, Viewer
+from .cut import Forest, TreeCut, TreeInstance, Viewer
 from .loaded_scene import STREAMED_SOG, Index, bytes_of
 from .runs import LoadedRuns, cut_of_runs
 from .viewer_settings import CONNECTIONS, LEAST_BASE_DISTANCE, PLAYCANVAS_FETCHERS, DetailRule, LodSettings
@@ -200,7 +200,7 @@ class RegionBounds:
         median = np.sort(half32, axis=0)[len(half32) // 2].astype(np.float64)
         self.excess = np.maximum(half32 - median, 0).astype(np.float32).astype(np.float64)
 
-    def squared_distances(self, view: Camera | CutView, object_to_world: Matrix, rule: DetailRule) -> Distances:
+    def squared_distances(self, view: Camera, object_to_world: Matrix, rule: DetailRule) -> Distances:
         """Return (R,) squared distances by which levels are chosen, world units at a field of view of 45 degrees.
 
         The distance is that from the camera to the nearest point of the bound, shrunk by `rule.shrink` of its excess;
@@ -367,7 +367,7 @@ class PlayCanvasViewer:
 
     def cut(
         self,
-        camera: Camera | CutView,
+        camera: Camera,
         *,
         budget: int,
         smallest: float = 0.0,

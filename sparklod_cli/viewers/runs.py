@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..cameras.camera import Camera
 from ..model.gaussian import spark_size
-from .cut import CutView, Forest, TreeCut, TreeInstance, views_of
+from .cut import Forest, TreeCut, TreeInstance, views_of
 from .loaded_scene import LoadedScene
 
 
@@ -44,7 +44,7 @@ class LoadedRuns(LoadedScene):
 def cut_of_runs(
     forest: Forest[Any],
     instances: Sequence[TreeInstance],
-    view: Camera | CutView,
+    view: Camera,
     nodes: Sequence[NDArray[np.uint32]],
     reason: str,
     missing: int,

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ..lod.kernels import cut_arrays
 from ..lod.kernels.cut import find_cut
 from ..model.lod_tree import CHUNK_BITS, CHUNK_NODES
-from .cut import CutView, Forest, TreeCut, TreeInstance, views_of
+from .cut import Forest, TreeCut, TreeInstance, views_of
 
 if TYPE_CHECKING:
     from ..cameras.camera import Camera
@@ -58,7 +58,7 @@ class SparkViewer:
 
     def cut(
         self,
-        camera: Camera | CutView,
+        camera: Camera,
         *,
         budget: int,
         smallest: float = 0.0,
@@ -89,7 +89,7 @@ class SparkViewer:
         for chunks, pages in self._pages:
             pages.read(np.flatnonzero(wanted[chunks] & ~pages.present).tolist())
 
-    def _cut(self, view: Camera | CutView, budget: int, smallest: float, present: NDArray[np.bool_]) -> TreeCut:
+    def _cut(self, view: Camera, budget: int, smallest: float, present: NDArray[np.bool_]) -> TreeCut:
         """Return the cut with these chunks, which are in memory."""
         start = time.perf_counter()
         views = views_of(self.forest, self.instances, view)

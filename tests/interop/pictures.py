@@ -18,10 +18,11 @@ from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.render.rasterizer import draw, shade
 from sparklod_cli.render.settings import RasterSettings
-from sparklod_cli.viewers.cut import CutView, Forest, TreeInstance
+from sparklod_cli.viewers.cut import Forest, TreeInstance
 from sparklod_cli.viewers.spark import SparkViewer
 from sparklod_cli.viewers.viewer_settings import pixel_limit
 from tests.interop.page import Page
+from tests.lod.sights import CutView
 
 FOV_Y = math.radians(50)
 

@@ -23,7 +23,7 @@ from sparklod_cli.model.lod_tree import CHUNK_NODES
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import FloatArray
 from sparklod_cli.model.traversed import Nodes
-from sparklod_cli.viewers.cut import CutView, TreeInstance
+from sparklod_cli.viewers.cut import TreeInstance
 from sparklod_cli.viewers.loaded_scene import nodes_of
 from sparklod_cli.viewers.read_scenes import read_scenes
 from sparklod_cli.viewers.spark import SparkViewer
@@ -35,6 +35,7 @@ from tests.interop.test_paged_traversal import Paged
 from tests.interop.test_rad import chunks_of
 from tests.interop.test_traversal import BUDGETS, FOV_Y, FOVEATIONS, LIMITS, LOD_SCALES, SPARKS_CONES, Tree, cameras
 from tests.interop.ties import Words
+from tests.lod.sights import CutView
 from tests.references.dynamic_cuts import dynamic_limit
 from tests.scenes import random_splats
 

@@ -19,7 +19,7 @@ from sparklod_cli.model.lod_tree import CHUNK_NODES
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.traversed import Nodes
 from sparklod_cli.simulation.frames import Simulation
-from sparklod_cli.viewers.cut import CutView, Forest, TreeCut, TreeInstance
+from sparklod_cli.viewers.cut import Forest, TreeCut, TreeInstance
 from sparklod_cli.viewers.read_scenes import read_scenes
 from sparklod_cli.viewers.spark import SparkViewer
 from sparklod_cli.viewers.viewer_settings import LodSettings, Network, StreamingSettings
@@ -27,6 +27,7 @@ from tests.conftest import real_scene
 from tests.interop.spark import NODE, PageUpdate, Spark
 from tests.interop.test_traversal import FOV_Y, FOVEATIONS, LOD_SCALES, SPARKS_CONES, Tree, cameras, scene
 from tests.lod.forests import links, transform
+from tests.lod.sights import CutView
 from tests.simulation.paths import around
 
 pytestmark = pytest.mark.slow

@@ -18,12 +18,13 @@ from sparklod_cli.lod.builders import BUILDERS
 from sparklod_cli.model.foveation import Cones
 from sparklod_cli.model.lod_tree import CHUNK_NODES
 from sparklod_cli.model.traversed import Nodes
-from sparklod_cli.viewers.cut import CutView, Forest, TreeCut, TreeInstance, views_of
+from sparklod_cli.viewers.cut import Forest, TreeCut, TreeInstance, views_of
 from sparklod_cli.viewers.spark import SparkViewer
 from sparklod_cli.viewers.viewer_settings import pixel_limit
 from tests.conftest import FIXTURES, real_scene
 from tests.interop.spark import NODE, Spark
 from tests.lod.forests import rotation, transform
+from tests.lod.sights import CutView
 from tests.references import budgeted_cuts
 
 pytestmark = pytest.mark.slow

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sparklod_cli.model.traversed import DetailScene
-from sparklod_cli.viewers.cut import CutView
+from tests.lod.sights import CutView
 from tests.scenes import random_splats
 
 

@@ -23,10 +23,11 @@ from sparklod_cli.model.lod_tree import CHUNK_NODES, LodTree
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.model.traversed import Nodes
 from sparklod_cli.system.threads import on_threads
-from sparklod_cli.viewers.cut import CutView, Forest, TreeCut, TreeInstance
+from sparklod_cli.viewers.cut import Forest, TreeCut, TreeInstance
 from sparklod_cli.viewers.spark import SparkViewer
 from sparklod_cli.viewers.viewer_settings import LodSettings
 from tests.lod.forests import links
+from tests.lod.sights import CutView
 from tests.lod.trees import check_threads
 from tests.references import chunk_splits
 from tests.references.chunk_orders import reordered, spark_order

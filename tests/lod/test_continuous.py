@@ -14,9 +14,10 @@ from sparklod_cli.lod.kernels.pixel_scale import pixel_scales
 from sparklod_cli.model.foveation import Cones
 from sparklod_cli.model.gaussian import lod_opacity
 from sparklod_cli.viewers.continuous import BlendedCut, ContinuousCuts, faded, find_threshold, shares
-from sparklod_cli.viewers.cut import CutView, Forest, TreeInstance
+from sparklod_cli.viewers.cut import Forest, TreeInstance
 from sparklod_cli.viewers.spark import SparkViewer
 from tests.lod.forests import Case, cases, random_tree, transform
+from tests.lod.sights import CutView
 from tests.references import budgeted_cuts, continuous_cuts
 
 WIDTHS = (1.05, 1.25, 2.0)

@@ -11,11 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sparklod_cli.model.traversed import Nodes
-from sparklod_cli.viewers.cut import CutView, TreeCut, TreeInstance
+from sparklod_cli.viewers.cut import TreeCut, TreeInstance
 from sparklod_cli.viewers.frame_statistics import Changes, CutStatistics, measure
 from sparklod_cli.viewers.spark import SparkViewer
 from sparklod_cli.viewers.viewer_settings import pixel_limit
 from tests.lod.forests import Case, cases, drawn, expected_cut, links, views
+from tests.lod.sights import CutView
 
 SIZE = (640, 480)
 

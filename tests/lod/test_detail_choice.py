@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sparklod_cli.viewers.cut import CutView
 from sparklod_cli.viewers.playcanvas import Chains, DetailChoice, Distant, RegionBounds, choose
 from sparklod_cli.viewers.viewer_settings import DetailRule
 from tests.lod.details import random_regions, random_view
+from tests.lod.sights import CutView
 
 RULES = (DetailRule(), DetailRule(mode="limit"), DetailRule(finest=1, coarsest=2), DetailRule(multiplier=1.2))
 

@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 
 from sparklod_cli.model import traversed
 from sparklod_cli.viewers import spark as traversal
-from sparklod_cli.viewers.cut import CutView, Forest, TreeInstance
+from sparklod_cli.viewers.cut import Forest, TreeInstance
 from tests.lod.forests import Case, ancestors_drawn, cases, check, random_tree, transform
+from tests.lod.sights import CutView
 
 #: Nodes of a chunk in tests of small trees, as a power of 2; so large that no node's children are in three.
 SMALL = 4

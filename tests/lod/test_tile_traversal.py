@@ -18,9 +18,10 @@ from sparklod_cli.lod.part_settings import TileSettings
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.traversed import TileScene
 from sparklod_cli.viewers.cesium import CesiumViewer, LoadedTiles, choose
-from sparklod_cli.viewers.cut import CutView, Forest, TreeInstance
+from sparklod_cli.viewers.cut import Forest, TreeInstance
 from sparklod_cli.viewers.viewer_settings import pixel_limit
 from tests.conftest import FIXTURES
+from tests.lod.sights import CutView
 
 EYE = np.eye(4)
 Mask = NDArray[np.bool_]

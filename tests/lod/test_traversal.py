@@ -14,10 +14,11 @@ from hypothesis import strategies as st
 from sparklod_cli.model.foveation import Cones, Frustum
 from sparklod_cli.model.lod_tree import CHUNK_NODES
 from sparklod_cli.model.traversed import Nodes
-from sparklod_cli.viewers.cut import CutView, Forest, TreeInstance, views_of
+from sparklod_cli.viewers.cut import Forest, TreeInstance, views_of
 from sparklod_cli.viewers.spark import VISITS
 from sparklod_cli.viewers.viewer_settings import pixel_limit
 from tests.lod.forests import Case, ancestors_drawn, cases, check, drawn, links, random_tree, transform, views
+from tests.lod.sights import CutView
 from tests.references import budgeted_cuts
 
 #: Pixel scales at which nothing happens, something does, and everything does.

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sparklod_cli.viewers.cut import CutView
 from sparklod_cli.viewers.playcanvas import Chains, Distant, RegionBounds, choose
 from sparklod_cli.viewers.viewer_settings import DetailRule
 from tests.interop.node import Node
 from tests.lod.details import Regions, random_regions, random_view
+from tests.lod.sights import CutView
 
 pytestmark = pytest.mark.slow
 
