@@ -158,14 +158,14 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
     besides = files_read(options, instances)
     keep_apart(ctx, besides)
     outputs = table.outputs(ctx, as_json=options.as_json)
-    asserts = table.assertions()
+    asserts = table.assertions() if table.asserts else []
     start = time.perf_counter()
     with Console(quiet=general.quiet, verbose=general.verbose) as console:
         from ..api.jobs import traverse_files
 
         question_budgets(console, budget)
         console.announce_compiling("cuts")
-        screen = outputs.table.on_stdout and is_terminal(sys.stdout)
+        screen = outputs.table.path is None and outputs.table.form is not None and is_terminal(sys.stdout)
         outputs.check()
         with options.cameras.usage_errors():
             plain = outputs.plot is not None

@@ -154,24 +154,6 @@ QUOTED = ',"\r\n'
 FORMULAS = ("=", "+", "-", "@", "\t", "\r", "\n")
 
 
-def encode(rows: Iterable[Row], columns: Sequence[Column], form: str) -> Iterator[bytes]:
-    """Return the pieces of a file of rows. CSV and JSON are made row by row, so that long paths take no memory.
-
-    An empty text is written as an empty cell, since CSV cannot tell them apart; what UTF-8 cannot hold becomes "?". In
-    CSV a ' is put before a text that a spreadsheet would take for a formula.
-
-    Args:
-        rows: with a cell for each column; other cells are ignored.
-
-    Raises:
-        SparklodError: pyarrow is not installed, for Parquet; raised by the call itself, before the first row.
-        ValueError: a number is not finite; raised while the pieces are taken.
-    """
-    if form not in FORMS:
-        raise ValueError(f"form is {form}, not one of {', '.join(FORMS)}")
-    return FORMS[form](rows, columns)
-
-
 def load_pyarrow() -> ModuleType:
     """Import pyarrow."""
     with optional_import("Parquet needs pyarrow", "parquet"):
@@ -192,15 +174,14 @@ def _cell(column: Column, row: Row) -> Cell:
 def _csv(rows: Iterable[Row], columns: Sequence[Column]) -> Iterator[bytes]:
     yield (",".join(column.name for column in columns) + "\n").encode()
     for row in rows:
-        yield (",".join(_field(column, row) for column in columns) + "\n").encode()
-
-
-def _field(column: Column, row: Row) -> str:
-    """Return a field of CSV; a ' before a formula makes it a text."""
-    text = column.text(_cell(column, row))
-    text = "'" + text if column.kind is str and text.startswith(FORMULAS) else text
-    # The module csv quotes carriage returns in some versions of Python only.
-    return '"' + text.replace('"', '""') + '"' if any(mark in text for mark in QUOTED) else text
+        fields = []
+        for column in columns:
+            text = column.text(_cell(column, row))
+            text = "'" + text if column.kind is str and text.startswith(FORMULAS) else text
+            # The module csv quotes carriage returns in some versions of Python only.
+            quotes = any(mark in text for mark in QUOTED)
+            fields.append('"' + text.replace('"', '""') + '"' if quotes else text)
+        yield (",".join(fields) + "\n").encode()
 
 
 def _json(rows: Iterable[Row], columns: Sequence[Column]) -> Iterator[bytes]:
@@ -245,7 +226,11 @@ def _parquet_pieces(rows: Iterable[Row], columns: Sequence[Column], pyarrow: Mod
     yield file.getvalue()
 
 
-#: The formats of tables by name, which is the suffix too, and the function that writes each; the first is the default.
+#: Formats of tables by name, which is the suffix too, and the functions that return the pieces of a file of rows with a
+#: cell for each column; the first is the default. CSV and JSON are made row by row, so that long paths take no memory.
+#: An empty text is written as an empty cell, since CSV cannot tell them apart; what UTF-8 cannot hold becomes "?". In
+#: CSV a ' is put before a text that a spreadsheet would take for a formula. Parquet raises a `SparklodError` at once
+#: where pyarrow is not installed; all raise `ValueError`, while the pieces are taken, where a number is not finite.
 FORMS: dict[str, Callable[[Iterable[Row], Sequence[Column]], Iterator[bytes]]] = {
     "csv": _csv,
     "json": _json,
@@ -271,10 +256,6 @@ class TableOutput:
     columns: Sequence[Column]
     overwrite: bool = False
 
-    @property
-    def on_stdout(self) -> bool:
-        return self.path is None and self.form is not None
-
     def check(self) -> None:
         if self.path is not None:
             check_writable(self.path, overwrite=self.overwrite)
@@ -287,7 +268,7 @@ class TableOutput:
             for _ in rows:
                 pass
             return
-        data: Iterable[bytes] = encode(iter(rows), self.columns, self.form)
+        data: Iterable[bytes] = FORMS[self.form](iter(rows), self.columns)
         if self.path is None and passed is not None:
             data = passed(data)
         write_file(self.path or DASH, data, overwrite=self.overwrite, may_end=self.form != "parquet")

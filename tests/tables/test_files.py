@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from sparklod_cli.simulation.results import COLUMNS
 from sparklod_cli.system.errors import SparklodError
 from sparklod_cli.system.packages import install_hint
-from sparklod_cli.tables.columns import FORMS, TYPES, Cell, Column, Row, encode
+from sparklod_cli.tables.columns import FORMS, TYPES, Cell, Column, Row
 from tests.tables.rows import flight, row
 
 pytestmark = pytest.mark.slow
@@ -36,7 +36,7 @@ def named(names: list[str]) -> list[Column]:
 def encoded(rows: Sequence[Row], form: str, columns: Sequence[Column] = COLUMNS) -> bytes:
     if form == "parquet":
         pytest.importorskip("pyarrow", reason="Parquet needs the extra `parquet`")
-    return b"".join(encode(rows, columns, form))
+    return b"".join(FORMS[form](rows, columns))
 
 
 def from_csv(data: bytes) -> list[dict[str, Cell]]:
@@ -146,7 +146,7 @@ def test_rows_are_written_before_all_are_known(form: str) -> None:
             taken += 1
             yield row(frame)
 
-    pieces = encode(endless(), COLUMNS, form)
+    pieces = FORMS[form](endless(), COLUMNS)
     while taken < 1:
         next(pieces)
     for frame in range(1, 5):
@@ -189,10 +189,5 @@ def test_parquet_has_types_and_units() -> None:
 def test_the_extra_that_brings_pyarrow_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(SparklodError, match=re.escape(install_hint("parquet"))) as caught:
-        encode([], COLUMNS, "parquet")
+        FORMS["parquet"]([], COLUMNS)
     assert "\n" not in str(caught.value)
-
-
-def test_an_unknown_format_of_tables_is_an_error() -> None:
-    with pytest.raises(ValueError, match="not one of csv, json, parquet"):
-        encode([], COLUMNS, "xlsx")
