@@ -413,10 +413,12 @@ def _draw(ctx: click.Context, options: RenderOptions) -> None:
             lod, render = options.cut.settings(), look.settings(console.say)
             # What looks at more than cuts is read whole.
             paged = budget is not None and lod.continuous is None and render.color_by in (None, *COLORS_OF_CUTS)
-            files = viewed_files(options, instances, console, through=look.through, paged=paged)
+            files = viewed_files(
+                instances, options.cameras, options.cut, general, console, through=look.through, paged=paged
+            )
             render = render if flags_set(ctx, PLANES) else files.with_planes(render)
             output, settings = _place(ctx, options, instances, files.path)
-            say_notes(ctx, console, options, files, options.streaming.network, files.scenes.notes)
+            say_notes(ctx, console, options.cameras, files, options.streaming.network, files.scenes.notes)
             console.detail(f"  read in {time.perf_counter() - start:.2f} s")
             pictures = draw_files(
                 files,
@@ -490,7 +492,7 @@ def _place(
     )
     bar = (look.render.color_by is not None or options.comparison.diff is not None) and settings.bar
     check_sizes(output, path.cameras, look.render.supersample, bar=bar)
-    keep_apart(ctx, {**files_read(options, instances), "output": output.paths(path.numbers)})
+    keep_apart(ctx, {**files_read(options.cameras, instances), "output": output.paths(path.numbers)})
     output.check(path.numbers, overwrite=options.pictures.overwrite)
     if output.kind == "animation":
         check_animation(output.form, frame_rate(path))
@@ -543,7 +545,7 @@ def _compare(ctx: click.Context, options: RenderOptions) -> int:
 
     table = table_output(output, COLUMNS, overwrite=overwrite, as_json=options.as_json)
     instances = options.inputs.instances()
-    keep_apart(ctx, files_read(options, instances))
+    keep_apart(ctx, files_read(options.cameras, instances))
     with Console(quiet=general.quiet, verbose=general.verbose) as console:
         question_budgets(console, *budgets)
         console.announce_compiling("pictures")
@@ -558,8 +560,8 @@ def _compare(ctx: click.Context, options: RenderOptions) -> int:
             check_chart(options.comparison.plot, overwrite=overwrite)
         with options.cameras.usage_errors():
             render = dataclasses.replace(options.appearance.settings(console.say), max_sh=options.comparison.max_sh)
-            files = viewed_files(options, instances, console, trees_only=True)
-            say_notes(ctx, console, options, files)
+            files = viewed_files(instances, options.cameras, options.cut, general, console, trees_only=True)
+            say_notes(ctx, console, options.cameras, files)
             render = render if flags_set(ctx, PLANES) else files.with_planes(render)
             compared = compare_files(
                 files,

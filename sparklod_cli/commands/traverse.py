@@ -155,7 +155,7 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
     claim_stdout(ctx, "output", as_json=options.as_json)
     budget = options.cut.one_budget()
     instances = options.inputs.instances()
-    besides = files_read(options, instances)
+    besides = files_read(options.cameras, instances)
     keep_apart(ctx, besides)
     outputs = table.outputs(ctx, as_json=options.as_json)
     asserts = table.assertions() if table.asserts else []
@@ -169,8 +169,10 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
         outputs.check()
         with options.cameras.usage_errors():
             plain = outputs.plot is not None
-            files = viewed_files(options, instances, console, trees_only=True, plain=plain, paged=True)
-            say_notes(ctx, console, options, files, options.streaming.network)
+            files = viewed_files(
+                instances, options.cameras, options.cut, general, console, trees_only=True, plain=plain, paged=True
+            )
+            say_notes(ctx, console, options.cameras, files, options.streaming.network)
             keep_apart(ctx, {**besides, "indices_out": outputs.index_files(files.path.numbers, len(instances))})
             written, whole, outcomes = traverse_files(
                 files,

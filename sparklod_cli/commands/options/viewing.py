@@ -41,8 +41,7 @@ if TYPE_CHECKING:
     from ...model.instances import Instance
     from ...viewers.scenes import Scenes
     from ..console import Console
-    from ..render import RenderOptions
-    from ..traverse import TraverseOptions
+    from .common import General
 
 #: The options that are each a source of cameras, of which one can be given.
 SOURCES = ("camera_path", "orbit", "dolly", "look_at", "keyframes", "views")
@@ -384,28 +383,27 @@ class CutOptions:
         return replace(self.lod, foveation=foveation)
 
 
-def files_read(options: RenderOptions | TraverseOptions, instances: list[Instance]) -> dict[str, list[Path]]:
+def files_read(cameras: Cameras, instances: list[Instance]) -> dict[str, list[Path]]:
     """For `keep_apart`: by the name of an option, the files that it names without being one."""
     splats = [instance.file for instance in instances if instance.file is not None]
-    matrix = options.cameras.world_transform and file_of(options.cameras.world_transform)
+    matrix = cameras.world_transform and file_of(cameras.world_transform)
     return {"scene": splats, "world_transform": [matrix] if matrix else []}
 
 
 def viewed_files(
-    options: RenderOptions | TraverseOptions, instances: list[Instance], console: Console, **how: Any
+    instances: list[Instance], cameras: Cameras, cut: CutOptions, general: General, console: Console, **how: Any
 ) -> ViewedFiles:
     """Return the files and the cameras that look at them; the other arguments are attributes of `ViewedFiles`."""
     from ...api.jobs import ViewedFiles
 
-    cameras, general = options.cameras, options.general
     source, settings = cameras.camera_source(), cameras.settings()
-    return ViewedFiles(instances, source, settings, options.cut.precision, general.threads, console.progress, **how)
+    return ViewedFiles(instances, source, settings, cut.precision, general.threads, console.progress, **how)
 
 
 def say_notes(
     ctx: click.Context,
     console: Console,
-    options: RenderOptions | TraverseOptions,
+    cameras: Cameras,
     files: ViewedFiles,
     network: Network | None = None,
     notes: Iterable[str] = (),
@@ -415,7 +413,7 @@ def say_notes(
 
     scenes, path = files.scenes, files.path
     check_scenes(ctx, scenes)
-    upright = options.cameras.up is None and options.cameras.camera_path is None  # by the axes of the files
+    upright = cameras.up is None and cameras.camera_path is None  # by the axes of the files
     for note in (*path.notes, *notes, *(scenes.axis_notes if upright else ())):
         console.say(note)
     if network is None or network.instant:
