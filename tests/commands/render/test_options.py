@@ -19,8 +19,9 @@ from sparklod_cli.codecs import ply
 from sparklod_cli.commands.render import render as command
 from sparklod_cli.lod.part_settings import TileSettings
 from sparklod_cli.model.scene import Scene
+from sparklod_cli.render import renderer
 from sparklod_cli.render.rasterizer import Image, ShadedSplats
-from sparklod_cli.render.settings import Backend, RasterSettings
+from sparklod_cli.render.settings import RasterSettings
 from tests.conftest import FIXTURES, Capture
 from tests.lod.details import row_of_regions
 from tests.scenes import random_splats
@@ -195,13 +196,16 @@ def test_every_option_of_render_is_used_or_refused(
     inputs = set(folder.iterdir())
     known: dict[tuple[str, ...], Came] = {}
     asked: list[Any] = []
-    draw = Backend.draw
+    draw = renderer.draw_styled
 
-    def told(self: Backend, shown: ShadedSplats, camera: Camera, look: RasterSettings, **options: Any) -> Image:
-        asked.append((self.name, look, options))  # pictures of 8 bits do not show it all
-        return draw(self, shown, camera, look, **options)
+    def recorded(
+        style: str, backend: str, shown: ShadedSplats, camera: Camera, look: RasterSettings, options: Any = None
+    ) -> Image:
+        if style == "splats":
+            asked.append((backend, look, options))  # pictures of 8 bits do not show it all
+        return draw(style, backend, shown, camera, look, options)
 
-    monkeypatch.setattr(Backend, "draw", told)
+    monkeypatch.setattr(renderer, "draw_styled", recorded)
 
     def came(*arguments: str) -> Came:
         if arguments not in known:
