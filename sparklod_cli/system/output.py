@@ -34,7 +34,6 @@ except ImportError:  # Windows, where a file that is open cannot be removed by o
 #: Names of files, as paths within the folder of an output ("0_0/meta.json"), and their contents.
 Files = Iterable[tuple[str, Iterable[bytes]]]
 
-
 #: Bytes written to try a folder, a block of most file systems: less may fit into a full one.
 _TRIED_BYTES = 4096
 
@@ -160,7 +159,13 @@ class Output(contextlib.AbstractContextManager["Output"]):
         if isinstance(self.target, Address):
             return (self.target.parent / name).write(pieces)
         assert self._stage is not None
-        return add(self._stage, name, pieces)
+        path = self._stage / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("xb") as file:
+            size = sum(map(file.write, pieces))
+            file.flush()
+            os.fsync(file.fileno())
+        return size
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
@@ -169,7 +174,24 @@ class Output(contextlib.AbstractContextManager["Output"]):
             with self._stack:
                 if error is not None:
                     raise error
-                self._publish()
+                if self._new is not None:
+                    self._new.publish()
+                elif self._stage is not None:
+                    publish(
+                        self._stage,
+                        self._written,
+                        self.target.name,
+                        overwrite=self._overwrite,
+                        outdated=self._former,
+                    )
+                elif isinstance(self.target, Address) and self._file is not None:
+                    check_free(self.target, overwrite=self._overwrite)
+                    self._file.flush()
+                    self.target.send(self._file.name)
+                elif isinstance(self.target, Address) and self._written:
+                    for name in self._former:
+                        if name not in self._written:
+                            (self.target.parent / name).unlink(missing_ok=True)
         except BaseException as failure:
             if isinstance(self.target, Address):
                 for name in reversed(self._written):
@@ -183,21 +205,6 @@ class Output(contextlib.AbstractContextManager["Output"]):
                 taken = failure.filename2 or failure.filename
                 raise _taken(Path(taken) if self.siblings is not None and taken else self.place) from None
             raise OutputError(f"cannot write {self.place}: {reason_of(failure)}") from None
-
-    def _publish(self) -> None:
-        if self._new is not None:
-            self._new.publish()
-        elif isinstance(self.target, Address) and self._file is not None:
-            check_free(self.target, overwrite=self._overwrite)
-            self._file.flush()
-            self.target.send(self._file.name)
-        elif isinstance(self.target, Address):
-            for name in self._former if self._written else ():
-                if name not in self._written:
-                    (self.target.parent / name).unlink(missing_ok=True)
-        elif self._stage is not None:
-            header, overwrite = self.target.name, self._overwrite
-            publish(self._stage, self._written, header, overwrite=overwrite, outdated=self._former)
 
     def _check_together(self, siblings: Siblings) -> None:
         if self.place == DASH:
@@ -341,11 +348,6 @@ _STAGE = re.compile(r"\.sparklod-[0-9a-f]{16}\.parts")
 FORMER = "former"
 
 
-def unique(name: str) -> str:
-    """Return a name of the form `PARTS` or `STAGES` with a random number."""
-    return name.format(secrets.token_hex(8))
-
-
 def lock(descriptor: int) -> None:
     """Lock a file or folder until it is closed or its process ends; do nothing where there are no locks."""
     if fcntl is not None:
@@ -355,43 +357,40 @@ def lock(descriptor: int) -> None:
 
 def try_lock(descriptor: int) -> bool:
     """Lock a file without waiting; return False if another process has locked it."""
-    if fcntl is None:
-        return True
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError:  # a file system without locks
-        return True
+    if fcntl is not None:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return False
+        except OSError:  # a file system without locks
+            pass
     return True
 
 
 @functools.lru_cache(256)
 def sweep(folder: Path) -> None:
-    """Remove the remains of killed writers from a folder; once, as thousands of files may be written there."""
+    """Remove the remains of killed writers from a folder; once, as thousands of files may be written there.
+
+    These are files and folders of this user that no process has locked.
+    """
     with contextlib.suppress(OSError):
         for path in [*folder.glob(PARTS.format("*")), *folder.glob(STAGES.format("*"))]:
-            with contextlib.suppress(OSError):
-                if fcntl is not None:
-                    _remove_unlocked(path)
-                elif path.match(PARTS.format("*")):
-                    path.unlink()
-
-
-def _remove_unlocked(path: Path) -> None:
-    """Remove a file or folder of this user; raise `OSError` if a process has locked it."""
-    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)  # it may be read-only
-    try:
-        status = os.fstat(descriptor)
-        is_stage = stat.S_ISDIR(status.st_mode) and _STAGE.fullmatch(path.name)
-        if (is_stage or stat.S_ISREG(status.st_mode)) and status.st_uid == os.geteuid():
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if is_stage:
-                shutil.rmtree(path)
-            else:
-                path.unlink()
-    finally:
-        os.close(descriptor)
+            with contextlib.suppress(OSError), contextlib.ExitStack() as stack:
+                if fcntl is None:
+                    if path.match(PARTS.format("*")):
+                        path.unlink()
+                    continue
+                # The file may be read-only.
+                descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
+                stack.callback(os.close, descriptor)
+                status = os.fstat(descriptor)
+                is_stage = stat.S_ISDIR(status.st_mode) and _STAGE.fullmatch(path.name)
+                if (is_stage or stat.S_ISREG(status.st_mode)) and status.st_uid == os.geteuid():
+                    fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    if is_stage:
+                        shutil.rmtree(path)
+                    else:
+                        path.unlink()
 
 
 #: The flag that opens an unnamed file in a folder; None where the system has none.
@@ -445,7 +444,7 @@ class NewFile:
                 self.file = os.fdopen(os.open(target.parent, UNNAMED | os.O_RDWR | os.O_CLOEXEC, mode), "w+b")
                 return
         while True:
-            part = target.with_name(unique(PARTS))
+            part = target.with_name(PARTS.format(secrets.token_hex(8)))
             descriptor = os.open(part, _FLAGS | os.O_CREAT | os.O_EXCL, mode)
             lock(descriptor)
             with contextlib.suppress(FileNotFoundError):  # another process removed it before it was locked
@@ -484,7 +483,7 @@ class NewFile:
             if mode is not None:
                 os.fchmod(number, mode)
             lock(number)
-            temporary = target.with_name(unique(PARTS))
+            temporary = target.with_name(PARTS.format(secrets.token_hex(8)))
             try:
                 link(temporary)  # link() cannot replace a file, so it has two names for a moment
                 temporary.replace(target)
@@ -568,7 +567,7 @@ def staged(folder: Path) -> Iterator[Path]:
     sweep(folder)
     descriptor: int | None = None
     while True:
-        stage = folder / unique(STAGES)
+        stage = folder / STAGES.format(secrets.token_hex(8))
         stage.mkdir(0o700)
         if not HAS_LOCKS:
             break
@@ -584,16 +583,6 @@ def staged(folder: Path) -> Iterator[Path]:
         shutil.rmtree(stage, ignore_errors=True)
         if descriptor is not None:
             os.close(descriptor)
-
-
-def add(stage: Path, name: str, pieces: Iterable[bytes]) -> int:
-    """Write and sync a file in the hidden folder, in folders there ("0_0/means_l.webp"); return its size in bytes."""
-    (stage / name).parent.mkdir(parents=True, exist_ok=True)
-    with (stage / name).open("xb") as file:
-        size = sum(map(file.write, pieces))
-        file.flush()
-        os.fsync(file.fileno())
-    return size
 
 
 def publish(stage: Path, names: Collection[str], header: str, *, overwrite: bool, outdated: Iterable[str] = ()) -> None:
