@@ -163,8 +163,6 @@ def _others(root: Mapping[str, Any], known: Collection[str]) -> Iterator[str]:
 
 
 class _TensorArchive:
-    """The zip of a checkpoint."""
-
     def __init__(self, source: OpenFile) -> None:
         self._file, self._size = source.file, source.size
         try:
@@ -396,7 +394,7 @@ class _Machine:
 
 
 def _extend(container: Any, values: list[Any]) -> None:
-    """Add values to a list, and keys and values in turn to a dict."""
+    """Add values to a list, or keys and values in turn to a dict."""
     if isinstance(container, list):
         container.extend(values)
     elif isinstance(container, dict):

@@ -74,7 +74,6 @@ def open_content(source: OpenFile) -> Reader:
 
 
 def _left_out(header: PlyHeader) -> tuple[str, ...]:
-    """Return the notes on properties and elements that are left out."""
     read = {"vertex": {*VERTEX}, "chunk": {name for names in BOUNDS.values() for name in names}}
     properties = [
         each.name
@@ -101,7 +100,6 @@ Element = tuple[int, np.dtype[Any], int]
 
 
 def _elements(file: BinaryIO, header: PlyHeader) -> dict[str, Element]:
-    """Return the elements that are read; their types have been checked."""
     return {
         name: (offset_of(file, header, name), row_type, header.count(name))
         for name in ("chunk", "vertex", "sh")

@@ -90,7 +90,6 @@ def gzip_member(
 
 
 def _at_level(way: Way, level: int) -> Way:
-    """Return a way, with the level that it has where one was chosen."""
     least, strategy = way
     if least is None or level < DEFAULT_COMPRESSION:
         return level, strategy
@@ -110,10 +109,9 @@ def _packed(block: memoryview, way: Way, *, last: bool) -> bytes:
 
 
 def blocks_of_pieces(pieces: Iterable[Any], sizes: Iterable[int]) -> Iterator[memoryview]:
-    """Cut the data of pieces into blocks of these sizes, which may be 0; a block within one piece is a view of it.
+    """Cut the data of pieces into blocks of these sizes, which may be 0; raises ValueError unless the sizes add up.
 
-    Raises:
-        ValueError: the pieces hold more data, or fewer.
+    A block within one piece is a view of it.
     """
     views = (memoryview(piece).cast("B") for piece in pieces if memoryview(piece).nbytes)
     view = memoryview(b"")

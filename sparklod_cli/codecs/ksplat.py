@@ -87,8 +87,7 @@ class KsplatSection:
         offset, end: positions in the file of its first row and after its last.
         middles: (buckets, 3) centres of the buckets, world units.
         ends: (buckets,) number of splats up to the end of each bucket.
-        step: width of a step, world units.
-        steps: from a bucket's low corner to its middle.
+        step: width of a step, world units; `steps` of them lead from a bucket's low corner to its middle.
     """
 
     first: int

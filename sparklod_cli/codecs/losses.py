@@ -40,11 +40,9 @@ MOST_PAGED_DEGREE = 2
 
 @dataclass(frozen=True)
 class LayoutLoss:
-    """Sums over splats, weighted by opacity and size.
+    """Sums over splats, weighted by opacity and size: of weights, and of losses in each layout.
 
-    Attributes:
-        weight: sum of weights.
-        ext, packed: sums of squared changes of displayed colour, 0..1, as ExtSplats and as PackedSplats.
+    A loss is the squared change of displayed colour, 0..1.
     """
 
     weight: float = 0.0
@@ -122,11 +120,7 @@ class Losses:
 
 
 def settled_with_losses(scene: Scene, form: Format, options: WriteOptions, threads: int) -> tuple[WriteOptions, Losses]:
-    """Return the options with nothing left open, and what a format loses of a scene; see `formats.Format.writable`.
-
-    Raises:
-        FormatError: the scene cannot be written.
-    """
+    """Return the options with nothing left open, and the losses of a scene in a format; raises as `settled`."""
     codec = form.codec()
     settled: WriteOptions = codec.settled(scene, options)
     counts, clamps = clamps_in(scene.splats, threads, codec.held(settled, scene.splats.sh_degree))
@@ -138,8 +132,7 @@ def settled_with_losses(scene: Scene, form: Format, options: WriteOptions, threa
 def after(through: str, file: Path, scene: Scene, threads: int = 1) -> Splats:
     """Encode and decode the splats of a scene in one of `formats.ROUND_TRIPS`.
 
-    Raises:
-        FormatError: SPZ cannot hold the splats, or some are invalid; names the file.
+    Raises `FormatError`, which names the file, if splats are invalid or SPZ cannot hold them.
     """
     from .gpu import ext_splats, packed_splats
 

@@ -34,13 +34,10 @@ class Placed:
 
 
 def merged(parts: Sequence[Placed]) -> Reader:
-    """Merge scenes into one: their splats in this order, of the highest SH degree; lower ones are padded with zeros.
+    """Merge one scene or more: their splats in this order, of the highest SH degree; lower ones are padded with zeros.
 
     The result is antialiased if most of the splats are, and a note says where they differ. It has an up axis if all
     scenes have the same. Errors name the scene.
-
-    Args:
-        parts: at least one.
     """
     firsts = tuple(itertools.accumulate((part.reader.count for part in parts), initial=0))
     degree = max(part.reader.sh_degree for part in parts)
@@ -104,7 +101,6 @@ class Chunk:
     Attributes:
         name: path relative to the manifest's folder.
         count: all its splats.
-        sh_degree, antialiased, up, up_by, format, notes: as in `Scene`.
         bytes: of the file and the files that it names.
     """
 
@@ -234,11 +230,7 @@ class SceneFiles:
         threads: int = 1,
         progress: Progress = silent,
     ) -> Iterator[RuleViolation]:
-        """Yield the rules about splats that files break, which are decoded one at a time.
-
-        Args:
-            rules: yields those that the splats of a file break.
-        """
+        """Decode files one at a time, and yield the `rules` that their splats break."""
         total, done = sum(chunk.count for chunk in chunks), 0
         for chunk in chunks:
             splats = Splats.empty(chunk.rows, chunk.sh_degree)

@@ -315,12 +315,7 @@ def _columns(names: Collection[str], mode: str) -> dict[str, tuple[tuple[str, ..
 def _unpack(
     rows: NDArray[Any], splats: Splats, places: Mapping[str, tuple[Places, Coding]], rest_places: Places
 ) -> None:
-    """Fill splats from rows.
-
-    Args:
-        places: of the properties of each column, and its decode.
-        rest_places: of the SH coefficients, those of red first.
-    """
+    """Fill splats from rows, by the places and the decode of each column, and the places of SH, red first."""
     names = rows.dtype.names or ()
     if rows.flags.c_contiguous and all(rows.dtype[name] == np.float32 for name in names):
         matrix: FloatArray = rows.view(np.float32).reshape(len(rows), len(names))  # not copied

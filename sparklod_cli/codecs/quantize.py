@@ -338,9 +338,7 @@ _ABOVE_1 = np.nextafter(np.float32(1), np.float32(2))
 def faces(scale: FloatArray, blur: float) -> NDArray[np.float64]:
     """Return (N,) sums of the products of two scales each, in proportion to the area that a splat shows on average.
 
-    Args:
-        scale: (N, 3) standard deviations, world units.
-        blur: added to each, as a pixel does: what is far thinner than that covers no less for it.
+    To each scale, a blur is added, as a pixel does: a splat far thinner than a pixel covers no less for it.
     """
     planes = np.array(scale.T, np.float64, order="C")
     planes *= planes
@@ -360,9 +358,7 @@ def compensated(opacity: FloatArray, scale: FloatArray, rounded: FloatArray, blu
     it is, bit for bit.
 
     Args:
-        opacity: (N,) linear opacities.
-        scale: (N, 3) standard deviations, world units.
-        rounded: (N, 3) the same as a file holds them.
+        rounded: (N, 3) scales as a file holds them.
         blur: see `faces`; a step of the positions is a good one, for it is far below a small splat of the scene.
     """
     area = faces(rounded, blur)

@@ -99,11 +99,7 @@ class OpenFile:
 def rows_of(
     read: ReadAt, offset: int, row_type: np.dtype[Any], start: int, stop: int, count: int, subject: str = "splats"
 ) -> Iterator[Rows]:
-    """Read rows from `start` to `stop`, in blocks of at least `BLOCK_ROWS` rows and `BLOCK_BYTES` bytes.
-
-    Args:
-        offset: of the first of the `count` rows of the file.
-    """
+    """Read rows from `start` to `stop` in blocks of at least `BLOCK_BYTES`; row 0 of `count` is at `offset`."""
     step = max(BLOCK_ROWS, BLOCK_BYTES // row_type.itemsize)
     for first in range(start, stop, step):
         part = slice(first, min(first + step, stop))
@@ -226,9 +222,6 @@ class Reader:
         Args:
             columns: of `Splats` to read; the others may be 0.
             once: as in `Target`.
-
-        Raises:
-            FormatError: the file is cut short or corrupt.
         """
         make = Splats.empty if set(COLUMNS) <= set(columns) else Splats.zeros
         splats, tree = make(stop - start, self.sh_degree), None
@@ -238,11 +231,7 @@ class Reader:
         return splats, tree
 
     def scene(self, *, columns: Collection[str] = COLUMNS, progress: Progress = silent, validate: bool = True) -> Scene:
-        """Read all splats, once; `validate` refuses a broken tree.
-
-        Raises:
-            FormatError: the file is cut short or corrupt, or its tree is broken.
-        """
+        """Read all splats, once; `validate` refuses a broken tree."""
         splats, tree = self.read(0, self.count, columns, progress, once=True)
         coding = PLAIN if self.coding is None else self.coding()
         scene = Scene(splats, tree, chunk_bytes=self.chunk_bytes, coding=coding, **facts_of(self))
@@ -347,12 +336,10 @@ GENERATOR = "sparklod "
 
 @dataclass(frozen=True)
 class FileNote:
-    """Contents of the note in a file.
+    """Contents of the note in a file; `is_ours` if sparklod wrote it.
 
     Attributes:
-        antialiased, up: as in `Scene`.
-        problems: what is ignored of it, as sentences for `Scene.notes`.
-        is_ours: sparklod wrote the file.
+        problems: sentences for `Scene.notes` on invalid values, which are ignored.
     """
 
     antialiased: bool = False

@@ -72,12 +72,9 @@ def read_values(file: BinaryIO, layout: ArrayLayout) -> NDArray[Any]:
 
 
 def decode(file: BinaryIO, count: int, rows: slice | None = None) -> FloatArray:
-    """Read colours and opacities for the `count` splats of a scene: (count, 4) float32, 0..1.
+    """Read colours and opacities for the `count` splats of a scene, or for a range: (n, 4) float32, 0..1.
 
     The type of a raw file follows from its size.
-
-    Args:
-        rows: the range of them to read; None for all.
 
     Raises:
         FormatError: the format, length or values are wrong; the text continues a sentence about the file.

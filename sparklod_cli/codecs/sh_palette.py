@@ -54,11 +54,9 @@ Offsets = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class ShPalette:
-    """Palette of spherical harmonics.
+    """Palette of spherical harmonics: (C, K, 3) coefficients as in `Splats.sh`, and (N,) the code of each row.
 
-    Attributes:
-        codes: (C, K, 3) float32 coefficients, in the order of `Splats.sh`. Each is the code of some row.
-        labels: (N,) uint32, the code of each row.
+    Each code is that of some row.
     """
 
     codes: FloatArray

@@ -135,8 +135,7 @@ def stored_lod_alpha(opacity: FloatArray) -> FloatArray:
 def checked_words(arrays: Mapping[str, NDArray[Any]], columns: Mapping[str, int]) -> dict[str, Words]:
     """Return the arrays of these names, each (N, columns) uint32 with the same N, C-contiguous.
 
-    Raises:
-        FormatError: an array is missing, or has another shape or type.
+    Raises `FormatError` if an array is missing, or has another shape or type.
     """
     found = {}
     rows = None

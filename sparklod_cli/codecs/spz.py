@@ -79,7 +79,6 @@ class SpzStream(NamedTuple):
     """One stream of a file: one column of all splats in order.
 
     Attributes:
-        name: for messages.
         size: bytes per splat.
         column: of `Splats` or `LodTree`.
         decode: (n, size) bytes to n rows of the column, of any shape.
@@ -388,11 +387,9 @@ def _read_v4(file: BinaryIO, size: int, header: dict[str, int]) -> tuple[Layout,
 
 
 def read_extensions(data: bytes, size: int) -> Extensions:
-    """Parse extension records; unknown ones are skipped, and what is broken is noted.
+    """Parse extension records; unknown ones are skipped, and broken ones are noted.
 
-    Args:
-        data: the records, or their first `MOST_EXTENSION_BYTES`.
-        size: bytes of all of them.
+    `data` are the records, `size` bytes together, or their first `MOST_EXTENSION_BYTES`.
     """
     at, up, notes, unknown, has_system = 0, None, list[str](), dict[str, int](), False
     while at + RECORD.size <= len(data):
@@ -432,8 +429,7 @@ LAST_CODE = quantize.FIXED24_MAX - 1
 def largest_fractional_bits(largest: float) -> int:
     """Return the most fractional bits, 0 to 24, with which 24-bit fixed point holds this magnitude of a coordinate.
 
-    Raises:
-        FormatError: not even whole units fit.
+    Raises `FormatError` if not even whole units fit.
     """
     if np.rint(largest) > LAST_CODE:
         reach = f"{largest:.0f}" if largest < 1e7 else f"{largest:.3g}"
@@ -610,11 +606,7 @@ def encoder(
     threads: int = 1,
     progress: Progress = silent,
 ) -> SpzEncoder:
-    """Return the encoder of a scene, of which nothing is read; `threads` and `progress` are not needed.
-
-    Raises:
-        ValueError: the options are not settled.
-    """
+    """Return the encoder of a scene, of which nothing is read; raises ValueError unless the options are settled."""
     if options.spz_version is None or options.fractional_bits is None or options.sh_bits is None:
         raise ValueError("the options leave choices open; `settled` makes them")
     return SpzEncoder.of(scene, options, ranges)
@@ -626,8 +618,7 @@ def to_code(
     """Return the values that the streams of a file are coded from; those of a file stay as they are.
 
     Args:
-        splats: N splats or nodes.
-        is_leaf: (N,) which of them are leaves; None for splats without a tree.
+        is_leaf: (N,) which splats are leaves of a tree; None for splats without one.
         fractional_bits: of the positions, a step of which is too thin to matter.
         sh_bits: bits kept of the SH bytes of leaves; merged splats keep `quantize.LEAST_SH_BITS`.
         covering: opacities make up for the rounding of scales.

@@ -117,7 +117,6 @@ _COLUMNS = ("counts", "least", "most")
 
 
 def _starts(rows: NDArray[Any]) -> NDArray[np.intp]:
-    """Return where runs of equal values begin."""
     return np.flatnonzero(np.concatenate([[True], rows[1:] != rows[:-1]])[: len(rows)])
 
 
@@ -165,10 +164,7 @@ def sh_code_counts(sh: FloatArray) -> tuple[NDArray[np.int64], int]:
 def sh_error(counts: NDArray[np.int64], bits: int) -> float:
     """Return the root mean square change of a colour, over splats and directions, if this many bits are kept.
 
-    The mean square of a basis function over all directions is 1 / (4 * pi).
-
-    Args:
-        counts: of `sh_code_counts`.
+    The mean square of a basis function over all directions is 1 / (4 * pi). The counts are those of `sh_code_counts`.
     """
     codes = np.broadcast_to(np.arange(256, dtype=np.uint8)[:, None, None], (256, COEFFICIENTS[MAX_SH_DEGREE], 3))
     whole = quantize.decode_sh(np.ascontiguousarray(codes))
@@ -274,11 +270,7 @@ class Statistics:
 
     @classmethod
     def merged(cls, parts: Sequence[Statistics]) -> Statistics:
-        """Merge the statistics of one part or more, for the same needs.
-
-        Raises:
-            ValueError: the parts are not of one scene: they differ in SH degree, or in whether they have a tree.
-        """
+        """Merge the statistics of one part or more; raises ValueError if they differ in SH degree or tree."""
         first = parts[0]
         if {(part.sh_degree, part.tree) for part in parts} != {(first.sh_degree, first.tree)}:
             raise ValueError("statistics of splats of several SH degrees, or of splats and nodes, cannot be merged")

@@ -34,8 +34,7 @@ FEW = 3
 class ZipFolder:
     """Zip of the files of a scene, possibly inside a folder.
 
-    Attributes:
-        first: name of the file that names the others, such as meta.json; the others' names are relative to it.
+    `first` is the name of the file that names the others, such as meta.json; their names are relative to it.
     """
 
     def __init__(self, file: BinaryIO) -> None:

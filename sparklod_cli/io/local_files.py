@@ -36,11 +36,7 @@ def is_file_name(text: str) -> bool:
 
 
 def leads_away(name: str, *, folders: bool = False) -> bool:
-    """Return whether a name may lead out of the folder of the file that has it, or into a folder below it.
-
-    Args:
-        folders: folders below it are allowed.
-    """
+    """Return whether a name may lead out of the folder of its file, or below it unless `folders`."""
     if folders and "/" in name:
         return any(leads_away(part) for part in name.split("/"))
     return name in ("", ".", "..") or any(mark in name for mark in "/\\:") or not is_file_name(name)
@@ -154,8 +150,7 @@ def _companion_paths(path: Path, names: Iterable[str], *, folders: bool = False)
 def in_folder(folder: Place) -> Place:
     """Return the splat file in a folder: a manifest of Streamed SOG or 3D Tiles, or a SOG's meta.json.
 
-    Raises:
-        UnreadableError: the folder has none or several.
+    Raises `UnreadableError` if the folder has none or several.
     """
     found = [name for name in FIRST_FILES if (folder / name).is_file()]
     if len(found) > 1:
@@ -169,7 +164,6 @@ def in_folder(folder: Place) -> Place:
 
 
 def _scans_in(folder: Path) -> str:
-    """Return the end of an error on a folder of splat files: the files to give instead; empty if it has none."""
     known = {suffix for form in FORMATS for suffix in form.suffixes} - {PurePath(META).suffix}
     with os.scandir(folder) as entries:
         files = [entry.name for entry in itertools.islice(entries, MOST_NAMES) if entry.is_file()]
@@ -257,11 +251,7 @@ def read_together(path: Path, sets: Collection[Collection[str]], limit: int) -> 
 
 
 def read_rgba(path: Path, count: int, rows: slice | None = None) -> FloatArray:
-    """Read colours and opacities for the `count` splats of a scene, or for a range of them, see `rgba.decode`.
-
-    Raises:
-        FormatError: as `rgba.decode`, or the file cannot be read; names it.
-    """
+    """Read colours and opacities for the `count` splats of a scene or a range; raises `FormatError`, which names it."""
     from ..codecs import rgba
 
     try:

@@ -38,11 +38,7 @@ class RadFile:
 
     @classmethod
     def open(cls, path: Path) -> RadFile | None:
-        """Read the header of a file, and its palette; None for a file of another format.
-
-        Raises:
-            FormatError: it cannot be read, or breaks a fatal rule of `rad_rules`.
-        """
+        """Read the header of a file, and its palette; None for another format. Raises as `read_rad_header`."""
         with opened(path) as (file, form, more):
             return cls.of(path, file, more["open_companion"]) if form.name == RAD else None
 
@@ -95,11 +91,7 @@ class RadFile:
 
 
 def read_rad_header(path: Path) -> RadHeader:
-    """Read the header of a RAD file; its chunks need not be there.
-
-    Raises:
-        FormatError: it cannot be read, is not RAD, or breaks a fatal rule of the format.
-    """
+    """Read the header of a RAD file, whose chunks need not be there; raises `FormatError` if it breaks a fatal rule."""
     with _opened_plain(path) as file:
         return _header(file)
 

@@ -60,11 +60,7 @@ def pack(splats: Splats, *, threads: int = 1) -> dict[str, Words]:
 
 
 def capacity(arrays: Mapping[str, NDArray[Any]]) -> int:
-    """Return how many splats fit into a texture.
-
-    Raises:
-        FormatError: the array is missing, or has another shape or type.
-    """
+    """Return how many splats fit into a texture; raises `FormatError` if it is missing or has another shape or type."""
     texture = arrays.get("texture")
     if texture is None:
         raise FormatError(f"there is no array texture, only {', '.join(arrays) or 'none'}")

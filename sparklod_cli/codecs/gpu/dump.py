@@ -21,10 +21,9 @@ Arrays = dict[str, NDArray[Any]]
 
 
 def pack(scene: Scene, encoding: str, threads: int = 1) -> Arrays:
-    """Return the arrays of a scene in one of `formats.ENCODINGS`, by name: uint32 words, see docs/formats/memory.md.
+    """Return the uint32 arrays, by name, of a scene in one of `formats.ENCODINGS`, see docs/formats/memory.md.
 
-    Raises:
-        ValueError: the encoding is that of a tree, and the scene has none.
+    Raises ValueError if the encoding is that of a tree, and the scene has none.
     """
     if encoding == "packed":
         return packed_splats.pack(scene.splats, packed_splats.of_scene(scene), threads=threads)
@@ -48,10 +47,9 @@ def encode(arrays: Arrays, *, raw: bool = False) -> Iterator[bytes]:
 
 
 def decode_npz(file: BinaryIO) -> Arrays | None:
-    """Read the arrays of a .npz file; None where a file is something else.
+    """Read the arrays of a .npz file; None if the file is something else.
 
-    Raises:
-        FormatError: an array is compressed, cut short or of no plain numbers.
+    Raises `FormatError` if an array is compressed, cut short or of no plain numbers.
     """
     try:
         with zipfile.ZipFile(file) as archive:
