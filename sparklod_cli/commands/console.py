@@ -6,9 +6,10 @@ import contextlib
 import json
 import os
 import sys
+import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from time import monotonic
+from time import monotonic, time
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, TextIO
 
@@ -17,7 +18,7 @@ import click
 from ..system import interrupts
 from ..system.stdio import silence
 from ..system.units import count_of as count_of
-from ..system.units import format_duration
+from ..system.units import format_duration, format_size
 from ..system.untrusted import MOST, printable
 
 if TYPE_CHECKING:
@@ -30,11 +31,11 @@ WIDTH, NAMES, INDENT = 80, 13, 4
 #: Version of the fields that commands print with --json, but for inspect, whose report has a schema of its own.
 JSON_VERSION = 1
 
-#: Seconds between two lines of progress where standard error is a log, and where it is a terminal.
-LOG_INTERVAL, BAR_INTERVAL = 10, 0.1
+#: The bar of a job of several stages, as tqdm formats it.
+JOB_BAR = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}, {remaining} left"
 
-#: Columns of the bar on a terminal.
-BAR = 20
+#: Seconds between two lines of progress where standard error is a log.
+LOG_INTERVAL = 10
 
 
 @dataclass
@@ -119,16 +120,16 @@ def for_screen(pieces: Iterable[bytes]) -> Iterator[bytes]:
         yield "\n".join(printable(line) for line in piece.decode("utf-8", "replace").split("\n")).encode()
 
 
-def _echo(text: str, *, end: bool = True) -> None:
-    """Print a text and, with `end`, a line end on standard error; work goes on where that is closed, gone or full."""
+def _echo(text: str) -> None:
+    """Print a line on standard error; work goes on where that is closed, gone or full."""
     try:
-        click.echo(text, err=True, nl=end)
+        click.echo(text, err=True)
     except OSError:
         silence(sys.stderr)
 
 
 class Console(contextlib.AbstractContextManager["Console"]):
-    """Prints messages on standard error, and the progress of work: a bar on a terminal, lines in a log.
+    """Prints lines on standard error, and the progress of each stage of work: a bar on a terminal, lines in a log.
 
     Used as a context manager, which clears the bar. With `verbose` it prints details. Its `progress` is a
     `system.progress.Progress`.
@@ -137,11 +138,11 @@ class Console(contextlib.AbstractContextManager["Console"]):
     def __init__(self, *, quiet: bool, verbose: bool) -> None:
         self._quiet, self.verbose = quiet, verbose
         self._bars = not quiet and is_terminal(sys.stderr)
-        self._bar = ""  # the text of the bar that is shown
-        #: Begin and share of each stage, 0 to 1, and how much of all stages is done, which never falls.
-        self._shares: dict[str, tuple[float, float]] = {}
-        self._reached, self._is_job = 0.0, False
-        self._start = self._logged = 0.0
+        self._bar: Any = None
+        self._stage, self._start, self._logged = "", 0.0, 0.0
+        #: Begin and share of each stage of a job, 0 to 1, and how much of the job is done, which never falls.
+        self._job: dict[str, tuple[float, float]] | None = None
+        self._reached = 0.0
         #: Ends the reports of compilation; duration of each; the process that compiles ahead, and for which work.
         self._stop_listening: Callable[[], None] | None = None
         self._compiled: list[float] = []
@@ -160,22 +161,9 @@ class Console(contextlib.AbstractContextManager["Console"]):
             self.say(f"compiled {count_of(count, 'kernel')} in {sum(self._compiled):.1f} s")
 
     def clear(self) -> None:
-        if self._bar:
-            _echo(f"\r{' ' * len(self._bar)}\r", end=False)
-            self._bar = ""
-
-    def _show(self, text: str) -> None:
-        """Show a text as the bar, in place of the last one."""
-        bar = text[: (self._width() or WIDTH) - 1]
-        _echo(f"\r{bar:<{len(self._bar)}}", end=False)
-        self._bar = bar
-
-    def _width(self) -> int:
-        """Return the columns of the terminal; 0 if standard error is closed, redirected, or no file."""
-        try:
-            return os.get_terminal_size(sys.stderr.fileno()).columns
-        except (AttributeError, OSError, ValueError):
-            return 0
+        if self._bar is not None:
+            self._bar.close()
+            self._bar = None
 
     def error(self, text: str) -> None:
         self.clear()
@@ -185,7 +173,11 @@ class Console(contextlib.AbstractContextManager["Console"]):
         """Print a line; on a terminal, one that is too long is broken between words."""
         if not self._quiet:
             self.clear()
-            line, width = printable(text, MOST), self._width()
+            try:
+                width = os.get_terminal_size(sys.stderr.fileno()).columns
+            except (AttributeError, OSError, ValueError):  # it is closed, redirected, or no file
+                width = 0
+            line = printable(text, MOST)
             for part in _wrapped(line, max(width, 2 * INDENT), INDENT) if width else [line]:
                 _echo(part)
 
@@ -196,44 +188,66 @@ class Console(contextlib.AbstractContextManager["Console"]):
 
     @contextlib.contextmanager
     def job(self, shares: Mapping[str, float]) -> Iterator[None]:
-        """Show the stages of the work inside as one bar; elsewhere, each stage has its own.
+        """Show the stages of the work inside as one bar, with the time left.
 
         Args:
             shares: the relative time of each stage, in order; other stages add nothing.
         """
-        self._begin(shares, monotonic())
-        self._is_job = True
+        self.clear()
+        whole, begin = sum(shares.values()), 0.0
+        self._job, self._reached = {}, 0.0
+        for stage, share in shares.items():
+            self._job[stage] = begin, share / whole
+            begin += share / whole
+        self._start = self._logged = monotonic()
         try:
             yield
         finally:
-            self._begin({}, 0.0)
-            self._is_job = False
-
-    def _begin(self, shares: Mapping[str, float], now: float) -> None:
-        self.clear()
-        whole, begin = sum(shares.values()), 0.0
-        self._shares, self._reached = {}, 0.0
-        for stage, share in shares.items():
-            self._shares[stage] = begin, share / whole
-            begin += share / whole
-        self._start = self._logged = now
+            self.clear()
+            self._job, self._stage = None, ""
 
     def progress(self, stage: str, done: int, total: int, unit: str) -> None:
         now = monotonic()
-        if not self._is_job and stage not in self._shares:
-            self._begin({stage: 1.0}, now)
-        begin, share = self._shares.get(stage, (0.0, 0.0))
-        self._reached = min(max(self._reached, begin + share * done / max(total, 1)), 1.0)
-        is_due = now - self._logged >= (BAR_INTERVAL if self._bars else LOG_INTERVAL)
-        if self._quiet or not (is_due or (self._bars and not self._bar)) or (done >= total and not self._is_job):
-            return
-        self._logged, lasted, reached = now, now - self._start, self._reached
-        left = f", about {format_duration(lasted * (1 / reached - 1))} left" if reached else ""
-        text = f"{stage}: {100 * reached:.0f} % done after {format_duration(lasted)}{left}"
+        if self._job is not None:
+            begin, share = self._job.get(stage, (0.0, 0.0))
+            self._reached = min(max(self._reached, begin + share * done / max(total, 1)), 1.0)
+        elif stage != self._stage:
+            self._stage, self._start, self._logged = stage, now, now
         if self._bars:
-            self._show(f"[{'#' * round(BAR * reached):.<{BAR}}] {text}")
-        else:
-            self.say(text)
+            self._draw(stage, done, total, unit)
+        elif now - self._logged >= LOG_INTERVAL and (self._job is not None or done < total):
+            self._logged, lasted, reached = now, now - self._start, self._reached
+            if self._job is not None:
+                left = f", about {format_duration(lasted * (1 / reached - 1))} left" if reached else ""
+                self.say(f"{stage}: {100 * reached:.0f} % done after {format_duration(lasted)}{left}")
+            else:
+                size = f"{format_size(done)} of {format_size(total)}"
+                amount = size if unit == "B" else f"{done:,} of {total:,} {unit}s"
+                self.say(f"{stage}: {amount} ({100 * done / total:.0f} %), {format_duration(lasted)}")
+
+    def _draw(self, stage: str, done: int, total: int, unit: str) -> None:
+        """Draw the bar of a stage, or of a job with the time left at the rate so far."""
+        bar = self._bar
+        if self._job is None:
+            if bar is None or bar.desc != stage:
+                scaled = {"unit_scale": True, "unit": unit if unit == "B" else f" {unit}s"}
+                bar = self._open_bar(total=total, desc=stage, **scaled)
+            bar.update(done - bar.n)
+            return
+        if bar is None:
+            bar = self._open_bar(total=1.0, desc=stage, initial=self._reached, bar_format=JOB_BAR, smoothing=0)
+        bar.initial, bar.start_t = 0, time() - (monotonic() - self._start)  # the rate is that of the whole job
+        bar.update(self._reached - bar.n)
+        if bar.desc != stage:
+            bar.set_description_str(stage)
+
+    def _open_bar(self, **how: Any) -> Any:
+        from tqdm import tqdm
+
+        self.clear()
+        tqdm.set_lock(threading.RLock())  # tqdm's own is for several processes, and may start one
+        self._bar = tqdm(leave=False, file=sys.stderr, dynamic_ncols=True, **how)
+        return self._bar
 
     def announce_compiling(self, work: str | BakeSettings | None = None) -> None:
         """Announce the first kernel that is compiled, show which one it is, and print at the end how long all took.
@@ -259,8 +273,10 @@ class Console(contextlib.AbstractContextManager["Console"]):
             advance = f"kept for later runs; sparklod warmup compiles all {len(absent)} in advance"
             often = advance if jit.CACHE_FOLDER else "in every run: no cache can be written"
             self.say(f"Compiling kernels for this machine, up to a minute ({often}) ...")
-        if self._bars:  # how many kernels a command needs is not known
-            self._show(f"compiling: kernel {len(self._compiled) + 1}, {sum(self._compiled):.0f} s so far")
+        if self._bars:
+            # How many a command needs is not known.
+            text = f"compiling: kernel {len(self._compiled) + 1}, {sum(self._compiled):.0f} s so far"
+            self._open_bar(desc=text, bar_format="{desc}")
 
     def _end_compiling(self, duration: float) -> None:
         self._compiled.append(duration)

@@ -183,15 +183,15 @@ def shown_on(stream: io.StringIO, monkeypatch: pytest.MonkeyPatch, *, quiet: boo
     with Console(quiet=quiet, verbose=False) as console:
         for done in (0, 5, 10):
             console.progress("reading", done, 10, "splat")
-            console.clear()
         console.progress("writing", 1, 4, "B")
     return stream.getvalue()
 
 
 def test_a_terminal_gets_a_bar_a_stage(monkeypatch: pytest.MonkeyPatch) -> None:
     text = shown_on(Terminal(), monkeypatch)
-    assert "[##########..........] reading: 50 % done" in text
-    assert "writing: 25 % done" in text
+    assert "reading:" in text
+    assert "splats" in text
+    assert "writing:" in text
     assert text.endswith("\r")  # and takes it away
 
 
@@ -210,10 +210,7 @@ def test_a_log_gets_a_line_of_a_long_stage_every_ten_seconds(quiet: bool, monkey
             console.progress("refining", 250 * done, 1750, "step")
         for done in range(3):
             console.progress("writing", done, 4, "B")
-    lines = [
-        f"refining: {share} % done after {lasted} s, about {left} s left"
-        for share, lasted, left in ((43, 11, 15), (71, 22, 9))
-    ]
+    lines = ["refining: 750 of 1,750 steps (43 %), 11 s", "refining: 1,250 of 1,750 steps (71 %), 22 s"]
     assert log.getvalue().splitlines() == ([] if quiet else lines)
 
 
@@ -226,11 +223,11 @@ def test_a_job_of_several_stages_is_one_bar_with_the_time_left(monkeypatch: pyte
                 console.say(f"{stage} {done}")  # which takes the bar away and brings it back
         console.progress("comparing", 1, 2, "frame")
     text = stream.getvalue()
-    shares = [int(share) for share in re.findall(r"(?:reading|writing): (\d+) %", text)]
+    shares = [int(share) for share in re.findall(r"(?:reading|writing): +(\d+)%", text)]
     assert shares == sorted(shares)
     assert {25, 62, 100} <= set(shares)
     assert " left" in text
-    assert "comparing: 50 %" in text  # after the job, a bar of one stage
+    assert "frames" in text  # after the job, a bar of one stage
 
 
 def test_a_log_gets_how_much_of_a_job_is_done_and_the_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
