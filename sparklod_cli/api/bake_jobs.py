@@ -13,13 +13,13 @@ from ..bake.settings import Baked as Baked
 from ..bake.settings import BakeSettings as BakeSettings
 from ..bake.settings import Merged, Resources, Source
 from ..codecs.options import WriteOptions
-from ..model.instances import Instance
 from ..system.addresses import Place
 from ..system.errors import SparklodError
 from ..system.progress import Progress, silent
 
 if TYPE_CHECKING:
     from ..bake.simplifying import Extracted
+    from ..model.instances import Instance
 
 #: Shows stages of work, by name with their relative times, as one job.
 Job = Callable[[Mapping[str, float]], contextlib.AbstractContextManager[None]]

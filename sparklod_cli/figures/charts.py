@@ -361,7 +361,7 @@ PANELS = (
 )
 
 
-#: Labels of the reasons for marking a frame (`simulation.summary.MOMENTS`).
+#: Labels of the reasons for marking a frame (`simulation.results.MOMENTS`).
 CALLED = {
     "churn": "most churn",
     "bytes": "most bytes fetched",
