@@ -64,6 +64,10 @@ ENDED = {"finished", "error", "cancelled"}
 #: Most task names in a message.
 LISTED = 3
 
+GONE = (
+    "the scheduler of the cluster no longer answers; finished work is kept: start the cluster again, and add --resume"
+)
+
 LESS_MEMORY = (
     "give a smaller --memory, which makes smaller blocks, or let fewer workers share a machine; finished work is"
     " kept, and --resume continues"
@@ -106,20 +110,13 @@ class Connection:
         try:
             yield
         except (OSError, CancelledError, RuntimeError, AttributeError):
-            raise self.gone() from None
-
-    def gone(self) -> SparklodError:
-        """Return the error for a scheduler that no longer answers."""
-        return SparklodError(
-            "the scheduler of the cluster no longer answers; finished work is kept: start the cluster again, and add"
-            " --resume"
-        )
+            raise SparklodError(GONE) from None
 
     def look(self) -> None:
         """Report lost workers, and a cluster without workers; raise a `SparklodError` without a scheduler."""
         self.tell_losses()
         if not self.alive:
-            raise self.gone()
+            raise SparklodError(GONE)
         if self.workers():
             self._alone_since = None
         elif self._alone_since is None:
@@ -143,7 +140,7 @@ class Connection:
     def failure(self, name: str, future: Any) -> Exception:
         """Return the error of a failed call."""
         if future.status == "cancelled":
-            return self.gone()
+            return SparklodError(GONE)
         with self.guarded():
             error: Exception = future.exception()
         if type(error).__name__ == "KilledWorker":
@@ -347,7 +344,13 @@ class ClusterEngine:
             if store is not None:
                 store.remove(name)
         for worker, answer in answers.items():
-            _check_answer(worker, answer, store)
+            if not isinstance(answer, tuple):  # an error: it has no sparklod, or one without `probe`
+                raise SparklodError(f"worker {worker} does not run sparklod {__version__} ({answer}): {_INSTALL}")
+            version, host, fault = answer
+            if version != __version__:
+                fault = f"has sparklod {version}, not {__version__} as here: {_INSTALL}"
+            if fault:
+                raise SparklodError(f"worker {worker} on {host} {fault}")
 
     def remove(self, folder: Path) -> None:
         """Remove a folder on the machines of all workers, and on this one."""
@@ -357,64 +360,36 @@ class ClusterEngine:
                 self._connection.client.run(shutil.rmtree, folder, ignore_errors=True)
 
 
-def _check_answer(worker: str, answer: Any, store: Store | None) -> None:
-    """Raise a `SparklodError` for a worker that cannot run tasks."""
-    if not isinstance(answer, Probed):  # an error: it has no sparklod, or one without `probe`
-        raise SparklodError(f"worker {worker} does not run sparklod {__version__} ({answer}): {_INSTALL}")
-    place = f"worker {worker} on {answer.host}"
-    if answer.version != __version__:
-        raise SparklodError(f"{place} has sparklod {answer.version}, not {__version__} as here: {_INSTALL}")
-    if not answer.reads:
-        raise SparklodError(
-            f"{place} does not see what was written to {store}: give --scratch-dir a folder that all machines share, or"
-            " a URL such as s3://bucket/scratch"
-        )
-    if answer.writes:
-        raise SparklodError(f"{place} cannot write to {store}: {answer.writes}")
-    if answer.missing:
-        raise SparklodError(
-            f"{place} does not see {', '.join(answer.missing)}: put inputs into a folder that all machines share, or at"
-            " a URL"
-        )
-
-
 #: Result of a probe, and its array.
 PROBE = "probe"
 
 
-@dataclass(frozen=True)
-class Probed:
-    """Result of probing a worker.
+def probe(store: Store | None, name: str, files: Sequence[Path]) -> tuple[str, str, str]:
+    """Try on a worker to see files, to write a result, and to read the result that the client wrote.
 
-    Attributes:
-        reads: it can read the result that the client wrote.
-        writes: why it cannot write a result; empty if it can.
-        missing: files that it does not see.
+    Returns:
+        version of sparklod, host, and what is wrong, as the end of a sentence; empty if nothing is.
     """
-
-    version: str
-    host: str
-    reads: bool
-    writes: str
-    missing: tuple[str, ...]
-
-
-def probe(store: Store | None, name: str, files: Sequence[Path]) -> Probed:
-    """Try on a worker to read the result that the client wrote, to write one, and to see files."""
-    reads, writes = True, ""
+    missing, fault = [str(path) for path in files if not path.exists()], ""
+    if missing:
+        fault = f"does not see {', '.join(missing)}: put inputs into a folder that all machines share, or at a URL"
     if store is not None:
         mine = f"{name}-{uuid.uuid4().hex}"
         try:
             store.put(mine, {PROBE: np.arange(2)})
             store.remove(mine)
         except Exception as error:
-            writes = f"{type(error).__name__}: {error}"
+            fault = f"cannot write to {store}: {type(error).__name__}: {error}"
         try:
             reads = store.has(name) and len(store.get(name)[PROBE]) > 0
         except Exception:
             reads = False
-    missing = tuple(str(path) for path in files if not path.exists())
-    return Probed(__version__, socket.gethostname(), reads, writes, missing)
+        if not reads:
+            fault = (
+                f"does not see what was written to {store}: give --scratch-dir a folder that all machines share, or a"
+                " URL such as s3://bucket/scratch"
+            )
+    return __version__, socket.gethostname(), fault
 
 
 def run_task(packed: bytes, task: Task, threads: int) -> tuple[int, int]:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
+import itertools
 import math
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -57,7 +59,7 @@ class BlockDivision:
         stages: by number, children first.
     """
 
-    splits: tuple[tuple[int, float, int, int], ...]
+    splits: tuple[Split, ...]
     stages: tuple[BuildStage, ...]
 
     @property
@@ -88,78 +90,9 @@ class BlockDivision:
         return np.concatenate(parts), np.cumsum([0, *map(len, parts)])
 
 
-@dataclass(frozen=True)
-class _Part:
-    """Part of a scene: a block, or two halves."""
-
-    side: int
-    region: Region
-    halves: tuple[_Part, ...] = ()
-
-
-class _Cut:
-    """Division of a scene by a sample of its centres, while it is made."""
-
-    def __init__(self, sample: FloatArray) -> None:
-        self.sample = sample
-        self.splits: list[tuple[int, float, int, int]] = []
-        self.stages: list[BuildStage] = []
-        self.blocks = 0
-
-    def part(self, index: NDArray[np.int64], count: int, region: Region) -> _Part:
-        """Divide a region, which has these centres of the sample, into at most `count` blocks."""
-        split = self._split(index, count) if count > 1 else None
-        if split is None:
-            self.blocks += 1
-            return _Part(~(self.blocks - 1), region)
-        axis, value = split
-        number = len(self.splits)
-        self.splits.append((axis, value, 0, 0))
-        below = self.sample[index, axis] < value
-        low = self.part(index[below], count // 2, Region(region.low, _moved(region.high, axis, value)))
-        high = self.part(index[~below], count - count // 2, Region(_moved(region.low, axis, value), region.high))
-        self.splits[number] = (axis, value, low.side, high.side)
-        return _Part(number, region, (low, high))
-
-    def _split(self, index: NDArray[np.int64], count: int) -> tuple[int, float] | None:
-        """Return the axis and the value of a split; None if all centres are the same."""
-        center = self.sample[index]
-        if not len(center):
-            return None
-        low, high = np.quantile(center, [OUTLIERS, 1 - OUTLIERS], axis=0)
-        whole = np.ptp(center, axis=0)
-        for axis in sorted(range(3), key=lambda axis: (low[axis] - high[axis], -whole[axis])):
-            values = np.sort(center[:, axis])
-            if values[0] < values[-1]:
-                value = values[len(values) * (count // 2) // count]
-                return axis, float(max(value, values[np.searchsorted(values, values[0], "right")]))
-        return None
-
-    def stage(self, part: _Part, region: Region | None) -> BuildStage:
-        """Make the stages of a part; the last one has this region."""
-        below = [self.stage(each, each.region) for each in _joined(part)] if part.halves else []
-        stage = BuildStage(
-            number=len(self.stages),
-            region=region,
-            block=None if part.halves else ~part.side,
-            children=tuple(each.number for each in below),
-            blocks=sum(each.blocks for each in below) or 1,
-        )
-        self.stages.append(stage)
-        return stage
-
-
-def _joined(part: _Part) -> list[_Part]:
-    """Return the parts, at most `CHILDREN`, that one stage joins."""
-    parts = [part]
-    for _ in range(int(math.log2(CHILDREN))):
-        parts = [half for each in parts for half in each.halves or (each,)]
-    return parts
-
-
-def _moved(corner: tuple[float, float, float], axis: int, value: float) -> tuple[float, float, float]:
-    x, y, z = (value if each == axis else corner[each] for each in range(3))
-    return x, y, z
+#: A split, see `BlockDivision`, and a part of a scene: its side of a split, and its region.
+Split = tuple[int, float, int, int]
+Part = tuple[int, Region]
 
 
 def cut_into_blocks(sample: FloatArray, count: int, block_splats: int) -> BlockDivision:
@@ -169,11 +102,75 @@ def cut_into_blocks(sample: FloatArray, count: int, block_splats: int) -> BlockD
         sample: (n, 3) centres, evenly drawn; without any, the scene is one block.
         block_splats: at least 1.
     """
-    cut = _Cut(sample)
-    everywhere = Region((-math.inf,) * 3, (math.inf,) * 3)
-    whole = cut.part(np.arange(len(sample)), -(-count // block_splats), everywhere)
-    cut.stage(whole, None)
-    return BlockDivision(tuple(cut.splits), tuple(cut.stages))
+    splits, stages = list[Split](), list[BuildStage]()
+    whole = _divide(sample, -(-count // block_splats), splits, itertools.count())
+    _add_stage((whole, Region((-math.inf,) * 3, (math.inf,) * 3)), splits, stages)
+    stages[-1] = dataclasses.replace(stages[-1], region=None)
+    return BlockDivision(tuple(splits), tuple(stages))
+
+
+def _divide(center: FloatArray, count: int, splits: list[Split], blocks: Iterator[int]) -> int:
+    """Divide centres into at most `count` blocks; return the side that stands for them in a split."""
+    split = _split(center, count) if count > 1 else None
+    if split is None:
+        return ~next(blocks)
+    axis, value = split
+    number = len(splits)
+    splits.append((axis, value, 0, 0))
+    below = center[:, axis] < value
+    low = _divide(center[below], count // 2, splits, blocks)
+    high = _divide(center[~below], count - count // 2, splits, blocks)
+    splits[number] = axis, value, low, high
+    return number
+
+
+def _split(center: FloatArray, count: int) -> tuple[int, float] | None:
+    """Return the axis and the value of a split; None if all centres are the same."""
+    if not len(center):
+        return None
+    low, high = np.quantile(center, [OUTLIERS, 1 - OUTLIERS], axis=0)
+    whole = np.ptp(center, axis=0)
+    for axis in sorted(range(3), key=lambda axis: (low[axis] - high[axis], -whole[axis])):
+        values = np.sort(center[:, axis])
+        if values[0] < values[-1]:
+            value = values[len(values) * (count // 2) // count]
+            return axis, float(max(value, values[np.searchsorted(values, values[0], "right")]))
+    return None
+
+
+def _add_stage(part: Part, splits: Sequence[Split], stages: list[BuildStage]) -> BuildStage:
+    """Add the stage of a part of a scene, after the stages that it joins."""
+    side, region = part
+    below = []
+    if side >= 0:
+        parts = [part]
+        for _ in range(int(math.log2(CHILDREN))):
+            parts = [half for each in parts for half in _halves(each, splits)]
+        below = [_add_stage(each, splits, stages) for each in parts]
+    stage = BuildStage(
+        number=len(stages),
+        region=region,
+        block=None if side >= 0 else ~side,
+        children=tuple(each.number for each in below),
+        blocks=sum(each.blocks for each in below) or 1,
+    )
+    stages.append(stage)
+    return stage
+
+
+def _halves(part: Part, splits: Sequence[Split]) -> list[Part]:
+    """Return the halves of a part; a block is one part."""
+    side, region = part
+    if side < 0:
+        return [part]
+    axis, value, low, high = splits[side]
+    below = Region(region.low, _moved(region.high, axis, value))
+    return [(low, below), (high, Region(_moved(region.low, axis, value), region.high))]
+
+
+def _moved(corner: tuple[float, float, float], axis: int, value: float) -> tuple[float, float, float]:
+    x, y, z = (value if each == axis else corner[each] for each in range(3))
+    return x, y, z
 
 
 #: Division of a scene before it is divided.

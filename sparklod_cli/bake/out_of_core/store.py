@@ -14,7 +14,7 @@ import math
 import os
 import threading
 import zlib
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from io import BufferedReader, FileIO
 from pathlib import Path
@@ -137,7 +137,7 @@ def _bytes(array: NDArray[Any]) -> memoryview:
 
 
 class Traffic:
-    """Bytes that this process has written to a store and read from it; an unpickled copy begins at 0."""
+    """Bytes that this process has written to a store and read from it."""
 
     def __init__(self) -> None:
         self.written = self.read = 0
@@ -148,9 +148,6 @@ class Traffic:
         with self._lock:
             self.written += written
             self.read += read
-
-    def __reduce__(self) -> tuple[type[Traffic], tuple[()]]:
-        return Traffic, ()
 
 
 class Store:
@@ -240,31 +237,31 @@ class Store:
         return arrays
 
     def rows(self, name: str, key: str, start: int, stop: int) -> NDArray[Any]:
-        """Read a range of rows of an array."""
-        with self._reading(name) as (file, directory):
-            stored = directory[key]
-            start, stop, _ = slice(start, stop).indices(stored.shape[0])
-            rows = np.empty((max(0, stop - start), *stored.shape[1:]), stored.dtype)
-            _filled(file, stored.offset + start * stored.row_bytes, rows)
-        self.traffic.add(read=rows.nbytes)
-        return rows
+        """Read a range of rows of an array, which may end after it."""
+        return self._runs(name, key, [start], [stop - start])
 
     def rows_at(self, name: str, key: str, index: NDArray[np.int64]) -> NDArray[Any]:
         """Read rows of an array by their ascending numbers, at least one; rows in short gaps are read, too."""
         cuts = np.flatnonzero(np.diff(index) > GAP) + 1
         first = index[np.concatenate([[0], cuts])]
         count = index[np.concatenate([cuts, [len(index)]]) - 1] + 1 - first
-        begin = np.cumsum(count) - count
-        with self._reading(name) as (file, directory):
-            stored = directory[key]
-            rows = np.empty((int(count.sum()), *stored.shape[1:]), stored.dtype)
-            for row, at, number in zip(first.tolist(), begin.tolist(), count.tolist(), strict=True):
-                _filled(file, stored.offset + row * stored.row_bytes, rows[at : at + number])
-        self.traffic.add(read=rows.nbytes)
+        rows = self._runs(name, key, first.tolist(), count.tolist())
         if len(rows) == len(index):
             return rows
         in_cut = np.diff(np.concatenate([[0], cuts, [len(index)]]))
-        return rows[index - np.repeat(first - begin, in_cut)]
+        return rows[index - np.repeat(first - (np.cumsum(count) - count), in_cut)]
+
+    def _runs(self, name: str, key: str, first: Sequence[int], count: Sequence[int]) -> NDArray[Any]:
+        """Read runs of rows of an array, by the first row and the length of each, one after the other."""
+        with self._reading(name) as (file, directory):
+            stored = directory[key]
+            rows, at = np.empty((sum(count), *stored.shape[1:]), stored.dtype), 0
+            for row, length in zip(first, count, strict=True):
+                end = at + max(0, min(length, stored.shape[0] - row))
+                _filled(file, stored.offset + row * stored.row_bytes, rows[at:end])
+                at = end
+        self.traffic.add(read=rows[:at].nbytes)
+        return rows[:at]
 
     def shape(self, name: str, key: str) -> tuple[int, ...]:
         """Return the shape of an array."""
