@@ -9,22 +9,19 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cameras.camera import Camera
 from ..codecs.formats import WRITABLE, Format
 from ..codecs.losses import Losses, settled_with_losses
 from ..codecs.options import WriteOptions
 from ..codecs.reader import check_valid
 from ..codecs.spz import like
 from ..fitting.settings import FitReport, FitSettings
-from ..images.metrics import MOST_PSNR
 from ..io import read_scene
 from ..io.writing import encoded, scene_output, write_scene
-from ..lod.budget import Budget
-from ..lod.detail_levels import RefinementOrder, with_plain_opacity
 from ..model.falloff import MIN_ALPHA
 from ..model.scene import Scene
 from ..model.splats import Splats
@@ -35,6 +32,10 @@ from ..system.output import Output
 from ..system.progress import Progress, silent
 from ..system.threads import on_threads
 from ..system.units import count_of
+
+if TYPE_CHECKING:
+    from ..cameras.camera import Camera
+    from ..lod.budget import Budget
 
 #: Number of cameras for a PSNR unless cameras are given, and their seed; a fitted tree is judged by as many.
 CAMERAS, SEED = 16, 0
@@ -66,6 +67,8 @@ class SimplifyGoal:
             raise ValueError("give one of to, max_bytes and psnr")
         if self.max_bytes is not None and self.max_bytes < 1:
             raise ValueError(f"max_bytes is {self.max_bytes}; give 1 or more")
+        from ..images.metrics import MOST_PSNR
+
         if self.psnr is not None and not 0 < self.psnr < MOST_PSNR:
             raise ValueError(f"psnr is {self.psnr}; give more than 0 and less than {MOST_PSNR:g} dB")
 
@@ -212,6 +215,8 @@ class Simplifier:
             FormatError, SparklodError: see `count_for` and `Fidelity`; or nothing could be seen of the cut.
             KeyboardInterrupt: see `refined`.
         """
+        from ..lod.detail_levels import RefinementOrder, with_plain_opacity
+
         assert tree.tree is not None
         progress("simplifying", 0, 1, "cut")
         order, is_leaf = RefinementOrder(tree.splats, tree.tree), tree.tree.is_leaf
