@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sparklod_cli.codecs import reader
 from sparklod_cli.codecs.reader import check_valid, is_valid_and_visible
+from sparklod_cli.model import selection
 from sparklod_cli.model.splats import COLUMNS
 from sparklod_cli.system.errors import InvalidSplatsError
 from tests.lod.trees import hard_cases
@@ -30,7 +30,7 @@ def test_splats_that_can_be_drawn_are_known_as_such(name: str) -> None:
 @pytest.mark.parametrize("fault", FAULTS)
 @pytest.mark.parametrize("place", [0, 35])
 def test_one_fault_is_found(fault: str, place: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reader, "EXAMINED", 32)
+    monkeypatch.setattr(selection, "EXAMINED", 32)
     splats = random_splats(40, sh_degree=1)
     name, value = FAULTS[fault]
     getattr(splats, name)[place] = value
