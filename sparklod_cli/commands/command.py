@@ -8,7 +8,7 @@ import math
 import os
 import re
 import string
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any, TypeVar
@@ -105,6 +105,7 @@ class Command(click.Command):
         options: dataclass whose fields, and those of groups in it, are the options, see `setting`; `--version` follows.
         examples: lines with a command each, the most useful ones first. A command may take several lines.
         headings: the order of the headings; others follow in the order of their first options, `GENERAL` last.
+        replaced: options of earlier versions, each with what to write instead.
     """
 
     def __init__(
@@ -113,9 +114,11 @@ class Command(click.Command):
         options: type[Any] | None = None,
         examples: str = "",
         headings: Sequence[str] = (COMMON,),
+        replaced: Mapping[str, str] | None = None,
         **attributes: Any,
     ) -> None:
         super().__init__(*arguments, **attributes)
+        self.replaced = replaced or {}
         if options is not None:
             self.context_settings["show_default"] = True
             self.params += _parameters(options, GENERAL)

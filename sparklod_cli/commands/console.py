@@ -96,10 +96,13 @@ def say_usage_error(error: click.ClickException) -> None:
 
 
 def _meant(error: click.NoSuchOption) -> str:
-    """Return a hint: a value of that name (--quality), the commands that have the option, or a similar option."""
+    """Return a hint: replacement, value of that name (--quality), the commands that have it, or a similar option."""
     ctx, flag = error.ctx, error.option_name
     if ctx is None:
         return ""
+    replaced: Mapping[str, str] = getattr(ctx.command, "replaced", {})
+    if flag in replaced:
+        return f" any more; write {replaced[flag]}"
     for param in ctx.command.params:
         if isinstance(param.type, click.Choice) and flag.lstrip("-") in param.type.choices:
             return f"; did you mean {param.opts[0]} {flag.lstrip('-')}?"

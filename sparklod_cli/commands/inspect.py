@@ -195,7 +195,18 @@ class InspectOptions:
     general: _InspectGeneral = dataclasses.field(default_factory=_InspectGeneral)
 
 
-@click.command("inspect", cls=Command, options=InspectOptions, examples=EXAMPLES)
+#: Options of earlier versions, and the assertions that replace them.
+REPLACED = {
+    "--require-lod": "--assert lod==true",
+    "--max-bytes": "--assert 'bytes<=N'",
+    "--min-splats": "--assert 'leaves>=N'",
+    "--max-splats": "--assert 'leaves<=N'",
+    "--sh": "--assert sh==N",
+    "--max-growth": "--assert 'growth<=N'",
+}
+
+
+@click.command("inspect", cls=Command, options=InspectOptions, examples=EXAMPLES, replaced=REPLACED)
 @click.pass_context
 def inspect(ctx: click.Context, /, **_: Any) -> None:
     """Report on splat files and check them.

@@ -200,6 +200,7 @@ def test_an_option_that_there_is_not_names_the_one_that_was_meant(
         (["inspect", "--unlod"], "; build-lod has it"),
         (["--overwrite", "build-lod"], "; options of a command follow its name, as in sparklod build-lod --overwrite"),
         (["-q"], "; options of a command follow its name, as in sparklod build-lod -q"),
+        (["inspect", "--max-bytes", "9"], " any more; write --assert 'bytes<=N'"),
         (["doctor", "--xyzzy"], ""),
     ],
 )
