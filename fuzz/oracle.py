@@ -24,7 +24,7 @@ from .streams import STREAMS
 #: Peak memory that a case may add to the process, in bytes: a fixed part, and a part for each byte of its files.
 MEMORY, MEMORY_PER_BYTE = 400 << 20, 64
 
-#: Length of an error message at most, in characters; `system.printable` shortens longer texts to it.
+#: Length of an error message at most, in characters; `system.untrusted` shortens longer texts to it.
 LONGEST = 500
 
 #: Size of an output at most, in bytes: a fixed part, and a part for each byte of the case's files.
