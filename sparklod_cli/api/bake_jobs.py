@@ -95,8 +95,9 @@ def bake_files(
             yield from bake_side_by_side(
                 pairs, **how, engine=engine, resources=resources, make=make, bake_large=outcome
             )
-        for pair in pairs if len(pairs) == 1 else ():
-            yield outcome(*pair)
+        else:
+            for pair in pairs:
+                yield outcome(*pair)
 
 
 def extract_files(

@@ -114,7 +114,7 @@ def build_tree(
 def select(
     splats: Splats, settings: BakeSettings, *, start: int = 0, total: int | None = None, threads: int = 1
 ) -> tuple[Splats, SelectionTally]:
-    """Recolour splats, limit their SH, and return those that are kept, with a tally of the others.
+    """Recolour splats, limit their SH, and return the selected splats and a tally of the rest.
 
     Args:
         splats: of an input, all or some.

@@ -80,7 +80,7 @@ Measure = Callable[[int], float]
 def count_for(
     goal: SimplifyGoal, leaves: int, *, bytes_of: Measure, psnr_of: Measure, progress: Progress
 ) -> tuple[int, float | None]:
-    """Return the number of splats that meets a goal, of so many leaves, and their PSNR if the goal is a PSNR.
+    """Return the number of splats, at most `leaves`, that meets a goal, and their PSNR if the goal is a PSNR.
 
     Raises:
         FormatError: not even one splat fits.

@@ -195,8 +195,8 @@ def tally(splats: Splats, ranges: Sequence[CodeRange], leaf: NDArray[np.bool_] |
 
     Returns:
         (ranges, 9) float64: splats below the range, above, and either; splats beyond any range of its column; the
-        least and the largest value, infinite where there is none; leaves below, above, and either, whose loss can be
-        seen.
+        least and the largest value, infinity and minus infinity without values; leaves with a visible loss below,
+        above, and either.
     """
     found = np.zeros((len(ranges), 9))
     found[:, 4:6] = np.inf, -np.inf

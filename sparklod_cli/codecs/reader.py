@@ -371,7 +371,7 @@ def read_note(note: Any) -> FileNote:
         return FileNote()
     up, problems = note.get("up"), tuple[str, ...]()
     if up is not None and not (isinstance(up, str) and up in AXES):
-        problems = (f"its up axis {quoted_value(up)} is ignored; it is none of {', '.join(AXES)}",)
+        problems = (f"its up axis {quoted_value(up)} is ignored; expected one of {', '.join(AXES)}",)
         up = None
     return FileNote(note.get("antialiased") is True, up, problems, is_ours=True)
 

@@ -75,7 +75,7 @@ class Schedule:
 
 
 def default_steps(leaves: int) -> int:
-    """Return the default number of steps for a tree of so many leaves."""
+    """Return the default number of steps for a tree with this number of leaves."""
     return max(LEAST_BY_DEFAULT, min(MOST_BY_DEFAULT, WORK // leaves))
 
 

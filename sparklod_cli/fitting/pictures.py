@@ -180,7 +180,7 @@ ASIDE_RADII, ASIDE_DISTANCES = 0.4, 0.25
 #: Training cameras at most. Their pictures, 1 MB each, are drawn once. Measured (benchmarks/notes/refining.md).
 TRAINING = 300
 
-#: Held-out cameras; of a path, one in so many, and at most so many.
+#: Largest number of held-out cameras, and the smallest interval at which cameras of a path are held out.
 HELD_OUT, OF_PATH = 16, 8
 
 #: Longest side of a picture of a path's camera, pixels.

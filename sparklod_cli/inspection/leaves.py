@@ -74,7 +74,7 @@ class LeafCoding:
 
 
 def codings_of(scene: Scene, leaves: Splats, original: Splats, facts: RadFacts | None) -> Iterator[LeafCoding | str]:
-    """Yield the possible codings of leaves that were `original`, the most likely first; or why there is none."""
+    """Yield the possible codings of leaves that were `original`, the most likely first, or why none is known."""
     if facts is None:
         yield from (of_spz(scene, leaves, covering=covering) for covering in (True, False))
         return
@@ -115,7 +115,7 @@ def of_spz(scene: Scene, leaves: Splats, *, covering: bool) -> LeafCoding:
 
 
 def of_rad(facts: RadFacts, leaves: Splats, rounded_to: int | None, *, covering: bool) -> LeafCoding | str:
-    """Return the coding of a RAD file, without a palette of SH; or why there is none.
+    """Return the coding of a RAD file, without a palette of SH, or the reason why its leaves cannot be compared.
 
     Args:
         rounded_to: bits after the binary point to which its writer rounded centres; None if it did not.

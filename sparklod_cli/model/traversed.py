@@ -19,6 +19,12 @@ Bounds = NDArray[np.float64]
 Counts = NDArray[np.int64]
 
 
+def _check_shapes(scene: DetailScene | TileScene, shapes: Mapping[str, tuple[int, ...]]) -> None:
+    for name, shape in shapes.items():
+        if getattr(scene, name).shape != shape:
+            raise ValueError(f"{name} has the shape {getattr(scene, name).shape}; expected {shape}")
+
+
 @dataclass(frozen=True)
 class Nodes:
     """N nodes of a tree, which is not validated, with (N, 3) float32 centres and (N,) feature sizes, world units."""
@@ -91,9 +97,7 @@ class DetailScene:
         regions, levels = self.counts.shape
         shapes = {"bounds": (regions, 2, 3), "children": (regions - 1, 2)}
         shapes |= {} if self.errors is None else {"errors": (regions, levels)}
-        for name, shape in shapes.items():
-            if getattr(self, name).shape != shape:
-                raise ValueError(f"{name} has the shape {getattr(self, name).shape}; expected {shape}")
+        _check_shapes(self, shapes)
         if self.counts.sum() != len(self.splats):
             raise ValueError(f"counts are of {self.counts.sum():,} splats, but there are {len(self.splats):,}")
 
@@ -169,9 +173,7 @@ class TileScene:
     def __post_init__(self) -> None:
         tiles = len(self.parent)
         shapes = {"level": (tiles,), "counts": (tiles,), "errors": (tiles,), "bounds": (tiles, 2, 3)}
-        for name, shape in (shapes | {"transform": (4, 4)}).items():
-            if getattr(self, name).shape != shape:
-                raise ValueError(f"{name} has the shape {getattr(self, name).shape}; expected {shape}")
+        _check_shapes(self, shapes | {"transform": (4, 4)})
         if not tiles or self.parent[0] != -1 or not (np.arange(tiles)[1:] > self.parent[1:]).all():
             raise ValueError("the first tile is the root, and every other comes after its parent")
         if self.counts.sum() != len(self.splats):
