@@ -5,13 +5,14 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
-from collections.abc import Callable, Generator, Mapping, Sequence
+import itertools
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Union
 
 from ..bake.flow import bake, stage_shares
+from ..bake.settings import LARGE, Merged, Resources, Source
 from ..bake.settings import Baked as Baked
 from ..bake.settings import BakeSettings as BakeSettings
-from ..bake.settings import Merged, Resources, Source
 from ..codecs.options import WriteOptions
 from ..system.addresses import Place
 from ..system.errors import SparklodError
@@ -71,33 +72,28 @@ def bake_files(
         from ..bake.skipping import bake_unless_there
 
         make = functools.partial(bake_unless_there, verify=skip == "verify")
-    resources = Resources(memory, scratch_dir, resume)
+    resources, engine = Resources(memory, scratch_dir, resume), None
     how: dict[str, Any] = {"settings": settings, "overwrite": overwrite, "progress": progress}
+    with contextlib.ExitStack() as stack:
+        outcomes: Iterator[Any] = itertools.repeat(LARGE)
+        if scheduler is not None or workers is not None:
+            from ..bake.out_of_core.cluster import ClusterSettings, cluster
+            from ..bake.side_by_side import bake_side_by_side
 
-    def outcome(source: Source, target: Place) -> Outcome:
-        try:
-            with job(stage_shares(settings)):
-                return make(source, target, **how, resources=resources, engine=engine, threads=threads, say=say)
-        except SparklodError as error:
-            return error
-
-    if scheduler is None and workers is None:
-        engine = None
-        for pair in pairs:
-            yield outcome(*pair)
-        return
-    from ..bake.out_of_core.cluster import ClusterSettings, cluster
-    from ..bake.side_by_side import bake_side_by_side
-
-    with cluster(ClusterSettings(scheduler, workers or 1, cluster_threads), memory=memory, say=say) as engine:
-        resources = dataclasses.replace(resources, memory=engine.memory)
-        if len(pairs) > 1:
-            yield from bake_side_by_side(
-                pairs, **how, engine=engine, resources=resources, make=make, bake_large=outcome
-            )
-        else:
-            for pair in pairs:
-                yield outcome(*pair)
+            chosen = ClusterSettings(scheduler, workers or 1, cluster_threads)
+            engine = stack.enter_context(cluster(chosen, memory=memory, say=say))
+            resources = dataclasses.replace(resources, memory=engine.memory)
+            if len(pairs) > 1:
+                small = bake_side_by_side(pairs, **how, engine=engine, resources=resources, make=make)
+                outcomes = stack.enter_context(contextlib.closing(small))
+        for pair, outcome in zip(pairs, outcomes, strict=False):
+            if outcome is LARGE:
+                try:
+                    with job(stage_shares(settings)):
+                        outcome = make(*pair, **how, resources=resources, engine=engine, threads=threads, say=say)
+                except SparklodError as error:
+                    outcome = error
+            yield outcome
 
 
 def extract_files(

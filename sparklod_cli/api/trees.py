@@ -11,7 +11,8 @@ from ..bake.simplifying import Refined, Simplifier, SimplifyGoal, refined
 from ..cameras.camera import Camera
 from ..cameras.sources import CameraPath
 from ..codecs.reader import check_valid
-from ..fitting.settings import STEPS, FitSettings
+from ..fitting import STEPS
+from ..fitting.settings import FitSettings
 from ..lod.builders import (
     BUILDERS,
     DEFAULT_BASE,

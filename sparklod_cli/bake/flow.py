@@ -167,11 +167,13 @@ def _may_need_blocks(
     """Return whether a bake goes out of core, or an interrupted one may have left a scratch folder."""
     if engine is not None or settings.files or not isinstance(target, Path):
         return True
-    memory = estimate.default_memory() if resources.memory is None else resources.memory
-    if resources != Resources(memory=resources.memory) or (
-        memory is not None and estimate.in_memory_bytes(settings, header.count, header.sh_degree) > memory
-    ):
+    if resources != Resources(memory=resources.memory):
         return True
+    # A scene of one small block takes hardly less memory out of core, so that what is available is not asked.
+    if resources.memory is not None or header.count > estimate.LEAST_BLOCK_SPLATS:
+        memory = estimate.default_memory() if resources.memory is None else resources.memory
+        if memory is not None and estimate.in_memory_bytes(settings, header.count, header.sh_degree) > memory:
+            return True
     if target == DASH:
         return any(Path(tempfile.gettempdir()).glob(f"standard-output-*{SCRATCH}"))
     return scratch_folder(source, target, settings, None).exists()

@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 #: Suffix of the format that is written unless another one is chosen.
 SPZ = ".spz"
 
+#: Result for a scene that is too large for a worker of a cluster.
+LARGE: Any = object()
+
 
 @dataclass(frozen=True)
 class BakeSettings:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from ..system.progress import Progress, silent
 from .estimate import in_memory_bytes
 from .flow import bake
 from .out_of_core.cluster import ClusterEngine
-from .settings import Baked, BakeSettings, Resources
+from .settings import LARGE, Baked, BakeSettings, Resources
 
 
 def bake_side_by_side(
@@ -23,17 +23,15 @@ def bake_side_by_side(
     settings: BakeSettings,
     engine: ClusterEngine,
     resources: Resources,
-    bake_large: Callable[[Source, Place], Any],
     make: Callable[..., Baked | None] = bake,
     overwrite: bool = False,
     progress: Progress = silent,
-) -> Iterator[Any]:
-    """Bake scenes; yield the result of each, a `Baked` or a `SparklodError`, in their order.
+) -> Generator[Any, None, None]:
+    """Bake scenes; yield the result of each, a `Baked` or a `SparklodError`, in their order, or `LARGE` unbaked.
 
     Args:
         pairs: inputs and outputs, which all workers see.
         resources: of a worker; a scene that fits into its memory is one task.
-        bake_large: bakes a scene too large for one worker.
         make: function of a module that bakes a scene.
     """
     small = [_fits_in_memory(source, settings, resources.memory) for source, _ in pairs]
@@ -47,7 +45,7 @@ def bake_side_by_side(
     engine.check(None, [place for source in sources for place in places_of(source)])
     with engine.map_calls("baking", _bake_small, calls, progress, "scene") as outcomes:
         for pair, is_small in zip(pairs, small, strict=True):
-            yield _checked_outcome(next(outcomes), pair[1]) if is_small else bake_large(*pair)
+            yield _checked_outcome(next(outcomes), pair[1]) if is_small else LARGE
 
 
 def _fits_in_memory(source: Source, settings: BakeSettings, memory: int | None) -> bool:

@@ -153,7 +153,10 @@ def write_windows(
     if tree.stored is not None and tree.before is not None:
         assert isinstance(tree.nodes, Scene)
         encoder = tree.stored.keeping(encoder, same_rows(tree.nodes.splats, tree.before))
-    windows = _encoded(tree, encoder, threads, progress) if encode is None else encode(tree, encoder)
+    if encode is None:
+        assert isinstance(tree.nodes, Scene)
+        encoded = list(results(encoder, tree.nodes, threads, progress, "encoding"))
+    windows = (lambda number, name: encoded[number][name]) if encode is None else encode(tree, encoder)
     options, numbers = encoder.options, range(len(windows_of(encoder.count)))
     with tree.out as out:
         name = out.target.name
@@ -175,13 +178,6 @@ def write_windows(
     baked.encodings = {name: getattr(options.rad, name) for name in RAD_ENCODINGS if encoder.sh_degree or name != "sh"}
     if options.rad.sh_codes and encoder.sh_degree:
         baked.sh_codes = min(options.rad.sh_codes, encoder.count)
-
-
-def _encoded(tree: BuiltTree, encoder: Encoder, threads: int, progress: Progress) -> Windows:
-    """Encode the windows of nodes in memory."""
-    assert isinstance(tree.nodes, Scene)
-    windows = list(results(encoder, tree.nodes, threads, progress, "encoding"))
-    return lambda number, name: windows[number][name]
 
 
 def write_whole(tree: BuiltTree, threads: int, progress: Progress) -> None:

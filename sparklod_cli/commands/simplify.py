@@ -11,7 +11,8 @@ import click
 
 from ..codecs.formats import WRITABLE, ending_of
 from ..codecs.options import WriteOptions
-from ..fitting.settings import STEPS, FitSettings
+from ..fitting import STEPS
+from ..fitting.settings import FitSettings
 from ..lod.budget import Budget, parse_budget
 from ..lod.builders import DETAIL_GROWTH
 from ..system import interrupts

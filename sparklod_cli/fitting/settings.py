@@ -6,14 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from ..render.settings import DEVICE_HELP, DEVICES
-from ..system.setting_fields import CheckedSettings, setting, whole
+from ..render import DEVICES
+from ..system.setting_fields import CheckedSettings, setting
+from . import FIT_DEVICE_HELP, SEED, SEED_HELP, STEPS
 
 if TYPE_CHECKING:
     from ..cameras.sources import CameraPath
-
-#: Numbers of steps, up to far more than pay, and hours of work; and seeds.
-STEPS, SEED = whole(1, 1_000_000), whole(0, (1 << 32) - 1)
 
 #: Shares of the leaves at which trees are judged.
 SHARES = (0.02, 0.05, 0.1, 0.25, 0.5)
@@ -30,9 +28,9 @@ class FitSettings(CheckedSettings):
     steps: int | None = setting(
         "Pictures of cuts that are drawn and compared; None for a number that suits the size of the tree.", STEPS
     )
-    seed: int = setting("Seed of the cameras and budgets that --refine draws at random.", SEED, 0, needs="refine")
+    seed: int = setting(SEED_HELP, SEED, 0, needs="refine")
     path: CameraPath | None = None
-    device: str = setting(DEVICE_HELP.format("--refine"), DEVICES, "cpu", needs="refine")
+    device: str = setting(FIT_DEVICE_HELP, DEVICES, "cpu", needs="refine")
 
 
 @dataclass(frozen=True)

@@ -10,22 +10,13 @@ from typing import Any
 from ..model import FARTHEST, MAX_SH_DEGREE
 from ..system.errors import BackendError
 from ..system.setting_fields import CheckedSettings, Range, setting, whole
+from . import DEVICE_HELP, DEVICES
 
 #: Largest supersampling factor: samples per pixel along each axis.
 MAX_SUPERSAMPLE = 4
 
-
 #: Backends; numba is the default, and draws on the processor or on a card.
 BACKENDS = ("numba", "osmesa", "open3d")
-
-#: Devices that can be requested: a card if there is one; the processor; a card.
-DEVICES = ("auto", "cpu", "cuda")
-
-#: Help of a setting of one of them; {} is what computes on it.
-DEVICE_HELP = (
-    "What {} computes with: an NVIDIA card if there is one (auto), the processor, or a card (cuda). Cards are tested in"
-    " a simulator only."
-)
 
 
 def uses_card(device: str, say: Callable[[str], None] = lambda text: None) -> bool:

@@ -11,9 +11,9 @@ import pytest
 
 from sparklod_cli.bake import side_by_side
 from sparklod_cli.bake.estimate import in_memory_bytes
-from sparklod_cli.bake.settings import BakeSettings, Resources
+from sparklod_cli.bake.settings import LARGE, BakeSettings, Resources
 from sparklod_cli.bake.side_by_side import bake_side_by_side
-from sparklod_cli.system.errors import OutputError, SparklodError
+from sparklod_cli.system.errors import SparklodError
 from tests.conftest import FIXTURES
 
 #: Splats and SH degree of the largest scene that a worker of these tests holds.
@@ -36,9 +36,9 @@ class Engine:
         yield (call(*each, threads=1) for each in arguments)
 
 
-def test_large_scenes_are_baked_here_in_their_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_large_scenes_are_left_to_be_baked_here_in_their_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    engine, large = Engine(), OutputError("too large for words")
+    engine = Engine()
     names = ("sh0.ply", "demo.ply", "sh1.ply")
     pairs = [(FIXTURES / name, Path(name).with_suffix(".spz")) for name in names]
     outcomes = bake_side_by_side(
@@ -46,10 +46,9 @@ def test_large_scenes_are_baked_here_in_their_place(tmp_path: Path, monkeypatch:
         settings=BakeSettings(),
         engine=engine,  # type: ignore[arg-type]
         resources=Resources(memory=in_memory_bytes(BakeSettings(), *HELD)),
-        bake_large=lambda source, target: large if (source, target) == pairs[1] else None,
     )
     found = list(outcomes)
-    assert found[1] is large
+    assert found[1] is LARGE
     assert [each.splats > 0 for each in (found[0], found[2])] == [True, True]
     assert engine.checked == [source for source, _ in pairs]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["sh0.spz", "sh1.spz"]
@@ -59,7 +58,7 @@ def test_an_output_that_is_nowhere_to_be_seen_is_an_error(tmp_path: Path, monkey
     baked = side_by_side.bake(FIXTURES / "one.ply", tmp_path / "there.spz", BakeSettings())
     monkeypatch.setattr(side_by_side, "_bake_small", lambda *_, **__: baked)
     pair = (FIXTURES / "one.ply", tmp_path / "one.spz")
-    how = {"settings": BakeSettings(), "engine": Engine(), "resources": Resources(), "bake_large": None}
+    how = {"settings": BakeSettings(), "engine": Engine(), "resources": Resources()}
     (found,) = bake_side_by_side([pair], **how)  # type: ignore[arg-type]
     assert isinstance(found, SparklodError)
     assert "wrote" in str(found) and "give --output-dir a folder that all machines share, or a URL" in str(found)

@@ -13,7 +13,7 @@ import click
 from ...codecs.formats import ENCODINGS, MANIFEST, NPZ, RAW_SUFFIXES, TILESET, WRITABLE, ending_of
 from ...codecs.formats import RAD_SUFFIX as RAD
 from ...codecs.options import MAX_SH_CODES, SH_CODES, RadOptions, SogOptions, WriteOptions
-from ...fitting.settings import STEPS, FitSettings
+from ...fitting import FIT_DEVICE_HELP, SEED, SEED_HELP, STEPS
 from ...lod.builders import (
     BUILDERS,
     DEFAULT_BASE,
@@ -27,8 +27,9 @@ from ...lod.builders import (
 )
 from ...lod.part_settings import DetailSettings, TileSettings
 from ...model import MAX_SH_DEGREE, UP_AXES
+from ...render import DEVICES
 from ...system.addresses import Place
-from ...system.setting_fields import Quantity, Range, setting, setting_of, whole
+from ...system.setting_fields import Quantity, Range, setting, whole
 from ...system.stdio import DASH
 from ...system.units import parse_size
 from ..command import BALL, COMMON, POINT, OptionalNumber, flag, flags_set, parameters_of, refuse
@@ -265,8 +266,8 @@ class BuildLodOptions:
         needs="refine",
         heading=REFINING,
     )
-    seed: int = setting_of(FitSettings, "seed", heading=REFINING)
-    device: str = setting_of(FitSettings, "device", heading=REFINING)
+    seed: int = setting(SEED_HELP, SEED, 0, needs="refine", heading=REFINING)
+    device: str = setting(FIT_DEVICE_HELP, DEVICES, "cpu", needs="refine", heading=REFINING)
     encoding: str | None = setting(
         f"Write arrays in a viewer's memory layout instead: a {NPZ} file, or the words alone if FILE ends in"
         f" {' or '.join(RAW_SUFFIXES)}.",
@@ -391,6 +392,11 @@ class BuildLodOptions:
         """Return the settings of bakes; loads numpy."""
         from ...api.bake_jobs import BakeSettings
 
+        refine = None
+        if self.refine is not None:
+            from ...fitting.settings import FitSettings
+
+            refine = FitSettings(self.refine or None, self.seed, device=self.device)
         form = self.output_form
         growth = DETAIL_GROWTH if form.cuts else DEFAULT_GROWTH
         return BakeSettings(
@@ -407,7 +413,7 @@ class BuildLodOptions:
             tiles=self.tiles if form.cuts == TILED else None,
             environment=self.environment,
             environment_beyond=self.environment_beyond,
-            refine=None if self.refine is None else FitSettings(self.refine or None, self.seed, device=self.device),
+            refine=refine,
             camera_path=self.camera_path,
             converts=self.form is not None or ending_of(self.name) in TREES or bool(form.cuts),
             unused=tuple(flags_set(ctx, (*OF_TREES, "environment_beyond"))),
