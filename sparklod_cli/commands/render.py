@@ -403,7 +403,7 @@ def _draw(ctx: click.Context, options: RenderOptions) -> None:
     budget = None if options.cut.full else options.cut.one_budget()
     instances = options.inputs.instances()
     # What is wrong with the output is said before much is read.
-    _output(ctx, options, options.cameras.least_count()).try_place()
+    _output(ctx, options, options.cameras.least_count()).check([], overwrite=True)
     with Console(quiet=general.quiet, verbose=general.verbose) as console:
         from ..api.jobs import draw_files
 

@@ -49,26 +49,19 @@ class PictureOutput:
     form: str
     kind: str
 
-    def path(self, number: int = 0) -> Path:
-        assert self.name is not None
-        if self.kind != "frames":
-            return self.name
-        return self.name.with_name(NUMBER.sub(lambda match: match[0] % number, self.name.name))
-
     def paths(self, numbers: Sequence[int]) -> list[Path]:
-        if self.name is None:
-            return []
-        return [self.path(number) for number in (numbers if self.kind == "frames" else [0])]
+        """Return the files of the frames of these numbers; the one file if they share it, none for standard output."""
+        if self.name is None or self.kind != "frames":
+            return [] if self.name is None else [self.name]
+        before, place, after = re.split(f"({NUMBER.pattern})", self.name.name)
+        return [self.name.with_name(f"{before}{place % number}{after}") for number in numbers]
 
     def check(self, numbers: Sequence[int], *, overwrite: bool) -> None:
+        """Raise an `OutputError` if the files of these frames exist, or no file can be written there."""
         for path in self.paths(numbers):
             check_free(path, overwrite=overwrite)
-        self.try_place()
-
-    def try_place(self) -> None:
-        """Raise an `OutputError` if no file can be written there, whatever the numbers of frames."""
-        if self.name is not None:
-            check_writable(self.path(), overwrite=True)
+        for path in self.paths([0]):
+            check_writable(path, overwrite=True)
 
 
 def output_for(name: Path | None, default: Path, cameras: int, *, sheet: bool) -> PictureOutput:

@@ -109,14 +109,10 @@ def over(image: Image, background: Color | None) -> Image:
 def eight_bits(image: Image) -> Pixels:
     """(H, W, 4) 8-bit pixels of an image, colours divided by alpha; (H, W, 3) if alpha is 1 everywhere."""
     alpha = image[..., 3:]
-    if (alpha == 1).all():
-        return _codes(image[..., :3])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        straight = np.where(alpha > 0, image[..., :3] / alpha, 0)
-    return np.concatenate([_codes(straight), _codes(alpha)], axis=2)
-
-
-def _codes(values: Image) -> Pixels:
+    values = image[..., :3]
+    if not (alpha == 1).all():
+        with np.errstate(divide="ignore", invalid="ignore"):
+            values = np.concatenate([np.where(alpha > 0, values / alpha, 0), alpha], axis=2)
     codes: Pixels = np.rint(255 * np.clip(values, 0, 1)).astype(np.uint8)
     return codes
 

@@ -166,7 +166,7 @@ class _Drawing:
         facts = {"frame": number, "time_s": camera.time, "name": camera.name, "splats": drawn.splats}
         facts |= {"width": camera.width, "height": camera.height}
         if output.kind == "frames":
-            facts["file"] = str(output.path(number))
+            facts["file"] = str(*output.paths([number]))
         image = codes.over(drawn.image, settings.background)
         if other is not None:
             from .metrics import check_covered, psnr

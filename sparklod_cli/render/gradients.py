@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from . import rasterizer
 from .kernels import backward
 from .kernels.backward import CENTER, LOD_OPACITY, LOG_SCALE, RGB, TURN
 from .kernels.shade import sh_gradients
-from .rasterizer import Image, Projected, ShadedSplats, Tiles
+from .rasterizer import Image, ShadedSplats
 from .settings import RasterSettings
 
 
@@ -50,8 +50,7 @@ class Drawing:
     splats: ShadedSplats
     camera: Camera
     settings: RasterSettings
-    projected: Projected
-    tiles: Tiles
+    drawn: backward.Drawn
 
     def gradients(self, by_image: Image) -> SplatGradients:
         """Return derivatives of a loss by each splat, the same for any number of threads.
@@ -61,16 +60,14 @@ class Drawing:
         (height, width, 4) float32 derivatives of the loss by the image's red, green and blue, which are multiplied by
         alpha, and by alpha.
         """
-        across, _ = rasterizer.tiles_across(self.camera)
-        screen, boxes = self.projected.screen, self.projected.boxes
-        first = backward.first_rows(boxes)
+        drawn = self.drawn
+        first = backward.first_rows(drawn.boxes)
         sums = np.empty((first[-1], backward.SUMS), np.float32)
-        drawn = backward.Drawn(screen, boxes, self.tiles.start, self.tiles.splats, self.tiles.stop, across)
         by_image = np.ascontiguousarray(by_image, np.float32)
         backward.weigh_tiles(len(drawn.stop), drawn, first, np.float32(MIN_ALPHA), self.image, by_image, sums)
         found = np.zeros((len(self.splats), backward.GRADIENT_COLUMNS), np.float32)
         arguments = rasterizer.arguments(self.splats, self.camera, self.settings)
-        backward.carry_back(len(screen), *arguments, backward.Rows(screen, first, sums), found)
+        backward.carry_back(len(drawn.screen), *arguments, backward.Rows(drawn.screen, first, sums), found)
         return SplatGradients(
             center=found[:, CENTER : CENTER + 3],
             log_scale=found[:, LOG_SCALE : LOG_SCALE + 3],
@@ -84,11 +81,12 @@ def draw(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> Draw
     """Draw the picture of `rasterizer.draw` for its gradients; `ValueError` for the profile `shifted`, without any."""
     if settings.profile == "shifted":
         raise ValueError("gradients of the profile shifted are not implemented; use the profile spark")
-    seen = rasterizer.project_splats(splats, camera, settings)
-    # The buffers are overwritten by the next picture.
-    seen = replace(seen, screen=seen.screen.copy(), boxes=seen.boxes.copy())
-    image, tiles = rasterizer.draw_projected(seen, camera, settings)
-    return Drawing(image, splats, camera, settings, seen, tiles)
+    screen, boxes, keys = rasterizer.project_splats(splats, camera, settings)
+    screen, boxes = screen.copy(), boxes.copy()  # the next picture overwrites these buffers
+    image, start, order, stop = rasterizer.draw_projected(screen, boxes, keys, camera, settings)
+    across, _ = rasterizer.tiles_across(camera)
+    drawn = backward.Drawn(screen, boxes, start, order, stop, across)
+    return Drawing(image, splats, camera, settings, drawn)
 
 
 def by_sh(

@@ -61,6 +61,12 @@ def shade(parts: Sequence[tuple[Splats, Matrix]], camera: Camera) -> ShadedSplat
 
 Image = NDArray[np.float32]
 
+#: (N, 4) first and last tile across and down that each splat overlaps; empty for splats that are not drawn.
+Boxes = NDArray[np.int16]
+
+#: (M,) from near to far, see `kernels.project.project`.
+Keys = NDArray[np.uint64]
+
 _working_memory = threading.local()
 
 #: Bytes that processors fetch from memory at once.
@@ -73,59 +79,33 @@ MAX_SIDE = project.TILE * np.iinfo(np.int16).max
 CHUNKS = 2
 
 
-@dataclass(frozen=True)
-class Projected:
-    """N splats on the screen, of which M are drawn.
-
-    Attributes:
-        screen: (N, `project.COLUMNS`) float32, filled for splats that are drawn.
-        boxes: (N, 4) int16 first and last tile across and down that each overlaps; empty for splats that are not drawn.
-        keys: (M,) uint64 from near to far, see `kernels.project.project`.
-    """
-
-    screen: NDArray[np.float32]
-    boxes: NDArray[np.int16]
-    keys: NDArray[np.uint64]
-
-
-@dataclass(frozen=True)
-class Tiles:
-    """Splats that each of T tiles was drawn with.
-
-    Attributes:
-        start: (T + 1,) int64 where in `splats` each tile begins.
-        splats: (total,) int32 splats, tile by tile, from near to far.
-        stop: (T,) int64 up to where in `splats` each tile was drawn; it is opaque before the rest.
-    """
-
-    start: NDArray[np.int64]
-    splats: NDArray[np.int32]
-    stop: NDArray[np.int64]
-
-
 def draw(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> Image:
     """Draw what a camera sees: (height, width, 4) float32, red, green, blue, multiplied by alpha, and alpha; 0..1.
 
     The image is the same for any number of threads.
     """
-    return draw_projected(project_splats(splats, camera, settings), camera, settings)[0]
+    return draw_projected(*project_splats(splats, camera, settings), camera, settings)[0]
 
 
-def draw_projected(seen: Projected, camera: Camera, settings: RasterSettings) -> tuple[Image, Tiles]:
-    """Draw splats on the screen; return the picture and its tiles."""
+def draw_projected(
+    screen: NDArray[np.float32], boxes: Boxes, keys: Keys, camera: Camera, settings: RasterSettings
+) -> tuple[Image, NDArray[np.int64], NDArray[np.int32], NDArray[np.int64]]:
+    """Draw splats of `project_splats`.
+
+    Returns:
+        The picture; of each of T tiles (T + 1,) where in the list of splats it begins; (total,) this list, as
+        `sort_into_tiles` returns it; (T,) up to where in it each tile was drawn: it is opaque before the rest.
+    """
     across, down = tiles_across(camera)
-    start, order = sort_into_tiles(seen, across, down, CHUNKS * threads_in_use())
-    drawn = Tiles(start, order, np.empty(across * down, np.int64))
-    image = np.empty((camera.height, camera.width, 4), np.float32)
+    start, order = sort_into_tiles(boxes, keys, across, down, CHUNKS * threads_in_use())
+    stop, image = np.empty(across * down, np.int64), np.empty((camera.height, camera.width, 4), np.float32)
     is_design = settings.profile == "shifted"
-    raster.draw_tiles(
-        len(drawn.stop), seen.screen, start, order, across, is_design, np.float32(MIN_ALPHA), image, drawn.stop
-    )
-    return image, drawn
+    raster.draw_tiles(len(stop), screen, start, order, across, is_design, np.float32(MIN_ALPHA), image, stop)
+    return image, start, order, stop
 
 
 def sort_into_tiles(
-    seen: Projected, across: int, down: int, blocks: int
+    boxes: Boxes, keys: Keys, across: int, down: int, blocks: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
     """List the splats of each tile, from near to far.
 
@@ -134,16 +114,16 @@ def sort_into_tiles(
         blocks: number of ranges of splats that threads process; the result does not depend on it.
 
     Returns:
-        (tiles + 1,) int64 where the splats of each tile begin; (total,) int32 splats.
+        (tiles + 1,) where the splats of each tile begin; (total,) splats.
     """
     counts = np.zeros((blocks, across * down), np.int32)
-    boxes = np.empty((len(seen.keys), 4), np.int16)
-    raster.count_in_tiles(blocks, seen.keys, seen.boxes, across, boxes, counts)
+    drawn = np.empty((len(keys), 4), np.int16)
+    raster.count_in_tiles(blocks, keys, boxes, across, drawn, counts)
     ends = np.cumsum(counts.T, dtype=np.int64).reshape(across * down, blocks)
     at = np.ascontiguousarray(ends.T - counts)
     start = np.append(at[0], ends[-1, -1])
     splats = np.empty(start[-1], np.int32)
-    raster.list_in_tiles(blocks, seen.keys, boxes, across, at, splats)
+    raster.list_in_tiles(blocks, keys, drawn, across, at, splats)
     return start, splats
 
 
@@ -154,8 +134,15 @@ def tiles_across(camera: Camera) -> tuple[int, int]:
     return -(-camera.width // project.TILE), -(-camera.height // project.TILE)
 
 
-def project_splats(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> Projected:
-    """Project splats onto the screen; `screen` and `boxes` are buffers, which the next call overwrites."""
+def project_splats(
+    splats: ShadedSplats, camera: Camera, settings: RasterSettings
+) -> tuple[NDArray[np.float32], Boxes, Keys]:
+    """Project N splats onto the screen, of which M are drawn.
+
+    Returns:
+        (N, `project.COLUMNS`) rows on the screen, filled for splats that are drawn; boxes; keys. Rows and boxes are
+        buffers, which the next call overwrites.
+    """
     tiles_across(camera)
     count = len(splats.center)
     memory = _working_memory  # kept by each thread, as the first access to new memory is slow
@@ -167,7 +154,7 @@ def project_splats(splats: ShadedSplats, camera: Camera, settings: RasterSetting
     screen, boxes, keys = memory.screen[:count], memory.boxes[:count], memory.keys[:count]
     is_radial = settings.sort == "radial"
     project.project(len(keys), *arguments(splats, camera, settings), is_radial, screen, keys, boxes)
-    return Projected(screen, boxes, np.sort(keys[keys != project.NOT_DRAWN]))
+    return screen, boxes, np.sort(keys[keys != project.NOT_DRAWN])
 
 
 def arguments(

@@ -237,7 +237,6 @@ def count_overdraw(splats: ShadedSplats, camera: Camera, settings: RasterSetting
     """Return (height, width) number of splats of the backend numba blended into each pixel, including hidden ones."""
     counts = np.zeros((camera.height, camera.width), np.int32)
     if len(splats.center):
-        seen = rasterizer.project_splats(splats, camera, settings)
-        is_design = settings.profile == "shifted"
-        count_fragments(len(counts), seen.screen, seen.keys, is_design, np.float32(MIN_ALPHA), counts)
+        screen, _, keys = rasterizer.project_splats(splats, camera, settings)
+        count_fragments(len(counts), screen, keys, settings.profile == "shifted", np.float32(MIN_ALPHA), counts)
     return counts.astype(np.float32)

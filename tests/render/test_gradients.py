@@ -185,7 +185,7 @@ def test_what_an_opaque_splat_hides_has_no_gradient() -> None:
     behind = shown(200, seed=4, spread=0.3)
     weights = np.random.default_rng(0).normal(size=(32, 32, 4)).astype(np.float32)
     drawing = draw(joined(behind, walls), camera, LOOK)
-    assert (drawing.tiles.stop < drawing.tiles.start[1:]).all()
+    assert (drawing.drawn.stop < drawing.drawn.start[1:]).all()
     found = drawing.gradients(weights)
     for name in PROPERTIES:
         assert not getattr(found, name)[: len(behind)].any()

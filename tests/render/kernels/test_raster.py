@@ -18,18 +18,18 @@ from tests.render.test_rasterizer import rows as rows_of
 def test_a_tile_lists_the_splats_whose_boxes_overlap_it_from_near_to_far(blocks: int) -> None:
     """Those that are not drawn have empty boxes, and no key."""
     camera = camera_at(size=(200, 150), focal=(100.0, 100.0))
-    seen = project_splats(shown(500, spread=2.0, most=3.0), camera, RasterSettings())
+    _, boxes, keys = project_splats(shown(500, spread=2.0, most=3.0), camera, RasterSettings())
     across, down = tiles_across(camera)
-    start, splats = sort_into_tiles(seen, across, down, blocks)
-    order = [index_of(key) for key in seen.keys]
+    start, splats = sort_into_tiles(boxes, keys, across, down, blocks)
+    order = [index_of(key) for key in keys]
     assert 0 < len(order) < 500
     for tile in range(across * down):
         y, x = divmod(tile, across)
-        left, right, top, bottom = seen.boxes[order].T
+        left, right, top, bottom = boxes[order].T
         overlap = (left <= x) & (x <= right) & (top <= y) & (y <= bottom)
         assert splats[start[tile] : start[tile + 1]].tolist() == np.array(order)[overlap].tolist()
     hidden = np.setdiff1d(np.arange(500), order)
-    assert (seen.boxes[hidden, 1] < seen.boxes[hidden, 0]).all()
+    assert (boxes[hidden, 1] < boxes[hidden, 0]).all()
 
 
 def test_a_picture_with_more_tiles_than_their_numbers_hold_is_refused() -> None:
@@ -49,10 +49,10 @@ def test_rows_beside_an_ellipse_are_those_without_a_pixel_of_it(scale: tuple[flo
     splats.scale[:] = np.float32(scale)
     camera = camera_at(size=(200, 150), focal=(300.0, 300.0))
     kept = boxed = 0
-    seen = project_splats(splats, camera, RasterSettings())
+    screen, boxes, keys = project_splats(splats, camera, RasterSettings())
     across, down = np.meshgrid(np.arange(TILE), np.arange(TILE))
-    for key in seen.keys:
-        row, box = seen.screen[index_of(key)], seen.boxes[index_of(key)]
+    for key in keys:
+        row, box = screen[index_of(key)], boxes[index_of(key)]
         for left in range(0, camera.width, TILE):
             for top in range(0, camera.height, TILE):
                 local, lines = row.copy(), np.empty((BLOCKS, 2), np.int32)
@@ -79,14 +79,14 @@ def test_a_splat_is_projected_alike_among_any_others(scale: float, sort: str) ->
     """Small ones, and ones whose axes are shortened; D from 0 to 5; some beside the picture."""
     camera, look, count = camera_at(), RasterSettings(sort=sort), 2 * GROUP + 7
     scene = shown(count, scale=scale, spread=2.0, most=5.0)
-    whole = project_splats(scene, camera, look)
-    drawn = sorted(index_of(key) for key in whole.keys)
-    found = whole.screen[drawn].copy(), whole.boxes.copy()
+    screen, boxes, keys = project_splats(scene, camera, look)
+    drawn = sorted(index_of(key) for key in keys)
+    found = screen[drawn].copy(), boxes.copy()
     assert 0 < len(drawn) < count
     for size in (1, GROUP - 1, GROUP, GROUP + 1):
         first = count - size
-        part = project_splats(rows_of(scene, slice(first, None)), camera, look)
-        kept = sorted(index_of(key) for key in part.keys)
+        screen, boxes, keys = project_splats(rows_of(scene, slice(first, None)), camera, look)
+        kept = sorted(index_of(key) for key in keys)
         assert [first + i for i in kept] == [i for i in drawn if i >= first]
-        np.testing.assert_array_equal(part.screen[kept], found[0][len(drawn) - len(kept) :])
-        np.testing.assert_array_equal(part.boxes, found[1][first:])
+        np.testing.assert_array_equal(screen[kept], found[0][len(drawn) - len(kept) :])
+        np.testing.assert_array_equal(boxes, found[1][first:])
