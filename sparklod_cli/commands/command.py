@@ -17,6 +17,7 @@ import click
 
 from .. import __version__
 from ..system.setting_fields import MOST_WHOLE, Quantity, Range, Setting, setting, settings_in
+from .console import Verbosity
 
 #: Headings of several commands: options that most users need, and options of every command.
 COMMON, GENERAL = "Common options", "General"
@@ -147,6 +148,9 @@ class Command(click.Command):
             raise
         if not ctx.resilient_parsing:
             refuse_output_among_inputs(ctx)
+        verbosity = ctx.find_object(Verbosity)
+        if verbosity is not None:
+            verbosity.verbose = ctx.params.get("verbose", False)
         return rest
 
     def by_heading(self, ctx: click.Context, *, whole: bool = True) -> dict[str, list[click.Parameter]]:
@@ -311,24 +315,33 @@ def flag(help: str, **attributes: Any) -> Any:
     return setting(help, default=False, **attributes)
 
 
-def _parameters(kind: type[Any], heading: str) -> Iterator[click.Parameter]:
+def _parameters(group: type[Any], heading: str) -> Iterator[click.Parameter]:
     """Yield those of a group; its heading is its class attribute `HEADING`, or that of the group around it."""
-    heading = getattr(kind, "HEADING", heading)
-    for field, declared in settings_in(kind):
+    heading = getattr(group, "HEADING", heading)
+    for field, declared in settings_in(group):
         if declared is None:
             yield from _parameters(field.default_factory, heading)  # type: ignore[arg-type]
             continue
-        name, attributes = declared.name or field.name, dict(declared.attributes)
+        name, attributes, kind = declared.name or field.name, dict(declared.attributes), declared.kind
         if attributes.pop("argument", False):
-            yield click.Argument([name], type=declared.kind, **attributes)
+            yield click.Argument([name], type=kind, **attributes)
             continue
         flags = attributes.pop("flags", None) or (f"--{name.replace('_', '-')}",)
         own_heading, bare = attributes.pop("heading", heading), attributes.pop("bare", None)
         if field.default is False:
             attributes["is_flag"] = True
         else:
-            unit = getattr(declared.kind, "unit", None)
-            attributes = {"type": click_type(declared.kind), "metavar": unit} | attributes
+            attributes.setdefault("metavar", getattr(kind, "unit", None))
+            if isinstance(kind, Quantity):
+                kind = Text()
+            elif isinstance(kind, tuple):
+                kind = click.Choice(kind) if all(isinstance(each, str) for each in kind) else Choice(kind)
+            elif isinstance(kind, Range):
+                least, most = (kind.least, kind.above), (kind.most, kind.below)
+                low, high = (next((end for end in ends if end is not None), None) for ends in (least, most))
+                base: type[Any] = Whole if kind.whole else Real
+                kind = base(low, high, min_open=kind.above is not None, max_open=kind.below is not None)
+            attributes["type"] = kind
         if "[default" in declared.help:
             attributes["show_default"] = False
         if not attributes.get("required"):  # click 8.3 and later take a default of None for a value
@@ -364,7 +377,7 @@ def check_declared(ctx: click.Context) -> None:
     for param in ctx.command.params:
         if not isinstance(param, Option) or not is_set(ctx, param.name or ""):
             continue
-        flag, declared = flag_of(ctx, param.name or ""), param.declared
+        flag, declared = max(param.opts, key=len), param.declared
         needed, _, value = declared.needs.partition("=")
         if needed and (str(ctx.params[needed]) != value if value else not is_set(ctx, needed)):
             raise click.UsageError(f"{flag} can only be used with {flag_of(ctx, needed)} {value}".rstrip(), ctx)
@@ -399,19 +412,6 @@ COLORS: dict[str, tuple[float, ...] | None] = {"black": (0.0, 0.0, 0.0), "white"
 MAX_SIDE, DIGITS = 1 << 16, 6
 
 
-def click_type(kind: Any) -> click.ParamType | None:
-    """Return the parameter type for the kind of a `Setting`."""
-    if isinstance(kind, Quantity):
-        return Text()
-    if not isinstance(kind, Range):
-        return Choice(list(map(str, kind))) if isinstance(kind, tuple) else kind
-    base: type[Any] = Whole if kind.whole else Real
-    least, most = (kind.least, kind.above), (kind.most, kind.below)
-    low, high = (next((end for end in ends if end is not None), None) for ends in (least, most))
-    result: click.ParamType = base(low, high, min_open=kind.above is not None, max_open=kind.below is not None)
-    return result
-
-
 class _Number(click.ParamType):
     """A number of a range; unlike click's, it fits into arrays and is not NaN."""
 
@@ -433,12 +433,15 @@ class Real(_Number, click.FloatRange):
 
 
 class Choice(click.Choice):
-    """One of the values of a `Setting`, which need not be texts."""
+    """One of the values of a `Setting` that are no texts."""
+
+    def __init__(self, values: Sequence[Any]) -> None:
+        super().__init__([str(each) for each in values])
+        self.values = values
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         text = super().convert(str(value), param, ctx)
-        assert isinstance(param, Option)
-        return next(each for each in param.declared.kind if str(each) == text)
+        return next(each for each in self.values if str(each) == text)
 
 
 class Text(click.ParamType):

@@ -20,7 +20,7 @@ from ..render.settings import OF_PIXELS, SORTINGS, RenderSettings, uses_card
 from ..system.setting_fields import Quantity, Range, setting, whole
 from ..system.units import format_size, parse_time
 from ..viewers.viewer_settings import BLEND, LodSettings, StreamingSettings
-from .command import COLOR, COMMON, VIEW, Command, check_declared, flag, flags_set, is_set, refuse, values_of
+from .command import COLOR, COMMON, VIEW, Command, check_declared, flag, is_set, refuse, values_of
 from .console import Console, count_of, for_screen, is_terminal, print_json
 from .options.common import (
     ASSERT,
@@ -145,7 +145,10 @@ class Appearance:
     HEADING: ClassVar[str] = "Appearance"
 
     background: Color | None = setting(
-        "Colour behind the splats: '#rrggbb', black, white or transparent.", COLOR, "black", heading=COMMON
+        "Colour behind the splats: '#rrggbb', black, white or transparent.  [default: black]",
+        COLOR,
+        (0.0, 0.0, 0.0),
+        heading=COMMON,
     )
     alpha: bool = flag("Keep alpha, as --background transparent does.")
     render: RenderSettings = field(default_factory=RenderSettings)
@@ -416,7 +419,7 @@ def _draw(ctx: click.Context, options: RenderOptions) -> None:
             files = viewed_files(
                 instances, options.cameras, options.cut, general, console, through=look.through, paged=paged
             )
-            render = render if flags_set(ctx, PLANES) else files.with_planes(render)
+            render = render if any(is_set(ctx, name) for name in PLANES) else files.with_planes(render)
             output, settings = _place(ctx, options, instances, files.path)
             say_notes(ctx, console, options.cameras, files, options.streaming.network, files.scenes.notes)
             console.detail(f"  read in {time.perf_counter() - start:.2f} s")
@@ -562,7 +565,7 @@ def _compare(ctx: click.Context, options: RenderOptions) -> int:
             render = dataclasses.replace(options.appearance.settings(console.say), max_sh=options.comparison.max_sh)
             files = viewed_files(instances, options.cameras, options.cut, general, console, trees_only=True)
             say_notes(ctx, console, options.cameras, files)
-            render = render if flags_set(ctx, PLANES) else files.with_planes(render)
+            render = render if any(is_set(ctx, name) for name in PLANES) else files.with_planes(render)
             compared = compare_files(
                 files,
                 budgets,

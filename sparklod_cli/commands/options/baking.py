@@ -127,9 +127,9 @@ class SceneOptions:
         heading=COMMON,
     )
     rotate: tuple[float, ...] = setting(
-        "Turn the scene by these angles in degrees, about x, then y, then z, after --up.",
+        "Turn the scene by these angles in degrees, about x, then y, then z, after --up.  [default: 0,0,0]",
         POINT,
-        "0,0,0",
+        (0.0, 0.0, 0.0),
         heading=POSITION,
     )
     scale: float = setting(
@@ -139,7 +139,10 @@ class SceneOptions:
         heading=POSITION,
     )
     translate: tuple[float, ...] = setting(
-        "Move the scene by this, in world units, after --scale.", POINT, "0,0,0", heading=POSITION
+        "Move the scene by this, in world units, after --scale.  [default: 0,0,0]",
+        POINT,
+        (0.0, 0.0, 0.0),
+        heading=POSITION,
     )
 
     def settings(self) -> dict[str, Any]:

@@ -15,7 +15,7 @@ import click
 from ...system.setting_fields import setting, whole
 from ...system.stdio import DASH
 from ..command import COMMON, flag
-from ..console import Console, Verbosity, is_terminal
+from ..console import Console, is_terminal
 from ..paths import OutputPath, require_suffix
 
 if TYPE_CHECKING:
@@ -27,13 +27,6 @@ if TYPE_CHECKING:
 MAX_THREADS = 256
 
 
-def _note_verbosity(ctx: click.Context, param: click.Parameter, value: bool) -> bool:
-    verbosity = ctx.find_object(Verbosity)
-    if verbosity is not None:
-        verbosity.verbose = value
-    return value
-
-
 def processors_to_use() -> int:
     """Return the default of --threads."""
     from ...system.threads import processors
@@ -41,10 +34,10 @@ def processors_to_use() -> int:
     return min(processors(), MAX_THREADS)
 
 
-#: Attributes of options that several commands have, see `setting`; `cli.run` reads the verbosity, too.
+#: Attributes of options that several commands have, see `setting`.
 JSON: dict[str, Any] = {"flags": ("--json",)}
 QUIET: dict[str, Any] = {"flags": ("-q", "--quiet")}
-VERBOSE: dict[str, Any] = {"flags": ("-v", "--verbose"), "callback": _note_verbosity}
+VERBOSE: dict[str, Any] = {"flags": ("-v", "--verbose")}
 OUTPUT: dict[str, Any] = {"flags": ("-o", "--output"), "heading": COMMON}
 OVERWRITE: dict[str, Any] = {
     "help": "Replace outputs that exist.",
