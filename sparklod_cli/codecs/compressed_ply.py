@@ -6,17 +6,17 @@ from collections.abc import Iterator
 from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..model import MAX_SH_DEGREE
 from ..model.sh import degree_of, notes_on_degree
 from ..model.splats import FloatArray
 from ..system.errors import FormatError
 from ..system.progress import Progress
+from ..system.threads import ordered_map
 from ..system.units import count_of
 from . import quantize
 from .ply import PlyHeader, offset_of, read_header
-from .reader import HARMLESS, OpenFile, Reader, Rows, Target, decode_rows, left_out, rows_of
+from .reader import HARMLESS, OpenFile, Reader, Rows, Target, left_out, rows_of
 
 #: Splats of a chunk, which share bounds.
 CHUNK_SPLATS = 256
@@ -47,7 +47,8 @@ def open_content(source: OpenFile) -> Reader:
 
     def fill(target: Target, threads: int, progress: Progress) -> None:
         @np.errstate(invalid="ignore", over="ignore")  # absurd bounds overflow
-        def unpack(part: slice, rows: NDArray[Any]) -> None:
+        def unpack(block: Rows) -> int:
+            part, rows = block
             splats, words = target.rows(part), {name: rows[name].astype(np.uint32) for name in VERTEX}
             center = quantize.decode_unorm_11_10_11(words["packed_position"])
             splats.center[:] = _within(bounds["position"], part, center)
@@ -57,17 +58,22 @@ def open_content(source: OpenFile) -> Reader:
             rgba = quantize.decode_unorm_8888(words["packed_color"])
             splats.rgb[:] = _within(bounds["color"], part, rgba[:, :3])
             splats.opacity[:] = rgba[:, 3]
+            return part.stop
 
-        def unpack_sh(part: slice, rows: NDArray[Any]) -> None:
+        def unpack_sh(block: Rows) -> int:
+            part, rows = block
             codes = rows.view(np.uint8).reshape(len(rows), 3, coefficients)  # all of red come first
             sh = target.rows(part).sh
             sh[:] = quantize.decode_centred_8(codes[:, :, : sh.shape[1]].transpose(0, 2, 1))
 
-        decode_rows(read("vertex", target.start, target.stop), unpack, count, threads, progress)
-        if coefficients:
-            decode_rows(read("sh", target.start, target.stop), unpack_sh, count, threads, progress)
+            return part.stop
 
-    facts = {"chunks": header.count("chunk"), "color_bounds": int(bounds["color"] is not None)}
+        steps = (("vertex", unpack), ("sh", unpack_sh)) if coefficients else (("vertex", unpack),)
+        for name, step in steps:
+            for done in ordered_map(step, read(name, target.start, target.stop), threads):
+                progress("reading", done, count, "splat")
+
+    facts = {"chunks": header.counts["chunk"], "color_bounds": int(bounds["color"] is not None)}
     facts["trailing_bytes"] = trailing
     kept, notes = min(degree, MAX_SH_DEGREE), notes_on_degree(degree) + _left_out(header)
     return Reader(count, kept, "compressed PLY", fill, header.mode == "mip", notes, facts, concurrent=True)
@@ -78,10 +84,10 @@ def _left_out(header: PlyHeader) -> tuple[str, ...]:
     properties = [
         each.name
         for name, names in read.items()
-        for each in header.elements[name][0].properties
+        for each in header.elements[name].properties
         if each.name not in names | HARMLESS
     ]
-    elements = [name for name, (_, count) in header.elements.items() if count and name not in {*read, "sh"}]
+    elements = [name for name, count in header.counts.items() if count and name not in {*read, "sh"}]
     return left_out("property", "properties", properties) + left_out("element", "elements", elements)
 
 
@@ -101,9 +107,9 @@ Element = tuple[int, np.dtype[Any], int]
 
 def _elements(file: BinaryIO, header: PlyHeader) -> dict[str, Element]:
     return {
-        name: (offset_of(file, header, name), row_type, header.count(name))
+        name: (offset_of(file, header, name), row_type, header.counts[name])
         for name in ("chunk", "vertex", "sh")
-        if name in header.elements and (row_type := header.row_type(name)) is not None
+        if (row_type := header.row_types.get(name)) is not None
     }
 
 
@@ -120,30 +126,30 @@ def _checked(header: PlyHeader) -> tuple[int, int]:
     """Check the elements, and return the number of splats and of SH coefficients per channel."""
     if header.text:
         raise FormatError("an ascii compressed PLY, but the format is binary")
-    count = header.count("vertex")
+    count = header.counts.get("vertex", 0)
     _check_types(header, "vertex", VERTEX, np.uint32)
     chunk_names = {*BOUNDS["position"], *BOUNDS["scale"]}
     have = set(_check_types(header, "chunk", tuple(chunk_names), np.float32))
     if have & {*BOUNDS["color"]}:
         _check_types(header, "chunk", BOUNDS["color"], np.float32)
-    if header.count("chunk") * CHUNK_SPLATS < count:
-        chunks = count_of(header.count("chunk"), "chunk")
+    if header.counts["chunk"] * CHUNK_SPLATS < count:
+        chunks = count_of(header.counts["chunk"], "chunk")
         raise FormatError(f"{chunks} of {CHUNK_SPLATS} cannot hold {count_of(count, 'splat')}")
     if "sh" not in header.elements:
         return count, 0
-    row_type = header.row_type("sh")
+    row_type = header.row_types["sh"]
     names = tuple(f"f_rest_{index}" for index in range(len(row_type.names or ()) if row_type else 1))
     if _check_types(header, "sh", names, np.uint8) != names:
         raise FormatError("the properties of its element sh are not f_rest_0, f_rest_1 and so on")
-    if len(names) % 3 or header.count("sh") != count:
-        rows, splats = count_of(header.count("sh"), "row"), count_of(count, "splat")
+    if len(names) % 3 or header.counts["sh"] != count:
+        rows, splats = count_of(header.counts["sh"], "row"), count_of(count, "splat")
         raise FormatError(f"its element sh has {rows} of {len(names)} values for {splats}")
     return count, len(names) // 3
 
 
 def _check_types(header: PlyHeader, element: str, names: tuple[str, ...], kind: type[np.generic]) -> tuple[str, ...]:
     """Return the names of an element's properties, after a check that `names` are among them and of a type."""
-    row_type = header.row_type(element) if element in header.elements else None
+    row_type = header.row_types.get(element)
     have: tuple[str, ...] = (row_type.names or ()) if row_type else ()
     bad = [name for name in names if row_type is None or name not in have or row_type[name].newbyteorder("=") != kind]
     if bad:

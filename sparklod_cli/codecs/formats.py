@@ -35,7 +35,8 @@ class Format:
         name: for display.
         module: in this package; has `open_content(source) -> Reader`, which raises `FormatError` if the file is of
             another format, cut short or corrupt.
-        writable: its module also has `encode(scene, options, *, threads, progress) -> Iterator[bytes]`;
+        endings: of the names of files that are written, suffixes or the name in `unbundled`; empty if it is only read.
+            Its module also has `encode(scene, options, *, threads, progress) -> Iterator[bytes]`;
             `settled(scene, options) -> WriteOptions`, the options with nothing left open, which raises `FormatError`
             if the scene cannot be written; and `held(options, sh_degree)`, the `encoder.CodeRange`s that it can hold.
         unbundled: the name of the first of the files as which a scene can also be written, all in one folder; None if
@@ -62,7 +63,7 @@ class Format:
     module: str
     suffixes: tuple[str, ...]
     beginning: bytes | None
-    writable: bool = False
+    endings: tuple[str, ...] = ()
     trees: bool = False
     unbundled: str | None = None
     companions: bool = False
@@ -75,13 +76,6 @@ class Format:
     def unmarked(self) -> bool:
         """Whether its files may begin with any bytes."""
         return self.beginning is None and not self.keys
-
-    @property
-    def endings(self) -> tuple[str, ...]:
-        """Endings of the names of files in this format: suffixes, or the name in `unbundled`."""
-        if self.unbundled is None:
-            return self.suffixes
-        return *(suffix for suffix in self.suffixes if not self.unbundled.endswith(suffix)), self.unbundled
 
     def codec(self) -> Any:
         """Import the module."""
@@ -97,11 +91,11 @@ FORMATS = (
         (".ply",),
         rb"ply\s(?:(?!end_header).)*[\r\n]\s*property\s+\w+\s+packed_position\s",
     ),
-    Format("PLY", "ply", (".ply",), rb"ply[\r\n]", writable=True),
+    Format("PLY", "ply", (".ply",), rb"ply[\r\n]", (".ply",)),
     # Gzipped up to version 3.
-    Format("SPZ", "spz", (".spz",), rb"\x1f\x8b\x08[\0-\x1f]|NGSP", writable=True, trees=True),
+    Format("SPZ", "spz", (".spz",), rb"\x1f\x8b\x08[\0-\x1f]|NGSP", (".spz",), trees=True),
     # RADC begins a chunk, which the codec refuses with what to give instead.
-    Format(RAD, "rad.codec", (".rad",), rb"RAD[0C]", writable=True, trees=True, companions=True),
+    Format(RAD, "rad.codec", (".rad",), rb"RAD[0C]", (".rad",), trees=True, companions=True),
     Format(
         "Streamed SOG",
         "streamed_sog.codec",
@@ -139,20 +133,20 @@ FORMATS = (
         "sog.codec",
         (".sog", ".json"),
         rb"PK\x03\x04",
-        writable=True,
+        (".sog", "meta.json"),
         unbundled="meta.json",
         companions=True,
         keys=("means", "quats"),
     ),
-    Format("GLB", "glb.codec", (".glb",), rb"glTF", writable=True, companions=True, folders=True),
+    Format("GLB", "glb.codec", (".glb",), rb"glTF", (".glb",), companions=True, folders=True),
     # Version 0.1 on, as a float denormal, and fewer than 2 ** 24 sections, which as a float would be, too.
     Format("KSPLAT", "ksplat", (".ksplat",), rb"\0[\x01-\xff]\0\0...\0"),
     Format("HIER", "hier", (".hier",), None),
-    Format("SPLAT", "splat", (".splat",), None, writable=True, bare=True),
+    Format("SPLAT", "splat", (".splat",), None, (".splat",), bare=True),
 )
 
 #: The formats that can be written, by how the name of the file ends, see `Format.endings`.
-WRITABLE = {ending: form for form in FORMATS if form.writable for ending in form.endings}
+WRITABLE = {ending: form for form in FORMATS for ending in form.endings}
 
 #: Layouts that `--encoding` knows, see `gpu.dump.pack`; docs/formats/memory.md has the arrays of each.
 ENCODINGS = ("packed", "ext", "lodtree", "texture")
@@ -198,8 +192,10 @@ def sniff(head: bytes, suffix: str) -> Format | None:
     """Return the format of a file by its first bytes, see `head_of`, or else by its suffix; None if that is not known.
 
     The suffix decides only for formats that may begin with any bytes, and not if the file is recognized as something
-    else.
+    else; and that of `NPZ` tells arrays from a scene, which are a zip both.
     """
+    if not head or (head.startswith(ZIP) and suffix.lower() == NPZ):
+        return None
     for form in FORMATS:
         if form.beginning is not None and re.match(form.beginning, head, re.DOTALL):
             return form

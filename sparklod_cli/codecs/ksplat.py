@@ -5,6 +5,7 @@ Compression level 0 uses floats; level 1 half floats and 16-bit centres; level 2
 
 from __future__ import annotations
 
+import functools
 from bisect import bisect
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -15,12 +16,13 @@ from numpy.typing import NDArray
 
 from ..model.gaussian import normalized_quat
 from ..model.sh import COEFFICIENTS
-from ..model.splats import FloatArray, Splats
+from ..model.splats import FloatArray
 from ..system.errors import FormatError, TruncatedError, VersionError
 from ..system.progress import Progress
+from ..system.threads import ordered_map
 from ..system.units import count_of
 from . import quantize
-from .reader import OpenFile, Reader, Rows, Target, decode_rows, rows_of
+from .reader import OpenFile, Reader, Rows, Target, rows_of
 
 HEADER = np.dtype(
     {
@@ -127,7 +129,9 @@ def open_content(source: OpenFile) -> Reader:
                 yield slice(section.first + part.start, section.first + part.stop), some
 
     @np.errstate(invalid="ignore", over="ignore")  # absurd numbers overflow
-    def unpack(part: slice, some: NDArray[Any], splats: Splats) -> None:
+    def unpack(target: Target, block: Rows) -> int:
+        part, some = block
+        splats = target.rows(part)
         section = sections[bisect(firsts, part.start) - 1]
         splats.center[:] = _centers(section, part, some["center"]) if level else some["center"]
         splats.scale[:] = some["scale"]
@@ -140,10 +144,11 @@ def open_content(source: OpenFile) -> Reader:
         coefficients = values.shape[1] // 3
         splats.sh[:, :coefficients] = values.reshape(len(some), coefficients, 3)
         splats.sh[:, coefficients:] = 0  # the degree of other sections may be higher
+        return part.stop
 
     def fill(target: Target, threads: int, progress: Progress) -> None:
-        some = rows(target.start, target.stop)
-        decode_rows(some, lambda part, rows: unpack(part, rows, target.rows(part)), count, threads, progress)
+        for done in ordered_map(functools.partial(unpack, target), rows(target.start, target.stop), threads):
+            progress("reading", done, count, "splat")
 
     facts = {"level": level, "sections": len(sections), "trailing_bytes": source.size - end}
     return Reader(count, max(degrees, default=0), "KSPLAT", fill, header=facts, concurrent=True)

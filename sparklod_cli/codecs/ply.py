@@ -25,7 +25,7 @@ from ..model.sh import degree_of, notes_on_degree
 from ..model.splats import FloatArray, Splats
 from ..system.errors import FormatError, NotSplatsError, PromiseError, TruncatedError
 from ..system.progress import Progress, silent
-from ..system.threads import blocks_of
+from ..system.threads import blocks_of, ordered_map
 from ..system.untrusted import quoted
 from . import quantize
 from .encoder import CodeRange
@@ -38,7 +38,6 @@ from .reader import (
     Rows,
     Target,
     comment_of,
-    decode_rows,
     encode_rows,
     left_out,
     read_comment,
@@ -102,7 +101,9 @@ class PlyHeader:
     """A PLY header.
 
     Attributes:
-        elements: descriptions of the elements without their data, and the number of rows of each, by name.
+        elements: descriptions of the elements without their data, by name.
+        counts: numbers of their rows.
+        row_types: types of their rows; None if rows have lists, and so no fixed size.
         text: whether the data are ascii.
         byte_order: "<" or ">" of binary data.
         size: bytes of the header.
@@ -111,22 +112,14 @@ class PlyHeader:
             (as disks) or "default"; Brush's last comment "SplatRenderMode: MODE" or Postshot's "antialiased 0|1".
     """
 
-    elements: dict[str, tuple[PlyElement, int]]
+    elements: dict[str, PlyElement]
+    counts: dict[str, int]
+    row_types: dict[str, np.dtype[Any] | None]
     text: bool
     byte_order: str
     size: int
     note: bytes = b""
     mode: str = "default"
-
-    def count(self, name: str) -> int:
-        """Return the number of rows of an element; 0 if it is missing."""
-        return self.elements[name][1] if name in self.elements else 0
-
-    def row_type(self, name: str) -> np.dtype[Any] | None:
-        """Return the type of a row; None if rows have lists, and so no fixed size."""
-        element = self.elements[name][0]
-        has_list = any(isinstance(prop, PlyListProperty) for prop in element.properties)
-        return None if has_list else np.dtype(element.dtype(self.byte_order))
 
     def check_size(self, size: int) -> int:
         """Check that a file of `size` bytes can hold all rows, before memory is allocated for them.
@@ -135,16 +128,15 @@ class PlyHeader:
             Bytes after the last row; 0 if their number is unknown.
         """
         need = self.size
-        for name, (element, count) in self.elements.items():
-            row_type = self.row_type(name)
-            if self.text:
-                need += count * 2 * max(1, len(element.properties))  # at least a digit and a separator for each value
+        for name, row_type in self.row_types.items():
+            if self.text:  # at least a digit and a separator for each value
+                need += self.counts[name] * 2 * max(1, len(self.elements[name].properties))
             else:
-                need += count * (row_type.itemsize if row_type else 1)
+                need += self.counts[name] * (row_type.itemsize if row_type else 1)
         missing = need - size - (1 if self.text else 0)  # the last separator is optional
         if missing > 0:
             raise TruncatedError(f"cut short: {missing:,} bytes are missing of what the header announces")
-        return 0 if self.text or any(self.row_type(name) is None for name in self.elements) else -missing
+        return 0 if self.text or None in self.row_types.values() else -missing
 
 
 def read_header(file: BinaryIO) -> PlyHeader:
@@ -178,32 +170,38 @@ def read_header(file: BinaryIO) -> PlyHeader:
         parsed = PlyData.read(io.BytesIO(b"\n".join(lines) + b"\n"))
     except (PlyParseError, ValueError) as error:
         raise FormatError(f"bad PLY header: {quoted(error)}") from None
-    elements = {element.name: (element, count) for element, count in zip(parsed, counts, strict=True)}
-    return PlyHeader(elements, parsed.text, parsed.byte_order, len(text), note, mode)
+    elements = {element.name: element for element in parsed}
+    row_types = {
+        element.name: None
+        if any(isinstance(each, PlyListProperty) for each in element.properties)
+        else np.dtype(element.dtype(parsed.byte_order))
+        for element in parsed
+    }
+    named_counts = {element.name: count for element, count in zip(parsed, counts, strict=True)}
+    return PlyHeader(elements, named_counts, row_types, parsed.text, parsed.byte_order, len(text), note, mode)
 
 
 def offset_of(file: BinaryIO, header: PlyHeader, name: str) -> int:
     """Return where rows of an element begin in a binary file; lists before them are read for their sizes."""
     at = header.size
-    for other, (element, count) in header.elements.items():
+    for other, row_type in header.row_types.items():
         if other == name:
             break
-        row_type = header.row_type(other)
         if row_type is not None:
-            at += count * row_type.itemsize
+            at += header.counts[other] * row_type.itemsize
             continue
         file.seek(at)
-        for _ in range(count):
-            _skip_row(file, element, header.byte_order)
+        for _ in range(header.counts[other]):
+            _skip_row(file, header.elements[other], header.byte_order)
         at = file.tell()
     return at
 
 
 def first_value(file: BinaryIO, header: PlyHeader, name: str) -> float | None:
     """Return the first value of an element that has rows; None in ascii files and files of lists, read row by row."""
-    if header.text or any(header.row_type(other) is None for other in header.elements):
+    row_type = header.row_types[name]
+    if header.text or row_type is None or None in header.row_types.values():
         return None
-    row_type = np.dtype(header.elements[name][0].dtype(header.byte_order))
     file.seek(offset_of(file, header, name))
     data = file.read(row_type.itemsize)
     if len(data) < row_type.itemsize:
@@ -241,7 +239,7 @@ def open_content(source: OpenFile) -> Reader:
         raise FormatError(f"{numbered} f_rest properties; expected f_rest_0, f_rest_1 and so on, a multiple of 3")
     facts = {"properties": len(names), "ascii": int(header.text)}
     facts |= {"big_endian": int(header.byte_order == ">"), "trailing_bytes": header.check_size(source.size)}
-    degree, count = degree_of(numbered // 3), header.count("vertex")
+    degree, count = degree_of(numbered // 3), header.counts["vertex"]
     needed = {part for parts, _ in columns.values() for part in parts} | {*rest, FILTER}
     offset = 0 if header.text else offset_of(file, header, "vertex")
     places = {name: (_places(names, parts), decode) for name, (parts, decode) in columns.items()}
@@ -256,9 +254,9 @@ def open_content(source: OpenFile) -> Reader:
             rows = text_rows()
         else:
             rows = rows_of(source.scratch(lambda: (some.tobytes() for _, some in text_rows())).read_at, 0, *span)
-        decode_rows(
-            rows, lambda part, some: _unpack(some, target.rows(part), places, rest_places), count, threads, progress
-        )
+        unpack = functools.partial(_unpack, target, places, rest_places)
+        for done in ordered_map(unpack, rows, threads):
+            progress("reading", done, count, "splat")
 
     noted = read_comment(header.note)
     notes = notes_on_degree(degree) + noted.problems + _notes(file, header, names, needed)
@@ -274,7 +272,7 @@ def _notes(file: BinaryIO, header: PlyHeader, names: Collection[str], needed: Co
         harmless = HARMLESS | {SCALES[2]}
     if FILTER in names:
         notes += (Note(f"the 3D filter of Mip-Splatting ({FILTER}) is applied to its scales and opacities"),)
-    elements = [name for name, (_, count) in header.elements.items() if count and name != "vertex"]
+    elements = [name for name, count in header.counts.items() if count and name != "vertex"]
     space = first_value(file, header, COLOR_SPACE) if COLOR_SPACE in elements else None
     if space is not None:
         elements.remove(COLOR_SPACE)
@@ -312,11 +310,14 @@ def _columns(names: Collection[str], mode: str) -> dict[str, tuple[tuple[str, ..
 
 # Converters write infinite logits and logarithms for an opacity of 0 or 1 and a scale of 0.
 @np.errstate(over="ignore", invalid="ignore")
-def _unpack(
-    rows: NDArray[Any], splats: Splats, places: Mapping[str, tuple[Places, Coding]], rest_places: Places
-) -> None:
-    """Fill splats from rows, by the places and the decode of each column, and the places of SH, red first."""
-    names = rows.dtype.names or ()
+def _unpack(target: Target, places: Mapping[str, tuple[Places, Coding]], rest_places: Places, block: Rows) -> int:
+    """Fill splats from a block, by the places and the decode of each column, and the places of SH, red first.
+
+    Returns:
+        The number of the row after the block.
+    """
+    part, rows = block
+    splats, names = target.rows(part), rows.dtype.names or ()
     if rows.flags.c_contiguous and all(rows.dtype[name] == np.float32 for name in names):
         matrix: FloatArray = rows.view(np.float32).reshape(len(rows), len(names))  # not copied
     else:
@@ -340,6 +341,7 @@ def _unpack(
     rest = matrix[:, rest_places]
     sh = rest.reshape(len(rows), 3, rest.shape[1] // 3)
     splats.sh[:] = sh[:, :, : splats.sh.shape[1]].transpose(0, 2, 1)
+    return part.stop
 
 
 def _smooth(scale: FloatArray, opacity: FloatArray, size: FloatArray) -> None:
@@ -361,7 +363,7 @@ def _row_type(header: PlyHeader) -> np.dtype[Any]:
     """Return the type of a vertex: in ascii files of floats alone, without `PREFIX` before names."""
     if "vertex" not in header.elements:
         raise NotSplatsError("its PLY header has no element vertex")
-    row_type = header.row_type("vertex")
+    row_type = header.row_types["vertex"]
     if row_type is None:
         raise NotSplatsError("its vertices have list properties, which splats do not have")
     fields = []
@@ -375,9 +377,9 @@ def _row_type(header: PlyHeader) -> np.dtype[Any]:
 
 def _text_rows(file: BinaryIO, header: PlyHeader, row_type: np.dtype[Any], needed: Collection[str]) -> Iterator[Rows]:
     """Read the vertices of an ascii file in blocks; plyfile's own reader takes value by value in Python."""
-    vertices = header.count("vertex")
+    vertices = header.counts["vertex"]
     file.seek(header.size)
-    for name, (_, count) in header.elements.items():
+    for name, count in header.counts.items():
         if name == "vertex":
             break
         deque(islice(file, count), maxlen=0)

@@ -110,20 +110,6 @@ def rows_of(
         yield part, np.frombuffer(data, row_type)
 
 
-def decode_rows(
-    rows: Iterator[Rows], decode: Callable[[slice, NDArray[Any]], None], count: int, threads: int, progress: Progress
-) -> None:
-    """Call `decode` with every block of rows, on several threads, while this thread reads on."""
-
-    def run(item: Rows) -> int:
-        part, content = item
-        decode(part, content)
-        return part.stop
-
-    for done in ordered_map(run, rows, threads):
-        progress("reading", done, count, "splat")
-
-
 def encode_rows(encode: Callable[[slice], bytes], count: int, threads: int, progress: Progress) -> Iterator[bytes]:
     """Return the bytes of `count` rows in order: `encode` is called with blocks of rows, on several threads."""
     parts = blocks_of(count)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,10 +11,11 @@ from ..model.scene import Scene
 from ..model.splats import Splats
 from ..system.errors import FormatError, TruncatedError
 from ..system.progress import Progress, silent
+from ..system.threads import ordered_map
 from . import quantize
 from .encoder import CodeRange
 from .options import DEFAULTS, WriteOptions
-from .reader import OpenFile, Reader, Target, decode_rows, encode_rows, rows_of
+from .reader import OpenFile, Reader, Rows, Target, encode_rows, rows_of
 
 ROW = np.dtype(
     [
@@ -40,16 +40,19 @@ def open_content(source: OpenFile) -> Reader:
     count = size // ROW.itemsize
 
     def fill(target: Target, threads: int, progress: Progress) -> None:
-        def decode_part(part: slice, rows: NDArray[Any]) -> None:
+        def decode_block(block: Rows) -> int:
+            part, rows = block
             splats = target.rows(part)
             splats.center[:] = rows["center"]
             splats.scale[:] = rows["scale"]
             splats.rgb[:] = quantize.decode_unorm8(rows["rgb"])
             splats.opacity[:] = quantize.decode_unorm8(rows["opacity"])
             splats.quat_xyzw[:] = quantize.decode_quat_bytes(rows["quat_wxyz"])[:, [1, 2, 3, 0]]
+            return part.stop
 
-        rows = rows_of(source.read_at, 0, ROW, target.start, target.stop, count)
-        decode_rows(rows, decode_part, count, threads, progress)
+        blocks = rows_of(source.read_at, 0, ROW, target.start, target.stop, count)
+        for done in ordered_map(decode_block, blocks, threads):
+            progress("reading", done, count, "splat")
 
     return Reader(count, 0, "SPLAT", fill, concurrent=True)
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
-from ..codecs.formats import FORMATS, NPZ, RAW_SUFFIXES, ZIP, Format, head_of, lookalike_of, sniff
+from ..codecs.formats import FORMATS, RAW_SUFFIXES, ZIP, Format, head_of, lookalike_of, sniff
 from ..codecs.reader import OpenCompanion, OpenFile, Reader, Target
 from ..model.scene import Scene
 from ..model.splats import COLUMNS
@@ -150,9 +150,11 @@ def open_splats(path: Place, closing: contextlib.ExitStack) -> tuple[BinaryIO, F
             "it is a pipe or a device; save it to a file, or give - to build-lod, simplify or inspect: - reads"
             " standard input"
         )
-    file = closing.enter_context(file_of(path))
+    file = spooled() if path == DASH else closing.enter_context(path.open("rb"))
     head = head_of(file)
-    form = recognised(head, path)
+    form = sniff(head, path.suffix)
+    if form is None:
+        raise unknown_format(head, path)
     open_companion: OpenCompanion = functools.partial(open_named, path, folders=form.folders)
     if head.startswith(ZIP) and form.companions:
         from ..codecs.zip_folder import ZipFolder  # what most files do without
@@ -160,31 +162,30 @@ def open_splats(path: Place, closing: contextlib.ExitStack) -> tuple[BinaryIO, F
         folder = ZipFolder(file)
         file.seek(0)
         if folder.first != form.unbundled:  # a folder of another format in a zip
-            file, open_companion = folder.open(folder.first), folder.open
-            form = recognised(head_of(file), Path(folder.first))
+            file, open_companion, path = folder.open(folder.first), folder.open, Path(folder.first)
+            form = sniff(head := head_of(file), path.suffix)
+            if form is None:
+                raise unknown_format(head, path)
     return file, form, {"open_companion": open_companion} if form.companions else {}
 
 
-def recognised(head: bytes, path: Place) -> Format:
-    """Return the format of a file by its first bytes, see `head_of`, or else by its suffix; raises `FormatError`."""
+def unknown_format(head: bytes, path: Place) -> FormatError:
+    """Return the error for a file whose format `sniff` does not know."""
     if not head:
-        raise UnreadableError("the file is empty")
-    form = sniff(head, path.suffix)
-    if form is None:
-        lookalike = lookalike_of(head)
-        if lookalike is not None:
-            raise UnknownFormatError(f"not a splat file, but {lookalike}")
-        names = ", ".join(form.name for form in FORMATS)
-        unmarked = " or ".join(ending for each in FORMATS if each.unmarked for ending in each.suffixes)
-        hint = f"; {unmarked} is not recognised by its content: pass it as a file" if path == DASH else ""
-        if path.suffix.lower() in RAW_SUFFIXES:
-            hint = "; words alone, as --encoding writes them by this suffix, do not tell what they are"
-        raise UnknownFormatError(f"not a splat file that sparklod reads ({names}){hint}")
-    if head.startswith(ZIP) and path.suffix.lower() == NPZ:
-        raise UnknownFormatError(
+        return UnreadableError("the file is empty")
+    if head.startswith(ZIP):
+        return UnknownFormatError(
             "it holds arrays for a viewer and no scene; use the file that they were made of, or unpack them in Python"
         )
-    return form
+    lookalike = lookalike_of(head)
+    if lookalike is not None:
+        return UnknownFormatError(f"not a splat file, but {lookalike}")
+    names = ", ".join(form.name for form in FORMATS)
+    unmarked = " or ".join(ending for each in FORMATS if each.unmarked for ending in each.suffixes)
+    hint = f"; {unmarked} is not recognised by its content: pass it as a file" if path == DASH else ""
+    if path.suffix.lower() in RAW_SUFFIXES:
+        hint = "; a file with this suffix has only words, as --encoding writes them, without a header"
+    return UnknownFormatError(f"not a splat file that sparklod reads ({names}){hint}")
 
 
 @contextlib.contextmanager

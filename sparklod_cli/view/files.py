@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import quote
 
-from ..codecs.formats import META, ZIP, head_of
+from ..codecs.formats import META, ZIP, head_of, sniff
 from ..codecs.glb.codec import open_content as open_glb
 from ..codecs.glb.glb_container import MAGIC as GLB_MAGIC
 from ..codecs.rad.rad_header import CHUNK_MAGIC, MAGIC, RadHeader, read_header
@@ -23,7 +23,7 @@ from ..codecs.tiles_3d.codec import names_of
 from ..codecs.tiles_3d.tileset import MAX_TILESET
 from ..codecs.zip_folder import ZipFolder
 from ..io.local_files import check_companion, in_folder, open_named, open_plain, reason_unreadable
-from ..io.reading import recognised
+from ..io.reading import unknown_format
 from ..model.lod_tree import CHUNK_NODES
 from ..system.errors import FormatError, NotSplatsError, UnreadableError, naming
 from ..system.untrusted import printable, quoted_value
@@ -143,7 +143,9 @@ def _shown(path: Path, folder: str) -> ShownFile:
     header = None
     with open_plain(path.resolve()) as file:
         head = head_of(file)
-        form = recognised(head, path)
+        form = sniff(head, path.suffix)
+        if form is None:
+            raise unknown_format(head, path)
         if head.startswith(MAGIC):
             header = read_header(file)
         elif head.startswith(GLB_MAGIC) and open_glb(OpenFile(file)).format != "GLB":

@@ -97,7 +97,7 @@ def test_words_alone_tell_nothing(tmp_path: Path, capsys: Capture) -> None:
         path = tmp_path / f"tree{suffix}"
         assert run(["build-lod", str(SCENE), "-q", "--encoding", "ext", "-o", str(path)]) == 0
         assert run(["inspect", str(path)]) == 1
-        assert "words alone, as --encoding writes them by this suffix, do not tell what they are" in (
+        assert "a file with this suffix has only words, as --encoding writes them, without a header" in (
             capsys.readouterr().err
         )
 
