@@ -18,8 +18,8 @@ from .codecs.formats import RAD_SUFFIX
 from .system import jit
 from .system.errors import SparklodError
 from .system.kernel_cache import PACKAGE, KernelCache, stem_of
-from .system.packages import program_command
 from .system.progress import Progress, silent
+from .system.python_process import program_command
 from .system.threads import processors
 
 #: Seconds between updates of the progress bar.

@@ -32,7 +32,7 @@ import json, sys
 from sparklod_cli.cli import run
 from sparklod_cli.system import jit
 compiled = []
-jit.listen(compiled.append, lambda seconds: None, compiled.append)
+jit.listeners.append((compiled.append, lambda seconds: None, compiled.append))
 print(json.dumps([[run(command) for command in json.loads(sys.argv[1])], compiled]))
 """
 

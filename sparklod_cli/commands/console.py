@@ -146,8 +146,8 @@ class Console(contextlib.AbstractContextManager["Console"]):
         #: Begin and share of each stage of a job, 0 to 1, and how much of the job is done, which never falls.
         self._job: dict[str, tuple[float, float]] | None = None
         self._reached = 0.0
-        #: Ends the reports of compilation; duration of each; the process that compiles ahead, and for which work.
-        self._stop_listening: Callable[[], None] | None = None
+        #: Its entry in `jit.listeners`, durations of compilations, the process that compiles ahead, and for which work.
+        self._listener: tuple[Callable[[str], None], Callable[[float], None], Callable[[str], None]] | None = None
         self._compiled: list[float] = []
         self._ahead: CompileAhead | None = None
         self._work: str | BakeSettings | None = None
@@ -157,8 +157,10 @@ class Console(contextlib.AbstractContextManager["Console"]):
         self.clear()
         if self._ahead is not None:
             self._ahead.close()
-        if self._stop_listening is not None:
-            self._stop_listening()
+        if self._listener is not None:
+            from ..system import jit
+
+            jit.listeners.remove(self._listener)
         if self._compiled:
             count = len(self._compiled) + (self._ahead.compiled if self._ahead is not None else 0)
             self.say(f"compiled {count_of(count, 'kernel')} in {sum(self._compiled):.1f} s")
@@ -263,7 +265,8 @@ class Console(contextlib.AbstractContextManager["Console"]):
         from ..system import jit
 
         self._work = work
-        self._stop_listening = jit.listen(self._begin_compiling, self._end_compiling, self._say_trouble)
+        self._listener = self._begin_compiling, self._end_compiling, self._say_trouble
+        jit.listeners.append(self._listener)
 
     def _begin_compiling(self, name: str) -> None:
         from ..system import jit

@@ -24,7 +24,8 @@ import click
 
 from .. import __version__
 from ..system import machine
-from ..system.packages import DISTRIBUTION, install_hint, pip_install, program_command, required_by
+from ..system.packages import DISTRIBUTION, install_hint, pip_install, required_by
+from ..system.python_process import program_command
 from ..system.threads import processors
 from ..system.untrusted import printable
 from .command import Command, flag, values_of

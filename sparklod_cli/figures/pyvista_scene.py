@@ -24,7 +24,8 @@ from ..model.gaussian import rotation_matrix
 from ..model.splats import FloatArray, Splats
 from ..render.color_scales import Coloring, ticks
 from ..system.errors import SparklodError
-from ..system.packages import optional_import, program_command
+from ..system.packages import optional_import
+from ..system.python_process import program_command
 
 #: (N, 3) points, or pairs of ends of lines; (3,) for a single point.
 Points = NDArray[np.floating[Any]]

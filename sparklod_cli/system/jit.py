@@ -114,14 +114,11 @@ def as_declared(declared: Any, argument: Any) -> Any:
 class Kernel:
     """A function that runs as machine code, which is compiled, or loaded from the cache, when it is first called.
 
-    Args:
-        function: the Python function.
+    Attributes:
+        py_func: the Python function.
         declared: the types that Python calls it with, for each signature, see `kernel`.
         ranges: Python calls it for ranges of rows, see `kernel`.
         options: keyword arguments of `numba.njit`.
-
-    Attributes:
-        py_func, declared, ranges, options: as above.
         has_wrapper: numba's dispatcher that other kernels call also has the code that makes it callable from Python.
             That takes as long to compile as many a kernel, so kernels that Python does not call have none.
         inner, built: numba's dispatchers that kernels and Python call; None until they are needed.
@@ -164,19 +161,16 @@ class Kernel:
                     inner = self._inner_on(numba)
                     self.built = inner if self.has_wrapper else numba.calling(inner, self.py_func)
                     if self.declared:
-                        _keep(self.built, self.py_func)
+                        self.built._cache = KernelCache(self.py_func, CACHE_FOLDER, READ_FOLDERS, report_trouble)
                         if before_first_call is not None:
                             before_first_call(self)
         return self.built
 
     def _inner_on(self, numba: ModuleType) -> Any:
-        """Return numba's dispatcher that other kernels call.
+        """Return the dispatcher of the module `jit_numba` that other kernels call.
 
-        What it compiles is a copy of the function, in whose globals numba finds its own dispatchers.
-        Nothing is replaced in the modules themselves, since other threads may be calling their functions.
-
-        Args:
-            numba: the module `jit_numba`.
+        It compiles a copy of the function, in whose globals numba finds its own dispatchers. Nothing is replaced in the
+        modules themselves, since other threads may be calling their functions.
         """
         if self.inner is None:
             function: Any = self.py_func
@@ -187,7 +181,7 @@ class Kernel:
             copy.__kwdefaults__ = function.__kwdefaults__
             self.inner = numba.compiled(copy, self.options, is_apart=self.ranges, has_wrapper=self.has_wrapper)
             if not self.declared:
-                _keep(self.inner, function)
+                self.inner._cache = KernelCache(function, CACHE_FOLDER, READ_FOLDERS, report_trouble)
             for name, value in list(function.__globals__.items()):
                 namespace[name] = _known(numba, value)
         return self.inner
@@ -203,16 +197,10 @@ class Kernel:
 
 
 def _known(numba: ModuleType, value: Any) -> Any:
-    """Return what numba knows a global as: dispatchers instead of kernels."""
+    """Return a global as numba uses it: a dispatcher instead of a kernel."""
     if value is prefetch:
         return numba.prefetch
     return value._inner_on(numba) if isinstance(value, Kernel) else value
-
-
-def _keep(dispatcher: Any, function: Callable[..., Any]) -> None:
-    """Have a dispatcher keep machine code in the cache."""
-    if CACHE_FOLDER is not None or READ_FOLDERS:
-        dispatcher._cache = KernelCache(function, CACHE_FOLDER, READ_FOLDERS, report_trouble)
 
 
 def kernel(
@@ -246,6 +234,8 @@ def kernel(
     """
     signatures = types if not types or isinstance(types[0], tuple) else (types,)
     if DISABLED:
+        from .jit_python import interpreted
+
         return functools.partial(interpreted, ranges=ranges) if signatures else lambda function: function
     options = {
         "nogil": nogil or ranges,
@@ -256,46 +246,35 @@ def kernel(
     return functools.partial(Kernel, declared=signatures, ranges=ranges, options=options)
 
 
-def check_numba_settings() -> None:
-    """Refuse settings that numba would read when it is imported, unless it has been.
+@functools.cache
+def load_numba() -> ModuleType:
+    """Import `jit_numba` and, with it, numba.
 
     A file of settings can name libraries, which numba loads. The current folder may be somebody else's: an unpacked
     archive, a shared folder.
 
     Raises:
+        ImportError: numba is missing or broken.
+        MemoryError: LLVM does not fit into memory.
         SparklodError: there is such a file, or a variable has a value that numba cannot use.
     """
-    if "numba" in sys.modules:
-        return
-    from .errors import SparklodError  # here, so that no kernel depends on its source
+    from .errors import SparklodError  # these here, so that no kernel depends on their sources
+    from .python_process import safe_path
 
-    if os.path.lexists(SETTINGS):
+    threads = os.environ.get("NUMBA_NUM_THREADS", "1")
+    if "numba" in sys.modules:
+        pass  # it has read its settings
+    elif os.path.lexists(SETTINGS):
         raise SparklodError(
             f"{SETTINGS} in the current folder can have numba load other programs' code; remove it, or work in another"
             " folder; NUMBA_ variables of the environment have the same effect"
         )
-    if (threads := os.environ.get("NUMBA_NUM_THREADS")) is None:
-        return
-    if not threads.strip():  # such as $SLURM_CPUS_PER_TASK outside of a job
+    elif not threads.strip():  # such as $SLURM_CPUS_PER_TASK outside of a job
         del os.environ["NUMBA_NUM_THREADS"]
     elif not (threads.isdecimal() and 1 <= int(threads) <= MOST_THREADS):
         raise SparklodError(
             f"NUMBA_NUM_THREADS is {threads[:40]!r}; set it to a whole number from 1 to {MOST_THREADS:,}, or unset it"
         )
-
-
-@functools.cache
-def load_numba() -> ModuleType:
-    """Import `jit_numba` and, with it, numba.
-
-    Raises:
-        ImportError: numba is missing or broken.
-        MemoryError: LLVM does not fit into memory.
-        SparklodError: see `check_numba_settings`.
-    """
-    check_numba_settings()
-    from .packages import safe_path  # here, so that no kernel depends on its source
-
     try:
         # Where processes are not forked, numba starts one when it is imported.
         with safe_path(), warnings.catch_warnings(record=True) as caught:
@@ -306,7 +285,7 @@ def load_numba() -> ModuleType:
         if is_memory and not isinstance(error, ImportError):  # which has a message of its own
             raise MemoryError from error
         raise
-    jit_numba.compilations.begun, jit_numba.compilations.done = report_begun, report_done
+    jit_numba.compilations.listeners = listeners
     for warning in caught:
         if warning.category is RuntimeWarning:  # of a variable; a traceback follows
             report_trouble(" ".join(str(warning.message).partition("\n")[0].split()))
@@ -319,94 +298,11 @@ def load_numba() -> ModuleType:
 #: process compiles it, too; None for nothing.
 before_first_call: Callable[[Kernel], None] | None = None
 
-_listeners: list[tuple[Begun, Done, Trouble]] = []
-
-
-def report_begun(name: str) -> None:
-    """Report to listeners which kernel is being compiled."""
-    for begun, _, _ in _listeners:
-        begun(name)
-
-
-def report_done(seconds: float) -> None:
-    """Report to listeners how long that took."""
-    for _, done, _ in _listeners:
-        done(seconds)
+#: Functions that receive the reports on the compilation and the cache, see their types.
+listeners: list[tuple[Begun, Done, Trouble]] = []
 
 
 def report_trouble(text: str) -> None:
-    """Report to listeners what is wrong with the cache."""
-    for _, _, trouble in _listeners:
+    """Report a problem of the cache to the listeners."""
+    for _, _, trouble in listeners:
         trouble(text)
-
-
-def listen(begun: Begun, done: Done, trouble: Trouble) -> Callable[[], None]:
-    """Report what happens when kernels are called for the first time.
-
-    Args:
-        begun: called with the name of each kernel that has to be compiled because it is not in the cache.
-        done: called with the duration of the compilation in seconds.
-        trouble: called with a one-line message if the cache cannot be used.
-
-    Returns:
-        a function that stops the reports.
-    """
-    listener = begun, done, trouble
-    _listeners.append(listener)
-    return lambda: _listeners.remove(listener)
-
-
-#: Whether a kernel runs on a thread, as `in_python`: one that it calls gets its arguments as they are.
-_running = threading.local()
-
-
-class Record(np.void):  # type: ignore[misc] # final for type checkers only
-    """An element of an array of records with its fields as attributes, also "size", which `numpy.record` hides."""
-
-    def __getattribute__(self, name: str) -> Any:
-        fields = np.void.__getattribute__(self, "dtype").names or ()
-        return self[name] if name in fields else np.void.__getattribute__(self, name)
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        self[name] = value
-
-
-def interpreted(function: Callable[..., Any], ranges: bool) -> Callable[..., Any]:
-    """Return a kernel as a function that Python runs.
-
-    As in machine code, fields of records are attributes, integers overflow without a warning, and results are numbers
-    of Python.
-
-    Args:
-        ranges: the function takes the ends of a range of rows; Python gives the second one only.
-    """
-
-    @functools.wraps(function)
-    def run(*arguments: Any) -> Any:
-        if getattr(_running, "in_python", False):
-            return function(*arguments)
-        _running.in_python = True
-        try:
-            with np.errstate(all="ignore"):
-                return _plain(function(*((0,) if ranges else ()), *map(_with_records, arguments)))
-        finally:
-            _running.in_python = False
-
-    return run
-
-
-def _with_records(argument: Any) -> Any:
-    """Return an argument whose arrays of records have elements of `Record`."""
-    if isinstance(argument, tuple) and hasattr(argument, "_fields"):
-        return type(argument)(*map(_with_records, argument))
-    if isinstance(argument, np.ndarray) and argument.dtype.names:
-        return argument.view((Record, argument.dtype))
-    return argument
-
-
-def _plain(result: Any) -> Any:
-    """Return a result with numbers of Python."""
-    if isinstance(result, tuple):
-        numbers = map(_plain, result)
-        return type(result)(*numbers) if hasattr(result, "_fields") else tuple(numbers)
-    return result.item() if isinstance(result, np.generic) else result

@@ -11,7 +11,7 @@ import functools
 import gc
 import inspect
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from types import FunctionType
 from typing import Any
 
@@ -98,8 +98,7 @@ class _CompilationListener(event.Listener):
     Python looks for garbage only afterwards: a compiler's millions of live objects make that a tenth of the time.
     """
 
-    begun: Callable[[str], None]  # called with the name of a kernel; `jit` sets both
-    done: Callable[[float], None]  # called with the duration in seconds
+    listeners: Sequence[tuple[Callable[[str], None], Callable[[float], None], object]] = ()  # `jit.listeners`
     _depth, _since, _collects = 0, 0.0, False
 
     def on_start(self, event: event.Event) -> None:
@@ -107,14 +106,16 @@ class _CompilationListener(event.Listener):
         if self._depth == 1:
             self._since, self._collects = time.perf_counter(), gc.isenabled()
             gc.disable()
-            self.begun(stem_of(event.data["dispatcher"].py_func))
+            for begun, _, _ in self.listeners:
+                begun(stem_of(event.data["dispatcher"].py_func))
 
     def on_end(self, event: event.Event) -> None:
         self._depth -= 1
         if self._depth == 0:
             if self._collects:
                 gc.enable()
-            self.done(time.perf_counter() - self._since)
+            for _, done, _ in self.listeners:
+                done(time.perf_counter() - self._since)
 
 
 compilations = _CompilationListener()

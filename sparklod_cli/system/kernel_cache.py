@@ -14,6 +14,7 @@ import re
 import stat
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ SUFFIX = ".kernel"
 #: Bytes of the checksum at the start of a file. 16 make an accidental match impossible in practice.
 CHECKSUM = 16
 
-#: Called with a one-line message if the cache cannot be used; see `jit.listen`.
+#: Called with a one-line message if the cache cannot be used.
 Trouble = Callable[[str], None]
 
 #: Variables for numba that do not change the machine code. All others count, although few of them change it.
@@ -154,6 +155,7 @@ def _machine() -> str:
     return hashlib.blake2b(described.encode(), digest_size=8).hexdigest()
 
 
+@dataclass(frozen=True)
 class KernelCache:
     """The files of what numba makes of one function, for numba's dispatcher in place of its own cache.
 
@@ -164,28 +166,26 @@ class KernelCache:
     atomically and begins with a checksum. If a file is damaged, the kernel is compiled again; if the folder cannot be
     used, the kernel is compiled but not stored.
 
-    Args:
-        function: the Python function.
+    Attributes:
         folder: where files are written, and read first; None if no folder can be written.
         read: further folders, which are only read.
         trouble: called with a one-line message if the cache cannot be used.
     """
 
-    def __init__(
-        self, function: Callable[..., Any], folder: Path | None, read: Sequence[Path], trouble: Trouble
-    ) -> None:
-        self._function, self._folder, self._read, self._trouble = function, folder, read, trouble
-        self.cache_path = str(folder)
+    function: Callable[..., Any]
+    folder: Path | None
+    read: Sequence[Path]
+    trouble: Trouble
 
     def name(self, signature: Any) -> str:
         """Return the name of the file for a signature, which is a tuple of numba's types."""
         digest = hashlib.blake2b(repr((str(signature),)).encode(), digest_size=8).hexdigest()
-        return f"{start_of(self._function)}-{digest}{SUFFIX}"
+        return f"{start_of(self.function)}-{digest}{SUFFIX}"
 
     def _found(self, signature: Any) -> tuple[Path, bytes | None] | None:
         """Return the first file for a signature that can be read and trusted, and its content; None if damaged."""
         name = self.name(signature)
-        for folder in (*([] if self._folder is None else [self._folder]), *self._read):
+        for folder in (*([] if self.folder is None else [self.folder]), *self.read):
             path = folder / name
             with contextlib.suppress(OSError):
                 if path.is_file():  # not a pipe or a device
@@ -195,7 +195,7 @@ class KernelCache:
                             checksum, content = file.read(CHECKSUM), file.read()
                             is_whole = checksum == hashlib.blake2b(content, digest_size=CHECKSUM).digest()
                             return path, content if is_whole else None
-                    self._trouble(_distrusting(folder))
+                    self.trouble(_distrusting(folder))
         return None
 
     def load_overload(self, signature: Any, target_context: Any) -> Any:
@@ -216,27 +216,27 @@ class KernelCache:
             # An undamaged file may still be unusable, for example if it refers to types of another numpy.
             if out_of_memory(error):
                 raise
-        self._trouble(f"compiled code in {path.parent} is damaged; the damaged kernels are compiled again")
+        self.trouble(f"compiled code in {path.parent} is damaged; the damaged kernels are compiled again")
         with contextlib.suppress(OSError):
             path.unlink()
         return None
 
     def save_overload(self, signature: Any, compiled: Any) -> None:
         """Write a compiled function to its file, if it can be cached."""
-        if self._folder is None or compiled.lifted or compiled.library.has_dynamic_globals:
+        if self.folder is None or compiled.lifted or compiled.library.has_dynamic_globals:
             return
         from numba.core.serialize import dumps
 
         from .output import write_atomically  # here, so that no kernel depends on its source
 
-        path, content = self._folder / self.name(signature), dumps(compiled._reduce())
+        path, content = self.folder / self.name(signature), dumps(compiled._reduce())
         try:
             path.parent.mkdir(OWN, parents=True, exist_ok=True)  # another process may have removed it
             checksum = hashlib.blake2b(content, digest_size=CHECKSUM).digest()
             write_atomically(path, [checksum, content], overwrite=True)
         except OSError as error:
             reason = (error.strerror or str(error)).lower()
-            self._trouble(f"cannot cache compiled code in {path.parent} ({reason}); it is compiled in every run")
+            self.trouble(f"cannot cache compiled code in {path.parent} ({reason}); it is compiled in every run")
 
     def is_cached(self, signature: Any) -> bool:
         """Return True if there is a whole file for a signature."""

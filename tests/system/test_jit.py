@@ -141,12 +141,12 @@ def test_read_only_arrays_are_read_by_the_same_code(monkeypatch: pytest.MonkeyPa
     frozen = values.copy()
     frozen.flags.writeable = False
     begun: list[str] = []
-    stop = jit.listen(begun.append, lambda seconds: None, print)
+    jit.listeners.append((begun.append, lambda seconds: None, print))
     for each in (values, frozen, np.load(tmp_path / "values.npy", mmap_mode="r")):
         doubled[:] = 0
         kernel(each, doubled)
         assert np.array_equal(doubled, values * 2)
-    stop()
+    jit.listeners.clear()
     assert begun == ["test_jit.double"]
     (signature,) = kernel.signatures
     assert Unit(kernel, 0).is_cached
@@ -223,12 +223,10 @@ def test_compilations_are_reported_but_not_nested_ones(monkeypatch: pytest.Monke
 
     begun: list[str] = []
     seconds: list[float] = []
-    stop = jit.listen(begun.append, seconds.append, lambda text: None)
-    try:
-        assert jit.kernel()(outer)(1) == 2
-        jit.kernel()(add)(1, 2)
-    finally:
-        stop()
+    jit.listeners.append((begun.append, seconds.append, lambda text: None))
+    assert jit.kernel()(outer)(1) == 2
+    jit.kernel()(add)(1, 2)
+    jit.listeners.clear()
     jit.kernel()(add)(1, 2)
     assert begun == ["test_jit.outer", "test_jit.add"]
     assert len(seconds) == 2

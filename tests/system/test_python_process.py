@@ -13,7 +13,7 @@ import pytest
 import sparklod_cli
 from sparklod_cli.commands import doctor
 from sparklod_cli.system.errors import SparklodError
-from sparklod_cli.system.packages import check_current_folder, module_command, program_command
+from sparklod_cli.system.python_process import check_current_folder, module_command, program_command
 from tests.conftest import ROOT
 
 pytestmark = pytest.mark.slow
@@ -128,11 +128,11 @@ def test_every_process_of_python_is_started_in_this_way() -> None:
         path.relative_to(package).with_suffix("").as_posix(): path.read_text(encoding="utf-8")
         for path in package.rglob("*.py")
     }
-    helper = "system/packages"
+    helper = "system/python_process"
     calls = re.compile(r"\b(program_command|module_command|safe_path)\(")
     users = {name for name, text in texts.items() if calls.search(text)}
     assert users - {helper, "system/jit"} == set(STARTED)
-    shown = {"commands/completion", "commands/doctor"}  # the interpreter's path, by which they start nothing
+    shown = {"commands/completion", "commands/doctor", "system/packages"}  # its path, by which they start nothing
     assert {name for name, text in texts.items() if "sys.executable" in text} == {helper, *shown}
 
 

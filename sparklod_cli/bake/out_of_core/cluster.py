@@ -31,8 +31,9 @@ from ... import __version__
 from ...system import machine
 from ...system.addresses import Place
 from ...system.errors import OutOfMemoryError, SparklodError, memory_errors_translated
-from ...system.packages import check_current_folder, optional_import, safe_path
+from ...system.packages import optional_import
 from ...system.progress import Progress, silent
+from ...system.python_process import check_current_folder, safe_path
 from ...system.threads import thread_count
 from ..estimate import default_memory
 from .job import Task

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...system.errors import BackendError
-from ...system.jit import check_numba_settings
+from ...system.jit import load_numba
 from ...system.packages import optional_import
 
 #: An array on the card, as numba has it.
@@ -42,7 +42,7 @@ class Card:
 
 def find_card() -> Card:
     """Return the card that numba uses; a BackendError says in one line why none can be used."""
-    check_numba_settings()
+    load_numba()
     with optional_import("--device cuda needs numba-cuda", "cuda", BackendError):
         from numba import cuda
     from ...system.jit_cuda import SIMULATED

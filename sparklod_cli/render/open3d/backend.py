@@ -34,7 +34,7 @@ from ...model.falloff import MAX_STD_DEV, MIN_ALPHA
 from ...model.gaussian import linear_opacity
 from ...model.sh import SH_C0
 from ...system.errors import BackendError
-from ...system.packages import module_command
+from ...system.python_process import module_command
 from ..rasterizer import Image, ShadedSplats
 from ..settings import BLUR, CLIP, RasterSettings
 from .child import COLUMNS, PACKAGES, PIECE, TILE, Array, receive, send
