@@ -24,9 +24,9 @@ from sparklod_cli.model.instances import Instance
 from sparklod_cli.model.lod_tree import CHUNK_NODES, LodTree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
-from sparklod_cli.simulation.frames import chunks_of
 from sparklod_cli.system.threads import processors
 from sparklod_cli.viewers import cut as viewer_cut
+from sparklod_cli.viewers.chunk_cache import Chunks
 from sparklod_cli.viewers.cut import TreeCut
 from sparklod_cli.viewers.network import ChunkStream
 from sparklod_cli.viewers.read_scenes import read_scenes
@@ -138,7 +138,8 @@ class Viewer:
 
     def stream(self) -> ChunkStream:
         """A cold start."""
-        stream = ChunkStream(chunks_of(self.scenes), NETWORK)
+        held = self.scenes.with_cuts
+        stream = ChunkStream(Chunks([each.requests for each in held], [each.headers for each in held]), NETWORK)
         stream.want([])
         return stream
 

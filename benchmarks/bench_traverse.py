@@ -227,7 +227,7 @@ class Measured:
             for view in self._views:
                 cut = self._traversal.cut(view, budget=budget)
                 seconds.append(
-                    _seconds(lambda cut=cut, view=view: measure(self._forest, cut, view, size=SIZE))
+                    _seconds(lambda cut=cut, view=view: measure(self._forest, cut, view))
                     + _seconds(lambda cut=cut: changes.next(cut))
                 )
         return statistics.mean(seconds)

@@ -178,20 +178,31 @@ def traverse_files(
         SparklodError: a file cannot be read or written, or is no tree.
     """
     from ..simulation.frames import Simulation, write_frames
-    from ..simulation.loading import Loader
     from ..simulation.results import EMPTY, LOADING, summarize
 
     scenes, path = files.scenes, files.path
     settings = dataclasses.replace(lod, budget=scenes.splats_of(budget))
     try:
-        simulation = Simulation(scenes, settings, streaming, by_instance=by_instance)
+        simulation = Simulation(scenes, settings, streaming)
     except ValueError as error:
         raise UnfitError(str(error)) from None
     if outputs.indices is not None:
         outputs.check_frames(path.numbers, len(files.instances))
     progress = files.progress if bar else silent
-    loading = None if streaming.network.instant else Loader(scenes, settings, streaming).load(path.cameras[0])
-    frames = write_frames(simulation, path, outputs, threads=files.threads, progress=progress, passed=passed)
+    loading = None
+    if not streaming.network.instant:
+        from ..simulation.loading import Loader
+
+        loading = Loader(scenes, settings, streaming).load(path.cameras[0])
+    frames = write_frames(
+        simulation,
+        path,
+        outputs,
+        by_instance=by_instance,
+        threads=files.threads,
+        progress=progress,
+        passed=passed,
+    )
     outcomes: list[Outcome] = []
     if asserts:
         from ..tables.assertions import check

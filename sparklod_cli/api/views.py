@@ -162,8 +162,8 @@ def traverse(
 
     with on_threads(threads) as count, progress_callback(progress) as callback, memory_errors_translated():
         scenes = trees_of(viewed, count, precision)
-        simulation = Simulation(scenes, _lod(scenes, budget, settings, False), streaming, by_instance=by_instance)
-        frames = simulation.run(path_like(cameras), threads=count, progress=callback)
+        simulation = Simulation(scenes, _lod(scenes, budget, settings, False), streaming)
+        frames = simulation.run(path_like(cameras), by_instance=by_instance, threads=count, progress=callback)
         return Frames([row for frame in frames for row in frame.rows], COLUMNS)
 
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import io
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,13 +18,16 @@ from ..system.output import write_file
 from ..system.progress import Progress, silent
 from ..system.threads import ordered_map
 from ..tables.columns import Filter, Row
+from ..viewers.chunk_cache import ChunkCache, Chunks
 from ..viewers.cut import TreeCut, Viewer
 from ..viewers.frame_statistics import Changes, CutStatistics, measure
 from ..viewers.loaded_scene import STREAMED_SOG, TILES, TREE
-from ..viewers.network import Chunks, ChunkStream
 from ..viewers.scenes import CutFinder, Scenes
 from ..viewers.viewer_settings import LodSettings, StreamingSettings
 from .results import COLUMNS, OF_BUDGETS, OF_TREES, FrameOutputs, Lookout, Moment
+
+if TYPE_CHECKING:
+    from ..viewers.network import ChunkStream
 
 
 class StreamedCuts(CutFinder):
@@ -44,23 +49,15 @@ class StreamedCuts(CutFinder):
     def __init__(self, scenes: Scenes, settings: LodSettings, streaming: StreamingSettings | None = None) -> None:
         self.streaming = streaming or StreamingSettings()
         super().__init__(scenes, settings, remembers=self.remembers and not self.streaming.network.instant)
-        self.chunks = chunks_of(scenes)
-        self.stream()  # raises what would fail later
-
-    def stream(self, start: float = 0.0) -> ChunkStream:
-        return ChunkStream(self.chunks, self.streaming.network, capacity=self.streaming.chunk_cache, start=start)
-
-
-def chunks_of(scenes: Scenes) -> Chunks:
-    """Return the chunks of scenes with cuts, and what a viewer needs before it can ask for them."""
-    held = scenes.with_cuts
-    return Chunks(
-        [loaded.requests for loaded in held],
-        [loaded.headers for loaded in held],
-        rooted=scenes.kind == TREE,
-        fetchers=held[0].fetchers,
-        connections=held[0].connections,
-    )
+        held = scenes.with_cuts
+        self.chunks = Chunks(
+            [loaded.requests for loaded in held],
+            [loaded.headers for loaded in held],
+            rooted=scenes.kind == TREE,
+            fetchers=held[0].fetchers,
+            connections=held[0].connections,
+        )
+        ChunkCache(self.chunks, self.streaming.chunk_cache)  # raises what would fail later
 
 
 @dataclass(frozen=True)
@@ -94,34 +91,32 @@ class Simulation(StreamedCuts):
 
     remembers = True
 
-    def __init__(
-        self,
-        scenes: Scenes,
-        settings: LodSettings,
-        streaming: StreamingSettings | None = None,
-        *,
-        by_instance: bool = False,
-    ) -> None:
-        super().__init__(scenes, settings, streaming)
-        self._by_instance = by_instance
-        self._names = [instance.name for instance in scenes.instances]
-
-    def run(self, path: CameraPath, *, threads: int = 1, progress: Progress = silent) -> Iterator[SimulatedFrame]:
-        """Yield the frames of a path, in order.
+    def run(
+        self, path: CameraPath, *, by_instance: bool = False, threads: int = 1, progress: Progress = silent
+    ) -> Iterator[SimulatedFrame]:
+        """Yield the frames of a path, in order; with `by_instance` also the rows of single instances.
 
         Cuts are found on several threads, some frames ahead; anything that depends on the previous frame is done in
         order. If chunks are missing, the cut is found again with the resident ones.
         """
-        stream = self.stream(path.cameras[0].time)
+        cache, stream = ChunkCache(self.chunks, self.streaming.chunk_cache), None
+        if not self.streaming.network.instant:
+            from ..viewers.network import ChunkStream
+
+            start, network = path.cameras[0].time, self.streaming.network
+            stream = ChunkStream(self.chunks, network, capacity=self.streaming.chunk_cache, start=start)
+            cache = stream.cache
         changes = Changes(self.viewer.forest, self.viewer.instances)
         # Loads or compiles the kernels, so that the time of the first frame does not include it.
         self.viewer.cut(path.cameras[0], budget=len(self.viewer.instances))
-        found = ordered_map(self._find, path.cameras, threads)
+        found = ordered_map(functools.partial(self._find, by_instance=by_instance), path.cameras, threads)
         for at, (number, camera, ideal) in enumerate(zip(path.numbers, path.cameras, found, strict=True)):
-            stream.advance(max(camera.time, stream.now))
-            drawn, resident, chunks = self._fetched(camera, ideal, stream)
+            if stream is not None:
+                stream.advance(max(camera.time, stream.now))
+            headers = 0 if at else sum(map(sum, self.chunks.headers))
+            drawn, resident, cells = self._fetched(camera, ideal, cache, stream, headers)
             rows = self._rows(number, camera, drawn, changes.next(drawn[0]))
-            rows[0] |= chunks
+            rows[0] |= cells
             whole = drawn[1]
             in_front = 1 - whole.behind / whole.selected if whole.selected else 1.0
             if self.scenes.kind != TREE:
@@ -131,31 +126,39 @@ class Simulation(StreamedCuts):
             yield SimulatedFrame(number, camera, drawn[0], resident, rows, in_front)
             progress("traverse", at + 1, len(path.cameras), "frame")
 
-    def _find(self, camera: Camera, resident: NDArray[np.bool_] | None = None) -> MeasuredCut:
-        cut, size = self.find(camera, resident), (camera.width, camera.height)
-        return cut, *measure(self.viewer.forest, cut, camera, size=size, by_instance=self._by_instance)
+    def _find(self, camera: Camera, resident: NDArray[np.bool_] | None = None, *, by_instance: bool) -> MeasuredCut:
+        cut = self.find(camera, resident)
+        return cut, *measure(self.viewer.forest, cut, camera, by_instance=by_instance)
 
     def _fetched(
-        self, camera: Camera, ideal: MeasuredCut, stream: ChunkStream
+        self, camera: Camera, ideal: MeasuredCut, cache: ChunkCache, stream: ChunkStream | None, headers: int
     ) -> tuple[MeasuredCut, NDArray[np.bool_], Row]:
-        """Return the cut with the resident chunks, these chunks, and the cells of the row that describe chunks."""
-        requested = ideal[0].wanted()
-        instant = self.streaming.network.instant
-        if instant:
-            stream.want(requested)
-        drawn, resident = ideal, stream.cache.resident()
+        """Return the cut with the resident chunks, these chunks, and the cells of the row that describe chunks.
+
+        Without a stream there is no network: the chunks that fit the cache arrive at once, after so many bytes of
+        `headers`.
+        """
+        requested, arrived, received, complete_in = ideal[0].wanted(), list[int](), headers, None
+        if stream is None:
+            cache.want(requested)
+            arrived = cache.missing()
+            received += sum(self.chunks.sizes[chunk] for chunk in arrived)
+            for chunk in arrived:
+                cache.arrive(chunk)
+        drawn, resident = ideal, cache.resident()
         # What is drawn of detail levels depends on what was drawn before, as long as files are missing.
-        if not all(chunk in stream.cache for chunk in requested) or (self.scenes.kind == STREAMED_SOG and not instant):
-            drawn = self._find(camera, resident)
-        if not instant:
+        if not resident[requested].all() or (self.scenes.kind == STREAMED_SOG and stream is not None):
+            drawn = self._find(camera, resident, by_instance=bool(ideal[2]))
+        if stream is not None:
             stream.want(drawn[0].wanted())  # a viewer discovers chunks through resident ones
-        arrived = stream.take_arrivals()
+            arrived, received = stream.take_arrivals(), stream.take_bytes()
+            complete_in = stream.complete_in(requested)
         cells: Row = {
-            "chunks_touched": len(stream.cache.requested),
+            "chunks_touched": len(cache.requested),
             "chunks_new": len(arrived),
-            "bytes_new": stream.take_bytes(),
-            "chunks_resident": len(stream.cache),
-            "complete_in_s": None if instant else stream.complete_in(requested),
+            "bytes_new": received,
+            "chunks_resident": len(cache),
+            "complete_in_s": complete_in,
         }
         return drawn, resident, cells
 
@@ -183,13 +186,13 @@ class Simulation(StreamedCuts):
             "missing": cut.missing,
             "traverse_ms": 1000 * cut.seconds,
         }
-        if not self._by_instance:
+        if not parts:
             return [total]
         return [
             total,
             *(
-                where | {"instance": name} | _cells(part, settings.budget, *change)
-                for name, part, change in zip(self._names, parts, changes, strict=True)
+                where | {"instance": instance.name} | _cells(part, settings.budget, *change)
+                for instance, part, change in zip(self.scenes.instances, parts, changes, strict=True)
             ),
         ]
 
@@ -225,6 +228,7 @@ def write_frames(
     path: CameraPath,
     outputs: FrameOutputs,
     *,
+    by_instance: bool = False,
     threads: int = 1,
     progress: Progress = silent,
     passed: Filter | None = None,
@@ -237,7 +241,7 @@ def write_frames(
     extremes: dict[str, SimulatedFrame] = {}  # by criterion, and the first frame
 
     def rows() -> Iterator[Row]:
-        for frame in simulation.run(path, threads=threads, progress=progress):
+        for frame in simulation.run(path, by_instance=by_instance, threads=threads, progress=progress):
             in_front.append(frame.in_front)
             together.append(frame.rows[0])
             if outputs.indices is not None:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ..cameras.camera import Camera
 from ..tables.columns import Row
 from ..viewers.cut import TreeCut
+from ..viewers.network import ChunkStream
 from ..viewers.scenes import Cut, Scenes
 from ..viewers.viewer_settings import LodSettings, StreamingSettings
 from .frames import StreamedCuts
@@ -58,7 +59,7 @@ class Loader(StreamedCuts):
         """
         per_chunk = self._splats_of(self.find(camera))
         total = max(1, int(per_chunk.sum()))
-        stream = self.stream()
+        stream = ChunkStream(self.chunks, self.streaming.network, capacity=self.streaming.chunk_cache)
         stream.want([])
         while True:
             resident = stream.cache.resident()

@@ -45,26 +45,17 @@ class CutStatistics:
 
 
 def measure(
-    forest: Forest[Any],
-    cut: TreeCut,
-    view: Camera,
-    *,
-    size: tuple[int, int],
-    by_instance: bool = False,
+    forest: Forest[Any], cut: TreeCut, view: Camera, *, by_instance: bool = False
 ) -> tuple[CutStatistics, list[CutStatistics]]:
-    """Return the statistics of a cut found for `view` as a whole and, optionally, of each instance in it.
-
-    Args:
-        size: width and height of the picture, pixels.
-    """
-    width, height = size
+    """Return the statistics of a cut found for `view` as a whole and, optionally, of each instance in it."""
+    pixels = view.width * view.height
     counts = np.empty((len(cut.views), kernels.COUNTS), np.int64)
     sizes, owners = np.empty(len(cut), np.float32), np.empty(len(cut), np.uint16)
     screen = kernels.Screen(
         np.float32(math.tan(view.fov_x / 2)),
         np.float32(math.tan(view.fov_y / 2)),
-        np.float32(pixel_limit(view.fov_y, height)),
-        float(width * height),
+        np.float32(pixel_limit(view.fov_y, view.height)),
+        float(pixels),
     )
     nodes = CutNodes(cut.node, cut.limit.view(np.int32), cut.instance)
     found = kernels.measure_cut(forest.nodes, forest.depth, cut.views, nodes, screen, counts, sizes, owners)
@@ -72,18 +63,27 @@ def measure(
     total = counts.sum(axis=0)
     total[kernels.DEPTH_MIN] = counts[:, kernels.DEPTH_MIN].min()
     total[kernels.DEPTH_MAX] = counts[:, kernels.DEPTH_MAX].max()
-    whole = _measured(total, sizes, width * height)
+    whole = _measured(total, sizes, pixels)
     if not by_instance:
         return whole, []
     order = np.argsort(owners, kind="stable")
     parts = np.split(sizes[order], np.cumsum(np.bincount(owners, minlength=len(cut.views)))[:-1])
-    return whole, [_measured(row, part, width * height) for row, part in zip(counts, parts, strict=True)]
+    return whole, [_measured(row, part, pixels) for row, part in zip(counts, parts, strict=True)]
 
 
 def _measured(row: NDArray[np.int64], sizes: NDArray[np.float32], pixels: int) -> CutStatistics:
     count = [int(value) for value in row]
     selected = count[kernels.SELECTED]
-    median, high = _percentiles(sizes, (0.50, 0.95))
+    percentiles: list[float | None] = [None, None]
+    if len(sizes):  # interpolated linearly between two sizes each
+        places = [share * (len(sizes) - 1) for share in (0.50, 0.95)]
+        pairs = [(int(at), min(int(at) + 1, len(sizes) - 1)) for at in places]
+        found = np.empty((len(pairs), 2), np.float32)
+        kernels.select(sizes, np.array(pairs, np.int64).ravel(), found.ravel())
+        percentiles = [
+            below + (at - int(at)) * (above - below) if above > below else below  # both may be infinite
+            for at, (below, above) in zip(places, found.tolist(), strict=True)
+        ]
     return CutStatistics(
         selected=selected,
         leaves=count[kernels.LEAVES],
@@ -94,24 +94,10 @@ def _measured(row: NDArray[np.int64], sizes: NDArray[np.float32], pixels: int) -
         level_min=count[kernels.DEPTH_MIN] if selected else None,
         level_mean=count[kernels.DEPTH_SUM] / selected if selected else None,
         level_max=count[kernels.DEPTH_MAX] if selected else None,
-        projected_px_p50=median,
-        projected_px_p95=high,
+        projected_px_p50=percentiles[0],
+        projected_px_p95=percentiles[1],
         overdraw_estimate=count[kernels.AREA] / kernels.AREA_PARTS / pixels,
     )
-
-
-def _percentiles(values: NDArray[np.float32], shares: Sequence[float]) -> list[float | None]:
-    """Return percentiles of numbers >= 0, by ascending shares, interpolated linearly; None without numbers."""
-    if not len(values):
-        return [None] * len(shares)
-    places = [share * (len(values) - 1) for share in shares]
-    pairs = [(int(at), min(int(at) + 1, len(values) - 1)) for at in places]
-    found = np.empty((len(pairs), 2), np.float32)
-    kernels.select(values, np.array(pairs, np.int64).ravel(), found.ravel())
-    return [
-        below + (at - int(at)) * (above - below) if above > below else below  # both may be infinite
-        for at, (below, above) in zip(places, found.tolist(), strict=True)
-    ]
 
 
 class Changes:

@@ -1,164 +1,20 @@
-"""Streaming of chunks to a viewer over a network: an exact discrete-event simulation, and the cache of chunks."""
+"""Streaming of chunks to a viewer over a network: an exact discrete-event simulation."""
 
 from __future__ import annotations
 
 import copy
-import itertools
 import math
 from bisect import bisect_right
-from collections import OrderedDict, deque
-from collections.abc import Iterable, Sequence
+from collections import deque
+from collections.abc import Iterable
 from heapq import heappop, heappush
-from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
+from .chunk_cache import ChunkCache, Chunks
+from .viewer_settings import Network
 
-from .viewer_settings import FETCHERS, Network
-
-
-class Chunks:
-    """The chunks of all scenes, numbered consecutively, scene by scene, as in `cut.Forest.chunk_base`.
-
-    Args:
-        requests: for each scene and chunk, bytes of the answer to its first request, and of the answers to the others,
-            which are asked for together.
-        headers: for each scene the sizes of the answers that a viewer waits for, one after the other, before it can ask
-            for a chunk; none unless given.
-        rooted: whether scenes are drawn from their first chunks on, which hold their roots; chunk files of Streamed SOG
-            are drawn each for itself.
-        fetchers: default number of chunks that a viewer fetches at a time.
-        connections: largest number of concurrent requests; None for any number.
-
-    Attributes:
-        sizes: bytes of each chunk.
-        firsts: the first chunk of each scene.
-        roots: the chunks that are always wanted: the first of each scene if `rooted`.
-
-    Raises:
-        ValueError: a scene has no chunks, or a size is negative; or there are not as many headers as scenes.
-    """
-
-    def __init__(
-        self,
-        requests: Sequence[Sequence[tuple[int, ...]]],
-        headers: Sequence[Sequence[int]] | None = None,
-        *,
-        rooted: bool = True,
-        fetchers: int = FETCHERS,
-        connections: int | None = None,
-    ) -> None:
-        self.fetchers = fetchers
-        self.connections = connections
-        self.requests = [parts or (0,) for of_scene in requests for parts in of_scene]
-        self.sizes = list(map(sum, self.requests))
-        self.headers = [tuple(each) for each in headers or [()] * len(requests)]
-        if len(self.headers) != len(requests):
-            raise ValueError(f"there are {len(self.headers)} headers of {len(requests)} trees")
-        for tree, of_tree in enumerate(requests):
-            if not len(of_tree) or min(map(min, filter(None, of_tree)), default=0) < 0:
-                raise ValueError(f"the chunks of tree {tree} must be a list of sizes, each 0 or more")
-        self.firsts = [0, *itertools.accumulate(map(len, requests))][:-1]
-        self.roots = self.firsts if rooted else []
-
-    def __len__(self) -> int:
-        return len(self.sizes)
-
-    def shows(self, resident: NDArray[np.bool_]) -> bool:
-        """Return True if anything is drawn with (chunks,) bool resident chunks."""
-        return bool((resident[self.roots] if self.roots else resident).any())
-
-
-class ChunkCache:
-    """Holds chunks, and evicts the least recently used ones when it is full.
-
-    A chunk is used when it arrives and as long as it is wanted; among wanted chunks the more important one counts as
-    more recently used. Wanted chunks beyond the capacity are not fetched, since they would evict more important ones or
-    be evicted by them. Spark's pager works the same way. Chunks with roots are always wanted, and come first.
-    `ValueError` if the capacity is less than the number of trees.
-
-    Attributes:
-        requested: the wanted chunks, each once, the most important first.
-        admitted: the first of them, as many as fit; they are never evicted.
-    """
-
-    def __init__(self, chunks: Chunks, capacity: int | None = None) -> None:
-        if capacity is not None and capacity < len(chunks.roots):
-            raise ValueError(
-                f"a cache of {capacity} chunks cannot hold the roots of {len(chunks.roots)} trees; make it larger"
-            )
-        self._chunks, self._capacity = chunks, capacity
-        self._roots = frozenset(chunks.roots)
-        # In order of eviction: unwanted chunks by last use, then wanted ones, the least important first.
-        self._resident: OrderedDict[int, None] = OrderedDict()
-        self.requested: list[int] = []
-        self.admitted: list[int] = []
-        self._is_admitted: frozenset[int] = frozenset()
-
-    def __len__(self) -> int:
-        return len(self._resident)
-
-    def __contains__(self, chunk: int) -> bool:
-        return chunk in self._resident
-
-    def resident(self) -> NDArray[np.bool_]:
-        """Return the resident chunks, (chunks,) bool, for `Viewer.cut`."""
-        present = np.zeros(len(self._chunks), np.bool_)
-        present[list(self._resident)] = True
-        return present
-
-    def missing(self) -> list[int]:
-        """Return the admitted chunks that are not resident, the most important first."""
-        return [chunk for chunk in self.admitted if chunk not in self._resident]
-
-    def want(self, requested: Iterable[int]) -> None:
-        """Replace the list of wanted chunks, the most important first; `ValueError` if there is no such chunk.
-
-        The roots of all trees come before them, in this order, too, whether listed or not.
-        """
-        named = [int(chunk) for chunk in requested]
-        if named and not 0 <= min(named) <= max(named) < len(self._chunks):
-            raise ValueError(f"chunks {min(named)} to {max(named)} are wanted, but there are {len(self._chunks)}")
-        self._arrange()  # chunks wanted until now count as used until now
-        roots = [chunk for chunk in named if chunk in self._roots]
-        self.requested = list(dict.fromkeys([*roots, *self._chunks.roots, *named]))
-        self.admitted = self.requested[: self._capacity]
-        self._is_admitted = frozenset(self.admitted)
-        self._arrange()
-
-    def arrive(self, chunk: int) -> int | None:
-        """Add a chunk that has been fetched, and return the one that was evicted; None if none was.
-
-        That is the least recently used of the unwanted chunks, or else the least important. It may be the new chunk
-        itself, if it is no longer wanted.
-        """
-        self._resident[chunk] = None
-        # All admitted chunks fit, so if an admitted one exceeds the capacity, the first in the order of eviction is not
-        # admitted. Any other new chunk must first be moved to its place in that order.
-        if chunk not in self._is_admitted:
-            self._arrange()
-        if self._capacity is None or len(self._resident) <= self._capacity:
-            return None
-        evicted, _ = self._resident.popitem(last=False)
-        return evicted
-
-    def copy(self) -> ChunkCache:
-        twin = copy.copy(self)  # the lists are replaced, never changed
-        twin._resident = self._resident.copy()
-        return twin
-
-    def _arrange(self) -> None:
-        """Put the resident chunks in order of eviction."""
-        for chunk in reversed(self.requested):
-            if chunk in self._resident:
-                self._resident.move_to_end(chunk)
-
-
-class _Request(NamedTuple):
-    """A request: `part` of `Chunks.requests` of a chunk, or the next answer with the header of tree -1 - chunk."""
-
-    chunk: int
-    part: int = 0
+#: A request for a part of `Chunks.requests` of a chunk: (chunk, part); or for the next answer with the header of a
+#: tree: (-1 - tree, 0).
+Request = tuple[int, int]
 
 
 class ChunkStream:
@@ -201,22 +57,22 @@ class ChunkStream:
         self._next = 0  # all admitted chunks before this one are resident or under way
         self._missing: dict[int, int] = {}  # of chunks under way, the answers that have not arrived
         # (Time of its first byte, request), in order, since all have the same latency.
-        self._requested: deque[tuple[float, _Request]] = deque()
+        self._requested: deque[tuple[float, Request]] = deque()
         self._connections = chunks.connections or math.inf
-        self._queue: deque[_Request] = deque()  # requests that wait for a connection
+        self._queue: deque[Request] = deque()  # requests that wait for a connection
         # For each tree whose header is under way, the answers that are still to come, and the chunks that wait for it.
         self._headers = {tree: answers for tree, answers in enumerate(chunks.headers) if answers}
         self._waiting: dict[int, tuple[int, ...]] = dict.fromkeys(self._headers, ())
         self.received = self._taken = 0
         # Concurrent transfers share the bandwidth equally. `_served` is the number of bytes that a transfer which began
         # with the first would have received at time `_since`; a transfer ends when that has grown by its size.
-        self._transfers: list[tuple[float, int, _Request]] = []  # heap of (`_served` at its end, number, request)
+        self._transfers: list[tuple[float, int, Request]] = []  # heap of (`_served` at its end, number, request)
         self._served = 0.0
         self._since = start
         self._begun = 0
         self._arrived: list[int] = []
         for tree in self._headers:
-            self._ask(start, _Request(-1 - tree))
+            self._ask(start, (-1 - tree, 0))
 
     def advance(self, to_time: float) -> None:
         """Process all events up to a time in seconds; raise `ValueError` if it is in the past, or not finite."""
@@ -283,19 +139,18 @@ class ChunkStream:
                 if tree in self._waiting:
                     self._waiting[tree] += (chunk,)
                 else:
-                    self._ask(time, _Request(chunk))
+                    self._ask(time, (chunk, 0))
 
-    def _ask(self, time: float, request: _Request) -> None:
+    def _ask(self, time: float, request: Request) -> None:
         """Send a request, once there is a connection for it."""
         if len(self._requested) + len(self._transfers) < self._connections:
             self._requested.append((time + self._network.latency, request))
         else:
             self._queue.append(request)
 
-    def _size(self, request: _Request) -> int:
-        if request.chunk < 0:
-            return self._headers[-1 - request.chunk][0]
-        return self._chunks.requests[request.chunk][request.part]
+    def _size(self, request: Request) -> int:
+        chunk, part = request
+        return self._headers[-1 - chunk][0] if chunk < 0 else self._chunks.requests[chunk][part]
 
     def _step(self, until: float) -> bool:
         """Process the next event, the start or end of a transfer; False if none is due until a time."""
@@ -330,7 +185,7 @@ class ChunkStream:
         self._missing[chunk] -= 1
         if part == 0:
             for other in range(1, len(self._chunks.requests[chunk])):
-                self._ask(end, _Request(chunk, other))
+                self._ask(end, (chunk, other))
         if not self._missing[chunk]:
             del self._missing[chunk]
             self._arrived.append(chunk)
@@ -343,8 +198,8 @@ class ChunkStream:
         _, *rest = self._headers[tree]
         if rest:
             self._headers[tree] = tuple(rest)
-            self._ask(time, _Request(-1 - tree))
+            self._ask(time, (-1 - tree, 0))
             return
         del self._headers[tree]
         for chunk in self._waiting.pop(tree):
-            self._ask(time, _Request(chunk))
+            self._ask(time, (chunk, 0))

@@ -25,9 +25,9 @@ def levels(case: Case) -> np.ndarray:
     return np.concatenate([tree.tree.depths() for tree in case.trees])
 
 
-def told(case: Case, cut: TreeCut, *, size: tuple[int, int] = SIZE) -> tuple[CutStatistics, list[CutStatistics]]:
+def told(case: Case, cut: TreeCut) -> tuple[CutStatistics, list[CutStatistics]]:
     found = case.traversal()
-    return measure(found.forest, cut, case.view, size=size, by_instance=True)
+    return measure(found.forest, cut, case.view, by_instance=True)
 
 
 def expected(case: Case, cut: TreeCut, instances: list[int], waiting: set[tuple[int, int]]) -> dict:
@@ -120,9 +120,9 @@ def test_added_and_removed_nodes_are_those_of_sets(case: Case, data: st.DataObje
 def at_distance(center: list[float], size: float) -> CutStatistics:
     """Of one splat, seen from the origin."""
     tree = Nodes(np.array([center], np.float32), np.array([size], np.float32), links([]))
-    case = Case([tree], [TreeInstance()], CutView(np.eye(4), math.radians(90), math.radians(90)), 1, 0.0)
+    case = Case([tree], [TreeInstance()], CutView(np.eye(4), math.radians(90), math.radians(90), 100, 100), 1, 0.0)
     found = SparkViewer(case.traversal().forest, case.instances)
-    whole, parts = told(case, case.find(found), size=(100, 100))
+    whole, parts = told(case, case.find(found))
     assert parts == [whole]
     return whole
 

@@ -62,8 +62,8 @@ def rows_of(
     by_instance: bool = False,
     threads: int = 1,
 ) -> list[Row]:
-    simulation = Simulation(scenes, settings, streaming, by_instance=by_instance)
-    return [row for frame in simulation.run(path, threads=threads) for row in frame.rows]
+    simulation = Simulation(scenes, settings, streaming)
+    return [row for frame in simulation.run(path, by_instance=by_instance, threads=threads) for row in frame.rows]
 
 
 def without(row: Row, names: set[str]) -> Row:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sparklod_cli.viewers.network import ChunkCache
+from sparklod_cli.viewers.chunk_cache import ChunkCache
 from sparklod_cli.viewers.spark import header_answers
 from tests.references.streaming import NaiveCache, roots_first, sized
 

@@ -47,7 +47,7 @@ def flight(frames: int = 12, seconds: float = 6.0) -> CameraPath:
 def rows_of(
     scenes: Scenes, path: CameraPath, streaming: StreamingSettings | None = None, cut: LodSettings = CUT
 ) -> list[Any]:
-    return [frame.rows[0] for frame in Simulation(scenes, cut, streaming, by_instance=True).run(path)]
+    return [frame.rows[0] for frame in Simulation(scenes, cut, streaming).run(path, by_instance=True)]
 
 
 def loaded(scenes: Scenes) -> LoadedDetail:

@@ -10,7 +10,8 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from sparklod_cli.viewers.network import Chunks, ChunkStream
+from sparklod_cli.viewers.chunk_cache import Chunks
+from sparklod_cli.viewers.network import ChunkStream
 from sparklod_cli.viewers.viewer_settings import Network
 from tests.references.streaming import NaiveCache, Twin, roots_first, sized
 
