@@ -22,7 +22,7 @@ from sparklod_cli.lod.kernels.geometry import find_bounds
 from sparklod_cli.render.kernels.shade import add_sh
 
 begun = []
-jit.listen(begun.append, lambda seconds: None, print)
+jit.listeners.append((begun.append, lambda seconds: None, print))
 center = np.arange(12, dtype=np.float32).reshape(4, 3)
 rgb, low, high = np.zeros((4, 3), np.float32), np.zeros((1, 4)), np.zeros((1, 4))
 add_sh(4, center, np.ones((4, 3, 3), np.float32), np.zeros(3, np.float32), 1, rgb)

@@ -109,7 +109,7 @@ def work(*args, **kwargs):
         os.kill(os.getpid(), signal.SIGHUP)
         signal.pause()
     except KeyboardInterrupt:
-        jit.report_begun("kernel")
+        jit.listeners[0][0]("kernel")
     print("went on")
 """
 

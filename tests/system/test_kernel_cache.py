@@ -64,9 +64,9 @@ class Cache:
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Cache]:
     found = Cache(tmp_path / "cache")
     monkeypatch.setattr(jit, "CACHE_FOLDER", found.folder)
-    stop = jit.listen(found.begun.append, lambda seconds: None, found.told.append)
+    jit.listeners.append((found.begun.append, lambda seconds: None, found.told.append))
     yield found
-    stop()
+    jit.listeners.pop()
 
 
 def test_code_compiled_for_another_processor_is_not_used(cache: Cache) -> None:
