@@ -7,6 +7,7 @@ __version__: str
 if TYPE_CHECKING:  # mypy then resolves the modules first, which import this one
     from .api.comparison import ComparisonTable as ComparisonTable
     from .api.comparison import compare as compare
+    from .api.files import Tree as Tree
     from .api.files import inspect as inspect
     from .api.files import pack as pack
     from .api.files import read as read
@@ -48,7 +49,6 @@ if TYPE_CHECKING:  # mypy then resolves the modules first, which import this one
     from .model.instances import Instance as Instance
     from .model.lod_tree import LodTree as LodTree
     from .model.scene import Scene as Scene
-    from .model.scene import Tree as Tree
     from .model.selection import Selection as Selection
     from .model.splats import Splats as Splats
     from .model.transforms import Transform as Transform

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from sparklod_cli.model.lod_tree import LodTree
-from sparklod_cli.model.scene import NodeStream, Scene
+from sparklod_cli.model.node_stream import NodeStream
+from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
 
 

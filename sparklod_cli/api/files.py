@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..io import rad_file, read_scene
-from ..model.scene import Scene, Tree
+from ..model.lod_tree import LodTree
+from ..model.scene import Scene
 from ..model.splats import COLUMNS, FloatArray
 from ..system.errors import FormatError, InvalidSplatsError, TreeError, memory_errors_translated, naming
 from ..system.threads import thread_count
@@ -26,6 +27,23 @@ if TYPE_CHECKING:
 
 #: Errors of public functions that begin with the name of the file.
 OF_FILES = (FormatError, InvalidSplatsError, TreeError)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Tree(Scene):
+    """A scene with a Level-of-Detail tree: its splats are the nodes, and `tree` says which are whose children."""
+
+    tree: LodTree = field()
+
+    def _facts(self) -> list[str]:
+        nodes, leaves = len(self.splats), int(np.count_nonzero(self.tree.is_leaf))
+        try:
+            self.check_tree()
+            depth = f"depth {self.tree.depths().max()}"
+        except TreeError as error:
+            depth = f"broken: {error}"
+        counts = [f"{nodes:,} node{'s' * (nodes != 1)}", f"{leaves:,} leaves", depth]
+        return [*counts, *super()._facts()[1:]]
 
 
 def read(

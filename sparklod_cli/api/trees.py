@@ -25,13 +25,14 @@ from ..lod.builders import (
     MIN_GROWTH,
 )
 from ..model import MAX_SH_DEGREE
-from ..model.scene import Scene, Tree
+from ..model.scene import Scene
 from ..model.selection import Selection
 from ..system.errors import FormatError, memory_errors_translated
 from ..system.progress import Progress
 from ..system.setting_fields import Range, whole
 from ..system.threads import on_threads, thread_count
 from .arguments import BudgetLike, ProgressLike, budget_like, path_like, progress_callback, scene_like
+from .files import Tree
 
 
 def build_lod(

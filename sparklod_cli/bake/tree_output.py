@@ -15,7 +15,7 @@ from ..codecs.formats import WRITABLE, Format
 from ..codecs.options import DEFAULTS, RAD_ENCODINGS, WriteOptions
 from ..io.reading import Merged, Source, opened, read_stored
 from ..io.writing import parts_output, scene_output
-from ..model.scene import NodeStream, Scene
+from ..model.scene import Scene
 from ..model.splats import Splats, same_rows
 from ..system.addresses import Place
 from ..system.errors import FormatError
@@ -26,6 +26,7 @@ from .settings import SPZ, Baked, BakeSettings
 if TYPE_CHECKING:
     from ..codecs.encoder import Stored
     from ..codecs.statistics import Statistics
+    from ..model.node_stream import NodeStream
     from .simplifying import Simplifier
 
 

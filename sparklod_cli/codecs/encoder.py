@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..model.lod_tree import CHUNK_NODES, LodTree
-from ..model.scene import NodeStream, Scene
+from ..model.scene import Scene
 from ..model.splats import FloatArray, Splats
 from ..system.progress import Progress
 from ..system.threads import blocks_of, ordered_map
@@ -24,6 +24,8 @@ from .options import WriteOptions
 
 if TYPE_CHECKING:
     from typing import Protocol, Self  # Python 3.10 has no Self
+
+    from ..model.node_stream import NodeStream
 
     class Stored(Protocol):
         """Codes of a tree's file as they stand in it, with which nodes can be written again bit for bit."""
@@ -90,10 +92,10 @@ class Encoder(ABC):
     @classmethod
     def of(cls, scene: Scene | NodeStream, options: WriteOptions, ranges: tuple[CodeRange, ...]) -> Self:
         """Return the encoder of a scene, of which nothing is read."""
-        if isinstance(scene, NodeStream):
-            count, sh_degree, tree = scene.count, scene.sh_degree, True
-        else:
+        if isinstance(scene, Scene):
             count, sh_degree, tree = len(scene), scene.splats.sh_degree, scene.tree is not None
+        else:
+            count, sh_degree, tree = scene.count, scene.sh_degree, True
         return cls(count, sh_degree, tree, scene.antialiased, scene.up, options, ranges)
 
     @abstractmethod

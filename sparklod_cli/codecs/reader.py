@@ -14,20 +14,23 @@ import re
 import threading
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .. import __version__
 from ..model.lod_tree import LodTree
-from ..model.scene import AXES, PLAIN, SPECIFIED, FileCoding, Scene, facts_of
+from ..model.scene import AXES, SPECIFIED, Scene, facts_of
 from ..model.splats import COLUMNS, UNIT_TOLERANCE, Splats, describe_invalid
 from ..system.errors import FormatError, HasTreeError, InvalidSplatsError, TreeError, TruncatedError
 from ..system.progress import Progress, silent
 from ..system.threads import BLOCK_ROWS, blocks_of, ordered_map
 from ..system.untrusted import parse_json, printable, quoted_value
 from .kernels.drawable import count_doubtful
+
+if TYPE_CHECKING:
+    from ..model.file_coding import FileCoding
 
 #: Least bytes of a block: with narrow rows, such as SPZ's streams, handing a smaller one to a thread costs more than it
 #: saves.
@@ -169,7 +172,7 @@ class Reader:
         fill: reads and decodes rows.
         header: as in `Scene`; reading all splats may add to it.
         has_tree: whether the splats are the nodes of a tree.
-        coding: called when all splats have been read, returns `Scene.coding`; None for `scene.PLAIN`.
+        coding: called when all splats have been read, returns `Scene.coding`; None for float32.
         block: smallest number of splats that are read together; ranges are read in multiples of it.
         concurrent: several threads may call `fill` at a time.
         threads: that decode rows.
@@ -219,7 +222,7 @@ class Reader:
     def scene(self, *, columns: Collection[str] = COLUMNS, progress: Progress = silent, validate: bool = True) -> Scene:
         """Read all splats, once; `validate` refuses a broken tree."""
         splats, tree = self.read(0, self.count, columns, progress, once=True)
-        coding = PLAIN if self.coding is None else self.coding()
+        coding = None if self.coding is None else self.coding()
         scene = Scene(splats, tree, chunk_bytes=self.chunk_bytes, coding=coding, **facts_of(self))
         return with_valid_tree(scene, scene.tree) if validate and scene.tree is not None else scene
 

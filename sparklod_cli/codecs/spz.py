@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from ..model import MAX_SH_DEGREE
 from ..model.gaussian import linear_opacity, lod_opacity
 from ..model.lod_tree import LodTree
-from ..model.scene import FileCoding, NodeStream, ScaleCoding, Scene
+from ..model.scene import Scene
 from ..model.sh import COEFFICIENTS, notes_on_degree
 from ..model.splats import COLUMNS, FloatArray, Splats
 from ..system.errors import FormatError, MembersError, NotSplatsError, TruncatedError, VersionError
@@ -37,6 +37,7 @@ from .reader import FileNote, OpenFile, Read, Reader, Target, comment_of, read_c
 from .statistics import ALL_BITS, Statistics, enough, fine_bits
 
 if TYPE_CHECKING:
+    from ..model.node_stream import NodeStream
     from .inflate import Inflate
 
 MAGIC = 0x5053474E  # "NGSP"
@@ -188,9 +189,6 @@ NO_EXTENSIONS: Extensions = (None, (), False)
 #: Versions that are read.
 READABLE = (1, 2, 3, 4)
 
-#: How all versions hold scales.
-CODING = FileCoding((ScaleCoding("spz"),), 1)
-
 
 def open_content(source: OpenFile) -> Reader:
     """Open a file of any version, with a tree or without."""
@@ -255,6 +253,8 @@ def open_streams(source: OpenFile) -> tuple[Reader, Layout, Iterator[StreamRows]
             done += count
             progress("reading", done, layout.total, "B")
 
+    from ..model.file_coding import SPZ_SCALES, FileCoding  # writing does without
+
     axis, ignored, has_system = extensions
     notes = notes_on_degree(layout.sh_degree) + note.problems + ignored
     if header.get("unknown_streams"):
@@ -271,7 +271,7 @@ def open_streams(source: OpenFile) -> tuple[Reader, Layout, Iterator[StreamRows]
         header,
         up,
         layout.has_tree,
-        coding=lambda: CODING,
+        coding=lambda: FileCoding((SPZ_SCALES,)),
         up_by=up_by,
         concurrent=True,
     )

@@ -18,7 +18,6 @@ from ..lod.kernels.tree_links import add_weighted, fill_weights, find_parents
 from ..model.foveation import Cones
 from ..model.gaussian import linear_opacity, lod_opacity, normalized_quat, size_factor
 from ..model.lod_tree import LodTree
-from ..model.scene import PLAIN
 from ..model.sh import COEFFICIENTS
 from ..model.splats import FloatArray, Splats
 from ..render import rasterizer
@@ -62,7 +61,7 @@ class FittedNodes:
         self.columns = _copied(self.old)
         self.leaves: Index = np.flatnonzero(tree.is_leaf)
         self.fitted: Index = np.flatnonzero(~tree.is_leaf)
-        self._forest = Forest([nodes_of(nodes, tree, PLAIN, precision="float16", threads=threads)])
+        self._forest = Forest([nodes_of(nodes, tree, None, precision="float16", threads=threads)])
         self._viewer = SparkViewer(self._forest, [TreeInstance(foveation=Cones())])
 
     def cut(self, camera: Camera, share: float) -> Index:

@@ -14,8 +14,9 @@ from ..codecs.rad.codec import RadChunk, read_chunk
 from ..codecs.rad.rad_header import RadHeader, header_violations, read_header
 from ..codecs.rad.rad_reader import RadReader, decoded_bytes, file_of
 from ..codecs.rules import check_rules
+from ..model.file_coding import FileCoding
 from ..model.lod_tree import LodTree
-from ..model.scene import FileCoding, Scene
+from ..model.scene import Scene
 from ..model.splats import FloatArray, Splats
 from ..system.errors import UnreadableError, reason_of
 from ..system.machine import available_memory

@@ -1,7 +1,5 @@
 """Contents of one splat file: `Scene`, splats with their tree if they have one, and metadata of the file.
 
-`FileCoding` describes how the file holds its scales, from which the numbers that another reader decodes follow.
-
 The axis that points up is known from a note of sparklod, from the coordinate system of an SPZ 4, or for the formats of
 `SPECIFIED` from their specification; outputs note it. All other formats, and trees in SPZ, have the axes of the files
 that they were made from: their axis is unknown and not noted, and cameras take `ASSUMED`. No coordinate is turned
@@ -12,9 +10,9 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,6 +21,9 @@ from ..system.errors import InvalidSplatsError, TreeError
 from .lod_tree import LodTree
 from .sh import COEFFICIENTS
 from .splats import Splats, describe_invalid
+
+if TYPE_CHECKING:
+    from .file_coding import FileCoding
 
 #: Unit vectors of the axes, by name.
 AXES: dict[str, tuple[float, float, float]] = {
@@ -42,50 +43,6 @@ SPECIFIED: Mapping[str, str] = {"SPZ": "y", "glTF": "y"}
 ASSUMED = "-y"
 
 
-@dataclass(frozen=True)
-class ScaleCoding:
-    """Coding of scales.
-
-    Attributes:
-        name: "spz", or one of RAD's "ln_0r8" and "ln_f16"; empty for plain numbers, which all readers decode alike.
-        low, high: ends of the range of the logarithms, where the codes have one.
-    """
-
-    name: str = ""
-    low: float = 0.0
-    high: float = 0.0
-
-
-@dataclass(frozen=True)
-class FileCoding:
-    """Codings of the scales in a file.
-
-    Attributes:
-        scales: of each run of splats, in order.
-        run: splats of each run but the last.
-        packed_range: ends of the range of logarithms in which Spark packs the scales of the file as PackedSplats, where
-            the file sets one (RAD's "splatEncoding"); None for Spark's own.
-    """
-
-    scales: tuple[ScaleCoding, ...]
-    run: int
-    packed_range: tuple[float, float] | None = None
-
-    def parts(self, count: int) -> Iterator[tuple[slice, ScaleCoding]]:
-        """Return the rows of `count` splats, as few slices as their codings allow."""
-        start = 0
-        for number, coding in enumerate(self.scales):
-            last = number + 1 == len(self.scales)
-            if last or self.scales[number + 1] != coding:
-                stop = count if last else min((number + 1) * self.run, count)
-                yield slice(start, stop), coding
-                start = stop
-
-
-#: That of splats that were not read from codes.
-PLAIN = FileCoding((ScaleCoding(),), 1)
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class Scene:
     """Splats, and what a file says of them all.
@@ -102,7 +59,7 @@ class Scene:
         notes: what the reader had to leave out, for display.
         header: numbers of the file's header that the splats do not tell, by name ("version", "fractional_bits").
         chunk_bytes: of each of its chunks in the file, where its format has chunks; None elsewhere.
-        coding: of the scales in the file; `PLAIN` for float32.
+        coding: of the scales in the file; None for float32.
         up: the axis that points up, one of `AXES` ("y", "-z"); None where it is unknown.
         up_by: the format that specifies this axis ("SPZ", "glTF"); empty if the file names it, or it is unknown.
     """
@@ -114,7 +71,7 @@ class Scene:
     notes: tuple[str, ...] = ()
     header: Mapping[str, int] = field(default_factory=dict)
     chunk_bytes: tuple[int, ...] | None = None
-    coding: FileCoding = PLAIN
+    coding: FileCoding | None = None
     up: str | None = None
     up_by: str = ""
 
@@ -203,23 +160,6 @@ class Scene:
         return [*facts, self.format] if self.format else facts
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class Tree(Scene):
-    """A scene with a Level-of-Detail tree: its splats are the nodes, and `tree` says which are whose children."""
-
-    tree: LodTree = field()
-
-    def _facts(self) -> list[str]:
-        nodes, leaves = len(self.splats), int(np.count_nonzero(self.tree.is_leaf))
-        try:
-            self.check_tree()
-            depth = f"depth {self.tree.depths().max()}"
-        except TreeError as error:
-            depth = f"broken: {error}"
-        counts = [f"{nodes:,} node{'s' * (nodes != 1)}", f"{leaves:,} leaves", depth]
-        return [*counts, *super()._facts()[1:]]
-
-
 def _column(name: str, values: ArrayLike, shape: tuple[int, ...]) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
     """Return a column of `Splats` from numbers of this very shape."""
     array = np.asarray(values)
@@ -234,25 +174,6 @@ def _column(name: str, values: ArrayLike, shape: tuple[int, ...]) -> np.ndarray[
 def facts_of(source: Any) -> dict[str, Any]:
     """Return the metadata that scenes of all kinds have of their files, by the names of its attributes."""
     return {name: getattr(source, name) for name in ("antialiased", "format", "notes", "header", "up", "up_by")}
-
-
-@dataclass(frozen=True, eq=False)
-class NodeStream:
-    """The M nodes of a tree in their final order, read window by window.
-
-    Attributes:
-        count: M.
-        sh_degree: of all windows.
-        antialiased, up: as in `Scene`.
-        read: called with a range of nodes, returns them and their tree columns, whose `child_start` counts from the
-            first node of the whole tree; may be called again, from several threads at once.
-    """
-
-    count: int
-    sh_degree: int
-    antialiased: bool
-    read: Callable[[int, int], tuple[Splats, LodTree]]
-    up: str | None = None
 
 
 def up_notes(up: str | None, up_by: str) -> tuple[str, ...]:

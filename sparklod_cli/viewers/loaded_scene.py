@@ -6,19 +6,22 @@ import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..codecs.formats import PRECISIONS
 from ..model.lod_tree import CHUNK_NODES, LodTree
-from ..model.scene import FileCoding, Scene
+from ..model.scene import Scene
 from ..model.splats import COLUMNS, Splats
 from ..model.traversed import Nodes
 from .cut import Forest, TreeInstance, Viewer
 from .spark import SparkViewer, header_answers
 from .viewer_settings import FETCHERS, LodSettings
+
+if TYPE_CHECKING:
+    from ..model.file_coding import FileCoding
 
 Index = NDArray[np.signedinteger]
 
@@ -152,7 +155,7 @@ class LoadedScene:
         return header_answers(self.scene.header.get("header_bytes", 0), self.bytes) if self.has_chunks else ()
 
 
-def nodes_of(splats: Splats, tree: LodTree, coding: FileCoding, *, precision: str, threads: int) -> Nodes:
+def nodes_of(splats: Splats, tree: LodTree, coding: FileCoding | None, *, precision: str, threads: int) -> Nodes:
     """Return nodes as a traversal reads them, in one of `codecs.formats.PRECISIONS`."""
     if precision == "float32":
         return Nodes.of(splats, tree)

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from ..cameras.framing import SAMPLE, USED, Balls, balls_of
 from ..io.rad_file import RadFile
 from ..lod.kernels.pixel_scale import NODE
+from ..model.file_coding import FileCoding
 from ..model.instances import Instance
 from ..model.lod_tree import CHUNK_BITS, CHUNK_NODES, LodTree
-from ..model.scene import FileCoding
 from ..model.splats import COLUMNS, Splats
 from ..model.traversed import Nodes
 from ..system.errors import TreeError, naming

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import sparklod_cli as sparklod
+from sparklod_cli.api.files import Tree
 from sparklod_cli.bake.flow import bake
 from sparklod_cli.bake.settings import BakeSettings
 from sparklod_cli.bake.simplifying import extract_leaves
@@ -18,7 +19,7 @@ from sparklod_cli.codecs.options import RadOptions, WriteOptions
 from sparklod_cli.codecs.spark_codings import SplatEncoding
 from sparklod_cli.lod.part_settings import DetailSettings
 from sparklod_cli.model.lod_tree import LodTree
-from sparklod_cli.model.scene import Scene, Tree
+from sparklod_cli.model.scene import Scene
 from sparklod_cli.system.errors import InvalidSplatsError, TreeError
 from sparklod_cli.system.output import write_file
 from tests.scenes import random_splats

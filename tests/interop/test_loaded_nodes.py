@@ -231,7 +231,7 @@ def test_files_written_by_hand_are_those_of_spark(spark: Spark, tmp_path: Path) 
     """Chunks of few splats, each with encodings and ranges of its own."""
     path = FIXTURES / "golden" / "sh1-tree.rad"
     scene = read_scene(path)
-    assert len(scene.coding.scales) == 3
+    assert scene.coding is not None and len(scene.coding.scales) == 3
     check_whole(spark, path)
 
 

@@ -18,7 +18,8 @@ from ...lod.families import band_order
 from ...lod.kernels.tree_links import find_limits
 from ...lod.stage_records import NO_FAMILY, STAGE_BITS
 from ...model.lod_tree import CHUNK_NODES, LodTree
-from ...model.scene import NodeStream, rotated_axis
+from ...model.node_stream import NodeStream
+from ...model.scene import rotated_axis
 from ...model.sh import degree_of, width_of
 from ...model.splats import COLUMNS, FloatArray, Splats
 from ...system.progress import Progress

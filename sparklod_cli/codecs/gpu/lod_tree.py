@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...model.file_coding import SPZ_SCALES, FileCoding, ScaleCoding
 from ...model.gaussian import size_factor, spark_size
 from ...model.lod_tree import MAX_CHILDREN, LodTree
-from ...model.scene import PLAIN, FileCoding, ScaleCoding
 from ...model.splats import FloatArray, Splats
 from ...model.traversed import Nodes
 from ...system.errors import FormatError
@@ -89,7 +89,7 @@ _LEAST = np.finfo(np.float32).smallest_subnormal
 _SAME = np.float32(2**-20)
 
 
-def nodes(splats: Splats, tree: LodTree, layout: str, coding: FileCoding = PLAIN, *, threads: int = 1) -> Nodes:
+def nodes(splats: Splats, tree: LodTree, layout: str, coding: FileCoding | None = None, *, threads: int = 1) -> Nodes:
     """Return the nodes of a tree as Spark's traversal reads them.
 
     Args:
@@ -98,6 +98,7 @@ def nodes(splats: Splats, tree: LodTree, layout: str, coding: FileCoding = PLAIN
         coding: of the file that they were read from. Scales that do not come from its codes, or of splats that were not
             read from a file, are taken to be those that Spark has.
     """
+    coding = coding or FileCoding()
     alpha_held, scale_held = _layout(layout, coding.packed_range)
     found = Nodes(np.empty((len(splats), 3), np.float32), np.empty(len(splats), np.float32), tree)
     for rows, scales in coding.parts(len(splats)):
@@ -154,14 +155,15 @@ def _half_log(scale: FloatArray) -> NDArray[np.uint16]:
 def _recoded(coding: ScaleCoding, held: Recode) -> Recode:
     """Return what a layout keeps (`held`) of scales that come from codes, whose last bits are others in Spark."""
     code_of: Callable[[FloatArray], NDArray[Any]]
-    if coding.name == "ln_0r8":
-        code_of = functools.partial(spark_codings.encode_log_scale, low=coding.low, high=coding.high)
-        scale_of = spark_codings.log_scale_table(coding.low, coding.high)
-        theirs = spark_codings.log_scale_table(coding.low, coding.high, exp=spark_codings.exp)
-    elif coding.name in ("spz", "ln_f16"):
+    name, low, high = coding
+    if name == "ln_0r8":
+        code_of = functools.partial(spark_codings.encode_log_scale, low=low, high=high)
+        scale_of = spark_codings.log_scale_table(low, high)
+        theirs = spark_codings.log_scale_table(low, high, exp=spark_codings.exp)
+    elif coding == SPZ_SCALES or name == "ln_f16":
         logs: NDArray[Any] = _HALVES.astype(np.float32)
         code_of = _half_log
-        if coding.name == "spz":
+        if coding == SPZ_SCALES:
             logs = np.arange(256, dtype=np.float32) / quantize.SCALE_STEPS - quantize.SCALE_OFFSET
             code_of = quantize.encode_log_scale
         scale_of, theirs = np.exp(logs), spark_codings.exp(logs)

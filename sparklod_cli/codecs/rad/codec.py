@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from zlib_ng import zlib_ng
 
 from ...model.lod_tree import CHUNK_NODES, LodTree
-from ...model.scene import NodeStream, Scene
+from ...model.node_stream import NodeStream
+from ...model.scene import Scene
 from ...model.sh import COEFFICIENTS
 from ...model.splats import COLUMNS, FloatArray, Splats
 from ...system.progress import Progress, silent
@@ -93,10 +94,10 @@ class Palette:
     @classmethod
     def of(cls, scene: Scene | NodeStream, most: int, threads: int, progress: Progress) -> Palette:
         """Cluster the SH of a scene to at most `most` codes; zeros follow, up to as many as Spark reads."""
-        if isinstance(scene, NodeStream):
-            splats, count = _sample(scene), scene.count
-        else:
+        if isinstance(scene, Scene):
             splats, count = scene.splats, len(scene)
+        else:
+            splats, count = _sample(scene), scene.count
         room = min(count, CHUNK_NODES)
         weight = sh_palette.visible_weight(splats)
         found = sh_palette.cluster(splats.sh, min(most, room), weight=weight, threads=threads, progress=progress)

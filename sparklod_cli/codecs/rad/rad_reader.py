@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...model import MAX_SH_DEGREE
+from ...model.file_coding import PLAIN_SCALES, FileCoding, ScaleCoding
 from ...model.lod_tree import LodTree
-from ...model.scene import FileCoding, ScaleCoding
 from ...model.sh import COEFFICIENTS, width_of
 from ...model.splats import COLUMNS, FloatArray, Splats
 from ...system.errors import FormatError, TooLongError, TruncatedError
@@ -181,7 +181,7 @@ class RadReader:
 
     def content(self) -> Reader:
         header, size = self.header, self.header.chunk_size
-        codings = [ScaleCoding()] * max(len(header.chunks), 1)
+        codings = [PLAIN_SCALES] * max(len(header.chunks), 1)
 
         def fill_rows(target: Target, threads: int, progress: Progress) -> None:
             def work(packed: PackedChunk) -> int:
@@ -354,8 +354,8 @@ class PackedChunk:
     def scale_coding(self) -> ScaleCoding:
         scales = next((each for each in self.header.properties if each.name == "scales"), None)
         if scales is None or not scales.encoding.startswith("ln_"):
-            return ScaleCoding()
-        return ScaleCoding(scales.encoding, scales.min or 0.0, scales.max or 0.0)
+            return PLAIN_SCALES
+        return (scales.encoding, scales.min or 0.0, scales.max or 0.0)
 
     def palette(self, header: RadHeader) -> FloatArray | None:
         """Return (codes, K, 3) SH coefficients that labels point to; None where the chunk has no palette."""

@@ -15,13 +15,14 @@ from sparklod_cli.codecs.formats import LOADED
 from sparklod_cli.codecs.gpu import ext_splats, lod_tree, packed_splats
 from sparklod_cli.codecs.spark_codings import SplatEncoding, log_scale_table
 from sparklod_cli.lod import quick
+from sparklod_cli.model.file_coding import PLAIN_SCALES, SPZ_SCALES, FileCoding, ScaleCoding
 from sparklod_cli.model.lod_tree import LodTree
-from sparklod_cli.model.scene import PLAIN, FileCoding, ScaleCoding, Scene
+from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.model.traversed import Nodes
 from tests.scenes import random_splats
 
-SPZ = FileCoding((ScaleCoding("spz"),), 1)
+SPZ = FileCoding((SPZ_SCALES,))
 NARROW = SplatEncoding(ln_scale_min=-9, ln_scale_max=1, lod_opacity=True)
 
 
@@ -30,7 +31,7 @@ def scene() -> Scene:
     return Scene(*quick.build(random_splats(40_000)))
 
 
-def nodes(scene: Scene, layout: str, coding: FileCoding = PLAIN, threads: int = 1) -> Nodes:
+def nodes(scene: Scene, layout: str, coding: FileCoding | None = None, threads: int = 1) -> Nodes:
     assert scene.tree is not None
     return lod_tree.nodes(scene.splats, scene.tree, layout, coding, threads=threads)
 
@@ -47,7 +48,7 @@ def unpacked(scene: Scene, layout: str, encoding: SplatEncoding) -> Splats:
 def test_nodes_are_nearly_those_of_unpacked_words(scene: Scene, layout: str, encoding: SplatEncoding) -> None:
     """The range of the file is that of PackedSplats, but not of those in pages."""
     assert scene.tree is not None
-    coding = FileCoding((ScaleCoding(),), 1, (NARROW.ln_scale_min, NARROW.ln_scale_max))
+    coding = FileCoding(packed_range=(NARROW.ln_scale_min, NARROW.ln_scale_max))
     found = nodes(scene, layout, coding)
     twin = lod_tree.unpack(lod_tree.pack(unpacked(scene, layout, encoding), scene.tree))
     assert np.array_equal(found.center, twin.center)
@@ -66,18 +67,18 @@ def with_scales(scene: Scene, scale: np.ndarray) -> Scene:
 
 
 @pytest.mark.parametrize("layout", LOADED)
-@pytest.mark.parametrize("coding", [ScaleCoding("spz"), ScaleCoding("ln_0r8", -12, 9), ScaleCoding("ln_f16")])
+@pytest.mark.parametrize("coding", [SPZ_SCALES, ("ln_0r8", -12, 9), ("ln_f16", 0, 0)])
 def test_codes_are_decoded_as_spark_decodes_them(scene: Scene, layout: str, coding: ScaleCoding) -> None:
     """Not by the scales that they have in `Splats`, whose last bits differ and decide ties."""
     codes = np.random.default_rng(0).integers(1, 256, (len(scene), 3)).astype(np.uint8)
     logs = codes.astype(np.float32) / 16 - 10
-    if coding.name == "ln_0r8":
+    if coding[0] == "ln_0r8":
         ours, theirs = log_scale_table(-12, 9)[codes], log_scale_table(-12, 9, exp=spark_codings.exp)[codes]
     else:
-        ours = quantize.decode_log_scale(codes) if coding.name == "spz" else np.exp(logs)
+        ours = quantize.decode_log_scale(codes) if coding == SPZ_SCALES else np.exp(logs)
         theirs = spark_codings.exp(logs)
     assert not np.array_equal(ours, theirs)
-    known = nodes(with_scales(scene, ours), layout, FileCoding((coding,), 1))
+    known = nodes(with_scales(scene, ours), layout, FileCoding((coding,)))
     assert np.array_equal(known.size, nodes(with_scales(scene, theirs), layout).size)
 
 
@@ -89,11 +90,11 @@ def test_scales_that_do_not_come_from_codes_are_taken_as_they_are(scene: Scene, 
 
 
 def test_runs_of_splats_have_codings_of_their_own(scene: Scene) -> None:
-    plain, spz = ScaleCoding(), ScaleCoding("spz")
+    plain, spz = PLAIN_SCALES, SPZ_SCALES
     ours = with_scales(scene, quantize.decode_log_scale(quantize.encode_log_scale(scene.splats.scale)))
     half = FileCoding((spz, spz, plain, plain), 10_000)
     assert [(part.start, part.stop) for part, _ in half.parts(len(scene))] == [(0, 20_000), (20_000, len(scene))]
-    found, coded, uncoded = (nodes(ours, "ext", coding).size for coding in (half, SPZ, PLAIN))
+    found, coded, uncoded = (nodes(ours, "ext", coding).size for coding in (half, SPZ, None))
     assert np.array_equal(found[:20_000], coded[:20_000])
     assert np.array_equal(found[20_000:], uncoded[20_000:])
 
