@@ -20,15 +20,8 @@ MAX_FRACTIONAL_BITS = 24
 MIN_COMPRESSION, MAX_COMPRESSION, DEFAULT_COMPRESSION = 1, 9, 5
 
 #: Entries of a palette of spherical harmonics: Spark's labels have 16 bits.
-MIN_SH_CODES, MAX_SH_CODES = 2, 65_536
-
-
-#: Entries of a palette of spherical harmonics.
-SH_CODES = whole(MIN_SH_CODES, MAX_SH_CODES)
-
-#: Binary digits after the point of a coordinate: the smallest number of float32 has 149.
-CENTER_BITS = whole(-149, 149)
-
+MAX_SH_CODES = 65_536
+SH_CODES = whole(2, MAX_SH_CODES)
 
 #: Profiles of GLB: attributes as KHR_gaussian_splatting defines them, and SPZ as CesiumJS reads it.
 KHRONOS, CESIUM = PROFILES = ("khronos", "cesium")
@@ -65,10 +58,6 @@ class RadOptions(CheckedSettings):
 
     Attributes:
         chunked: write each chunk into a file of its own.
-        sh_codes: the most entries of a palette of spherical harmonics, which a label for each splat points into; None
-            for coefficients of each splat's own.
-        center_bits: centres are rounded to multiples of 2 ** -center_bits; None leaves them as they are, but where
-            `center` is "auto" it is chosen, too.
         ranges: of the codes; None for those that suit the scene.
     """
 
@@ -81,32 +70,31 @@ class RadOptions(CheckedSettings):
     orientation: str = _encoding("orientation", "rotations")
     sh: str = _encoding("sh", "spherical harmonics")
     chunked: bool = False
-    sh_codes: int | None = None
-    center_bits: int | None = None
+    sh_codes: int | None = setting(
+        "Most entries of a palette of spherical harmonics, which a label for each splat points into; None for"
+        " coefficients of each splat's own.",
+        SH_CODES,
+        only_api=True,
+    )
+    center_bits: int | None = setting(
+        "Round centres to multiples of 2 ** -center_bits; None leaves them as they are, but where `center` is auto it"
+        " is chosen, too.",
+        whole(-149, 149),  # the smallest number of float32 has 149 binary digits after the point
+        only_api=True,
+    )
     ranges: SplatEncoding | None = None
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.sh_codes is not None:
-            SH_CODES.check("sh_codes", self.sh_codes)
-        if self.center_bits is not None:
-            CENTER_BITS.check("center_bits", self.center_bits)
 
 
 @dataclass(frozen=True)
-class SogOptions:
-    """Options of SOG files.
+class SogOptions(CheckedSettings):
+    """Options of SOG files."""
 
-    Attributes:
-        sh_codes: the most entries of the palette of spherical harmonics, which a label for each splat points into; None
-            for as many as suit the number of splats, see `sog.codec.codes_for`.
-    """
-
-    sh_codes: int | None = None
-
-    def __post_init__(self) -> None:
-        if self.sh_codes is not None:
-            SH_CODES.check("sh_codes", self.sh_codes)
+    sh_codes: int | None = setting(
+        "Most entries of the palette of spherical harmonics, which a label for each splat points into; None for as many"
+        " as suit the number of splats, see `sog.codec.codes_for`.",
+        SH_CODES,
+        only_api=True,
+    )
 
 
 @dataclass(frozen=True)

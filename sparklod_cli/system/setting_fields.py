@@ -94,6 +94,7 @@ class Setting:
         name: of the parameter of a command, from which its flag is made; empty for that of the field.
         needs: parameter without which the option does nothing; with "=VALUE", one that must have that value.
         excludes: parameters that cannot be given together with the option.
+        only_api: the command line has no such option.
         attributes: further ones of the option.
     """
 
@@ -102,6 +103,7 @@ class Setting:
     name: str = ""
     needs: str = ""
     excludes: tuple[str, ...] = ()
+    only_api: bool = False
     attributes: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -113,10 +115,11 @@ def setting(
     name: str = "",
     needs: str = "",
     excludes: tuple[str, ...] = (),
+    only_api: bool = False,
     **attributes: Any,
 ) -> Any:
     """Return a dataclass field with a `Setting`, whose attributes the arguments are, and a default value."""
-    declared = Setting(help, kind, name, needs, excludes, attributes)
+    declared = Setting(help, kind, name, needs, excludes, only_api, attributes)
     return field(default=default, metadata={SETTING: declared})
 
 
@@ -129,10 +132,10 @@ def setting_of(kind: type[Any], name: str, **attributes: Any) -> Any:
 
 
 def settings_in(kind: type[Any]) -> Iterator[tuple[dataclasses.Field[Any], Setting | None]]:
-    """Yield the fields of a dataclass that are settings, and those that are groups of settings, with None."""
+    """Yield the fields of a dataclass that are options, and those that are groups of options, with None."""
     for each in dataclasses.fields(kind):
         declared = each.metadata.get(SETTING)
-        if declared is not None or dataclasses.is_dataclass(each.default_factory):
+        if (declared is not None and not declared.only_api) or dataclasses.is_dataclass(each.default_factory):
             yield each, declared
 
 
@@ -152,8 +155,8 @@ class CheckedSettings:
             cls.__doc__ = "\n".join([text + heading, *helps])
 
     def __post_init__(self) -> None:
-        for each, declared in settings_in(type(self)):
-            value = getattr(self, each.name)
+        for each in dataclasses.fields(self):  # type: ignore[arg-type]
+            declared, value = each.metadata.get(SETTING), getattr(self, each.name)
             if declared is None or value is each.default:
                 continue
             allowed = declared.kind.range if isinstance(declared.kind, Quantity) else declared.kind
