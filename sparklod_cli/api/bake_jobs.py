@@ -33,8 +33,9 @@ Outcome = Union[Baked, "Extracted", SparklodError, None]
 
 
 def merged_source(files: Sequence[Place], instances: Sequence[Instance] = ()) -> Source:
-    """Return the source that is one scene of files, or else of instances, each where it stands."""
-    return Merged.of_instances(instances) if instances else Merged.of(files)
+    """Return the source that is one scene of files, or else of the files of instances, each where it stands."""
+    placed = tuple((each.file, each.transform) for each in instances if each.file is not None)
+    return Merged(placed) if placed else Merged.of(files)
 
 
 def bake_files(

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..model.gaussian import normalized_quat
 from ..model.sh import COEFFICIENTS
-from ..model.splats import FloatArray, Splats
+from ..model.splats import FloatArray
 from ..system.errors import FormatError, TruncatedError
 from ..system.progress import Progress
 from ..system.threads import BLOCK_ROWS, blocks_of, ordered_map
@@ -36,40 +36,25 @@ HALF_NODE = np.dtype(
 BOX_NUMBERS = 8
 
 
-def _put_center(splats: Splats, values: FloatArray) -> None:
-    splats.center[:] = values
-
-
-def _put_rotation(splats: Splats, wxyz: FloatArray) -> None:
-    splats.quat_xyzw[:] = normalized_quat(wxyz)[:, [1, 2, 3, 0]]
-
-
-def _put_scale(splats: Splats, values: FloatArray) -> None:
-    splats.scale[:] = quantize.decode_log(values)
-
-
-def _put_opacity(splats: Splats, values: FloatArray) -> None:
-    # Linear. The optimiser of hierarchies does not bound it; a leaf is an input splat.
-    splats.opacity[:] = np.minimum(values[:, 0], np.float32(1))
-
-
-def _put_colours(splats: Splats, values: FloatArray) -> None:
-    coefficients = values.reshape(len(values), -1, 3)
-    splats.rgb[:] = quantize.decode_dc(coefficients[:, 0])
-    splats.sh[:] = coefficients[:, 1:]
-
-
 #: SH degree of all files.
 DEGREE = 3
 
 #: The columns in the order of the file: the numbers of a splat, whether they are floats even where the file has halves,
-#: and the decoder of (n, numbers) values into a column of n splats.
-COLUMNS: tuple[tuple[int, bool, Callable[[Splats, FloatArray], None]], ...] = (
-    (3, True, _put_center),
-    (4, False, _put_rotation),
-    (3, False, _put_scale),
-    (1, False, _put_opacity),
-    (3 * (1 + COEFFICIENTS[DEGREE]), False, _put_colours),
+#: and the decoders of (n, numbers) values into columns of `Splats`.
+COLUMNS: tuple[tuple[int, bool, dict[str, Callable[[FloatArray], FloatArray]]], ...] = (
+    (3, True, {"center": np.asarray}),
+    (4, False, {"quat_xyzw": lambda wxyz: normalized_quat(wxyz)[:, [1, 2, 3, 0]]}),
+    (3, False, {"scale": quantize.decode_log}),
+    # Linear. The optimiser of hierarchies does not bound it; a leaf is an input splat.
+    (1, False, {"opacity": lambda values: np.minimum(values[:, 0], np.float32(1))}),
+    (
+        3 * (1 + COEFFICIENTS[DEGREE]),
+        False,
+        {
+            "rgb": lambda values: quantize.decode_dc(values[:, :3]),
+            "sh": lambda values: values[:, 3:].reshape(len(values), -1, 3),
+        },
+    ),
 )
 
 
@@ -93,10 +78,11 @@ def open_content(source: OpenFile) -> Reader:
             first, last = np.searchsorted(rows, [part.start, part.stop])
             splats = target.splats.rows(slice(first, last))
             some = rows[first:last] - part.start
-            for (_, _, put), row_type, start in zip(COLUMNS, types, starts[:-1], strict=True):
+            for (_, _, decoders), row_type, start in zip(COLUMNS, types, starts[:-1], strict=True):
                 between = rows_of(source.read_at, int(start), row_type, part.start, part.stop, count)
-                values = np.concatenate([values for _, values in between])
-                put(splats, values[some].astype(np.float32))
+                values = np.concatenate([values for _, values in between])[some].astype(np.float32)
+                for name, decode in decoders.items():
+                    getattr(splats, name)[:] = decode(values)
             return target.start + int(last)
 
         rows = leaves[target.start : target.stop]

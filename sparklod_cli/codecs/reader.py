@@ -39,16 +39,15 @@ BLOCK_BYTES = 1 << 18
 #: A block of rows: which rows, and their content.
 Rows = tuple[slice, NDArray[Any]]
 
-#: Reads the next `size` bytes, or fewer at the end of the data; or those from a place on.
+#: Reads the next `size` bytes, or fewer at the end of the data; or `size` bytes from a position on.
 Read = Callable[[int], bytes | memoryview]
 ReadAt = Callable[[int, int], bytes | memoryview]
-
 
 #: Opens a file that another one names; raises `FormatError` where it cannot.
 OpenCompanion = Callable[[str], BinaryIO]
 
-#: Opens a file of these bytes, which are made only if they have not been before; for formats whose splats do not lie
-#: one after the other. The file stays open as long as the one that is read.
+#: Opens an unpacked file with these bytes, which are made at the first call, for formats whose splats do not lie one
+#: after the other. The file stays open as long as the one that is read.
 Scratch = Callable[[Callable[[], Iterable[bytes]]], "OpenFile"]
 
 
@@ -65,9 +64,9 @@ class OpenFile:
     Attributes:
         file: open for reading, at its beginning, until the last read.
         size: bytes of the file.
-        open_companion: opens the files that it names; None if there are none to open.
-        scratch: keeps what has to be unpacked before rows can be read in any order; None to read all rows once.
-        threads: number that read the files which it names.
+        open_companion: opens the files that it names; None if no other files can be opened.
+        scratch: keeps data that must be unpacked before rows can be read in any order; None to read all rows once.
+        threads: number of threads that read the files which it names.
     """
 
     def __init__(
@@ -220,11 +219,20 @@ class Reader:
         return splats, tree
 
     def scene(self, *, columns: Collection[str] = COLUMNS, progress: Progress = silent, validate: bool = True) -> Scene:
-        """Read all splats, once; `validate` refuses a broken tree."""
+        """Read all splats, once; `validate` refuses a broken tree, and gives leaves a `child_start` of 0."""
         splats, tree = self.read(0, self.count, columns, progress, once=True)
         coding = None if self.coding is None else self.coding()
         scene = Scene(splats, tree, chunk_bytes=self.chunk_bytes, coding=coding, **facts_of(self))
-        return with_valid_tree(scene, scene.tree) if validate and scene.tree is not None else scene
+        tree = scene.tree  # which knows that it is valid once it has been validated
+        if tree is None or not validate:
+            return scene
+        try:
+            tree.validate()
+        except TreeError as error:
+            raise FormatError(f"its Level-of-Detail tree is broken: {error}") from error
+        start = tree.first_child()
+        is_same = np.array_equal(start, tree.child_start)
+        return scene if is_same else dataclasses.replace(scene, tree=LodTree(tree.child_count, start))
 
     def blocks(self, start: int = 0, stop: int | None = None) -> Iterator[Splats]:
         """Read a range of splats, all by default, in blocks; raises as `check_plain` and `read`."""
@@ -373,18 +381,6 @@ def read_comment(comment: str | bytes | None) -> FileNote:
         return read_note(parse_json(comment))
     except ValueError:
         return FileNote()
-
-
-def with_valid_tree(scene: Scene, tree: LodTree) -> Scene:
-    """Return a scene whose tree is valid and has leaves with a `child_start` of 0; raises `FormatError` if broken."""
-    try:
-        tree.validate()
-    except TreeError as error:
-        raise FormatError(f"its Level-of-Detail tree is broken: {error}") from error
-    start = tree.first_child()
-    if np.array_equal(start, tree.child_start):
-        return scene  # whose tree knows that it is valid
-    return dataclasses.replace(scene, tree=LodTree(tree.child_count, start))
 
 
 def is_valid_and_visible(splats: Splats, threads: int) -> tuple[bool, bool]:

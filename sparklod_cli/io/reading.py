@@ -29,7 +29,6 @@ from .local_files import in_folder, open_named, reason_unreadable
 if TYPE_CHECKING:
     from ..codecs.encoder import Stored
     from ..codecs.gpu import dump
-    from ..model.instances import Instance
     from ..model.transforms import Transform
     from ..model.traversed import DetailScene, TileScene
 
@@ -57,11 +56,6 @@ class Merged:
         from ..model.transforms import Transform
 
         return cls(tuple((place, Transform()) for place in places))
-
-    @classmethod
-    def of_instances(cls, instances: Sequence[Instance]) -> Merged:
-        """Return the files of instances, where these stand."""
-        return cls(tuple((each.file, each.transform) for each in instances if each.file is not None))
 
     def __str__(self) -> str:
         return count_of(len(self.files), "file")
