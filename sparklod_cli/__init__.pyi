@@ -31,7 +31,6 @@ if TYPE_CHECKING:  # mypy then resolves the modules first, which import this one
     from .api.views import traverse as traverse
     from .api.writing import Written as Written
     from .api.writing import write as write
-    from .bake.simplifying import Refined as Refined
     from .cameras.camera import Camera as Camera
     from .cameras.sources import CameraPath as CameraPath
     from .codecs.options import RadOptions as RadOptions
@@ -42,6 +41,7 @@ if TYPE_CHECKING:  # mypy then resolves the modules first, which import this one
     from .codecs.rad.rad_header import RadHeader as RadHeader
     from .codecs.spark_codings import SplatEncoding as SplatEncoding
     from .fitting.settings import FitSettings as FitSettings
+    from .fitting.settings import Refined as Refined
     from .inspection.report import Report as Report
     from .lod.part_settings import DetailSettings as DetailSettings
     from .model.foveation import Cones as Cones

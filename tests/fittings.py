@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli.fitting import fit as fitting
-from sparklod_cli.fitting.settings import SHARES, FitReport, FitSettings, FitStage
+from sparklod_cli.fitting.settings import SHARES, FitSettings, FitStage, Refined
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.splats import COLUMNS, Splats
 
@@ -53,14 +53,14 @@ class StandIn:
 
     def __call__(
         self, nodes: Splats, tree: LodTree, settings: FitSettings, *, say: Callable[[str], None], **how: Any
-    ) -> tuple[Splats, FitReport]:
+    ) -> tuple[Splats, Refined]:
         """Changes merged splats."""
         self.calls.append((settings, how))
         steps = settings.steps or STEPS
         how["progress"]("refining", steps, steps, "step")
         say("fit 1 of 1: 2 % 30.0 -> 32.5 dB")
         stages = (FitStage("colours", steps, BEFORE, AFTER),)
-        report = FitReport(steps, stages, BEFORE, AFTER, self.kept, is_complete=self.is_complete)
+        report = Refined(steps, stages, BEFORE, AFTER, self.kept, self.is_complete, settings.seed)
         return changed(nodes, tree, settings.seed) if self.kept else nodes, report
 
 

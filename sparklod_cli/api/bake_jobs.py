@@ -63,7 +63,7 @@ def bake_files(
         say: receives one-line messages for the user.
         skip: skip outputs of the same inputs and settings: "date" compares sizes and dates, "verify" contents; None
             bakes all.
-        scheduler, workers, cluster_threads: see `ClusterSettings`; a cluster is used if one of the first two is given.
+        scheduler, workers, cluster_threads: see `cluster`; one is used if one of the first two is given.
 
     Raises:
         SparklodError: there is no such cluster.
@@ -78,11 +78,11 @@ def bake_files(
     with contextlib.ExitStack() as stack:
         outcomes: Iterator[Any] = itertools.repeat(LARGE)
         if scheduler is not None or workers is not None:
-            from ..bake.out_of_core.cluster import ClusterSettings, cluster
-            from ..bake.side_by_side import bake_side_by_side
+            from ..bake.out_of_core.cluster import bake_side_by_side, cluster
 
-            chosen = ClusterSettings(scheduler, workers or 1, cluster_threads)
-            engine = stack.enter_context(cluster(chosen, memory=memory, say=say))
+            engine = stack.enter_context(
+                cluster(scheduler, workers=workers or 1, threads=cluster_threads, memory=memory, say=say)
+            )
             resources = dataclasses.replace(resources, memory=engine.memory)
             if len(pairs) > 1:
                 small = bake_side_by_side(pairs, **how, engine=engine, resources=resources, make=make)

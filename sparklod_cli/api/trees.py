@@ -7,12 +7,12 @@ from collections.abc import Callable, Iterable
 
 from ..bake.in_memory import build_tree, select
 from ..bake.settings import BakeSettings
-from ..bake.simplifying import Refined, Simplifier, SimplifyGoal, refined
+from ..bake.simplifying import SimplifyGoal, refined, simplified
 from ..cameras.camera import Camera
 from ..cameras.sources import CameraPath
 from ..codecs.reader import check_valid
 from ..fitting import STEPS
-from ..fitting.settings import FitSettings
+from ..fitting.settings import FitSettings, Refined
 from ..lod.builders import (
     BUILDERS,
     DEFAULT_BASE,
@@ -135,8 +135,10 @@ def simplify(
     else:
         check_valid(scene.splats, thread_count(threads))
     with on_threads(threads) as count, progress_callback(progress) as callback, memory_errors_translated():
-        simplifier = Simplifier(goal, fitting, None if path is None else path.cameras)
-        chosen, *_ = simplifier.choose(scene, bytes_of=len, threads=count, progress=callback)
+        cameras = None if path is None else path.cameras
+        chosen, *_ = simplified(
+            scene, goal, refine=fitting, cameras=cameras, bytes_of=len, threads=count, progress=callback
+        )
         return Scene(chosen.splats, antialiased=scene.antialiased, up=scene.up)
 
 

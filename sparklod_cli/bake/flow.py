@@ -68,15 +68,14 @@ def bake(
         KeyboardInterrupt: see `refined`.
     """
     with memory_errors_translated(), contextlib.ExitStack() as stack:
-        resources, fitting, blocks = resources or Resources(), None, None
-        if settings.refine is not None and settings.simplify is None:  # of a simplified scene, its one cut is fitted
-            fitting = settings.refine
-            if settings.camera_path is not None:
-                from ..cameras.camera_files import read_path
-
-                fitting = dataclasses.replace(fitting, path=read_path(settings.camera_path))
+        resources, fitting, cameras, blocks = resources or Resources(), settings.refine, None, None
         overwrite = overwrite or (resources.resume and has_published(source, target, settings, resources))
-        tree = output_of(target, settings, overwrite=overwrite, say=say)
+        tree = output_of(target, settings, overwrite=overwrite)
+        if settings.camera_path is not None:
+            from ..cameras.camera_files import read_path
+
+            path = read_path(settings.camera_path)
+            fitting, cameras = fitting and dataclasses.replace(fitting, path=path), path.cameras
         opened = stack.enter_context(contextlib.ExitStack())
         reader = opened.enter_context(open_reader(source, threads=threads))
         if not reader.has_tree and _may_need_blocks(reader, source, target, settings, resources, engine):
@@ -106,7 +105,7 @@ def bake(
         del reader  # which may hold much memory
         if blocks is None:
             build(tree, source, threads, progress)
-            if fitting is not None:
+            if fitting is not None and settings.simplify is None:  # of a simplified scene, its one cut is fitted
                 from .simplifying import refined
 
                 assert isinstance(tree.nodes, Scene)
@@ -117,7 +116,7 @@ def bake(
             blocks.build(tree)
             blocks.order(tree)
         if tree.form is None:
-            write_whole(tree, threads, progress)
+            write_whole(tree, threads, progress, refine=fitting, cameras=cameras, say=say)
         else:
             write_windows(tree, None if blocks is None else blocks.encode, threads, progress)
         if blocks is not None:

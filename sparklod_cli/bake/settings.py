@@ -15,12 +15,12 @@ from ..model.selection import Selection
 
 if TYPE_CHECKING:
     from ..codecs.encoder import Clamp
-    from ..fitting.settings import FitSettings
+    from ..fitting.settings import FitSettings, Refined
     from ..lod.part_settings import DetailSettings, TileSettings
     from ..model.transforms import Transform
     from ..system.addresses import Place
     from .parts_output import WrittenDetail, WrittenTiles
-    from .simplifying import Refined, SimplifyGoal, WrittenSet
+    from .simplifying import SimplifyGoal, WrittenSet
 
 #: Suffix of the format that is written unless another one is chosen.
 SPZ = ".spz"

@@ -8,8 +8,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +18,7 @@ from ..codecs.losses import Losses, settled_with_losses
 from ..codecs.options import WriteOptions
 from ..codecs.reader import check_valid
 from ..codecs.spz import like
-from ..fitting.settings import FitReport, FitSettings
+from ..fitting.settings import FitSettings, Refined
 from ..io import read_scene
 from ..io.writing import encoded, scene_output, write_scene
 from ..model.falloff import MIN_ALPHA
@@ -169,115 +168,99 @@ class Fidelity:
         return self.psnr(cut)
 
 
-@dataclass(frozen=True)
-class Simplifier:
-    """Simplification of trees to a goal.
+def simplified(
+    tree: Scene,
+    goal: SimplifyGoal,
+    *,
+    refine: FitSettings | None,
+    cameras: Sequence[Camera] | None,
+    bytes_of: Callable[[Scene], float],
+    threads: int,
+    progress: Progress,
+    say: Callable[[str], None] = lambda text: None,
+) -> tuple[Scene, int, float | None, Refined | None]:
+    """Find the cut of a tree that meets a goal, and fit it if requested.
 
-    Attributes:
+    Args:
         refine: how the cut is fitted to pictures of full detail, for all cameras; None for not at all.
         cameras: for a PSNR; None for cameras around and inside the scene.
+        bytes_of: size of the file of a scene.
+
+    Returns:
+        the cut as a scene without a tree, `WrittenSet.faint`, and its PSNR and the result of fitting it, if requested.
+
+    Raises:
+        FormatError, SparklodError: see `count_for` and `Fidelity`; or nothing could be seen of the cut.
+        KeyboardInterrupt: see `refined`.
+    """
+    from ..lod.detail_levels import RefinementOrder, with_plain_opacity
+
+    assert tree.tree is not None
+    progress("simplifying", 0, 1, "cut")
+    order, is_leaf = RefinementOrder(tree.splats, tree.tree), tree.tree.is_leaf
+    tree = dataclasses.replace(tree, splats=with_plain_opacity(tree.splats))
+
+    def cut(count: int) -> Scene:
+        return dataclasses.replace(tree, splats=tree.splats.take(order.cut(count)), tree=None)
+
+    fidelity = None if goal.psnr is None else Fidelity(tree, cameras, threads)
+    count, measured = count_for(
+        goal,
+        order.leaves,
+        bytes_of=lambda count: bytes_of(cut(count)),
+        psnr_of=lambda count: 0.0 if fidelity is None else fidelity.psnr(order.cut(count)),
+        progress=progress,
+    )
+    fixed, is_seen = order.cut(count), tree.splats.opacity >= MIN_ALPHA
+    faint = int(np.count_nonzero(~is_seen[fixed] & ~is_leaf[fixed]))
+    if faint and not is_seen[fixed].any() and is_seen[is_leaf].any():
+        raise SparklodError(
+            f"nothing could be seen of {count_of(len(fixed), 'splat')}: merged across wide gaps, their opacity is"
+            f" {tree.splats.opacity[fixed].max():.1g} at most, and viewers draw none"
+            f" below {MIN_ALPHA:.1g}; keep more splats"
+        )
+    if refine is None:
+        return cut(count), faint, measured, None
+    fitted, report = refined(tree, refine, fixed=fixed, threads=threads, progress=progress, say=say)
+    measured = None if fidelity is None else fidelity.fitted(fixed, fitted.splats)
+    scene = dataclasses.replace(fitted, splats=fitted.splats.take(fixed), tree=None)
+    return scene, faint, measured, report
+
+
+def write_simplified(
+    tree: Scene,
+    goal: SimplifyGoal,
+    out: Output,
+    form: Format,
+    options: WriteOptions,
+    leaves: int,
+    end: Callable[[str], None],
+    *,
+    threads: int,
+    progress: Progress,
+    **how: Any,
+) -> tuple[int, WrittenSet]:
+    """Cut a tree and write the cut, a scene without a tree; return the bytes of its files, and their record.
+
+    Args:
+        leaves: number of splats at full detail.
+        end: called with the name of each stage before the last one, when it is done.
+        how: further arguments of `simplified`.
     """
 
-    goal: SimplifyGoal
-    refine: FitSettings | None = None
-    cameras: Sequence[Camera] | None = None
-    say: Callable[[str], None] = lambda text: None
+    def bytes_of(scene: Scene) -> int:
+        files = encoded(out, form, scene, form.codec().settled(scene, options), threads=threads)
+        return sum(sum(map(len, pieces)) for _, pieces in files)
 
-    @classmethod
-    def of(
-        cls,
-        goal: SimplifyGoal,
-        refine: FitSettings | None,
-        camera_path: Path | None,
-        say: Callable[[str], None],
-    ) -> Simplifier:
-        """Return a simplifier with the cameras of a file, if one is given; raise `CameraPathError` for a bad one."""
-        if camera_path is None:
-            return cls(goal, refine, None, say)
-        from ..cameras.camera_files import read_path
-
-        path = read_path(camera_path)
-        return cls(goal, refine and dataclasses.replace(refine, path=path), path.cameras, say)
-
-    def choose(
-        self, tree: Scene, *, bytes_of: Callable[[Scene], float], threads: int, progress: Progress
-    ) -> tuple[Scene, int, float | None, Refined | None]:
-        """Find the cut of a tree that meets the goal, and fit it if requested.
-
-        Args:
-            bytes_of: size of the file of a scene.
-
-        Returns:
-            the cut as a scene without a tree, `WrittenSet.faint`, and its PSNR and the result of fitting it, if
-            requested.
-
-        Raises:
-            FormatError, SparklodError: see `count_for` and `Fidelity`; or nothing could be seen of the cut.
-            KeyboardInterrupt: see `refined`.
-        """
-        from ..lod.detail_levels import RefinementOrder, with_plain_opacity
-
-        assert tree.tree is not None
-        progress("simplifying", 0, 1, "cut")
-        order, is_leaf = RefinementOrder(tree.splats, tree.tree), tree.tree.is_leaf
-        tree = dataclasses.replace(tree, splats=with_plain_opacity(tree.splats))
-
-        def cut(count: int) -> Scene:
-            return dataclasses.replace(tree, splats=tree.splats.take(order.cut(count)), tree=None)
-
-        fidelity = None if self.goal.psnr is None else Fidelity(tree, self.cameras, threads)
-        count, measured = count_for(
-            self.goal,
-            order.leaves,
-            bytes_of=lambda count: bytes_of(cut(count)),
-            psnr_of=lambda count: 0.0 if fidelity is None else fidelity.psnr(order.cut(count)),
-            progress=progress,
+    with on_threads(threads):
+        scene, faint, psnr, refine = simplified(
+            tree, goal, bytes_of=bytes_of, threads=threads, progress=progress, **how
         )
-        fixed, is_seen = order.cut(count), tree.splats.opacity >= MIN_ALPHA
-        faint = int(np.count_nonzero(~is_seen[fixed] & ~is_leaf[fixed]))
-        if faint and not is_seen[fixed].any() and is_seen[is_leaf].any():
-            raise SparklodError(
-                f"nothing could be seen of {count_of(len(fixed), 'splat')}: merged across wide gaps, their opacity is"
-                f" {tree.splats.opacity[fixed].max():.1g} at most, and viewers draw none"
-                f" below {MIN_ALPHA:.1g}; keep more splats"
-            )
-        if self.refine is None:
-            return cut(count), faint, measured, None
-        fitted, report = refined(tree, self.refine, fixed=fixed, threads=threads, progress=progress, say=self.say)
-        measured = None if fidelity is None else fidelity.fitted(fixed, fitted.splats)
-        scene = dataclasses.replace(fitted, splats=fitted.splats.take(fixed), tree=None)
-        return scene, faint, measured, report
-
-    def write(
-        self,
-        tree: Scene,
-        out: Output,
-        form: Format,
-        options: WriteOptions,
-        leaves: int,
-        end: Callable[[str], None],
-        threads: int,
-        progress: Progress,
-    ) -> tuple[int, WrittenSet]:
-        """Cut a tree and write the cut, a scene without a tree; return the bytes of its files, and their record.
-
-        Args:
-            leaves: number of splats at full detail.
-            end: called with the name of each stage before the last one, when it is done.
-        """
-
-        def bytes_of(scene: Scene) -> int:
-            files = encoded(out, form, scene, form.codec().settled(scene, options), threads=threads)
-            return sum(sum(map(len, pieces)) for _, pieces in files)
-
-        with on_threads(threads):
-            scene, faint, psnr, refine = self.choose(tree, bytes_of=bytes_of, threads=threads, progress=progress)
-        settled, losses = settled_with_losses(scene, form, options, threads)
-        end("simplify")
-        size = write_scene(out, form, scene, settled, threads=threads, progress=progress)
-        count = len(scene)
-        share = round(count / leaves, 6)
-        return size, WrittenSet(**vars(losses), splats=count, share=share, faint=faint, psnr=psnr, refine=refine)
+    settled, losses = settled_with_losses(scene, form, options, threads)
+    end("simplify")
+    size = write_scene(out, form, scene, settled, threads=threads, progress=progress)
+    share = round(len(scene) / leaves, 6)
+    return size, WrittenSet(**vars(losses), splats=len(scene), share=share, faint=faint, psnr=psnr, refine=refine)
 
 
 @dataclass(frozen=True)
@@ -297,14 +280,6 @@ class WrittenSet(Losses):
     faint: int
     psnr: float | None
     refine: Refined | None
-
-
-@dataclass(frozen=True, kw_only=True)
-class Refined(FitReport):
-    """Result of fitting merged splats, as reported by `--json`; the seed is that of random cameras and budgets."""
-
-    seed: int
-    seconds: float
 
 
 def refined(
@@ -350,8 +325,8 @@ def refined(
     # Centres stay in their former box: with another one, a format may need another number of bits, and leaves move.
     before = scene.splats.center
     nodes = dataclasses.replace(nodes, center=nodes.center.clip(before.min(axis=0), before.max(axis=0)))
-    seconds = round(time.perf_counter() - start, 4)
-    return dataclasses.replace(scene, splats=nodes), Refined(**vars(report), seed=settings.seed, seconds=seconds)
+    report = dataclasses.replace(report, seconds=round(time.perf_counter() - start, 4))
+    return dataclasses.replace(scene, splats=nodes), report
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from ..codecs.encoder import Stored
     from ..codecs.statistics import Statistics
     from ..model.node_stream import NodeStream
-    from .simplifying import Simplifier
 
 
 @dataclass(kw_only=True, eq=False)
@@ -39,7 +38,6 @@ class BuiltTree:
         form: format of an SPZ or RAD file, which is written in windows; None for an output that is made of all nodes at
             once, in memory, and takes any tree.
         in_chunks: viewers read the output in chunks, for which nodes are ordered first.
-        simplifier: of a simplified scene, else None.
         stored: codes of unchanged nodes, which keep them; None for none.
         before: (N,) nodes with these codes.
         repacked: RAD file whose chunks are copied; None for none.
@@ -58,7 +56,6 @@ class BuiltTree:
     options: WriteOptions
     form: Format | None = None
     in_chunks: bool = False
-    simplifier: Simplifier | None = None
     stored: Stored | None = None
     before: Splats | None = None
     repacked: Place | None = None
@@ -76,10 +73,8 @@ class BuiltTree:
         self.started = now
 
 
-def output_of(
-    target: Place, settings: BakeSettings, *, overwrite: bool, say: Callable[[str], None] = lambda text: None
-) -> BuiltTree:
-    """Return a tree to be built, with its output; raise `OutputError` or `CameraPathError` now, before the work."""
+def output_of(target: Place, settings: BakeSettings, *, overwrite: bool) -> BuiltTree:
+    """Return a tree to be built, with its output; raise `OutputError` now, before the work."""
     options, simplify = settings.options, settings.simplify
     if settings.detail is not None or settings.tiles is not None:
         return BuiltTree(settings=settings, out=parts_output(target, overwrite=overwrite), options=options)
@@ -87,12 +82,9 @@ def output_of(
         return BuiltTree(settings=settings, out=Output(target, overwrite=overwrite), options=options)
     form = WRITABLE[settings.suffix]
     out = scene_output(target, form, chunked=options.rad.chunked, overwrite=overwrite)
-    if simplify is None:
-        return BuiltTree(settings=settings, out=out, options=options, form=form, in_chunks=form is WRITABLE[RAD])
-    from .simplifying import Simplifier
-
-    simplifier = Simplifier.of(simplify, settings.refine, settings.camera_path, say)
-    return BuiltTree(settings=settings, out=out, options=options, simplifier=simplifier)
+    if simplify is not None:
+        return BuiltTree(settings=settings, out=out, options=options)
+    return BuiltTree(settings=settings, out=out, options=options, form=form, in_chunks=form is WRITABLE[RAD])
 
 
 def keep_tree(tree: BuiltTree, source: Source, scene: Scene) -> None:
@@ -181,8 +173,12 @@ def write_windows(
         baked.sh_codes = min(options.rad.sh_codes, encoder.count)
 
 
-def write_whole(tree: BuiltTree, threads: int, progress: Progress) -> None:
-    """Write an output that is made of all nodes of a tree at once."""
+def write_whole(tree: BuiltTree, threads: int, progress: Progress, **how: Any) -> None:
+    """Write an output that is made of all nodes of a tree at once.
+
+    Args:
+        how: further arguments of `simplifying.simplified`, for a simplified scene.
+    """
     baked, out, settings, options, scene = tree.baked, tree.out, tree.settings, tree.options, tree.nodes
     assert isinstance(scene, Scene)
     if tree.repacked is not None:
@@ -199,13 +195,16 @@ def write_whole(tree: BuiltTree, threads: int, progress: Progress) -> None:
         baked.bytes, baked.detail = write_levels(
             scene, above, out, settings.detail, options, tree.end, threads, progress
         )
-    elif tree.simplifier is not None:
+    elif settings.simplify is not None:
+        from .simplifying import write_simplified
+
         form = WRITABLE[settings.suffix]
         baked.output_format = form.name
         # The opacities of a tree that was read make up for the rounding of its scales already.
         options = dataclasses.replace(options, covering=baked.method is not None)
-        baked.bytes, baked.simplified = tree.simplifier.write(
-            scene, out, form, options, baked.splats, tree.end, threads, progress
+        rest = form, options, baked.splats, tree.end
+        baked.bytes, baked.simplified = write_simplified(
+            scene, settings.simplify, out, *rest, threads=threads, progress=progress, **how
         )
     else:
         assert settings.encoding is not None

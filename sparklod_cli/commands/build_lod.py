@@ -46,8 +46,9 @@ if TYPE_CHECKING:
     from ..api.bake_jobs import Outcome, Pair
     from ..bake.parts_output import WrittenDetail
     from ..bake.settings import Baked, Source
-    from ..bake.simplifying import Extracted, Refined, WrittenSet
+    from ..bake.simplifying import Extracted, WrittenSet
     from ..codecs.encoder import Clamp
+    from ..fitting.settings import Refined
     from ..model.instances import Instance
 
 EXAMPLES = """\

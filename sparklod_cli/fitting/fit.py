@@ -36,7 +36,7 @@ from .pictures import (
     scores_of,
     split_path,
 )
-from .settings import FitReport, FitSettings, FitStage
+from .settings import FitSettings, FitStage, Refined
 
 #: Stages, after each of which held-out cameras decide.
 STAGES = 12
@@ -107,7 +107,7 @@ def fit(
     progress: Progress = silent,
     say: Callable[[str], None] = lambda text: None,
     interrupted: Callable[[], bool] = lambda: False,
-) -> tuple[Splats, FitReport]:
+) -> tuple[Splats, Refined]:
     """Fit the merged splats of a finished tree to pictures of full detail.
 
     Args:
@@ -126,7 +126,7 @@ def fit(
         N nodes, and the report; at none of `settings.SHARES` are held-out cameras farther from full detail than before.
     """
 
-    def run(device: str) -> tuple[Splats, FitReport]:
+    def run(device: str) -> tuple[Splats, Refined]:
         fitting = _Fitting(nodes, tree, dataclasses.replace(settings, device=device), fixed, threads, say)
         is_complete = True
         while fitting.has_steps:
@@ -165,7 +165,7 @@ class _Fitting:
         threads: int,
         say: Callable[[str], None],
     ) -> None:
-        self._threads = threads
+        self._threads, self._seed = threads, settings.seed
         place = Place.of(nodes.center[tree.is_leaf])
         raster = raster_for(place)
         self.nodes = (
@@ -251,12 +251,13 @@ class _Fitting:
         changes = (f"{percent_of(share)} {before[share]:.2f} -> {after[share]:.2f} dB" for share in after)
         return f"{stage.name}: {', '.join(changes)}"
 
-    def finish(self, is_complete: bool) -> tuple[Splats, FitReport]:
+    def finish(self, is_complete: bool) -> tuple[Splats, Refined]:
         """Return the best nodes, where those that break a law have their first values, and the report."""
         self.nodes.restore(self.nodes.fitted, self._kept)
         after = self._lawful() if self._stages else self._before
         kept = float(self.nodes.changed()[self.nodes.fitted].mean()) if self.nodes.fitted.size else 0.0
-        report = FitReport(self._schedule.done, tuple(self._stages), self._before, after, kept, is_complete)
+        stages = tuple(self._stages)
+        report = Refined(self._schedule.done, stages, self._before, after, kept, is_complete, self._seed)
         return self.nodes.result(), report
 
     def _lawful(self) -> Scores:

@@ -49,13 +49,14 @@ class FitStage:
 
 
 @dataclass(frozen=True)
-class FitReport:
-    """Result of fitting a tree.
+class Refined:
+    """Result of fitting merged splats, as reported by `--json`.
 
     Attributes:
         psnr_before, psnr_after: share of the leaves -> mean PSNR in dB of the held-out cameras.
         kept: share of the splats fitted that have new values.
         is_complete: False if it was interrupted.
+        seed: of the cameras and budgets drawn at random.
     """
 
     steps: int
@@ -64,3 +65,5 @@ class FitReport:
     psnr_after: Mapping[float, float]
     kept: float
     is_complete: bool = True
+    seed: int = 0
+    seconds: float = 0.0

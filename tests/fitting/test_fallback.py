@@ -12,7 +12,7 @@ from sparklod_cli.fitting.fit import fit
 from sparklod_cli.fitting.kernels.adam import Rates
 from sparklod_cli.fitting.optimiser import Optimiser
 from sparklod_cli.fitting.pictures import FittedNodes, FullDetailPicture, Index
-from sparklod_cli.fitting.settings import FitReport, FitSettings
+from sparklod_cli.fitting.settings import FitSettings, Refined
 from sparklod_cli.lod import quality
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.system.errors import BackendError
@@ -39,7 +39,7 @@ def optimiser_on(device: str, nodes: FittedNodes, say: Callable[[str], None]) ->
     return Optimiser(nodes) if device == "cpu" else FailingOptimiser(nodes)
 
 
-def fitted(device: str, said: list[str]) -> tuple[Splats, FitReport]:
+def fitted(device: str, said: list[str]) -> tuple[Splats, Refined]:
     tree = quality.build(random_splats(400, sh_degree=0))
     return fit(*tree, FitSettings(steps=STEPS, device=device), say=said.append)
 

@@ -16,7 +16,7 @@ from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.fitting import fit as fit_module
 from sparklod_cli.fitting.fit import fit
 from sparklod_cli.fitting.pictures import FittedNodes, Place, pictures, scores_of
-from sparklod_cli.fitting.settings import SHARES, FitReport, FitSettings
+from sparklod_cli.fitting.settings import SHARES, FitSettings, Refined
 from sparklod_cli.inspection.tree import examine
 from sparklod_cli.lod import quality, quick
 from sparklod_cli.model.lod_tree import LodTree
@@ -40,7 +40,7 @@ def demo() -> tuple[Splats, LodTree]:
 
 
 @functools.cache
-def fitted(seed: int = 0, threads: int = 1, steps: int = STEPS) -> tuple[Splats, FitReport]:
+def fitted(seed: int = 0, threads: int = 1, steps: int = STEPS) -> tuple[Splats, Refined]:
     """The demo tree, fitted."""
     return fit(*demo(), FitSettings(steps=steps, seed=seed), threads=threads)
 

@@ -6,6 +6,7 @@ A cluster is a running one, or processes on this machine that are started and en
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import errno
 import functools
 import logging
@@ -19,23 +20,24 @@ import tempfile
 import time
 import uuid
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import CancelledError
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ... import __version__
+from ...io.reading import Source, absolute_source, open_reader, places_of
 from ...system import machine
-from ...system.addresses import Place
-from ...system.errors import OutOfMemoryError, SparklodError, memory_errors_translated
+from ...system.addresses import Place, absolute
+from ...system.errors import FormatError, OutOfMemoryError, SparklodError, memory_errors_translated
 from ...system.packages import optional_import
 from ...system.progress import Progress, silent
 from ...system.python_process import check_current_folder, safe_path
 from ...system.threads import thread_count
-from ..estimate import default_memory
+from ..estimate import default_memory, in_memory_bytes
+from ..settings import LARGE, Baked, BakeSettings, Resources
 from .job import Task
 from .store import Store
 
@@ -458,31 +460,21 @@ TLS = "tls://"
 CERTIFICATES = "DASK_DISTRIBUTED__COMM__TLS__CA_FILE, ..__CLIENT__CERT and ..__CLIENT__KEY"
 
 
-@dataclass(frozen=True)
-class ClusterSettings:
-    """Cluster that runs the tasks of a bake.
-
-    Attributes:
-        scheduler: address of a running cluster, as tcp://host:8786; None starts processes on this machine.
-        workers: number of these processes.
-        threads: of a task on a running cluster; shared by all processes started here.
-    """
-
-    scheduler: str | None = None
-    workers: int = 1
-    threads: int | None = None
-
-
 @contextlib.contextmanager
 def cluster(
-    settings: ClusterSettings,
+    scheduler: str | None = None,
     *,
+    workers: int = 1,
+    threads: int | None = None,
     memory: int | None = None,
     say: Callable[[str], None] = lambda text: None,
 ) -> Iterator[ClusterEngine]:
     """Yield an engine on a cluster, which is ended with the context if it was started here.
 
     Args:
+        scheduler: address of a running cluster, as tcp://host:8786; None starts processes on this machine.
+        workers: number of these processes.
+        threads: of a task on a running cluster; shared by all processes started here.
         memory: bytes shared by workers started here, or for a task of a running cluster; None for the default share of
             the available memory, or of the memory of a worker.
         say: receives one-line messages for the user.
@@ -494,14 +486,14 @@ def cluster(
         import distributed  # noqa: F401  # sets its loggers up
     with contextlib.ExitStack() as stack:
         stack.enter_context(_quiet())
-        if settings.scheduler is None:
-            threads = max(1, thread_count(settings.threads) // settings.workers)
-            client = stack.enter_context(_started(settings.workers, threads, memory))
+        if scheduler is None:
+            threads = max(1, thread_count(threads) // workers)
+            client = stack.enter_context(_started(workers, threads, memory))
             shared = default_memory() if memory is None else memory
-            limit = None if shared is None else shared // settings.workers
+            limit = None if shared is None else shared // workers
         else:
-            threads = settings.threads or 1
-            client = stack.enter_context(_connected(settings.scheduler))
+            threads = threads or 1
+            client = stack.enter_context(_connected(scheduler))
             limit = _least_memory(client, memory)
             say(f"the cluster's dashboard is at {client.dashboard_link}")
             if not client.scheduler.address.startswith(TLS):
@@ -629,3 +621,55 @@ def _quiet() -> Iterator[None]:
     finally:
         for name, level in before.items():
             logging.getLogger(name).setLevel(level)
+
+
+def bake_side_by_side(
+    pairs: Sequence[tuple[Source, Place]],
+    *,
+    make: Callable[..., Baked | None],
+    settings: BakeSettings,
+    engine: ClusterEngine,
+    resources: Resources,
+    overwrite: bool = False,
+    progress: Progress = silent,
+) -> Generator[Any, None, None]:
+    """Bake each scene that fits into a worker as one task.
+
+    Args:
+        pairs: inputs and outputs, which all workers see.
+        make: function of a module that bakes a scene, such as `flow.bake`.
+        resources: of a worker.
+
+    Yields:
+        the result of each scene, a `Baked` or a `SparklodError`, in their order; `LARGE` for a scene that a worker has
+        no memory for.
+    """
+    small = [_fits_in_memory(source, settings, resources.memory) for source, _ in pairs]
+    settings = dataclasses.replace(settings, **{name: path.absolute() for name, path in settings.files.items()})
+    sources = [absolute_source(source) for source, _ in pairs]  # workers have folders of their own
+    engine.check(None, [place for source in sources for place in places_of(source)])
+    call = functools.partial(make, settings=settings, overwrite=overwrite, resources=resources)
+    calls = [
+        (source, absolute(target))
+        for source, (_, target), is_small in zip(sources, pairs, small, strict=True)
+        if is_small
+    ]
+    with engine.map_calls("baking", call, calls, progress, "scene") as outcomes:
+        for (_, target), is_small in zip(pairs, small, strict=True):
+            outcome = next(outcomes) if is_small else LARGE
+            if isinstance(outcome, Baked) and isinstance(target, Path) and not target.exists():
+                outcome = SparklodError(
+                    f"a worker wrote {target} into a folder that is not seen here: give --output-dir a folder that all"
+                    " machines share, or a URL"
+                )
+            yield outcome
+
+
+def _fits_in_memory(source: Source, settings: BakeSettings, memory: int | None) -> bool:
+    """Return whether an input can be baked in this many bytes of memory; trees and unreadable inputs can."""
+    try:
+        with open_reader(source) as header:
+            needed = in_memory_bytes(settings, header.count, header.sh_degree)
+            return header.has_tree or memory is None or needed <= memory
+    except FormatError:  # reported when it is baked
+        return True

@@ -17,7 +17,7 @@ pytest.importorskip("cryptography")
 pytest.importorskip("distributed")
 
 from sparklod_cli.bake.out_of_core import cluster as module
-from sparklod_cli.bake.out_of_core.cluster import ClusterEngine, ClusterSettings, cluster
+from sparklod_cli.bake.out_of_core.cluster import ClusterEngine, cluster
 from sparklod_cli.bake.out_of_core.job import Task
 from sparklod_cli.bake.out_of_core.store import Store
 from sparklod_cli.system.errors import OutOfMemoryError, ScratchError, SparklodError
@@ -36,7 +36,7 @@ def engine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ClusterEngine]:
     temporary = tmp_path_factory.mktemp("temporary")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tempfile, "tempdir", str(temporary))
-        with cluster(ClusterSettings(workers=2, threads=2), say=SAID.append) as started:
+        with cluster(workers=2, threads=2, say=SAID.append) as started:
             assert list(temporary.iterdir())
             yield started
     assert not list(temporary.iterdir())
@@ -190,7 +190,7 @@ def test_a_block_that_does_not_fit_into_memory_is_named(tmp_path: Path, monkeypa
     monkeypatch.setattr("sparklod_cli.bake.out_of_core.cluster.LOSSES", 0)
     monkeypatch.setattr("sparklod_cli.bake.out_of_core.cluster._memory_limit", lambda workers, memory: 400_000_000)
     job = Job(Store(tmp_path / "store"))
-    with cluster(ClusterSettings(workers=1)) as started:
+    with cluster(workers=1) as started:
         with pytest.raises(
             OutOfMemoryError, match=r"^stage/7 does not fit into the memory of a worker; give a smaller"
         ):

@@ -19,7 +19,7 @@ import distributed
 import psutil
 
 from sparklod_cli.bake.out_of_core import cluster as module
-from sparklod_cli.bake.out_of_core.cluster import ClusterEngine, ClusterSettings, cluster
+from sparklod_cli.bake.out_of_core.cluster import ClusterEngine, cluster
 from sparklod_cli.bake.out_of_core.store import Store
 from sparklod_cli.system.progress import silent
 
@@ -46,7 +46,7 @@ def listening() -> dict[int, int]:
 def attacked() -> Iterator[tuple[ClusterEngine, dict[int, int]]]:
     """An engine, and the ports on which its processes listen."""
     before, said = listening(), list[str]()
-    with cluster(ClusterSettings(workers=1), say=said.append) as engine:
+    with cluster(workers=1, say=said.append) as engine:
         yield engine, {port: pid for port, pid in listening().items() if port not in before}
     assert said == []  # no address of a dashboard
 

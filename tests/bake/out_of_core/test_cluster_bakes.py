@@ -21,7 +21,7 @@ import distributed
 
 from sparklod_cli.bake.flow import bake
 from sparklod_cli.bake.out_of_core import cluster as module
-from sparklod_cli.bake.out_of_core.cluster import ClusterEngine, ClusterSettings, cluster
+from sparklod_cli.bake.out_of_core.cluster import ClusterEngine, cluster
 from sparklod_cli.bake.out_of_core.job import Engine
 from sparklod_cli.bake.settings import Baked, BakeSettings, Resources
 from sparklod_cli.codecs.formats import RAD_SUFFIX as RAD
@@ -44,7 +44,7 @@ BLOCKS = Resources(block_splats=4000)
 @pytest.fixture(scope="module")
 def two() -> Iterator[ClusterEngine]:
     """Two processes."""
-    with cluster(ClusterSettings(workers=2, threads=2), say=SAID.append) as engine:
+    with cluster(workers=2, threads=2, say=SAID.append) as engine:
         yield engine
 
 
@@ -62,7 +62,7 @@ def running() -> Iterator[Any]:
 @pytest.fixture
 def one(running: Any) -> Iterator[ClusterEngine]:
     """One worker."""
-    with cluster(ClusterSettings(scheduler=running.scheduler_address)) as engine:
+    with cluster(scheduler=running.scheduler_address) as engine:
         yield engine
 
 

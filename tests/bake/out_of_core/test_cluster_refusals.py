@@ -16,7 +16,7 @@ import dask
 import distributed
 
 from sparklod_cli.bake.out_of_core import cluster as module
-from sparklod_cli.bake.out_of_core.cluster import ClusterSettings, cluster
+from sparklod_cli.bake.out_of_core.cluster import cluster
 from sparklod_cli.bake.out_of_core.store import Store
 from sparklod_cli.system.errors import SparklodError
 from sparklod_cli.system.progress import silent
@@ -49,7 +49,7 @@ def test_a_scheduler_that_runs_is_used_and_left_alone(scheduler: Any, tmp_path: 
     said: list[str] = []
     for count in (4, 8):
         tasks = tree_of(count)
-        with cluster(ClusterSettings(scheduler=address), say=said.append) as engine:
+        with cluster(scheduler=address, say=said.append) as engine:
             engine.run("building", tasks, job, silent)
         assert job.store.has(tasks[-1].name)
     assert len(said) == 4 and "dashboard" in said[0]
@@ -66,14 +66,14 @@ def test_a_scheduler_with_certificates_is_used_with_those_of_dask_s_settings(tmp
         f"{of_dask}.client.key": own.tls_client_key,
     }
     with module._quiet(), contextlib.contextmanager(_scheduler)(protocol="tls", security=own) as running:
-        settings = ClusterSettings(scheduler=running.scheduler_address)
-        with pytest.raises(SparklodError, match=r"^tls://.* asks for a certificate; set DASK_"), cluster(settings):
+        at = running.scheduler_address
+        with pytest.raises(SparklodError, match=r"^tls://.* asks for a certificate; set DASK_"), cluster(at):
             pass
         lost = dask.config.set({f"{of_dask}.ca-file": "lost.pem", f"{of_dask}.client.cert": "lost.pem"})
-        with lost, pytest.raises(SparklodError, match=r"^a file that DASK_.* name cannot be read"), cluster(settings):
+        with lost, pytest.raises(SparklodError, match=r"^a file that DASK_.* name cannot be read"), cluster(at):
             pass
         tasks = tree_of(4)
-        with dask.config.set(names), cluster(settings, say=said.append) as engine:
+        with dask.config.set(names), cluster(at, say=said.append) as engine:
             engine.run("building", tasks, job, silent)
     assert job.store.has(tasks[-1].name)
     assert len(said) == 1 and "dashboard" in said[0]
@@ -81,7 +81,7 @@ def test_a_scheduler_with_certificates_is_used_with_those_of_dask_s_settings(tmp
 
 def test_a_scheduler_that_goes_away_keeps_what_is_done(scheduler: Any, tmp_path: Path) -> None:
     job, tasks = Job(Store(tmp_path)), tree_of(64, seconds=0.05)
-    with cluster(ClusterSettings(scheduler=scheduler.scheduler_address)) as engine:
+    with cluster(scheduler=scheduler.scheduler_address) as engine:
 
         def close() -> None:
             while not job.store.has(tasks[0].name):
@@ -102,7 +102,7 @@ def test_a_cluster_without_workers_is_refused(scheduler: Any, monkeypatch: pytes
         time.sleep(0.01)
     with (
         pytest.raises(SparklodError, match=r"has no workers; start some with dask worker tcp://"),
-        cluster(ClusterSettings(scheduler=scheduler.scheduler_address)),
+        cluster(scheduler=scheduler.scheduler_address),
     ):
         pass
 
@@ -112,6 +112,6 @@ def test_an_address_without_a_scheduler_is_refused(address: str, monkeypatch: py
     monkeypatch.setattr(module, "ANSWER_SECONDS", 0.2)
     with (
         pytest.raises(SparklodError, match=r"no scheduler answers at .*; start one with dask scheduler"),
-        cluster(ClusterSettings(scheduler=address)),
+        cluster(scheduler=address),
     ):
         pass

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from sparklod_cli.bake.flow import bake
-from sparklod_cli.bake.out_of_core.cluster import ClusterSettings, cluster
+from sparklod_cli.bake.out_of_core.cluster import cluster
 from sparklod_cli.bake.settings import BakeSettings, Resources
 from sparklod_cli.cli import run
 from sparklod_cli.system.addresses import Address, Place
@@ -72,7 +72,7 @@ def test_workers_share_a_scratch_folder_in_a_bucket(bucket: str, tmp_path: Path)
     resources = Resources(block_splats=14_000, scratch_dir=Address(f"{bucket}/scratch"))
     target = Address(f"{bucket}/demo-lod.spz")
     pytest.importorskip("distributed", reason="the extra cluster is not installed")
-    with cluster(ClusterSettings(workers=2, threads=2)) as engine:
+    with cluster(workers=2, threads=2) as engine:
         baked = bake(
             Address(f"{bucket}/demo.ply"), target, BakeSettings(), resources=resources, engine=engine, threads=2
         )

@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
-from sparklod_cli.bake import side_by_side
 from sparklod_cli.bake.estimate import in_memory_bytes
+from sparklod_cli.bake.flow import bake
+from sparklod_cli.bake.out_of_core.cluster import bake_side_by_side
 from sparklod_cli.bake.settings import LARGE, BakeSettings, Resources
-from sparklod_cli.bake.side_by_side import bake_side_by_side
 from sparklod_cli.system.errors import SparklodError
 from tests.conftest import FIXTURES
 
@@ -43,6 +43,7 @@ def test_large_scenes_are_left_to_be_baked_here_in_their_place(tmp_path: Path, m
     pairs = [(FIXTURES / name, Path(name).with_suffix(".spz")) for name in names]
     outcomes = bake_side_by_side(
         pairs,
+        make=bake,
         settings=BakeSettings(),
         engine=engine,  # type: ignore[arg-type]
         resources=Resources(memory=in_memory_bytes(BakeSettings(), *HELD)),
@@ -54,11 +55,10 @@ def test_large_scenes_are_left_to_be_baked_here_in_their_place(tmp_path: Path, m
     assert sorted(path.name for path in tmp_path.iterdir()) == ["sh0.spz", "sh1.spz"]
 
 
-def test_an_output_that_is_nowhere_to_be_seen_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    baked = side_by_side.bake(FIXTURES / "one.ply", tmp_path / "there.spz", BakeSettings())
-    monkeypatch.setattr(side_by_side, "_bake_small", lambda *_, **__: baked)
+def test_an_output_that_is_nowhere_to_be_seen_is_an_error(tmp_path: Path) -> None:
+    baked = bake(FIXTURES / "one.ply", tmp_path / "there.spz", BakeSettings())
     pair = (FIXTURES / "one.ply", tmp_path / "one.spz")
-    how = {"settings": BakeSettings(), "engine": Engine(), "resources": Resources()}
+    how = {"make": lambda *_, **__: baked, "settings": BakeSettings(), "engine": Engine(), "resources": Resources()}
     (found,) = bake_side_by_side([pair], **how)  # type: ignore[arg-type]
     assert isinstance(found, SparklodError)
     assert "wrote" in str(found) and "give --output-dir a folder that all machines share, or a URL" in str(found)
