@@ -112,7 +112,7 @@ def run(arguments: list[str] | None = None) -> int:
         except Exception as error:
             cause = error.__cause__ if isinstance(error, _EndOfFileError) else None
             code = _failed(cause or error, verbosity)
-    return interrupts.INTERRUPTED if code and interrupts.came() else code
+    return interrupts.INTERRUPTED if code and interrupts.came.is_set() else code
 
 
 def _failed(error: BaseException, verbosity: Verbosity) -> int:
@@ -120,7 +120,7 @@ def _failed(error: BaseException, verbosity: Verbosity) -> int:
 
     Last resort: reaching this line is a bug, but a user has no use for a traceback.
     """
-    if interrupts.came():
+    if interrupts.came.is_set():
         say("interrupted")
         return interrupts.INTERRUPTED
     if verbosity.verbose:

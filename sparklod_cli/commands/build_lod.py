@@ -136,7 +136,7 @@ def build_lod(ctx: click.Context, /, **_: Any) -> None:
                 report(console, source, "standard output" if target == DASH else str(target), outcome)
             if options.as_json:
                 print_json(record_of(source, target, outcome))
-            if interrupts.came():  # during fitting, which then ends early
+            if interrupts.came.is_set():  # during fitting, which then ends early
                 console.clear()
                 say("interrupted")
                 ctx.exit(interrupts.INTERRUPTED)

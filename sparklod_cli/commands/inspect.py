@@ -23,7 +23,7 @@ from ..system.untrusted import MOST, printable, shortened
 from .command import COMMON, Command, flag, refuse, values_of
 from .console import Console, count_of, rows
 from .options.common import ASSERT, EACH_AS_JSON, JSON, OVERWRITE, PNG, QUIET, General, assert_errors, table_output
-from .paths import InputPath, OutputPath, keep_apart, name_outputs
+from .paths import NamedPath, keep_apart, name_outputs
 
 if TYPE_CHECKING:
     from ..api.inspect_jobs import Inspected, InspectSettings
@@ -72,11 +72,11 @@ class Checks:
     )
     leaves_of: Path | None = setting(
         "Expect the leaves to be exactly the splats of this file, within the rounding of the format.",
-        InputPath(),
+        NamedPath(),
         heading=COMMON,
     )
     expect: Path | None = setting(
-        "Expect what a text file says, with an assertion on each line.", InputPath(), heading=COMMON
+        "Expect what a text file says, with an assertion on each line.", NamedPath(), heading=COMMON
     )
     fail_on: str = setting("Lowest severity of a finding that makes the exit status 3.", ("error", "warning"), "error")
     style: str = setting(
@@ -121,7 +121,9 @@ class InspectOutput:
         "Print one value of the JSON report, such as tree.leaves, instead of a report.", metavar="NAME", heading=COMMON
     )
     html: Path | None = setting(
-        "Write the reports as one HTML page, with pictures.", OutputPath(suffixes=[".html", ".htm"]), heading=COMMON
+        "Write the reports as one HTML page, with pictures.",
+        NamedPath(output=True, suffixes=[".html", ".htm"]),
+        heading=COMMON,
     )
     histogram: tuple[str, ...] = setting(
         "Print a histogram of a quantity that --stats lists; can be given several times.", metavar="NAME", multiple=True
@@ -131,7 +133,7 @@ class InspectOutput:
         " splats in which a viewer would stream them."
     )
     chunks_out: Path | None = setting(
-        "Write the table of the chunks of a single file to FILE: .csv, .json or .parquet.", OutputPath()
+        "Write the table of the chunks of a single file to FILE: .csv, .json or .parquet.", NamedPath(output=True)
     )
     json_schema: bool = flag("Print the JSON Schema of --json and exit.", is_eager=True, callback=_print_schema)
     plot: Path | None = setting("Draw the structure of a single file as a .png, with pyvista.", PNG, heading=PICTURES)
@@ -187,7 +189,7 @@ class InspectOptions:
     """Options of the command, group by group."""
 
     files: tuple[Path, ...] = setting(
-        "", InputPath(stdin=True), (), argument=True, nargs=-1, metavar="FILE...", required=True
+        "", NamedPath(stdin=True), (), argument=True, nargs=-1, metavar="FILE...", required=True
     )
     checks: Checks = dataclasses.field(default_factory=Checks)
     output: InspectOutput = dataclasses.field(default_factory=InspectOutput)

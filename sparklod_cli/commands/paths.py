@@ -32,17 +32,27 @@ class Folder:
     path: Place
 
 
-class _NamedPath(click.Path):
-    """A path as given. Whether it can be opened is checked later, so that a bad file does not stop the others."""
+class NamedPath(click.Path):
+    """A file or folder that a command reads or, if `output`, writes; with `stdin` also -, which is standard input.
 
-    #: Whether a command reads it, and what to do about an address that it cannot use.
-    _is_input, _to_do = True, "download it first"
+    Whether it can be opened is checked later, so that a bad file does not stop the others. With `folder`, the command
+    fills a folder. An output file may be given as a `Folder`: a name that ends in a slash, or an existing folder.
+    `suffixes` are those of the formats that it can have: `keep_apart` refuses others. With `addresses`, it may also be
+    s3://bucket/file and the like.
+    """
 
     def __init__(
-        self, *, folder: bool = False, suffixes: Sequence[str] = (), addresses: bool = False, stdin: bool = False
+        self,
+        *,
+        output: bool = False,
+        folder: bool = False,
+        suffixes: Sequence[str] = (),
+        addresses: bool = False,
+        stdin: bool = False,
     ) -> None:
         super().__init__(path_type=Path, file_okay=not folder, readable=False)
-        self.folder, self.suffixes, self.addresses, self.stdin = folder, suffixes, addresses, stdin
+        self.output, self.folder, self.suffixes = output, folder, suffixes
+        self.addresses, self.stdin = addresses, stdin
         self.unit = "DIR" if folder else "FILE"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
@@ -53,30 +63,14 @@ class _NamedPath(click.Path):
         if isinstance(place, Path):
             place = super().convert(os.fspath(place), param, ctx)
         elif not self.addresses:
-            self.fail(f"'{place}' is an address on a network, not a path; {self._to_do}", param, ctx)
-        if self._is_input and place == DASH and not self.stdin:
+            to_do = "write a file and upload that" if self.output else "download it first"
+            self.fail(f"'{place}' is an address on a network, not a path; {to_do}", param, ctx)
+        if place == DASH and not (self.output or self.stdin):
             self.fail("standard input is not read here; save it to a file first", param, ctx)
-        if self._is_input or self.folder:
+        if not self.output or self.folder:
             return place
         is_folder = text.endswith(("/", os.sep)) or (isinstance(place, Path) and os.path.isdir(place))  # noqa: PTH112
         return Folder(place) if is_folder else place
-
-
-class InputPath(_NamedPath):
-    """A file or folder that a command reads; with `stdin` also -, which is standard input.
-
-    With `addresses`, also s3://bucket/file and the like.
-    """
-
-
-class OutputPath(_NamedPath):
-    """A file that a command writes, or with `folder` a folder that it fills.
-
-    A file may be given as a `Folder`: a name that ends in a slash, or an existing folder. `suffixes` are those of the
-    formats that it can have: `keep_apart` refuses others. With `addresses`, also s3://bucket/file and the like.
-    """
-
-    _is_input, _to_do = False, "write a file and upload that"
 
 
 def name_outputs(ctx: click.Context, source: Place | None) -> None:
@@ -119,22 +113,22 @@ def keep_apart(ctx: click.Context, stands_for: Mapping[str, Iterable[Place]] | N
     that links and other spellings of a name do not matter. Pipes and devices are never replaced.
 
     Args:
-        ctx: of the command; its parameters of type `InputPath` and `OutputPath` are checked.
+        ctx: of the command; its parameters of type `NamedPath` are checked.
         stands_for: by the name of a parameter, further files that it means: files that an input names, and files that
             are written into an output folder.
     """
     stands_for = stands_for or {}
     inputs: list[Place] = []
     outputs: list[Place] = []
-    promised: list[tuple[click.Parameter, OutputPath, Place]] = []
+    promised: list[tuple[click.Parameter, NamedPath, Place]] = []
     for parameter in ctx.command.params:
         kind, value, more = parameter.type, ctx.params.get(parameter.name or ""), stands_for.get(parameter.name or "")
         values = [] if value is None else list(value) if isinstance(value, tuple) else [value]
-        if isinstance(kind, OutputPath):
+        if isinstance(kind, NamedPath) and kind.output:
             outputs += more if more is not None else [] if kind.folder else values
             promised += [(parameter, kind, path) for path in values if kind.suffixes or kind.folder]
         else:
-            inputs += [*(values if isinstance(kind, InputPath) else []), *(more or ())]
+            inputs += [*(values if isinstance(kind, NamedPath) else []), *(more or ())]
     files, places = set[tuple[int, int]](), dict[str, str]()
     written = [(path, status) for path in outputs if path != DASH and not _is_stream(status := _status(path))]
     read = [path for path in dict.fromkeys(inputs) if path != DASH]

@@ -49,7 +49,7 @@ from .options.viewing import (
     say_notes,
     viewed_files,
 )
-from .paths import Folder, InputPath, OutputPath, claim_stdout, keep_apart, name_outputs, require_suffix, stem_of
+from .paths import Folder, NamedPath, claim_stdout, keep_apart, name_outputs, require_suffix, stem_of
 
 if TYPE_CHECKING:
     from ..api.comparison import BudgetSummary, Compared
@@ -230,7 +230,7 @@ class ComparisonOptions:
         needs="compare",
     )
     diff: Path | None = setting(
-        "Draw the difference from the picture of another file, and print its PSNR.", InputPath()
+        "Draw the difference from the picture of another file, and print its PSNR.", NamedPath()
     )
     gain: float | None = setting(
         "Factor by which --diff multiplies differences.  [default: chosen for the pictures]",
@@ -280,7 +280,7 @@ class PictureFiles:
         "Write a .png, .jpg, .webp or .npy (floats), or with out.%04d.png one for each camera; a .mp4, .webm, .gif or"
         " .webp for an animation; with --compare a .csv, .json or .parquet; or into the folder FILE as NAME.png; - is"
         " standard output.  [default: NAME.png beside the first FILE; with --compare standard output]",
-        OutputPath(),
+        NamedPath(output=True),
         **OUTPUT,
     )
     overwrite: bool = flag(**OVERWRITE)

@@ -52,8 +52,7 @@ from .options.common import EACH_AS_JSON, JSON, OVERWRITE, General, question_bud
 from .paths import (
     NAMELESS,
     Folder,
-    InputPath,
-    OutputPath,
+    NamedPath,
     claim_stdout,
     keep_apart,
     require_suffix,
@@ -86,7 +85,7 @@ class SimplifyOptions:
     """Options of simplify."""
 
     inputs: tuple[Place, ...] = setting(
-        "", InputPath(stdin=True, addresses=True), (), argument=True, nargs=-1, metavar="INPUT...", required=True
+        "", NamedPath(stdin=True, addresses=True), (), argument=True, nargs=-1, metavar="INPUT...", required=True
     )
     to: Budget | None = setting(
         "Number of splats, such as 100k, or share of the INPUT's, such as 10%.",
@@ -106,7 +105,7 @@ class SimplifyOptions:
     camera_path: Path | None = setting(
         "Cameras that --psnr is measured with and --refine fits for, in the coordinates of the output, in any format"
         " that render reads.  [default: cameras around and inside the scene]",
-        InputPath(),
+        NamedPath(),
         heading=COMMON,
     )
     refine: int | None = setting(
@@ -123,7 +122,7 @@ class SimplifyOptions:
     output: Place = setting(
         "Output, whose name chooses the format: .ply, .spz, .sog, DIR/meta.json (an unpacked SOG), .glb, .rad or"
         " .splat, which has no SH; DIR/ means DIR/NAME-small.spz, - standard output, as SPZ.",
-        OutputPath(addresses=True),
+        NamedPath(output=True, addresses=True),
         flags=("-o", "--output"),
         heading=COMMON,
         required=True,
@@ -212,7 +211,7 @@ def simplify(ctx: click.Context, /, **_: Any) -> None:
         report_simplified(console, source, "standard output" if options.output == DASH else str(options.output), baked)
         if options.as_json:
             print_json(record_of(source, options.output, baked))
-        if interrupts.came():  # during fitting, which then ends early
+        if interrupts.came.is_set():  # during fitting, which then ends early
             console.clear()
             say("interrupted")
             ctx.exit(interrupts.INTERRUPTED)

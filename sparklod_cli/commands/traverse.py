@@ -31,7 +31,7 @@ from .options.common import (
     table_output,
 )
 from .options.viewing import Cameras, CutOptions, Inputs, files_read, say_notes, viewed_files
-from .paths import OutputPath, claim_stdout, keep_apart, name_outputs
+from .paths import NamedPath, claim_stdout, keep_apart, name_outputs
 
 if TYPE_CHECKING:
     from ..simulation.results import FrameOutputs, FrameStatistics, Moment, Summary
@@ -67,7 +67,7 @@ class FrameTable:
     output: Path | None = setting(
         "Write the table to FILE: .csv, .json or .parquet; - is standard output.  [default: standard output, but for a"
         " terminal, which gets the summary]",
-        OutputPath(),
+        NamedPath(output=True),
         **OUTPUT,
     )
     overwrite: bool = flag(**OVERWRITE)
@@ -90,7 +90,7 @@ class FrameTable:
         "Leave out traverse_ms, the time that each traversal took, so that two runs write the same bytes."
     )
     indices_out: Path | None = setting(
-        "Write the nodes of every cut to DIR, as .npy of uint32.", OutputPath(folder=True)
+        "Write the nodes of every cut to DIR, as .npy of uint32.", NamedPath(output=True, folder=True)
     )
     padded: bool = flag(
         "With --indices-out: pad each file to rows of 16,384 nodes, as Spark's index texture has them.",

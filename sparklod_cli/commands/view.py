@@ -19,7 +19,7 @@ from ..system.untrusted import printable
 from .command import COMMON, DIRECTION, VIEW, Command, check_declared, flag, values_of
 from .console import Console, count_of, print_json
 from .options.common import DEFAULT_UP, JSON, OVERWRITE, QUIET, UP, VERBOSE, General
-from .paths import InputPath, OutputPath, keep_apart
+from .paths import NamedPath, keep_apart
 
 if TYPE_CHECKING:
     from ..api.viewing import Server, Site
@@ -49,12 +49,12 @@ class _Page:
         heading=COMMON,
     )
     camera_path: Path | None = setting(
-        "Play the cameras of a file, or of a folder written by COLMAP.", InputPath(), heading=COMMON
+        "Play the cameras of a file, or of a folder written by COLMAP.", NamedPath(), heading=COMMON
     )
     spark_dir: Path | None = setting(
         "Take Spark, PlayCanvas or CesiumJS, and three.js from the node_modules of a folder.  [default: from a CDN, but"
         " for CesiumJS]",
-        InputPath(),
+        NamedPath(),
         heading=COMMON,
         metavar="DIR",
     )
@@ -76,7 +76,7 @@ class _Place:
 
     export: Path | None = setting(
         "Write the page and the files into a folder, for any web server, in place of serving them.",
-        OutputPath(folder=True),
+        NamedPath(output=True, folder=True),
         heading=COMMON,
         excludes=("host", "port", "cors", "no_open"),
     )
@@ -102,7 +102,7 @@ class _ViewGeneral(General):
 class _ViewOptions:
     """Options of the command, group by group."""
 
-    files: tuple[Path, ...] = setting("", InputPath(), (), argument=True, nargs=-1, metavar="FILE...", required=True)
+    files: tuple[Path, ...] = setting("", NamedPath(), (), argument=True, nargs=-1, metavar="FILE...", required=True)
     page: _Page = field(default_factory=_Page)
     place: _Place = field(default_factory=_Place)
     as_json: bool = flag("Print the address and the files as one JSON object on standard output.", **JSON)

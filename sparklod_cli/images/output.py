@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..system.output import check_free, check_writable
+from ..system.output import check_writable
 
 #: Quantities by which `inspect` can colour a picture.
 PLOT_BY = ("level", "opacity", "size", "chunk")
@@ -59,7 +59,7 @@ class PictureOutput:
     def check(self, numbers: Sequence[int], *, overwrite: bool) -> None:
         """Raise an `OutputError` if the files of these frames exist, or no file can be written there."""
         for path in self.paths(numbers):
-            check_free(path, overwrite=overwrite)
+            check_writable(path, overwrite=overwrite, tried=False)
         for path in self.paths([0]):
             check_writable(path, overwrite=True)
 

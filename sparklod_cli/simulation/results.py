@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, cast
 
-from ..system.output import check_free, check_writable
+from ..system.output import check_writable
 from ..tables.columns import FRAME, Column, Row, TableOutput
 from ..tables.row_statistics import Number, numbers, statistic, totals
 
@@ -341,7 +341,7 @@ class FrameOutputs:
     def check_frames(self, numbers: Sequence[int], instances: int) -> None:
         """Raise an `OutputError` if an index file of a frame exists and may not be replaced."""
         for file in self.index_files(numbers, instances):
-            check_free(file, overwrite=self.overwrite)
+            check_writable(file, overwrite=self.overwrite, tried=False)
 
     def index_files(self, numbers: Sequence[int], instances: int) -> Iterator[Path]:
         if self.indices is not None:

@@ -31,8 +31,9 @@ RACE = "ignored due to race condition"
 #: What is written to the pipe of signals for an interruption that was lost, and the seconds until it is raised again.
 LOST, PATIENCE = 0, 0.02
 
-#: Set when a signal has interrupted the run.
-_came = threading.Event()
+#: Set when a signal has interrupted the run. Failures after that are its consequences: libraries, such as numpy's C
+#: modules, turn `KeyboardInterrupt` into errors of their own.
+came = threading.Event()
 
 
 class _Deferral:
@@ -54,17 +55,17 @@ def handle() -> None:
 
     Ending at once loses nothing: outputs and the kernel cache are consistent at all times.
     """
-    _came.clear()
+    came.clear()
     # An ignored signal stays ignored, as under nohup.
     handled = [number for number in ENDING if signal.getsignal(number) != signal.SIG_IGN]
 
     def interrupt(signum: int, frame: FrameType | None) -> None:
         if signum == signal.SIGINT and _deferral.lasts and not _deferral.asked:
             _deferral.asked = True
-            _came.set()
+            came.set()
             return
         _leave_if_compiling()
-        _came.set()
+        came.set()
         for number in handled:
             signal.signal(number, signal.SIG_DFL)  # a second signal ends the process during the clean-up
         raise KeyboardInterrupt
@@ -91,20 +92,11 @@ def handle() -> None:
         threading.Thread(target=_watch, args=(reader, handled), daemon=True).start()
 
 
-def came() -> bool:
-    """Return whether a signal has interrupted the run.
-
-    Failures after that are its consequences: libraries, such as numpy's C modules, turn `KeyboardInterrupt` into errors
-    of their own.
-    """
-    return _came.is_set()
-
-
 @contextlib.contextmanager
 def deferred() -> Iterator[Callable[[], bool]]:
     """Let work stop early by itself at the first Ctrl-C; yield a function that returns whether it has to stop.
 
-    `came` is True then, too. A second Ctrl-C and other signals interrupt as usual, and so does a Ctrl-C after the
+    `came` is set then, too. A second Ctrl-C and other signals interrupt as usual, and so does a Ctrl-C after the
     context. Without `handle`, as in a library, nothing is deferred.
     """
     _deferral.asked = _deferral.seen = False
@@ -149,7 +141,7 @@ def _leave_if_compiling() -> None:
 
 def leave_if_lost() -> None:
     """End the process if a library has lost the exception of an interruption; called before long work."""
-    if _came.is_set() and not _deferral.asked:
+    if came.is_set() and not _deferral.asked:
         _leave()
 
 

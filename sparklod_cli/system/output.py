@@ -148,7 +148,7 @@ class Output(contextlib.AbstractContextManager["Output"]):
         if not self._written:
             self._find_former(self.siblings)
             if isinstance(self.target, Address):
-                check_free(self.target, overwrite=self._overwrite)
+                check_writable(self.target, overwrite=self._overwrite)
                 self.target.unlink(missing_ok=True)
             else:
                 self._stack.enter_context(created(self.target.parent))
@@ -185,7 +185,7 @@ class Output(contextlib.AbstractContextManager["Output"]):
                         outdated=self._former,
                     )
                 elif isinstance(self.target, Address) and self._file is not None:
-                    check_free(self.target, overwrite=self._overwrite)
+                    check_writable(self.target, overwrite=self._overwrite)
                     self._file.flush()
                     self.target.send(self._file.name)
                 elif isinstance(self.target, Address) and self._written:
@@ -265,20 +265,14 @@ def real_target(place: Place) -> Place:
     return place if isinstance(place, Address) or place == DASH else Path(os.path.realpath(place))
 
 
-def check_writable(place: Place, *, overwrite: bool) -> None:
-    """Raise `OutputError` if a file cannot be written.
+def check_writable(place: Place, *, overwrite: bool, tried: bool = True) -> None:
+    """Raise `OutputError` if a file cannot be written: a folder or another file is in its way, or it has no room.
 
     At an address, its service has to answer; permission to write is not tried, as others would see the file.
+
+    Args:
+        tried: try permission and room by a temporary file, see `try_place`.
     """
-    check_free(place, overwrite=overwrite)
-    if isinstance(place, Path) and not _is_no_file(place):
-        try_place(place)
-    elif isinstance(place, Path) and not os.access(place, os.W_OK):
-        raise OutputError(f"cannot write {place}: {os.strerror(errno.EACCES).lower()}")
-
-
-def check_free(place: Place, *, overwrite: bool) -> None:
-    """Raise `OutputError` if a folder or an existing file is in the way, or the name is impossible."""
     try:
         if isinstance(place, Address):
             if place.is_read_only:
@@ -291,6 +285,10 @@ def check_free(place: Place, *, overwrite: bool) -> None:
             raise _taken(place)
         if isinstance(place, Path) and not _is_no_file(place):
             _nearest_folder(place)
+            if tried:
+                try_place(place)
+        elif isinstance(place, Path) and tried and not os.access(place, os.W_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
     except OSError as error:
         raise OutputError(f"cannot write {place}: {reason_of(error)}") from None
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli.cli import COMMANDS, cli, run
-from sparklod_cli.commands.paths import InputPath, OutputPath
+from sparklod_cli.commands.paths import NamedPath
 from tests.conftest import FIXTURES, Capture
 
 PLAIN, LOD = FIXTURES / "one.ply", FIXTURES / "golden" / "tree-v3.spz"
@@ -87,12 +87,12 @@ def test_the_table_has_all_parameters_that_are_files(name: str) -> None:
     command = cli.get_command(click.Context(cli), name)
     assert command is not None
     for parameter in command.params:
-        if isinstance(parameter.type, InputPath):
+        if isinstance(parameter.type, NamedPath):
             assert parameter.name in INPUTS[name]
-        elif isinstance(parameter.type, OutputPath) and not parameter.type.folder:
+        elif isinstance(parameter.type, NamedPath) and not parameter.type.folder:
             assert parameter.name in OUTPUTS[name]
         else:
-            assert isinstance(parameter.type, OutputPath) or not isinstance(parameter.type, click.Path), parameter.name
+            assert isinstance(parameter.type, NamedPath) or not isinstance(parameter.type, click.Path), parameter.name
 
 
 @pytest.mark.parametrize("way", ["itself", "symbolic", "hard"])

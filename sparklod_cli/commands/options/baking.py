@@ -33,7 +33,7 @@ from ...system.setting_fields import Quantity, Range, setting, whole
 from ...system.stdio import DASH
 from ...system.units import parse_size
 from ..command import BALL, COMMON, POINT, OptionalNumber, flag, flags_set, parameters_of, refuse
-from ..paths import InputPath, OutputPath, stem_of
+from ..paths import NamedPath, stem_of
 from .common import EACH_AS_JSON, JSON, OUTPUT, OVERWRITE, General
 
 if TYPE_CHECKING:
@@ -117,7 +117,7 @@ class SceneOptions:
     rgba: Path | None = setting(
         "Replace colours and opacities by those of a .npy or raw file of (N, 4) bytes or floats 0..1; splats of alpha 0"
         " are left out.",
-        InputPath(),
+        NamedPath(),
         heading=SELECTION,
     )
     up: str | None = setting(
@@ -202,7 +202,7 @@ class BuildLodOptions:
     """Options of build-lod."""
 
     inputs: tuple[Place, ...] = setting(
-        "", InputPath(stdin=True, addresses=True), (), argument=True, nargs=-1, metavar="INPUT..."
+        "", NamedPath(stdin=True, addresses=True), (), argument=True, nargs=-1, metavar="INPUT..."
     )
     merge: bool = flag(
         "Bake all INPUTs as one scene, into the file that --output names: tiles of a city, each where its own"
@@ -211,7 +211,7 @@ class BuildLodOptions:
     )
     scene: Path | None = setting(
         "Merge the files of an instances file, each where it stands there, in place of INPUTs (see docs/build-lod.md).",
-        InputPath(),
+        NamedPath(),
         heading=COMMON,
     )
     output: Place | None = setting(
@@ -219,12 +219,12 @@ class BuildLodOptions:
         f" the input; NAME-lod.rad with --format rad, NAME-lod/{MANIFEST} with --format {STREAMED_SOG},"
         f" NAME-lod/{TILESET} with --format {TILES_3D}, NAME-lod.npz with --encoding, NAME-unlod.spz with --unlod,"
         " NAME-lod-refined.spz of a NAME-lod.spz with --refine]",
-        OutputPath(addresses=True),
+        NamedPath(output=True, addresses=True),
         **OUTPUT,
     )
     output_dir: Place | None = setting(
         "Folder for the outputs; created if it does not exist.",
-        OutputPath(folder=True, addresses=True),
+        NamedPath(output=True, folder=True, addresses=True),
         heading=COMMON,
     )
     overwrite: bool = flag(**OVERWRITE)
@@ -265,7 +265,7 @@ class BuildLodOptions:
     camera_path: Path | None = setting(
         "Cameras that --refine fits for, in the coordinates of the output, in any format that render reads: those of"
         " visitors whose paths are known.  [default: cameras around and inside the scene]",
-        InputPath(),
+        NamedPath(),
         needs="refine",
         heading=REFINING,
     )
@@ -315,7 +315,7 @@ class BuildLodOptions:
     environment: Path | None = setting(
         "Splats that are always drawn, such as a sky, from a file of any format without a tree; turned and moved as the"
         " scene.",
-        InputPath(),
+        NamedPath(),
         heading=DETAIL,
     )
     environment_beyond: float | None = setting(
@@ -333,7 +333,7 @@ class BuildLodOptions:
     )
     scratch_dir: Place | None = setting(
         "Where a bake out of core makes its scratch folder, which is removed at the end.  [default: beside the output]",
-        OutputPath(folder=True, addresses=True),
+        NamedPath(output=True, folder=True, addresses=True),
         heading=LARGE,
     )
     resume: bool = flag(

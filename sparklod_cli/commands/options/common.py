@@ -16,7 +16,7 @@ from ...system.setting_fields import setting, whole
 from ...system.stdio import DASH
 from ..command import COMMON, flag
 from ..console import Console, is_terminal
-from ..paths import OutputPath, require_suffix
+from ..paths import NamedPath, require_suffix
 
 if TYPE_CHECKING:
     from ...lod.budget import Budget
@@ -47,7 +47,7 @@ OVERWRITE: dict[str, Any] = {
 ASSERT: dict[str, Any] = {"flags": ("--assert",), "metavar": "TEXT", "multiple": True}
 
 #: Type of a picture of a table or of a file.
-PNG = OutputPath(suffixes=[".png"])
+PNG = NamedPath(output=True, suffixes=[".png"])
 
 #: Help of `--up` of cameras, and its default.
 UP = "Axis that is up, such as -y, or a direction x,y,z."

@@ -30,7 +30,7 @@ from ...viewers.viewer_settings import (
     Network,
 )
 from ..command import COMMON, DIRECTION, POINT, SIZE, VIEW, VIEWS, flag, flag_of, is_set, parameters_of, refuse
-from ..paths import InputPath, file_of
+from ..paths import NamedPath, file_of
 from .common import DEFAULT_UP, UP
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ class Cameras:
     HEADING: ClassVar[str] = "Cameras"
 
     camera_path: Path | None = setting(
-        "Read the cameras from a file, or from a folder written by COLMAP.", InputPath(), heading=COMMON
+        "Read the cameras from a file, or from a folder written by COLMAP.", NamedPath(), heading=COMMON
     )
     orbit: int | None = setting(f"{AROUND_SCENE}an orbit of {ORBIT}]", CAMERAS, heading=COMMON)
     look_at: Any = setting("Place one camera at EYE that looks at TARGET, each x,y,z.", VIEW, heading=COMMON)
@@ -281,9 +281,9 @@ class Inputs:
 
     HEADING: ClassVar[str] = "Inputs"
 
-    files: tuple[Path, ...] = setting("", InputPath(), (), argument=True, nargs=-1, metavar="[FILE]...")
+    files: tuple[Path, ...] = setting("", NamedPath(), (), argument=True, nargs=-1, metavar="[FILE]...")
     scene: Path | None = setting(
-        "Read an instances file: JSON that lists splat files and where they stand (see docs/traverse.md).", InputPath()
+        "Read an instances file: JSON that lists splat files and where they stand (see docs/traverse.md).", NamedPath()
     )
 
     def instances(self) -> list[Instance]:
