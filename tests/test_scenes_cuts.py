@@ -69,7 +69,7 @@ def test_colours_of_whole_numbers_span_what_the_cuts_have(by: str, budget: int) 
     parts = [part for view in views for part in finder.cut(view).parts]
     values = np.concatenate([values_of(by, part) for part in parts])
     assert (scale.low, scale.high) == (values.min(), values.max())
-    texts = [text for _, text in scale.bar.marks]
+    texts = [text for _, text in scale.marks]
     assert (texts[0], texts[-1]) == (f"{scale.low}", f"{scale.high}")
 
 

@@ -142,7 +142,7 @@ def test_colours_are_of_detail_levels_and_chunk_files(row: DetailScene, tmp_path
     (part,) = finder.cut(AT).parts
     levels = numbers_of("level", part.scene, part.index)
     assert set(levels[:-5].tolist()) == {0, 1} and (levels[-5:] == 0).all()
-    assert scale_of_splats("level", finder, [AT]).bar.title == "detail level"
+    assert scale_of_splats("level", finder, [AT]).title == "detail level"
     chunks = numbers_of("chunk", part.scene, part.index)
     assert chunks[-1] == 9 and (chunks[:-5] // 3 == levels[:-5]).all()
 

@@ -15,7 +15,7 @@ from PIL import Image, ImageDraw
 from ..cameras.camera import Camera
 from ..images.pixels import BACKGROUND, FAINT, INK, LINE, write_title
 from ..model.splats import Splats
-from ..render.color_scales import range_of, whole_numbers
+from ..render.color_scales import depth_scale
 from ..system.errors import SparklodError
 from ..system.packages import optional_import
 from ..system.units import count_of, percent_of
@@ -513,14 +513,14 @@ def picture_of_path(scene: PathScene, *, size: tuple[int, int] = (1600, 1000)) -
     drawable = splats.with_max_sh(0).take(index)
     chosen = index[evenly(len(index), MOST_POINTS)]
     shown = splats.with_max_sh(0).take(chosen)
-    coloring = whole_numbers(scene.title, depth[chosen], *range_of(depth[chosen]))
+    coloring = depth_scale(scene.title, depth[chosen])
     low, high = bounds(drawable)
     way = np.array([camera.position for camera in cameras])
     low, high = np.minimum(low, way.min(axis=0)), np.maximum(high, way.max(axis=0))
     eye = _above(cameras, low, high, size)
     parts = _path_lines(cameras, way, frame, float((high - low).max()))
     with PyvistaStage(low, high, size, BACKGROUND) as stage:
-        drawn = stage.splats(shown, coloring.rgb, eye)
+        drawn = stage.splats(shown, coloring.rgb(depth[chosen]), eye)
         for ends, color in parts:
             stage.lines(ends, color, 1.0, width=1.5)
         pixels = stage.photograph(eye)

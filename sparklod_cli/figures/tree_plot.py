@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,20 +18,14 @@ from ..model.lod_tree import CHUNK_NODES
 from ..model.scene import Scene
 from ..model.splats import FloatArray, Splats
 from ..render.color_scales import (
-    MAGMA,
-    PLASMA,
     VIRIDIS,
     Coloring,
-    log_marks,
-    log_range,
+    depth_scale,
     nice_step,
+    opacity_scale,
     ramp,
-    range_of,
-    smooth,
-    ticks,
-    top_opacity,
+    size_scale,
     whole_numbers,
-    with_ends,
 )
 from ..system.errors import SparklodError
 from ..system.units import count_of
@@ -52,35 +47,32 @@ from .pyvista_scene import (
 APART = 0.04
 
 
-def color_by(by: str, splats: Splats, index: NDArray[np.int64], depth: NDArray[np.int32] | None) -> Coloring:
-    """Return the colours of M of N splats, and the scale that explains them.
+def color_by(
+    by: str, splats: Splats, index: NDArray[np.int64], depth: NDArray[np.int32] | None
+) -> tuple[Coloring, NDArray[np.uint8]]:
+    """Return a colour scale for M of N splats, and their (M, 3) colours.
 
     Args:
         by: one of `PLOT_BY`: "level", the depth of a node, needs `depth`; else "opacity", "size" or "chunk".
         index: (M,) indices of the splats that are coloured; at least one.
         depth: (N,) edges from the root; None for a scene without a tree.
     """
+    values: NDArray[Any]
     if by == "level" and depth is not None:
-        chosen = depth[index]
-        if chosen.min() == chosen.max():  # one depth alone: its colour says how far down the tree it lies
-            return whole_numbers("tree depth", chosen, 0, int(depth.max()))
-        return whole_numbers("tree depth", chosen, *range_of(chosen))
-    if by == "chunk":
-        chunk = index // CHUNK_NODES
-        return whole_numbers("chunk", chunk, 0, (len(splats) - 1) // CHUNK_NODES)
-    if by == "opacity":
+        values = depth[index]
+        # One depth alone: its colour says how far down the tree it lies.
+        one = values.min() == values.max()
+        scale = whole_numbers("tree depth", 0, int(depth.max())) if one else depth_scale("tree depth", values)
+    elif by == "chunk":
+        values = index // CHUNK_NODES
+        scale = whole_numbers("chunk", 0, (len(splats) - 1) // CHUNK_NODES)
+    elif by == "opacity":
         values = lod_opacity(np.maximum(splats.opacity[index], 0))
-        top = top_opacity(values)
-        marks = [(tick / top, text) for tick, text in ticks(0, top, top / 6)]
-        if values.max() > top:
-            marks = with_ends(marks, None, f"{top:g} or more", APART)
-        return smooth("opacity" if values.max() <= 1 else "opacity (D)", values / top, MAGMA, marks)
-    logs = np.log10(np.clip(spark_size(splats)[index], 1e-30, 1e30).astype(np.float64))
-    low, high = log_range(logs)
-    marks = log_marks(low, high)
-    less = f"{10**low:.2g} or less" if logs.min() < low else None
-    more = f"{10**high:.2g} or more" if logs.max() > high else None
-    return smooth("feature size", (logs - low) / (high - low), PLASMA, with_ends(marks, less, more, APART))
+        scale = opacity_scale("opacity" if values.max() <= 1 else "opacity (D)", values, APART)
+    else:
+        values = spark_size(splats)[index]
+        scale = size_scale(values, APART, sampled=False)
+    return scale, scale.rgb(values)
 
 
 #: Most nodes that are drawn; of more, an even sample.
@@ -134,7 +126,7 @@ def plot(
     chosen, others, depths, title = _subject(scene, depth, drawable)
     index, others = (of[evenly(len(of), MOST_POINTS)] for of in (chosen, others))
     by = "size" if by == "level" and depths is None else by
-    coloring = color_by(by, splats, index, depths)
+    coloring, rgb = color_by(by, splats, index, depths)
     shown = splats.take(index)
     low, high = bounds(splats.take(drawable))
     up = np.array(direction_of(scene.up))
@@ -142,7 +134,7 @@ def plot(
     direction = np.array(DIRECTION) @ np.stack([right, up, np.cross(right, up)])
     eye = viewpoint(box_lines(low[None], high[None]), direction, up, aspect=size[0] / size[1], frame=FRAME)
     with PyvistaStage(low, high, size, BACKGROUND) as stage:
-        drawn = stage.splats(shown, coloring.rgb, eye)
+        drawn = stage.splats(shown, rgb, eye)
         if len(index) < len(chosen):
             drawn += f", an even sample of {len(index):,}"
         if len(others):

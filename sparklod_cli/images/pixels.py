@@ -170,7 +170,7 @@ def difference_bar(gain: float) -> Coloring:
     from ..render.color_scales import smooth  # most pictures have no scale
 
     marks = [(0.0, "0"), (0.5, f"{0.5 / gain:.3g}"), (1.0, f"{1 / gain:.3g}" + " or more" * (gain > 1))]
-    return smooth("difference", np.empty(0), GRAYS, marks)
+    return smooth("difference", GRAYS, marks, 0, 1 / gain)
 
 
 def encode(pixels: Pixels, form: str, jpeg_quality: int = JPEG_QUALITY) -> bytes:

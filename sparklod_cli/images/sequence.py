@@ -182,9 +182,7 @@ class _Drawing:
             values = drawn.values if by in OF_PIXELS and drawn.values is not None else image
             return facts, empty, codes.encode_floats(values)
         pixels = codes.eight_bits(image)
-        bar = self.renderer.scale.bar if self.renderer.scale is not None else None
-        if reference is not None:
-            bar = codes.difference_bar(self.gain)
+        bar = self.renderer.scale if reference is None else codes.difference_bar(self.gain)
         if settings.bar and bar is not None:
             pixels = codes.with_scale(pixels, bar)
             facts["width"] = pixels.shape[1]

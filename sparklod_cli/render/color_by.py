@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,19 +15,7 @@ from ..system.errors import SparklodError
 from ..system.progress import Progress, silent
 from ..viewers.loaded_scene import TREE, Index, LoadedScene
 from ..viewers.scenes import CutFinder, Part
-from .color_scales import (
-    CLIPPED,
-    MAGMA,
-    PLASMA,
-    Coloring,
-    log_marks,
-    log_range,
-    smooth,
-    ticks,
-    top_opacity,
-    whole_numbers,
-    with_ends,
-)
+from .color_scales import CLIPPED, MAGMA, PLASMA, Coloring, linear, opacity_scale, size_scale, whole_numbers
 from .settings import RasterSettings
 
 #: Sample sizes, splats and cameras, to find the ends of a scale.
@@ -39,31 +26,6 @@ CUTS = 16
 
 #: Marks nearer to an end of a scale than this would touch its own.
 APART = 0.05
-
-
-@dataclass(frozen=True)
-class Scale:
-    """Colour scale for numbers, the same for all pictures of a run.
-
-    Attributes:
-        low, high: numbers of the first colour and of the last; those beyond have these, too.
-        log: they are powers of ten.
-    """
-
-    bar: Coloring
-    low: float
-    high: float
-    log: bool = False
-
-    def rgb(self, values: FloatArray) -> NDArray[np.float32]:
-        """Return (..., 3) colours, 0..1, of numbers; NaN has the first colour."""
-        values = np.asarray(values, np.float64)
-        if self.log:
-            values = np.log10(np.clip(values, 1e-30, 1e30))
-        at = np.nan_to_num((values - self.low) / ((self.high - self.low) or 1))
-        index = np.rint(np.clip(at, 0, 1) * (len(self.bar.ramp) - 1)).astype(np.intp)
-        colors: NDArray[np.float32] = (self.bar.ramp[index] / 255).astype(np.float32)
-        return colors
 
 
 def values_of(by: str, part: Part) -> FloatArray:
@@ -79,7 +41,7 @@ def values_of(by: str, part: Part) -> FloatArray:
     return spark_size(part.splats) * np.float32(np.cbrt(np.linalg.det(part.object_to_world[:3, :3])))
 
 
-def scale_of_splats(by: str, source: CutFinder, cameras: Sequence[Camera], progress: Progress = silent) -> Scale:
+def scale_of_splats(by: str, source: CutFinder, cameras: Sequence[Camera], progress: Progress = silent) -> Coloring:
     """Return the scale of a quantity of `values_of`, for all splats that cameras may see; of whole numbers, do see.
 
     `SparklodError` by level, where no file has any.
@@ -94,16 +56,12 @@ def scale_of_splats(by: str, source: CutFinder, cameras: Sequence[Camera], progr
         return _whole(by, by, source, cameras, progress)
     every = max(1, sum(len(part.index) for part in candidates) // SAMPLE)
     values = np.concatenate([values_of(by, part)[::every] for part in candidates])
-    if by == "lod-opacity":
-        top = top_opacity(values)
-        return _linear("LoD opacity", 0.0, top, MAGMA, ends=bool(values.max() > top))
-    logs = np.log10(np.clip(values, 1e-30, 1e30).astype(np.float64))
-    low, high = log_range(logs)
-    marks = with_ends(log_marks(low, high), f"{10**low:.2g} or less", f"{10**high:.2g} or more", APART)
-    return Scale(smooth("feature size", np.empty(0), PLASMA, marks), low, high, log=True)
+    return (
+        opacity_scale("LoD opacity", values, APART) if by == "lod-opacity" else size_scale(values, APART, sampled=True)
+    )
 
 
-def scale_of_depth(source: CutFinder, cameras: Sequence[Camera], settings: RasterSettings) -> Scale:
+def scale_of_depth(source: CutFinder, cameras: Sequence[Camera], settings: RasterSettings) -> Coloring:
     """Return the scale from the nearest splats to the farthest that cameras see, but for a few."""
     parts = source.candidates().parts
     every = max(1, sum(len(part.index) for part in parts) // SAMPLE)
@@ -121,16 +79,16 @@ def scale_of_depth(source: CutFinder, cameras: Sequence[Camera], settings: Raste
     low, high = np.percentile(depths, [CLIPPED, 100 - CLIPPED]) if len(depths) else (settings.near, settings.near + 1)
     # The depth of a nearly flat scene is not stretched over all colours.
     high = max(high, low + 1e-3 * abs(low))
-    return _linear("depth", float(low), float(high), tuple(reversed(PLASMA)), ends=True)
+    return linear("depth", tuple(reversed(PLASMA)), float(low), float(high), APART)
 
 
-def scale_of_overdraw(counts: Sequence[FloatArray]) -> Scale:
+def scale_of_overdraw(counts: Sequence[FloatArray]) -> Coloring:
     """Return the scale from none to the most that all but a few pixels of some pictures have."""
     most = max(float(np.percentile(count, 99.9)) for count in counts)
-    return _linear("overdraw", 0.0, max(1.0, float(math.ceil(most))), MAGMA, ends=True)
+    return linear("overdraw", MAGMA, 0.0, max(1.0, float(math.ceil(most))), APART)
 
 
-def _whole(by: str, title: str, source: CutFinder, cameras: Sequence[Camera], progress: Progress) -> Scale:
+def _whole(by: str, title: str, source: CutFinder, cameras: Sequence[Camera], progress: Progress) -> Coloring:
     """Return the scale from the least to the most that some cameras see; others may see less, or more."""
     every = -(-len(cameras) // CUTS)
     some = cameras[::every]
@@ -142,16 +100,9 @@ def _whole(by: str, title: str, source: CutFinder, cameras: Sequence[Camera], pr
     ends = ends or [(0, 0)]
     low, high = min(low for low, _ in ends), max(high for _, high in ends)
     beyond = int(every > 1)
-    return Scale(whole_numbers(title, np.arange(low - beyond, high + 1 + beyond), low, high), low, high)
+    return whole_numbers(title, low, high, least=low - beyond, most=high + beyond)
 
 
 def numbers_of(by: str, scene: LoadedScene, index: Index) -> NDArray[np.int64]:
     """Return (M,) the "level" or the "chunk" of some splats of a file; without levels, all are of level 0."""
     return scene.chunk_of(index) if by == "chunk" else scene.depth[index].astype(np.int64)
-
-
-def _linear(title: str, low: float, high: float, stops: tuple[str, ...], *, ends: bool) -> Scale:
-    marks = [((tick - low) / (high - low), text) for tick, text in ticks(low, high, (high - low) / 6)]
-    if ends:
-        marks = with_ends(marks, f"{low:.3g} or less" if low else None, f"{high:.3g} or more", APART)
-    return Scale(smooth(title, np.empty(0), stops, marks), low, high)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -27,19 +27,30 @@ LEAST_DECADES = 0.1
 
 @dataclass(frozen=True)
 class Coloring:
-    """Colours of N splats, with the scale that explains them.
+    """A colour scale: colours for numbers, and the marks that explain them.
 
     Attributes:
         title: the quantity, for display.
-        rgb: (N, 3) uint8.
         ramp: (S, 3) uint8 colours of the scale, from its low to its high end; few and distinct for whole numbers.
         marks: positions on the scale, 0..1, and their labels.
+        low, high: numbers of the first colour and of the last; those beyond have these, too.
+        log: they are powers of ten.
     """
 
     title: str
-    rgb: NDArray[np.uint8]
     ramp: NDArray[np.uint8]
     marks: tuple[Mark, ...]
+    low: float
+    high: float
+    log: bool = False
+
+    def rgb(self, values: NDArray[Any]) -> NDArray[np.uint8]:
+        """Return (..., 3) colours of numbers; NaN has the first colour."""
+        values = np.asarray(values, np.float64)
+        if self.log:
+            values = np.log10(np.clip(values, 1e-30, 1e30))
+        at = np.nan_to_num((values - self.low) / ((self.high - self.low) or 1))
+        return self.ramp[np.rint(np.clip(at, 0, 1) * (len(self.ramp) - 1)).astype(np.intp)]
 
 
 def ramp(stops: tuple[str, ...], count: int) -> NDArray[np.uint8]:
@@ -50,53 +61,61 @@ def ramp(stops: tuple[str, ...], count: int) -> NDArray[np.uint8]:
     return np.stack(channels, 1).round().astype(np.uint8)
 
 
-def range_of(values: NDArray[Any]) -> tuple[int, int]:
-    """Return the ends of a scale for some whole numbers: few of them at either end take no colours from the others."""
-    low, high = np.percentile(values, [CLIPPED, 100 - CLIPPED]) if np.ptp(values) > 1 else (values.min(), values.max())
-    return int(low), int(high)
-
-
-def whole_numbers(title: str, values: NDArray[Any], low: int, high: int) -> Coloring:
-    """Return a colour for each whole number from low to high; (N,) values beyond have the colour of that end."""
+def whole_numbers(title: str, low: int, high: int, *, least: int | None = None, most: int | None = None) -> Coloring:
+    """Return a colour for each whole number from low to high; `least` and `most` may lie beyond these ends."""
     count = high - low + 1
-    colors = ramp(VIRIDIS, count)
     every = math.ceil(count / 12)
     labelled = [*range(low, high - every // 2, every), high] if count > 1 else [low]
     text = {value: f"{value}" for value in labelled}
-    if values.min() < low:
+    if least is not None and least < low:
         text[low] += " or less"
-    if values.max() > high:
+    if most is not None and most > high:
         text[high] += " or more"
-    marks = [((value - low + 0.5) / count, text[value]) for value in labelled]
-    return Coloring(title, colors[np.clip(values - low, 0, count - 1)], colors, tuple(marks))
+    marks = tuple(((value - low + 0.5) / count, text[value]) for value in labelled)
+    return Coloring(title, ramp(VIRIDIS, count), marks, low, high)
 
 
-def smooth(title: str, at: FloatArray, stops: tuple[str, ...], marks: list[Mark]) -> Coloring:
-    """Return a ramp without steps, for (N,) places on it, 0..1; those beyond have the colour of that end."""
-    colors = ramp(stops, 256)
-    return Coloring(title, colors[np.rint(255 * np.clip(at, 0, 1)).astype(np.intp)], colors, tuple(marks))
+def depth_scale(title: str, values: NDArray[Any]) -> Coloring:
+    """Return the scale of some whole numbers: few of them at either end take no colours from the others."""
+    least, most = int(values.min()), int(values.max())
+    low, high = np.percentile(values, [CLIPPED, 100 - CLIPPED]) if most - least > 1 else (least, most)
+    return whole_numbers(title, int(low), int(high), least=least, most=most)
 
 
-def top_opacity(values: FloatArray) -> float:
-    """Return where a scale of D ends: at 1, or above it at the next tenth."""
-    return max(1.0, math.ceil(10 * float(np.percentile(values, 100 - CLIPPED))) / 10)
+def smooth(title: str, stops: tuple[str, ...], marks: list[Mark], low: float, high: float) -> Coloring:
+    """Return a ramp without steps."""
+    return Coloring(title, ramp(stops, 256), tuple(marks), low, high)
 
 
-def log_range(logs: FloatArray) -> tuple[float, float]:
-    """Return the ends of a logarithmic scale, in powers of ten, at least LEAST_DECADES apart."""
+def linear(title: str, stops: tuple[str, ...], low: float, high: float, apart: float | None) -> Coloring:
+    """Return a ramp with round numbers; `apart`, if numbers lie beyond its ends, is that of `with_ends`."""
+    marks = [((tick - low) / (high - low), text) for tick, text in ticks(low, high, (high - low) / 6)]
+    if apart is not None:
+        marks = with_ends(marks, f"{low:.3g} or less" if low else None, f"{high:.3g} or more", apart)
+    return smooth(title, stops, marks, low, high)
+
+
+def opacity_scale(title: str, values: FloatArray, apart: float) -> Coloring:
+    """Return the scale of D, which ends at 1, or above it at the next tenth."""
+    top = max(1.0, math.ceil(10 * float(np.percentile(values, 100 - CLIPPED))) / 10)
+    return linear(title, MAGMA, 0.0, top, apart if values.max() > top else None)
+
+
+def size_scale(values: FloatArray, apart: float, *, sampled: bool) -> Coloring:
+    """Return the logarithmic scale of sizes; of a sample, other sizes may lie beyond its ends."""
+    logs = np.log10(np.clip(values, 1e-30, 1e30).astype(np.float64))
     low, high = (float(end) for end in np.percentile(logs, [CLIPPED, 100 - CLIPPED]))
     if high - low < LEAST_DECADES:
         low, high = (low + high - LEAST_DECADES) / 2, (low + high + LEAST_DECADES) / 2
-    return low, high
-
-
-def log_marks(low: float, high: float) -> list[Mark]:
-    """Return round numbers on a scale between two powers of ten."""
+    less = f"{10**low:.2g} or less" if sampled or logs.min() < low else None
+    more = f"{10**high:.2g} or more" if sampled or logs.max() > high else None
     span = high - low
     factors = (1,) if span > 2.5 else (1, 2, 5) if span > 0.8 else (1, 1.25, 1.5, 2, 2.5, 3, 4, 5, 6, 8)
     decades = range(math.floor(low), math.ceil(high) + 1)
     every = [math.log10(factor) + decade for decade in decades for factor in factors]
-    return [((at - low) / span, f"{10**at:.3g}") for at in every if low <= at <= high]
+    marks = [((at - low) / span, f"{10**at:.3g}") for at in every if low <= at <= high]
+    scale = smooth("feature size", PLASMA, with_ends(marks, less, more, apart), low, high)
+    return replace(scale, log=True)
 
 
 def with_ends(marks: list[Mark], low: str | None, high: str | None, apart: float) -> list[Mark]:

@@ -22,7 +22,7 @@ from .rasterizer import Image, ShadedSplats, shade
 from .settings import CLIP, RasterSettings, RenderSettings, uses_card
 
 if TYPE_CHECKING:
-    from .color_by import Scale
+    from .color_scales import Coloring
 
 #: The device that draws instead of the backend numba where a card is used, and modules of all that draw: each has a
 #: function `draw`.
@@ -76,7 +76,7 @@ class Renderer:
         by = settings.color_by
         self.scale = None if by is None else self._scale(by, cameras, progress)
 
-    def _scale(self, by: str, cameras: Sequence[Camera], progress: Progress) -> Scale:
+    def _scale(self, by: str, cameras: Sequence[Camera], progress: Progress) -> Coloring:
         from . import color_by
 
         if by == "depth":
@@ -101,8 +101,8 @@ class Renderer:
             elif self.scale is not None and by is not None:
                 from .color_by import values_of
 
-                rgb = [self.scale.rgb(values_of(by, part)) for part in cut.parts]
-                shaded = replace(shaded, rgb=np.concatenate(rgb))
+                values = np.concatenate([values_of(by, part) for part in cut.parts])
+                shaded = replace(shaded, rgb=self.scale.rgb(values) / np.float32(255))
             style, options = self.settings.style, self.settings.options
             image = draw_styled(style, self._backend, shaded, fine, self._raster, options)
         if times > 1:
@@ -127,7 +127,8 @@ class Renderer:
 
     def _colored(self, values: NDArray[np.float32], alpha: NDArray[np.float32]) -> Image:
         assert self.scale is not None
-        return np.concatenate([self.scale.rgb(values) * alpha[..., None], alpha[..., None]], axis=2)
+        rgb = self.scale.rgb(values) / np.float32(255)
+        return np.concatenate([rgb * alpha[..., None], alpha[..., None]], axis=2)
 
 
 def colored_by_depth(splats: ShadedSplats, camera: Camera, raster: RasterSettings) -> tuple[ShadedSplats, float]:

@@ -43,11 +43,11 @@ def test_ramps_get_brighter_all_the_way(stops: tuple[str, ...]) -> None:
 def test_colors_tell_sizes_apart() -> None:
     splats = random_splats(500)
     index = np.arange(100, 300)
-    coloring = color_by("size", splats, index, None)
+    coloring, rgb = color_by("size", splats, index, None)
     assert coloring.title == "feature size"
-    assert coloring.rgb.shape == (200, 3)
+    assert rgb.shape == (200, 3)
     order = np.argsort(spark_size(splats)[index])
-    assert (np.diff(brightness(coloring.rgb[order])) >= 0).all()
+    assert (np.diff(brightness(rgb[order])) >= 0).all()
     places = [place for place, _ in coloring.marks]
     assert len(places) > 3
     assert 0 <= min(places) <= max(places) <= 1
@@ -56,8 +56,8 @@ def test_colors_tell_sizes_apart() -> None:
 def test_equal_splats_have_one_color() -> None:
     splats = random_splats(5).take(np.zeros(5, np.int64))
     for by in ("size", "opacity", "chunk"):
-        coloring = color_by(by, splats, np.arange(5), None)
-        assert len(np.unique(coloring.rgb, axis=0)) == 1
+        coloring, rgb = color_by(by, splats, np.arange(5), None)
+        assert len(np.unique(rgb, axis=0)) == 1
         assert coloring.marks
 
 
@@ -65,25 +65,25 @@ def test_every_level_has_a_colour_and_a_mark() -> None:
     splats = random_splats(1000)
     depth = np.repeat(np.arange(10, dtype=np.int32), 100)
     depth[-1] = -1
-    many = color_by("level", splats, np.arange(0, 900), depth)
+    many, rgb = color_by("level", splats, np.arange(0, 900), depth)
     assert [text for _, text in many.marks] == [str(level) for level in range(9)]
-    assert len(np.unique(many.rgb, axis=0)) == 9
-    one = color_by("level", splats, np.arange(300, 400), depth)
+    assert len(np.unique(rgb, axis=0)) == 9
+    one, rgb = color_by("level", splats, np.arange(300, 400), depth)
     assert [text for _, text in one.marks] == [str(level) for level in range(10)]
-    assert len(np.unique(one.rgb, axis=0)) == 1
+    assert len(np.unique(rgb, axis=0)) == 1
 
 
 def test_few_levels_at_the_ends_do_not_take_colors_from_the_others() -> None:
     depth = np.concatenate([np.zeros(2), np.repeat([5, 6, 7], 300), np.full(3, 60)]).astype(np.int32)
-    coloring = color_by("level", random_splats(len(depth)), np.arange(len(depth)), depth)
+    coloring, _ = color_by("level", random_splats(len(depth)), np.arange(len(depth)), depth)
     assert [text for _, text in coloring.marks] == ["5 or less", "6", "7 or more"]
 
 
 def test_opacities_above_one_are_labelled_as_lod_opacity() -> None:
     splats = random_splats(1000)
-    assert color_by("opacity", splats, np.arange(1000), None).title == "opacity"
+    assert color_by("opacity", splats, np.arange(1000), None)[0].title == "opacity"
     splats.opacity[0] = 50
-    coloring = color_by("opacity", splats, np.arange(1000), None)
+    coloring, _ = color_by("opacity", splats, np.arange(1000), None)
     assert coloring.title == "opacity (D)"
     assert coloring.marks[-1] == (1.0, "1 or more")
 

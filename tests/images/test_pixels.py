@@ -113,7 +113,7 @@ def test_a_picture_of_floats_is_kept_to_the_bit() -> None:
 
 @pytest.mark.parametrize("channels", [3, 4])
 def test_a_color_scale_is_added_at_the_right(channels: int) -> None:
-    bar = smooth("numbers", np.empty(0), VIRIDIS, [(0.0, "0"), (1.0, "12 or more")])
+    bar = smooth("numbers", VIRIDIS, [(0.0, "0"), (1.0, "12 or more")], 0, 12)
     codes = np.full((360, 640, channels), 255, np.uint8)
     result = pixels.with_scale(codes, bar)
     assert result.shape == (360, 640 + pixels.scale_width(640, 360), channels)

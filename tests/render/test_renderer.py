@@ -106,7 +106,7 @@ def test_colours_are_those_of_the_scale(by: str) -> None:
         column = round(32 + camera().focal[0] * center[0] / 5)
         pixel = image[24, column]
         assert pixel[3] > 0.8
-        assert np.allclose(pixel[:3] / pixel[3], renderer.scale.rgb(np.array(value)), atol=0.01)
+        assert np.allclose(pixel[:3] / pixel[3], renderer.scale.rgb(np.array(value)) / 255, atol=0.01)
 
 
 def test_color_by_ignores_spherical_harmonics() -> None:
