@@ -12,7 +12,7 @@ from . import __version__
 from .commands.command import Group
 from .commands.console import Verbosity, say, say_error, say_usage_error
 from .system import interrupts, stdio
-from .system.errors import SparklodError, out_of_memory, reason_of
+from .system.errors import SparklodError, UnfitError, out_of_memory, reason_of
 from .system.untrusted import printable
 
 #: Most characters of an unexpected error in its message.
@@ -95,6 +95,9 @@ def run(arguments: list[str] | None = None) -> int:
         except click.ClickException as error:
             say_usage_error(error)
             code = error.exit_code
+        except UnfitError as error:
+            say_error(str(error))
+            code = 2
         except stdio.ReaderGoneError:
             pass
         except SparklodError as error:

@@ -27,7 +27,6 @@ from ..tables.row_statistics import numbers, statistic
 from ..viewers.scenes import CutFinder, Scenes
 from ..viewers.viewer_settings import LodSettings
 from .arguments import BudgetLike, ProgressLike, budget_like, path_like, progress_callback
-from .jobs import UnfitError, ViewedFiles
 from .views import Viewed, scenes_of, trees_of
 
 if TYPE_CHECKING:
@@ -343,7 +342,8 @@ def check_chart(plot: Path, *, overwrite: bool) -> None:
 
 
 def compare_files(
-    files: ViewedFiles,
+    scenes: Scenes,
+    cameras: CameraPath,
     budgets: Sequence[Budget],
     lod: LodSettings,
     render: RenderSettings,
@@ -353,8 +353,10 @@ def compare_files(
     plot: Path | None = None,
     overwrite: bool = False,
     passed: Filter | None = None,
+    threads: int = 1,
+    progress: Progress = silent,
 ) -> Compared:
-    """Measure how far cuts of files are from full detail, and write the table and the charts.
+    """Measure how far cuts of scenes are from full detail, and write the table and the charts.
 
     Args:
         table: where the rows go, at once when all are known.
@@ -363,21 +365,18 @@ def compare_files(
 
     Raises:
         UnfitError: there are both trees and Streamed SOG, or too many instances.
-        SparklodError: a file cannot be read or written, has no levels, or a picture cannot be drawn.
+        SparklodError: a file cannot be written, or a picture cannot be drawn.
     """
-    with on_threads(files.threads):
-        try:
-            comparison = Comparison(files.scenes, lod, budgets, render)
-        except ValueError as error:
-            raise UnfitError(str(error)) from None
-        rows = list(comparison.run(files.path, threads=files.threads, progress=files.progress))
+    with on_threads(threads):
+        comparison = Comparison(scenes, lod, budgets, render)
+        rows = list(comparison.run(cameras, threads=threads, progress=progress))
     table.write(rows, passed=passed)
     groups = rows_by_budget(rows, len(budgets))
     if plot is not None:
         from ..figures.charts import plot_comparison as chart
 
         series = list(zip((budget.text for budget in budgets), groups, strict=True))
-        write_file(plot, [chart(series, files.scenes.title)], overwrite=overwrite)
+        write_file(plot, [chart(series, scenes.title)], overwrite=overwrite)
     outcomes = [each for at, what in asserts for each in check([what], rows if at is None else groups[at], empty=EMPTY)]
     summary = summarize(rows, [budget.text for budget in budgets])
     return Compared(len(rows), comparison.leaves, summary, outcomes)

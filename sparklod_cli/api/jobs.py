@@ -1,22 +1,13 @@
-"""Whole-file jobs of the commands: pictures, comparisons and traversals of files, from reading to writing.
-
-The outputs are checked before, so that no work is lost.
-"""
+"""Whole-file jobs of `render` and `traverse`: pictures and traversals of files, from reading to writing."""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from ..cameras.frame import Point, direction_of
 from ..cameras.framing import reach
-from ..model.instances import instances_of
 from ..model.splats import COLUMNS
 from ..system.progress import Progress, silent
 from ..viewers.loaded_scene import TRAVERSED
@@ -24,8 +15,7 @@ from ..viewers.read_scenes import read_scenes
 from ..viewers.scenes import CutFinder
 
 if TYPE_CHECKING:
-    from ..cameras.frame import Settings
-    from ..cameras.sources import CameraPath, CameraSource
+    from ..cameras.sources import CameraPath
     from ..images.output import PictureOutput
     from ..images.sequence import PictureSettings, WrittenPictures
     from ..lod.budget import Budget
@@ -39,72 +29,50 @@ if TYPE_CHECKING:
     from ..viewers.viewer_settings import LodSettings, StreamingSettings
 
 
-@dataclass(frozen=True)
-class ViewedFiles:
-    """Splat files, and the cameras that look at them; both are read when they are first needed.
+def scenes_of_files(
+    instances: Sequence[Instance],
+    *,
+    precision: str,
+    threads: int,
+    progress: Progress = silent,
+    trees_only: bool = False,
+    through: str | None = None,
+    plain: bool = True,
+    paged: bool = False,
+) -> Callable[[], Scenes]:
+    """Return a function that reads the scenes of instances when it is first called.
 
-    Attributes:
-        instances: at least one.
-        cameras: the source of the cameras.
-        settings: override those of a camera file.
+    Args:
         precision: one of `PRECISIONS`, of the nodes that cuts are found with.
         trees_only: refuse files without a tree or detail levels.
         through: one of `formats.ROUND_TRIPS`, after which splats are drawn.
         plain: read all columns of splats.
         paged: read splats as cuts need them.
     """
-
-    instances: Sequence[Instance]
-    cameras: CameraSource
-    settings: Settings
-    precision: str
-    threads: int
-    progress: Progress = silent
-    trees_only: bool = False
-    through: str | None = None
-    plain: bool = True
-    paged: bool = False
-
-    @functools.cached_property
-    def scenes(self) -> Scenes:
-        return read_scenes(
-            self.instances,
-            columns=COLUMNS if self.plain else TRAVERSED,
-            trees_only=self.trees_only,
-            through=self.through,
-            precision=self.precision,
-            paged=self.paged,
-            threads=self.threads,
-            progress=self.progress,
+    return functools.cache(
+        functools.partial(
+            read_scenes,
+            instances,
+            columns=COLUMNS if plain else TRAVERSED,
+            trees_only=trees_only,
+            through=through,
+            precision=precision,
+            paged=paged,
+            threads=threads,
+            progress=progress,
         )
-
-    @functools.cached_property
-    def path(self) -> CameraPath:
-        """The cameras; scenes are read only where cameras are chosen for them, or need their up axis."""
-        settings = dataclasses.replace(self.settings, up_of_scene=self._up)
-        return self.cameras.cameras(settings, lambda: self.scenes.balls())
-
-    def _up(self) -> Point:
-        up = direction_of(self.scenes.up)
-        if self.scenes.up is None or self.settings.world is None:
-            return up
-        x, y, z = (np.asarray(up) @ self.settings.world[:3, :3]).tolist()  # the inverse rotation, of any length
-        return x, y, z
-
-    def with_planes(self, render: RenderSettings) -> RenderSettings:
-        """Return settings whose near and far planes enclose the scenes, where the cameras are chosen for them."""
-        if not self.cameras.fits_scene:
-            return render
-        near, far = reach(render.raster.near, render.raster.far, self.path.cameras, self.scenes.balls())
-        return dataclasses.replace(render, raster=dataclasses.replace(render.raster, near=near, far=far))
+    )
 
 
-class UnfitError(ValueError):
-    """Error for settings that do not fit the scenes: a budget, or a chunk cache, too small for their roots."""
+def with_planes(render: RenderSettings, cameras: CameraPath, scenes: Scenes) -> RenderSettings:
+    """Return settings whose near and far planes enclose the scenes."""
+    near, far = reach(render.raster.near, render.raster.far, cameras.cameras, scenes.balls())
+    return dataclasses.replace(render, raster=dataclasses.replace(render.raster, near=near, far=far))
 
 
 def draw_files(
-    files: ViewedFiles,
+    scenes: Scenes,
+    cameras: CameraPath,
     budget: Budget | None,
     lod: LodSettings,
     render: RenderSettings,
@@ -112,16 +80,17 @@ def draw_files(
     settings: PictureSettings,
     *,
     loading: tuple[StreamingSettings, float] | None = None,
-    reference: Path | None = None,
+    reference: Callable[[], Scenes] | None = None,
     overwrite: bool = False,
+    progress: Progress = silent,
 ) -> WrittenPictures:
-    """Draw files and write the pictures.
+    """Draw scenes and write the pictures.
 
     Args:
         budget: of the cuts; None draws full detail.
         loading: how chunks get to the viewer, and the seconds since a visitor opened the page in front of each camera;
             None where every chunk is resident.
-        reference: the file whose pictures are subtracted from these.
+        reference: the scenes whose pictures are subtracted from these.
 
     Raises:
         UnfitError: the budget is too small for the roots.
@@ -129,31 +98,24 @@ def draw_files(
     """
     from ..images.sequence import write_pictures
 
-    source, other = _source(files.scenes, budget, lod, loading), None
-    if reference is not None:
-        plain = dataclasses.replace(files, instances=instances_of([reference]), through=None, paged=False)
-        other = _source(plain.scenes, budget, lod)
+    def cuts_of(scenes: Scenes) -> CutFinder:
+        return CutFinder(scenes, None if budget is None else dataclasses.replace(lod, budget=scenes.splats_of(budget)))
+
+    if loading is not None and budget is not None and scenes.with_cuts:
+        from ..simulation.loading import Loader
+
+        source: CutFinder = Loader(scenes, dataclasses.replace(lod, budget=scenes.splats_of(budget)), *loading)
+    else:
+        source = cuts_of(scenes)
+    other = None if reference is None else cuts_of(reference())
     return write_pictures(
-        source, files.path, output, render, settings, reference=other, overwrite=overwrite, progress=files.progress
+        source, cameras, output, render, settings, reference=other, overwrite=overwrite, progress=progress
     )
 
 
-def _source(
-    scenes: Scenes, budget: Budget | None, lod: LodSettings, loading: tuple[StreamingSettings, float] | None = None
-) -> CutFinder:
-    settings = None if budget is None else dataclasses.replace(lod, budget=scenes.splats_of(budget))
-    try:
-        if loading is None or settings is None or not scenes.with_cuts:
-            return CutFinder(scenes, settings)
-        from ..simulation.loading import Loader
-
-        return Loader(scenes, settings, *loading)
-    except ValueError as error:
-        raise UnfitError(str(error)) from None
-
-
 def traverse_files(
-    files: ViewedFiles,
+    scenes: Scenes,
+    cameras: CameraPath,
     budget: Budget,
     lod: LodSettings,
     streaming: StreamingSettings,
@@ -162,46 +124,35 @@ def traverse_files(
     by_instance: bool = False,
     asserts: Sequence[Assertion] = (),
     passed: Filter | None = None,
-    bar: bool = True,
+    threads: int = 1,
+    progress: Progress = silent,
 ) -> tuple[WrittenFrames, Summary, list[Outcome]]:
-    """Simulate what a viewer draws of files along a path, and write tables and charts of the frames.
+    """Simulate what a viewer draws of scenes along a path, and write tables and charts of the frames.
 
     Args:
         by_instance: make rows of single instances, too.
-        bar: report the number of frames done.
 
     Returns:
         the frames written, their summary, and the outcomes of `asserts`.
 
     Raises:
         UnfitError: the budget, or the chunk cache, is too small for the roots.
-        SparklodError: a file cannot be read or written, or is no tree.
+        SparklodError: a file cannot be written.
     """
     from ..simulation.frames import Simulation, write_frames
     from ..simulation.results import EMPTY, LOADING, summarize
 
-    scenes, path = files.scenes, files.path
     settings = dataclasses.replace(lod, budget=scenes.splats_of(budget))
-    try:
-        simulation = Simulation(scenes, settings, streaming)
-    except ValueError as error:
-        raise UnfitError(str(error)) from None
+    simulation = Simulation(scenes, settings, streaming)
     if outputs.indices is not None:
-        outputs.check_frames(path.numbers, len(files.instances))
-    progress = files.progress if bar else silent
+        outputs.check_frames(cameras.numbers, len(scenes.instances))
     loading = None
     if not streaming.network.instant:
         from ..simulation.loading import Loader
 
-        loading = Loader(scenes, settings, streaming).load(path.cameras[0])
+        loading = Loader(scenes, settings, streaming).load(cameras.cameras[0])
     frames = write_frames(
-        simulation,
-        path,
-        outputs,
-        by_instance=by_instance,
-        threads=files.threads,
-        progress=progress,
-        passed=passed,
+        simulation, cameras, outputs, by_instance=by_instance, threads=threads, progress=progress, passed=passed
     )
     outcomes: list[Outcome] = []
     if asserts:

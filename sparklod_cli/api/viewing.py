@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ..cameras.camera_files import read_path
-from ..cameras.frame import Settings, direction_of
+from ..cameras.frame import Settings
 from ..model.scene import common_axis
 from ..system.errors import NotSplatsError, SparklodError, memory_errors_translated
 from ..system.progress import Progress, silent
@@ -61,7 +61,7 @@ def prepare(
     libraries = from_cdn(engine) if spark_dir is None else from_folder(spark_dir, engine)
     # Files are read only after the camera path, unless its cameras need their up axis.
     extents = functools.cache(lambda: [extent_of(file, threads=threads, progress=progress) for file in shown])
-    cameras = Settings(up=up, up_of_scene=lambda: direction_of(common_axis(extent.up for extent in extents())))
+    cameras = Settings(up=up, up_of_scene=lambda: common_axis(extent.up for extent in extents()))
     path = None
     with memory_errors_translated():
         if camera_path is not None:

@@ -15,7 +15,7 @@ from ..cameras import DEFAULT_SIZE, ELEVATION
 from ..cameras.camera import Camera
 from ..cameras.camera_files import read_path, similarity
 from ..cameras.formats.table import FORMATS, Axes
-from ..cameras.frame import MAX_FRAMES, Settings, direction_of
+from ..cameras.frame import MAX_FRAMES, Settings
 from ..cameras.sources import CameraPath
 from ..cameras.sources import orbit as orbit_cameras
 from ..codecs.formats import PRECISIONS
@@ -419,5 +419,5 @@ def orbit(
     if not 1 <= count <= MAX_FRAMES:
         raise CameraPathError(f"count is {count}; give 1 to {MAX_FRAMES:,} cameras")
     scenes = functools.cache(lambda: scenes_of(viewed, None))
-    settings = Settings(size=size, fov_y=math.radians(fov_y), up=up, up_of_scene=lambda: direction_of(scenes().up))
+    settings = Settings(size=size, fov_y=math.radians(fov_y), up=up, up_of_scene=lambda: scenes().up)
     return orbit_cameras(count, center, distance, elevation, settings, lambda: scenes().balls())

@@ -114,7 +114,8 @@ class Settings:
         fps: frames a second; times are then computed from the numbers of the frames.
         every: keep every n-th frame only.
         up: x, y, z of the up axis of cameras that have only an eye and a target.
-        up_of_scene: called for that where neither file nor user says it.
+        up_of_scene: called where neither file nor user says it; returns the axis of the world of the splats that is up,
+            one of `scene.AXES`, or None if it is unknown.
     """
 
     axes: Axes | None = None
@@ -124,12 +125,19 @@ class Settings:
     fps: float | None = None
     every: int = 1
     up: Point | None = None
-    up_of_scene: Callable[[], Point] = lambda: DEFAULT_UP
+    up_of_scene: Callable[[], str | None] = lambda: None
 
     @property
     def up_axis(self) -> Point:
-        """x, y, z of the up axis that was chosen, or else that of the scene."""
-        return self.up or self.up_of_scene()
+        """x, y, z of the up axis that was chosen, or else that of the scene, in the world of the cameras."""
+        if self.up is not None:
+            return self.up
+        axis = self.up_of_scene()
+        up = direction_of(axis)
+        if axis is None or self.world is None:
+            return up
+        x, y, z = (np.asarray(up) @ self.world[:3, :3]).tolist()  # the inverse rotation, of any length
+        return x, y, z
 
 
 def camera_of(pose: Matrix, lens: Intrinsics, time: float, name: str, settings: Settings) -> Camera:

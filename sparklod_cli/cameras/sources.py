@@ -7,7 +7,7 @@ import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -348,20 +348,6 @@ def hermite(knots: Matrix, points: Matrix, tangents: Matrix, at: Matrix) -> Matr
         + t * t * (3 - 2 * t) * points[piece + 1]
         + t * t * (t - 1) * step * tangents[piece + 1]
     )
-
-
-class CameraSource(NamedTuple):
-    """Cameras that a user chose.
-
-    Attributes:
-        cameras: makes them, of settings and the scene. It raises a `CameraPathError` where a camera makes no sense, its
-            subclass `TooManyCamerasError` where there are too many, and an `InvalidSplatsError` where there is no scene
-            to fit.
-        fits_scene: they are as far away as the scene asks for.
-    """
-
-    cameras: Callable[[Settings, Scene], CameraPath]
-    fits_scene: bool = False
 
 
 def orbit(

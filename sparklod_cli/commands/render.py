@@ -42,12 +42,12 @@ from .options.viewing import (
     DETAIL,
     LOADING,
     MOST_DRAWN,
+    ONLY_WITH,
     Cameras,
     CutOptions,
     Inputs,
+    check_view,
     files_read,
-    say_notes,
-    viewed_files,
 )
 from .paths import Folder, NamedPath, claim_stdout, keep_apart, name_outputs, require_suffix, stem_of
 
@@ -408,39 +408,52 @@ def _draw(ctx: click.Context, options: RenderOptions) -> None:
     # What is wrong with the output is said before much is read.
     _output(ctx, options, options.cameras.least_count()).check([], overwrite=True)
     with Console(quiet=general.quiet, verbose=general.verbose) as console:
-        from ..api.jobs import draw_files
+        from ..api.jobs import draw_files, scenes_of_files, with_planes
+        from ..model.instances import instances_of
 
         question_budgets(console, budget)
         console.announce_compiling("pictures")
-        with options.cameras.usage_errors():
-            lod, render = options.cut.settings(), look.settings(console.say)
-            # What looks at more than cuts is read whole.
-            paged = budget is not None and lod.continuous is None and render.color_by in (None, *COLORS_OF_CUTS)
-            files = viewed_files(
-                instances, options.cameras, options.cut, general, console, through=look.through, paged=paged
-            )
-            render = render if any(is_set(ctx, name) for name in PLANES) else files.with_planes(render)
-            output, settings = _place(ctx, options, instances, files.path)
-            say_notes(ctx, console, options.cameras, files, options.streaming.network, files.scenes.notes)
-            console.detail(f"  read in {time.perf_counter() - start:.2f} s")
-            pictures = draw_files(
-                files,
-                budget,
-                lod,
-                render,
-                output,
-                settings,
-                loading=None if options.after is None else (options.streaming, options.after),
-                reference=options.comparison.diff,
-                overwrite=options.pictures.overwrite,
-            )
+        lod, render = options.cut.settings(), look.settings(console.say)
+        reads: dict[str, Any] = {
+            "precision": options.cut.precision,
+            "threads": general.threads,
+            "progress": console.progress,
+        }
+        # What looks at more than cuts is read whole.
+        paged = budget is not None and lod.continuous is None and render.color_by in (None, *COLORS_OF_CUTS)
+        scenes = scenes_of_files(instances, **reads, through=look.through, paged=paged)
+        path, diff = options.cameras.path(scenes), options.comparison.diff
+        if _planes_follow(ctx, options.cameras):
+            render = with_planes(render, path, scenes())
+        output, settings = _place(ctx, options, instances, path)
+        check_view(ctx, console, options.cameras, path, scenes(), options.streaming.network, scenes().notes)
+        console.detail(f"  read in {time.perf_counter() - start:.2f} s")
+        pictures = draw_files(
+            scenes(),
+            path,
+            budget,
+            lod,
+            render,
+            output,
+            settings,
+            loading=None if options.after is None else (options.streaming, options.after),
+            reference=None if diff is None else scenes_of_files(instances_of([diff]), **reads),
+            overwrite=options.pictures.overwrite,
+            progress=console.progress,
+        )
         console.clear()
         seconds = time.perf_counter() - start
         _report(console, pictures, output, seconds, as_json=options.as_json)
         console.detail(
-            f"  {files.path.format}, {format_size(pictures.bytes)} of {output.form}; {render.style} by"
+            f"  {path.format}, {format_size(pictures.bytes)} of {output.form}; {render.style} by"
             f" {render.backend}, from {render.raster.near:g} to {render.raster.far:g} units away"
         )
+
+
+def _planes_follow(ctx: click.Context, cameras: Cameras) -> bool:
+    """Return whether the near and far planes are chosen for the scene, as the distance of the cameras is."""
+    fits = cameras.distance is None and cameras.source in ONLY_WITH["distance"]
+    return fits and not any(is_set(ctx, name) for name in PLANES)
 
 
 def _output(ctx: click.Context, options: RenderOptions, cameras: int) -> PictureOutput:
@@ -545,6 +558,7 @@ def _compare(ctx: click.Context, options: RenderOptions) -> int:
     output, general, overwrite = options.pictures.output, options.general, options.pictures.overwrite
     assert not isinstance(output, Folder)  # see `name_outputs`
     from ..api.comparison import COLUMNS, check_chart, compare_files
+    from ..api.jobs import scenes_of_files, with_planes
 
     table = table_output(output, COLUMNS, overwrite=overwrite, as_json=options.as_json)
     instances = options.inputs.instances()
@@ -561,26 +575,36 @@ def _compare(ctx: click.Context, options: RenderOptions) -> int:
         table.check()
         if options.comparison.plot is not None:
             check_chart(options.comparison.plot, overwrite=overwrite)
-        with options.cameras.usage_errors():
-            render = dataclasses.replace(options.appearance.settings(console.say), max_sh=options.comparison.max_sh)
-            files = viewed_files(instances, options.cameras, options.cut, general, console, trees_only=True)
-            say_notes(ctx, console, options.cameras, files)
-            render = render if any(is_set(ctx, name) for name in PLANES) else files.with_planes(render)
-            compared = compare_files(
-                files,
-                budgets,
-                _limited(options),
-                render,
-                table,
-                asserts=asserts,
-                plot=options.comparison.plot,
-                overwrite=overwrite,
-                passed=passed,
-            )
+        render = dataclasses.replace(options.appearance.settings(console.say), max_sh=options.comparison.max_sh)
+        scenes = scenes_of_files(
+            instances,
+            precision=options.cut.precision,
+            threads=general.threads,
+            progress=console.progress,
+            trees_only=True,
+        )
+        path = options.cameras.path(scenes)
+        check_view(ctx, console, options.cameras, path, scenes())
+        if _planes_follow(ctx, options.cameras):
+            render = with_planes(render, path, scenes())
+        compared = compare_files(
+            scenes(),
+            path,
+            budgets,
+            _limited(options),
+            render,
+            table,
+            asserts=asserts,
+            plot=options.comparison.plot,
+            overwrite=overwrite,
+            passed=passed,
+            threads=general.threads,
+            progress=console.progress,
+        )
         console.clear()
         console.detail(f"  {compared.pictures:,} pictures, {time.perf_counter() - start:.2f} s")
         on_stdout, about = table.form is None and not options.as_json, [at for at, _ in asserts]
-        return _report_compared(console, files.path, compared, about, as_json=options.as_json, on_stdout=on_stdout)
+        return _report_compared(console, path, compared, about, as_json=options.as_json, on_stdout=on_stdout)
 
 
 def _limited(options: RenderOptions) -> LodSettings:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import click
 
+from ..system.progress import silent
 from ..system.setting_fields import setting
 from ..system.units import format_size, percent_of
 from ..system.untrusted import printable
@@ -30,7 +31,7 @@ from .options.common import (
     report_outcomes,
     table_output,
 )
-from .options.viewing import Cameras, CutOptions, Inputs, files_read, say_notes, viewed_files
+from .options.viewing import Cameras, CutOptions, Inputs, check_view, files_read
 from .paths import NamedPath, claim_stdout, keep_apart, name_outputs
 
 if TYPE_CHECKING:
@@ -161,35 +162,41 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
     asserts = table.assertions() if table.asserts else []
     start = time.perf_counter()
     with Console(quiet=general.quiet, verbose=general.verbose) as console:
-        from ..api.jobs import traverse_files
+        from ..api.jobs import scenes_of_files, traverse_files
 
         question_budgets(console, budget)
         console.announce_compiling("cuts")
         screen = outputs.table.path is None and outputs.table.form is not None and is_terminal(sys.stdout)
         outputs.check()
-        with options.cameras.usage_errors():
-            plain = outputs.plot is not None
-            files = viewed_files(
-                instances, options.cameras, options.cut, general, console, trees_only=True, plain=plain, paged=True
-            )
-            say_notes(ctx, console, options.cameras, files, options.streaming.network)
-            keep_apart(ctx, {**besides, "indices_out": outputs.index_files(files.path.numbers, len(instances))})
-            written, whole, outcomes = traverse_files(
-                files,
-                budget,
-                options.cut.settings(),
-                options.streaming,
-                outputs,
-                by_instance=table.per_instance,
-                asserts=asserts,
-                passed=for_screen if screen and outputs.table.form != "parquet" else None,
-                bar=not screen,  # a bar and a table do not go together on one screen
-            )
-        cameras_read = len(files.path.cameras)
+        scenes = scenes_of_files(
+            instances,
+            precision=options.cut.precision,
+            threads=general.threads,
+            progress=console.progress,
+            trees_only=True,
+            plain=outputs.plot is not None,
+            paged=True,
+        )
+        path = options.cameras.path(scenes)
+        check_view(ctx, console, options.cameras, path, scenes(), options.streaming.network)
+        keep_apart(ctx, {**besides, "indices_out": outputs.index_files(path.numbers, len(instances))})
+        written, whole, outcomes = traverse_files(
+            scenes(),
+            path,
+            budget,
+            options.cut.settings(),
+            options.streaming,
+            outputs,
+            by_instance=table.per_instance,
+            asserts=asserts,
+            passed=for_screen if screen and outputs.table.form != "parquet" else None,
+            threads=general.threads,
+            progress=silent if screen else console.progress,  # a bar and a table do not go together on one screen
+        )
         console.clear()
-        console.detail(f"  {cameras_read:,} frames of {files.path.format}, {time.perf_counter() - start:.2f} s")
+        console.detail(f"  {len(path.cameras):,} frames of {path.format}, {time.perf_counter() - start:.2f} s")
         if outputs.table.path is not None:
-            console.say(f"{outputs.table.path}  table of {count_of(cameras_read, 'frame')}")
+            console.say(f"{outputs.table.path}  table of {count_of(len(path.cameras), 'frame')}")
         if written.note:
             console.say(f"{outputs.plot}: {written.note}")
         if written.in_front < LEAST_IN_FRONT:

@@ -39,7 +39,7 @@ class StreamedCuts(CutFinder):
         streaming: network and cache; everything is resident unless given.
 
     Raises:
-        ValueError: the budget, or the cache, is too small for the roots; or there are too many instances.
+        UnfitError: the budget, or the cache, is too small for the roots; or there are too many instances.
     """
 
     settings: LodSettings

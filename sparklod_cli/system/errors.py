@@ -118,6 +118,10 @@ class OutOfMemoryError(SparklodError):
     """The operation needs more memory than there is."""
 
 
+class UnfitError(ValueError):
+    """Settings that do not fit scenes, such as a budget, or a chunk cache, too small for their roots: a wrong usage."""
+
+
 def reason_of(error: OSError) -> str:
     """Return the reason of an error of the system, for the end of a message."""
     return (error.strerror or str(error)).lower()

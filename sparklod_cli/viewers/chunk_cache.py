@@ -10,6 +10,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from ..system.errors import UnfitError
 from .viewer_settings import FETCHERS
 
 
@@ -71,7 +72,7 @@ class ChunkCache:
     A chunk is used when it arrives and as long as it is wanted; among wanted chunks the more important one counts as
     more recently used. Wanted chunks beyond the capacity are not fetched, since they would evict more important ones or
     be evicted by them. Spark's pager works the same way. Chunks with roots are always wanted, and come first.
-    `ValueError` if the capacity is less than the number of trees.
+    `UnfitError` if the capacity is less than the number of trees.
 
     Attributes:
         requested: the wanted chunks, each once, the most important first.
@@ -80,7 +81,7 @@ class ChunkCache:
 
     def __init__(self, chunks: Chunks, capacity: int | None = None) -> None:
         if capacity is not None and capacity < len(chunks.roots):
-            raise ValueError(
+            raise UnfitError(
                 f"a cache of {capacity} chunks cannot hold the roots of {len(chunks.roots)} trees; make it larger"
             )
         self._chunks, self._capacity = chunks, capacity

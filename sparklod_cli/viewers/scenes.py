@@ -19,6 +19,7 @@ from ..model.gaussian import placed
 from ..model.instances import Instance, Matrix
 from ..model.scene import common_axis, rotated_axis, up_notes_of
 from ..model.splats import Splats
+from ..system.errors import UnfitError
 from ..system.units import count_of
 from .cut import Forest, TreeCut, TreeInstance, Viewer
 from .loaded_scene import STREAMED_SOG, TILES, TREE, Index, LoadedScene
@@ -157,13 +158,13 @@ class Scenes:
     def with_cuts(self) -> Sequence[LoadedScene]:
         """The scenes of which viewers draw cuts, in the order of `forest`: trees, detail levels or tiles.
 
-        `ValueError` for two kinds of them, which no viewer draws.
+        `UnfitError` for two kinds of them, which no viewer draws.
         """
         scenes = [loaded for loaded in self.loaded if loaded.kind is not None]
         kinds = {kind: loaded for kind in KINDS for loaded in reversed(scenes) if loaded.kind == kind}
         if len(kinds) > 1:
             (kind, first), (other, second), *_ = kinds.items()
-            raise ValueError(
+            raise UnfitError(
                 f"{first.name} is {kind} and {second.name} is {other}, whose viewers choose splats in different ways;"
                 " look at one of them at a time, or at full detail"
             )
@@ -201,22 +202,22 @@ class Scenes:
             remembers: of `PlayCanvasViewer`: cuts are found one after the other, along a path.
 
         Raises:
-            ValueError: the budget is too small for the roots, there are too many instances, or scenes for several
+            UnfitError: the budget is too small for the roots, there are too many instances, or scenes for several
                 viewers; or the settings are for trees alone.
         """
         instances = self.tree_instances(settings.foveation)
         if settings.budget < len(instances):
             budget = count_of(settings.budget, "splat")
-            raise ValueError(f"a budget of {budget} is less than one for each of {len(instances)} instances")
+            raise UnfitError(f"a budget of {budget} is less than one for each of {len(instances)} instances")
         if len(instances) > MAX_INSTANCES:
-            raise ValueError(f"{len(instances):,} instances are more than {MAX_INSTANCES:,}")
+            raise UnfitError(f"{len(instances):,} instances are more than {MAX_INSTANCES:,}")
         first = self.with_cuts[0]
         if self.kind != TREE:
             if settings.continuous is not None:
-                raise ValueError(f"{first.name} is {self.kind}; continuous cuts are of trees alone")
+                raise UnfitError(f"{first.name} is {self.kind}; continuous cuts are of trees alone")
             for at, loaded in zip(self.instances, self.of_instance, strict=True):
                 if loaded.kind is not None and at.foveation is not None:
-                    raise ValueError(
+                    raise UnfitError(
                         f"{at.name} is {self.kind}, and has a foveation, which is for trees alone; leave it out"
                     )
         fixed = sum(loaded.leaf_count for loaded in self.of_instance if loaded.kind is None)
@@ -263,7 +264,7 @@ class CutFinder:
     Args:
         remembers: see `Scenes.viewer`.
 
-    `ValueError` if the budget is too small for the roots, or there are too many instances.
+    `UnfitError` if the budget is too small for the roots, or there are too many instances.
     """
 
     def __init__(self, scenes: Scenes, settings: LodSettings | None, *, remembers: bool = False) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import click
@@ -47,8 +48,7 @@ def run(*arguments: str | Path, scene: Any = scene_of_shells) -> tuple[Result, l
     def fly(ctx: click.Context, **_: Any) -> None:
         asked = values_of(ctx, Flight)
         asked.check(ctx)
-        with asked.usage_errors():
-            found.append(asked.camera_source().cameras(asked.settings(), scene))
+        found.append(asked.path(lambda: SimpleNamespace(balls=scene, up=None)))
 
     return CliRunner().invoke(fly, [str(argument) for argument in arguments]), found
 

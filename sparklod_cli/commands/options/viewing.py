@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
-import functools
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -34,14 +32,11 @@ from ..paths import NamedPath, file_of
 from .common import DEFAULT_UP, UP
 
 if TYPE_CHECKING:
-    from ...api.jobs import ViewedFiles
     from ...cameras.camera import Matrix
-    from ...cameras.frame import Settings
-    from ...cameras.sources import CameraSource
+    from ...cameras.sources import CameraPath
     from ...model.instances import Instance
     from ...viewers.scenes import Scenes
     from ..console import Console
-    from .common import General
 
 #: The options that are each a source of cameras, of which one can be given.
 SOURCES = ("camera_path", "orbit", "dolly", "look_at", "keyframes", "views")
@@ -177,64 +172,46 @@ class Cameras:
             return 2 if self.every == 1 else 1
         return -(-(self.orbit or 1) // self.every)
 
-    def camera_source(self) -> CameraSource:
-        """Return the source of the cameras, for the library."""
-        from ...cameras import sources
-
-        elevation = ELEVATION if self.elevation is None else self.elevation
-        seconds = self.seconds or sources.SECONDS
-        if self.camera_path is not None:
-            from ...cameras.camera_files import read_path
-
-            path, form = self.camera_path, None if self.camera_format == "auto" else self.camera_format
-            return sources.CameraSource(lambda settings, scene: read_path(path, form, settings))
-        if self.views or self.look_at:
-            views, named = self.views or (self.look_at,), bool(self.views)
-            return sources.CameraSource(lambda settings, scene: sources.single_views(views, settings, named=named))
-        if self.keyframes:
-            return sources.CameraSource(lambda settings, scene: sources.keyframes(self.keyframes, seconds, settings))
-        if self.dolly:
-            dolly = functools.partial(sources.dolly, seconds, self.center, self.distance, elevation)
-            return sources.CameraSource(dolly, fits_scene=self.distance is None)
-        if self.orbit is None and self.still and self.center is None and self.distance is None:
-            return sources.CameraSource(functools.partial(sources.whole_scene, elevation), fits_scene=True)
-        count = self.orbit or (1 if self.still else ORBIT)
-        orbit = functools.partial(sources.orbit, count, self.center, self.distance, elevation)
-        return sources.CameraSource(orbit, fits_scene=self.distance is None)
-
-    def settings(self) -> Settings:
-        """Return settings that override those of a camera file.
+    def path(self, scenes: Callable[[], Scenes]) -> CameraPath:
+        """Return the cameras; scenes are read only where cameras are chosen for them, or need their up axis.
 
         Raises:
-            CameraPathError: its file holds no transform; names the file.
+            CameraPathError: a file cannot be read, or a camera makes no sense.
+            InvalidSplatsError: there is no scene to fit.
         """
+        from ...cameras import sources
         from ...cameras.frame import Settings
 
-        fps = self.fps
-        if self.source == "orbit" and self.seconds is not None:
-            fps = (self.orbit or ORBIT) / self.seconds
-        return Settings(
+        settings = Settings(
             axes=Axes(self.camera_axes) if self.camera_axes else None,
             world=None if self.world_transform is None else _world(self.world_transform),
             size=self.size,
             fov_y=None if self.fov is None else math.radians(self.fov),
-            fps=fps,
+            fps=self.fps,
             every=self.every,
             up=self.up,
+            up_of_scene=lambda: scenes().up,
         )
+        if self.camera_path is not None:
+            from ...cameras.camera_files import read_path
 
-    @contextlib.contextmanager
-    def usage_errors(self) -> Iterator[None]:
-        """Turn errors about values of options into usage errors; that of too many cameras names the option."""
-        from ...api.jobs import UnfitError
-
+            return read_path(self.camera_path, None if self.camera_format == "auto" else self.camera_format, settings)
+        elevation = ELEVATION if self.elevation is None else self.elevation
+        seconds = self.seconds or sources.SECONDS
         try:
-            yield
-        except UnfitError as error:
-            raise click.UsageError(str(error)) from None
+            if self.views or self.look_at:
+                return sources.single_views(self.views or (self.look_at,), settings, named=bool(self.views))
+            if self.keyframes:
+                return sources.keyframes(self.keyframes, seconds, settings)
+            if self.dolly:
+                return sources.dolly(seconds, self.center, self.distance, elevation, settings, lambda: scenes().balls())
+            if self.orbit is None and self.still and self.center is None and self.distance is None:
+                return sources.whole_scene(elevation, settings, lambda: scenes().balls())
+            count = self.orbit or (1 if self.still else ORBIT)
+            if self.seconds is not None:
+                settings = replace(settings, fps=count / self.seconds)
+            return sources.orbit(count, self.center, self.distance, elevation, settings, lambda: scenes().balls())
         except TooManyCamerasError as error:
-            if self.camera_path is not None:
-                raise
             raise click.UsageError(f"--{self.source.replace('_', '-')}: {error}") from None
 
 
@@ -390,44 +367,20 @@ def files_read(cameras: Cameras, instances: list[Instance]) -> dict[str, list[Pa
     return {"scene": splats, "world_transform": [matrix] if matrix else []}
 
 
-def viewed_files(
-    instances: list[Instance], cameras: Cameras, cut: CutOptions, general: General, console: Console, **how: Any
-) -> ViewedFiles:
-    """Return the files and the cameras that look at them; the other arguments are attributes of `ViewedFiles`."""
-    from ...api.jobs import ViewedFiles
-
-    source, settings = cameras.camera_source(), cameras.settings()
-    return ViewedFiles(instances, source, settings, cut.precision, general.threads, console.progress, **how)
-
-
-def say_notes(
+def check_view(
     ctx: click.Context,
     console: Console,
     cameras: Cameras,
-    files: ViewedFiles,
+    path: CameraPath,
+    scenes: Scenes,
     network: Network | None = None,
     notes: Iterable[str] = (),
 ) -> None:
-    """Print notes on the cameras, further ones, and those on scenes; raise a `click.UsageError` as `check_scenes`."""
-    from ...viewers.loaded_scene import TREE
+    """Print notes on the cameras, further ones, and those on scenes.
 
-    scenes, path = files.scenes, files.path
-    check_scenes(ctx, scenes)
-    upright = cameras.up is None and cameras.camera_path is None  # by the axes of the files
-    for note in (*path.notes, *notes, *(scenes.axis_notes if upright else ())):
-        console.say(note)
-    if network is None or network.instant:
-        return
-    trees = [loaded for loaded in scenes.loaded if loaded.kind == TREE]
-    if whole := dict.fromkeys(printable(loaded.name) for loaded in trees if not loaded.has_chunks):
-        names = ", ".join(whole)
-        console.say(
-            f"{names}: loaded whole by viewers before they draw; the waits are those of a RAD with the same nodes"
-        )
-
-
-def check_scenes(ctx: click.Context, scenes: Scenes) -> None:
-    """Raise a `click.UsageError` where an option is for trees or Streamed SOG, and the files are something else."""
+    Raises:
+        click.UsageError: an option is for trees, or for Streamed SOG, and the files are something else.
+    """
     from ...viewers.loaded_scene import STREAMED_SOG, TILES, TREE
 
     if scenes.kind == STREAMED_SOG:
@@ -444,3 +397,14 @@ def check_scenes(ctx: click.Context, scenes: Scenes) -> None:
             "is for Level-of-Detail files, and no file is one, so that all splats are drawn; bake one with build-lod"
         )
         refuse(ctx, (*CUTS, *LOADING, *DETAIL), plain)
+    upright = cameras.up is None and cameras.camera_path is None  # by the axes of the files
+    for note in (*path.notes, *notes, *(scenes.axis_notes if upright else ())):
+        console.say(note)
+    if network is None or network.instant:
+        return
+    trees = [loaded for loaded in scenes.loaded if loaded.kind == TREE]
+    if whole := dict.fromkeys(printable(loaded.name) for loaded in trees if not loaded.has_chunks):
+        names = ", ".join(whole)
+        console.say(
+            f"{names}: loaded whole by viewers before they draw; the waits are those of a RAD with the same nodes"
+        )
