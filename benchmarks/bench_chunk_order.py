@@ -29,8 +29,7 @@ from sparklod_cli.viewers import cut as viewer_cut
 from sparklod_cli.viewers.chunk_cache import Chunks
 from sparklod_cli.viewers.cut import TreeCut
 from sparklod_cli.viewers.network import ChunkStream
-from sparklod_cli.viewers.read_scenes import read_scenes
-from sparklod_cli.viewers.scenes import Scenes
+from sparklod_cli.viewers.scenes import Scenes, read_scenes
 from sparklod_cli.viewers.viewer_settings import LodSettings, Network, pixel_limit
 
 sys.path.insert(0, str(Path(__file__).parents[1]))

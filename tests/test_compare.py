@@ -28,8 +28,7 @@ from sparklod_cli.model.instances import Instance
 from sparklod_cli.render.settings import RenderSettings
 from sparklod_cli.system.errors import SparklodError
 from sparklod_cli.tables.columns import Row
-from sparklod_cli.viewers.read_scenes import read_scenes
-from sparklod_cli.viewers.scenes import Scenes
+from sparklod_cli.viewers.scenes import Scenes, read_scenes
 from sparklod_cli.viewers.viewer_settings import LodSettings
 from tests.conftest import FIXTURES
 

@@ -21,8 +21,7 @@ from sparklod_cli.render.color_by import values_of
 from sparklod_cli.render.renderer import Renderer
 from sparklod_cli.render.settings import RenderSettings
 from sparklod_cli.system.errors import FormatError, InvalidSplatsError
-from sparklod_cli.viewers.read_scenes import read_scenes
-from sparklod_cli.viewers.scenes import CutFinder, Scenes
+from sparklod_cli.viewers.scenes import CutFinder, Scenes, read_scenes
 from sparklod_cli.viewers.viewer_settings import LodSettings
 from tests.conftest import FIXTURES
 from tests.render.drawables import camera

@@ -18,8 +18,7 @@ from sparklod_cli.model.splats import Splats
 from sparklod_cli.model.traversed import DetailScene
 from sparklod_cli.render.color_by import numbers_of, scale_of_splats
 from sparklod_cli.viewers.playcanvas import LoadedDetail
-from sparklod_cli.viewers.read_scenes import read_scenes
-from sparklod_cli.viewers.scenes import CutFinder, Scenes
+from sparklod_cli.viewers.scenes import CutFinder, Scenes, read_scenes
 from sparklod_cli.viewers.viewer_settings import PLAYCANVAS_BUDGET, DetailRule, LodSettings
 from tests.conftest import FIXTURES
 from tests.lod.details import row_of_regions

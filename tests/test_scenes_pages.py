@@ -23,8 +23,7 @@ from sparklod_cli.model.splats import COLUMNS
 from sparklod_cli.system.errors import FormatError, TreeError
 from sparklod_cli.viewers import paging
 from sparklod_cli.viewers.paging import PagedScene
-from sparklod_cli.viewers.read_scenes import read_scenes
-from sparklod_cli.viewers.scenes import CutFinder, Scenes
+from sparklod_cli.viewers.scenes import CutFinder, Scenes, read_scenes
 from sparklod_cli.viewers.viewer_settings import LodSettings, Network, StreamingSettings
 from tests.conftest import FIXTURES
 from tests.lod.forests import transform

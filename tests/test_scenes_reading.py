@@ -22,10 +22,10 @@ from sparklod_cli.model.instances import Instance, names_of
 from sparklod_cli.model.lod_tree import CHUNK_NODES
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.system.errors import FormatError, SparklodError, TreeError
-from sparklod_cli.viewers import read_scenes as reading
+from sparklod_cli.viewers import scenes as reading
 from sparklod_cli.viewers.loaded_scene import TRAVERSED
-from sparklod_cli.viewers.read_scenes import read_scenes
-from sparklod_cli.viewers.scenes import Cut, Part
+from sparklod_cli.viewers.scenes import Cut, Part, read_scenes
+from sparklod_cli.viewers.viewer_settings import LodSettings
 from tests.conftest import FIXTURES
 from tests.lod.forests import transform
 from tests.references import gaussians
@@ -107,7 +107,7 @@ def test_splats_of_an_instance_are_placed() -> None:
 
 def test_the_forest_has_the_nodes_of_the_files() -> None:
     made = read_scenes(five())
-    instances = made.tree_instances(Cones())
+    instances = made.viewer(LodSettings()).instances
     assert [tree.file for tree in made.with_cuts] == [TREE, TOWN, HAND]
     assert [instance.tree for instance in instances] == [0, 1, 0, 2, 2]
     assert [instance.lod_scale for instance in instances] == [1, 2, 3, 4, 5]
@@ -201,11 +201,11 @@ def test_foveation_is_that_of_all_or_its_own() -> None:
     own, of_all = Frustum(0.5, 0.1), Cones(90, 120, 0.4, 0.2)
     instances = [Instance(TREE, "a"), Instance(TREE, "b", SHIFTED, 3.0, own), Instance(HAND, "c")]
     made = read_scenes(instances)
-    instances = made.tree_instances(of_all)
+    instances = made.viewer(LodSettings(foveation=of_all)).instances
     assert [instance.foveation for instance in instances] == [of_all, own, of_all]
     assert [instance.lod_scale for instance in instances] == [1, 3, 1]
     assert np.array_equal(instances[1].object_to_world, SHIFTED)
-    assert made.tree_instances(Cones())[1].foveation == own
+    assert made.viewer(LodSettings()).instances[1].foveation == own
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,7 @@ from ..cameras.framing import reach
 from ..model.splats import COLUMNS
 from ..system.progress import Progress, silent
 from ..viewers.loaded_scene import TRAVERSED
-from ..viewers.read_scenes import read_scenes
-from ..viewers.scenes import CutFinder
+from ..viewers.scenes import CutFinder, read_scenes
 
 if TYPE_CHECKING:
     from ..cameras.sources import CameraPath

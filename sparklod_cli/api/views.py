@@ -30,8 +30,7 @@ from ..system.errors import CameraPathError, FormatError, memory_errors_translat
 from ..system.threads import on_threads, thread_count
 from ..tables.columns import Table
 from ..viewers.loaded_scene import STREAMED_SOG, TILES, UNNAMED
-from ..viewers.read_scenes import read_scenes
-from ..viewers.scenes import Cut, CutFinder, Scenes
+from ..viewers.scenes import Cut, CutFinder, Scenes, read_scenes
 from ..viewers.viewer_settings import BLEND, PLAYCANVAS_BUDGET, LodSettings
 from .arguments import (
     BudgetLike,

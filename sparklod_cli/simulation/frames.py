@@ -24,7 +24,7 @@ from ..viewers.frame_statistics import Changes, CutStatistics, measure
 from ..viewers.loaded_scene import STREAMED_SOG, TILES, TREE
 from ..viewers.scenes import CutFinder, Scenes
 from ..viewers.viewer_settings import LodSettings, StreamingSettings
-from .results import COLUMNS, OF_BUDGETS, OF_TREES, FrameOutputs, Lookout, Moment
+from .results import COLUMNS, OF_BUDGETS, OF_TREES, Extremes, FrameOutputs, Moment, add_extremes, moments_of
 
 if TYPE_CHECKING:
     from ..viewers.network import ChunkStream
@@ -157,7 +157,7 @@ class Simulation(StreamedCuts):
             "chunks_touched": len(cache.requested),
             "chunks_new": len(arrived),
             "bytes_new": received,
-            "chunks_resident": len(cache),
+            "chunks_resident": int(cache.resident().sum()),
             "complete_in_s": complete_in,
         }
         return drawn, resident, cells
@@ -237,24 +237,25 @@ def write_frames(
 
     `passed` filters the bytes of a table on standard output. `OutputError` if a file cannot be written.
     """
-    together, in_front, lookout = list[Row](), list[float](), Lookout()
+    together, in_front, most = list[Row](), list[float](), Extremes()
     extremes: dict[str, SimulatedFrame] = {}  # by criterion, and the first frame
 
     def rows() -> Iterator[Row]:
         for frame in simulation.run(path, by_instance=by_instance, threads=threads, progress=progress):
             in_front.append(frame.in_front)
-            together.append(frame.rows[0])
             if outputs.indices is not None:
                 _write_indices(frame, outputs)
             if outputs.plot is not None:
-                extremes.update(dict.fromkeys(lookout.add(frame.rows[0]), frame))
                 extremes.setdefault("first", frame)
+                criteria = add_extremes(most, frame.rows[0], is_first=not together)
+                extremes.update(dict.fromkeys(criteria, frame))
+            together.append(frame.rows[0])
             yield from frame.rows
 
     outputs.table.write(rows(), passed=passed)
     note = None
     if outputs.plot is not None:
-        png, note = _charts(simulation, path, together, lookout.moments(), extremes)
+        png, note = _charts(simulation, path, together, moments_of(most), extremes)
         write_file(outputs.plot, [png], overwrite=outputs.overwrite)
     return WrittenFrames(together, float(np.mean(in_front)), note)
 

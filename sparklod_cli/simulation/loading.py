@@ -84,7 +84,7 @@ class Loader(StreamedCuts):
 
     def cut(self, camera: Camera) -> Cut:
         """Return what a visitor sees after `seconds`."""
-        resident = np.zeros(len(self.chunks), np.bool_)
+        resident = np.zeros(len(self.chunks.sizes), np.bool_)
         for arrival in self.arrivals(camera):
             if arrival.seconds > self.seconds:
                 break
@@ -93,7 +93,7 @@ class Loader(StreamedCuts):
 
     def _splats_of(self, cut: TreeCut) -> NDArray[np.int64]:
         """Return the (chunks,) numbers of splats of a cut in each chunk of all trees."""
-        counts = np.zeros(len(self.chunks), np.int64)
+        counts = np.zeros(len(self.chunks.sizes), np.int64)
         scenes = [loaded for loaded in self.scenes.of_instance if loaded.kind is not None]
         for loaded, view, nodes in zip(scenes, cut.views, cut.indices(), strict=True):
             chunks, splats = np.unique(loaded.chunk_of(nodes.astype(np.int64)) - loaded.first_chunk, return_counts=True)

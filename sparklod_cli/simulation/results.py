@@ -227,9 +227,16 @@ def summarize(rows: Iterable[Row], loading: Row | None = None) -> Summary:
     times = numbers(frames, "time_s")
     reasons = Counter(str(row["stop_reason"]) for row in frames if row["stop_reason"] is not None)
     chunks, size = numbers(frames, "chunks_new"), numbers(frames, "bytes_new")
-    lookout = Lookout()
+    most: Extremes = {}
     for row in frames:
-        lookout.add(row)
+        add_extremes(most, row, is_first=row is frames[0])
+    drawn = [(row["in_frustum"], row["selected"]) for row in frames]
+    shares = [seen / all_ for seen, all_ in drawn if isinstance(seen, int) and isinstance(all_, int) and all_]
+    quantities = []
+    for name in QUANTITIES:
+        if values := shares if name == IN_FRUSTUM else numbers(frames, name):
+            found = {each: _rounded(statistic(each, values)) for each in STATISTICS}
+            quantities.append(FrameStatistics(name, UNITS.get(name, "share"), len(values), **found))
     return Summary(
         frames=len(frames),
         seconds=round(times[-1] - times[0], 6) if times else 0.0,
@@ -238,22 +245,10 @@ def summarize(rows: Iterable[Row], loading: Row | None = None) -> Summary:
         chunks_first=int(sum(numbers(frames[:1], "chunks_new"))),
         bytes_first=int(sum(numbers(frames[:1], "bytes_new"))),
         stop_reasons={reason: round(count / reasons.total(), 6) for reason, count in reasons.most_common()},
-        quantities=tuple(quantity for name in QUANTITIES if (quantity := _quantity(name, frames)) is not None),
-        moments=tuple(lookout.moments()),
+        quantities=tuple(quantities),
+        moments=tuple(moments_of(most)),
         loading=loading,
     )
-
-
-def _quantity(name: str, frames: Sequence[Row]) -> FrameStatistics | None:
-    if name == IN_FRUSTUM:
-        counts = ((row["in_frustum"], row["selected"]) for row in frames)
-        values = [seen / drawn for seen, drawn in counts if isinstance(seen, int) and isinstance(drawn, int) and drawn]
-    else:
-        values = numbers(frames, name)
-    if not values:
-        return None
-    found = {each: _rounded(statistic(each, values)) for each in STATISTICS}
-    return FrameStatistics(name, UNITS.get(name, "share"), len(values), **found)
 
 
 def _rounded(value: Number) -> Number:
@@ -261,13 +256,8 @@ def _rounded(value: Number) -> Number:
     return value if isinstance(value, int) else float(f"{value:.9g}")
 
 
-def coarseness(row: Row) -> Number | None:
-    """Return the smallest pixel scale of a refined node, as a multiple of the limit; None if either is missing."""
-    scale, limit = row["pixel_scale_min"], row["pixel_scale_limit"]
-    return scale / limit if isinstance(scale, (int, float)) and isinstance(limit, (int, float)) and limit else None
-
-
-#: Criteria for extreme frames: the column, None for `coarseness`, the threshold that it must exceed, and the unit.
+#: Criteria for extreme frames: the column, None for the least pixel scale of a
+#: refined node as a multiple of the limit, the threshold that it must exceed, and the unit.
 MOMENTS: dict[str, tuple[str | None, Number, str]] = {
     "churn": ("churn", 0, "share"),
     "bytes": ("bytes_new", 0, "bytes"),
@@ -278,38 +268,41 @@ MOMENTS: dict[str, tuple[str | None, Number, str]] = {
 }
 
 
-class Lookout:
-    """Finds the frame with the largest value of each criterion, the first among equals.
+#: By criterion, the largest value so far, and the first row that has it.
+Extremes = dict[str, tuple[Number, Row]]
+
+
+def add_extremes(most: Extremes, row: Row, *, is_first: bool) -> list[str]:
+    """Add the row of the next frame, and return the criteria in which it exceeds all earlier frames.
 
     The bytes fetched by the first frame do not count, since it has to fetch everything.
     """
+    criteria = []
+    for criterion, (column, above, _) in MOMENTS.items():
+        if criterion == "bytes" and is_first:
+            continue
+        value = next(iter(numbers([row], column or "pixel_scale_min")), None)
+        if column is None and value is not None:
+            limit = next(iter(numbers([row], "pixel_scale_limit")), 0)
+            value = value / limit if limit else None
+        if value is not None and value > (most[criterion][0] if criterion in most else above):
+            most[criterion] = value, row
+            criteria.append(criterion)
+    return criteria
 
-    def __init__(self) -> None:
-        self._most: dict[str, tuple[Number, Row]] = {}
-        self._frames = 0
 
-    def add(self, row: Row) -> list[str]:
-        """Add the row of the next frame; returns the criteria in which it exceeds all earlier frames."""
-        found = []
-        for criterion, (column, above, _) in MOMENTS.items():
-            if criterion == "bytes" and not self._frames:
-                continue
-            value = coarseness(row) if column is None else next(iter(numbers([row], column)), None)
-            if value is not None and value > (self._most[criterion][0] if criterion in self._most else above):
-                self._most[criterion] = value, row
-                found.append(criterion)
-        self._frames += 1
-        return found
-
-    def moments(self) -> list[Moment]:
-        moments = []
-        for criterion, (_, _, unit) in MOMENTS.items():
-            if criterion in self._most:
-                value, row = self._most[criterion]
-                frame, name = cast("int", row["frame"]), cast("str | None", row["name"])
-                time = cast("float | None", row["time_s"])
-                moments.append(Moment(criterion, frame, time, name or None, _rounded(value), unit))
-        return moments
+def moments_of(most: Extremes) -> list[Moment]:
+    """Return the frame of each criterion that any frame meets, in the order of `MOMENTS`."""
+    moments = []
+    for criterion in filter(most.__contains__, MOMENTS):
+        value, row = most[criterion]
+        frame, name, time = (
+            cast("int", row["frame"]),
+            cast("str | None", row["name"]),
+            cast("float | None", row["time_s"]),
+        )
+        moments.append(Moment(criterion, frame, time, name or None, _rounded(value), MOMENTS[criterion][2]))
+    return moments
 
 
 @dataclass(frozen=True)

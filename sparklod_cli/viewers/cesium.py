@@ -12,7 +12,6 @@ import functools
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,10 +19,9 @@ from numpy.typing import NDArray
 from ..cameras.camera import Camera
 from ..lod.tiles import PIXEL_ERROR
 from ..model.traversed import TileScene
-from .cut import Forest, TreeCut, TreeInstance, Viewer
-from .loaded_scene import TILES, Index, bytes_of
-from .runs import LoadedRuns, cut_of_runs
-from .viewer_settings import CESIUM_FETCHERS, LodSettings
+from .cut import Forest, TreeCut, TreeInstance
+from .loaded_scene import TILES, Index, LoadedRuns, bytes_of, cut_of_runs
+from .viewer_settings import CESIUM_FETCHERS
 
 #: Corners of a box, as shares of its extent.
 CORNERS = np.stack(np.meshgrid(*[(0.0, 1.0)] * 3, indexing="ij"), axis=-1).reshape(8, 3)
@@ -31,30 +29,22 @@ CORNERS = np.stack(np.meshgrid(*[(0.0, 1.0)] * 3, indexing="ij"), axis=-1).resha
 Mask = NDArray[np.bool_]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class LoadedTiles(LoadedRuns):
     """A scene of tiles; `scene` and `splats` have those of all tiles."""
 
     fetchers = CESIUM_FETCHERS
 
-    kind = TILES
-
     tiles: TileScene = field(kw_only=True)
 
-    def viewer(
-        self,
-        forest: Forest[Any],
-        instances: Sequence[TreeInstance],
-        settings: LodSettings,
-        *,
-        fixed: int,
-        remembers: bool,
-    ) -> Viewer:
-        return CesiumViewer(forest, instances)
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.kind, self.chunks = TILES, self.tiles.tiles
 
     @property
-    def manifest_bytes(self) -> int:
-        return 0 if self.tiles.sizes is None else self.bytes - int(self.tiles.sizes.sum())
+    def headers(self) -> tuple[int, ...]:
+        """Bytes of the manifest; none for a scene in memory."""
+        return () if self.tiles.sizes is None else (self.bytes - int(self.tiles.sizes.sum()),)
 
     @functools.cached_property
     def depth(self) -> NDArray[np.int32]:
@@ -95,7 +85,7 @@ class TileChoice:
 class CesiumViewer:
     """Finds cuts of scenes of tiles; several threads may ask it."""
 
-    def __init__(self, forest: Forest[LoadedTiles], instances: Sequence[TreeInstance]) -> None:
+    def __init__(self, forest: Forest, instances: Sequence[TreeInstance]) -> None:
         self.forest, self.instances = forest, list(instances)
 
     def cut(self, camera: Camera, *, budget: int, smallest: float = 0.0, resident: Mask | None = None) -> TreeCut:

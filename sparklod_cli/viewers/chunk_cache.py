@@ -58,9 +58,6 @@ class Chunks:
         self.firsts = [0, *itertools.accumulate(map(len, requests))][:-1]
         self.roots = self.firsts if rooted else []
 
-    def __len__(self) -> int:
-        return len(self.sizes)
-
     def shows(self, resident: NDArray[np.bool_]) -> bool:
         """Return True if anything is drawn with (chunks,) bool resident chunks."""
         return bool((resident[self.roots] if self.roots else resident).any())
@@ -92,15 +89,12 @@ class ChunkCache:
         self.admitted: list[int] = []
         self._is_admitted: frozenset[int] = frozenset()
 
-    def __len__(self) -> int:
-        return len(self._resident)
-
     def __contains__(self, chunk: int) -> bool:
         return chunk in self._resident
 
     def resident(self) -> NDArray[np.bool_]:
         """Return the resident chunks, (chunks,) bool, for `Viewer.cut`."""
-        present = np.zeros(len(self._chunks), np.bool_)
+        present = np.zeros(len(self._chunks.sizes), np.bool_)
         present[list(self._resident)] = True
         return present
 
@@ -114,8 +108,8 @@ class ChunkCache:
         The roots of all trees come before them, in this order, too, whether listed or not.
         """
         named = [int(chunk) for chunk in requested]
-        if named and not 0 <= min(named) <= max(named) < len(self._chunks):
-            raise ValueError(f"chunks {min(named)} to {max(named)} are wanted, but there are {len(self._chunks)}")
+        if named and not 0 <= min(named) <= max(named) < len(self._chunks.sizes):
+            raise ValueError(f"chunks {min(named)} to {max(named)} are wanted, but there are {len(self._chunks.sizes)}")
         self._arrange()  # chunks wanted until now count as used until now
         roots = [chunk for chunk in named if chunk in self._roots]
         self.requested = list(dict.fromkeys([*roots, *self._chunks.roots, *named]))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar, Generic, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,10 +23,11 @@ Matrix = NDArray[np.float64]
 class Viewer(Protocol):
     """A viewer of instances of some scenes; several threads may ask it.
 
-    A fourth one is a module with two classes: this one, and a `loaded_scene.LoadedScene` with the chunks of a scene.
+    A fourth one is a module with two classes, this one and a `loaded_scene.LoadedScene` with the chunks of a scene, and
+    a row in `Scenes.viewer`.
     """
 
-    forest: Forest[Any]
+    forest: Forest
     instances: list[TreeInstance]
 
     def cut(
@@ -46,36 +47,19 @@ class Viewer(Protocol):
         """
 
 
-class Held(Protocol):
-    """A scene in a viewer: splats as nodes, in chunks."""
-
-    paged: ClassVar[bool]
-
-    @property
-    def count(self) -> int: ...
-
-    @property
-    def chunks(self) -> int: ...
-
-    @property
-    def depth(self) -> NDArray[np.int32]: ...
-
-    def fill(self, rows: NDArray[np.void]) -> None:
-        """Fill (count,) `pixel_scale.NODE`."""
-
-
-Scene = TypeVar("Scene", bound=Held)
-
-
-class Forest(Generic[Scene]):
+class Forest:
     """Scenes in the memory layout of cuts, one after the other.
+
+    Args:
+        scenes: each a `LoadedScene`, or `Nodes`: with numbers of splats (`count`) and of `chunks`, and the `depth` of
+            each splat; `fill` sets their `pixel_scale.NODE`.
 
     Attributes:
         node_base: (scenes + 1,) int64 index of each scene's first node.
         chunk_base: (scenes + 1,) int64 index of each scene's first chunk.
     """
 
-    def __init__(self, scenes: Sequence[Scene]) -> None:
+    def __init__(self, scenes: Sequence[Any]) -> None:
         self.scenes = scenes
         self.node_base = np.cumsum([0, *(scene.count for scene in scenes)]).astype(np.int64)
         self.chunk_base = np.cumsum([0, *(scene.chunks for scene in scenes)]).astype(np.int64)
@@ -153,28 +137,19 @@ class TreeCut:
         return order
 
 
-def views_of(forest: Forest[Any], instances: Sequence[TreeInstance], view: Camera) -> NDArray[np.void]:
+def views_of(forest: Forest, instances: Sequence[TreeInstance], view: Camera) -> NDArray[np.void]:
     """Return (instances,) `pixel_scale.VIEW`: the camera in the space of each instance, in Spark's precision."""
     views = np.zeros(len(instances), pixel_scale.VIEW)
     for row, instance in zip(views, instances, strict=True):
         view_to_object = (np.linalg.inv(instance.object_to_world) @ view.camera_to_world).astype(np.float32)
-        right, up, backward, origin = view_to_object[:3].T
-        for name, vector in (
-            ("right", _unit(right)),
-            ("up", _unit(up)),
-            ("forward", -_unit(backward)),
-            ("origin", origin),
-        ):
+        # Unit vectors as glam, Spark's library, computes them: divided by their length, in float32.
+        x, y, z = view_to_object[:3, :3]
+        right, up, backward = (view_to_object[:3, :3] / np.sqrt((x * x + y * y) + z * z)).T
+        vectors = {"right": right, "up": up, "forward": -backward, "origin": view_to_object[:3, 3]}
+        for name, vector in vectors.items():
             row[f"{name}_x"], row[f"{name}_y"], row[f"{name}_z"] = vector
         row["lod_scale"] = instance.lod_scale
         row["node_base"] = forest.node_base[instance.tree]
         row["chunk_base"] = forest.chunk_base[instance.tree]
         set_foveation(row, instance.foveation, view.fov_x, view.fov_y)
     return views
-
-
-def _unit(vector: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return a unit vector as glam, Spark's library, computes it: divided by its length, in float32."""
-    x, y, z = vector
-    unit: NDArray[np.float32] = vector / np.sqrt((x * x + y * y) + z * z)
-    return unit

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,12 +44,12 @@ class CutStatistics:
 
 
 def measure(
-    forest: Forest[Any], cut: TreeCut, view: Camera, *, by_instance: bool = False
+    forest: Forest, cut: TreeCut, view: Camera, *, by_instance: bool = False
 ) -> tuple[CutStatistics, list[CutStatistics]]:
     """Return the statistics of a cut found for `view` as a whole and, optionally, of each instance in it."""
     pixels = view.width * view.height
     counts = np.empty((len(cut.views), kernels.COUNTS), np.int64)
-    sizes, owners = np.empty(len(cut), np.float32), np.empty(len(cut), np.uint16)
+    sizes, owners = np.empty(len(cut.node), np.float32), np.empty(len(cut.node), np.uint16)
     screen = kernels.Screen(
         np.float32(math.tan(view.fov_x / 2)),
         np.float32(math.tan(view.fov_y / 2)),
@@ -103,7 +102,7 @@ def _measured(row: NDArray[np.int64], sizes: NDArray[np.float32], pixels: int) -
 class Changes:
     """Compares each cut with the one before it."""
 
-    def __init__(self, forest: Forest[Any], instances: Sequence[TreeInstance]) -> None:
+    def __init__(self, forest: Forest, instances: Sequence[TreeInstance]) -> None:
         sizes = np.diff(forest.node_base)
         bits = [int(sizes[instance.tree]) for instance in instances]
         # Each instance begins with a new word.

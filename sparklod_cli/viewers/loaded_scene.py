@@ -1,26 +1,29 @@
-"""Scenes for viewing, shared by their instances: plain ones and trees."""
+"""Scenes for viewing, shared by their instances: plain ones, trees, and those with runs of splats in files."""
 
 from __future__ import annotations
 
 import functools
+import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..codecs.formats import PRECISIONS
+from ..model.gaussian import spark_size
 from ..model.lod_tree import CHUNK_NODES, LodTree
 from ..model.scene import Scene
 from ..model.splats import COLUMNS, Splats
 from ..model.traversed import Nodes
-from .cut import Forest, TreeInstance, Viewer
-from .spark import SparkViewer, header_answers
-from .viewer_settings import FETCHERS, LodSettings
+from .cut import Forest, TreeCut, TreeInstance, views_of
+from .spark import header_answers
+from .viewer_settings import FETCHERS
 
 if TYPE_CHECKING:
+    from ..cameras.camera import Camera
     from ..model.file_coding import FileCoding
 
 Index = NDArray[np.signedinteger]
@@ -35,7 +38,7 @@ TREE, STREAMED_SOG, TILES = "a Level-of-Detail tree", "Streamed SOG", "3D Tiles"
 TRAVERSED = ("center", "scale", "opacity")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class LoadedScene:
     """A scene, read once however many instances it has.
 
@@ -47,6 +50,10 @@ class LoadedScene:
         first_chunk: number of its first chunk, where the chunks of all scenes are counted.
         precision: one of `PRECISIONS`, of the nodes that cuts are found with.
         threads: to prepare nodes on.
+        kind: of scene that cuts are drawn of, `TREE`, `STREAMED_SOG` or `TILES`; None for a plain scene.
+        count: number of splats.
+        chunks: number of chunks, of 65,536 splats each, or of files.
+        has_chunks: its format has chunks of as many splats as Spark streams (RAD).
     """
 
     #: Whether nodes are read as cuts need them.
@@ -64,26 +71,20 @@ class LoadedScene:
     precision: str = PRECISIONS[0]
     threads: int = 1
 
-    @property
-    def name(self) -> str:
-        return self.file.name if self.file is not None else UNNAMED
+    name: str = field(init=False)
+    kind: str | None = field(init=False)
+    count: int = field(init=False)
+    chunks: int = field(init=False)
+    has_chunks: bool = field(init=False)
 
-    @property
-    def kind(self) -> str | None:
-        """Kind of scene that cuts are drawn of: `TREE`, `STREAMED_SOG` or `TILES`; None for a plain scene."""
-        return None if self.scene.tree is None else TREE
-
-    def viewer(
-        self,
-        forest: Forest[Any],
-        instances: Sequence[TreeInstance],
-        settings: LodSettings,
-        *,
-        fixed: int,
-        remembers: bool,
-    ) -> Viewer:
-        """Return the viewer of scenes of this kind; see `Scenes.viewer`, and `PlayCanvasViewer` for `fixed`."""
-        return SparkViewer(forest, instances)
+    def __post_init__(self) -> None:
+        scene = self.scene
+        self.name = UNNAMED if self.file is None else self.file.name
+        self.kind = None if scene.tree is None else TREE
+        self.count = len(self.splats)
+        self.chunks = -(-self.count // CHUNK_NODES)
+        sizes, splats = scene.chunk_bytes, scene.header.get("chunk_size")
+        self.has_chunks = sizes is not None and len(sizes) == self.chunks and splats == CHUNK_NODES
 
     def fill(self, rows: NDArray[np.void]) -> None:
         """Fill (N,) `NODE` with the nodes of the tree."""
@@ -111,27 +112,12 @@ class LoadedScene:
         return self.splats if self.leaves is self.every else self.rows(self.leaves)
 
     @property
-    def count(self) -> int:
-        return len(self.splats)
-
-    @property
     def leaf_count(self) -> int:
         return len(self.leaves)
-
-    @property
-    def chunks(self) -> int:
-        """Number of chunks, of 65,536 splats each."""
-        return -(-self.count // CHUNK_NODES)
 
     def rows(self, index: Index) -> Splats:
         """Return some splats, in the space of the scene, by their indices, ascending."""
         return self.splats if index is self.every else self.splats.take(index)
-
-    @property
-    def has_chunks(self) -> bool:
-        """Whether its format has chunks of as many splats as Spark streams (RAD)."""
-        sizes, splats = self.scene.chunk_bytes, self.scene.header.get("chunk_size")
-        return sizes is not None and len(sizes) == self.chunks and splats == CHUNK_NODES
 
     def chunk_of(self, index: Index) -> NDArray[np.int64]:
         """Return the (M,) numbers of the chunks that some splats are in, where the chunks of all scenes are counted."""
@@ -153,6 +139,43 @@ class LoadedScene:
     def headers(self) -> tuple[int, ...]:
         """Bytes of the answers that a viewer waits for before it can ask for a chunk."""
         return header_answers(self.scene.header.get("header_bytes", 0), self.bytes) if self.has_chunks else ()
+
+
+class LoadedRuns(LoadedScene):
+    """A scene of which viewers draw whole runs of splats; its chunks are files."""
+
+    def fill(self, rows: NDArray[np.void]) -> None:
+        """Fill (N,) `NODE` with splats, for statistics of cuts; splats that finer ones replace have a child."""
+        splats = self.scene.splats
+        rows["x"], rows["y"], rows["z"] = splats.center.T
+        rows["size"] = spark_size(splats)
+        rows["child_count"] = 1
+        rows["child_count"][self.leaves] = 0
+
+
+def cut_of_runs(
+    forest: Forest,
+    instances: Sequence[TreeInstance],
+    view: Camera,
+    nodes: Sequence[NDArray[np.uint32]],
+    reason: str,
+    missing: int,
+    demand: NDArray[np.float32],
+    start: float,
+) -> TreeCut:
+    """Return the cut of these splats of each instance, which `time.perf_counter` timed from `start` on."""
+    return TreeCut(
+        views=views_of(forest, instances, view),
+        node=np.concatenate(nodes),
+        instance=np.repeat(np.arange(len(nodes), dtype=np.uint16), [len(each) for each in nodes]),
+        limit=np.full(sum(map(len, nodes)), -1, np.float32),
+        reason=reason,
+        missing=missing,
+        least=np.inf,
+        stop=None,
+        demand=demand,
+        seconds=time.perf_counter() - start,
+    )
 
 
 def nodes_of(splats: Splats, tree: LodTree, coding: FileCoding | None, *, precision: str, threads: int) -> Nodes:

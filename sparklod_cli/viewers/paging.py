@@ -155,13 +155,18 @@ class Pages:
             return self.file.chunk(number, columns)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class PagedScene(LoadedScene):
     """A tree that may be larger than memory; `scene` and `splats` have no rows."""
 
     paged = True
 
     pages: Pages = field(kw_only=True)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.count, self.chunks = self.pages.count, len(self.pages.present)
+        self.has_chunks = True
 
     def fill(self, rows: NDArray[np.void]) -> None:
         """Leave the rows to `Pages.place`."""
@@ -170,10 +175,6 @@ class PagedScene(LoadedScene):
     def depth(self) -> NDArray[np.int32]:
         """(N,) edges from the root to each node that was read, and to their children."""
         return self.pages.depth
-
-    @property
-    def count(self) -> int:
-        return self.pages.count
 
     @functools.cached_property
     def leaves(self) -> Index:

@@ -12,7 +12,6 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,10 +23,9 @@ from ..codecs.streamed_sog.manifest import MAX_MANIFEST, files_of_chunk, parse
 from ..io import opened
 from ..model.traversed import DetailScene
 from ..system.errors import FormatError
-from .cut import Forest, TreeCut, TreeInstance, Viewer
-from .loaded_scene import STREAMED_SOG, Index, bytes_of
-from .runs import LoadedRuns, cut_of_runs
-from .viewer_settings import CONNECTIONS, LEAST_BASE_DISTANCE, PLAYCANVAS_FETCHERS, DetailRule, LodSettings
+from .cut import Forest, TreeCut, TreeInstance
+from .loaded_scene import STREAMED_SOG, Index, LoadedRuns, bytes_of, cut_of_runs
+from .viewer_settings import CONNECTIONS, LEAST_BASE_DISTANCE, PLAYCANVAS_FETCHERS, DetailRule
 
 Levels = NDArray[np.int64]
 
@@ -249,37 +247,24 @@ class DetailFiles:
     requests: tuple[tuple[int, ...], ...] = ()
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class LoadedDetail(LoadedRuns):
-    """A scene at several detail levels; `scene` and `splats` have those of all levels, then the environment.
-
-    Attributes:
-        detail: its regions.
-        files: where its splats are.
-    """
+    """A scene at several detail levels; `scene` and `splats` have those of all levels, then the environment."""
 
     fetchers = PLAYCANVAS_FETCHERS
     connections = CONNECTIONS
 
-    kind = STREAMED_SOG
-
     detail: DetailScene = field(kw_only=True)
     files: DetailFiles = field(kw_only=True)
 
-    def viewer(
-        self,
-        forest: Forest[Any],
-        instances: Sequence[TreeInstance],
-        settings: LodSettings,
-        *,
-        fixed: int,
-        remembers: bool,
-    ) -> Viewer:
-        return PlayCanvasViewer(forest, instances, settings.detail, fixed=fixed, remembers=remembers)
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.kind, self.chunks = STREAMED_SOG, len(self.files.sizes)
 
     @property
-    def manifest_bytes(self) -> int:
-        return self.files.manifest
+    def headers(self) -> tuple[int, ...]:
+        """Bytes of the manifest; none for a scene in memory."""
+        return (self.files.manifest,) if self.files.manifest else ()
 
     @property
     def requests(self) -> Sequence[tuple[int, ...]]:
@@ -352,7 +337,7 @@ class PlayCanvasViewer:
 
     def __init__(
         self,
-        forest: Forest[LoadedDetail],
+        forest: Forest,
         instances: Sequence[TreeInstance],
         rule: DetailRule,
         *,

@@ -43,9 +43,11 @@ REASONS = {
 class SparkViewer:
     """Finds cuts of at most 65,535 instances. Each thread has its own buffers, which are reused for the next cut."""
 
-    def __init__(self, forest: Forest[Any], instances: Sequence[TreeInstance]) -> None:
+    def __init__(self, forest: Forest, instances: Sequence[TreeInstance]) -> None:
         self.forest, self.instances = forest, list(instances)
-        self._nodes, self._memory = forest.nodes, _Memory()
+        self._nodes = forest.nodes
+        # The buffers of a thread, `slots`, and the threshold that its next cut begins with, `guess`.
+        self._memory = threading.local()
         sizes = np.diff(forest.node_base)
         self._most = sum(int(sizes[instance.tree]) for instance in self.instances)
         # Trees that are read as cuts need them, and the numbers of their chunks.
@@ -98,18 +100,18 @@ class SparkViewer:
         room = min(budget, self._most) + 1  # the kernel writes one more before it knows whether that is drawn
         nodes = cut_arrays.CutNodes(np.empty(room, np.uint32), np.empty(room, np.int32), np.empty(room, np.uint16))
         demand, memory = np.empty(len(present), np.float32), self._memory
+        slots, guess = getattr(memory, "slots", None), np.float32(getattr(memory, "guess", 0.0))
         size = VISITS * budget + CHUNK_NODES
         while True:
             size = min(size, 2 * self._most)  # a node is visited by its threshold, and once more by the queue
-            if memory.slots is None or len(memory.slots.node) <= size:
-                memory.slots = cut_arrays.Slots(
+            if slots is None or len(slots.node) <= size:
+                slots = memory.slots = cut_arrays.Slots(
                     node=np.empty(size + 1, np.uint32),
                     instance=np.empty(size + 1, np.uint16),
                     sums=np.empty(cut_arrays.BUCKETS, np.int32),
                     tally=np.empty(cut_arrays.TALLIES, np.int64),
                     **{name: np.empty(size + 1, np.int32) for name in ("limit", "first", "queue", "pending", "heap")},
                 )
-            slots, guess = memory.slots, np.float32(memory.guess)
             selected, reason, missing, least, last = find_cut(trees, stop, guess, slots, demand, nodes)
             if reason != cut_arrays.FULL:
                 break
@@ -135,13 +137,6 @@ class SparkViewer:
     def forget(self) -> None:
         """Discard the threshold of this thread's last cut. The next cut is the same either way."""
         self._memory.guess = 0.0
-
-
-class _Memory(threading.local):
-    """Buffers of a thread, and the threshold that its next cut begins with; 0 for none."""
-
-    slots: cut_arrays.Slots | None = None
-    guess = 0.0
 
 
 #: How many bytes Spark's pager asks for at first, then if they do not hold the whole header of a file.

@@ -10,7 +10,7 @@ from PIL import Image
 
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.figures.charts import PathScene, plot
-from sparklod_cli.simulation.results import Lookout
+from sparklod_cli.simulation.results import Extremes, add_extremes, moments_of
 from sparklod_cli.tables.columns import Row
 from sparklod_cli.tables.row_statistics import totals
 from tests.scenes import random_splats
@@ -42,10 +42,10 @@ def path_scene(frame: int | None = 3) -> PathScene:
 
 def marked(rows: list[Row]) -> dict[str, int]:
     """The frames worth a look, as `traverse --plot` marks them."""
-    lookout = Lookout()
-    for row in totals(rows):
-        lookout.add(row)
-    return {moment.criterion: moment.frame for moment in lookout.moments()}
+    most: Extremes = {}
+    for number, row in enumerate(totals(rows)):
+        add_extremes(most, row, is_first=number == 0)
+    return {moment.criterion: moment.frame for moment in moments_of(most)}
 
 
 def plotted(rows: list[Row], title: str = "scene.spz", path_scene: PathScene | None = None) -> tuple[bytes, str | None]:

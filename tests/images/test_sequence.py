@@ -14,8 +14,7 @@ from sparklod_cli.images.sequence import PictureSettings, WrittenPictures, write
 from sparklod_cli.model.instances import instances_of
 from sparklod_cli.render.renderer import DrawnPicture, Renderer
 from sparklod_cli.render.settings import RenderSettings
-from sparklod_cli.viewers.read_scenes import read_scenes
-from sparklod_cli.viewers.scenes import CutFinder
+from sparklod_cli.viewers.scenes import CutFinder, read_scenes
 from sparklod_cli.viewers.viewer_settings import LodSettings
 from tests.conftest import FIXTURES
 

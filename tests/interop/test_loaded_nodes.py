@@ -25,7 +25,7 @@ from sparklod_cli.model.splats import FloatArray
 from sparklod_cli.model.traversed import Nodes
 from sparklod_cli.viewers.cut import TreeInstance
 from sparklod_cli.viewers.loaded_scene import nodes_of
-from sparklod_cli.viewers.read_scenes import read_scenes
+from sparklod_cli.viewers.scenes import read_scenes
 from sparklod_cli.viewers.spark import SparkViewer
 from tests.conftest import FIXTURES, real_scene
 from tests.fittings import StandIn

@@ -20,7 +20,7 @@ from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.traversed import Nodes
 from sparklod_cli.simulation.frames import Simulation
 from sparklod_cli.viewers.cut import Forest, TreeCut, TreeInstance
-from sparklod_cli.viewers.read_scenes import read_scenes
+from sparklod_cli.viewers.scenes import read_scenes
 from sparklod_cli.viewers.spark import SparkViewer
 from sparklod_cli.viewers.viewer_settings import LodSettings, Network, StreamingSettings
 from tests.conftest import real_scene

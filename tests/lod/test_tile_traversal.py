@@ -99,7 +99,7 @@ def test_it_is_what_a_walk_down_the_tiles_finds(
     assert set(np.flatnonzero(found.wanted).tolist()) == wanted
 
 
-def forest_of(scene: TileScene) -> Forest[LoadedTiles]:
+def forest_of(scene: TileScene) -> Forest:
     return Forest([LoadedTiles(None, 0, Scene(scene.splats), scene.splats, 0, tiles=scene)])
 
 

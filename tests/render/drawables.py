@@ -8,8 +8,7 @@ from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.model.instances import Instance
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
-from sparklod_cli.viewers.read_scenes import read_scenes
-from sparklod_cli.viewers.scenes import CutFinder
+from sparklod_cli.viewers.scenes import CutFinder, read_scenes
 
 
 def balls(*centers: tuple[float, float, float], size: float = 0.3, opacity: float = 1.0, rgb: object = 1.0) -> Splats:

@@ -10,8 +10,7 @@ from sparklod_cli.io import read_scene
 from sparklod_cli.model.foveation import Frustum
 from sparklod_cli.model.instances import Instance
 from sparklod_cli.viewers.loaded_scene import TRAVERSED
-from sparklod_cli.viewers.read_scenes import read_scenes
-from sparklod_cli.viewers.scenes import Scenes
+from sparklod_cli.viewers.scenes import Scenes, read_scenes
 from tests.lod.forests import transform
 from tests.simulation.paths import HAND, TOWN
 

@@ -14,7 +14,7 @@ from tests.references.streaming import NaiveCache, roots_first, sized
 
 def here(cache: ChunkCache) -> set[int]:
     present = set(np.flatnonzero(cache.resident()).tolist())
-    assert len(cache) == len(present)
+    assert int(cache.resident().sum()) == len(present)
     assert all((chunk in cache) == (chunk in present) for chunk in range(len(cache.resident())))
     return present
 
@@ -25,12 +25,12 @@ def here(cache: ChunkCache) -> set[int]:
 def test_the_least_recently_used_chunk_is_evicted(data: st.DataObject) -> None:
     trees = data.draw(st.lists(st.integers(1, 5), min_size=1, max_size=3))
     chunks = sized([[1] * count for count in trees])
-    capacity = data.draw(st.none() | st.integers(len(trees), len(chunks) + 1))
+    capacity = data.draw(st.none() | st.integers(len(trees), len(chunks.sizes) + 1))
     cache, naive = ChunkCache(chunks, capacity), NaiveCache(capacity)
-    numbers = st.integers(0, len(chunks) - 1)
+    numbers = st.integers(0, len(chunks.sizes) - 1)
     rooted = False
     for _ in range(data.draw(st.integers(1, 25))):
-        absent = [chunk for chunk in range(len(chunks)) if chunk not in cache]
+        absent = [chunk for chunk in range(len(chunks.sizes)) if chunk not in cache]
         if absent and data.draw(st.booleans()):
             chunk = data.draw(st.sampled_from(absent))
             importance = {each: -place for place, each in enumerate(cache.requested)}
@@ -49,7 +49,7 @@ def test_the_least_recently_used_chunk_is_evicted(data: st.DataObject) -> None:
             assert cache.admitted == cache.requested[:capacity]
             naive.want(cache.requested)
         assert here(cache) == set(naive.used)
-        assert len(cache) <= naive.capacity
+        assert int(cache.resident().sum()) <= naive.capacity
         assert cache.missing() == [chunk for chunk in cache.admitted if chunk not in naive.used]
         assert not rooted or set(chunks.roots) <= set(cache.admitted)
 
@@ -102,7 +102,7 @@ def test_chunks_are_numbered_across_trees() -> None:
     chunks = sized([[5, 6], [7], [8, 9]])
     assert chunks.sizes == [5, 6, 7, 8, 9]
     assert chunks.roots == [0, 2, 3]
-    assert len(chunks) == 5
+    assert len(chunks.sizes) == 5
 
 
 @pytest.mark.parametrize("sizes", [[[1], []], [[1], [2, -1]]])

@@ -17,8 +17,7 @@ from sparklod_cli.simulation.frames import Simulation
 from sparklod_cli.simulation.loading import Loader
 from sparklod_cli.simulation.results import OF_TREES
 from sparklod_cli.viewers.playcanvas import LoadedDetail
-from sparklod_cli.viewers.read_scenes import read_scenes
-from sparklod_cli.viewers.scenes import CutFinder, Scenes
+from sparklod_cli.viewers.scenes import CutFinder, Scenes, read_scenes
 from sparklod_cli.viewers.viewer_settings import DetailRule, LodSettings, Network, StreamingSettings
 from tests.lod.details import row_of_regions
 from tests.simulation.test_loading import cut_after

@@ -8,8 +8,7 @@ from typing import Any
 import pytest
 
 from sparklod_cli.model.instances import Instance
-from sparklod_cli.viewers.read_scenes import read_scenes
-from sparklod_cli.viewers.scenes import Scenes
+from sparklod_cli.viewers.scenes import Scenes, read_scenes
 from sparklod_cli.viewers.viewer_settings import LodSettings, Network, StreamingSettings
 from tests.simulation.paths import HAND, OF_THE_PAST, SPARK, TOWN, around, path_of, resting, rows_of, without
 

@@ -352,7 +352,7 @@ def test_the_first_look_is_that_of_render() -> None:
     from sparklod_cli.cameras.frame import Settings
     from sparklod_cli.cameras.sources import whole_scene
     from sparklod_cli.model.instances import instances_of
-    from sparklod_cli.viewers.read_scenes import read_scenes
+    from sparklod_cli.viewers.scenes import read_scenes
 
     start = settings_of(TREE)["start"]
     scenes = read_scenes(instances_of([TREE]))
