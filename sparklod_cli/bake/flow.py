@@ -120,8 +120,8 @@ def bake(
         else:
             write_windows(tree, None if blocks is None else blocks.encode, threads, progress)
         if blocks is not None:
-            traffic = blocks.job.store.traffic
-            baked.scratch_bytes_written, baked.scratch_bytes_read = traffic.written, traffic.read
+            store = blocks.job.store
+            baked.scratch_bytes_written, baked.scratch_bytes_read = store.written, store.read
     return baked
 
 
@@ -164,7 +164,8 @@ def _may_need_blocks(
     engine: Engine | None,
 ) -> bool:
     """Return whether a bake goes out of core, or an interrupted one may have left a scratch folder."""
-    if engine is not None or settings.files or not isinstance(target, Path):
+    files = settings.rgba or settings.environment or settings.camera_path  # a missing one is reported early
+    if engine is not None or files or not isinstance(target, Path):
         return True
     if resources != Resources(memory=resources.memory):
         return True

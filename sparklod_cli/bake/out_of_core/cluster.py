@@ -290,7 +290,7 @@ class ClusterEngine:
                 name, result, error = pool.next()
                 if error is None:
                     written, read = result
-                    store.traffic.add(written=written, read=read)
+                    store.count_bytes(written=written, read=read)
                 elif not store.has(name):
                     raise error
                 done += left[name][1].weight
@@ -409,7 +409,7 @@ def run_task(packed: bytes, task: Task, threads: int) -> tuple[int, int]:
         with memory_errors_translated():
             task.run(job, *task.arguments, threads=threads, progress=silent)
         machine.release_memory()
-    return job.store.traffic.written, job.store.traffic.read
+    return job.store.written, job.store.read
 
 
 def dask_setup(worker: Any) -> None:

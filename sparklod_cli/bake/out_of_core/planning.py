@@ -62,19 +62,18 @@ def blocks_for(
         FormatError, OutOfMemoryError: as `flow.bake`.
     """
     name, settings = name_of(source), tree.settings
-    if settings.files:
-        BakeIdentity.of(source, settings)  # reports a missing one before the bake begins
+    identity = BakeIdentity.of(source, settings)  # reports a missing file before the bake begins
     memory = estimate.default_memory() if resources.memory is None else resources.memory
     store = Store(folder if engine is None else absolute(folder))  # other processes have working folders of their own
     is_left = bool(store.names())
     whole = _needs_whole_tree(settings)
     why = _reason(header, settings, resources, memory, engine, whole, is_left=is_left)
-    work = functools.partial(at_work, store, resume=resources.resume, overwrite=overwrite, say=say)
+    work = functools.partial(at_work, store, identity, resume=resources.resume, overwrite=overwrite, say=say)
     if why is not None and whole is not None:
         say(f"{name}: goes on in memory, although {why}: {whole}")
     if why is None or whole is not None:
         if is_left:
-            with work(BakeIdentity.of(source, settings), 0):
+            with work(0):
                 pass
         yield None
         return
@@ -89,7 +88,7 @@ def blocks_for(
         f" {block_splats:,}, scratch of about {format_size(scratch)} in {store}"
     )
     with (
-        work(BakeIdentity.of(source, settings), block_splats) as block_splats,
+        work(block_splats) as block_splats,
         _opened(source, store.folder, threads, engine) as stream,
     ):
         settings = dataclasses.replace(settings, rgba=settings.rgba and settings.rgba.absolute())

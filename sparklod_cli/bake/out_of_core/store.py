@@ -72,11 +72,6 @@ class StoredArray:
     begun: int
     checksum: int
 
-    @property
-    def row_bytes(self) -> int:
-        """Size of one row, bytes."""
-        return math.prod(self.shape[1:]) * self.dtype.itemsize
-
     def check(self, pieces: Iterable[NDArray[Any]]) -> int:
         """Return the size of the numbers in bytes; raise `DamagedError` if they do not match the checksum."""
         checksum, size = self.begun, 0
@@ -126,28 +121,8 @@ def read_directory(file: _File, size: int) -> dict[str, StoredArray]:
     return arrays
 
 
-def _plain(name: str, array: NDArray[Any]) -> NDArray[Any]:
-    if array.dtype.kind not in "biufc":
-        raise TypeError(f"{name} is an array of {array.dtype}; results have arrays of plain numbers")
-    return np.ascontiguousarray(array).reshape(array.shape)
-
-
 def _bytes(array: NDArray[Any]) -> memoryview:
     return array.reshape(-1).view(np.uint8).data
-
-
-class Traffic:
-    """Bytes that this process has written to a store and read from it."""
-
-    def __init__(self) -> None:
-        self.written = self.read = 0
-        self._lock = threading.Lock()
-
-    def add(self, *, written: int = 0, read: int = 0) -> None:
-        """Count bytes; may be called by several threads at once."""
-        with self._lock:
-            self.written += written
-            self.read += read
 
 
 class Store:
@@ -162,12 +137,12 @@ class Store:
 
     Attributes:
         folder: on this machine, mounted by several, or at an address; created with the first result.
-        traffic: bytes that this process has written and read.
+        written, read: bytes, of this process and those that were counted for others.
     """
 
     def __init__(self, folder: Place) -> None:
         self.folder = folder
-        self.traffic = Traffic()
+        self.written = self.read = 0
         self._directories: dict[str, tuple[int, dict[str, StoredArray]]] = {}  # with the size of the file
         self._lock = threading.Lock()
 
@@ -176,6 +151,12 @@ class Store:
 
     def __str__(self) -> str:
         return str(self.folder)
+
+    def count_bytes(self, *, written: int = 0, read: int = 0) -> None:
+        """Count bytes that were written and read."""
+        with self._lock:
+            self.written += written
+            self.read += read
 
     def names(self) -> list[str]:
         """Return the names of all results, in order."""
@@ -196,14 +177,6 @@ class Store:
         size, _ = self._directories.get(name, (None, {}))
         return place.open(buffering=READ_AHEAD, size=size)
 
-    def _write(self, name: str, pieces: Iterable[bytes | memoryview]) -> int:
-        """Write a result file, which appears when it is complete; return its size."""
-        place = self._place(name)
-        if isinstance(place, Address):
-            return place.write(pieces)
-        place.parent.mkdir(parents=True, exist_ok=True)
-        return write_atomically(place, pieces, overwrite=True, sync=False)
-
     def has(self, name: str) -> bool:
         """Return whether a result exists; in a folder, also that it is not cut short."""
         place = self._place(name)
@@ -216,15 +189,20 @@ class Store:
         return False
 
     def put(self, name: str, arrays: Arrays) -> None:
-        """Write a result; replaces one of this name.
-
-        Raises:
-            TypeError: an array is not of plain numbers.
-        """
+        """Write a result, or replace one of this name; raise `TypeError` for an array of anything but plain numbers."""
         self._forget(name)
-        plain = {key: _plain(key, array) for key, array in arrays.items()}
+        for key, array in arrays.items():
+            if array.dtype.kind not in "biufc":
+                raise TypeError(f"{key} is an array of {array.dtype}; results have arrays of plain numbers")
+        pieces = encode({key: np.ascontiguousarray(array).reshape(array.shape) for key, array in arrays.items()})
+        place = self._place(name)
         with self._translated("write"):
-            self.traffic.add(written=self._write(name, encode(plain)))
+            if isinstance(place, Address):
+                size = place.write(pieces)
+            else:
+                place.parent.mkdir(parents=True, exist_ok=True)
+                size = write_atomically(place, pieces, overwrite=True, sync=False)
+        self.count_bytes(written=size)
 
     def get(self, name: str, keys: Collection[str] | None = None) -> dict[str, NDArray[Any]]:
         """Read a result, or some of its arrays, and compare their checksums."""
@@ -233,7 +211,7 @@ class Store:
             for key in directory if keys is None else keys:
                 stored = directory[key]
                 arrays[key] = _filled(file, stored.offset, np.empty(stored.shape, stored.dtype))
-                self.traffic.add(read=stored.check([arrays[key]]))
+                self.count_bytes(read=stored.check([arrays[key]]))
         return arrays
 
     def rows(self, name: str, key: str, start: int, stop: int) -> NDArray[Any]:
@@ -255,12 +233,13 @@ class Store:
         """Read runs of rows of an array, by the first row and the length of each, one after the other."""
         with self._reading(name) as (file, directory):
             stored = directory[key]
+            row_bytes = math.prod(stored.shape[1:]) * stored.dtype.itemsize
             rows, at = np.empty((sum(count), *stored.shape[1:]), stored.dtype), 0
             for row, length in zip(first, count, strict=True):
                 end = at + max(0, min(length, stored.shape[0] - row))
-                _filled(file, stored.offset + row * stored.row_bytes, rows[at:end])
+                _filled(file, stored.offset + row * row_bytes, rows[at:end])
                 at = end
-        self.traffic.add(read=rows[:at].nbytes)
+        self.count_bytes(read=rows[:at].nbytes)
         return rows[:at]
 
     def shape(self, name: str, key: str) -> tuple[int, ...]:
@@ -277,11 +256,10 @@ class Store:
     def is_sound(self, name: str) -> bool:
         """Return whether a result exists and is undamaged; reads all of it."""
         self._forget(name)
-        if not self.has(name):
-            return False
-        with self._translated("read"), contextlib.suppress(FileNotFoundError, DamagedError), self._open(name) as file:
+        missing = contextlib.suppress(FileNotFoundError, NotADirectoryError, DamagedError)
+        with self._translated("read"), missing, self._open(name) as file:
             for stored in self._directory(name, file).values():
-                self.traffic.add(read=stored.check(_pieces(file, stored)))
+                self.count_bytes(read=stored.check(_pieces(file, stored)))
             return True
         return False
 
@@ -335,7 +313,6 @@ class Store:
 
 
 def _filled(file: _File, offset: int, array: NDArray[Any]) -> NDArray[Any]:
-    """Fill an array with the bytes of a file and return it."""
     view = _bytes(array)
     file.seek(offset)
     while view:
@@ -347,7 +324,6 @@ def _filled(file: _File, offset: int, array: NDArray[Any]) -> NDArray[Any]:
 
 
 def _pieces(file: _File, stored: StoredArray) -> Iterator[NDArray[Any]]:
-    """Yield the bytes of an array in pieces."""
     size = math.prod(stored.shape) * stored.dtype.itemsize
     for start in range(0, size, CHECK_BYTES):
         piece = np.empty(min(CHECK_BYTES, size - start), np.uint8)

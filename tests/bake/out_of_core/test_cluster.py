@@ -67,7 +67,7 @@ def test_tasks_run_after_what_they_need_on_all_workers(engine: ClusterEngine, jo
 def test_what_is_done_is_not_done_again(engine: ClusterEngine, job: Job) -> None:
     tasks = tree_of(4)
     engine.run("building", tasks, job, silent)
-    written = job.store.traffic.written
+    written = job.store.written
     assert written > 0  # what workers wrote
     job.store.remove(tasks[-1].name)
     told: list[int] = []

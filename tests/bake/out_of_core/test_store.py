@@ -71,10 +71,10 @@ def test_some_rows_are_those_of_the_whole_array(
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(store_module, "GAP", gap)
         store.put("stage/1", {"key": np.zeros(3), "rows": array})
-        store.traffic.read = 0
+        store.read = 0
         assert np.array_equal(store.rows_at("stage/1", "rows", index), array[index])
-        assert store.traffic.read >= 8 * len(index)
-        assert gap or store.traffic.read == 8 * len(index)
+        assert store.read >= 8 * len(index)
+        assert gap or store.read == 8 * len(index)
 
 
 def test_arrays_that_are_not_contiguous_are_put_as_they_look(store: Store) -> None:
@@ -116,17 +116,17 @@ def test_a_copy_for_another_process_is_small_and_finds_the_results(store: Store)
     assert len(packed) < 500
     copy = pickle.loads(packed)
     assert same(copy.get("x"), ARRAYS)
-    assert copy.traffic.written == 0
+    assert copy.written == 0
 
 
 def test_bytes_are_counted(store: Store) -> None:
     store.put("x", ARRAYS)
-    assert store.traffic.written == file_of(store).stat().st_size
-    assert store.traffic.read == 0
+    assert store.written == file_of(store).stat().st_size
+    assert store.read == 0
     store.get("x")
-    assert store.traffic.read == 100 * 12 + 100 * 2
+    assert store.read == 100 * 12 + 100 * 2
     store.rows("x", "center", 10, 20)
-    assert store.traffic.read == 100 * 14 + 10 * 12
+    assert store.read == 100 * 14 + 10 * 12
 
 
 def test_nothing_is_left_where_writing_fails(store: Store) -> None:
