@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import PurePath
 from typing import TYPE_CHECKING, Any
 
-from ..codecs.encoder import CLAMPED, Encoder, Windows, clamps_of, results, windows_of
+from ..codecs.encoder import CLAMPED, clamps_of, results, windows_of
 from ..codecs.formats import RAD_SUFFIX as RAD
 from ..codecs.formats import WRITABLE, Format
 from ..codecs.options import DEFAULTS, RAD_ENCODINGS, WriteOptions
@@ -24,7 +24,7 @@ from ..system.progress import Progress
 from .settings import SPZ, Baked, BakeSettings
 
 if TYPE_CHECKING:
-    from ..codecs.encoder import Stored
+    from ..codecs.encoder import Encoder, Windows
     from ..codecs.statistics import Statistics
     from ..model.node_stream import NodeStream
 
@@ -56,7 +56,7 @@ class BuiltTree:
     options: WriteOptions
     form: Format | None = None
     in_chunks: bool = False
-    stored: Stored | None = None
+    stored: Any = None
     before: Splats | None = None
     repacked: Place | None = None
     nodes: Scene | NodeStream | None = None
@@ -120,8 +120,8 @@ def keep_tree(tree: BuiltTree, source: Source, scene: Scene) -> None:
         return
     if is_same and settings.refine is not None:
         assert not isinstance(source, Merged)  # of which no part is a tree
-        tree.stored, tree.before, tree.is_ordered = read_stored(source), scene.splats, True
-        tree.options = tree.stored.like(options)
+        tree.stored, tree.options = read_stored(source, options)
+        tree.before, tree.is_ordered = scene.splats, True
     elif is_same and dataclasses.replace(options, rad=dataclasses.replace(options.rad, chunked=False)) == DEFAULTS:
         assert not isinstance(source, Merged)
         tree.form, tree.in_chunks, tree.repacked = None, False, source
@@ -141,16 +141,15 @@ def write_windows(
     assert form is not None
     codec = form.codec()
     settled: WriteOptions = codec.settled(tree.statistics, tree.options)
-    ranges = tuple(codec.held(settled, baked.sh_degree))
-    encoder: Any = codec.encoder(tree.nodes, settled, ranges, threads=threads, progress=progress)
-    if tree.stored is not None and tree.before is not None:
+    encoder: Any = codec.encoder(tree.nodes, settled, counting=True, threads=threads, progress=progress)
+    if tree.before is not None:
         assert isinstance(tree.nodes, Scene)
-        encoder = tree.stored.keeping(encoder, same_rows(tree.nodes.splats, tree.before))
+        encoder = encoder.keeping(tree.stored, same_rows(tree.nodes.splats, tree.before))
     if encode is None:
         assert isinstance(tree.nodes, Scene)
         encoded = list(results(encoder, tree.nodes, threads, progress, "encoding"))
     windows = (lambda number, name: encoded[number][name]) if encode is None else encode(tree, encoder)
-    options, numbers = encoder.options, range(len(windows_of(encoder.count)))
+    options, numbers = encoder.options, range(len(windows_of(baked.nodes)))
     with tree.out as out:
         name = out.target.name
         if out.siblings is None:
@@ -160,17 +159,17 @@ def write_windows(
             chunks = (windows(number, codec.CHUNK).tobytes() for number in numbers)
             for each, pieces in encoder.files(chunks, PurePath(name).stem, progress=progress):
                 baked.bytes += out.write(each, pieces)
-    if ranges:
-        baked.clamped, baked.clamps = clamps_of([windows(number, CLAMPED) for number in numbers], ranges)
+    if encoder.ranges:
+        baked.clamped, baked.clamps = clamps_of([windows(number, CLAMPED) for number in numbers], encoder.ranges)
     tree.end("write")
     if not tree.in_chunks:
         baked.output_format, baked.version, baked.fractional_bits = "spz", options.spz_version, options.fractional_bits
         return
     baked.output_format = "rad-chunked" if options.rad.chunked else "rad"
     baked.chunks = len(numbers)
-    baked.encodings = {name: getattr(options.rad, name) for name in RAD_ENCODINGS if encoder.sh_degree or name != "sh"}
-    if options.rad.sh_codes and encoder.sh_degree:
-        baked.sh_codes = min(options.rad.sh_codes, encoder.count)
+    baked.encodings = {name: getattr(options.rad, name) for name in RAD_ENCODINGS if baked.sh_degree or name != "sh"}
+    if options.rad.sh_codes and baked.sh_degree:
+        baked.sh_codes = min(options.rad.sh_codes, baked.nodes)
 
 
 def write_whole(tree: BuiltTree, threads: int, progress: Progress, **how: Any) -> None:

@@ -6,7 +6,6 @@ share. The pieces of the file are then made of the results.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -25,16 +24,30 @@ from .options import WriteOptions
 if TYPE_CHECKING:
     from typing import Protocol, Self  # Python 3.10 has no Self
 
-    from ..model.node_stream import NodeStream
+    class Encoder(Protocol):
+        """Encoder of the windows of one file, which can be pickled."""
 
-    class Stored(Protocol):
-        """Codes of a tree's file as they stand in it, with which nodes can be written again bit for bit."""
+        @property
+        def options(self) -> WriteOptions:
+            """Options with nothing left open."""
 
-        def like(self, options: WriteOptions) -> WriteOptions:
-            """Return the options, and where they leave a choice open, that of the file."""
+        @property
+        def ranges(self) -> tuple[CodeRange, ...]:
+            """Ranges of which the values beyond are counted; empty for no count."""
 
-        def keeping(self, encoder: Any, unchanged: NDArray[np.bool_]) -> Encoder:
-            """Return an encoder of as many nodes in the same order that gives (N,) `unchanged` ones their old codes."""
+        def encode(self, splats: Splats, tree: LodTree | None, start: int) -> Encoded:
+            """Encode a window, and `tally` the values beyond the ranges as `CLAMPED`.
+
+            Args:
+                tree: of the window, whose children have the numbers of the file; None where the file has no tree.
+                start: number of the first splat; the start of one of `windows_of`.
+            """
+
+        def pieces(self, windows: Windows, *, threads: int, progress: Progress) -> Iterator[bytes]:
+            """Return the bytes of the file, piece by piece, made of the results of all windows."""
+
+        def keeping(self, stored: Any, unchanged: NDArray[np.bool_]) -> Self:
+            """Return an encoder that gives (N,) unchanged nodes their codes of a file, by the codec's `stored`."""
 
 
 #: The result of a window: arrays by name.
@@ -71,54 +84,6 @@ class CodeRange:
 SPZ_RANGES = tuple(CodeRange(column, low, high) for column, (low, high) in quantize.CLAMPS.items())
 
 
-@dataclass(frozen=True, eq=False)
-class Encoder(ABC):
-    """Encoder of the windows of one file. It can be pickled.
-
-    Attributes:
-        count: splats of the file, which are nodes where there is a tree.
-        options: with nothing left open.
-        ranges: values beyond them are counted, see `tally`; empty for no count.
-    """
-
-    count: int
-    sh_degree: int
-    tree: bool
-    antialiased: bool
-    up: str | None
-    options: WriteOptions
-    ranges: tuple[CodeRange, ...] = ()
-
-    @classmethod
-    def of(cls, scene: Scene | NodeStream, options: WriteOptions, ranges: tuple[CodeRange, ...]) -> Self:
-        """Return the encoder of a scene, of which nothing is read."""
-        if isinstance(scene, Scene):
-            count, sh_degree, tree = len(scene), scene.splats.sh_degree, scene.tree is not None
-        else:
-            count, sh_degree, tree = scene.count, scene.sh_degree, True
-        return cls(count, sh_degree, tree, scene.antialiased, scene.up, options, ranges)
-
-    @abstractmethod
-    def codes(self, splats: Splats, tree: LodTree | None, start: int) -> Encoded:
-        """Encode a window, see `encode`."""
-
-    def encode(self, splats: Splats, tree: LodTree | None, start: int) -> Encoded:
-        """Encode a window, and count what that clamps.
-
-        Args:
-            tree: of the window, whose children have the numbers of the file; None where the file has no tree.
-            start: number of the first splat; the start of one of `windows_of`.
-        """
-        encoded = self.codes(splats, tree, start)
-        if self.ranges:
-            encoded[CLAMPED] = tally(splats, self.ranges, None if tree is None else tree.is_leaf)
-        return encoded
-
-    @abstractmethod
-    def pieces(self, windows: Windows, *, threads: int, progress: Progress) -> Iterator[bytes]:
-        """Return the bytes of the file, piece by piece, made of the results of all windows."""
-
-
 def windows_of(count: int) -> list[slice]:
     """Return the windows of a file of so many splats."""
     return blocks_of(count, CHUNK_NODES)
@@ -126,12 +91,11 @@ def windows_of(count: int) -> list[slice]:
 
 def results(encoder: Encoder, scene: Scene, threads: int, progress: Progress, stage: str) -> Iterator[Encoded]:
     """Encode all windows of a scene in order, a few ahead; `stage` is the word for it that `progress` gets."""
-    windows = windows_of(encoder.count)
-    tree = scene.tree
+    windows, tree = windows_of(len(scene)), scene.tree
     rows = ((scene.splats.rows(part), None if tree is None else tree.rows(part), part.start) for part in windows)
     encoded = ordered_map(lambda arguments: encoder.encode(*arguments), rows, threads)
     for part, result in zip(windows, encoded, strict=True):
-        progress(stage, part.stop, encoder.count, "splat")
+        progress(stage, part.stop, len(scene), "splat")
         yield result
 
 
@@ -212,10 +176,12 @@ def tally(splats: Splats, ranges: Sequence[CodeRange], leaf: NDArray[np.bool_] |
                 continue
             if each.zero:
                 values = np.where(values < each.zero, each.low, values)
+            found[number, 4:6] = values.min(), values.max()
+            if found[number, 4] >= each.low and found[number, 5] <= each.high:
+                continue
             below, above = _rows_with(values < each.low), _rows_with(values > each.high)
             either |= below | above
-            counts = (np.count_nonzero(mask) for mask in (below, above, below | above))
-            found[number, :6] = (*counts, 0, values.min(), values.max())
+            found[number, :3] = [np.count_nonzero(mask) for mask in (below, above, below | above)]
             rows = np.flatnonzero(below | above if leaf is None else (below | above) & leaf)
             seen = rows[_is_seen(each, values[rows], splats.opacity[rows])]
             found[number, 6:] = np.count_nonzero(below[seen]), np.count_nonzero(above[seen]), len(seen)

@@ -1,4 +1,4 @@
-"""Inflating: gzip members and zstd frames on one thread, without buffering more than a piece of a file and its data.
+"""Inflating: gzip members on one thread, without buffering more than a piece of a file and its data.
 
 The one place that chooses the library for gzip: ISA-L (package isal) where it is installed, zlib-ng elsewhere. What
 they inflate is the same; docs/decisions/05-spz.md has their speeds.
@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any, BinaryIO
 
-import zstandard
 from zlib_ng import zlib_ng
 
 from ..system.errors import ChecksumError, FormatError, TooLongError, TruncatedError
@@ -46,6 +45,7 @@ class Inflate:
     Attributes:
         comment: of the head of the member, or empty; None if the head has other fields, or too long a comment.
         end: position in the file behind the member; None until the member has been read to its end.
+        behind: the first two bytes after the member, or fewer at the end of the file; none before `end`.
     """
 
     def __init__(self, file: BinaryIO) -> None:
@@ -53,6 +53,7 @@ class Inflate:
         self._pieces, self._rest = self._all_pieces(), memoryview(b"")
         self.comment: bytes | None = None
         self.end: int | None = None
+        self.behind = b""
         head = file.read(_HEAD_SIZE)
         if head.startswith(PLAIN_HEAD):
             self.comment = b""
@@ -80,13 +81,6 @@ class Inflate:
         if self.end is None:
             raise TruncatedError("cut short: the gzip checksum is missing")
 
-    def behind(self) -> bytes:
-        """Return the first two bytes after the member, or fewer at the end of the file; none before its end."""
-        if self.end is None:
-            return b""
-        self._file.seek(self.end)
-        return self._file.read(2)
-
     def _all_pieces(self) -> Iterator[bytes]:
         """Yield the data in pieces, none of them empty."""
         library = zlib_ng if self.comment is None else _library  # ISA-L misreads heads of which a read ends in a field
@@ -105,39 +99,6 @@ class Inflate:
                 yield piece
             elif not packed and not unpacker.eof:
                 return
-        self.end = self._file.tell() - len(unpacker.unused_data)
-
-
-class _Window:
-    """The next `size` bytes of a file."""
-
-    def __init__(self, file: BinaryIO, size: int) -> None:
-        self._file, self._left = file, size
-
-    def read(self, size: int) -> bytes:
-        data = self._file.read(min(size, self._left))
-        self._left -= len(data)
-        return data
-
-
-class Unzstd:
-    """Reader of a zstd frame, the next `packed` bytes of a file, that buffers little more than requested."""
-
-    def __init__(self, file: BinaryIO, packed: int, name: str) -> None:
-        self._name = name
-        window: Any = _Window(file, packed)
-        self._reader = zstandard.ZstdDecompressor().stream_reader(window, read_size=PIECE)
-
-    def read(self, size: int) -> bytes:
-        """Return the next `size` bytes, or fewer where the data ends; raises `FormatError` where they are corrupt."""
-        try:
-            piece: bytes = self._reader.read(size)
-        except zstandard.ZstdError as error:
-            kind = ChecksumError if "checksum" in str(error) else FormatError
-            raise kind(f"corrupt zstd data in stream {self._name}: {error}") from None
-        return piece
-
-    def finish(self) -> None:
-        """Raise `FormatError` unless the stream ends here."""
-        if self.read(1):
-            raise TooLongError(f"stream {self._name} is longer than its table announces")
+        behind: bytes = unpacker.unused_data
+        self.end = self._file.tell() - len(behind)
+        self.behind = (behind[:2] + self._file.read(2))[:2]

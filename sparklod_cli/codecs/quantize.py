@@ -27,6 +27,9 @@ COLOR_GAIN = 0.15
 #: Fewest bits kept of the SH bytes of all degrees but the first, and of the first, as Niantic's library writes them.
 LEAST_SH_BITS, LEAST_SH_BITS_1 = 4, 5
 
+#: All bits of a byte.
+ALL_BITS = 8
+
 #: Largest code of signed 24-bit fixed point.
 FIXED24_MAX = 2**23 - 1
 

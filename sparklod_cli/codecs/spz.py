@@ -30,15 +30,15 @@ from ..system.errors import FormatError, MembersError, NotSplatsError, Truncated
 from ..system.progress import Progress, silent
 from ..system.threads import blocks_of, ordered_map
 from . import compression, quantize
-from .encoder import SPZ_RANGES, CodeRange, Encoded, Encoder, Windows, results, windows_of
 from .options import DEFAULT_SPZ_VERSION, DEFAULTS, MAX_FRACTIONAL_BITS, TREE_SPZ_VERSIONS, WriteOptions
-from .quantize import Bytes
-from .reader import FileNote, OpenFile, Read, Reader, Target, comment_of, read_comment, rows_of
-from .statistics import ALL_BITS, Statistics, enough, fine_bits
+from .quantize import ALL_BITS, Bytes
+from .reader import FileNote, OpenFile, Read, Reader, Scratch, Target, comment_of, read_comment, rows_of, size_of
 
 if TYPE_CHECKING:
     from ..model.node_stream import NodeStream
+    from .encoder import CodeRange, Encoded, Windows
     from .inflate import Inflate
+    from .statistics import Statistics
 
 MAGIC = 0x5053474E  # "NGSP"
 HEADER = struct.Struct("<IIIBBBB")  # magic, version, splats, SH degree, fractional bits, flags, reserved
@@ -91,17 +91,6 @@ class SpzStream(NamedTuple):
     column: str
     decode: Callable[[quantize.Bytes], NDArray[Any]]
     encode: Callable[[NDArray[Any]], NDArray[Any]]
-
-    @property
-    def row_type(self) -> np.dtype[Any]:
-        """(size,) bytes."""
-        return np.dtype((np.uint8, (self.size,)))
-
-
-def column_of(splats: Splats, tree: LodTree | None, stream: SpzStream) -> NDArray[Any]:
-    """Return the column that a stream holds."""
-    column: NDArray[Any] = getattr(splats if hasattr(splats, stream.column) else tree, stream.column)
-    return column
 
 
 @dataclass(frozen=True)
@@ -157,11 +146,6 @@ class Layout:
         return [stream for stream in table if stream.size]
 
     @property
-    def has_tree(self) -> bool:
-        """Whether the splats are the nodes of a tree."""
-        return bool(self.flags & LOD)
-
-    @property
     def total(self) -> int:
         """Bytes of all streams."""
         return self.count * sum(stream.size for stream in self.streams())
@@ -191,129 +175,115 @@ READABLE = (1, 2, 3, 4)
 
 
 def open_content(source: OpenFile) -> Reader:
-    """Open a file of any version, with a tree or without."""
-    return open_streams(source)[0]
+    """Open a file of any version, with a tree or without.
 
-
-def open_streams(source: OpenFile) -> tuple[Reader, Layout, Iterator[StreamRows]]:
-    """Open a file: its content, its layout, and the rows of its streams, which can be read once.
-
-    With `scratch`, its streams are unpacked to that. The header of its scene has the flags, the reserved byte and, once
-    all is read, the number of bytes after the data.
+    The header of its scene has the fields of `Layout`, the reserved byte and, once all is read, the number of bytes
+    after the data.
 
     Raises:
         FormatError: the file is not SPZ, of an unknown version or SH degree, cut short or corrupt, or announces far
             more splats than its size can hold.
     """
-    file, note, extensions, header = source.file, FileNote(), NO_EXTENSIONS, dict[str, int]()
-    size = source.size
-    plain = file.read(4) == struct.pack("<I", MAGIC)
-    file.seek(0)
-    if plain:
-        layout, rows, extensions = _read_v4(file, size, header)
-    else:
-        from .inflate import Inflate  # not needed to write
-
-        inflate = Inflate(file)
-        layout, rows = _read_gzip(inflate, size, header)
-        note = read_comment(inflate.comment)
-        if layout.flags & EXTENSIONS:  # they follow the streams, which are read again
-            extensions = _extensions_behind(inflate, layout)
-            file.seek(0)
-            layout, rows = _read_gzip(Inflate(file), size, header)
-
-    def unpacked() -> Iterator[bytes]:
-        for _, _, codes in rows:
-            yield codes.tobytes()
-
-    def read(target: Target) -> Iterator[StreamRows]:
-        if source.scratch is None or target.once:
-            yield from rows
-            return
-        scratch, offset = source.scratch(unpacked), 0
-        for each in layout.streams():
-            between = rows_of(
-                scratch.read_at, offset, each.row_type, target.start, target.stop, layout.count, each.name
-            )
-            for part, codes in between:
-                yield each, part, codes
-            offset += each.size * layout.count
+    layout, rows, header, note, (axis, notes, has_system) = open_streams(source.file, source.size)
 
     def fill(target: Target, threads: int, progress: Progress) -> None:
         def decode(item: StreamRows) -> int:
             stream, part, codes = item
             if stream.column in target.columns or stream.column not in COLUMNS:
-                column = column_of(target.splats, target.tree, stream)
-                out = column[part.start - target.start : part.stop - target.start]
+                columns = target.splats if stream.column in COLUMNS else target.tree
+                out = getattr(columns, stream.column)[part.start - target.start : part.stop - target.start]
                 out[...] = stream.decode(codes).reshape(out.shape)
             return codes.size
 
-        done = 0
-        for count in ordered_map(decode, read(target), threads):
+        requested, done = rows, 0
+        if source.scratch is not None and not target.once:
+            requested = _unpacked_rows(source.scratch, layout, rows, target)
+        for count in ordered_map(decode, requested, threads):
             done += count
             progress("reading", done, layout.total, "B")
 
     from ..model.file_coding import SPZ_SCALES, FileCoding  # writing does without
 
-    axis, ignored, has_system = extensions
-    notes = notes_on_degree(layout.sh_degree) + note.problems + ignored
+    notes = notes_on_degree(layout.sh_degree) + note.problems + notes
     if header.get("unknown_streams"):
         notes += (f"{header['unknown_streams']} streams of an unknown kind are left out",)
-    note = dataclasses.replace(note, up=note.up or axis)
-    up, up_by = (note.up, "") if layout.has_tree or has_system else note.axis_of("SPZ")
-    content = Reader(
+    has_tree = bool(layout.flags & LOD)
+    up, up_by = note.up or axis, ""
+    if not has_tree and not has_system:
+        up, up_by = dataclasses.replace(note, up=up).axis_of("SPZ")
+    return Reader(
         layout.count,
         min(layout.sh_degree, MAX_SH_DEGREE),
-        f"SPZ {layout.version}" + " LoD" * layout.has_tree,
+        f"SPZ {layout.version}" + " LoD" * has_tree,
         fill,
         bool(layout.flags & ANTIALIASED),
         notes,
         header,
         up,
-        layout.has_tree,
+        has_tree,
         coding=lambda: FileCoding((SPZ_SCALES,)),
         up_by=up_by,
         concurrent=True,
     )
-    return content, layout, rows
 
 
-def _checked(layout: Layout, file_size: int, header: dict[str, int]) -> Layout:
-    """Check that a layout can be read and that the file is large enough for it, and add its fields to a header."""
-    if layout.version not in READABLE:
-        raise VersionError(f"SPZ version {layout.version} is unknown, only 1 to 4 are read")
-    if layout.sh_degree > (4 if layout.version == 4 else MAX_SH_DEGREE):
-        raise VersionError(f"SPZ version {layout.version} has no SH degree {layout.sh_degree}")
-    if layout.fractional_bits > 31:
-        raise FormatError(f"{layout.fractional_bits} fractional bits; at most 31 can be read")
-    compression.check_promise(layout.total, file_size)
-    header |= {"version": layout.version, "fractional_bits": layout.fractional_bits, "flags": layout.flags}
-    return layout
+def _unpacked_rows(
+    scratch: Scratch, layout: Layout, rows: Iterator[StreamRows], target: Target
+) -> Iterator[StreamRows]:
+    """Yield the rows of a target from a scratch file of all streams, which is made first if it does not exist."""
+    file, offset = scratch(lambda: (codes.tobytes() for _, _, codes in rows)), 0
+    for stream in layout.streams():
+        row_type = np.dtype((np.uint8, (stream.size,)))
+        for part, codes in rows_of(
+            file.read_at, offset, row_type, target.start, target.stop, layout.count, stream.name
+        ):
+            yield stream, part, codes
+        offset += stream.size * layout.count
 
 
-def _rows(layout: Layout, read: Read, stream: SpzStream) -> Iterator[StreamRows]:
-    for part, codes in rows_of(
-        lambda at, size: read(size), 0, stream.row_type, 0, layout.count, layout.count, stream.name
-    ):
+def _rows(stream: SpzStream, read: Read, count: int) -> Iterator[StreamRows]:
+    """Read all rows of a stream, one after the other."""
+    row_type = np.dtype((np.uint8, (stream.size,)))
+    for part, codes in rows_of(lambda at, size: read(size), 0, row_type, 0, count, count, stream.name):
         yield stream, part, codes
 
 
-def _read_gzip(inflate: Inflate, size: int, header: dict[str, int]) -> tuple[Layout, Iterator[StreamRows]]:
+def open_streams(
+    file: BinaryIO, size: int
+) -> tuple[Layout, Iterator[StreamRows], dict[str, int], FileNote, Extensions]:
+    """Open a file of `size` bytes, see `open_content`.
+
+    Returns:
+        its layout; the rows of its streams, which can be read once; its header, to which reading them adds; its note;
+        and its extensions.
+    """
+    if file.read(4) == struct.pack("<I", MAGIC):
+        file.seek(0)
+        return _open_v4(file, size)
+    from .inflate import Inflate  # not needed to write
+
+    file.seek(0)
+    inflate = Inflate(file)
     head = inflate.read(HEADER.size)
     if len(head) < HEADER.size:
         raise TruncatedError("cut short inside the SPZ header")
     magic, *fields, reserved = HEADER.unpack(head)
     if magic != MAGIC:
         raise NotSplatsError("a gzip file, but not of SPZ")
-    layout = _checked(Layout(*fields), size, header)
-    header["reserved"] = reserved
+    layout, extensions = Layout(*fields), NO_EXTENSIONS
+    header = _checked(layout, size) | {"reserved": reserved}
+    if layout.flags & EXTENSIONS:  # they follow the streams, which are read again
+        extensions = _extensions_behind(inflate, layout)
+        file.seek(0)
+        inflate = Inflate(file)
+        inflate.read(HEADER.size)
 
     def rows() -> Iterator[StreamRows]:
         try:
             for stream in layout.streams():
-                yield from _rows(layout, inflate.read, stream)
+                yield from _rows(stream, inflate.read, layout.count)
         except TruncatedError as error:
-            if inflate.behind() == compression.GZIP_MAGIC:
+            if inflate.behind == compression.GZIP_MAGIC:
                 raise MembersError(
                     f"{error}; its data continue in a second gzip member, which Spark does not read"
                 ) from None
@@ -323,9 +293,21 @@ def _read_gzip(inflate: Inflate, size: int, header: dict[str, int]) -> tuple[Lay
         inflate.finish()
         assert inflate.end is not None
         header["trailing_bytes"] = size - inflate.end
-        header["trailing_members"] = int(inflate.behind() == compression.GZIP_MAGIC)
+        header["trailing_members"] = int(inflate.behind == compression.GZIP_MAGIC)
 
-    return layout, rows()
+    return layout, rows(), header, read_comment(inflate.comment), extensions
+
+
+def _checked(layout: Layout, file_size: int) -> dict[str, int]:
+    """Check that a layout can be read and that the file is large enough for it; return its fields for the header."""
+    if layout.version not in READABLE:
+        raise VersionError(f"SPZ version {layout.version} is unknown, only 1 to 4 are read")
+    if layout.sh_degree > (4 if layout.version == 4 else MAX_SH_DEGREE):
+        raise VersionError(f"SPZ version {layout.version} has no SH degree {layout.sh_degree}")
+    if layout.fractional_bits > 31:
+        raise FormatError(f"{layout.fractional_bits} fractional bits; at most 31 can be read")
+    compression.check_promise(layout.total, file_size)
+    return {"version": layout.version, "fractional_bits": layout.fractional_bits, "flags": layout.flags}
 
 
 def _extensions_behind(inflate: Inflate, layout: Layout) -> Extensions:
@@ -340,15 +322,15 @@ def _extensions_behind(inflate: Inflate, layout: Layout) -> Extensions:
     return read_extensions(data, len(data))
 
 
-def _read_v4(file: BinaryIO, size: int, header: dict[str, int]) -> tuple[Layout, Iterator[StreamRows], Extensions]:
+def _open_v4(file: BinaryIO, size: int) -> tuple[Layout, Iterator[StreamRows], dict[str, int], FileNote, Extensions]:
     head = file.read(HEADER_V4.size)
     if len(head) < HEADER_V4.size:
         raise TruncatedError("cut short inside the SPZ header")
     _, version, count, sh_degree, bits, flags, streams, table, reserved = HEADER_V4.unpack(head)
     if version != 4:
         raise VersionError(f"SPZ version {version} must be gzipped, only version 4 is not")
-    layout = _checked(Layout(version, count, sh_degree, bits, flags), size, header)
-    expected = layout.streams()
+    layout = Layout(version, count, sh_degree, bits, flags)
+    header, expected = _checked(layout, size), layout.streams()
     if streams < len(expected):
         raise FormatError(f"{streams} streams, but SH degree {sh_degree} and flags {flags:#x} need {len(expected)}")
     header |= {"reserved": int(any(reserved)), "unknown_streams": streams - len(expected)}
@@ -373,17 +355,17 @@ def _read_v4(file: BinaryIO, size: int, header: dict[str, int]) -> tuple[Layout,
             raise TruncatedError(f"cut short inside stream {stream.name}")
 
     def rows() -> Iterator[StreamRows]:
-        from .inflate import Unzstd
+        from .unzstd import Unzstd
 
         for stream, (packed, _) in zip(expected, sizes, strict=False):
             end = file.tell() + packed
             unzstd = Unzstd(file, packed, stream.name)
-            yield from _rows(layout, unzstd.read, stream)
+            yield from _rows(stream, unzstd.read, count)
             unzstd.finish()
             file.seek(end)
         header["trailing_bytes"] = size - end if streams == len(expected) else 0
 
-    return layout, rows(), extensions
+    return layout, rows(), header, FileNote(), extensions
 
 
 def read_extensions(data: bytes, size: int) -> Extensions:
@@ -461,10 +443,12 @@ def settled(scene: Scene | Statistics, options: WriteOptions) -> WriteOptions:
             chosen for a tree, or for a scene in which x points up.
         ValueError: there are no such bits.
     """
+    from .statistics import Statistics, enough, fine_bits  # not needed to read
+
     version = DEFAULT_SPZ_VERSION if options.spz_version is None else options.spz_version
     if version not in TREE_SPZ_VERSIONS:
         _check_v4(scene)
-    found = scene if isinstance(scene, Statistics) else Statistics.of_scene(scene, needed(options))
+    found = Statistics.of_scene(scene, needed(options)) if isinstance(scene, Scene) else scene
     assert found.reach is not None
     bits, most = options.fractional_bits, largest_fractional_bits(found.reach)
     if bits is None:
@@ -481,7 +465,7 @@ def settled(scene: Scene | Statistics, options: WriteOptions) -> WriteOptions:
 
 def _check_v4(scene: Scene | Statistics) -> None:
     """Raise `FormatError` if version 4 cannot hold a scene; statistics are those of a tree."""
-    if isinstance(scene, Statistics) or scene.tree is not None:
+    if not isinstance(scene, Scene) or scene.tree is not None:
         raise FormatError("SPZ version 4 holds no tree that Spark reads; use version 2 or 3, or RAD")
     if scene.up is not None and scene.up not in SYSTEM_OF_UP:
         raise FormatError(f"SPZ version 4 cannot note that {scene.up} points up; use version 3, or turn the scene")
@@ -513,30 +497,26 @@ WAYS = {
 
 
 @dataclass(frozen=True, eq=False)
-class SpzEncoder(Encoder):
-    """Encoder of a file: the result of a window has its part of each stream, by its name.
+class SpzEncoder:
+    """`encoder.Encoder` of a file: the result of a window has its part of each stream, by its name.
 
     Attributes:
+        up: the axis that points up; None where it is unknown.
         stored: (N, bytes or more) codes of streams by name, see `unchanged`. Of SH, there may be more coefficients than
             are written.
         unchanged: (N,) nodes that get their codes of `stored`; None for none.
     """
 
+    layout: Layout
+    up: str | None
+    options: WriteOptions
+    ranges: tuple[CodeRange, ...]
     stored: Mapping[str, Bytes] = field(default_factory=dict)
     unchanged: NDArray[np.bool_] | None = None
 
-    @property
-    def layout(self) -> Layout:
-        """Layout of the file."""
-        version, bits = self.options.spz_version, self.options.fractional_bits
-        assert version is not None and bits is not None
-        flags = ANTIALIASED * self.antialiased | LOD * self.tree
-        return Layout(version, self.count, self.sh_degree, bits, flags)
-
-    def codes(self, splats: Splats, tree: LodTree | None, start: int) -> Encoded:
+    def encode(self, splats: Splats, tree: LodTree | None, start: int) -> Encoded:
         """Encode a window, wherever it begins."""
-        layout, sh_bits = self.layout, self.options.sh_bits
-        streams, bits = layout.streams(), layout.fractional_bits
+        streams, bits, sh_bits = self.layout.streams(), self.layout.fractional_bits, self.options.sh_bits
         codes = {stream.name: np.empty((len(splats), stream.size), np.uint8) for stream in streams}
         assert sh_bits is not None
         for part in blocks_of(len(splats)):
@@ -547,18 +527,25 @@ class SpzEncoder(Encoder):
                 if stream.name == "sh":
                     values = sh_codes(some.sh, is_leaf, sh_bits)
                 else:
-                    values = np.ascontiguousarray(stream.encode(column_of(some, links, stream)))
+                    column = getattr(some if stream.column in COLUMNS else links, stream.column)
+                    values = np.ascontiguousarray(stream.encode(column))
                 codes[stream.name][part] = values.view(np.uint8).reshape(-1, stream.size)
         if self.unchanged is not None:
             here = slice(start, start + len(splats))
             unchanged = self.unchanged[here]
             for name, stored in self.stored.items():
                 codes[name][unchanged] = stored[here][unchanged, : codes[name].shape[1]]
-        return codes
+        if not self.ranges:
+            return codes
+        from .encoder import CLAMPED, tally
+
+        return codes | {CLAMPED: tally(splats, self.ranges, None if tree is None else tree.is_leaf)}
 
     def pieces(self, windows: Windows, *, threads: int, progress: Progress) -> Iterator[bytes]:
         """Return the header and all streams, piece by piece: as one gzip member, or those of version 4."""
-        layout, streams, count = self.layout, self.layout.streams(), self.count
+        from .encoder import windows_of
+
+        layout, streams, count = self.layout, self.layout.streams(), self.layout.count
         if layout.version not in TREE_SPZ_VERSIONS:
             yield from self._pieces_v4(windows, threads, progress)
             return
@@ -568,7 +555,7 @@ class SpzEncoder(Encoder):
         runs = [(stream.size * count, WAYS.get(stream.name, compression.MIXED)) for stream in streams]
         runs[0] = runs[0][0] + HEADER.size, runs[0][1]
         # A plain file without it would be one of another program, whose y is up.
-        comment = "" if self.up is None and self.tree else comment_of(up=self.up)
+        comment = "" if self.up is None and layout.flags & LOD else comment_of(up=self.up)
         yield from compression.gzip_member(
             itertools.chain([HEADER.pack(MAGIC, *fields)], data),
             runs,
@@ -580,6 +567,8 @@ class SpzEncoder(Encoder):
 
     def _pieces_v4(self, windows: Windows, threads: int, progress: Progress) -> Iterator[bytes]:
         """Return the header, the extensions, the table of streams, and the streams, which are compressed before."""
+        from .encoder import windows_of
+
         layout, streams, frames = self.layout, self.layout.streams(), list[bytes]()
 
         def packed(stream: SpzStream) -> bytes:
@@ -597,19 +586,43 @@ class SpzEncoder(Encoder):
         yield b"".join(STREAM_SIZES.pack(len(frame), size) for frame, size in zip(frames, sizes, strict=True))
         yield from frames
 
+    def keeping(self, stored: StoredCodes, unchanged: NDArray[np.bool_]) -> SpzEncoder:
+        """Return an encoder of as many nodes that gives some the codes of a file, where its coding is the same."""
+        (layout, codes), kept = stored, {}
+        for stream in self.layout.streams():
+            is_alike = stream.column in COLUMNS
+            if stream.name == "positions":
+                is_alike = layout.version > 1 and layout.fractional_bits == self.layout.fractional_bits
+            elif stream.name == "rotations":
+                is_alike = (layout.version >= 3) == (self.layout.version >= 3)
+            elif stream.name == "alphas":
+                is_alike = layout.flags & LOD == self.layout.flags & LOD
+            if is_alike:
+                kept[stream.name] = codes[stream.name]
+        return dataclasses.replace(self, stored=kept, unchanged=unchanged)
+
 
 def encoder(
     scene: Scene | NodeStream,
     options: WriteOptions,
-    ranges: tuple[CodeRange, ...] = (),
     *,
+    counting: bool = False,
     threads: int = 1,
     progress: Progress = silent,
 ) -> SpzEncoder:
-    """Return the encoder of a scene, of which nothing is read; raises ValueError unless the options are settled."""
+    """Return the encoder of a scene, of which nothing is read; raises ValueError unless the options are settled.
+
+    With `counting`, it counts the values that it clamps.
+    """
     if options.spz_version is None or options.fractional_bits is None or options.sh_bits is None:
         raise ValueError("the options leave choices open; `settled` makes them")
-    return SpzEncoder.of(scene, options, ranges)
+    if isinstance(scene, Scene):
+        count, sh_degree, has_tree = len(scene), scene.splats.sh_degree, scene.tree is not None
+    else:
+        count, sh_degree, has_tree = scene.count, scene.sh_degree, True
+    flags = ANTIALIASED * scene.antialiased | LOD * has_tree
+    layout = Layout(options.spz_version, count, sh_degree, options.fractional_bits, flags)
+    return SpzEncoder(layout, scene.up, options, tuple(held(options, sh_degree)) if counting else ())
 
 
 def to_code(
@@ -647,6 +660,8 @@ def sh_codes(sh: FloatArray, is_leaf: NDArray[np.bool_] | None, sh_bits: int) ->
 
 def held(options: WriteOptions, sh_degree: int) -> Sequence[CodeRange]:
     """Return the values that SPZ holds without clamping them."""
+    from .encoder import SPZ_RANGES
+
     return SPZ_RANGES
 
 
@@ -660,51 +675,28 @@ def encode(
     Raises:
         FormatError: a coordinate does not fit the fractional bits; the text names the most that would.
     """
+    from .encoder import results
+
     of_scene = encoder(scene, settled(scene, options))
     windows = list(results(of_scene, scene, threads, progress, "encoding"))
     yield from of_scene.pieces(lambda number, name: windows[number][name], threads=threads, progress=progress)
 
 
-@dataclass(frozen=True, eq=False)
-class StoredSpz:
-    """Codes of a file, see `encoder.Stored`.
+#: Codes of a file: its layout, and (N, bytes) of each stream by name. Decoding and encoding again is not the same: a
+#: rotation whose two largest components are equal, but for rounding, may get another code.
+StoredCodes = tuple[Layout, Mapping[str, Bytes]]
 
-    Decoding and encoding again would nearly do: but a rotation whose two largest components are equal, but for
-    rounding, may get another code.
+
+def stored(file: BinaryIO, options: WriteOptions) -> tuple[StoredCodes, WriteOptions]:
+    """Read the codes of a file; raises `FormatError` as `open_content`.
+
+    Returns:
+        the codes, and the options, which have the file's value where they leave a choice open.
     """
-
-    layout: Layout
-    codes: Mapping[str, Bytes]
-
-    def like(self, options: WriteOptions) -> WriteOptions:
-        """Return the options, and where they leave a choice open, that of the file."""
-        layout = self.layout
-        if layout.version == 1 or layout.fractional_bits > MAX_FRACTIONAL_BITS:
-            return options  # its positions are in no coding that is written
-        return like({"version": layout.version, "fractional_bits": layout.fractional_bits}, options)
-
-    def keeping(self, encoder: SpzEncoder, unchanged: NDArray[np.bool_]) -> SpzEncoder:
-        """Return an encoder of as many nodes that gives some the codes of the file, where its coding is the same."""
-        streams = encoder.layout.streams()
-        codes = {each.name: self.codes[each.name] for each in streams if self._is_alike(each, encoder.layout)}
-        return dataclasses.replace(encoder, stored=codes, unchanged=unchanged)
-
-    def _is_alike(self, stream: SpzStream, other: Layout) -> bool:
-        """Return True if a layout has a stream of splats in the coding of the file."""
-        own = self.layout
-        if stream.column not in COLUMNS:
-            return False
-        if stream.name == "positions":
-            return own.version > 1 and own.fractional_bits == other.fractional_bits
-        if stream.name == "rotations":
-            return (own.version >= 3) == (other.version >= 3)
-        return stream.name != "alphas" or own.has_tree == other.has_tree
-
-
-def stored(file: BinaryIO) -> StoredSpz:
-    """Read the codes of a file, (N, bytes) of each of its streams, by name; raises `FormatError` as `open_content`."""
-    _, layout, rows = open_streams(OpenFile(file))
+    layout, rows, *_ = open_streams(file, size_of(file))
     codes = {each.name: np.empty((layout.count, each.size), np.uint8) for each in layout.streams()}
     for each, part, some in rows:
         codes[each.name][part] = some
-    return StoredSpz(layout, codes)
+    if layout.version > 1 and layout.fractional_bits <= MAX_FRACTIONAL_BITS:  # positions in a coding that is written
+        options = like({"version": layout.version, "fractional_bits": layout.fractional_bits}, options)
+    return (layout, codes), options

@@ -21,6 +21,7 @@ from ..model.sh import COEFFICIENTS
 from ..model.splats import FloatArray, Splats
 from ..system.threads import blocks_of, ordered_map
 from . import quantize
+from .quantize import ALL_BITS
 
 #: A bin holds the float32 values with the same upper 16 bits: sign, exponent and 7 bits of the mantissa. Its ends
 #: are at most 0.8 % apart.
@@ -48,7 +49,7 @@ class Distribution:
         ordered = np.sort(values, axis=None) + np.float32(0)  # -0 becomes 0
         ordered[np.isnan(ordered)] = np.nan  # without a sign
         bits = ordered.view(np.uint32) >> np.uint32(_SHIFT)
-        first = _starts(bits)
+        first = np.flatnonzero(np.diff(bits, prepend=~bits[:1]))
         ends = np.append(first, len(bits))[1:]
         bins = bits[first].astype(np.int64)
         bins = np.where(bins < _BINS // 2, bins + _BINS // 2, _BINS - 1 - bins)
@@ -61,7 +62,7 @@ class Distribution:
             return parts[0]
         bins = np.concatenate([part.bins for part in parts])
         order = np.argsort(bins, kind="stable")
-        first = _starts(bins[order])
+        first = np.flatnonzero(np.diff(bins[order], prepend=-1))
         counts, least, most = (np.concatenate([getattr(part, name) for part in parts])[order] for name in _COLUMNS)
         if len(first):  # `reduceat` takes no empty list
             counts, least = np.add.reduceat(counts, first), np.minimum.reduceat(least, first)
@@ -116,10 +117,6 @@ class Distribution:
 _COLUMNS = ("counts", "least", "most")
 
 
-def _starts(rows: NDArray[Any]) -> NDArray[np.intp]:
-    return np.flatnonzero(np.concatenate([[True], rows[1:] != rows[:-1]])[: len(rows)])
-
-
 #: Ends of the bins of magnitudes, 32,768 from 0 up. The last ones are of infinity and of what is not a number.
 _BITS = np.arange(_BINS // 2 + 1, dtype=np.uint32) << np.uint32(_SHIFT)
 with np.errstate(invalid="ignore"):
@@ -132,9 +129,6 @@ def tops(counts: NDArray[np.int64], total: int, most: float, beyond: NDArray[np.
     first = [int(np.count_nonzero(above > share * total)) for share in beyond]
     return np.minimum([UPPER[each - 1] if each else 0.0 for each in first], most)
 
-
-#: All bits of a byte.
-ALL_BITS = 8
 
 #: Largest root mean square, over splats and directions, of what dropping bits changes of a splat's colour: with
 #: it, SH alone cost what 58 dB and more are, see docs/decisions/08-rounding.md.

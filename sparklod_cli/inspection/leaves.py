@@ -15,7 +15,7 @@ from ..codecs.rad.codec import rounded
 from ..codecs.rad.property_codings import CODINGS, PROPERTIES, Row
 from ..codecs.spark_codings import STEPS_8_8_8, encode_axis_angle, encode_lod_alpha
 from ..codecs.spz import LOD, Layout, to_code
-from ..codecs.statistics import ALL_BITS, Distribution, enough, fine_bits, sh_code_counts
+from ..codecs.statistics import Distribution, enough, fine_bits, sh_code_counts
 from ..model.scene import Scene
 from ..model.selection import Selection
 from ..model.sh import COEFFICIENTS
@@ -94,7 +94,7 @@ def of_spz(scene: Scene, leaves: Splats, *, covering: bool) -> LeafCoding:
     degree = scene.splats.sh_degree
     steps = np.full(3 + 1 + 3 + 3 + 3 * COEFFICIENTS[degree], STEPS)
     steps[10:] = SH_STEPS
-    sh_bits = enough(*sh_code_counts(leaves.sh)) if degree else ALL_BITS
+    sh_bits = enough(*sh_code_counts(leaves.sh)) if degree else quantize.ALL_BITS
 
     def encode(splats: Splats) -> CodedSplats:
         parts, numbers = [], {}

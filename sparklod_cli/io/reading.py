@@ -27,8 +27,8 @@ from ..system.units import count_of
 from .local_files import in_folder, open_named, reason_unreadable
 
 if TYPE_CHECKING:
-    from ..codecs.encoder import Stored
     from ..codecs.gpu import dump
+    from ..codecs.options import WriteOptions
     from ..model.transforms import Transform
     from ..model.traversed import DetailScene, TileScene
 
@@ -108,10 +108,14 @@ def read_scene(
         return reader.scene(columns=columns, progress=progress, validate=validate)
 
 
-def read_stored(path: Place) -> Stored:
-    """Read the codes of a file whose format can hold a tree, so that its leaves can be written again bit for bit."""
+def read_stored(path: Place, options: WriteOptions) -> tuple[Any, WriteOptions]:
+    """Read the codes of a file whose format can hold a tree, so that its leaves can be written again bit for bit.
+
+    Returns:
+        the codes, for `Encoder.keeping`, and the options, which have the file's value where they leave a choice open.
+    """
     with opened(path) as (file, form, more):
-        found: Stored = form.codec().stored(file, **more)
+        found: tuple[Any, WriteOptions] = form.codec().stored(file, options, **more)
     return found
 
 

@@ -39,16 +39,16 @@ def files_of(folder: Path) -> dict[str, bytes]:
     return {each.name: each.read_bytes() for each in folder.iterdir()}
 
 
-def written(tree: BuiltTree, nodes: Scene | NodeStream, found: Statistics) -> Baked:
+def written(tree: BuiltTree, scene: Scene, nodes: Scene | NodeStream, found: Statistics) -> Baked:
     """Writes a tree window by window."""
 
     def encode(tree: BuiltTree, made: encoder.Encoder) -> encoder.Windows:
         read = nodes.read if isinstance(nodes, NodeStream) else node_stream(nodes).read
-        parts = encoder.windows_of(made.count)
+        parts = encoder.windows_of(len(scene))
         windows = [made.encode(*read(part.start, part.stop), part.start) for part in parts]
         return lambda number, name: windows[number][name]
 
-    tree.nodes, tree.baked.sh_degree, tree.statistics = nodes, 1, found
+    tree.nodes, tree.baked.nodes, tree.baked.sh_degree, tree.statistics = nodes, len(scene), 1, found
     write_windows(tree, encode, 2, silent)
     tree.baked.seconds.clear()
     return tree.baked
@@ -68,7 +68,7 @@ def test_a_stream_is_written_as_the_scene(
         parts = np.array_split(np.arange(len(scene)), 3)
         leaf = scene.tree.is_leaf
         found = Statistics.merged([Statistics.of(scene.splats.take(at), leaf[at], needed) for at in parts])
-        said.append(written(tree, nodes, found))
+        said.append(written(tree, scene, nodes, found))
     assert said[0] == said[1] and said[0].clamped
     whole = files_of(tmp_path / "scene")
     assert len(whole) == (1 if name != "rad-chunked" else 1 + -(-len(scene) // 900))
@@ -78,7 +78,7 @@ def test_a_stream_is_written_as_the_scene(
 def test_windows_that_cannot_be_read_leave_no_output(scene: Scene, tmp_path: Path) -> None:
     for name in ("spz", "rad", "rad-chunked"):
         tree = output_of(tmp_path / f"{name}{SETTINGS[name].suffix}", SETTINGS[name], overwrite=False)
-        tree.nodes, tree.baked.sh_degree = node_stream(scene), 1
+        tree.nodes, tree.baked.nodes, tree.baked.sh_degree = node_stream(scene), len(scene), 1
         tree.statistics = Statistics.of_scene(scene, tree.form.codec().needed(tree.options))
 
         def encode(tree: BuiltTree, made: encoder.Encoder) -> encoder.Windows:

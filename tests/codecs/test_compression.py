@@ -15,7 +15,7 @@ import zstandard
 
 from sparklod_cli.codecs import compression
 from sparklod_cli.codecs.compression import MIXED, Way
-from sparklod_cli.codecs.inflate import Unzstd
+from sparklod_cli.codecs.unzstd import Unzstd
 from sparklod_cli.system.errors import FormatError
 from sparklod_cli.system.progress import silent
 

@@ -45,7 +45,7 @@ def test_windows_are_encoded_anywhere_and_count_what_they_clamp(
     scene = tree_of(method, sh_degree)
     nodes, options = node_stream(scene), codec.settled(scene, PALETTE)
     ranges = tuple(encoder.SPZ_RANGES if codec is spz else rad_options.held(options, sh_degree))
-    sent = pickle.dumps(codec.encoder(nodes, options, ranges))
+    sent = pickle.dumps(codec.encoder(nodes, options, counting=True))
     found = {}
     for number, part in reversed(list(enumerate(encoder.windows_of(len(scene))))):
         found[number] = pickle.loads(sent).encode(*nodes.read(part.start, part.stop), part.start)

@@ -129,7 +129,7 @@ def assert_reads(packed: bytes) -> None:
         assert found == expected
         reader.finish()
         assert reader.end == len(packed)
-        assert reader.behind() == behind[:2]
+        assert reader.behind == behind[:2]
 
 
 @pytest.mark.parametrize("kind", list(members(0)))

@@ -19,7 +19,6 @@ from sparklod_cli.codecs.rad import codec as rad
 from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.codecs.statistics import (
     ALL,
-    ALL_BITS,
     EXACT_BITS,
     LARGEST_ERROR,
     LOWER,
@@ -236,7 +235,7 @@ def sh_of(degree: int, spread: float, count: int = 400, seed: int = 0) -> np.nda
 
 @pytest.mark.parametrize("degree", [1, 2, 3])
 def test_the_error_is_that_of_colours_over_all_directions(degree: int) -> None:
-    sh = quantize.decode_sh(quantize.encode_sh(sh_of(degree, 0.2), ALL_BITS))
+    sh = quantize.decode_sh(quantize.encode_sh(sh_of(degree, 0.2), quantize.ALL_BITS))
     counts, _ = sh_code_counts(sh)
     rng = np.random.default_rng(1)
     direction = rng.normal(size=(1_000, 3))
@@ -245,7 +244,7 @@ def test_the_error_is_that_of_colours_over_all_directions(degree: int) -> None:
         off = quantize.decode_sh(quantize.encode_sh(sh, bits)) - sh
         seen = np.sqrt(np.square(np.einsum("dk,nkc->dnc", basis, off)).mean())
         assert sh_error(counts, bits) == pytest.approx(seen, rel=0.05)
-    assert sh_error(counts, ALL_BITS) == 0
+    assert sh_error(counts, quantize.ALL_BITS) == 0
 
 
 @pytest.mark.parametrize(("degree", "spread", "bits"), [(3, 0.002, 4), (1, 0.2, 4), (2, 0.2, 6), (3, 0.2, 7)])

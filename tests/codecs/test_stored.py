@@ -58,10 +58,10 @@ def check(form: object, data: bytes, options: WriteOptions | None = None) -> Sce
     assert before.tree is not None
     kept = before.tree.is_leaf.copy()
     kept[1::3] = True
-    stored = codec.stored(io.BytesIO(data))
+    stored, like_file = codec.stored(io.BytesIO(data), options or WriteOptions())
     scene = dataclasses.replace(before, splats=others(before.splats, kept))
-    settled = codec.settled(scene, stored.like(options or WriteOptions()))
-    encoder = stored.keeping(codec.encoder(scene, settled), kept)
+    settled = codec.settled(scene, like_file)
+    encoder = codec.encoder(scene, settled).keeping(stored, kept)
     windows = list(results(encoder, scene, 2, lambda *_: None, "encoding"))
     written = b"".join(encoder.pieces(lambda number, name: windows[number][name], threads=2, progress=lambda *_: None))
     after = decode_file(codec, io.BytesIO(written))
@@ -104,11 +104,11 @@ def test_a_choice_of_another_coding_is_heeded() -> None:
     """Only the streams that it changes are encoded anew."""
     scene = tree_of()
     data = b"".join(spz.encode(scene))
-    stored = spz.stored(io.BytesIO(data))
     bits = decode_file(spz, io.BytesIO(data)).header["fractional_bits"]
     asked = WriteOptions(spz_version=2, fractional_bits=bits - 1)
-    assert stored.like(asked) == asked
-    encoder = stored.keeping(spz.encoder(scene, spz.settled(scene, asked)), np.ones(len(scene), bool))
+    stored, like_file = spz.stored(io.BytesIO(data), asked)
+    assert like_file == asked
+    encoder = spz.encoder(scene, spz.settled(scene, asked)).keeping(stored, np.ones(len(scene), bool))
     assert {*encoder.stored} == {"alphas", "colors", "scales", "sh"}
 
 
@@ -119,9 +119,9 @@ def test_a_rad_of_any_encodings_keeps_its_codes(given: RadOptions) -> None:
     scene = tree_of()
     options = rad.settled(scene, WriteOptions(rad=given))
     data = b"".join(rad.encode(scene, options))
-    stored = rad.stored(io.BytesIO(data))
+    _, like_file = rad.stored(io.BytesIO(data), WriteOptions())
     after = check(rad, data)
-    found = rad.settled(after, stored.like(WriteOptions())).rad
+    found = rad.settled(after, like_file).rad
     assert [getattr(found, name) for name in RAD_ENCODINGS] == [getattr(options.rad, name) for name in RAD_ENCODINGS]
     assert found.ranges == options.rad.ranges
 
@@ -148,10 +148,11 @@ def test_a_rad_of_other_chunks_keeps_its_codes() -> None:
 def test_a_property_in_another_encoding_is_encoded_anew() -> None:
     scene = tree_of()
     data = b"".join(rad.encode(scene))
-    before, stored = decode_file(rad, io.BytesIO(data)), rad.stored(io.BytesIO(data))
-    settled = rad.settled(before, stored.like(WriteOptions(rad=RadOptions(rgb="f16"))))
+    before = decode_file(rad, io.BytesIO(data))
+    stored, like_file = rad.stored(io.BytesIO(data), WriteOptions(rad=RadOptions(rgb="f16")))
+    settled = rad.settled(before, like_file)
     assert settled.rad.rgb == "f16"
-    encoder = stored.keeping(rad.encoder(before, settled), np.ones(len(before), bool))
+    encoder = rad.encoder(before, settled).keeping(stored, np.ones(len(before), bool))
     made = list(results(encoder, before, 1, lambda *_: None, "encoding"))
     pieces = encoder.pieces(lambda number, name: made[number][name], threads=1, progress=lambda *_: None)
     after = decode_file(rad, io.BytesIO(b"".join(pieces)))

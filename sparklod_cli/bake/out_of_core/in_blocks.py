@@ -8,11 +8,11 @@ import itertools
 import math
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...codecs.encoder import Encoder, Windows
 from ...codecs.reader import Reader
 from ...codecs.statistics import Statistics
 from ...lod.builders import BUILDERS
@@ -44,6 +44,9 @@ from .job import (
 )
 from .order import WINDOW_NODES, Rows, encode, encoded_array, fill_rows, node_stream, put_order, rows_of, splats_of
 from .store import Arrays
+
+if TYPE_CHECKING:
+    from ...codecs.encoder import Encoder, Windows
 
 #: Largest size of a block, as a multiple of the requested one; a scene with a larger block is divided again. Chosen.
 SLACK = 1.3
@@ -121,8 +124,14 @@ class InBlocks:
         """Encode the windows of the tree; the output may be in place if the bake is interrupted from then on."""
         job = dataclasses.replace(self.job, encoder=encoder)
         tasks = [
-            Task(encoded_of(window), encode, (window,), weight=part.stop - part.start, together=self.windows)
-            for window, part in enumerate(blocks_of(encoder.count, WINDOW_NODES))
+            Task(
+                encoded_of(window),
+                encode,
+                (part.start, part.stop),
+                weight=part.stop - part.start,
+                together=self.windows,
+            )
+            for window, part in enumerate(blocks_of(tree.baked.nodes, WINDOW_NODES))
         ]
         self.engine.run("encoding", tasks, job, self.progress)
         tree.end("encode")

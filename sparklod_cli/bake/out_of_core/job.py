@@ -7,12 +7,11 @@ import itertools
 import math
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...codecs.encoder import Encoder
 from ...codecs.reader import Reader
 from ...lod.builders import BUILDERS
 from ...lod.stage_records import Region, StagedBuilder
@@ -22,6 +21,9 @@ from ...system.progress import Progress, silent
 from ...system.threads import ordered_map
 from ..settings import BakeSettings
 from .store import Store
+
+if TYPE_CHECKING:
+    from ...codecs.encoder import Encoder
 
 #: The most regions that are joined at once: those of three splits.
 CHILDREN = 8

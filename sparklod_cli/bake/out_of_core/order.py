@@ -270,12 +270,10 @@ def node_stream(job: Job, count: int) -> NodeStream:
     return NodeStream(count, job.sh_degree, job.stream.antialiased, read, up)
 
 
-def encode(job: Job, window: int, *, threads: int, progress: Progress) -> None:
-    """Encode a window; a task. Result: the encoded arrays of its chunks, as NUMBER.NAME."""
+def encode(job: Job, start: int, stop: int, *, threads: int, progress: Progress) -> None:
+    """Encode the nodes of a window; a task. Result: the encoded arrays of its chunks, as NUMBER.NAME."""
     assert job.encoder is not None
     encoder = job.encoder
-    start = window * WINDOW_NODES
-    stop = min(start + WINDOW_NODES, encoder.count)
     splats, tree = _read(job.store, width_of(job.sh_degree), start, stop, threads)
 
     def encoded(part: slice) -> dict[str, NDArray[np.generic]]:
@@ -284,7 +282,7 @@ def encode(job: Job, window: int, *, threads: int, progress: Progress) -> None:
     arrays: dict[str, NDArray[np.generic]] = {}
     for number, chunk in enumerate(ordered_map(encoded, windows_of(stop - start), threads)):
         arrays |= {f"{number}.{name}": array for name, array in chunk.items()}
-    job.store.put(encoded_of(window), arrays)
+    job.store.put(encoded_of(start // WINDOW_NODES), arrays)
 
 
 def encoded_array(store: Store, number: int, name: str) -> NDArray[np.generic]:

@@ -24,7 +24,7 @@ from ...model.splats import COLUMNS, FloatArray, Splats
 from ...system.progress import Progress, silent
 from ...system.threads import blocks_of
 from .. import quantize, sh_palette, spark_codings
-from ..encoder import CodeRange, Encoded, Encoder, Windows, results, windows_of
+from ..encoder import CLAMPED, CodeRange, Encoded, Windows, results, tally, windows_of
 from ..options import AUTO, DEFAULTS, RAD_ENCODINGS, WriteOptions
 from ..quantize import Bytes
 from ..reader import OpenCompanion, comment_of
@@ -121,45 +121,47 @@ def _sample(nodes: NodeStream) -> Splats:
 
 
 @dataclass(frozen=True, eq=False)
-class RadEncoder(Encoder):
-    """Encoder of a file: the result of a window is a chunk; `palette` is that of SH, or None."""
+class RadEncoder:
+    """`encoder.Encoder` of a file: the result of a window is a chunk.
 
+    Attributes:
+        header: of the file, but for its chunks.
+        codes: ranges of codes.
+        palette: of SH; None for coefficients of each splat.
+    """
+
+    header: RadHeader
+    codes: SplatEncoding
+    options: WriteOptions
+    ranges: tuple[CodeRange, ...]
     palette: Palette | None = None
 
-    @property
-    def _codes(self) -> SplatEncoding:
-        assert self.options.rad.ranges is not None
-        return self.options.rad.ranges
-
-    def codes(self, splats: Splats, tree: LodTree | None, start: int) -> Encoded:
+    def encode(self, splats: Splats, tree: LodTree | None, start: int) -> Encoded:
         """Encode a chunk: its bytes, and their number."""
         chunk = np.frombuffer(self._chunk(splats, tree, start), np.uint8)
-        return {CHUNK: chunk, SIZE: np.array([len(chunk)])}
+        encoded = {CHUNK: chunk, SIZE: np.array([len(chunk)])}
+        if self.ranges:
+            encoded[CLAMPED] = tally(splats, self.ranges, None if tree is None else tree.is_leaf)
+        return encoded
 
     def pieces(self, windows: Windows, *, threads: int, progress: Progress) -> Iterator[bytes]:
         """Return the bytes of one file, piece by piece."""
-        numbers = range(len(windows_of(self.count)))
+        numbers = range(len(windows_of(self.header.count)))
         sizes = [int(windows(number, SIZE)[0]) for number in numbers]
         yield from self.one_file(sizes, (windows(number, CHUNK).tobytes() for number in numbers), progress)
 
     def one_file(self, sizes: Sequence[int], chunks: Iterable[bytes], progress: Progress) -> Iterator[bytes]:
         """Return the bytes of one file, piece by piece, of the sizes and the bytes of its chunks."""
-        return in_one_file(self._header, sizes, self._counted(chunks, progress))
+        return in_one_file(self.header, sizes, self._counted(chunks, progress))
 
     def files(self, chunks: Iterable[bytes], stem: str, *, progress: Progress = silent) -> Files:
         """Return the name and the bytes of each file, one for each of the chunks; see `rad_header.in_files`."""
-        return in_files(self._header, self._counted(chunks, progress), stem)
+        return in_files(self.header, self._counted(chunks, progress), stem)
 
     def _counted(self, chunks: Iterable[bytes], progress: Progress) -> Iterator[bytes]:
-        for part, chunk in zip(windows_of(self.count), chunks, strict=True):
+        for part, chunk in zip(windows_of(self.header.count), chunks, strict=True):
             yield chunk
-            progress("writing", part.stop, self.count, "splat")
-
-    @property
-    def _header(self) -> RadHeader:
-        codes = None if self.palette is None else len(self.palette.codes)
-        comment = comment_of(antialiased=self.antialiased, up=self.up)
-        return RadHeader(self.count, self.sh_degree, self.tree, CHUNK_NODES, 0, (), self._codes, codes, comment)
+            progress("writing", part.stop, self.header.count, "splat")
 
     def _chunk(self, splats: Splats, tree: LodTree | None, start: int) -> bytes:
         payload, properties, at = [], [], 0
@@ -170,15 +172,20 @@ class RadEncoder(Encoder):
             properties.append(Property(at, len(data), row.name, made.encoding, GZ, made.min, made.max))
             payload += [data, bytes(padding(len(data)))]
             at += len(data) + padding(len(data))
-        header = RadChunkHeader(start, len(splats), at, self.sh_degree, self.tree, tuple(properties), self._codes)
+        sh_degree, has_tree = self.header.max_sh, self.header.lod_tree
+        header = RadChunkHeader(start, len(splats), at, sh_degree, has_tree, tuple(properties), self.codes)
         return b"".join([pack_chunk_header(header), *payload])
+
+    def keeping(self, stored: Sequence[StoredChunk], unchanged: NDArray[np.bool_]) -> KeepingEncoder:
+        """Return an encoder that gives (N,) `unchanged` nodes their codes of a file, where its encoding is the same."""
+        return KeepingEncoder(**vars(self), stored=stored, unchanged=unchanged)
 
     def coded(
         self, row: Row, splats: Splats, tree: LodTree | None, labels: NDArray[np.uint32] | None, start: int
     ) -> CodedProperty:
         """Encode a property of the chunk that begins with node `start`."""
         encoding = getattr(self.options.rad, row.option) if row.option else row.encodings[0]
-        low, high = code_range(row, self._codes)
+        low, high = code_range(row, self.codes)
         codes = CODINGS[encoding].encode(self.values(row, encoding, splats, tree, labels), low, high)
         return CodedProperty(encoding, codes, *((low, high) if CODINGS[encoding].ends else (None, None)))
 
@@ -186,11 +193,11 @@ class RadEncoder(Encoder):
         for row in PROPERTIES:
             if row.degree:
                 own = row.codes and first if self.palette is not None else not row.codes
-                present = row.degree <= self.sh_degree and own
+                present = row.degree <= self.header.max_sh and own
             elif row.column == "labels":
                 present = self.palette is not None
             else:
-                present = row.column in COLUMNS or self.tree
+                present = row.column in COLUMNS or self.header.lod_tree
             if present:
                 yield row
 
@@ -207,7 +214,7 @@ class RadEncoder(Encoder):
             return labels[:, None]
         column: NDArray[Any] = getattr(splats if row.column in COLUMNS else tree, row.column)
         if row.column == "opacity":
-            return _alpha(self._opacity(splats), encoding, self._codes)[:, None]
+            return _alpha(self._opacity(splats), encoding, self.codes)[:, None]
         if row.column == "quat_xyzw" and encoding != "oct88r8":
             return column[:, :3] * np.where(column[:, 3:] < 0, np.float32(-1), np.float32(1))
         if row.column == "center" and self.options.rad.center_bits is not None:
@@ -218,7 +225,7 @@ class RadEncoder(Encoder):
         """Return (n,) opacities that make up for the rounding of scales."""
         if not self.options.covering:
             return splats.opacity
-        ends = code_range(BY_NAME["scales"], self._codes)
+        ends = code_range(BY_NAME["scales"], self.codes)
         bits = self.options.rad.center_bits
         blur, kept = 0.0 if bits is None else 2.0**-bits, np.empty_like(splats.opacity)
         for part in blocks_of(len(splats), BLOCK):
@@ -239,18 +246,28 @@ class RadEncoder(Encoder):
 def encoder(
     scene: Scene | NodeStream,
     options: WriteOptions,
-    ranges: tuple[CodeRange, ...] = (),
     *,
+    counting: bool = False,
     threads: int = 1,
     progress: Progress = silent,
 ) -> RadEncoder:
-    """Return the encoder of a scene, of which only the splats for a palette are read."""
-    if options.rad.ranges is None:
+    """Return the encoder of a scene, of which only the splats for a palette are read.
+
+    With `counting`, it counts the values that it clamps.
+    """
+    codes, most, palette = options.rad.ranges, options.rad.sh_codes, None
+    if codes is None:
         raise ValueError("the options leave choices open; `settled` makes them")
-    bare, codes = RadEncoder.of(scene, options, ranges), options.rad.sh_codes
-    if codes is None or not bare.sh_degree or not bare.count:
-        return bare
-    return dataclasses.replace(bare, palette=Palette.of(scene, codes, threads, progress))
+    if isinstance(scene, Scene):
+        count, sh_degree, has_tree = len(scene), scene.splats.sh_degree, scene.tree is not None
+    else:
+        count, sh_degree, has_tree = scene.count, scene.sh_degree, True
+    if most is not None and sh_degree and count:
+        palette = Palette.of(scene, most, threads, progress)
+    entries = None if palette is None else len(palette.codes)
+    comment = comment_of(antialiased=scene.antialiased, up=scene.up)
+    header = RadHeader(count, sh_degree, has_tree, CHUNK_NODES, 0, (), codes, entries, comment)
+    return RadEncoder(header, codes, options, tuple(held(options, sh_degree)) if counting else (), palette)
 
 
 def rounded(center: FloatArray, bits: int) -> FloatArray:
@@ -307,58 +324,32 @@ class StoredChunk:
     codes: Mapping[str, Bytes]
 
 
-@dataclass(frozen=True, eq=False)
-class StoredRad:
-    """Codes of a file, see `encoder.Stored`: its header, and the chunks in order."""
+def _like(header: RadHeader, first: Mapping[str, Property], options: WriteOptions) -> WriteOptions:
+    """Return the options, and where they leave a choice open, that of the first chunk of a file, by its properties.
 
-    header: RadHeader
-    chunks: tuple[StoredChunk, ...]
-
-    def like(self, options: WriteOptions) -> WriteOptions:
-        """Return the options, and where they leave a choice open, that of the first chunk of the file.
-
-        The rounding of centres stays open where the encoding is that of "auto": it matters for merged splats.
-        """
-        rad = options.rad
-        found = encodings_of(self.chunks[0].properties.values())
-        if found.get("center") == AUTOMATIC.center:
-            found["center"] = AUTO
-        chosen: dict[str, Any] = {name: found.get(name, AUTO) for name in RAD_ENCODINGS if getattr(rad, name) == AUTO}
-        ranges = rad.ranges or self._ranges()
-        return dataclasses.replace(options, rad=dataclasses.replace(rad, **chosen, ranges=ranges))
-
-    def _ranges(self) -> SplatEncoding:
-        ranges, properties = self.header.encoding or SplatEncoding(lod_opacity=True), self.chunks[0].properties
-        for name, low, high in (("rgb", "rgb_min", "rgb_max"), ("scales", "ln_scale_min", "ln_scale_max")):
-            each = properties.get(name)
-            if each is not None and CODINGS[each.encoding].ends and each.min is not None and each.max is not None:
-                ends: dict[str, Any] = {low: each.min, high: each.max}
-                ranges = dataclasses.replace(ranges, **ends)
-        return ranges
-
-    def keeping(self, encoder: RadEncoder, unchanged: NDArray[np.bool_]) -> KeepingEncoder:
-        """Return an encoder that gives (N,) `unchanged` nodes the codes of the file, where its encoding is the same."""
-        given = {each.name: getattr(encoder, each.name) for each in dataclasses.fields(RadEncoder)}
-        return KeepingEncoder(**given, stored=self, unchanged=unchanged)
-
-    def codes(self, name: str, start: int, stop: int) -> tuple[Property, Bytes] | None:
-        """Return a property of some nodes and (n, ...) their codes; None where its coding differs between chunks."""
-        found, codes = [], []
-        for chunk in self.chunks:
-            own = chunk.codes.get(name)
-            part = slice(max(start - chunk.start, 0), max(stop - chunk.start, 0))
-            if own is None:
-                return None
-            if len(own[part]):
-                found.append(chunk.properties[name])
-                codes.append(own[part])
-        if len({(each.encoding, each.min, each.max) for each in found}) != 1:
-            return None
-        return found[0], np.concatenate(codes)
+    The rounding of centres stays open where the encoding is that of "auto": it matters for merged splats.
+    """
+    rad, found = options.rad, encodings_of(first.values())
+    if found.get("center") == AUTOMATIC.center:
+        found["center"] = AUTO
+    chosen: dict[str, Any] = {name: found.get(name, AUTO) for name in RAD_ENCODINGS if getattr(rad, name) == AUTO}
+    ranges = rad.ranges or header.encoding or SplatEncoding(lod_opacity=True)
+    for name, low, high in (("rgb", "rgb_min", "rgb_max"), ("scales", "ln_scale_min", "ln_scale_max")):
+        each = first.get(name) if rad.ranges is None else None
+        if each is not None and CODINGS[each.encoding].ends and each.min is not None and each.max is not None:
+            ends: dict[str, Any] = {low: each.min, high: each.max}
+            ranges = dataclasses.replace(ranges, **ends)
+    return dataclasses.replace(options, rad=dataclasses.replace(rad, **chosen, ranges=ranges))
 
 
-def stored(file: BinaryIO, *, open_companion: OpenCompanion | None = None) -> StoredRad:
-    """Read the codes of a file and of the files that it names."""
+def stored(
+    file: BinaryIO, options: WriteOptions, *, open_companion: OpenCompanion | None = None
+) -> tuple[list[StoredChunk], WriteOptions]:
+    """Read the codes of a file and of the files that it names.
+
+    Returns:
+        the codes, and the options, which have the file's value where they leave a choice open.
+    """
     reader, chunks = RadReader.open(file, open_companion), []
     for packed in reader.packed():
         count, properties = packed.header.count, {each.name: each for each in packed.header.properties}
@@ -369,14 +360,14 @@ def stored(file: BinaryIO, *, open_companion: OpenCompanion | None = None) -> St
                 flat = _flat(packed.unpacked(each, row, count), each.encoding, count)
                 codes[row.name] = np.ascontiguousarray(_by_splat(flat, row, each.encoding))
         chunks.append(StoredChunk(packed.header.base, properties, codes))
-    return StoredRad(reader.header, tuple(chunks))
+    return chunks, _like(reader.header, chunks[0].properties, options)
 
 
 @dataclass(frozen=True, eq=False)
 class KeepingEncoder(RadEncoder):
     """Encoder that gives the (N,) `unchanged` nodes their `stored` codes."""
 
-    stored: StoredRad | None = None
+    stored: Sequence[StoredChunk] = ()
     unchanged: NDArray[np.bool_] = dataclasses.field(default_factory=lambda: np.zeros(0, bool))
 
     def coded(
@@ -384,7 +375,7 @@ class KeepingEncoder(RadEncoder):
     ) -> CodedProperty:
         """Encode a property of a chunk in its former range."""
         made, stop = super().coded(row, splats, tree, labels, start), start + len(splats)
-        found = None if self.stored is None else self.stored.codes(row.name, start, stop)
+        found = self._stored(row.name, start, stop)
         if found is None or found[0].encoding != made.encoding:
             return made
         each, before = found
@@ -393,6 +384,21 @@ class KeepingEncoder(RadEncoder):
         flat, unchanged = _flat(codes, made.encoding, len(splats)), self.unchanged[start:stop]
         _by_splat(flat, row, made.encoding)[unchanged] = before[unchanged]
         return CodedProperty(made.encoding, _stored(flat, made.encoding, len(splats)), each.min, each.max)
+
+    def _stored(self, name: str, start: int, stop: int) -> tuple[Property, Bytes] | None:
+        """Return a property of some nodes and (n, ...) their codes; None where its coding differs between chunks."""
+        found, codes = [], []
+        for chunk in self.stored:
+            own = chunk.codes.get(name)
+            part = slice(max(start - chunk.start, 0), max(stop - chunk.start, 0))
+            if own is None:
+                return None
+            if len(own[part]):
+                found.append(chunk.properties[name])
+                codes.append(own[part])
+        if len({(each.encoding, each.min, each.max) for each in found}) != 1:
+            return None
+        return found[0], np.concatenate(codes)
 
 
 def _flat(codes: NDArray[Any], encoding: str, count: int) -> Bytes:
