@@ -16,8 +16,7 @@ from ..cameras.camera import Camera
 from ..images.pixels import BACKGROUND, FAINT, INK, LINE, write_title
 from ..model.splats import Splats
 from ..render.color_scales import depth_scale
-from ..system.errors import SparklodError
-from ..system.packages import optional_import
+from ..system.errors import SparklodError, optional_import
 from ..system.units import count_of, percent_of
 from ..tables.columns import Row
 from ..tables.row_statistics import numbers, totals

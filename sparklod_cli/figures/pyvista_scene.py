@@ -23,8 +23,7 @@ from ..lod.builders import DEFAULT_BASE
 from ..model.gaussian import rotation_matrix
 from ..model.splats import FloatArray, Splats
 from ..render.color_scales import Coloring, ticks
-from ..system.errors import SparklodError
-from ..system.packages import optional_import
+from ..system.errors import SparklodError, optional_import
 from ..system.python_process import program_command
 
 #: (N, 3) points, or pairs of ends of lines; (3,) for a single point.

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from PIL import Image as Pillow
 from PIL import ImageDraw, ImageFont
 
-from ..system.errors import SparklodError
-from ..system.packages import optional_import
+from ..system.errors import SparklodError, optional_import
 from ..system.untrusted import printable
 from .output import JPEG_QUALITY
 

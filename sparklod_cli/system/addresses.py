@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Literal
 from urllib.parse import unquote, urlsplit
 
-from .errors import SparklodError
+from .errors import SparklodError, optional_import
 from .untrusted import redacted, without_secrets
 
 #: How addresses begin, chained ones too (simplecache::s3://). A letter and a colon alone are a drive of Windows.
@@ -234,8 +234,6 @@ def _cut(url: str) -> tuple[str, str]:
 @functools.lru_cache(maxsize=64)
 def _system(url: str) -> tuple[Any, str]:
     """Return the file system that opens an address, and the name of the address there."""
-    from .packages import optional_import  # which few commands need
-
     with optional_import("addresses need fsspec and the package of their service", "cloud"):
         import fsspec
 

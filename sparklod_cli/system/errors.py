@@ -139,6 +139,27 @@ def naming(
 
 
 @contextlib.contextmanager
+def optional_import(
+    purpose: str, extra: str = "", error: type[SparklodError] = SparklodError, *, package: str = ""
+) -> Iterator[None]:
+    """Turn failed imports inside into an error, of the class `error`, that says what to install.
+
+    The import stays a statement, so that type checkers and import-linter see it.
+
+    Args:
+        purpose: what needs which package: "--plot needs matplotlib".
+        extra: the extra that brings it: "render".
+        package: name for pip, where one package of the extra suffices, or no extra brings it.
+    """
+    try:
+        yield
+    except ImportError as reason:
+        from .packages import install_hint  # as every command loads this module
+
+        raise error(f"{purpose}: {install_hint(extra, package=package)} ({reason})") from None
+
+
+@contextlib.contextmanager
 def memory_errors_translated() -> Iterator[None]:
     """Translate errors that mean that memory ran out into an `OutOfMemoryError` with the shape of the array."""
     try:

@@ -8,8 +8,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from .errors import SparklodError
-
 #: Folder that this package is in: a checkout, or one of installed packages.
 _HOME = Path(__file__).parents[2]
 
@@ -18,25 +16,6 @@ DISTRIBUTION = "sparklod"
 
 #: Files in the environment of a program that pipx or `uv tool` installed.
 _PIPX, _UV_TOOL = "pipx_metadata.json", "uv-receipt.toml"
-
-
-@contextlib.contextmanager
-def optional_import(
-    purpose: str, extra: str = "", error: type[SparklodError] = SparklodError, *, package: str = ""
-) -> Iterator[None]:
-    """Turn failed imports inside into an error, of the class `error`, that says what to install.
-
-    The import stays a statement, so that type checkers and import-linter see it.
-
-    Args:
-        purpose: what needs which package: "--plot needs matplotlib".
-        extra: the extra that brings it: "render".
-        package: name for pip, where one package of the extra suffices, or no extra brings it.
-    """
-    try:
-        yield
-    except ImportError as reason:
-        raise error(f"{purpose}: {install_hint(extra, package=package)} ({reason})") from None
 
 
 def pip_install(*packages: str, options: Sequence[str] = ()) -> str:

@@ -12,8 +12,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, overload
 
+from ..system.errors import optional_import
 from ..system.output import check_writable, write_file
-from ..system.packages import optional_import
 from ..system.stdio import DASH
 
 #: The value of a cell; None for an empty one, such as the churn of the first frame.

@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from sparklod_cli.system import packages
-from sparklod_cli.system.errors import CameraPathError, SparklodError
-from sparklod_cli.system.packages import Required, install_hint, optional_import, pip_install, required_by
+from sparklod_cli.system.errors import CameraPathError, SparklodError, optional_import
+from sparklod_cli.system.packages import Required, install_hint, pip_install, required_by
 from tests.conftest import ROOT
 
 

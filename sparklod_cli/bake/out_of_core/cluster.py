@@ -31,8 +31,7 @@ from ... import __version__
 from ...io.reading import Source, absolute_source, open_reader, places_of
 from ...system import machine
 from ...system.addresses import Place, absolute
-from ...system.errors import FormatError, OutOfMemoryError, SparklodError, memory_errors_translated
-from ...system.packages import optional_import
+from ...system.errors import FormatError, OutOfMemoryError, SparklodError, memory_errors_translated, optional_import
 from ...system.progress import Progress, silent
 from ...system.python_process import check_current_folder, safe_path
 from ...system.threads import thread_count

@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...system.errors import BackendError
+from ...system.errors import BackendError, optional_import
 from ...system.jit import load_numba
-from ...system.packages import optional_import
 
 #: An array on the card, as numba has it.
 CardArray = Any

@@ -21,8 +21,7 @@ from ...codecs.gpu import data_texture
 from ...model.falloff import HALF_LOG2E, LEAST_EXPONENT, LEAST_REST, MAX_STD_DEV, MIN_ALPHA, STD_DEV_PER_D
 from ...model.sh import COEFFICIENTS
 from ...model.splats import FloatArray, Splats
-from ...system.errors import BackendError
-from ...system.packages import optional_import
+from ...system.errors import BackendError, optional_import
 from ..kernels.ellipse import LEAST_COVARIANCE, MAX_D, MAX_VARIANCE
 from ..kernels.project import MAX_COLOR
 from ..rasterizer import Image, ShadedSplats, world_to_camera
