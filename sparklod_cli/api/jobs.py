@@ -7,7 +7,6 @@ import functools
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
-from ..cameras.framing import reach
 from ..model.splats import COLUMNS
 from ..system.progress import Progress, silent
 from ..viewers.loaded_scene import TRAVERSED
@@ -63,12 +62,6 @@ def scenes_of_files(
     )
 
 
-def with_planes(render: RenderSettings, cameras: CameraPath, scenes: Scenes) -> RenderSettings:
-    """Return settings whose near and far planes enclose the scenes."""
-    near, far = reach(render.raster.near, render.raster.far, cameras.cameras, scenes.balls())
-    return dataclasses.replace(render, raster=dataclasses.replace(render.raster, near=near, far=far))
-
-
 def draw_files(
     scenes: Scenes,
     cameras: CameraPath,
@@ -76,7 +69,7 @@ def draw_files(
     lod: LodSettings,
     render: RenderSettings,
     output: PictureOutput,
-    settings: PictureSettings,
+    written: PictureSettings,
     *,
     loading: tuple[StreamingSettings, float] | None = None,
     reference: Callable[[], Scenes] | None = None,
@@ -97,18 +90,20 @@ def draw_files(
     """
     from ..images.sequence import write_pictures
 
-    def cuts_of(scenes: Scenes) -> CutFinder:
-        return CutFinder(scenes, None if budget is None else dataclasses.replace(lod, budget=scenes.splats_of(budget)))
-
-    if loading is not None and budget is not None and scenes.with_cuts:
+    settings = None if budget is None else dataclasses.replace(lod, budget=scenes.splats_of(budget))
+    if loading is not None and settings is not None and scenes.with_cuts:
         from ..simulation.loading import Loader
 
-        source: CutFinder = Loader(scenes, dataclasses.replace(lod, budget=scenes.splats_of(budget)), *loading)
+        source: CutFinder = Loader(scenes, settings, *loading)
     else:
-        source = cuts_of(scenes)
-    other = None if reference is None else cuts_of(reference())
+        source = CutFinder(scenes, settings)
+    other = None
+    if reference is not None:
+        compared = reference()
+        cuts = None if budget is None else dataclasses.replace(lod, budget=compared.splats_of(budget))
+        other = CutFinder(compared, cuts)
     return write_pictures(
-        source, cameras, output, render, settings, reference=other, overwrite=overwrite, progress=progress
+        source, cameras, output, render, written, reference=other, overwrite=overwrite, progress=progress
     )
 
 

@@ -42,12 +42,12 @@ from .options.viewing import (
     DETAIL,
     LOADING,
     MOST_DRAWN,
-    ONLY_WITH,
     Cameras,
     CutOptions,
     Inputs,
     check_view,
     files_read,
+    with_planes,
 )
 from .paths import Folder, NamedPath, claim_stdout, keep_apart, name_outputs, require_suffix, stem_of
 
@@ -81,10 +81,6 @@ NO_THUMBNAIL = (
     *("size", "supersample", "camera_path", "orbit", "dolly", "look_at", "views", "keyframes", "center", "distance"),
     *("sheet", "fps", "every"),
 )
-
-#: Options of the near and the far plane. Without them, the planes move apart, so that a view of the whole scene clips
-#: nothing.
-PLANES = ("near", "far")
 
 #: Colours whose scale spans the numbers that cameras see, rather than all numbers of the scenes.
 COLORS_OF_CUTS = ("level", "chunk", "overdraw")
@@ -132,10 +128,6 @@ class PictureCut(CutOptions):
         Range(above=1),
         needs="continuous",
     )
-
-    def settings(self) -> LodSettings:
-        width = (self.blend or BLEND) if self.continuous else None
-        return dataclasses.replace(super().settings(), continuous=width)
 
 
 @dataclass(frozen=True)
@@ -238,17 +230,6 @@ class ComparisonOptions:
         needs="diff",
     )
 
-    def check(self, ctx: click.Context, appearance: Appearance) -> None:
-        if self.compare:
-            return
-        if self.diff is None:
-            if appearance.render.color_by is None:
-                refuse(ctx, ["no_bar"], "can only be used with --color-by or --diff")
-            return
-        refuse(ctx, ["color_by"], "cannot be used with --diff, which compares the splats' own colours")
-        if appearance.alpha or appearance.background is None:
-            raise click.UsageError("--diff compares pictures without alpha; name a --background such as black")
-
     def assertions(self, budgets: Sequence[Budget]) -> list[tuple[int | None, Assertion]]:
         """Return the assertions, each with the index of the budget before its colon; None for all budgets."""
         from ..api.comparison import COLUMNS
@@ -265,36 +246,6 @@ class ComparisonOptions:
                 assertion = dataclasses.replace(assertions.parse(rest, COLUMNS), text=text.strip())
             parsed.append((texts.index(name) if colon else None, assertion))
         return parsed
-
-
-@dataclass(frozen=True)
-class PictureFiles:
-    """Options of the files of pictures.
-
-    The output is a file, a name with a place for a number, a folder for files named after the input, or -.
-    """
-
-    HEADING: ClassVar[str] = "Output"
-
-    output: Path | Folder | None = setting(
-        "Write a .png, .jpg, .webp or .npy (floats), or with out.%04d.png one for each camera; a .mp4, .webm, .gif or"
-        " .webp for an animation; with --compare a .csv, .json or .parquet; or into the folder FILE as NAME.png; - is"
-        " standard output.  [default: NAME.png beside the first FILE; with --compare standard output]",
-        NamedPath(output=True),
-        **OUTPUT,
-    )
-    overwrite: bool = flag(**OVERWRITE)
-    thumbnail: bool = flag(
-        f"Draw a small picture of the whole scene: {THUMBNAIL_SIZE[0]}x{THUMBNAIL_SIZE[1]} pixels, each the mean of"
-        f" {THUMBNAIL_SUPERSAMPLE} x {THUMBNAIL_SUPERSAMPLE} samples, to NAME-thumbnail.png.",
-        heading=COMMON,
-        excludes=NO_THUMBNAIL,
-    )
-    sheet: bool = flag("Put the pictures of all cameras on one contact sheet.")
-    jobs: int = setting(
-        "Number of pictures to work on at a time: while one is drawn, others are sorted and written.", whole(1, 256), 2
-    )
-    jpeg_quality: int = setting("Quality of a .jpg, from 1 to 100.", whole(1, 100), JPEG_QUALITY)
 
 
 def check_sizes(output: PictureOutput, cameras: Sequence[Camera], supersample: int, *, bar: bool) -> None:
@@ -345,9 +296,32 @@ HEADINGS = (
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """Options of the command, group by group."""
+    """Options of the command: those of its files, and groups of others.
 
-    pictures: PictureFiles = field(default_factory=PictureFiles)
+    The output is a file, a name with a place for a number, a folder for files named after the input, or -.
+    """
+
+    HEADING: ClassVar[str] = "Output"
+
+    output: Path | Folder | None = setting(
+        "Write a .png, .jpg, .webp or .npy (floats), or with out.%04d.png one for each camera; a .mp4, .webm, .gif or"
+        " .webp for an animation; with --compare a .csv, .json or .parquet; or into the folder FILE as NAME.png; - is"
+        " standard output.  [default: NAME.png beside the first FILE; with --compare standard output]",
+        NamedPath(output=True),
+        **OUTPUT,
+    )
+    overwrite: bool = flag(**OVERWRITE)
+    thumbnail: bool = flag(
+        f"Draw a small picture of the whole scene: {THUMBNAIL_SIZE[0]}x{THUMBNAIL_SIZE[1]} pixels, each the mean of"
+        f" {THUMBNAIL_SUPERSAMPLE} x {THUMBNAIL_SUPERSAMPLE} samples, to NAME-thumbnail.png.",
+        heading=COMMON,
+        excludes=NO_THUMBNAIL,
+    )
+    sheet: bool = flag("Put the pictures of all cameras on one contact sheet.")
+    jobs: int = setting(
+        "Number of pictures to work on at a time: while one is drawn, others are sorted and written.", whole(1, 256), 2
+    )
+    jpeg_quality: int = setting("Quality of a .jpg, from 1 to 100.", whole(1, 100), JPEG_QUALITY)
     inputs: Inputs = field(default_factory=Inputs)
     cameras: PictureCameras = field(default_factory=PictureCameras)
     cut: PictureCut = field(default_factory=PictureCut)
@@ -384,18 +358,23 @@ def render(ctx: click.Context, /, **_: Any) -> None:
         name_outputs(ctx, ctx.params["scene"] or next(iter(ctx.params["files"]), None))
     check_declared(ctx)
     options = values_of(ctx, RenderOptions)
-    options.comparison.check(ctx, options.appearance)
+    look = options.appearance
+    if options.comparison.diff is not None:
+        refuse(ctx, ["color_by"], "cannot be used with --diff, which compares the splats' own colours")
+        if look.alpha or look.background is None:
+            raise click.UsageError("--diff compares pictures without alpha; name a --background such as black")
+    elif not options.comparison.compare and look.render.color_by is None:
+        refuse(ctx, ["no_bar"], "can only be used with --color-by or --diff")
     options.cameras.check(ctx)
     if options.after is None:
         refuse(ctx, LOADING, "can only be used with --after")
-    options.appearance.check(ctx)
+    look.check(ctx)
     claim_stdout(ctx, "output", as_json=options.as_json)
     if options.comparison.compare:
         ctx.exit(_compare(ctx, options))
-    if options.pictures.thumbnail:
+    if options.thumbnail:
         small = dataclasses.replace(options.cameras, size=THUMBNAIL_SIZE)
-        fine = dataclasses.replace(options.appearance.render, supersample=THUMBNAIL_SUPERSAMPLE)
-        look = dataclasses.replace(options.appearance, render=fine)
+        look = dataclasses.replace(look, render=dataclasses.replace(look.render, supersample=THUMBNAIL_SUPERSAMPLE))
         options = dataclasses.replace(options, cameras=small, appearance=look)
     _draw(ctx, options)
 
@@ -408,7 +387,7 @@ def _draw(ctx: click.Context, options: RenderOptions) -> None:
     # What is wrong with the output is said before much is read.
     _output(ctx, options, options.cameras.least_count()).check([], overwrite=True)
     with Console(quiet=general.quiet, verbose=general.verbose) as console:
-        from ..api.jobs import draw_files, scenes_of_files, with_planes
+        from ..api.jobs import draw_files, scenes_of_files
         from ..model.instances import instances_of
 
         question_budgets(console, budget)
@@ -423,8 +402,7 @@ def _draw(ctx: click.Context, options: RenderOptions) -> None:
         paged = budget is not None and lod.continuous is None and render.color_by in (None, *COLORS_OF_CUTS)
         scenes = scenes_of_files(instances, **reads, through=look.through, paged=paged)
         path, diff = options.cameras.path(scenes), options.comparison.diff
-        if _planes_follow(ctx, options.cameras):
-            render = with_planes(render, path, scenes())
+        render = with_planes(ctx, options.cameras, render, path, scenes)
         output, settings = _place(ctx, options, instances, path)
         check_view(ctx, console, options.cameras, path, scenes(), options.streaming.network, scenes().notes)
         console.detail(f"  read in {time.perf_counter() - start:.2f} s")
@@ -438,7 +416,7 @@ def _draw(ctx: click.Context, options: RenderOptions) -> None:
             settings,
             loading=None if options.after is None else (options.streaming, options.after),
             reference=None if diff is None else scenes_of_files(instances_of([diff]), **reads),
-            overwrite=options.pictures.overwrite,
+            overwrite=options.overwrite,
             progress=console.progress,
         )
         console.clear()
@@ -450,24 +428,20 @@ def _draw(ctx: click.Context, options: RenderOptions) -> None:
         )
 
 
-def _planes_follow(ctx: click.Context, cameras: Cameras) -> bool:
-    """Return whether the near and far planes are chosen for the scene, as the distance of the cameras is."""
-    fits = cameras.distance is None and cameras.source in ONLY_WITH["distance"]
-    return fits and not any(is_set(ctx, name) for name in PLANES)
-
-
 def _output(ctx: click.Context, options: RenderOptions, cameras: int) -> PictureOutput:
     """Return the output of the pictures of some cameras; one without a name goes beside the first input."""
     from ..images.output import output_for
 
-    files, first = options.pictures, options.inputs.scene or options.inputs.files[0]
-    named, folder = (None, files.output.path) if isinstance(files.output, Folder) else (files.output, first.parent)
+    first = options.inputs.scene or options.inputs.files[0]
+    named, folder = (
+        (None, options.output.path) if isinstance(options.output, Folder) else (options.output, first.parent)
+    )
     assert isinstance(folder, Path)  # pictures go to no addresses
     if named is not None:
         require_suffix("--output", named, (f".{form}" for form in dict.fromkeys((*STILL, *MOVING))))
-    name = folder / (stem_of(first) + ("-thumbnail" if files.thumbnail else ""))
+    name = folder / (stem_of(first) + ("-thumbnail" if options.thumbnail else ""))
     try:
-        output = output_for(named, name, cameras, sheet=files.sheet or len(options.cameras.views) > 1)
+        output = output_for(named, name, cameras, sheet=options.sheet or len(options.cameras.views) > 1)
     except ValueError as error:
         raise click.UsageError(str(error)) from None
     if output.form != "jpg":
@@ -502,14 +476,14 @@ def _place(
         background=background,
         bar=not look.no_bar,
         gain=options.comparison.gain,
-        jpeg_quality=options.pictures.jpeg_quality,
-        jobs=options.pictures.jobs,
+        jpeg_quality=options.jpeg_quality,
+        jobs=options.jobs,
         threads=options.general.threads,
     )
     bar = (look.render.color_by is not None or options.comparison.diff is not None) and settings.bar
     check_sizes(output, path.cameras, look.render.supersample, bar=bar)
     keep_apart(ctx, {**files_read(options.cameras, instances), "output": output.paths(path.numbers)})
-    output.check(path.numbers, overwrite=options.pictures.overwrite)
+    output.check(path.numbers, overwrite=options.overwrite)
     if output.kind == "animation":
         check_animation(output.form, frame_rate(path))
     return output, settings
@@ -555,10 +529,10 @@ def _compare(ctx: click.Context, options: RenderOptions) -> int:
     """Compare, write the table and the charts, and print the summary; return the exit status."""
     budgets = options.cut.budget or parse_budgets(DEFAULT_BUDGETS)
     asserts = options.comparison.assertions(budgets)
-    output, general, overwrite = options.pictures.output, options.general, options.pictures.overwrite
+    output, general, overwrite = options.output, options.general, options.overwrite
     assert not isinstance(output, Folder)  # see `name_outputs`
     from ..api.comparison import COLUMNS, check_chart, compare_files
-    from ..api.jobs import scenes_of_files, with_planes
+    from ..api.jobs import scenes_of_files
 
     table = table_output(output, COLUMNS, overwrite=overwrite, as_json=options.as_json)
     instances = options.inputs.instances()
@@ -585,8 +559,7 @@ def _compare(ctx: click.Context, options: RenderOptions) -> int:
         )
         path = options.cameras.path(scenes)
         check_view(ctx, console, options.cameras, path, scenes())
-        if _planes_follow(ctx, options.cameras):
-            render = with_planes(render, path, scenes())
+        render = with_planes(ctx, options.cameras, render, path, scenes)
         compared = compare_files(
             scenes(),
             path,

@@ -60,8 +60,8 @@ OF_TABLES = ("form", "per_instance", "no_timing")
 
 
 @dataclass(frozen=True)
-class FrameTable:
-    """Options of the outputs of a traversal."""
+class TraverseOptions:
+    """Options of the command: those of its outputs, and groups of others."""
 
     HEADING: ClassVar[str] = "Output"
 
@@ -98,15 +98,24 @@ class FrameTable:
         needs="indices_out",
     )
 
-    def outputs(self, ctx: click.Context, *, as_json: bool) -> FrameOutputs:
+    inputs: Inputs = field(default_factory=Inputs)
+    cameras: Cameras = field(default_factory=Cameras)
+    cut: CutOptions = field(default_factory=CutOptions)
+    streaming: StreamingSettings = field(default_factory=StreamingSettings)
+    as_json: bool = flag(
+        "Print the summary as one JSON object on standard output; write a table only to --output.", **JSON
+    )
+    general: General = field(default_factory=General)
+
+    def outputs(self, ctx: click.Context) -> FrameOutputs:
         from ..simulation.results import COLUMNS, TIMING, FrameOutputs
 
         columns = [each for each in COLUMNS if each.name not in TIMING or not self.no_timing]
-        table = table_output(self.output, columns, overwrite=self.overwrite, as_json=as_json, form=self.form)
+        table = table_output(self.output, columns, overwrite=self.overwrite, as_json=self.as_json, form=self.form)
         if table.form is None:
             none = "cannot be used with --json without --output, which writes no table"
             summary = "is of the table, and a terminal gets the summary; redirect it, or add --output"
-            refuse(ctx, OF_TABLES, none if as_json else summary)
+            refuse(ctx, OF_TABLES, none if self.as_json else summary)
         return FrameOutputs(table, self.indices_out, self.padded, self.plot, self.overwrite)
 
     def assertions(self) -> list[Assertion]:
@@ -118,21 +127,6 @@ class FrameTable:
 
 
 HEADINGS = (COMMON, "Inputs", "Cameras", "Cut", "Streamed SOG", "Streaming", "Output")
-
-
-@dataclass(frozen=True)
-class TraverseOptions:
-    """Options of the command, group by group."""
-
-    table: FrameTable = field(default_factory=FrameTable)
-    inputs: Inputs = field(default_factory=Inputs)
-    cameras: Cameras = field(default_factory=Cameras)
-    cut: CutOptions = field(default_factory=CutOptions)
-    streaming: StreamingSettings = field(default_factory=StreamingSettings)
-    as_json: bool = flag(
-        "Print the summary as one JSON object on standard output; write a table only to --output.", **JSON
-    )
-    general: General = field(default_factory=General)
 
 
 @click.command("traverse", cls=Command, options=TraverseOptions, examples=EXAMPLES, headings=HEADINGS)
@@ -151,15 +145,15 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
     name_outputs(ctx, ctx.params["scene"] or next(iter(ctx.params["files"]), None))
     check_declared(ctx)
     options = values_of(ctx, TraverseOptions)
-    table, general = options.table, options.general
+    general = options.general
     options.cameras.check(ctx)
     claim_stdout(ctx, "output", as_json=options.as_json)
     budget = options.cut.one_budget()
     instances = options.inputs.instances()
     besides = files_read(options.cameras, instances)
     keep_apart(ctx, besides)
-    outputs = table.outputs(ctx, as_json=options.as_json)
-    asserts = table.assertions() if table.asserts else []
+    outputs = options.outputs(ctx)
+    asserts = options.assertions() if options.asserts else []
     start = time.perf_counter()
     with Console(quiet=general.quiet, verbose=general.verbose) as console:
         from ..api.jobs import scenes_of_files, traverse_files
@@ -187,7 +181,7 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
             options.cut.settings(),
             options.streaming,
             outputs,
-            by_instance=table.per_instance,
+            by_instance=options.per_instance,
             asserts=asserts,
             passed=for_screen if screen and outputs.table.form != "parquet" else None,
             threads=general.threads,
@@ -208,12 +202,13 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
         on_stdout = outputs.table.form is None and not options.as_json
         if options.as_json:
             print_json(whole.as_dict() | {"asserts": [each.as_dict() for each in outcomes]})
-        if on_stdout and table.summary is not False:
+        if on_stdout and options.summary is not False:
             click.echo("\n".join(lines(whole)))
-        elif table.summary or (table.summary is None and is_terminal(sys.stderr)):
+        elif options.summary or (options.summary is None and is_terminal(sys.stderr)):
             for line in lines(whole):
                 console.say(line)
-        ctx.exit(report_outcomes(console, outcomes))
+        if outcomes:
+            ctx.exit(report_outcomes(console, outcomes))
 
 
 #: Names of the quantities, and how a number of each is printed.

@@ -8,13 +8,13 @@ import sys
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import click
 
 from ...system.setting_fields import setting, whole
 from ...system.stdio import DASH
-from ..command import COMMON, flag
+from ..command import COMMON, GENERAL, flag
 from ..console import Console, is_terminal
 from ..paths import NamedPath, require_suffix
 
@@ -35,7 +35,7 @@ def processors_to_use() -> int:
 
 
 #: Attributes of options that several commands have, see `setting`.
-JSON: dict[str, Any] = {"flags": ("--json",)}
+JSON: dict[str, Any] = {"flags": ("--json",), "heading": GENERAL}
 QUIET: dict[str, Any] = {"flags": ("-q", "--quiet")}
 VERBOSE: dict[str, Any] = {"flags": ("-v", "--verbose")}
 OUTPUT: dict[str, Any] = {"flags": ("-o", "--output"), "heading": COMMON}
@@ -60,6 +60,8 @@ EACH_AS_JSON = "Print one JSON object for each file on standard output."
 @dataclass(frozen=True)
 class General:
     """General options of the commands that read splat files."""
+
+    HEADING: ClassVar[str] = GENERAL
 
     quiet: bool = flag("Print nothing but errors.", **QUIET)
     verbose: bool = flag("Print how long each stage took, and which settings were chosen.", **VERBOSE)

@@ -20,6 +20,7 @@ from ...system.setting_fields import Quantity, Range, setting, whole
 from ...system.units import check_grouping
 from ...system.untrusted import printable
 from ...viewers.viewer_settings import (
+    BLEND,
     FACTOR,
     PLAYCANVAS_BUDGET,
     PRESETS,
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from ...cameras.camera import Matrix
     from ...cameras.sources import CameraPath
     from ...model.instances import Instance
+    from ...render.settings import RenderSettings
     from ...viewers.scenes import Scenes
     from ..console import Console
 
@@ -57,6 +59,10 @@ ONLY_WITH = {
     "seconds": ("orbit", "dolly", "keyframes", AROUND),
     "world_transform": ("camera_path", "look_at", "views", "keyframes"),
 }
+
+#: Options of the near and the far plane. Without them, the planes move apart, so that a view of the whole scene clips
+#: nothing.
+PLANES = ("near", "far")
 
 #: Characters of a --world-transform given as numbers; any other text names a file.
 NUMERIC = set("0123456789+-.,eE ")
@@ -329,6 +335,11 @@ class CutOptions:
         PRECISIONS[0],
     )
 
+    #: Options of pictures alone.
+    full: bool = False
+    continuous: bool = False
+    blend: float | None = None
+
     def one_budget(self) -> Budget:
         """Return the budget, or that of the preset, times --lod-splat-scale."""
         if self.budget is not None and len(self.budget) > 1:
@@ -357,7 +368,8 @@ class CutOptions:
         else:
             behind = BEHIND_FOVEATE if behind is None else behind
             foveation = Cones(self.cone_fov0, self.cone_fov, self.cone_foveate, behind)
-        return replace(self.lod, foveation=foveation)
+        width = (self.blend or BLEND) if self.continuous else None
+        return replace(self.lod, foveation=foveation, continuous=width)
 
 
 def files_read(cameras: Cameras, instances: list[Instance]) -> dict[str, list[Path]]:
@@ -408,3 +420,16 @@ def check_view(
         console.say(
             f"{names}: loaded whole by viewers before they draw; the waits are those of a RAD with the same nodes"
         )
+
+
+def with_planes(
+    ctx: click.Context, cameras: Cameras, render: RenderSettings, path: CameraPath, scenes: Callable[[], Scenes]
+) -> RenderSettings:
+    """Return settings whose near and far planes enclose the scenes, where the distance is chosen for them, too."""
+    fits_scene = cameras.distance is None and cameras.source in ONLY_WITH["distance"]
+    if not fits_scene or any(is_set(ctx, name) for name in PLANES):
+        return render
+    from ...cameras.framing import reach
+
+    near, far = reach(render.raster.near, render.raster.far, path.cameras, scenes().balls())
+    return replace(render, raster=replace(render.raster, near=near, far=far))
