@@ -15,7 +15,7 @@ from ..codecs.formats import META, RAD_SUFFIX
 from ..codecs.reader import Reader
 from ..io.reading import Source, open_reader
 from ..lod.builders import METHODS
-from ..model.scene import Scene, up_notes
+from ..model.scene import Scene, up_note
 from ..system.addresses import Place
 from ..system.errors import memory_errors_translated
 from ..system.progress import Progress, silent
@@ -97,8 +97,8 @@ def bake(
             )
         baked = tree.baked
         baked.format, baked.notes, baked.read = reader.format, reader.notes, reader.count
-        if settings.up is None and reader.up:
-            baked.notes += up_notes(reader.up, reader.up_by)
+        if settings.up is None and reader.up and reader.up_by:
+            baked.notes += (up_note(reader.up, reader.up_by),)
         if blocks is None:
             tree.nodes = reader.scene(progress=progress)
         opened.close()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from importlib import import_module
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -44,7 +45,8 @@ def build(tree: BuiltTree, source: Source, threads: int, progress: Progress) -> 
         tree.end("read")
         return
     splats, tally = select(scene.splats, settings, threads=threads)
-    settings.selection.check(tally)
+    if tally.dropped or not len(splats):
+        settings.selection.check(tally)
     far = None
     if settings.environment_beyond is not None:
         splats, far = split_environment(splats, settings.environment_beyond)
@@ -103,7 +105,8 @@ def build_tree(
     With `in_chunks`, the nodes are put into the order for streaming later.
     """
     row = BUILDERS[settings.method]
-    built = [row.load().build(leaves.pop(), getattr(settings, row.setting), progress=progress)]
+    builder = import_module(f"..lod.{settings.method}", __package__)
+    built = [builder.build(leaves.pop(), getattr(settings, row.setting), progress=progress)]
     if row.in_bands and not in_chunks:
         from ..lod.families import banded
 
@@ -123,7 +126,9 @@ def select(
     if settings.rgba is not None:  # SH stay, as where Spark is given new colours
         values = read_rgba(settings.rgba, len(splats) if total is None else total, slice(start, start + len(splats)))
         splats = dataclasses.replace(splats, rgb=np.ascontiguousarray(values[:, :3]), opacity=values[:, 3].copy())
-    splats, selection = splats.with_max_sh(settings.max_sh), settings.selection
+    if settings.max_sh < splats.sh_degree:
+        splats = splats.with_max_sh(settings.max_sh)
+    selection = settings.selection
     drops_nothing = len(splats) and dataclasses.replace(selection, drop_invalid=False) == Selection()
     if drops_nothing and all(is_valid_and_visible(splats, threads)):
         return splats, SelectionTally(len(splats))

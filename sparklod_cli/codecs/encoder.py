@@ -92,7 +92,7 @@ def windows_of(count: int) -> list[slice]:
 def results(encoder: Encoder, scene: Scene, threads: int, progress: Progress, stage: str) -> Iterator[Encoded]:
     """Encode all windows of a scene in order, a few ahead; `stage` is the word for it that `progress` gets."""
     windows, tree = windows_of(len(scene)), scene.tree
-    rows = ((scene.splats.rows(part), None if tree is None else tree.rows(part), part.start) for part in windows)
+    rows = ((scene.splats.take(part), None if tree is None else tree.rows(part), part.start) for part in windows)
     encoded = ordered_map(lambda arguments: encoder.encode(*arguments), rows, threads)
     for part, result in zip(windows, encoded, strict=True):
         progress(stage, part.stop, len(scene), "splat")
@@ -220,7 +220,7 @@ def clamps_in(
     """Find the values of splats, or of the nodes of a tree, that lie beyond ranges, in the order of the ranges."""
 
     def counted(part: slice) -> Tally:
-        return tally(splats.rows(part), ranges, None if tree is None else tree.rows(part).is_leaf)
+        return tally(splats.take(part), ranges, None if tree is None else tree.rows(part).is_leaf)
 
     return clamps_of(list(ordered_map(counted, blocks_of(len(splats)), threads)), ranges)
 

@@ -76,7 +76,7 @@ def open_content(source: OpenFile) -> Reader:
         @np.errstate(over="ignore", invalid="ignore")  # whether numbers are valid is for others to say
         def read(part: slice) -> int:
             first, last = np.searchsorted(rows, [part.start, part.stop])
-            splats = target.splats.rows(slice(first, last))
+            splats = target.splats.take(slice(first, last))
             some = rows[first:last] - part.start
             for (_, _, decoders), row_type, start in zip(COLUMNS, types, starts[:-1], strict=True):
                 between = rows_of(source.read_at, int(start), row_type, part.start, part.stop, count)

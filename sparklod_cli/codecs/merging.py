@@ -12,7 +12,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from ..model.scene import common_axis, differing_axes, rotated_axis
+from ..model.scene import common_axis, differing, rotated_axis
 from ..model.splats import COLUMNS, Splats
 from ..model.transforms import Transform
 from ..system.errors import FormatError, UnsupportedError, naming
@@ -44,7 +44,8 @@ def merged(parts: Sequence[Placed]) -> Reader:
     antialiased, notes = _antialiased(parts)
     notes += tuple(f"{part.name}: {note}" for part in parts for note in part.reader.notes)
     axes = [rotated_axis(part.reader.up, part.transform.rotation) for part in parts]
-    notes += tuple(f"{text}, so none is noted unless --up names it" for text in differing_axes(axes))
+    if len(set(axes)) > 1:
+        notes += (f"{differing(axes)}, so none is noted unless --up names it",)
     return Reader(
         firsts[-1],
         degree,
@@ -183,7 +184,7 @@ class SceneFiles:
                 raise FormatError(f"{quoted_value(chunk.name)} was changed while it was read; start again")
             for start, count, row in chunk.pieces:
                 rows = slice(row - first_row, row - first_row + count)
-                copy_rows(splats.rows(slice(start, start + count)), out.rows(rows))
+                copy_rows(splats.take(slice(start, start + count)), out.take(rows))
             return chunk.rows
 
         done = 0
@@ -216,7 +217,7 @@ class SceneFiles:
                     splats = Splats.empty(chunk.rows, degree)
                     self.read([chunk], splats, threads, first_row=begin)
                     last[begin] = splats
-                part = last[begin].rows(slice(start - begin, stop - begin))
+                part = last[begin].take(slice(start - begin, stop - begin))
                 copy_rows(part, target.rows(slice(start, stop)))
             if target.stop == count:
                 last.clear()

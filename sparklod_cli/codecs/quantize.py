@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..model.falloff import nearly_harmonic
 from ..model.gaussian import normalized_quat
 from ..model.sh import COEFFICIENTS, SH_C0
 from ..model.splats import FloatArray
@@ -55,6 +54,9 @@ _STEPS = sorted(itertools.product((0, -1, 1), repeat=3), key=lambda step: sum(ma
 #: Written in place of an infinite logarithm or logit: in float32 its exponential and sigmoid are exactly those of
 #: infinity, and readers that refuse infinite numbers accept it.
 FAR = np.float32(110)
+
+#: Euler's constant, of the harmonic numbers.
+EULER = 0.5772156649015329
 
 #: Largest float32.
 LARGEST = np.finfo(np.float32).max
@@ -371,6 +373,7 @@ def compensated(opacity: FloatArray, scale: FloatArray, rounded: FloatArray, blu
     grown = np.minimum(wide * ratio, 1)
     merged = np.flatnonzero(~(opacity <= 1))  # usually few
     most = wide[merged]
-    covered, slope = nearly_harmonic(most)
+    covered = np.log(most) + EULER + (1 - EULER) / most  # H within 1.5 %, in a fraction of the time of `harmonic`
+    slope = most / (most + 0.5)  # its derivative by ln(A), within 4 %
     grown[merged] = np.maximum(most * np.exp(covered * (ratio[merged] - 1) / slope), _ABOVE_1)
     return np.where(ratio == 1, opacity, grown).astype(np.float32)

@@ -149,7 +149,7 @@ class Target:
 
     def rows(self, part: slice) -> Splats:
         """Return views of rows, which are counted as those of the file."""
-        return self.splats.rows(slice(part.start - self.start, part.stop - self.start))
+        return self.splats.take(slice(part.start - self.start, part.stop - self.start))
 
     def nodes(self, part: slice) -> LodTree | None:
         """Return views of nodes, counted as `rows`."""
@@ -211,8 +211,7 @@ class Reader:
             columns: of `Splats` to read; the others may be 0.
             once: as in `Target`.
         """
-        make = Splats.empty if set(COLUMNS) <= set(columns) else Splats.zeros
-        splats, tree = make(stop - start, self.sh_degree), None
+        splats, tree = Splats.zeros(stop - start, self.sh_degree), None
         if self.has_tree:
             tree = LodTree(np.empty(stop - start, np.uint16), np.empty(stop - start, np.uint32))
         self.fill(Target(splats, start, tree, columns, once), self.threads, progress)

@@ -520,7 +520,7 @@ class SpzEncoder:
         codes = {stream.name: np.empty((len(splats), stream.size), np.uint8) for stream in streams}
         assert sh_bits is not None
         for part in blocks_of(len(splats)):
-            some, links = splats.rows(part), None if tree is None else tree.rows(part)
+            some, links = splats.take(part), None if tree is None else tree.rows(part)
             is_leaf = None if links is None else links.is_leaf
             some = dataclasses.replace(some, opacity=opacities(some, bits, covering=self.options.covering))
             for stream in streams:

@@ -237,7 +237,7 @@ class Statistics:
         """
 
         def count(part: slice) -> Statistics:
-            block, leaves = splats.rows(part), slice(None) if leaf is None or leaf[part].all() else leaf[part]
+            block, leaves = splats.take(part), slice(None) if leaf is None or leaf[part].all() else leaf[part]
             reach, leaf_sh, between = None, None, 0
             if "reach" in needed:
                 reach = float(np.maximum(block.center.max(initial=0), -block.center.min(initial=0)))  # NaN stays

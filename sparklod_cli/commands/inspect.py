@@ -392,7 +392,7 @@ MOST_DEPTHS = 64
 
 def lines(name: str, report: dict[str, Any]) -> Iterator[str]:
     """Yield the lines of a report on a file, given as its JSON."""
-    from ..model.scene import up_notes
+    from ..model.scene import up_note
 
     tree, values = report["tree"], report["values"]
     noun = "node" if tree else "splat"
@@ -408,8 +408,10 @@ def lines(name: str, report: dict[str, Any]) -> Iterator[str]:
         ratio = report["compression_ratio"]
         less = "" if ratio is None else f", {ratio:.1f} times less than as floats"
         yield from rows("takes", f"{report['bytes_per_splat']:.1f} bytes a {noun}{less}")
-    for note in (*report["notes"], *up_notes(report["up"], report["up_by"])):
+    for note in report["notes"]:
         yield from rows("note", note)
+    if report["up"] and report["up_by"]:
+        yield from rows("note", up_note(report["up"], report["up_by"]))
     for hint in report["hints"]:
         yield from rows("hint", hint)
     if report["rad"]:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from importlib import import_module
-from typing import Any
 
 from ..model.sh import COEFFICIENTS
 
@@ -33,9 +31,9 @@ def bytes_of(each: SplatBytes, splats: int, sh_degree: int) -> int:
 class Builder:
     """A tree builder.
 
+    Its module has `build(splats, SETTING, *, progress) -> (nodes, tree)` and is a `stage_records.StagedBuilder`.
+
     Attributes:
-        module: module of this package that has `build(splats, SETTING, *, progress) -> (nodes, tree)`, and is a
-            `stage_records.StagedBuilder` of such trees.
         setting: name of its only parameter, a number.
         summary: phrase for help texts.
         in_bands: its trees are put in the order of `band_order` for files that are read whole. That saves 3 to 4 % of
@@ -46,7 +44,6 @@ class Builder:
             nodes are made.
     """
 
-    module: str
     setting: str
     summary: str
     in_bands: bool
@@ -54,15 +51,10 @@ class Builder:
     in_block: SplatBytes
     in_scratch: SplatBytes
 
-    def load(self) -> Any:
-        """Import the module."""
-        return import_module(f".{self.module}", __package__)
 
-
-#: Builders by the name of the method; the first is the default.
+#: Builders by the name of the method, which is that of the module; the first is the default.
 BUILDERS = {
     "quick": Builder(
-        "quick",
         "base",
         "pairs in cells of a voxel grid, in seconds",
         in_bands=False,
@@ -71,7 +63,6 @@ BUILDERS = {
         in_scratch=(190, 32),
     ),
     "quality": Builder(
-        "quality",
         "growth",
         "the pairs that cost least, in all",
         in_bands=True,

@@ -23,10 +23,9 @@ from ..system.progress import Progress, silent
 from ..system.threads import blocks_of, threads_for
 from .families import families_of, node_order, reordered
 from .kernels.chunk_sets import DEMAND_BYTES, LANES, Families, fill_demand, sort_within_chunks, split_sets
-from .kernels.pixel_scale import NODE, VIEW
+from .kernels.pixel_scale import NODE, VIEW, set_foveation
 from .kernels.sort import sort_by_key
 from .kernels.tree_links import find_limits
-from .view_foveation import set_foveation
 
 #: Viewpoints: half outside of the scene looking at it, a quarter anywhere inside, a quarter near a node. Chosen: 16
 #: are as good for large trees, not for those of four chunks (benchmarks/notes/cuts-and-chunks.md).

@@ -39,7 +39,17 @@ from .kernels.cell_pairs import SPAN, merge_in_cells, split_families
 from .kernels.geometry import SplatColumns
 from .kernels.node_rows import Space, fill_leaf_rows, fill_leaves, fill_merged_splats, merge_colors
 from .kernels.pair_cost import WEIGHT, WIDTH
-from .kernels.sort import PART_BITS, Keys, Nodes, Parts, cell_words, fill_level_keys, sort_by_cell, sort_by_key
+from .kernels.sort import (
+    AXIS_BITS,
+    PART_BITS,
+    Keys,
+    Nodes,
+    Parts,
+    cell_words,
+    fill_level_keys,
+    sort_by_cell,
+    sort_by_key,
+)
 
 if TYPE_CHECKING:  # builds in memory do without
     from .stage_records import Margins, Pending, Region, StageFamilies
@@ -165,7 +175,8 @@ class VoxelGrid:
         shift = np.floor(np.array(SHIFT) * level % 1 * PARTS).astype(np.int64)
         low, high = (np.floor(corner / edge).astype(np.int64) for corner in self.box)
         lowest = (low - shift) // PARTS * PARTS + shift
-        return Parts(edge, lowest, int((high - lowest).max()).bit_length())
+        bits = int((high - lowest).max()).bit_length()
+        return Parts(edge, lowest, bits, max(1, -(-bits // AXIS_BITS)))
 
     def sorted_leaves(
         self, center: FloatArray, scale: FloatArray, threads: int, order: Nodes | None = None

@@ -47,9 +47,6 @@ DRAWN_AREA = np.float64(np.pi / 4 * SQUARE_STD_DEV)
 #: Terms of the harmonic sums that are added one by one; the rest is an integral. With 64 the sums are exact to 1e-7.
 TERMS = 64
 
-#: Euler's constant, of the harmonic numbers.
-EULER = 0.5772156649015329
-
 
 # Alpha
 
@@ -143,8 +140,3 @@ def harmonic(a: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.fl
     first = (1 / k - 1 / (k + a)).sum(axis=0) + np.log((start + a) / start)
     second = (1 / k**2 - 1 / (k + a) ** 2).sum(axis=0) + 1 / start - 1 / (start + a)
     return first, second
-
-
-def nearly_harmonic(a: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return H(a) of a >= 1 within 1.5 %, and its derivative by ln(a) within 4 %, in a fraction of the time."""
-    return np.log(a) + EULER + (1 - EULER) / a, a / (a + 0.5)

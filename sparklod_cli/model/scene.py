@@ -176,11 +176,9 @@ def facts_of(source: Any) -> dict[str, Any]:
     return {name: getattr(source, name) for name in ("antialiased", "format", "notes", "header", "up", "up_by")}
 
 
-def up_notes(up: str | None, up_by: str) -> tuple[str, ...]:
-    """Return the message on an axis that a specification names, which a file may contradict; empty for other axes."""
-    if up is None or not up_by:
-        return ()
-    return (f"{up} is up, as {up_by} specifies; if the scene is upside down, its converter kept y down: give --up -y",)
+def up_note(up: str, up_by: str) -> str:
+    """Return the message on an axis that a specification names, which a file may contradict."""
+    return f"{up} is up, as {up_by} specifies; if the scene is upside down, its converter kept y down: give --up -y"
 
 
 def up_notes_of(files: Iterable[tuple[str, str | None, str]]) -> list[str]:
@@ -190,16 +188,14 @@ def up_notes_of(files: Iterable[tuple[str, str | None, str]]) -> list[str]:
         files: the name of each, and `up` and `up_by` of its scene.
     """
     each = list(dict.fromkeys(files))
-    messages = [f"{name}: {text}" for name, up, up_by in each for text in up_notes(up, up_by)]
-    return messages + [
-        f"{text}, so {ASSUMED} is taken; --up chooses" for text in differing_axes(up for _, up, _ in each)
-    ]
+    messages = [f"{name}: {up_note(up, up_by)}" for name, up, up_by in each if up and up_by]
+    axes = dict.fromkeys(up for _, up, _ in each)
+    return [*messages, f"{differing(axes)}, so {ASSUMED} is taken; --up chooses"] if len(axes) > 1 else messages
 
 
-def differing_axes(axes: Iterable[str | None]) -> tuple[str, ...]:
-    """Return the beginning of a sentence that names the different axes of files; empty if all have the same."""
-    names = list(dict.fromkeys(axis or "unknown" for axis in axes))
-    return (f"the files differ in the axis that is up ({', '.join(names)})",) if len(names) > 1 else ()
+def differing(axes: Iterable[str | None]) -> str:
+    """Return the beginning of a sentence that names the different axes of files."""
+    return f"the files differ in the axis that is up ({', '.join(dict.fromkeys(axis or 'unknown' for axis in axes))})"
 
 
 def rotated_axis(axis: str | None, rotation: ArrayLike) -> str | None:

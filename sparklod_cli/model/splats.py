@@ -80,8 +80,8 @@ class Splats:
     @classmethod
     def zeros(cls, count: int, sh_degree: int) -> Splats:
         """Return columns of zeros, which take no memory until they are written to."""
-        columns = cls.empty(0, sh_degree)
-        return cls(**{name: np.zeros((count, *getattr(columns, name).shape[1:]), np.float32) for name in COLUMNS})
+        shapes = {"opacity": (count,), "quat_xyzw": (count, 4), "sh": (count, COEFFICIENTS[sh_degree], 3)}
+        return cls(**{name: np.zeros(shapes.get(name, (count, 3)), np.float32) for name in COLUMNS})
 
     @classmethod
     def concat(cls, parts: Sequence[Splats]) -> Splats:
@@ -98,12 +98,8 @@ class Splats:
         return Splats(**columns)
 
     def take(self, index: NDArray[Any] | slice) -> Splats:
-        """Return the splats of an index array, a mask or a slice: the one way to filter, permute and truncate."""
+        """Return the splats of an index array, a mask or a slice, of which consecutive rows are views."""
         return Splats(**{name: np.ascontiguousarray(getattr(self, name)[index]) for name in COLUMNS})
-
-    def rows(self, part: slice) -> Splats:
-        """Return views of some consecutive splats."""
-        return Splats(**{name: getattr(self, name)[part] for name in COLUMNS})
 
     def invalid(self) -> dict[str, NDArray[np.bool_]]:
         """Return (N,) masks of invalid splats, by the kinds of `INVALID` that occur; a splat is in at most one mask.

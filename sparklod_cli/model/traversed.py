@@ -10,7 +10,6 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from .gaussian import spark_size
 from .lod_tree import CHUNK_NODES, LodTree
 from .scene import Scene, facts_of
 from .splats import FloatArray, Splats
@@ -35,11 +34,6 @@ class Nodes:
 
     #: Whether nodes are read as cuts need them.
     paged: ClassVar[bool] = False
-
-    @classmethod
-    def of(cls, splats: Splats, tree: LodTree) -> Nodes:
-        """Return the nodes of a tree in full precision, with Spark's feature sizes."""
-        return cls(splats.center, spark_size(splats), tree)
 
     @property
     def count(self) -> int:

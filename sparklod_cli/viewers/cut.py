@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..lod.kernels import pixel_scale
-from ..lod.view_foveation import set_foveation
 from ..model.foveation import Cones, Foveation
 
 if TYPE_CHECKING:
@@ -151,5 +150,5 @@ def views_of(forest: Forest, instances: Sequence[TreeInstance], view: Camera) ->
         row["lod_scale"] = instance.lod_scale
         row["node_base"] = forest.node_base[instance.tree]
         row["chunk_base"] = forest.chunk_base[instance.tree]
-        set_foveation(row, instance.foveation, view.fov_x, view.fov_y)
+        pixel_scale.set_foveation(row, instance.foveation, view.fov_x, view.fov_y)
     return views

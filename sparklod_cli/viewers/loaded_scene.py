@@ -181,7 +181,7 @@ def cut_of_runs(
 def nodes_of(splats: Splats, tree: LodTree, coding: FileCoding | None, *, precision: str, threads: int) -> Nodes:
     """Return nodes as a traversal reads them, in one of `codecs.formats.PRECISIONS`."""
     if precision == "float32":
-        return Nodes.of(splats, tree)
+        return Nodes(splats.center, spark_size(splats), tree)
     from ..codecs.gpu import lod_tree
 
     if precision == "float16":

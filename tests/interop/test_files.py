@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+from importlib import import_module
 
 import numpy as np
 import pytest
 
 from sparklod_cli.codecs import spz
 from sparklod_cli.codecs.options import WriteOptions
-from sparklod_cli.lod.builders import BUILDERS, METHODS
+from sparklod_cli.lod.builders import METHODS
 from sparklod_cli.model.lod_tree import MAX_CHILDREN
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
@@ -21,7 +22,7 @@ pytestmark = pytest.mark.slow
 
 
 def baked(splats: Splats, method: str = "quick") -> Scene:
-    return Scene(*BUILDERS[method].load().build(splats))
+    return Scene(*import_module(f"sparklod_cli.lod.{method}").build(splats))
 
 
 def encoded(scene: Scene) -> bytes:

@@ -17,7 +17,7 @@ from sparklod_cli.codecs.rad.rad_options import HALF
 from sparklod_cli.codecs.spark_codings import SplatEncoding
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quick
-from sparklod_cli.model.gaussian import linear_opacity
+from sparklod_cli.model.gaussian import linear_opacity, spark_size
 from sparklod_cli.model.instances import Instance
 from sparklod_cli.model.lod_tree import CHUNK_NODES
 from sparklod_cli.model.scene import Scene
@@ -90,7 +90,9 @@ def check_cuts(spark: Spark, path: Path, precision: str, views: int) -> None:
     assert loaded.scene.tree is not None
     tree = spark.keep_tree(spark.load_words(LAYOUTS[precision], path)["lodTree"])
     splats = loaded.scene.splats
-    for number, camera in enumerate(cameras(Nodes.of(splats, loaded.scene.tree), views, seed=len(splats))):
+    for number, camera in enumerate(
+        cameras(Nodes(splats.center, spark_size(splats), loaded.scene.tree), views, seed=len(splats))
+    ):
         cones, lod_scale = FOVEATIONS[number % len(FOVEATIONS)], LOD_SCALES[number % 5]
         budget = BUDGETS[number % len(BUDGETS)]
         smallest = LIMITS[number // 2 % len(LIMITS)] if number % 4 else 0.0
@@ -133,7 +135,9 @@ def check_dynamic_cuts(spark: Spark, path: Path, precision: str, views: int) -> 
     splats, count = loaded.scene.splats, loaded.count
     cones, limit = SPARKS_CONES, LIMITS[2]
     found = SparkViewer(scenes.forest, [TreeInstance(0, foveation=cones)])
-    for number, camera in enumerate(cameras(Nodes.of(splats, loaded.scene.tree), views, seed=count)):
+    for number, camera in enumerate(
+        cameras(Nodes(splats.center, spark_size(splats), loaded.scene.tree), views, seed=count)
+    ):
         budget, view = BUDGETS[1 + number % 4], CutView(camera, FOV_Y, FOV_Y)
 
         def nodes_at(scale: float, view: CutView = view) -> int:

@@ -12,7 +12,7 @@ import pytest
 
 from sparklod_cli.codecs.gpu import lod_tree
 from sparklod_cli.io import read_scene
-from sparklod_cli.lod.builders import BUILDERS
+from sparklod_cli.lod import quick
 from sparklod_cli.model.foveation import Cones
 from sparklod_cli.model.instances import Instance
 from sparklod_cli.model.lod_tree import CHUNK_NODES
@@ -242,7 +242,7 @@ def test_the_cut_of_a_file_of_spark_with_missing_chunks_is_that_of_spark(spark: 
 @cache
 def robot() -> Scene:
     """A tree of eleven chunks."""
-    return Scene(*BUILDERS["quick"].load().build(read_scene(scene("playbot.sog")).splats))
+    return Scene(*quick.build(read_scene(scene("playbot.sog")).splats))
 
 
 @pytest.mark.parametrize("capacity", [None, 6])

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,6 @@ import pytest
 
 from sparklod_cli.codecs.gpu import ext_splats, lod_tree
 from sparklod_cli.io import read_scene
-from sparklod_cli.lod.builders import BUILDERS
 from sparklod_cli.model.foveation import Cones
 from sparklod_cli.model.lod_tree import CHUNK_NODES
 from sparklod_cli.model.traversed import Nodes
@@ -66,7 +66,7 @@ class Tree:
 @cache
 def baked(path: Path, method: str = "quick") -> Tree:
     """Bakes a scene; sizes of nodes are those of the splats in Spark's coding, as in Spark."""
-    splats, tree = BUILDERS[method].load().build(read_scene(path).splats)
+    splats, tree = import_module(f"sparklod_cli.lod.{method}").build(read_scene(path).splats)
     return Tree.of(lod_tree.pack(ext_splats.unpack(ext_splats.pack(splats)), tree)["lod_tree"])
 
 

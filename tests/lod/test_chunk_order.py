@@ -220,7 +220,9 @@ def cut_at(tree: tuple[Splats, LodTree], turn: float) -> TreeCut:
     pose = np.eye(4)
     pose[:3, 0], pose[:3, 1], pose[:3, 2], pose[:3, 3] = across, [0, 1, 0], -along, 9 * across
     foveation = LodSettings().foveation
-    found = SparkViewer(Forest([Nodes.of(*tree)]), [TreeInstance(foveation=foveation)])
+    found = SparkViewer(
+        Forest([Nodes(tree[0].center, spark_size(tree[0]), tree[1])]), [TreeInstance(foveation=foveation)]
+    )
     return found.cut(CutView(pose, 1.5, 1.0), budget=40_000)
 
 

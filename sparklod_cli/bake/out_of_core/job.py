@@ -7,13 +7,13 @@ import itertools
 import math
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...codecs.reader import Reader
-from ...lod.builders import BUILDERS
 from ...lod.stage_records import Region, StagedBuilder
 from ...model.splats import FloatArray
 from ...system import machine
@@ -216,7 +216,8 @@ class Job:
 
     def builder(self) -> StagedBuilder:
         """Return the builder of the tree."""
-        return BUILDERS[self.settings.method].load()
+        builder: StagedBuilder = import_module(f"...lod.{self.settings.method}", __package__)
+        return builder
 
     def part(self, number: int) -> str:
         """Return the name of the result that marks an input part as scattered to blocks, with its statistics."""

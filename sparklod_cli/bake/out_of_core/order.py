@@ -277,7 +277,7 @@ def encode(job: Job, start: int, stop: int, *, threads: int, progress: Progress)
     splats, tree = _read(job.store, width_of(job.sh_degree), start, stop, threads)
 
     def encoded(part: slice) -> dict[str, NDArray[np.generic]]:
-        return encoder.encode(splats.rows(part), tree.rows(part), start + part.start)
+        return encoder.encode(splats.take(part), tree.rows(part), start + part.start)
 
     arrays: dict[str, NDArray[np.generic]] = {}
     for number, chunk in enumerate(ordered_map(encoded, windows_of(stop - start), threads)):

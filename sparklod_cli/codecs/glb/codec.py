@@ -276,7 +276,7 @@ def _reopened(opened: Callable[[], Reader]) -> Reader:
             splats = Splats.empty(content.count, content.sh_degree)
             opened().fill(Target(splats), threads, progress)
             held.append(splats)
-        copy_rows(held[0].rows(slice(target.start, target.stop)), target.splats)
+        copy_rows(held[0].take(slice(target.start, target.stop)), target.splats)
         if target.stop == content.count:
             held.clear()
 

@@ -225,7 +225,7 @@ def encode_files(
     names, together, done = tile_names(scene), max(1, min(threads, scene.tiles)), 0
 
     def encoded(tile: int) -> bytes:
-        one = Scene(scene.splats.rows(scene.run(tile)), antialiased=scene.antialiased, up=scene.up)
+        one = Scene(scene.splats.take(scene.run(tile)), antialiased=scene.antialiased, up=scene.up)
         return b"".join(glb.encode(one, options, threads=max(1, threads // together)))
 
     for tile, data in enumerate(ordered_map(encoded, range(scene.tiles), together)):

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
+from ...model.foveation import Foveation, Frustum
 from ...system.jit import Type, f4, i8, kernel, out
 
 #: A node as the traversal reads it; child indices are relative to its own tree. Siblings are adjacent, so that
@@ -46,6 +49,22 @@ NO_FOVEATION, CONE, FRUSTUM = 0, 1, 2
 #: Least distance to a node, in object space; nearer nodes are treated as this far away, as in Spark 2.2.0's traversal.
 NEAREST = np.float32(1e-6)
 ZERO, ONE, INFINITE = np.float32(0), np.float32(1), np.float32(np.inf)
+
+
+def set_foveation(row: np.void, foveation: Foveation, fov_x: float, fov_y: float) -> None:
+    """Fill the foveation fields of a `VIEW`; fields of view in radians."""
+    row["behind"] = foveation.behind
+    if isinstance(foveation, Frustum):
+        row["kind"], row["side"] = FRUSTUM, foveation.outside
+        row["inner"], row["outer"] = math.tan(fov_x / 2), math.tan(fov_y / 2)
+    else:
+        row["kind"], row["side"] = CONE, foveation.foveate
+        for name, degrees in (("inner", foveation.fov0), ("outer", foveation.fov)):
+            radians = np.float32(0.5) * np.float32(min(degrees, 180)) * np.float32(math.pi / 180)
+            row[name] = math.cos(float(radians)) if degrees > 0 else 1  # rounded where Spark rounds
+        row["outer"] = min(row["inner"], row["outer"])
+    if row["behind"] == row["side"] == 1:
+        row["kind"] = NO_FOVEATION
 
 
 @kernel(inline=True)

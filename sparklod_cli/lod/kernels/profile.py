@@ -45,14 +45,10 @@ def _profiles(lod_opacity: NDArray[np.float32]) -> tuple[NDArray[np.float64], ..
     return a, spread, first / spread
 
 
-def _table() -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """Return linear opacity and spread at ENTRIES densities from 1 to that of MAX_D, which is third."""
-    a, spread, density = _profiles(np.linspace(1, MAX_D, 4096, dtype=np.float32))
-    even = np.linspace(1, density[-1], ENTRIES)
-    return np.interp(even, density, a), np.interp(even, density, spread), float(density[-1])
-
-
-OPACITIES, SPREADS, MAX_DENSITY = _table()
+#: Linear opacity and spread at ENTRIES densities from 1 to that of MAX_D.
+_OPACITY, _SPREAD, _DENSITY = _profiles(np.linspace(1, MAX_D, 4096, dtype=np.float32))
+MAX_DENSITY = float(_DENSITY[-1])
+OPACITIES, SPREADS = (np.interp(np.linspace(1, MAX_DENSITY, ENTRIES), _DENSITY, each) for each in (_OPACITY, _SPREAD))
 NEEDLE_OPACITY, NEEDLE_SPREAD, NEEDLE_DENSITY = (float(x[0]) for x in _profiles(np.array([NEEDLE_D], np.float32)))
 
 

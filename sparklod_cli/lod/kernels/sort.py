@@ -33,11 +33,7 @@ class Parts:
     step: np.float64  # edge of a part; that of a cell is 2 ** PART_BITS times it
     low: NDArray[np.int64]  # (3,) int64, the lowest part of the scene's lowest cell: the origin of offsets
     axis_bits: int  # number of bits of the largest offset of a part, up to 63
-
-    @property
-    def words(self) -> int:
-        """The number of 63-bit words of the Morton codes of parts."""
-        return max(1, -(-self.axis_bits // AXIS_BITS))
+    words: int  # number of 63-bit words of the Morton codes of parts
 
 
 @kernel()

@@ -37,6 +37,6 @@ def reader_of(scene: Scene) -> Reader:
     """A reader of a scene in memory."""
 
     def fill(target: Target, threads: int, progress: Progress) -> None:
-        copy_rows(scene.splats.rows(slice(target.start, target.stop)), target.splats)
+        copy_rows(scene.splats.take(slice(target.start, target.stop)), target.splats)
 
     return Reader(len(scene), scene.splats.sh_degree, scene.format, fill, scene.antialiased, scene.notes, scene.header)

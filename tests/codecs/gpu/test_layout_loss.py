@@ -40,7 +40,7 @@ def test_ext_splats_lose_more_of_stronger_sh() -> None:
 
 def test_a_sample_stands_for_all() -> None:
     splats = random_splats(3 * SAMPLE + 1, sh_degree=1)
-    parts = [LayoutLoss.of(splats.rows(slice(start, start + SAMPLE))) for start in range(0, len(splats), SAMPLE)]
+    parts = [LayoutLoss.of(splats.take(slice(start, start + SAMPLE))) for start in range(0, len(splats), SAMPLE)]
     for layout in ("ext", "packed"):
         assert sample_loss(splats).psnr(layout) == pytest.approx(LayoutLoss.total(parts).psnr(layout), abs=0.2)
 

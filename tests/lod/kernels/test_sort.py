@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from sparklod_cli.lod.kernels.pair_cost import CENTER, WIDTH
-from sparklod_cli.lod.kernels.sort import PART_BITS, Parts, sort_by_cell, sort_by_key, split_box, spread_bits
+from sparklod_cli.lod.kernels.sort import AXIS_BITS, PART_BITS, Parts, sort_by_cell, sort_by_key, split_box, spread_bits
 
 
 @given(
@@ -41,7 +41,8 @@ def test_cells_come_in_morton_order_and_are_told_apart(span: int, within: bool) 
     geometry = np.zeros((300, WIDTH), np.float32)
     geometry[:, CENTER : CENTER + 3] = (parts - span // 2 + 0.5) * step
     nodes = rng.permutation(300).astype(np.uint32)
-    grid = Parts(np.float64(step), np.array([-(span // 2)] * 3), int(span - 1).bit_length())
+    bits = int(span - 1).bit_length()
+    grid = Parts(np.float64(step), np.array([-(span // 2)] * 3), bits, -(-bits // AXIS_BITS))
     got, is_first = sort_by_cell(geometry, nodes, grid, 2, within=within)
     cells = parts >> PART_BITS
     codes = [morton(tuple(int(axis) for axis in (parts if within else cells)[node])) for node in nodes]
