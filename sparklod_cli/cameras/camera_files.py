@@ -43,7 +43,7 @@ def read(files: Files, *, format: str | None = None, settings: Settings | None =
     if settings.up is not None and (parsed.turned or not form.looking):
         raise CameraPathError("its cameras have their own up axes, so --up cannot be used with them")
     notes = parsed.notes + ((form.world,) if form.world and settings.world is None else ())
-    return cameras_of(parsed.frames, settings, form.title, form.axes, fps=parsed.fps, notes=notes)
+    return cameras_of(parsed.frames, settings, form.title, form.axes, count=parsed.count, fps=parsed.fps, notes=notes)
 
 
 def _known(files: Files) -> PathFormat:

@@ -7,12 +7,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ..model.scene import ASSUMED, AXES
-from ..system.errors import TooManyCamerasError
+from ..system.errors import CameraPathError
 from . import DEFAULT_SIZE
-from .camera import Camera, Matrix
+from .camera import Camera, Matrix, look_at
 from .formats.table import Axes
 
 #: x, y and z in world units, or of a direction.
@@ -34,13 +34,14 @@ MOST_PIXELS = 1e15
 #: Numbers of frames are below this, so that float64 holds them exactly.
 NUMBERED = 1 << 53
 
+#: Mean seconds from one key to the next, if the keys have no times.
+DEFAULT_SECONDS = 2.0
+
+#: (K,) int64 numbers of frames, from 0.
+Numbers = NDArray[np.int64]
+
 #: Up axis of cameras without one.
 DEFAULT_UP: Point = AXES[ASSUMED]
-
-
-def direction_of(up: str | None) -> Point:
-    """x, y, z of the up axis of a scene; that of `ASSUMED` for None."""
-    return AXES[up or ASSUMED]
 
 
 @dataclass(frozen=True)
@@ -83,23 +84,23 @@ class Frame:
     axes: Axes | None = None
 
 
-@dataclass(frozen=True)
-class Sampled:
-    """Frames that are computed when they are used, as a few keys can yield any number of them.
+def frame_looking(
+    eye: ArrayLike,
+    target: ArrayLike,
+    up: ArrayLike,
+    lens: Intrinsics = NO_LENS,
+    time: float | None = None,
+    name: str = "",
+) -> Frame:
+    """Return a frame at `eye`, (3,), that looks at `target`, (3,), with `up`, (3,), pointing up in the image.
 
-    Attributes:
-        at: computes the frames of (K,) int64 numbers, each below `length`.
+    `CameraPathError` if eye and target are the same point.
     """
-
-    length: int
-    at: Callable[[NDArray[np.int64]], list[Frame]]
-
-
-def sampled(count: float, at: Callable[[NDArray[np.int64]], list[Frame]]) -> Sampled:
-    """Return computed frames, `count` rounded up and at least one; `TooManyCamerasError` from `NUMBERED` on."""
-    if not count < NUMBERED:
-        raise TooManyCamerasError(f"{count:.3g} frames are more than {MAX_GENERATED:,}")
-    return Sampled(max(math.ceil(count), 1), at)
+    try:
+        return Frame(look_at(eye, target, up), lens, time, name, Axes.OPENGL_C2W)
+    except ValueError as error:
+        place = ", ".join(f"{value:g}" for value in np.asarray(eye))
+        raise CameraPathError(f"the camera at {place} {error}") from None
 
 
 @dataclass(frozen=True)
@@ -133,7 +134,7 @@ class Settings:
         if self.up is not None:
             return self.up
         axis = self.up_of_scene()
-        up = direction_of(axis)
+        up = AXES[axis or ASSUMED]
         if axis is None or self.world is None:
             return up
         x, y, z = (np.asarray(up) @ self.world[:3, :3]).tolist()  # the inverse rotation, of any length

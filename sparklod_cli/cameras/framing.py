@@ -125,7 +125,18 @@ def covered(scene: Balls) -> Balls:
     # The nearest is always kept, however large it is.
     near = reach <= max(OUTSIDE * radius, float(reach.min()))
     center, size, reach = center[near], size[near], reach[near]
-    dense = _is_dense(Balls(center - middle, size), radius)
+    # Of the cells around the middle, those are dense that splats cover nearly as much of as of a typical cell.
+    side = radius * max(CELL, (FEW / len(center)) ** (1 / 3))
+    area = np.clip(size, SPECK * radius, side) ** 2
+    dense = np.zeros(len(area), np.bool_)
+    for shift in (0.0, 0.5):  # of the cells at the border of something, either set may have thin slices
+        _, cell = np.unique(np.floor((center - middle) / side + shift).astype(np.int64), axis=0, return_inverse=True)
+        cell = cell.reshape(-1)
+        cover = np.bincount(cell, area)
+        # The typical cell is the one that the middle of all that is covered lies in.
+        order = np.argsort(cover)
+        typical = cover[order[np.searchsorted(np.cumsum(cover[order]), cover.sum() / 2)]]
+        dense |= (cover >= SPARSE * typical)[cell]
     most = float(np.quantile(reach[dense], COVERED, method="higher"))
     framed = dense & (reach <= most)
     center, size = center[framed], size[framed]
@@ -133,22 +144,6 @@ def covered(scene: Balls) -> Balls:
     # than the steps of the numbers there.
     least = max(SPECK * most, STEPS * float(np.abs(center).max())) or radius
     return Balls(center, np.maximum(size, least))
-
-
-def _is_dense(scene: Balls, size: float) -> NDArray[np.bool_]:
-    """Return the mask (N,) of the splats in cells that are not sparse, of a scene of this size around the origin."""
-    side = size * max(CELL, (FEW / len(scene.center)) ** (1 / 3))
-    area = np.clip(scene.radius, SPECK * size, side) ** 2
-    dense = np.zeros(len(area), np.bool_)
-    for shift in (0.0, 0.5):  # of the cells at the border of something, either set may have thin slices
-        _, cell = np.unique(np.floor(scene.center / side + shift).astype(np.int64), axis=0, return_inverse=True)
-        cell = cell.reshape(-1)
-        cover = np.bincount(cell, area)
-        # The typical cell is the one that the middle of all that is covered lies in.
-        order = np.argsort(cover)
-        typical = cover[order[np.searchsorted(np.cumsum(cover[order]), cover.sum() / 2)]]
-        dense |= (cover >= SPARSE * typical)[cell]
-    return dense
 
 
 def middle_of(scene: Balls) -> Matrix:

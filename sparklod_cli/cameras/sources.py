@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
@@ -10,25 +11,22 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..system.errors import CameraPathError, TooManyCamerasError
 from . import framing
-from .camera import Camera, Matrix, look_at, normalized, rigid, to_opengl
+from .camera import Camera, Matrix, normalized, rigid, to_opengl
 from .formats.table import Axes
 from .frame import (
-    DEFAULT_FOV_Y,
     DEFAULT_FPS,
     MAX_FRAMES,
     MAX_GENERATED,
-    NO_LENS,
     NUMBERED,
     Frame,
-    Intrinsics,
-    Sampled,
+    Numbers,
     Settings,
     camera_of,
-    sampled,
+    frame_looking,
 )
 
 if TYPE_CHECKING:
@@ -90,19 +88,22 @@ class CameraPath:
 
 
 def cameras_of(
-    frames: Sequence[Frame] | Sampled,
+    frames: Sequence[Frame] | Callable[[Numbers], list[Frame]],
     settings: Settings,
     title: str,
     axes: Axes | None = Axes.OPENGL_C2W,
     *,
+    count: float = 0,
     fps: float | None = None,
     notes: tuple[str, ...] = (),
 ) -> CameraPath:
     """Return the cameras of frames from a file or a generator.
 
     Args:
+        frames: all of them; or a function of (K,) numbers of frames, as a few keys can yield any number of them.
         title: origin of the frames, for display.
         axes: of frames without their own, unless settings have some.
+        count: number of frames, rounded up and at least one, where a function computes them.
         fps: frames a second of the file; None if it gives none.
         notes: what was ignored or assumed.
 
@@ -110,15 +111,16 @@ def cameras_of(
         CameraPathError: there are no cameras, or one makes no sense, which the text names; its subclass
             `TooManyCamerasError` if there are too many.
     """
-    length = frames.length if isinstance(frames, Sampled) else len(frames)
-    numbers = range(0, length, settings.every)
+    every, is_listed = settings.every, isinstance(frames, Sequence)
+    if not is_listed and not count < NUMBERED:
+        raise TooManyCamerasError(f"{count:.3g} frames are more than {MAX_GENERATED:,}")
+    numbers = range(0, len(frames) if isinstance(frames, Sequence) else max(math.ceil(count), 1), every)
     if not numbers:
         raise CameraPathError("it has no cameras")
-    most = MAX_GENERATED if isinstance(frames, Sampled) else MAX_FRAMES
+    most = MAX_FRAMES if is_listed else MAX_GENERATED
     if len(numbers) > most:
         raise TooManyCamerasError(f"it has {len(numbers):,} cameras, more than {most:,}; leave some out with --every")
-    every = settings.every
-    chosen = frames.at(np.arange(0, length, every)) if isinstance(frames, Sampled) else frames[::every]
+    chosen = frames[::every] if isinstance(frames, Sequence) else frames(np.array(numbers))
     first = chosen[0].time
     world = np.eye(4) if settings.world is None else settings.world
     cameras = []
@@ -144,210 +146,52 @@ def cameras_of(
     return CameraPath(tuple(cameras), title, notes, tuple(numbers))
 
 
-#: Mean seconds from one key to the next, if the keys have no times.
-SECONDS = 2.0
-
 #: Distance at the start of a dolly, in multiples of that at which the scene fits the image, and how many times larger
 #: the scene is at its end.
 DOLLY_START, DOLLY_ZOOM = 4.0, 16.0
 
-#: Smallest step between knots as a share of the mean step, so that no step takes no time.
-SHORTEST = 1e-3
 
-
-@dataclass(frozen=True)
-class Key:
-    """A keyframe: a view through which the camera must pass.
-
-    Attributes:
-        eye, target: x, y, z in the world.
-        up: x, y, z; None for the up axis of the path.
-        fov: field of view in radians; None for that of the lens.
-        time: seconds; either all keys of a path have a time or none.
-    """
-
-    eye: tuple[float, ...]
-    target: tuple[float, ...]
-    up: tuple[float, ...] | None = None
-    fov: float | None = None
-    time: float | None = None
-
-
-def frame_looking(
-    eye: ArrayLike,
-    target: ArrayLike,
-    up: ArrayLike,
-    lens: Intrinsics = NO_LENS,
-    time: float | None = None,
-    name: str = "",
-) -> Frame:
-    """Return a frame at `eye`, (3,), that looks at `target`, (3,), with `up`, (3,), pointing up in the image.
-
-    `CameraPathError` if eye and target are the same point.
-    """
-    try:
-        return Frame(look_at(eye, target, up), lens, time, name, Axes.OPENGL_C2W)
-    except ValueError as error:
-        place = ", ".join(f"{value:g}" for value in np.asarray(eye))
-        raise CameraPathError(f"the camera at {place} {error}") from None
-
-
-def orbit_frames(count: int, center: ArrayLike, distance: float, elevation: float, up: ArrayLike) -> Sampled:
-    """Return `count` frames once around a point, (3,) `center`, counter-clockwise seen from above.
+def orbit_frames(
+    numbers: Numbers, count: int, center: ArrayLike, distance: float, elevation: float, up: ArrayLike
+) -> list[Frame]:
+    """Return frames, by (K,) numbers, of `count` once around a point, (3,), counter-clockwise seen from above.
 
     `distance` is in world units, `elevation` an angle above the point, radians, `up` the (3,) axis of the orbit.
     """
     axis = normalized(up)
     front = _front(axis)
     side = np.cross(axis, front)
-
-    def at(numbers: NDArray[np.int64]) -> list[Frame]:
-        turn = 2 * math.pi * numbers[:, None] / count
-        offset = math.cos(elevation) * (np.cos(turn) * front + np.sin(turn) * side) + math.sin(elevation) * axis
-        return _looking_at(center, np.full(len(numbers), distance), offset, axis)
-
-    return Sampled(count, at)
+    turn = 2 * math.pi * numbers[:, None] / count
+    offset = math.cos(elevation) * (np.cos(turn) * front + np.sin(turn) * side) + math.sin(elevation) * axis
+    return _looking_at(center, np.full(len(numbers), distance), offset, axis)
 
 
-def dolly_frames(count: float, center: ArrayLike, far: float, near: float, elevation: float, up: ArrayLike) -> Sampled:
-    """Return `count` frames, at least 2, straight towards a point, which grows by the same factor from frame to frame.
+def dolly_frames(
+    numbers: Numbers, count: float, center: ArrayLike, far: float, near: float, elevation: float, up: ArrayLike
+) -> list[Frame]:
+    """Return frames, by (K,) numbers, of `count`, at least 2, straight towards a point.
 
-    `far` and `near` are distances of the first and the last frame, world units; `center`, `elevation` and `up` as in
-    `orbit_frames`.
+    It grows by the same factor from frame to frame. `far` and `near` are distances of the first and the last frame,
+    world units; `center`, `elevation` and `up` as in `orbit_frames`.
     """
     axis = normalized(up)
     offset = math.cos(elevation) * _front(axis) + math.sin(elevation) * axis
-
-    def at(numbers: NDArray[np.int64]) -> list[Frame]:
-        away = far * (near / far) ** (numbers / (count - 1))
-        return _looking_at(center, away, np.broadcast_to(offset, (len(numbers), 3)), axis)
-
-    return sampled(count, at)
+    away = far * (near / far) ** (numbers / (count - 1))
+    return _looking_at(center, away, np.broadcast_to(offset, (len(numbers), 3)), axis)
 
 
 def _looking_at(center: ArrayLike, distance: Matrix, offset: Matrix, up: Matrix) -> list[Frame]:
-    """N frames that look at a point, (3,), from (N,) distances along (N, 3) unit vectors."""
+    """Return N frames that look at a point, (3,), from (N,) distances along (N, 3) unit vectors."""
     target = np.asarray(center, np.float64)
     with np.errstate(over="ignore", invalid="ignore"):
         eyes = target + distance[:, None] * offset
     return [frame_looking(eye, target, up) for eye in eyes]
 
 
-def between(
-    keys: Sequence[Key], fps: float | None, up: ArrayLike, lens: Intrinsics = NO_LENS, seconds: float = SECONDS
-) -> Sampled:
-    """Return frames from the first key to the last, on a Catmull-Rom spline through all of them.
-
-    Eye, target, up axis and field of view are interpolated separately, so that a target of two keys stays in view
-    between them. The parameter of the spline is time. Keys without times are spaced centripetally, by the square roots
-    of the distances between them (Yuksel, Schaefer and Keyser 2011), which avoids loops and cusps.
-
-    Args:
-        fps: frames a second; None for `DEFAULT_FPS`.
-        up: (3,) up axis of keys without one.
-        lens: of keys without a field of view.
-        seconds: mean time from key to key, if keys have no times.
-
-    Raises:
-        CameraPathError: there are fewer than two keys, or too many frames; times are missing, or do not increase.
-    """
-    rate = fps or DEFAULT_FPS
-    if len(keys) < 2:
-        raise CameraPathError("a path needs at least two keyframes")
-    ups = [normalized(key.up or up) for key in keys]
-    known = lens.fov if lens.fov is not None else DEFAULT_FOV_Y
-    fovs = [key.fov if key.fov is not None else known for key in keys]
-    values = np.array([[*key.eye, *key.target, *up, fov] for key, up, fov in zip(keys, ups, fovs, strict=True)])
-    knots = _times(keys, values, seconds)
-    with np.errstate(all="ignore"):
-        count = (float(knots[-1]) - float(knots[0])) * rate
-        tangents = catmull_rom_tangents(knots, values)
-    fov_is_known = any(key.fov is not None for key in keys)
-
-    def at(numbers: NDArray[np.int64]) -> list[Frame]:
-        times = numbers / rate
-        samples = along(lambda at: hermite(knots, values, tangents, at), np.minimum(knots[0] + times, knots[-1]))
-        frames = []
-        for time, sample in zip(times, samples, strict=True):
-            fov = float(np.clip(sample[9], min(fovs), max(fovs)))  # a spline may overshoot
-            own = dataclasses.replace(lens, fov=fov, focal=None) if fov_is_known else lens
-            frames.append(frame_looking(sample[:3], sample[3:6], sample[6:9], own, float(time)))
-        return frames
-
-    return sampled(math.floor(count + 1e-6) + 1 if count < NUMBERED else count, at)
-
-
-def along(curve: Callable[[Matrix], Matrix], at: Matrix) -> Matrix:
-    """Return (N, K) points of a curve; `CameraPathError` if keys are too far apart, or too close in time."""
-    with np.errstate(all="ignore"):
-        points = curve(at)
-    if not np.isfinite(points).all():
-        raise CameraPathError("its keyframes are too far apart, or too close in time, to interpolate between them")
-    return points
-
-
-def _times(keys: Sequence[Key], values: Matrix, seconds: float) -> Matrix:
-    times = [key.time for key in keys]
-    if all(time is None for time in times):
-        knots = centripetal_knots(values[:, :6])
-        return knots * (seconds * (len(keys) - 1) / knots[-1])
-    if any(time is None for time in times):
-        raise CameraPathError("some of its keyframes have a time and some have none; give a time to all or to none")
-    knots = np.array(times, np.float64)
-    with np.errstate(all="ignore"):
-        if not (np.diff(knots) > 0).all():
-            raise CameraPathError("the times of its keyframes do not increase")
-    return knots
-
-
 def _front(up: Matrix) -> Matrix:
     """(3,) direction from which a scene is seen first: -z if -y is up, +z if y is up, -y if z is up."""
     across = np.cross([1.0, 0.0, 0.0], up)
     return normalized(across if np.linalg.norm(across) > 1e-6 else np.cross([0.0, 1.0, 0.0], up))
-
-
-def centripetal_knots(points: Matrix) -> Matrix:
-    """Return (n,) knots from 0 on that differ by the square roots of the distances between n >= 2 points, (n, D).
-
-    If all points are the same, the steps are 1.
-    """
-    with np.errstate(over="ignore"):
-        steps = np.sqrt(np.linalg.norm(np.diff(points, axis=0), axis=1))
-    steps = np.maximum(steps, SHORTEST * steps.mean()) if steps.any() else np.ones(len(steps))
-    return np.concatenate([[0.0], np.cumsum(steps)])
-
-
-def catmull_rom_tangents(knots: Matrix, points: Matrix) -> Matrix:
-    """Return (n, D) tangents of the Catmull-Rom spline with (n,) increasing knots, n >= 2 (Barry and Goldman 1988).
-
-    Each is the tangent of the parabola through a point and its neighbours; at the ends, through the last three points.
-    """
-    steps = np.diff(knots)[:, None]
-    slopes = np.diff(points, axis=0) / steps
-    if len(points) == 2:
-        return np.repeat(slopes, 2, axis=0)
-    inner = (slopes[:-1] * steps[1:] + slopes[1:] * steps[:-1]) / (steps[:-1] + steps[1:])
-    return np.concatenate([2 * slopes[:1] - inner[:1], inner, 2 * slopes[-1:] - inner[-1:]])
-
-
-def cardinal_tangents(knots: Matrix, points: Matrix) -> Matrix:
-    """Return (n, D) tangents along the line from the previous to the next point, as SuperSplat has them."""
-    slopes = np.diff(points, axis=0) / np.diff(knots)[:, None]
-    inner = (points[2:] - points[:-2]) / (knots[2:] - knots[:-2])[:, None]
-    return np.concatenate([slopes[:1], inner, slopes[-1:]])
-
-
-def hermite(knots: Matrix, points: Matrix, tangents: Matrix, at: Matrix) -> Matrix:
-    """Return (m, D) points, at (m,) parameters, of the piecewise cubic curve with points and tangents at `knots`."""
-    piece = np.clip(np.searchsorted(knots, at, side="right") - 1, 0, len(knots) - 2)
-    step = np.diff(knots)[piece, None]
-    t = (at[:, None] - knots[piece, None]) / step
-    return (
-        (1 + 2 * t) * (1 - t) ** 2 * points[piece]
-        + t * (1 - t) ** 2 * step * tangents[piece]
-        + t * t * (3 - 2 * t) * points[piece + 1]
-        + t * t * (t - 1) * step * tangents[piece + 1]
-    )
 
 
 def orbit(
@@ -361,9 +205,12 @@ def orbit(
         elevation: above there, degrees.
     """
     up, tilt = settings.up_axis, math.radians(elevation)
-    around = orbit_frames(count, (0.0, 0.0, 0.0), 1, tilt, up)
-    target, away = _aim(around, center, distance, settings, scene)
-    return cameras_of(orbit_frames(count, target, away, tilt, up), settings, "an orbit")
+    frames = functools.partial(orbit_frames, count=count, elevation=tilt, up=up)
+    if center is None or distance is None:
+        some = np.arange(0, count, -(-count // framing.CAMERAS))
+        center, distance = _aim(frames(some, center=(0.0, 0.0, 0.0), distance=1), center, distance, settings, scene)
+    around = functools.partial(frames, center=center, distance=distance)
+    return cameras_of(around, settings, "an orbit", count=count)
 
 
 def dolly(
@@ -378,38 +225,37 @@ def dolly(
     """
     up, tilt = settings.up_axis, math.radians(elevation)
     count = max(2, round(seconds * (settings.fps or DEFAULT_FPS)))
-    ahead = dolly_frames(2, (0.0, 0.0, 0.0), 1, 1, tilt, up)
-    target, first = _aim(ahead, center, distance, settings, scene, DOLLY_START)
-    last = first / DOLLY_ZOOM
-    return cameras_of(dolly_frames(count, target, first, last, tilt, up), settings, "a dolly")
+    frames = functools.partial(dolly_frames, elevation=tilt, up=up)
+    if center is None or distance is None:
+        ahead = frames(np.arange(2), 2, center=(0.0, 0.0, 0.0), far=1, near=1)
+        center, distance = _aim(ahead, center, distance, settings, scene, DOLLY_START)
+    towards = functools.partial(frames, count=count, center=center, far=distance, near=distance / DOLLY_ZOOM)
+    return cameras_of(towards, settings, "a dolly", count=count)
 
 
 def _aim(
-    directions: Sampled,
+    frames: Sequence[Frame],
     center: Point | None,
     distance: float | None,
     settings: Settings,
     scene: Scene,
     times: float = 1,
-) -> tuple[ArrayLike, float]:
+) -> tuple[Point, float]:
     """Return the target of cameras, (3,), and their distance from there; both are chosen for the scene where None.
 
     Args:
-        directions: the cameras, at any distance.
+        frames: of the cameras, at any distance.
         times: factor of a chosen distance over that at which the scene just fits the image.
     """
-    if center is not None and distance is not None:
-        return center, distance
     visible = framing.covered(scene())
     target = framing.middle_of(visible) if center is None else np.asarray(center, np.float64)
     if distance is None:
-        frames = directions.at(np.arange(0, directions.length, -(-directions.length // framing.CAMERAS)))
         try:
             cameras = [camera_of(frame.matrix, frame.lens, 0, "", settings) for frame in frames]
         except ValueError as error:
             raise CameraPathError(f"the camera {error}") from None
         distance = times * framing.distance(cameras, target, visible)
-    return target, distance
+    return tuple(target), distance
 
 
 def whole_scene(elevation: float, settings: Settings, scene: Scene) -> CameraPath:
@@ -434,6 +280,8 @@ def single_views(views: Sequence[tuple[Point, Point]], settings: Settings, *, na
 
 def keyframes(views: Sequence[tuple[Point, Point]], seconds: float, settings: Settings) -> CameraPath:
     """Return cameras that move smoothly along at least two views, eye and target, `seconds` each on average."""
+    from .keyframes import Key, between
+
     keys = [Key(eye, target) for eye, target in views]
-    fps, up = settings.fps or DEFAULT_FPS, settings.up_axis
-    return cameras_of(between(keys, fps, up, seconds=seconds), settings, "keyframes")
+    frames, count = between(keys, settings.fps or DEFAULT_FPS, settings.up_axis, seconds=seconds)
+    return cameras_of(frames, settings, "keyframes", count=count)

@@ -8,14 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cameras.frame import direction_of
 from ..images.output import PLOT_BY
 from ..images.pixels import BACKGROUND
 from ..lod.builders import DEFAULT_BASE
 from ..lod.kernels.tree_links import find_depths
 from ..model.gaussian import lod_opacity, spark_size
 from ..model.lod_tree import CHUNK_NODES
-from ..model.scene import Scene
+from ..model.scene import ASSUMED, AXES, Scene
 from ..model.splats import FloatArray, Splats
 from ..render.color_scales import (
     VIRIDIS,
@@ -129,7 +128,7 @@ def plot(
     coloring, rgb = color_by(by, splats, index, depths)
     shown = splats.take(index)
     low, high = bounds(splats.take(drawable))
-    up = np.array(direction_of(scene.up))
+    up = np.array(AXES[scene.up or ASSUMED])
     right = np.array([0.0, 1.0, 0.0] if up[0] else [1.0, 0.0, 0.0])
     direction = np.array(DIRECTION) @ np.stack([right, up, np.cross(right, up)])
     eye = viewpoint(box_lines(low[None], high[None]), direction, up, aspect=size[0] / size[1], frame=FRAME)

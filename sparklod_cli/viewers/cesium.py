@@ -20,7 +20,7 @@ from ..cameras.camera import Camera
 from ..lod.tiles import PIXEL_ERROR
 from ..model.traversed import TileScene
 from .cut import Forest, TreeCut, TreeInstance
-from .loaded_scene import TILES, Index, LoadedRuns, bytes_of, cut_of_runs
+from .loaded_scene import TILES, Index, LoadedScene, bytes_of, cut_of_runs
 from .viewer_settings import CESIUM_FETCHERS
 
 #: Corners of a box, as shares of its extent.
@@ -30,7 +30,7 @@ Mask = NDArray[np.bool_]
 
 
 @dataclass(eq=False)
-class LoadedTiles(LoadedRuns):
+class LoadedTiles(LoadedScene):
     """A scene of tiles; `scene` and `splats` have those of all tiles."""
 
     fetchers = CESIUM_FETCHERS

@@ -87,10 +87,15 @@ class LoadedScene:
         self.has_chunks = sizes is not None and len(sizes) == self.chunks and splats == CHUNK_NODES
 
     def fill(self, rows: NDArray[np.void]) -> None:
-        """Fill (N,) `NODE` with the nodes of the tree."""
+        """Fill (N,) `NODE`: nodes of a tree; of other scenes splats, with a child where finer ones replace them."""
         scene = self.scene
-        assert scene.tree is not None
-        nodes_of(scene.splats, scene.tree, scene.coding, precision=self.precision, threads=self.threads).fill(rows)
+        if scene.tree is not None:
+            nodes_of(scene.splats, scene.tree, scene.coding, precision=self.precision, threads=self.threads).fill(rows)
+            return
+        rows["x"], rows["y"], rows["z"] = scene.splats.center.T
+        rows["size"] = spark_size(scene.splats)
+        rows["child_count"] = 1
+        rows["child_count"][self.leaves] = 0
 
     @functools.cached_property
     def depth(self) -> NDArray[np.int32]:
@@ -98,26 +103,23 @@ class LoadedScene:
         return np.zeros(self.count, np.int32) if self.scene.tree is None else self.scene.tree.depths()
 
     @functools.cached_property
-    def every(self) -> Index:
-        return np.arange(self.count)
-
-    @functools.cached_property
     def leaves(self) -> Index:
         """(M,) indices of full detail: the leaves of a tree, or all splats."""
-        return self.every if self.scene.tree is None else np.flatnonzero(self.scene.tree.is_leaf)
+        tree = self.scene.tree
+        return np.arange(self.count) if tree is None else np.flatnonzero(tree.is_leaf)
 
     @functools.cached_property
     def full(self) -> Splats:
         """M splats of full detail, in the space of the scene."""
-        return self.splats if self.leaves is self.every else self.rows(self.leaves)
+        return self.rows(self.leaves)
 
     @property
     def leaf_count(self) -> int:
         return len(self.leaves)
 
     def rows(self, index: Index) -> Splats:
-        """Return some splats, in the space of the scene, by their indices, ascending."""
-        return self.splats if index is self.every else self.splats.take(index)
+        """Return some splats, in the space of the scene, by their indices, ascending and each once."""
+        return self.splats if len(index) == self.count else self.splats.take(index)
 
     def chunk_of(self, index: Index) -> NDArray[np.int64]:
         """Return the (M,) numbers of the chunks that some splats are in, where the chunks of all scenes are counted."""
@@ -139,18 +141,6 @@ class LoadedScene:
     def headers(self) -> tuple[int, ...]:
         """Bytes of the answers that a viewer waits for before it can ask for a chunk."""
         return header_answers(self.scene.header.get("header_bytes", 0), self.bytes) if self.has_chunks else ()
-
-
-class LoadedRuns(LoadedScene):
-    """A scene of which viewers draw whole runs of splats; its chunks are files."""
-
-    def fill(self, rows: NDArray[np.void]) -> None:
-        """Fill (N,) `NODE` with splats, for statistics of cuts; splats that finer ones replace have a child."""
-        splats = self.scene.splats
-        rows["x"], rows["y"], rows["z"] = splats.center.T
-        rows["size"] = spark_size(splats)
-        rows["child_count"] = 1
-        rows["child_count"][self.leaves] = 0
 
 
 def cut_of_runs(

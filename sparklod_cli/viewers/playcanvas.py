@@ -24,7 +24,7 @@ from ..io import opened
 from ..model.traversed import DetailScene
 from ..system.errors import FormatError
 from .cut import Forest, TreeCut, TreeInstance
-from .loaded_scene import STREAMED_SOG, Index, LoadedRuns, bytes_of, cut_of_runs
+from .loaded_scene import STREAMED_SOG, Index, LoadedScene, bytes_of, cut_of_runs
 from .viewer_settings import CONNECTIONS, LEAST_BASE_DISTANCE, PLAYCANVAS_FETCHERS, DetailRule
 
 Levels = NDArray[np.int64]
@@ -248,7 +248,7 @@ class DetailFiles:
 
 
 @dataclass(eq=False)
-class LoadedDetail(LoadedRuns):
+class LoadedDetail(LoadedScene):
     """A scene at several detail levels; `scene` and `splats` have those of all levels, then the environment."""
 
     fetchers = PLAYCANVAS_FETCHERS

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import functools
+import itertools
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,7 +23,7 @@ from ..lod.budget import Budget
 from ..model.gaussian import placed
 from ..model.instances import Instance, Matrix
 from ..model.lod_tree import CHUNK_NODES, LodTree
-from ..model.scene import Scene, common_axis, facts_of, rotated_axis, up_notes_of
+from ..model.scene import Scene, common_axis, facts_of, rotated_axis
 from ..model.splats import COLUMNS, Splats
 from ..model.traversed import DetailScene, TileScene
 from ..system.errors import FormatError, InvalidSplatsError, TreeError, UnfitError, memory_errors_translated, naming
@@ -35,7 +36,7 @@ from .spark import SparkViewer
 from .viewer_settings import PLAYCANVAS_BUDGET, LodSettings
 
 if TYPE_CHECKING:
-    from .continuous import ContinuousCuts
+    from .continuous import BlendedCut, ContinuousCuts
     from .paging import Pages
 
 Weights = NDArray[np.float64]
@@ -143,15 +144,10 @@ class Scenes:
     @property
     def up(self) -> str | None:
         """The axis of the world that points up, one of `scene.AXES`, where it is the same for all files; else None."""
-        return common_axis(axis for _, axis, _ in self._axes)
+        return common_axis(axis for _, axis, _ in self.axes)
 
-    @property
-    def axis_notes(self) -> list[str]:
-        """Lines for a user whose cameras take `up`: who says it, and whether files differ."""
-        return up_notes_of(self._axes)
-
-    @property
-    def _axes(self) -> list[tuple[str, str | None, str]]:
+    @functools.cached_property
+    def axes(self) -> list[tuple[str, str | None, str]]:
         """For each instance the name of its file, the axis of the world that is up, and which specification says so."""
         axes = list[tuple[str, str | None, str]]()
         for instance, loaded in zip(self.instances, self.of_instance, strict=True):
@@ -238,27 +234,22 @@ class Scenes:
 
     def full(self) -> Cut:
         """Full detail: all leaves, and all splats of scenes without trees."""
-        return Cut(tuple(map(self._whole, range(len(self.instances)))))
+        pairs = zip(self.instances, self.of_instance, strict=True)
+        return Cut(tuple(Part(loaded, loaded.leaves, None, at.object_to_world) for at, loaded in pairs))
 
-    def cut_of(self, found: TreeCut) -> Cut:
-        least = found.least if np.isfinite(found.least) else None
-        return Cut(self.parts_of([(nodes, None) for nodes in found.indices()]), least, found.reason)
-
-    def parts_of(self, of_trees: Sequence[tuple[NDArray[np.uint32], Weights | None]]) -> tuple[Part, ...]:
-        """Return what is drawn of each instance: of those with cuts, in order, these nodes; of others all."""
-        found = iter(of_trees)
-        parts = []
-        for number, (at, loaded) in enumerate(zip(self.instances, self.of_instance, strict=True)):
+    def cut_of(self, found: TreeCut | BlendedCut) -> Cut:
+        """Return what is drawn: of instances with cuts the nodes of this one, of others all splats."""
+        numbers, parts = itertools.count(), list[Part]()
+        for at, loaded in zip(self.instances, self.of_instance, strict=True):
+            index, weight = loaded.leaves, None
             if loaded.kind is not None:
-                nodes, weight = next(found)
-                parts.append(Part(loaded, nodes.astype(np.int64), weight, at.object_to_world))
-            else:
-                parts.append(self._whole(number))
-        return tuple(parts)
-
-    def _whole(self, number: int) -> Part:
-        loaded = self.of_instance[number]
-        return Part(loaded, loaded.leaves, None, self.instances[number].object_to_world)
+                mask = found.instance == next(numbers)
+                index = np.sort(found.node[mask]).astype(np.int64)
+                weight = None if isinstance(found, TreeCut) else found.weight[mask]
+            parts.append(Part(loaded, index, weight, at.object_to_world))
+        if isinstance(found, TreeCut):
+            return Cut(tuple(parts), found.least if np.isfinite(found.least) else None, found.reason)
+        return Cut(tuple(parts), found.threshold)
 
     def balls(self) -> Balls:
         if any(loaded.paged for loaded in self.loaded):
@@ -317,9 +308,7 @@ class CutFinder:
             smallest=self.settings.limit(camera.fov_y, camera.height),
             width=self.settings.continuous,
         )
-        masks = [blended.instance == number for number in range(len(self.viewer.instances))]
-        nodes = [(blended.node[mask], blended.weight[mask]) for mask in masks]
-        return Cut(self.scenes.parts_of(nodes), blended.threshold)
+        return self.scenes.cut_of(blended)
 
     def candidates(self) -> Cut:
         """Return all that some camera may see: whole trees and all levels where cuts are drawn, else full detail."""
@@ -327,7 +316,7 @@ class CutFinder:
             return self.scenes.full()
         return Cut(
             tuple(
-                Part(loaded, loaded.every, None, at.object_to_world)
+                Part(loaded, np.arange(loaded.count), None, at.object_to_world)
                 for at, loaded in zip(self.scenes.instances, self.scenes.of_instance, strict=True)
             )
         )

@@ -42,7 +42,7 @@ def scenes(draw: st.DrawFn) -> Balls:
 
 
 def orbited(count: int, center: object, distance: float, elevation: float, up: object) -> list[Frame]:
-    return sources.orbit_frames(count, center, distance, elevation, up).at(np.arange(count))  # type: ignore[arg-type]
+    return sources.orbit_frames(np.arange(count), count, center, distance, elevation, up)  # type: ignore[arg-type]
 
 
 def places(camera: Camera, scene: Balls) -> np.ndarray:

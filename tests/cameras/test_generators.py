@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,22 +11,26 @@ from numpy.typing import NDArray
 
 from sparklod_cli.cameras import sources
 from sparklod_cli.cameras.camera import look_at
-from sparklod_cli.cameras.frame import Frame, Intrinsics, Sampled, Settings
-from sparklod_cli.cameras.sources import (
+from sparklod_cli.cameras.frame import Frame, Intrinsics, Settings
+from sparklod_cli.cameras.keyframes import (
     Key,
-    cameras_of,
+    between,
     cardinal_tangents,
     catmull_rom_tangents,
     centripetal_knots,
     hermite,
 )
+from sparklod_cli.cameras.sources import cameras_of
 from sparklod_cli.system.errors import CameraPathError
 
 DOWN_Y = (0.0, -1.0, 0.0)
 
 
-def every(frames: Sampled) -> list[Frame]:
-    return frames.at(np.arange(frames.length))
+def moved(*how: Any) -> list[Frame]:
+    """All frames between keys."""
+    frames, count = between(*how)
+    cameras_of(frames, Settings(), "keyframes", count=count)  # fails for too many
+    return frames(np.arange(math.ceil(count)))
 
 
 def positions(frames: list[Frame]) -> NDArray[np.float64]:
@@ -39,7 +44,7 @@ def aheads(frames: list[Frame]) -> NDArray[np.float64]:
 @pytest.mark.parametrize("up", [(0, -1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 0), (1, 2, 3)])
 def test_an_orbit_goes_around_once_and_looks_inwards(up: tuple[float, float, float]) -> None:
     center, distance, elevation = np.array([1.0, 2.0, 3.0]), 5.0, math.radians(30)
-    frames = every(sources.orbit_frames(12, center, distance, elevation, up))
+    frames = sources.orbit_frames(np.arange(12), 12, center, distance, elevation, up)
     offsets = positions(frames) - center
     axis = np.array(up) / np.linalg.norm(up)
     assert np.allclose(np.linalg.norm(offsets, axis=1), distance)
@@ -53,12 +58,12 @@ def test_an_orbit_goes_around_once_and_looks_inwards(up: tuple[float, float, flo
 
 @pytest.mark.parametrize(("up", "front"), [((0, -1, 0), (0, 0, -1)), ((0, 1, 0), (0, 0, 1)), ((0, 0, 1), (0, -1, 0))])
 def test_a_scene_is_first_seen_from_its_front(up: tuple[float, ...], front: tuple[float, ...]) -> None:
-    assert np.allclose(positions(every(sources.orbit_frames(4, (0, 0, 0), 2, 0, up)))[0], 2 * np.array(front))
-    assert np.allclose(positions(every(sources.dolly_frames(4, (0, 0, 0), 2, 1, 0, up)))[0], 2 * np.array(front))
+    assert np.allclose(positions(sources.orbit_frames(np.arange(4), 4, (0, 0, 0), 2, 0, up))[0], 2 * np.array(front))
+    assert np.allclose(positions(sources.dolly_frames(np.arange(4), 4, (0, 0, 0), 2, 1, 0, up))[0], 2 * np.array(front))
 
 
 def test_distances_of_a_dolly_have_one_ratio() -> None:
-    frames = every(sources.dolly_frames(9, (1, 1, 1), 16.0, 1.0, math.radians(20), DOWN_Y))
+    frames = sources.dolly_frames(np.arange(9), 9, (1, 1, 1), 16.0, 1.0, math.radians(20), DOWN_Y)
     distances = np.linalg.norm(positions(frames) - 1, axis=1)
     assert distances[[0, -1]] == pytest.approx([16, 1])
     assert np.allclose(distances[1:] / distances[:-1], 16 ** (-1 / 8))
@@ -81,7 +86,7 @@ KEYS = [
 
 
 def test_a_path_passes_its_keyframes_without_jumps() -> None:
-    frames = every(sources.between(KEYS, 200, DOWN_Y))
+    frames = moved(KEYS, 200, DOWN_Y)
     seen = positions(frames)
     assert len(frames) == 1 + 200 * 6
     for key in KEYS:
@@ -99,7 +104,7 @@ def test_a_path_passes_its_keyframes_without_jumps() -> None:
 
 def test_keyframes_with_times_are_passed_in_time() -> None:
     keys = [Key((float(t), 0.0, 0.0), (0.0, 0.0, 99.0), time=10 + t) for t in (0, 1, 3, 4)]
-    frames = every(sources.between(keys, 4, DOWN_Y))
+    frames = moved(keys, 4, DOWN_Y)
     assert len(frames) == 17
     assert np.allclose(positions(frames)[:, 0], np.arange(17) / 4), "equally fast all along"
     assert [frame.time for frame in frames] == pytest.approx(np.arange(17) / 4)
@@ -107,10 +112,10 @@ def test_keyframes_with_times_are_passed_in_time() -> None:
 
 def test_keyframes_in_one_place_turn_the_camera() -> None:
     keys = [Key((0.0, 0.0, 0.0), (math.sin(a), 0.0, math.cos(a))) for a in (0, 1, 1.5)]
-    frames = every(sources.between(keys, 30, DOWN_Y))
+    frames = moved(keys, 30, DOWN_Y)
     assert np.allclose(positions(frames), 0)
     assert np.allclose(aheads(frames)[-1], (math.sin(1.5), 0, math.cos(1.5)))
-    same = every(sources.between([keys[0], keys[0]], 10, DOWN_Y))
+    same = moved([keys[0], keys[0]], 10, DOWN_Y)
     assert len(same) == 21
     assert np.allclose(aheads(same), (0, 0, 1))
 
@@ -118,8 +123,8 @@ def test_keyframes_in_one_place_turn_the_camera() -> None:
 def test_keyframes_without_a_lens_keep_the_given_one() -> None:
     lens = Intrinsics((640, 480), (600, 610), (300, 200))
     keys = [Key(key.eye, key.target) for key in KEYS]
-    assert all(frame.lens == lens for frame in every(sources.between(keys, 5, DOWN_Y, lens)))
-    mixed = every(sources.between([keys[0], KEYS[1]], 5, DOWN_Y))
+    assert all(frame.lens == lens for frame in moved(keys, 5, DOWN_Y, lens))
+    mixed = moved([keys[0], KEYS[1]], 5, DOWN_Y)
     assert mixed[0].lens.fov == pytest.approx(math.radians(60))
 
 
@@ -130,7 +135,7 @@ def test_keyframes_without_a_lens_keep_the_given_one() -> None:
 def test_keyframe_times_that_do_not_rise_are_refused(times: tuple[float | None, ...], said: str) -> None:
     keys = [Key(key.eye, key.target, time=time) for key, time in zip(KEYS, times, strict=False)]
     with pytest.raises(CameraPathError, match=said):
-        every(sources.between(keys, 30, DOWN_Y))
+        moved(keys, 30, DOWN_Y)
 
 
 def test_centripetal_splines_make_no_loop() -> None:
@@ -155,7 +160,7 @@ def test_both_tangents_reproduce_straight_lines_and_catmull_rom_parabolas() -> N
 
 
 def test_generated_cameras_have_times_by_the_frame_rate() -> None:
-    path = cameras_of(every(sources.orbit_frames(4, (0, 0, 0), 1, 0, DOWN_Y)), Settings(fps=2), "an orbit")
+    path = cameras_of(sources.orbit_frames(np.arange(4), 4, (0, 0, 0), 1, 0, DOWN_Y), Settings(fps=2), "an orbit")
     assert [camera.time for camera in path.cameras] == [0, 0.5, 1, 1.5]
     assert path.format == "an orbit"
     assert path.notes == ()

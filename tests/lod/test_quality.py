@@ -139,7 +139,7 @@ def test_splats_farther_apart_than_float32_holds_make_a_node_as_large_as_it_hold
 
 def cameras_around(splats: Splats) -> tuple[Camera, ...]:
     middle, radius = framing(splats.center)
-    frames = orbit_frames(3, middle, 1.6 * radius, math.radians(15), DEFAULT_UP)
+    frames = orbit_frames(np.arange(3), 3, middle, 1.6 * radius, math.radians(15), DEFAULT_UP)
     settings = Settings(size=(240, 135), fov_y=math.radians(60))
     return cameras_of(frames, settings, "an orbit").cameras
 

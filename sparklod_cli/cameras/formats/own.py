@@ -11,8 +11,8 @@ import numpy as np
 
 from ...system.errors import CameraPathError
 from ...system.untrusted import quoted_value
-from ..frame import NO_LENS, Frame, Intrinsics, Settings
-from ..sources import Key, between, frame_looking
+from ..frame import NO_LENS, Frame, Intrinsics, Settings, frame_looking
+from ..keyframes import Key, between
 from .parsing import CameraJson, Files, Parsed, finite, posed, side
 from .table import Axes
 
@@ -39,8 +39,8 @@ def parse_sparklod(files: Files, settings: Settings) -> Parsed:
         raise CameraPathError("it has frames and keyframes; give one of them")
     if root.has("keyframes"):
         keys = [_key(item) for item in root.items("keyframes")]
-        frames = between(keys, settings.fps or fps, settings.up_axis, lens)
-        return Parsed(frames, fps=fps, turned=all(key.up for key in keys))
+        frames, count = between(keys, settings.fps or fps, settings.up_axis, lens)
+        return Parsed(frames, fps=fps, turned=all(key.up for key in keys), count=count)
     name = root.optional("axes", CameraJson.text, Axes.OPENGL_C2W.value)
     try:
         axes = Axes(name)

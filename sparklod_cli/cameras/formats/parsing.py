@@ -7,7 +7,7 @@ poses in the axes of their format, and lenses as the file has them.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -17,7 +17,7 @@ from ...system import untrusted
 from ...system.errors import CameraPathError
 from ...system.untrusted import LARGEST, Origin, decoded_text, quoted_value
 from ..camera import Matrix, pose, rotation_of
-from ..frame import Frame, Sampled
+from ..frame import Frame, Numbers
 
 #: Most pixels along a side of an image.
 MAX_SIDE = 1 << 16
@@ -69,16 +69,18 @@ class Parsed:
     """The result of a parser.
 
     Attributes:
-        frames: in order; those between keys are computed when they are used.
+        frames: in order; or a function that computes frames between keys from their numbers.
         notes: what was ignored or assumed, one sentence each, for display.
         fps: frames a second in the file; None if it gives none.
         turned: every camera has its own up axis.
+        count: number of frames that are computed, rounded up and at least one.
     """
 
-    frames: Sequence[Frame] | Sampled
+    frames: Sequence[Frame] | Callable[[Numbers], list[Frame]]
     notes: tuple[str, ...] = ()
     fps: float | None = None
     turned: bool = False
+    count: float = 0
 
 
 class CameraJson(untrusted.Json):

@@ -11,13 +11,12 @@ import math
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...system.errors import CameraPathError
 from ...system.untrusted import quoted_value
 from ..camera import Matrix
-from ..frame import Frame, Intrinsics, Settings, sampled
-from ..sources import along, cardinal_tangents, frame_looking, hermite
+from ..frame import Frame, Intrinsics, Numbers, Settings, frame_looking
+from ..keyframes import along, cardinal_tangents, hermite
 from .parsing import CameraJson, Files, Parsed
 
 UP = (0.0, 1.0, 0.0)
@@ -145,12 +144,12 @@ def _sampled(curve: Callable[[Matrix], Matrix], count: float, rate: float, setti
     """Return all frames of a path of `count` frames; --fps changes their number, not the duration."""
     fps = settings.fps or rate
 
-    def at(numbers: NDArray[np.int64]) -> list[Frame]:
+    def at(numbers: Numbers) -> list[Frame]:
         times = numbers / fps
         samples = along(curve, times * rate)
         return [_looking(sample, float(time), settings) for sample, time in zip(samples, times, strict=True)]
 
-    return Parsed(sampled(max(count, 1) / rate * fps - 1e-6, at), fps=rate)
+    return Parsed(at, fps=rate, count=max(count, 1) / rate * fps - 1e-6)
 
 
 def _looking(sample: Matrix | list[float], time: float | None, settings: Settings) -> Frame:

@@ -186,7 +186,7 @@ class Cameras:
             InvalidSplatsError: there is no scene to fit.
         """
         from ...cameras import sources
-        from ...cameras.frame import Settings
+        from ...cameras.frame import DEFAULT_SECONDS, Settings
 
         settings = Settings(
             axes=Axes(self.camera_axes) if self.camera_axes else None,
@@ -203,7 +203,7 @@ class Cameras:
 
             return read_path(self.camera_path, None if self.camera_format == "auto" else self.camera_format, settings)
         elevation = ELEVATION if self.elevation is None else self.elevation
-        seconds = self.seconds or sources.SECONDS
+        seconds = self.seconds or DEFAULT_SECONDS
         try:
             if self.views or self.look_at:
                 return sources.single_views(self.views or (self.look_at,), settings, named=bool(self.views))
@@ -393,6 +393,7 @@ def check_view(
     Raises:
         click.UsageError: an option is for trees, or for Streamed SOG, and the files are something else.
     """
+    from ...model.scene import up_notes_of
     from ...viewers.loaded_scene import STREAMED_SOG, TILES, TREE
 
     if scenes.kind == STREAMED_SOG:
@@ -410,7 +411,7 @@ def check_view(
         )
         refuse(ctx, (*CUTS, *LOADING, *DETAIL), plain)
     upright = cameras.up is None and cameras.camera_path is None  # by the axes of the files
-    for note in (*path.notes, *notes, *(scenes.axis_notes if upright else ())):
+    for note in (*path.notes, *notes, *(up_notes_of(scenes.axes) if upright else ())):
         console.say(note)
     if network is None or network.instant:
         return
