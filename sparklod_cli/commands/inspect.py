@@ -6,7 +6,7 @@ import dataclasses
 import json
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -15,9 +15,11 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import click
 
 from ..images.output import PLOT_BY
-from ..system.errors import OutOfMemoryError, SparklodError, StdoutError
+from ..system.errors import FormatError, OutOfMemoryError, SparklodError, StdoutError, memory_errors_translated, naming
+from ..system.output import check_writable, write_file
 from ..system.setting_fields import setting, whole
 from ..system.stdio import name_of
+from ..system.threads import on_threads
 from ..system.units import format_size
 from ..system.untrusted import MOST, printable, shortened
 from .command import COMMON, Command, flag, refuse, values_of
@@ -26,10 +28,10 @@ from .options.common import ASSERT, EACH_AS_JSON, JSON, OVERWRITE, PNG, QUIET, G
 from .paths import NamedPath, keep_apart, name_outputs
 
 if TYPE_CHECKING:
-    from ..api.inspect_jobs import Inspected, InspectSettings
     from ..inspection.findings import Finding
     from ..inspection.html import FileSection
     from ..inspection.report import Report, ReportSettings
+    from ..model.scene import Scene
     from ..tables.assertions import Assertion
     from ..tables.columns import TableOutput
 
@@ -142,13 +144,6 @@ class InspectOutput:
     )
     plot_by: str = setting("What the colours of the picture show.", PLOT_BY, PLOT_BY[0], heading=PICTURES)
 
-    def table(self) -> TableOutput | None:
-        from ..inspection.blocks import CHUNK_COLUMNS
-
-        if self.chunks_out is None:
-            return None
-        return table_output(self.chunks_out, CHUNK_COLUMNS, overwrite=self.overwrite, flag="--chunks-out")
-
 
 def check_usage(ctx: click.Context, count: int, checks: Checks, output: InspectOutput, *, as_json: bool) -> None:
     """Raise a `click.UsageError` where options exclude each other or would do nothing."""
@@ -225,31 +220,28 @@ def inspect(ctx: click.Context, /, **_: Any) -> None:
     keep_apart(ctx)
     check_usage(ctx, len(files), checks, output, as_json=options.as_json)
     with Console(quiet=general.quiet, verbose=general.verbose) as console:
-        from ..api.inspect_jobs import InspectSettings, check_outputs, read_original
+        from ..inspection.blocks import CHUNK_COLUMNS
+        from ..io import read_scene
 
         console.announce_compiling()
-        table = output.table()
-        check_outputs(output.plot, output.html, table, overwrite=output.overwrite)
+        table = None
+        if output.chunks_out is not None:
+            table = table_output(output.chunks_out, CHUNK_COLUMNS, overwrite=output.overwrite, flag="--chunks-out")
+            table.check()
+        for target in (output.plot, output.html):
+            if target is not None:
+                check_writable(target, overwrite=output.overwrite)
+        if output.plot is not None:
+            from ..figures.pyvista_scene import load_pyvista
+
+            load_pyvista()
         expected = checks.expectations()
         original = None
         if checks.leaves_of is not None:
-            original = read_original(checks.leaves_of, threads=general.threads, progress=console.progress)
-        settings = InspectSettings(
-            report=_report_settings(checks, output, expected, as_json=options.as_json),
-            expected=expected,
-            original=original,
-            everything=checks.check,
-            histograms=output.histogram,
-            plot=output.plot,
-            depth=output.plot_level,
-            by=output.plot_by,
-            html=output.html,
-            overwrite=output.overwrite,
-            chunks=table,
-            threads=general.threads,
-            progress=console.progress,
-        )
-        job = _Job(console, options, settings)
+            with naming(checks.leaves_of, FormatError):
+                original = read_scene(checks.leaves_of, threads=general.threads, progress=console.progress)
+        settings = _report_settings(checks, output, expected, as_json=options.as_json)
+        job = _Job(console, options, settings, expected, original, table)
         worst = max(job.inspect(file) for file in files)
         job.write_page()
     if worst:
@@ -288,27 +280,59 @@ class _Job:
 
     console: Console
     options: InspectOptions
-    settings: InspectSettings
+    settings: ReportSettings
+    expected: list[Assertion] | None
+    original: Scene | None
+    table: TableOutput | None
     sections: list[FileSection] = dataclasses.field(default_factory=list)
 
     def inspect(self, file: Path) -> int:
-        from ..api.inspect_jobs import inspect_file
+        from ..api.inspect_jobs import inspect_file, picture_of, thumbnail_of
 
-        start, name = time.perf_counter(), name_of(file)
+        start, name, options, output = time.perf_counter(), name_of(file), self.options, self.options.output
+        threads, picture, problem, size = options.general.threads, None, None, 0
         try:
-            inspected = inspect_file(file, self.settings)
+            with memory_errors_translated(), on_threads(threads):
+                report, scene = inspect_file(
+                    file,
+                    self.settings,
+                    self.expected,
+                    self.original,
+                    everything=options.checks.check,
+                    threads=threads,
+                    progress=self.console.progress,
+                )
+                if self.table is not None and report.chunks is not None:
+                    self.table.write(report.chunks)
+                if (output.plot is not None or output.html is not None) and report.format is not None:
+                    picture, problem = picture_of(scene, output.plot_by, output.plot_level)
+                if picture is not None and output.plot is not None:
+                    size = write_file(output.plot, [picture.png], overwrite=output.overwrite)
+                histograms = _histograms(scene, output.histogram)
+                if output.html is not None:
+                    from ..inspection.html import section_of
+
+                    thumbnail = None if scene is None else thumbnail_of(report, scene, threads)
+                    self.sections.append(section_of(report, scene, picture, thumbnail))
         except OutOfMemoryError as error:
             self.console.error(f"{name}: {error}")
             return 1
         self.console.clear()
-        status = self._report(name, inspected)
-        if inspected.section is not None:
-            self.sections.append(inspected.section)
-        self.console.detail(f"  {name}: {inspected.report.format or 'not read'}, {time.perf_counter() - start:.2f} s")
+        status = self._report(name, report)
+        for quantity, text in histograms.items():
+            click.echo(f"\n  {quantity}\n{text}")
+        if picture is not None and output.plot is not None:
+            self.console.say(f"{output.plot}  {picture.description.partition(';')[0]}, {format_size(size)}")
+        elif problem is not None and output.plot is not None:
+            self.console.error(f"{name}: {problem}")
+            status = max(status, 1)
+        elif problem is not None:
+            self.console.say(f"{name}: no plot of the tree on the page: {problem}")
+        self.console.detail(f"  {name}: {report.format or 'not read'}, {time.perf_counter() - start:.2f} s")
         return status
 
-    def _report(self, name: str, inspected: Inspected) -> int:
-        report, checks = inspected.report, self.options.checks
+    def _report(self, name: str, report: Report) -> int:
+        checks = self.options.checks
         status = 3 if checks.holds and report.fails(checks.fail_on) else 0
         if report.format is None and not checks.holds:
             status = 1
@@ -321,18 +345,8 @@ class _Job:
         except SparklodError as error:
             self.console.error(f"{name}: {error}")
             status = 1
-        if report.format is not None and self.settings.report.chunks:
+        if report.format is not None and self.settings.chunks:
             status = max(status, self._print_chunks(name, report))
-        for quantity, text in inspected.histograms.items():
-            click.echo(f"\n  {quantity}\n{text}")
-        if inspected.picture is not None:
-            description, size = inspected.picture
-            self.console.say(f"{self.settings.plot}  {description.partition(';')[0]}, {format_size(size)}")
-        elif inspected.problem is not None and self.settings.plot is not None:
-            self.console.error(f"{name}: {inspected.problem}")
-            status = max(status, 1)
-        elif inspected.problem is not None:
-            self.console.say(f"{name}: no plot of the tree on the page: {inspected.problem}")
         return status
 
     def _print_chunks(self, name: str, report: Report) -> int:
@@ -343,8 +357,8 @@ class _Job:
             return 1
         if self.options.output.chunks and not self.options.as_json:
             click.echo("\n".join(chunk_lines(report.chunks)))
-        if self.settings.chunks is not None:
-            self.console.say(f"{self.settings.chunks.path}  table of {count_of(len(report.chunks), 'chunk')}")
+        if self.table is not None:
+            self.console.say(f"{self.table.path}  table of {count_of(len(report.chunks), 'chunk')}")
         return 0
 
     def _print(self, name: str, report: Report) -> None:
@@ -372,12 +386,24 @@ class _Job:
             self.console.say(f"{name}: {hint}")
 
     def write_page(self) -> None:
-        if self.settings.html is None:
+        output = self.options.output
+        if output.html is None:
             return
-        from ..api.inspect_jobs import write_page
+        from ..inspection.html import page
 
-        size = write_page(self.settings.html, self.sections, overwrite=self.settings.overwrite)
-        self.console.say(f"{self.settings.html}  page of {count_of(len(self.sections), 'file')}, {format_size(size)}")
+        size = write_file(output.html, [page(self.sections).encode()], overwrite=output.overwrite)
+        self.console.say(f"{output.html}  page of {count_of(len(self.sections), 'file')}, {format_size(size)}")
+
+
+def _histograms(scene: Scene | None, names: Sequence[str]) -> dict[str, str]:
+    """Return the histograms of quantities that a file has, as text."""
+    if scene is None or not names:
+        return {}
+    from ..inspection import values
+    from ..tables.histograms import as_text
+
+    held = values.names_of(scene.splats)
+    return {name: as_text(values.histogram_of(scene.splats, name)) for name in names if name in held}
 
 
 #: Numbers of children that get a row of their own.
