@@ -28,7 +28,7 @@ from ..render.renderer import Renderer
 from ..render.settings import RenderSettings
 from ..system.errors import CameraPathError, FormatError, memory_errors_translated
 from ..system.threads import on_threads, thread_count
-from ..tables.columns import Table
+from ..tables.notebook_table import Table
 from ..viewers.loaded_scene import STREAMED_SOG, TILES, UNNAMED
 from ..viewers.scenes import Cut, CutFinder, Scenes, read_scenes
 from ..viewers.viewer_settings import BLEND, PLAYCANVAS_BUDGET, LodSettings

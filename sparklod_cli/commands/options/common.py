@@ -84,8 +84,6 @@ def table_output(
     Without an output, the table is CSV on standard output. It is not written (form None) where an object goes there
     with --json, and on a terminal, where it would scroll by and the summary is printed instead.
     """
-    from ...codecs.formats import FORMATS
-    from ...images.output import MOVING, STILL, SUFFIXES
     from ...tables.columns import FORMS, TableOutput
 
     if output is None and (as_json or is_terminal(sys.stdout)):
@@ -96,6 +94,9 @@ def table_output(
     if suffix and form is None and suffix not in FORMS:
         raise click.UsageError(f"{flag} {output}: tables are written as {', '.join(f'.{form}' for form in FORMS)}")
     if suffix and form is not None:
+        from ...codecs.formats import FORMATS
+        from ...images.output import MOVING, STILL, SUFFIXES
+
         of_splats = (suffix for each in FORMATS for suffix in each.suffixes)
         others = {*FORMS, *STILL, *MOVING, *SUFFIXES, "html", "npz"}
         if suffix != form and (suffix in others or f".{suffix}" in of_splats):

@@ -61,7 +61,10 @@ def test_json_has_the_same_cells(tmp_path: Path, capsys: Capture) -> None:
     data = json.loads(capsys.readouterr().out)["data"]
     assert traverse(*settings, "-o", tmp_path / "frames.JSON") == 0
     assert json.loads((tmp_path / "frames.JSON").read_text())["data"] == data
-    texts = [{c.name: c.text(row[c.name]) for c in COLUMNS if c.name in row} for row in data]
+    texts = [
+        {c.name: "" if row[c.name] is None else format(row[c.name], c.digits) for c in COLUMNS if c.name in row}
+        for row in data
+    ]
     assert texts == rows
 
 
