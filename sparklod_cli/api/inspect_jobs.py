@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING
 from ..inspection import expectations, leaves
 from ..inspection.findings import Finding
 from ..inspection.report import Report, ReportSettings, inspect
+from ..io import read_scene
 from ..model.scene import Scene
-from ..system.errors import SparklodError
+from ..system.errors import FormatError, SparklodError, naming
 from ..system.progress import Progress
 from ..tables.assertions import Assertion
 
@@ -22,6 +23,12 @@ if TYPE_CHECKING:
 #: Width and height of the thumbnail on a page, pixels; the splats of the cut that it shows; and the most splats of a
 #: scene without a tree that is drawn for it: more take seconds.
 THUMBNAIL, THUMBNAIL_BUDGET, MOST_SPLATS = (512, 384), 200_000, 3_000_000
+
+
+def read_original(path: Path, *, threads: int, progress: Progress) -> Scene:
+    """Read the scene whose splats the leaves must equal; a `FormatError` names the file."""
+    with naming(path, FormatError):
+        return read_scene(path, threads=threads, progress=progress)
 
 
 def inspect_file(

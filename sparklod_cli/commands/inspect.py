@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import click
 
 from ..images.output import PLOT_BY
-from ..system.errors import FormatError, OutOfMemoryError, SparklodError, StdoutError, memory_errors_translated, naming
+from ..system.errors import OutOfMemoryError, SparklodError, StdoutError, memory_errors_translated
 from ..system.output import check_writable, write_file
 from ..system.setting_fields import setting, whole
 from ..system.stdio import name_of
@@ -220,8 +220,8 @@ def inspect(ctx: click.Context, /, **_: Any) -> None:
     keep_apart(ctx)
     check_usage(ctx, len(files), checks, output, as_json=options.as_json)
     with Console(quiet=general.quiet, verbose=general.verbose) as console:
+        from ..api.inspect_jobs import read_original
         from ..inspection.blocks import CHUNK_COLUMNS
-        from ..io import read_scene
 
         console.announce_compiling()
         table = None
@@ -238,8 +238,7 @@ def inspect(ctx: click.Context, /, **_: Any) -> None:
         expected = checks.expectations()
         original = None
         if checks.leaves_of is not None:
-            with naming(checks.leaves_of, FormatError):
-                original = read_scene(checks.leaves_of, threads=general.threads, progress=console.progress)
+            original = read_original(checks.leaves_of, threads=general.threads, progress=console.progress)
         settings = _report_settings(checks, output, expected, as_json=options.as_json)
         job = _Job(console, options, settings, expected, original, table)
         worst = max(job.inspect(file) for file in files)
