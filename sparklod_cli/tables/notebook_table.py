@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from html import escape
 from typing import Any, overload
 
-from ..system.packages import optional_import
+from ..system.errors import optional_import
 from .columns import Cell, Column, Row
 
 #: Rows that are shown of a table in a notebook, half from its beginning and half from its end.
