@@ -13,6 +13,7 @@ from ..inspection.report import Report, ReportSettings, inspect
 from ..io import read_scene
 from ..model.scene import Scene
 from ..system.errors import FormatError, SparklodError, naming
+from ..system.output import check_writable
 from ..system.progress import Progress
 from ..tables.assertions import Assertion
 
@@ -23,6 +24,17 @@ if TYPE_CHECKING:
 #: Width and height of the thumbnail on a page, pixels; the splats of the cut that it shows; and the most splats of a
 #: scene without a tree that is drawn for it: more take seconds.
 THUMBNAIL, THUMBNAIL_BUDGET, MOST_SPLATS = (512, 384), 200_000, 3_000_000
+
+
+def check_outputs(plot: Path | None, html: Path | None, *, overwrite: bool) -> None:
+    """Raise a `SparklodError` where a picture or a page cannot be written or drawn, before anything is read."""
+    for target in (plot, html):
+        if target is not None:
+            check_writable(target, overwrite=overwrite)
+    if plot is not None:
+        from ..figures.pyvista_scene import load_pyvista
+
+        load_pyvista()
 
 
 def read_original(path: Path, *, threads: int, progress: Progress) -> Scene:

@@ -16,7 +16,7 @@ import click
 
 from ..images.output import PLOT_BY
 from ..system.errors import OutOfMemoryError, SparklodError, StdoutError, memory_errors_translated
-from ..system.output import check_writable, write_file
+from ..system.output import write_file
 from ..system.setting_fields import setting, whole
 from ..system.stdio import name_of
 from ..system.threads import on_threads
@@ -220,7 +220,7 @@ def inspect(ctx: click.Context, /, **_: Any) -> None:
     keep_apart(ctx)
     check_usage(ctx, len(files), checks, output, as_json=options.as_json)
     with Console(quiet=general.quiet, verbose=general.verbose) as console:
-        from ..api.inspect_jobs import read_original
+        from ..api.inspect_jobs import check_outputs, read_original
         from ..inspection.blocks import CHUNK_COLUMNS
 
         console.announce_compiling()
@@ -228,13 +228,7 @@ def inspect(ctx: click.Context, /, **_: Any) -> None:
         if output.chunks_out is not None:
             table = table_output(output.chunks_out, CHUNK_COLUMNS, overwrite=output.overwrite, flag="--chunks-out")
             table.check()
-        for target in (output.plot, output.html):
-            if target is not None:
-                check_writable(target, overwrite=output.overwrite)
-        if output.plot is not None:
-            from ..figures.pyvista_scene import load_pyvista
-
-            load_pyvista()
+        check_outputs(output.plot, output.html, overwrite=output.overwrite)
         expected = checks.expectations()
         original = None
         if checks.leaves_of is not None:
