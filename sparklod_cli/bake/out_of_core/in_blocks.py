@@ -6,7 +6,7 @@ import dataclasses
 import functools
 import itertools
 import math
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -31,7 +31,6 @@ from .job import (
     ORDER,
     PUBLISHED,
     ROOT,
-    BuildStage,
     Engine,
     Job,
     Task,
@@ -159,19 +158,18 @@ class InBlocks:
             ]
             self.engine.run("reading", tasks, job, self.progress)
             arrays = [job.store.get(task.name) for task in tasks]
-            parts = [InputSummary.from_arrays(each) for each in arrays]
-            summary = InputSummary.merged(parts)
+            summary = InputSummary.of(arrays)
             job.settings.selection.check(summary.tally)
             check_transformed(summary.beyond)
             if not summary.bounds.smallest > 0:
                 raise InvalidSplatsError(INVISIBLE)
-            selected = tuple(itertools.accumulate((part.tally.selected for part in parts), initial=0))
+            selected = tuple(itertools.accumulate((tally.selected for tally in summary.tallies), initial=0))
             self.job = job = dataclasses.replace(job, selected=selected)
             largest = int(np.sum([np.diff(each["first"]) for each in arrays], axis=0).max())
             again = cut_into_blocks(summary.sample[:, :3], summary.tally.selected, block_splats)
             if largest <= SLACK * block_splats or job.round + 1 == ROUNDS or again == job.blocks:
                 return summary
-            for part, group in itertools.product(range(len(parts)), range(len(job.blocks.groups))):
+            for part, group in itertools.product(range(len(arrays)), range(len(job.blocks.groups))):
                 job.store.remove(job.splats(part, group))
             job = dataclasses.replace(job, blocks=again, round=job.round + 1)
 
@@ -213,75 +211,51 @@ def _sample_centers(stream: Reader, settings: BakeSettings, blocks: int) -> tupl
 
 @dataclass(frozen=True, eq=False)
 class InputSummary:
-    """Counts, bounds, sample and statistics of the splats of an input, or a part of it.
+    """Counts, bounds, sample and statistics of the splats of an input.
 
     Attributes:
-        tally: of selected and dropped splats.
+        tallies: of selected and dropped splats, by part of the input.
         beyond: number of selected splats that left the range of float32 when they were transformed.
-        limits: (2, 4) float64 least and largest centre and size of selected splats, see `Bounds`.
+        bounds: of selected splats.
         sample: even sample of selected splats.
         statistics: of selected splats.
     """
 
-    tally: SelectionTally
+    tallies: Sequence[SelectionTally]
     beyond: int
-    limits: NDArray[np.float64]
+    bounds: Bounds
     sample: Rows
     statistics: Statistics
 
     @classmethod
-    def of(
-        cls, splats: Splats, tally: SelectionTally, beyond: int, stride: int, needed: Collection[str]
-    ) -> InputSummary:
-        """Examine selected splats, sampled at this stride."""
-        bounds = Bounds.of(splats)
-        limits = np.array([[*bounds.low, bounds.smallest], [*bounds.high, bounds.largest]])
-        sample = rows_of(splats.take(slice(None, None, stride)))
-        return cls(tally, beyond, limits, sample, Statistics.of(splats, needed=needed))
-
-    @classmethod
-    def merged(cls, parts: Sequence[InputSummary]) -> InputSummary:
-        """Merge the summaries of one or more parts, in their order."""
-        limits = np.stack([part.limits for part in parts])
+    def of(cls, parts: Sequence[Arrays]) -> InputSummary:
+        """Return the summary of one or more parts, in their order, from the results of `scatter`."""
+        tallies = []
+        for _, count, first, *dropped in (part["counts"].tolist() for part in parts):
+            reasons = {reason: number for reason, number in zip(REASONS, dropped, strict=True) if number}
+            tallies.append(SelectionTally(count, reasons, None if first < 0 else first))
+        limits = np.stack([part["limits"] for part in parts])
+        (*low, smallest), (*high, largest) = limits[:, 0].min(axis=0).tolist(), limits[:, 1].max(axis=0).tolist()
         return cls(
-            functools.reduce(SelectionTally.then, [part.tally for part in parts]),
-            sum(part.beyond for part in parts),
-            np.stack([limits[:, 0].min(axis=0), limits[:, 1].max(axis=0)]),
-            np.concatenate([part.sample for part in parts]),
-            Statistics.merged([part.statistics for part in parts]),
+            tallies,
+            sum(int(part["counts"][0]) for part in parts),
+            Bounds(np.array(low), np.array(high), smallest, largest),
+            np.concatenate([part["sample"] for part in parts]),
+            Statistics.merged([Statistics.from_array(part["statistics"]) for part in parts]),
         )
 
-    def arrays(self) -> Arrays:
-        """Return arrays for `from_arrays`."""
-        first = -1 if self.tally.first_invalid is None else self.tally.first_invalid
-        counts = [self.beyond, self.tally.count, first, *(self.tally.dropped.get(reason, 0) for reason in REASONS)]
-        return {
-            "counts": np.array(counts, np.int64),
-            "limits": self.limits,
-            "sample": self.sample,
-            "statistics": self.statistics.array(),
-        }
-
-    @classmethod
-    def from_arrays(cls, arrays: Arrays) -> InputSummary:
-        """Return the summary of `arrays`."""
-        beyond, count, first, *dropped = arrays["counts"].tolist()
-        reasons = {reason: number for reason, number in zip(REASONS, dropped, strict=True) if number}
-        tally = SelectionTally(count, reasons, None if first < 0 else first)
-        return cls(tally, beyond, arrays["limits"], arrays["sample"], Statistics.from_array(arrays["statistics"]))
-
     @property
-    def bounds(self) -> Bounds:
-        """Bounds of selected splats."""
-        (*low, smallest), (*high, largest) = self.limits.tolist()
-        return Bounds(np.array(low), np.array(high), smallest, largest)
+    def tally(self) -> SelectionTally:
+        return functools.reduce(SelectionTally.then, self.tallies)
 
 
 def scatter(job: Job, number: int, *, threads: int, progress: Progress) -> None:
     """Sort the splats of an input part into blocks; a task.
 
     Results, by group of blocks: `rows`, sorted by block, and `index`, places among the selected splats of this part;
-    then the summary, with `first`, the first splat of each block.
+    then their summary: `first`, the first splat of each block; `counts`, of splats beyond the range of float32, all
+    splats, the first invalid one or -1, and dropped ones by reason; `limits`, (2, 4) float64 least and largest centre
+    and size; `sample`, rows at an even stride; and `statistics`.
     """
     start, stop = job.parts[number : number + 2]
     rows = np.empty((stop - start, width_of(job.sh_degree)), np.float32)
@@ -297,9 +271,14 @@ def scatter(job: Job, number: int, *, threads: int, progress: Progress) -> None:
         here = index[first[members.start] : first[members.stop]]
         job.store.put(job.splats(number, group), {"rows": rows[here], "index": here.astype(np.int32)})
     stride = max(1, job.stream.count // SAMPLE_SPLATS)
+    invalid = -1 if tally.first_invalid is None else tally.first_invalid
+    counts = [beyond, tally.count, invalid, *(tally.dropped.get(reason, 0) for reason in REASONS)]
     with on_threads(threads):
-        summary = InputSummary.of(splats_of(rows, threads), tally, beyond, stride, job.needed)
-    job.store.put(job.part(number), {**summary.arrays(), "first": first})
+        splats = splats_of(rows, threads)
+        bounds, statistics = Bounds.of(splats), Statistics.of(splats, needed=job.needed)
+    limits = np.array([[*bounds.low, bounds.smallest], [*bounds.high, bounds.largest]])
+    summary = {"counts": np.array(counts, np.int64), "limits": limits, "sample": rows[::stride]}
+    job.store.put(job.part(number), {**summary, "statistics": statistics.array(), "first": first})
 
 
 def _stages(job: Job) -> Iterator[Task]:
@@ -325,7 +304,10 @@ def build_stage(job: Job, number: int, *, threads: int, progress: Progress) -> N
     """
     stage, builder = job.blocks.stages[number], job.builder()
     with on_threads(threads):
-        pending = _begun(job, stage, threads)
+        if stage.block is None:
+            pending = Pending.concat([Pending(job.store.get(pending_of(child))) for child in stage.children])
+        else:
+            pending = builder.leaves(*_read_block(job, stage.block, threads), job.plan)
         families, left = builder.advance(pending, stage.region, number, job.plan, progress=progress)
         del pending
         columns = dict(vars(families))
@@ -346,13 +328,6 @@ def clean(job: Job, group: int, *, threads: int, progress: Progress) -> None:
     for part in range(len(job.parts) - 1):
         job.store.remove(job.splats(part, group))
     job.store.put(clean_of(group), {})
-
-
-def _begun(job: Job, stage: BuildStage, threads: int) -> Pending:
-    """Return the nodes that a stage builds on."""
-    if stage.block is None:
-        return Pending.concat([Pending(job.store.get(pending_of(child))) for child in stage.children])
-    return job.builder().leaves(*_read_block(job, stage.block, threads), job.plan)
 
 
 def _read_block(job: Job, block: int, threads: int) -> tuple[Splats, NDArray[np.int64]]:

@@ -88,7 +88,8 @@ def put_order(job: Job, *, threads: int, progress: Progress) -> None:
     levels = 1
     sequence = _by_key(job, links, progress)
     if len(sequence):
-        by_place = _by_place(links, sequence)
+        by_place = links.families_at(links.starts(sequence))
+        by_place = by_place[by_place >= 0]  # the families in the order of their parent nodes
         if job.in_chunks:
             del sequence  # memory for what follows
         with on_threads(threads):
@@ -114,12 +115,6 @@ def _by_key(job: Job, links: _Links, progress: Progress) -> NDArray[np.uint32]:
     return sequence
 
 
-def _by_place(links: _Links, sequence: NDArray[np.uint32]) -> NDArray[np.int32]:
-    """Return (F,) the families in the order of their parent nodes, if families are in this sequence."""
-    at = links.families_at(links.starts(sequence))
-    return at[at >= 0]
-
-
 def _links(job: Job) -> _Links:
     begin = np.cumsum([0, *job.families])
     total = int(begin[-1])
@@ -130,7 +125,9 @@ def _links(job: Job) -> _Links:
         here = slice(begin[stage], begin[stage + 1])
         count[here] = families["count"]
         row[here] = np.cumsum(families["count"], dtype=np.int64) - families["count"]
-        runs.append(_runs_of(stage, families["batch"]))
+        batch = families["batch"]
+        ends = [*(np.flatnonzero(np.diff(batch)) + 1).tolist(), len(batch)]
+        runs.append({int(batch[a]): (stage, a, b) for a, b in zip([0, *ends], ends, strict=False) if a < b})
         inner = np.flatnonzero(families["family"] != NO_FAMILY)
         family = families["family"][inner]
         child = begin[family >> STAGE_BITS] + (family & ((1 << STAGE_BITS) - 1))
@@ -216,12 +213,6 @@ def _put_window(
             "child_count": links.count[mine[owner]],
         },
     )
-
-
-def _runs_of(stage: int, batch: NDArray[np.int32]) -> dict[int, Run]:
-    """Return the families of a stage by batch."""
-    ends = [*(np.flatnonzero(np.diff(batch)) + 1).tolist(), len(batch)]
-    return {int(batch[a]): (stage, a, b) for a, b in zip([0, *ends], ends, strict=False) if a < b}
 
 
 def _merged(store: Store, batches: list[dict[int, Run]], begin: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
@@ -316,20 +307,14 @@ def _read_window(store: Store, width: int, window: int) -> tuple[Rows, LodTree]:
     ends = plan["stages"]
     for stage in np.flatnonzero(np.diff(ends)).tolist():
         here = slice(ends[stage], ends[stage + 1])
-        _fill(store, families_of(stage), row[here], count[here], target[here], rows)
+        length = count[here]
+        step = np.arange(length.sum()) - np.repeat(np.cumsum(length) - length, length)
+        place = np.repeat(row[here], length) + step
+        rows[np.repeat(target[here], length) + step] = store.rows_at(families_of(stage), "rows", place)
     tree = LodTree(np.zeros(total, np.uint16), np.zeros(total, np.uint32))
     tree.child_count[plan["owner"]] = plan["child_count"]
     tree.child_start[plan["owner"]] = plan["child_start"]
     return rows, tree
-
-
-def _fill(
-    store: Store, name: str, row: NDArray[np.int64], count: NDArray[np.int64], target: NDArray[np.int64], rows: Rows
-) -> None:
-    """Copy children of families of a stage into the rows of a window; see `_put_window`."""
-    total = int(count.sum())
-    step = np.arange(total) - np.repeat(np.cumsum(count) - count, count)
-    rows[np.repeat(target, count) + step] = store.rows_at(name, "rows", np.repeat(row, count) + step)
 
 
 #: (N, `width_of`) float32: the columns of splats side by side, in the order of `COLUMNS`.
